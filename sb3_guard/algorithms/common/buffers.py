@@ -1,0 +1,125 @@
+"""Rollout buffers that carry costs beside rewards."""
+
+from collections.abc import Generator
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.type_aliases import TensorDict
+
+from sb3_guard.algorithms.common.advantage import discounted_returns, gae
+
+
+class CostRolloutBufferSamples(NamedTuple):
+    """A batch of B transitions with m cost signals; the first six fields are SB3's."""
+
+    observations: th.Tensor | TensorDict
+    actions: th.Tensor  # [B, action_dim]
+    old_values: th.Tensor  # [B]
+    old_log_prob: th.Tensor  # [B]
+    advantages: th.Tensor  # [B]
+    returns: th.Tensor  # [B]
+    costs: th.Tensor  # [B, m], raw
+    cost_advantages: th.Tensor  # [B, m]
+    cost_returns: th.Tensor  # [B, m]
+
+
+class _Costs:
+    """The cost half of both buffers; mixed in before SB3's class, which owns everything else."""
+
+    buffer_size: int
+    n_envs: int
+    gamma: float
+    rewards: np.ndarray
+    episode_starts: np.ndarray
+    generator_ready: bool
+
+    def __init__(
+        self,
+        *args: Any,
+        n_costs: int = 1,
+        cost_gamma: float = 0.99,
+        cost_gae_lambda: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        self.n_costs = n_costs
+        self.cost_gamma = cost_gamma
+        self.cost_gae_lambda = cost_gae_lambda
+        super().__init__(*args, **kwargs)
+
+    def reset(self) -> None:
+        shape = (self.buffer_size, self.n_envs, self.n_costs)
+        self.costs = np.zeros(shape, dtype=np.float32)
+        # γ V_c of the observation an episode was cut at: kept apart, the costs stay raw.
+        self.cost_bootstraps = np.zeros(shape, dtype=np.float32)
+        self.cost_values = np.zeros(shape, dtype=np.float32)
+        self.cost_advantages = np.zeros(shape, dtype=np.float32)
+        self.cost_returns = np.zeros(shape, dtype=np.float32)
+        super().reset()  # type: ignore[misc]
+
+    def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
+        """SB3's advantages, and discounted returns in place of its λ-returns.
+
+        The critics regress on returns as in the paper, whatever ``gae_lambda`` is.
+        """
+        super().compute_returns_and_advantage(last_values, dones)  # type: ignore[misc]
+        last = last_values.cpu().numpy().flatten()
+        self.returns = discounted_returns(
+            self.rewards, self.episode_starts, last, dones, self.gamma
+        )
+
+    def compute_cost_returns_and_advantage(
+        self, last_cost_values: np.ndarray, dones: np.ndarray
+    ) -> None:
+        """Finish the cost half once the rollout is full and ``cost_values`` are known.
+
+        :param last_cost_values: values of the observations after the last step, shape [n_envs, m]
+        :param dones: whether the last step ended an episode, shape [n_envs]
+        """
+        costs = self.costs + self.cost_bootstraps
+        self.cost_advantages = gae(
+            costs,
+            self.cost_values,
+            self.episode_starts,
+            last_cost_values,
+            dones,
+            self.cost_gamma,
+            self.cost_gae_lambda,
+        )
+        self.cost_returns = discounted_returns(
+            costs, self.episode_starts, last_cost_values, dones, self.cost_gamma
+        )
+
+    def get(self, batch_size: int | None = None) -> Generator[CostRolloutBufferSamples, None, None]:
+        if not self.generator_ready:
+            for name in ("costs", "cost_advantages", "cost_returns"):
+                # [T, n, m] -> [n·T, m], in the order of SB3's swap_and_flatten.
+                array = getattr(self, name)
+                setattr(self, name, array.swapaxes(0, 1).reshape(-1, self.n_costs))
+        yield from super().get(batch_size)  # type: ignore[misc]
+
+    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> CostRolloutBufferSamples:
+        samples = super()._get_samples(batch_inds, env)  # type: ignore[misc]
+        costs = (self.costs, self.cost_advantages, self.cost_returns)
+        return CostRolloutBufferSamples(
+            *samples,
+            *(self.to_torch(array[batch_inds]) for array in costs),  # type: ignore[attr-defined]
+        )
+
+
+class CostRolloutBuffer(_Costs, RolloutBuffer):
+    """On-policy transitions with their costs, cost advantages and cost returns.
+
+    ``costs`` [T, n_envs, m] are raw; ``cost_bootstraps`` hold what a time-out adds to them.
+
+    :param n_costs: number m of cost signals
+    :param cost_gamma: discount factor of the costs
+    :param cost_gae_lambda: bias-variance trade-off of the cost advantages
+
+    Other parameters are those of SB3's ``RolloutBuffer``.
+    """
+
+
+class CostDictRolloutBuffer(_Costs, DictRolloutBuffer):
+    """:class:`CostRolloutBuffer` for dictionary observations."""

@@ -1,0 +1,291 @@
+"""The linear algebra of a natural-gradient step, with and without constraints: pure functions.
+
+One convention holds throughout. The policy parameters move by ``x`` so as to
+
+    maximise  gᵀx   subject to   c + Bx ≤ 0   and   ½ xᵀFx ≤ δ
+
+where ``g`` is the gradient of the reward surrogate (ascent), the rows of ``B`` are the gradients of
+the cost surrogates, ``c`` the violations of the limits by the old policy (positive: violated), ``F``
+the Fisher matrix and ``δ`` the trust-region radius. Only ``v = F⁻¹g`` and ``w_i = F⁻¹b_i`` are ever
+needed, and the answer lies in their span, so everything past the conjugate gradient happens in
+``m + 1`` dimensions, in float64.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from scipy.optimize import brentq, nnls
+
+
+def flatten(tensors: Iterable[th.Tensor]) -> th.Tensor:
+    """Lay tensors end to end in one vector, the form in which steps are computed."""
+    return th.cat([tensor.reshape(-1) for tensor in tensors])
+
+
+def unflatten(vector: th.Tensor, like: Sequence[th.Tensor]) -> list[th.Tensor]:
+    """Cut a vector into views shaped like the given tensors; undoes :func:`flatten`."""
+    pieces = th.split(vector, [tensor.numel() for tensor in like])
+    return [piece.view_as(tensor) for piece, tensor in zip(pieces, like, strict=True)]
+
+
+def assign(parameters: Sequence[th.Tensor], vector: th.Tensor) -> None:
+    """Write a flat vector into parameters, in place and outside autograd."""
+    with th.no_grad():
+        for parameter, piece in zip(parameters, unflatten(vector, parameters), strict=True):
+            parameter.copy_(piece)
+
+
+def conjugate_gradient(
+    product: Callable[[th.Tensor], th.Tensor],
+    rhs: th.Tensor,
+    max_steps: int,
+    tolerance: float = 1e-10,
+) -> th.Tensor:
+    """Solve ``F x = rhs`` knowing only products with F (Hestenes & Stiefel, 1952).
+
+    It starts from zero, so equal inputs give equal answers, and ``rhsᵀx = xᵀFx`` holds at every
+    iterate: the step length computed from it is right even if the solution is not exact.
+
+    :param product: maps x to F x; F symmetric and positive definite
+    :param rhs: right-hand side, shape (P,)
+    :param max_steps: iterations at most
+    :param tolerance: stop once the squared residual falls below this fraction of the squared rhs
+    :return: the solution, shape (P,); the zero vector for a zero rhs
+    """
+    x = th.zeros_like(rhs)
+    residual, direction = rhs.clone(), rhs.clone()
+    square = float(residual @ residual)
+    threshold = tolerance * square
+    for _ in range(max_steps):
+        if not square > threshold:
+            break
+        image = product(direction)
+        curvature = float(direction @ image)
+        # Rounding can spend the positive curvature of a nearly solved system.
+        if not curvature > 0.0:
+            break
+        x.add_(direction, alpha=square / curvature)
+        residual.sub_(image, alpha=square / curvature)
+        previous, square = square, float(residual @ residual)
+        direction.mul_(square / previous).add_(residual)
+    return x
+
+
+class Case(IntEnum):
+    """How the cost constraints lie to the trust region; decides what a step may ask for.
+
+    Numbered as in the code that accompanies CPO (Achiam et al., 2017).
+    """
+
+    LOST = 0  # no point of the trust region satisfies the constraints
+    RECOVERABLE = 1  # violated now, satisfiable within the trust region
+    BINDING = 2  # satisfied now, the boundary cuts the trust region
+    INACTIVE = 3  # satisfied throughout the trust region
+    NO_GRADIENT = 4  # satisfied, and no step changes the cost
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the old policy satisfies every constraint."""
+        return self >= Case.BINDING
+
+
+class Step(NamedTuple):
+    """A solved step: where to go, and the multipliers that say why.
+
+    :param x: the step, shape (P,)
+    :param case: how the constraints lie to the trust region
+    :param lambda_kl: multiplier λ of the trust region, 0 where lost
+    :param nu: multipliers ν of the constraints, shape (m,), 0 where lost
+    """
+
+    x: th.Tensor
+    case: Case
+    lambda_kl: float
+    nu: np.ndarray
+
+
+# A constraint whose cost moves by less than this within the trust region has no usable gradient
+# (units of the cost per step).
+_NO_REACH = 1e-7
+# Share of the reward gradient that must remain across the constraint to be worth following: below
+# it the remainder is rounding error.
+_PARALLEL = 1e-8
+
+
+def constrained_step(
+    g: th.Tensor,
+    B: th.Tensor,
+    c: np.ndarray,
+    v: th.Tensor,
+    W: th.Tensor,
+    delta: float,
+) -> Step:
+    """The step of highest linearised reward within the constraints and the trust region.
+
+    One constraint has a closed form (Achiam et al., 2017, theorem 2, here for ascent); several are
+    solved through the dual. If no point of the trust region satisfies them, the step minimises
+    ``Σ max(0, c_i + b_iᵀx)²`` over the region instead, which for one constraint is the steepest
+    descent of its cost.
+
+    :param g: reward gradient, shape (P,)
+    :param B: cost gradients, shape (m, P)
+    :param c: violations, shape (m,), in the units of the cost surrogate
+    :param v: F⁻¹g, shape (P,)
+    :param W: F⁻¹b_i, shape (m, P)
+    :param delta: trust-region radius δ > 0
+    """
+    rows, images = th.cat([g[None], B]).double(), th.cat([v[None], W]).double()
+    gram = (rows @ images.T).cpu().numpy()  # [1 + m, 1 + m]
+    a, beta, case, lambda_kl, nu = _solve(
+        (gram + gram.T) / 2, np.asarray(c, dtype=np.float64), delta
+    )
+    x = a * v + th.as_tensor(beta, dtype=W.dtype, device=W.device) @ W
+    return Step(x, case, lambda_kl, nu)
+
+
+_Solution = tuple[float, np.ndarray, float, np.ndarray]
+
+
+def _solve(
+    gram: np.ndarray, c: np.ndarray, delta: float
+) -> tuple[float, np.ndarray, Case, float, np.ndarray]:
+    """Coefficients (a, β) of x = a v + Σ β_i w_i, the case, λ and ν.
+
+    :param gram: inner products of (g, b_1, …, b_m) in the metric F⁻¹, shape (1 + m, 1 + m)
+    """
+    zero = np.zeros(len(c))
+    q, reach = gram[0, 0], np.sqrt(2 * delta * np.maximum(np.diag(gram)[1:], 0.0))
+    trpo = np.sqrt(2 * delta / q) if q > 0.0 else 0.0
+    lambda_trpo = np.sqrt(max(0.0, q) / (2 * delta))
+    # A constraint that no step can move either always holds or can't be met.
+    moves, satisfied = reach > _NO_REACH, c <= 0.0
+    if satisfied.all():
+        if not moves.any():
+            return trpo, zero, Case.NO_GRADIENT, lambda_trpo, zero
+        inactive = bool(np.all(c[moves] + reach[moves] < 0.0))
+        case = Case.INACTIVE if inactive else Case.BINDING
+    elif np.all(moves | satisfied) and _reachable(gram[1:, 1:], c, moves, delta):
+        case = Case.RECOVERABLE
+    else:
+        return 0.0, -_least_violation(gram[1:, 1:], c, delta), Case.LOST, 0.0, zero
+    if np.all(c[moves] + trpo * gram[1:, 0][moves] <= 0.0):
+        return trpo, zero, case, lambda_trpo, zero
+    a, beta, lambda_kl, nu = (_closed_form if len(c) == 1 else _dual)(gram, c, moves, delta)
+    return a, beta, case, lambda_kl, nu
+
+
+def _closed_form(gram: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) -> _Solution:
+    """One binding constraint: walk to its boundary, spend what is left of δ along it."""
+    (q, r), (_, s) = gram
+    along = q - r**2 / s  # squared length of the reward gradient along the boundary
+    if along <= _PARALLEL * q:
+        return 0.0, -c / s, 0.0, np.array([max(0.0, r / s)])
+    # Twice the KL left once the boundary is reached; kept off zero so that λ stays finite.
+    room = max(2 * delta - c[0] ** 2 / s, 1e-12 * delta)
+    lambda_kl = np.sqrt(along / room)
+    nu = (r + lambda_kl * c) / s
+    return 1.0 / lambda_kl, -nu / lambda_kl, lambda_kl, nu
+
+
+def _unit_normals(S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors (rows) whose angles are those of the inner products S, and their lengths."""
+    lengths = np.sqrt(np.diag(S))
+    values, vectors = np.linalg.eigh(S / np.outer(lengths, lengths))
+    return vectors * np.sqrt(np.maximum(values, 0.0)), lengths
+
+
+def _project(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, float]:
+    """Shortest z with ``normals @ z + offsets ≤ 0`` (Lawson & Hanson, 1974, problem LDP).
+
+    :return: (u, φ) such that the multipliers are u / φ, ``z = -normalsᵀu / φ`` and
+        ``|z|² = 1/φ - 1``; φ is 0 if the half-spaces contradict each other
+    """
+    target = np.append(np.zeros(normals.shape[1]), 1.0)
+    u, _ = nnls(np.vstack([-normals.T, offsets]), target)
+    return u, max(0.0, 1.0 - float(offsets @ u))
+
+
+def _reachable(S: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) -> bool:
+    """Whether some point of the trust region satisfies every constraint."""
+    normals, lengths = _unit_normals(S[np.ix_(moves, moves)])
+    # In units in which the trust region is the unit ball.
+    _, phi = _project(normals, c[moves] / (lengths * np.sqrt(2 * delta)))
+    return phi >= 0.5
+
+
+def _dual(gram: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) -> _Solution:
+    """Several constraints: for a fixed λ, project g/λ on the polyhedron; λ by a scalar search.
+
+    The KL of that projection falls as λ rises, because the dual is convex in λ.
+    """
+    # Without a reward gradient the same projection, of zero, is the shortest way to feasibility.
+    if gram[0, 0] <= 0.0:
+        gram = gram.copy()
+        gram[0] = gram[:, 0] = 0.0
+        gram[0, 0] = np.finfo(np.float64).tiny
+    mask = np.append(True, moves)
+    points, lengths = _unit_normals(gram[np.ix_(mask, mask)])
+    gradient, normals = points[0], points[1:]
+    size, lengths, radius = lengths[0], lengths[1:], np.sqrt(2 * delta)
+    offsets = c[moves] / (lengths * radius)
+
+    def project(lam: float) -> tuple[np.ndarray, np.ndarray]:
+        """The projected point and its multipliers, where the trust region is the unit ball."""
+        # Two scalings of one problem: each keeps its numbers near one in its range of λ.
+        scale = max(1.0, lam)
+        u, phi = _project(normals, (lam * offsets + normals @ gradient) / scale)
+        mu = u / phi * scale / lam
+        return gradient / lam - mu @ normals, mu
+
+    def excess(log_lam: float) -> float:
+        point, _ = project(np.exp(log_lam))
+        return float(point @ point) - 1.0
+
+    lam = np.exp(_root(excess, np.log(1e-7), np.log(1e7)))
+    _, mu = project(lam)
+    beta, nu = np.zeros(len(c)), np.zeros(len(c))
+    beta[moves] = -mu * radius / lengths
+    nu[moves] = mu * lam * size / lengths
+    return radius / (lam * size), beta, lam * size / radius, nu
+
+
+def _root(decreasing: Callable[[float], float], low: float, high: float) -> float:
+    """Where a decreasing function is zero, or the nearer end of the interval."""
+    if decreasing(low) <= 0.0:
+        return low
+    if decreasing(high) >= 0.0:
+        return high
+    return float(brentq(decreasing, low, high, xtol=1e-12))
+
+
+def _least_violation(S: np.ndarray, c: np.ndarray, delta: float) -> np.ndarray:
+    """Weights p ≥ 0 of ``x = -Σ p_i w_i`` that minimise ``Σ max(0, c_i + b_iᵀx)²`` in the region.
+
+    For a fixed multiplier μ of the trust region the dual is a non-negative least-squares problem
+    whose solution is p μ; μ by a scalar search, the KL of the step falls as it rises.
+    """
+    moves = np.diag(S) > 0.0
+    if not moves.any():
+        return np.zeros(len(c))
+    normals, lengths = _unit_normals(S[np.ix_(moves, moves)])
+    largest, radius = lengths.max(), np.sqrt(2 * delta)
+    normals = normals * (lengths / largest)[:, None]
+    offsets = c[moves] / (largest * radius)
+
+    def weights(mu: float) -> np.ndarray:
+        stacked = np.vstack([np.eye(len(offsets)), normals.T / np.sqrt(mu)])
+        residual, _ = nnls(stacked, np.append(offsets, np.zeros(normals.shape[1])))
+        return residual / mu
+
+    def excess(log_mu: float) -> float:
+        point = weights(np.exp(log_mu)) @ normals
+        return float(point @ point) - 1.0
+
+    # The compromise between contradictory constraints may lie inside the region: then μ is zero.
+    top = 1e9 * max(1.0, float(np.abs(offsets).max()))
+    p = np.zeros(len(c))
+    p[moves] = weights(np.exp(_root(excess, np.log(1e-9), np.log(top)))) * radius / largest
+    return p

@@ -1,0 +1,764 @@
+"""The base of all algorithms here: trust-region policy optimisation with five places to differ.
+
+One update reads like the algorithm box of the papers: collect a rollout, estimate advantages of the
+reward and of each cost, find a step within a trust region around the old policy, search along it,
+fit the critics. What an algorithm may replace:
+
+``surrogate(batch, ratio)``
+    what is ascended; the mean of ratio times advantage.
+``step(region)``
+    where to go, given the gradients, the violations and products with F⁻¹; the natural gradient
+    of length √(2δ).
+``accept(trial)``
+    whether a candidate on the way is good enough; KL at most δ and a surrogate no worse.
+``correct(observations, actions)``
+    what is executed in place of an action; the action itself.
+``fit(batch)``
+    what else is learnt after the policy moved; nothing.
+"""
+
+import difflib
+import random
+import time
+import warnings
+from collections import deque
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import explained_variance, obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
+
+from sb3_guard.algorithms.common.actor import Actor
+from sb3_guard.algorithms.common.buffers import (
+    CostDictRolloutBuffer,
+    CostRolloutBuffer,
+    CostRolloutBufferSamples,
+)
+from sb3_guard.algorithms.common.critics import CostCritic, Regression
+from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
+
+SelfTrustRegion = TypeVar("SelfTrustRegion", bound="TrustRegion")
+
+
+class CostEstimate(NamedTuple):
+    """What a rollout says about the costs, m of them.
+
+    :param episode_cost: J_C, mean undiscounted cost of the episodes that ended, shape (m,)
+    :param horizon: T, the length of an episode, steps
+    :param violation: (J_C - d) / T, in the per-step units of mean(ratio · cost advantage),
+        shape (m,)
+    """
+
+    episode_cost: np.ndarray
+    horizon: float
+    violation: np.ndarray
+
+
+class Trial(NamedTuple):
+    """A candidate of the line search, compared with the old policy.
+
+    :param kl: mean KL(old ‖ candidate)
+    :param improvement: change of the surrogate
+    :param cost_change: changes of mean(ratio · cost advantage), shape (m,)
+    """
+
+    kl: float
+    improvement: float
+    cost_change: np.ndarray
+
+
+class Region:
+    """The update's local picture: a linear surrogate inside a quadratic trust region.
+
+    :param actor: the policy on the batch
+    :param batch: the batch
+    :param gradient: of the surrogate at the old policy, shape (P,)
+    :param violation: of the cost limits, in units of the cost surrogates, shape (m,)
+    :param delta: bound on the mean KL
+    :param damping: added to the Fisher matrix's diagonal
+    :param cg_max_steps: conjugate-gradient iterations per solve
+    """
+
+    def __init__(
+        self,
+        actor: Actor,
+        batch: CostRolloutBufferSamples,
+        gradient: th.Tensor,
+        violation: np.ndarray,
+        delta: float,
+        damping: float,
+        cg_max_steps: int,
+    ) -> None:
+        self.actor = actor
+        self.batch = batch
+        self.gradient = gradient
+        self.violation = violation
+        self.delta = delta
+        self.damping = damping
+        self.cg_max_steps = cg_max_steps
+
+    @cached_property
+    def cost_gradients(self) -> th.Tensor:
+        """Gradients of mean(ratio · cost advantage) at the old policy, shape (m, P)."""
+        weights = self.batch.cost_advantages / len(self.batch.cost_advantages)
+        return th.stack([self.actor.score(column) for column in weights.unbind(dim=1)])
+
+    def product(self, vector: th.Tensor) -> th.Tensor:
+        """F · vector, damped, shape (P,)."""
+        return self.actor.fisher(vector).add_(vector, alpha=self.damping)
+
+    def solve(self, vector: th.Tensor) -> th.Tensor:
+        """F⁻¹ · vector by conjugate gradients, shape (P,)."""
+        return conjugate_gradient(self.product, vector, self.cg_max_steps)
+
+    def natural_step(self) -> th.Tensor:
+        """The unconstrained step: along F⁻¹ gradient, as far as the region goes, shape (P,)."""
+        direction = self.solve(self.gradient)
+        length = float(self.gradient @ direction)
+        if not length > 0.0:
+            return th.zeros_like(direction)
+        return direction * float(np.sqrt(2 * self.delta / length))
+
+
+class _CorrectedEnv(VecEnvWrapper):
+    """Executes corrected actions during one rollout; the algorithm's own env stays unwrapped."""
+
+    def __init__(self, venv: VecEnv, algorithm: "TrustRegion") -> None:
+        super().__init__(venv)
+        self.algorithm = algorithm
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self.venv.step_async(self.algorithm.correct(self.algorithm._last_obs, actions))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        return self.venv.step_wait()
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+
+class TrustRegion(OnPolicyAlgorithm):
+    """Trust-region policy optimisation that knows of costs: the spine of every algorithm here.
+
+    On its own it is TRPO (Schulman et al., 2015) as the GUARD paper runs it: KL summed over action
+    dimensions, and critics fitted full-batch to discounted returns.
+
+    :param policy: policy class or its alias (``MlpPolicy``, ``CnnPolicy``, ``MultiInputPolicy``)
+    :param env: environment, vectorised or not, or its id; its ``info`` reports the costs
+    :param learning_rate: of the critics, a number or a function of the remaining progress
+    :param n_steps: steps per environment and update; a multiple of the episode length makes every
+        update see whole episodes
+    :param batch_size: rows per critic step; None for the whole rollout, as in the paper
+    :param gamma: discount factor of the reward
+    :param gae_lambda: bias-variance trade-off of the reward advantages
+    :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key
+    :param cost_keys: entries of ``info`` that hold the costs of a step
+    :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
+        absent key means that nothing was charged
+    :param cost_gamma: discount factor of the costs; None for ``gamma``
+    :param cost_gae_lambda: likewise for ``gae_lambda``
+    :param target_kl: δ, bound on the mean KL(old ‖ new) per update, summed over action dimensions
+    :param cg_max_steps: conjugate-gradient iterations per solve
+    :param cg_damping: added to the diagonal of the Fisher matrix
+    :param line_search_max_iter: candidates tried along a step
+    :param line_search_shrinking_factor: ratio of successive candidates
+    :param n_critic_updates: passes over the rollout per critic and update
+    :param normalize_advantage: whether to standardise the reward advantages; cost advantages are
+        centred but never scaled, since they share the limit's units
+    :param use_sde: generalised state-dependent exploration
+    :param sde_sample_freq: steps between draws of its noise matrix; -1 for once per rollout
+    :param rollout_buffer_class: a subclass of ``CostRolloutBuffer``; None chooses
+    :param rollout_buffer_kwargs: further arguments of the buffer
+    :param stats_window_size: episodes over which logged episode statistics are averaged
+    :param tensorboard_log: folder for TensorBoard; None for none
+    :param policy_kwargs: arguments of the policy
+    :param verbose: 0 silent, 1 progress, 2 debug
+    :param seed: of every random generator involved
+    :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``
+    :param _init_setup_model: whether to build the networks at once
+    :raises ValueError: if a value is out of range; the message names it and what is allowed
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": ActorCriticPolicy,
+        "CnnPolicy": ActorCriticCnnPolicy,
+        "MultiInputPolicy": MultiInputActorCriticPolicy,
+    }
+    #: Whether training depends on costs at all.
+    constrained: ClassVar[bool] = True
+    #: Whether a critic of the costs is built and trained.
+    uses_cost_critic: ClassVar[bool] = True
+
+    rollout_buffer: CostRolloutBuffer | CostDictRolloutBuffer  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        n_steps: int = 2048,
+        batch_size: int | None = None,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.97,
+        cost_limit: float | Sequence[float] = 0.0,
+        cost_keys: Sequence[str] = ("cost",),
+        missing_cost: Literal["error", "zero"] = "error",
+        cost_gamma: float | None = None,
+        cost_gae_lambda: float | None = None,
+        target_kl: float = 0.02,
+        cg_max_steps: int = 15,
+        cg_damping: float = 0.1,
+        line_search_max_iter: int = 100,
+        line_search_shrinking_factor: float = 0.8,
+        n_critic_updates: int = 80,
+        normalize_advantage: bool = True,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        rollout_buffer_class: type[RolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            # SB3's loss weights: nothing here mixes the losses of actor and critic.
+            ent_coef=0.0,
+            vf_coef=0.0,
+            max_grad_norm=0.0,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            rollout_buffer_class=rollout_buffer_class,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+            supported_action_spaces=(
+                spaces.Box,
+                spaces.Discrete,
+                spaces.MultiDiscrete,
+                spaces.MultiBinary,
+            ),
+        )
+        self.batch_size = batch_size
+        self.cost_limit = cost_limit
+        self.cost_keys = cost_keys
+        self.missing_cost = missing_cost
+        self.cost_gamma = cost_gamma
+        self.cost_gae_lambda = cost_gae_lambda
+        self.target_kl = target_kl
+        self.cg_max_steps = cg_max_steps
+        self.cg_damping = cg_damping
+        self.line_search_max_iter = line_search_max_iter
+        self.line_search_shrinking_factor = line_search_shrinking_factor
+        self.n_critic_updates = n_critic_updates
+        self.normalize_advantage = normalize_advantage
+
+        # Running episodes outlive rollouts, and a run may be saved between two.
+        self.running_costs: np.ndarray | None = None  # [n_envs, m]
+        self.running_lengths: np.ndarray | None = None  # [n_envs]
+        self.total_costs: np.ndarray | None = None  # [m]
+        self.ep_cost_buffer: deque[np.ndarray] | None = None
+        self.horizon: float | None = None  # T of the last rollout in which an episode ended
+        self.cost_seen = False
+        self._warned: set[str] = set()
+        self.costs: CostEstimate | None = None
+        self.timing: dict[str, float] = {}
+        self._rng_at_rollout: tuple[Any, Any, th.Tensor] | None = None
+        self._begin_rollout_statistics()
+
+        if _init_setup_model:
+            self._setup_model()
+
+    # Construction and saving
+
+    def _check_hyperparameters(self) -> None:
+        """Refuse values that could only fail later or silently do harm."""
+        positive_integers = ["n_steps", "cg_max_steps", "line_search_max_iter", "n_critic_updates"]
+        if self.batch_size is not None:
+            positive_integers.append("batch_size")
+        for name in positive_integers:
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+                raise ValueError(f"{name}={value!r}: must be an integer of at least 1")
+        ranges = {
+            "gamma": (0.0, 1.0, "[]"),
+            "gae_lambda": (0.0, 1.0, "[]"),
+            "cost_gamma": (0.0, 1.0, "[]"),
+            "cost_gae_lambda": (0.0, 1.0, "[]"),
+            "target_kl": (0.0, np.inf, "()"),
+            "cg_damping": (0.0, np.inf, "[)"),
+            "line_search_shrinking_factor": (0.0, 1.0, "()"),
+        }
+        for name, (low, high, ends) in ranges.items():
+            value = getattr(self, name)
+            if value is None and name.startswith("cost_"):
+                continue
+            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            above = number and (value >= low if ends[0] == "[" else value > low)
+            below = number and (value <= high if ends[1] == "]" else value < high)
+            if not (above and below):
+                raise ValueError(
+                    f"{name}={value!r}: must be a number in {ends[0]}{low:g}, {high:g}{ends[1]}"
+                )
+        if not callable(self.learning_rate) and not self.learning_rate > 0.0:
+            raise ValueError(
+                f"learning_rate={self.learning_rate!r}: must be a positive number or a schedule"
+            )
+        if self.missing_cost not in ("error", "zero"):
+            raise ValueError(f"missing_cost={self.missing_cost!r}: must be 'error' or 'zero'")
+        if (
+            isinstance(self.cost_keys, str)
+            or len(self.cost_keys) < 1
+            or not all(isinstance(key, str) for key in self.cost_keys)
+            or len(set(self.cost_keys)) < len(self.cost_keys)
+        ):
+            raise ValueError(
+                f"cost_keys={self.cost_keys!r}: must be a sequence of one or more different names "
+                "of info entries, such as ('cost',)"
+            )
+        limits = np.asarray(self.cost_limit)
+        if limits.ndim > 1 or (limits.ndim == 1 and len(limits) != len(self.cost_keys)):
+            raise ValueError(
+                f"cost_limit={self.cost_limit!r}: must be one number, or one for each of the "
+                f"{len(self.cost_keys)} cost keys {tuple(self.cost_keys)}"
+            )
+        if limits.dtype.kind not in "iuf" or not np.all(np.isfinite(limits)):
+            raise ValueError(f"cost_limit={self.cost_limit!r}: must be finite numbers")
+        buffer_class = self.rollout_buffer_class
+        if buffer_class is not None and not issubclass(
+            buffer_class, CostRolloutBuffer | CostDictRolloutBuffer
+        ):
+            raise ValueError(
+                f"rollout_buffer_class={buffer_class.__name__}: must be a subclass of "
+                "CostRolloutBuffer, or of CostDictRolloutBuffer for Dict observations"
+            )
+        if self.env is not None and self.normalize_advantage and self.n_steps * self.n_envs < 2:
+            raise ValueError(
+                f"n_steps={self.n_steps} with {self.n_envs} environment: standardising advantages "
+                "takes at least two steps per update; raise n_steps or pass "
+                "normalize_advantage=False"
+            )
+
+    def _setup_model(self) -> None:
+        self._check_hyperparameters()
+        # Loading turns tuples into lists.
+        self.cost_keys = tuple(self.cost_keys)
+        n_costs = len(self.cost_keys)
+        self.cost_limits = np.broadcast_to(np.asarray(self.cost_limit, np.float64), (n_costs,))
+        if self.rollout_buffer_class is None:
+            dictionary = isinstance(self.observation_space, spaces.Dict)
+            self.rollout_buffer_class = CostDictRolloutBuffer if dictionary else CostRolloutBuffer
+        gamma, gae_lambda = self.cost_gamma, self.cost_gae_lambda
+        self.rollout_buffer_kwargs = {
+            **self.rollout_buffer_kwargs,
+            "n_costs": n_costs,
+            "cost_gamma": self.gamma if gamma is None else gamma,
+            "cost_gae_lambda": self.gae_lambda if gae_lambda is None else gae_lambda,
+        }
+        super()._setup_model()
+        self._value_regression = Regression.of_value(self.policy)
+        if self.uses_cost_critic:
+            self.cost_critic = CostCritic(self.policy, n_costs, self.lr_schedule)
+            self._cost_regression = Regression.of_cost(self.cost_critic)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [
+            *super()._excluded_save_params(),
+            "_value_regression",
+            "_cost_regression",
+            "_timeouts",
+            "_rng_at_rollout",
+        ]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        if self.uses_cost_critic:
+            state_dicts = [*state_dicts, "cost_critic", "cost_critic.optimizer"]
+        return state_dicts, tensors
+
+    # Collecting
+
+    @property
+    def total_cost(self) -> float:
+        """Cost of the whole training so far, summed over the cost keys."""
+        return 0.0 if self.total_costs is None else float(self.total_costs.sum())
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        n_costs = len(self.cost_keys)
+        if self.ep_cost_buffer is None or reset_num_timesteps:
+            self.ep_cost_buffer = deque(maxlen=self._stats_window_size)
+            self.total_costs = np.zeros(n_costs)
+        # The environments are reset under the same condition.
+        if reset_num_timesteps or self._last_obs is None:
+            self.running_costs = np.zeros((self.n_envs, n_costs))
+            self.running_lengths = np.zeros(self.n_envs, dtype=np.int64)
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def learn(
+        self: SelfTrustRegion,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfTrustRegion:
+        return super().learn(
+            total_timesteps,
+            callback,
+            log_interval,
+            tb_log_name or type(self).__name__,
+            reset_num_timesteps,
+            progress_bar,
+        )
+
+    def _begin_rollout_statistics(self) -> None:
+        self._ended_costs: list[np.ndarray] = []
+        self._ended_lengths: list[int] = []
+        # (step, env, observation) of every episode cut by a time limit
+        self._timeouts: list[tuple[int, int, Any]] = []
+        self._cost_seen_in_rollout = False
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        # Taken before anything is drawn: a checkpoint written at the start of a rollout restores
+        # these to continue as if it had never been written.
+        self._rng_at_rollout = (random.getstate(), np.random.get_state(), th.get_rng_state())
+        started = time.perf_counter()
+        self._begin_rollout_statistics()
+        corrects = type(self).correct is not TrustRegion.correct
+        full = super().collect_rollouts(
+            _CorrectedEnv(env, self) if corrects else env,
+            callback,
+            rollout_buffer,
+            n_rollout_steps,
+        )
+        if full:
+            self._finish_costs()
+        self.timing["collect"] = time.perf_counter() - started
+        return full
+
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
+    ) -> None:
+        super()._update_info_buffer(infos, dones)
+        assert dones is not None and self.ep_cost_buffer is not None
+        assert self.running_costs is not None and self.running_lengths is not None
+        costs = self._read_costs(infos)
+        # SB3 calls this just before it adds the transition.
+        step = self.rollout_buffer.pos
+        self.rollout_buffer.costs[step] = costs
+        self.total_costs += costs.sum(axis=0)
+        self.running_costs += costs
+        self.running_lengths += 1
+        for i in np.flatnonzero(dones):
+            self._ended_costs.append(self.running_costs[i].copy())
+            self._ended_lengths.append(int(self.running_lengths[i]))
+            self.ep_cost_buffer.append(self._ended_costs[-1])
+            self.running_costs[i] = 0.0
+            self.running_lengths[i] = 0
+            info = infos[i]
+            if info.get("TimeLimit.truncated", False) and (
+                info.get("terminal_observation") is not None
+            ):
+                self._timeouts.append((step, int(i), info["terminal_observation"]))
+
+    def _read_costs(self, infos: list[dict[str, Any]]) -> np.ndarray:
+        """Costs of one step of every environment, shape (n_envs, m)."""
+        try:
+            rows = [[info[key] for key in self.cost_keys] for info in infos]
+            self._cost_seen_in_rollout = True
+        except KeyError:
+            if self.missing_cost == "error":
+                raise self._missing_cost_error(infos) from None
+            rows = [[info.get(key, 0.0) for key in self.cost_keys] for info in infos]
+            self._cost_seen_in_rollout |= any(k in info for info in infos for k in self.cost_keys)
+        try:
+            costs = np.array(rows, dtype=np.float64).reshape(len(infos), len(self.cost_keys))
+        except (TypeError, ValueError):
+            costs = np.full((len(infos), len(self.cost_keys)), np.nan)
+        if not np.isfinite(costs).all():
+            i, j = np.argwhere(~np.isfinite(costs))[0]
+            raise ValueError(
+                f"info[{self.cost_keys[j]!r}] of environment {i} is {rows[i][j]!r}: "
+                "a cost must be a finite number"
+            )
+        return costs
+
+    def _missing_cost_error(self, infos: list[dict[str, Any]]) -> KeyError | ValueError:
+        i, key = next(
+            (i, key) for i, info in enumerate(infos) for key in self.cost_keys if key not in info
+        )
+        present = sorted(str(name) for name in infos[i])
+        nearest = difflib.get_close_matches(key, present, n=1, cutoff=0.4)
+        hint = f" (nearest: {nearest[0]!r})" if nearest else ""
+        return ValueError(
+            f"info of environment {i} has no cost key {key!r}; its keys are {present}{hint}. "
+            "Pass the right names as cost_keys=(...), or missing_cost='zero' if the key appears "
+            "only when there is a cost"
+        )
+
+    @th.no_grad()
+    def _finish_costs(self) -> None:
+        """Complete the rollout's cost half: values, advantages, returns, estimate of J_C."""
+        self.cost_seen |= self._cost_seen_in_rollout
+        if self.constrained and not self._cost_seen_in_rollout:
+            self._warn_once(
+                f"no info had a cost key of {tuple(self.cost_keys)} during a whole rollout: "
+                "training goes on as if nothing cost anything (missing_cost='zero')"
+            )
+        self.costs = self._estimate_costs()
+        if not self.uses_cost_critic:
+            return
+        buffer = self.rollout_buffer
+        self.policy.set_training_mode(False)
+        self.cost_critic.train(False)
+        stored: Any = buffer.observations
+        stored = {"": stored} if not isinstance(stored, dict) else stored
+        flat = {key: value.reshape(-1, *value.shape[2:]) for key, value in stored.items()}
+        observations = obs_as_tensor(flat, self.device)
+        values = self.cost_critic.predict(observations.get("", observations))  # type: ignore
+        buffer.cost_values = values.cpu().numpy().reshape(buffer.costs.shape)
+        for step, i, observation in self._timeouts:
+            terminal, _ = self.policy.obs_to_tensor(observation)
+            buffer.cost_bootstraps[step, i] = (
+                buffer.cost_gamma * self.cost_critic(terminal)[0].cpu().numpy()
+            )
+        self._timeouts = []
+        last = self.cost_critic(obs_as_tensor(self._last_obs, self.device)).cpu().numpy()
+        assert self._last_episode_starts is not None
+        buffer.compute_cost_returns_and_advantage(last, self._last_episode_starts)
+
+    def _estimate_costs(self) -> CostEstimate:
+        """J_C, T and the violations from the episodes that ended in this rollout."""
+        if self._ended_costs:
+            self.horizon = float(np.mean(self._ended_lengths))
+            episode_cost = np.mean(self._ended_costs, axis=0)
+        else:
+            if self.horizon is None:
+                self.horizon = self._horizon_before_any_episode()
+            # Nothing ended: what an episode would cost at the rate of this rollout.
+            episode_cost = self.rollout_buffer.costs.mean(axis=(0, 1)) * self.horizon
+        violation = (episode_cost - self.cost_limits) / self.horizon
+        return CostEstimate(episode_cost, self.horizon, violation)
+
+    def _horizon_before_any_episode(self) -> float:
+        assert self.env is not None and self.running_lengths is not None
+        try:
+            limits = [
+                getattr(spec, "max_episode_steps", None) for spec in self.env.get_attr("spec")
+            ]
+        except (AttributeError, NotImplementedError):
+            limits = []
+        if limits and all(limits):
+            return float(np.mean(limits))
+        longest = float(self.running_lengths.max())
+        if self.constrained:
+            self._warn_once(
+                "no episode has ended yet and the environment states no max_episode_steps: until "
+                f"one ends, the cost limit is spread over the longest so far, {longest:g} steps"
+            )
+        return longest
+
+    def _warn_once(self, message: str) -> None:
+        topic = message.split(":")[0]
+        if topic not in self._warned:
+            self._warned.add(topic)
+            warnings.warn(message, UserWarning, stacklevel=3)
+
+    # Updating
+
+    def train(self) -> None:
+        """One update from the rollout: the policy's step, what a leaf learns, the critics."""
+        self.policy.set_training_mode(True)
+        optimizers = [self.policy.optimizer]
+        if self.uses_cost_critic:
+            self.cost_critic.train(True)
+            optimizers.append(self.cost_critic.optimizer)
+        self._update_learning_rate(optimizers)
+
+        started = time.perf_counter()
+        batch = self._batch()
+        self._update_actor(batch)
+        self.fit(batch)
+        moved = time.perf_counter()
+        self._update_critics(batch)
+        self.timing.update(actor=moved - started, critics=time.perf_counter() - moved)
+
+        self._n_updates += 1
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        log_std = getattr(self.policy, "log_std", None)
+        if log_std is not None:
+            self.logger.record("train/std", th.exp(log_std).mean().item())
+        self.logger.record(
+            "train/explained_variance",
+            explained_variance(
+                self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
+            ),
+        )
+
+    def _batch(self) -> CostRolloutBufferSamples:
+        """The whole rollout, with advantages and critic targets as the updates use them."""
+        buffer = self.rollout_buffer
+        batch: CostRolloutBufferSamples = next(buffer.get(batch_size=None))
+        advantages, cost_advantages = batch.advantages, batch.cost_advantages
+        if self.normalize_advantage:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        actions = batch.actions
+        if isinstance(self.action_space, spaces.Discrete):
+            actions = actions.long().flatten()
+        return batch._replace(
+            actions=actions,
+            advantages=advantages,
+            cost_advantages=cost_advantages - cost_advantages.mean(dim=0),
+        )
+
+    def _update_actor(self, batch: CostRolloutBufferSamples) -> None:
+        assert self.costs is not None
+        actor = Actor.of(self.policy, batch.observations, batch.actions)
+        ratio = th.ones_like(batch.advantages).requires_grad_()
+        before = self.surrogate(batch, ratio)
+        (weights,) = th.autograd.grad(before, ratio)
+        region = Region(
+            actor,
+            batch,
+            actor.score(weights),
+            self.costs.violation,
+            self.target_kl,
+            self.cg_damping,
+            self.cg_max_steps,
+        )
+        fraction, trial = self._line_search(region, self.step(region), float(before))
+        logger = self.logger
+        logger.record("train/policy_objective", float(before) + trial.improvement)
+        logger.record("train/kl", trial.kl)
+        logger.record("train/line_search_step", fraction)
+        if self.constrained:
+            excess = self.costs.violation * self.costs.horizon
+            self._record_per_cost("train/constraint_violation", excess)
+            if self.uses_cost_critic:
+                self._record_per_cost("train/cost_surrogate", trial.cost_change)
+
+    @th.no_grad()
+    def _line_search(self, region: Region, x: th.Tensor, before: float) -> tuple[float, Trial]:
+        """Move the actor to the first acceptable point on the way to x.
+
+        :return: the fraction of x that was taken (0 if none was acceptable) and the trial there
+        """
+        actor, batch = region.actor, region.batch
+        stay = Trial(0.0, 0.0, np.zeros(len(region.violation)))
+        if not bool(th.isfinite(x).all()) or not bool(x.any()):
+            return 0.0, stay
+        origin = flatten(actor.parameters)
+        fraction = 1.0
+        for _ in range(self.line_search_max_iter):
+            assign(actor.parameters, origin + fraction * x)
+            ratio, kl = actor.evaluate()
+            change = ((ratio - 1.0) @ batch.cost_advantages) / len(ratio)
+            improvement = float(self.surrogate(batch, ratio)) - before
+            trial = Trial(kl, improvement, change.cpu().numpy().astype(np.float64))
+            if self.accept(trial):
+                return fraction, trial
+            fraction *= self.line_search_shrinking_factor
+        assign(actor.parameters, origin)
+        return 0.0, stay
+
+    def _update_critics(self, batch: CostRolloutBufferSamples) -> None:
+        loss = self._value_regression.fit(
+            batch.observations, batch.returns[:, None], self.n_critic_updates, self.batch_size
+        )
+        self.logger.record("train/value_loss", loss)
+        if self.uses_cost_critic:
+            loss = self._cost_regression.fit(
+                batch.observations, batch.cost_returns, self.n_critic_updates, self.batch_size
+            )
+            self.logger.record("train/cost_value_loss", loss)
+
+    # Logging
+
+    def _record_per_cost(self, name: str, values: np.ndarray) -> None:
+        """Record one number per constraint; the key is appended where there are several."""
+        for key, value in zip(self.cost_keys, values, strict=True):
+            self.logger.record(f"{name}/{key}" if len(values) > 1 else name, float(value))
+
+    def dump_logs(self, iteration: int = 0) -> None:
+        assert self.ep_cost_buffer is not None and self.total_costs is not None
+        if self.constrained or self.cost_seen:
+            if self.ep_cost_buffer:
+                self._record_per_cost("rollout/ep_cost_mean", np.mean(self.ep_cost_buffer, axis=0))
+            if self.num_timesteps:
+                self._record_per_cost("rollout/cost_rate", self.total_costs / self.num_timesteps)
+        super().dump_logs(iteration)
+
+    # What an algorithm may replace
+
+    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
+        """What is ascended, as a function of the likelihood ratios.
+
+        :param batch: the rollout; reward advantages standardised, cost advantages centred
+        :param ratio: π(a|s) / π_old(a|s), shape (N,); all gradients flow through it
+        :return: a scalar
+        """
+        return (ratio * batch.advantages).mean()
+
+    def step(self, region: Region) -> th.Tensor:
+        """Where to go from the old policy's parameters.
+
+        :param region: gradients, violations and products with F⁻¹
+        :return: the step, shape (P,); zero to stay
+        """
+        return region.natural_step()
+
+    def accept(self, trial: Trial) -> bool:
+        """Whether a candidate of the line search becomes the new policy."""
+        return trial.kl <= self.target_kl and trial.improvement >= 0.0
+
+    def correct(self, observations: Any, actions: np.ndarray) -> np.ndarray:
+        """The actions to execute in place of the sampled ones, both shaped (n_envs, …)."""
+        return actions
+
+    def fit(self, batch: CostRolloutBufferSamples) -> None:
+        """Learn what else the algorithm has to learn, after the policy has moved."""

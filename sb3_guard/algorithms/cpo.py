@@ -1,0 +1,68 @@
+"""CPO: trust-region steps that keep the linearised cost limits."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_guard.algorithms.common.natural_gradient import Case, constrained_step
+from sb3_guard.algorithms.common.trust_region import Region, TrustRegion, Trial
+
+
+class CPO(TrustRegion):
+    """Constrained policy optimisation (Achiam et al., 2017, arXiv 1705.10528).
+
+    ::
+
+        maximise   gᵀx            g    gradient of E[ratio · A]
+        subject to c + Bx ≤ 0     B, c gradients of E[ratio · A_C], violations (J_C - d) / T
+                   ½ xᵀFx ≤ δ     F    Fisher matrix of the old policy
+
+    solved exactly at each update. From a policy that no step within the trust region can make
+    feasible, the step lowers the violation as much as the region allows; until the limits hold,
+    the line search asks for less cost and not for more reward.
+
+    :param policy: policy class or its alias
+    :param env: environment or its id
+    :param cost_reduction: smallest decrease of a violated cost surrogate that the line search
+        accepts, in cost per step; never more than the violation itself
+
+    Other parameters are those of :class:`TrustRegion`.
+    """
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        *args: Any,
+        cost_reduction: float = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        self.cost_reduction = cost_reduction
+        self._case = Case.INACTIVE
+        super().__init__(policy, env, *args, **kwargs)
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        if not (isinstance(self.cost_reduction, int | float) and self.cost_reduction >= 0.0):
+            raise ValueError(f"cost_reduction={self.cost_reduction!r}: must be at least 0")
+
+    def step(self, region: Region) -> th.Tensor:
+        g, B, c, delta = region.gradient, region.cost_gradients, region.violation, region.delta
+        v, W = region.solve(g), th.stack([region.solve(b) for b in B])
+        x, self._case, lambda_kl, nu = constrained_step(g, B, c, v, W, delta)
+        self.logger.record("train/cpo_case", int(self._case))
+        self.logger.record("train/lambda_kl", lambda_kl)
+        self._record_per_cost("train/nu", nu)
+        return x
+
+    def accept(self, trial: Trial) -> bool:
+        assert self.costs is not None
+        allowed = np.maximum(-self.costs.violation, -self.cost_reduction)
+        return (
+            trial.kl <= self.target_kl
+            and bool(np.all(trial.cost_change <= allowed))
+            and (trial.improvement >= 0.0 or not self._case.feasible)
+        )

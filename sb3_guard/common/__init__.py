@@ -1,0 +1,1 @@
+"""What training and evaluation need besides an algorithm: vector envs, monitor, callbacks."""

@@ -1,0 +1,221 @@
+"""Evaluation during training that knows about costs, and the model worth keeping."""
+
+import io
+import os
+import pickle
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy
+from sb3_guard.common.files import replacing
+
+
+class CostEvalCallback(EvalCallback):
+    """
+    Evaluate the agent every so often, and keep the best model: safe first, then good.
+
+    SB3's callback keeps the model of highest reward, which for a constrained problem is apt to be
+    the least safe one. Here models whose mean episode cost is within ``selection_limit`` come
+    before all others and are ordered by return; the others are ordered by violation, the sum over
+    the costs of what exceeds the limit.
+
+    Every evaluation plays the same episodes (``seed``) and draws no random number of training's: a
+    run is the same with and without it, and after a resume.
+
+    Logs ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/mean_ep_cost`` and, for several
+    costs, ``eval/mean_ep_cost/<key>``. ``evaluations.npz`` has ``timesteps`` [K], ``results``,
+    ``ep_lengths`` and ``costs`` [K, E]. Beside ``best_model.zip`` of an agent that was trained on
+    normalised observations lies ``best_model_vecnormalize.pkl``.
+
+    :param eval_env: environment to evaluate in, wrapped as the training environment is
+    :param selection_limit: episode cost up to which a model counts as safe, one number or one per
+        cost key. None: ``max(cost_limit, 1)`` of the algorithm (a limit of 0 would choose nobody,
+        or the untrained agent); for an unconstrained algorithm the return alone decides
+    :param seed: seed of the evaluation episodes
+    :param callback_on_new_best: called when there is a new best model
+    :param callback_after_eval: called after each evaluation
+    :param n_eval_episodes: episodes per evaluation
+    :param eval_freq: evaluate every this many calls, i.e. ``eval_freq * n_envs`` steps
+    :param log_path: folder of ``evaluations.npz``; None: not written
+    :param best_model_save_path: folder of ``best_model.zip``; None: not written
+    :param deterministic: evaluate the most likely actions instead of sampled ones
+    :param verbose: 1 prints a line per evaluation
+    """
+
+    def __init__(
+        self,
+        eval_env: gym.Env | VecEnv,
+        *,
+        selection_limit: float | Sequence[float] | None = None,
+        seed: int = 0,
+        callback_on_new_best: BaseCallback | None = None,
+        callback_after_eval: BaseCallback | None = None,
+        n_eval_episodes: int = 5,
+        eval_freq: int = 10_000,
+        log_path: str | os.PathLike[str] | None = None,
+        best_model_save_path: str | os.PathLike[str] | None = None,
+        deterministic: bool = True,
+        verbose: int = 1,
+    ):
+        super().__init__(
+            eval_env,
+            callback_on_new_best=callback_on_new_best,
+            callback_after_eval=callback_after_eval,
+            n_eval_episodes=n_eval_episodes,
+            eval_freq=eval_freq,
+            log_path=None if log_path is None else os.fspath(log_path),
+            best_model_save_path=None
+            if best_model_save_path is None
+            else os.fspath(best_model_save_path),
+            deterministic=deterministic,
+            verbose=verbose,
+        )
+        self.selection_limit = selection_limit
+        self.seed = seed
+        self.evaluations_costs: list[list[float]] = []
+        #: (safe, return if safe else minus the violation) of the best model
+        self.best_score: tuple[bool, float] = (False, -np.inf)
+        self.last_mean_cost = np.inf
+
+    @property
+    def cost_keys(self) -> tuple[str, ...]:
+        """The entries of info that are the algorithm's costs."""
+        return tuple(getattr(self.model, "cost_keys", ("cost",)))
+
+    def limits(self) -> np.ndarray:
+        """Episode cost up to which a model counts as safe, one per cost key, shape [m]."""
+        limit: Any = self.selection_limit
+        if limit is None:
+            cost_limit = getattr(self.model, "cost_limit", None)
+            constrained = cost_limit is not None and getattr(self.model, "constrained", True)
+            limit = np.maximum(cost_limit, 1.0) if constrained else np.inf
+        return np.broadcast_to(np.asarray(limit, dtype=np.float64), (len(self.cost_keys),))
+
+    def score(self, evaluation: Evaluation) -> tuple[bool, float]:
+        """How two models compare: the greater tuple is the better model."""
+        excess = np.maximum(evaluation.key_costs.mean(axis=0) - self.limits(), 0.0)  # [m]
+        violation = float(excess.sum())
+        if violation > 0.0:
+            return (False, -violation)
+        return (True, float(evaluation.returns.mean()))
+
+    def _on_step(self) -> bool:
+        if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
+            return True
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+        evaluation = evaluate_policy(
+            self.model,
+            self.eval_env,
+            n_eval_episodes=self.n_eval_episodes,
+            deterministic=self.deterministic,
+            seed=self.seed,
+            cost_keys=self.cost_keys,
+        )
+        self.last_mean_reward = float(evaluation.returns.mean())
+        self.last_mean_cost = float(evaluation.costs.mean())
+
+        self.evaluations_timesteps.append(self.num_timesteps)
+        self.evaluations_results.append(evaluation.returns.tolist())
+        self.evaluations_length.append(evaluation.lengths.tolist())
+        self.evaluations_costs.append(evaluation.costs.tolist())
+        if len(evaluation.successes):
+            self.evaluations_successes.append(evaluation.successes.tolist())
+        self.write_history()
+        self._log(evaluation)
+
+        score = self.score(evaluation)
+        is_best = np.isfinite(score[1]) and score > self.best_score
+        if self.verbose >= 1:
+            returns = evaluation.estimate(evaluation.returns)
+            costs = evaluation.estimate(evaluation.costs)
+            print(
+                f"Evaluation after {self.num_timesteps} steps: "
+                f"return {returns.mean:.2f} ± {returns.std:.2f}, "
+                f"cost {costs.mean:.2f} ± {costs.std:.2f}{' (best so far)' if is_best else ''}"
+            )
+        proceed = True
+        if is_best:
+            self.best_score = score
+            self.best_mean_reward = self.last_mean_reward
+            self._save_best()
+            if self.callback_on_new_best is not None:
+                proceed = self.callback_on_new_best.on_step()
+        if self.callback is not None:
+            proceed = proceed and self._on_event()
+        return proceed
+
+    def _log(self, evaluation: Evaluation) -> None:
+        self.logger.record("eval/mean_reward", self.last_mean_reward)
+        self.logger.record("eval/mean_ep_length", float(evaluation.lengths.mean()))
+        self.logger.record("eval/mean_ep_cost", self.last_mean_cost)
+        if len(self.cost_keys) > 1:
+            for key, cost in zip(self.cost_keys, evaluation.key_costs.mean(axis=0), strict=True):
+                self.logger.record(f"eval/mean_ep_cost/{key}", float(cost))
+        if len(evaluation.successes):
+            self.logger.record("eval/success_rate", float(evaluation.successes.mean()))
+        # Written at once, so that the row bears the step of the evaluation.
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+
+    def _save_best(self) -> None:
+        if self.best_model_save_path is None:
+            return
+        folder = Path(self.best_model_save_path)
+        model = io.BytesIO()
+        self.model.save(model)
+        with replacing(folder / "best_model.zip") as file:
+            file.write(model.getvalue())
+        normalizer = self.model.get_vec_normalize_env()
+        if normalizer is not None:
+            with replacing(folder / "best_model_vecnormalize.pkl") as file:
+                pickle.dump(normalizer, file)
+
+    def write_history(self) -> None:
+        """Write all evaluations so far to ``evaluations.npz``."""
+        if self.log_path is None:
+            return
+        arrays: dict[str, Any] = {
+            "timesteps": self.evaluations_timesteps,
+            "results": self.evaluations_results,
+            "ep_lengths": self.evaluations_length,
+            "costs": self.evaluations_costs,
+        }
+        if self.evaluations_successes:
+            arrays["successes"] = self.evaluations_successes
+        with replacing(f"{self.log_path}.npz") as file:
+            np.savez(file, **arrays)
+
+    def state(self) -> dict[str, Any]:
+        """What :meth:`restore` needs to continue the history and the choice of the best model."""
+        return {
+            "timesteps": list(self.evaluations_timesteps),
+            "results": list(self.evaluations_results),
+            "lengths": list(self.evaluations_length),
+            "costs": list(self.evaluations_costs),
+            "successes": list(self.evaluations_successes),
+            "best_score": self.best_score,
+            "best_mean_reward": self.best_mean_reward,
+            "last_mean_reward": self.last_mean_reward,
+            "last_mean_cost": self.last_mean_cost,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state`; ``evaluations.npz`` is written anew to match."""
+        self.evaluations_timesteps = list(state["timesteps"])
+        self.evaluations_results = list(state["results"])
+        self.evaluations_length = list(state["lengths"])
+        self.evaluations_costs = list(state["costs"])
+        self.evaluations_successes = list(state["successes"])
+        self.best_score = state["best_score"]
+        self.best_mean_reward = state["best_mean_reward"]
+        self.last_mean_reward = state["last_mean_reward"]
+        self.last_mean_cost = state["last_mean_cost"]
+        if self.evaluations_timesteps:
+            self.write_history()

@@ -1,0 +1,190 @@
+"""How good and how safe a policy is: returns and costs of whole episodes, with their uncertainty."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecEnv,
+    VecMonitor,
+    is_vecenv_wrapped,
+)
+
+from sb3_guard.common.monitor import total_cost
+
+
+class Estimate(NamedTuple):
+    """A mean over episodes, their standard deviation, and an interval for the mean."""
+
+    mean: float
+    std: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.3f} ± {self.std:.3f} (95 % [{self.low:.3f}, {self.high:.3f}])"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """
+    What :func:`evaluate_policy` saw; E episodes in the order in which they ended.
+
+    :param returns: undiscounted return of each episode, shape [E]
+    :param costs: undiscounted episode cost, the sum of ``info["cost"]``, shape [E]
+    :param lengths: steps of each episode, shape [E]
+    :param key_costs: episode cost of each of the cost keys asked for, shape [E, m]
+    :param successes: ``info["is_success"]`` at the end of the episodes that report one
+    """
+
+    returns: np.ndarray
+    costs: np.ndarray
+    lengths: np.ndarray
+    key_costs: np.ndarray
+    successes: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def __len__(self) -> int:
+        return len(self.returns)
+
+    def estimate(self, values: np.ndarray, resamples: int = 2000) -> Estimate:
+        """
+        Mean, standard deviation and 95 % percentile-bootstrap interval of one of the arrays.
+
+        The resampling has its own fixed seed: the same episodes give the same interval.
+
+        :param values: one value an episode, shape [E], e.g. ``evaluation.costs``
+        :param resamples: number of bootstrap samples
+        :return: NaNs where there are too few episodes (none; for the interval, one)
+        """
+        if len(values) == 0:
+            return Estimate(*[float("nan")] * 4)
+        low = high = float("nan")
+        if len(values) > 1:
+            rows = np.random.default_rng(0).integers(len(values), size=(resamples, len(values)))
+            low, high = np.quantile(values[rows].mean(axis=1), [0.025, 0.975]).tolist()
+        return Estimate(float(np.mean(values)), float(np.std(values)), low, high)
+
+
+@contextmanager
+def _own_random_numbers(seed: int | None) -> Iterator[None]:
+    """Let a stochastic policy draw from ``seed``, and leave torch's generators as they were."""
+    if seed is None:
+        yield
+        return
+    with th.random.fork_rng():
+        th.manual_seed(seed)
+        yield
+
+
+def evaluate_policy(
+    model: PolicyPredictor,
+    env: gym.Env | VecEnv,
+    n_eval_episodes: int = 10,
+    deterministic: bool = True,
+    *,
+    seed: int | None = None,
+    cost_keys: Sequence[str] | None = None,
+    max_steps: int | None = None,
+    on_step: Callable[[], Any] | None = None,
+    on_episode: Callable[[float, float, int], Any] | None = None,
+) -> Evaluation:
+    """
+    Play whole episodes and report return and cost of each.
+
+    Each row of a vectorised environment plays its own share of the episodes, fixed beforehand. To
+    take the first ones that end, whichever row they come from, would favour short episodes.
+
+    Returns and lengths are those of a monitor wrapper where there is one, so that reward
+    normalisation outside it does not show. A policy that corrects its actions by what the last
+    step cost says so by a true attribute ``acts_on_cost`` and is given the true last costs, shape
+    [n_envs, m], zeros at the start of an episode, as ``predict(..., state=(costs,))``.
+
+    :param model: anything with ``predict``: an algorithm or a policy
+    :param env: a single or a vectorised environment; it is reset first
+    :param n_eval_episodes: number of episodes
+    :param deterministic: take the most likely action instead of sampling
+    :param seed: seed of the episodes and of sampled actions. With the same seed, the same policy
+        has the same evaluation and training is not touched by it; None: go on from where the
+        generators are
+    :param cost_keys: entries of info that are costs; None: those of ``model``, else ``"cost"``
+    :param max_steps: stop after this many steps of the (vectorised) environment; episodes that
+        have not ended are left out
+    :param on_step: called after each step, e.g. to render
+    :param on_episode: called with return, cost and length of each counted episode as it ends
+    :raises ValueError: fewer than one episode is asked for
+    """
+    if n_eval_episodes < 1:
+        raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
+    if not isinstance(env, VecEnv):
+        lone = env
+        env = DummyVecEnv([lambda: lone])
+    keys = tuple(getattr(model, "cost_keys", ("cost",)) if cost_keys is None else cost_keys)
+    monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
+    acts_on_cost = getattr(getattr(model, "policy", model), "acts_on_cost", False)
+
+    n = env.num_envs
+    left = np.array([(n_eval_episodes + i) // n for i in range(n)])
+    returns, lengths = np.zeros(n), np.zeros(n, dtype=np.int64)
+    costs = np.zeros((n, len(keys)))  # [n, m], episodes under way
+    totals = np.zeros(n)
+    ended: list[tuple[float, float, int, np.ndarray]] = []
+    successes: list[bool] = []
+
+    with _own_random_numbers(seed):
+        if seed is not None:
+            env.seed(seed)
+        observations = env.reset()
+        starts = np.ones(n, dtype=bool)
+        state: tuple[np.ndarray, ...] | None = None
+        last_costs = np.zeros((n, len(keys)))
+        steps = 0
+        while left.any() and (max_steps is None or steps < max_steps):
+            actions, state = model.predict(
+                observations,  # type: ignore[arg-type]
+                state=(last_costs,) if acts_on_cost else state,
+                episode_start=starts,
+                deterministic=deterministic,
+            )
+            observations, rewards, starts, infos = env.step(actions)
+            steps += 1
+            last_costs = np.array([[info.get(key, 0.0) for key in keys] for info in infos])
+            returns += rewards
+            lengths += 1
+            costs += last_costs
+            totals += [total_cost(info, keys) for info in infos]
+            if on_step is not None:
+                on_step()
+            for i in np.flatnonzero(starts):
+                last_costs[i] = 0.0
+                episode = infos[i].get("episode")
+                if monitored and episode is None:
+                    # A wrapper outside the monitor cut the episode (a life lost, in Atari): its
+                    # true end is still to come.
+                    continue
+                if left[i]:
+                    left[i] -= 1
+                    outcome = (float(returns[i]), int(lengths[i]))
+                    if episode is not None:
+                        outcome = (float(episode["r"]), int(episode["l"]))
+                    ended.append((outcome[0], float(totals[i]), outcome[1], costs[i].copy()))
+                    if "is_success" in infos[i]:
+                        successes.append(bool(infos[i]["is_success"]))
+                    if on_episode is not None:
+                        on_episode(outcome[0], float(totals[i]), outcome[1])
+                returns[i] = totals[i] = lengths[i] = 0
+                costs[i] = 0.0
+
+    return Evaluation(
+        returns=np.array([episode[0] for episode in ended]),
+        costs=np.array([episode[1] for episode in ended]),
+        lengths=np.array([episode[2] for episode in ended], dtype=np.int64),
+        key_costs=np.array([episode[3] for episode in ended]).reshape(len(ended), len(keys)),
+        successes=np.array(successes, dtype=bool),
+    )

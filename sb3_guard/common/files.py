@@ -1,0 +1,31 @@
+"""Files that hold either their old content or their new one, never half of each."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """
+    Write a file that appears whole or not at all, even if the process is killed meanwhile.
+
+    The content goes to a hidden sibling, is forced to disk, and takes the name in one step. The
+    sibling's name is fixed, so what a killed process left behind is overwritten by the next write.
+
+    :param path: the file to create or to replace; its folder exists
+    :return: the open sibling; when the block raises, ``path`` is left as it was
+    """
+    path = Path(path)
+    sibling = path.with_name(f".{path.name}.tmp")
+    try:
+        with open(sibling, "wb") as handle:
+            yield handle
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.replace(sibling, path)
+    except BaseException:
+        sibling.unlink(missing_ok=True)
+        raise

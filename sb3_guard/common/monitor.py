@@ -1,0 +1,160 @@
+"""Episode statistics with costs, for every vectorised environment."""
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+
+def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) -> float:
+    """
+    The cost of one step: ``info["cost"]``, else the sum of ``cost_keys``; absent keys count as 0.
+
+    Whether an absent key is an error is for the algorithm to say; statistics only count.
+    """
+    cost = info.get("cost")
+    if cost is None:
+        return float(sum(info.get(key, 0.0) for key in cost_keys))
+    return float(cost)
+
+
+class CostMonitor(VecMonitor):
+    """
+    Report return, length, time **and cost** of every episode, in ``info["episode"]`` and in a csv.
+
+    ``info["episode"]`` has ``r`` (return), ``l`` (steps), ``t`` (seconds since the start) and ``c``,
+    the undiscounted sum of ``info["cost"]`` over the episode. When an environment has several
+    costs, each of ``cost_keys`` is summed too, as ``c_<key>``. The csv is what
+    :func:`stable_baselines3.common.monitor.load_results` reads.
+
+    The sums of the episodes under way are part of :meth:`state`, so that a resumed training run
+    reports the episodes it was stopped in as if it had never been.
+
+    :param venv: the environment to watch
+    :param filename: csv to write, see :meth:`log_to`; None: no file
+    :param info_keywords: other entries of the last step's info to report as they are
+    :param cost_keys: the entries of info that are costs
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        filename: str | os.PathLike[str] | None = None,
+        info_keywords: tuple[str, ...] = (),
+        cost_keys: Sequence[str] = ("cost",),
+    ):
+        super().__init__(venv, info_keywords=tuple(info_keywords))
+        self.cost_keys = tuple(cost_keys)
+        self._columns = [f"c_{key}" for key in self.cost_keys] if self.cost_keys != ("cost",) else []
+        #: cost and number of all steps so far, episodes under way included
+        self.total_cost = 0.0
+        self.total_steps = 0
+        self._clear()
+        if filename is not None:
+            self.log_to(filename)
+
+    def _clear(self) -> None:
+        self.episode_returns = np.zeros(self.num_envs)
+        self.episode_lengths = np.zeros(self.num_envs, dtype=np.int64)
+        self.episode_costs = np.zeros(self.num_envs)
+        self._key_costs = np.zeros((len(self._columns), self.num_envs))
+
+    def reset(self) -> VecEnvObs:
+        """Begin new episodes everywhere; those under way are not reported."""
+        self._clear()
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Pass a step on; the infos of rows that ended an episode gain ``"episode"``."""
+        obs, rewards, dones, infos = self.venv.step_wait()
+        costs = [total_cost(info, self.cost_keys) for info in infos]
+        self.episode_returns += rewards
+        self.episode_lengths += 1
+        self.episode_costs += costs
+        self.total_cost += sum(costs)
+        self.total_steps += self.num_envs
+        if self._columns:
+            for sums, key in zip(self._key_costs, self.cost_keys, strict=True):
+                sums += [info.get(key, 0.0) for info in infos]
+        if dones.any():
+            # Infos may be the environment's own objects: a copy gets the new entry.
+            infos = list(infos)
+            for i in np.flatnonzero(dones):
+                infos[i] = {**infos[i], "episode": self._end_episode(i, infos[i])}
+        return obs, rewards, dones, infos
+
+    def _end_episode(self, i: int, info: dict[str, Any]) -> dict[str, Any]:
+        episode: dict[str, Any] = {
+            "r": float(self.episode_returns[i]),
+            "l": int(self.episode_lengths[i]),
+            "t": round(time.time() - self.t_start, 6),
+            "c": float(self.episode_costs[i]),
+        }
+        episode.update(zip(self._columns, self._key_costs[:, i].tolist(), strict=True))
+        episode.update((key, info[key]) for key in self.info_keywords)
+        self.episode_count += 1
+        for sums in (self.episode_returns, self.episode_lengths, self.episode_costs):
+            sums[i] = 0
+        self._key_costs[:, i] = 0.0
+        if self.results_writer is not None:
+            self.results_writer.write_row(episode)
+        return episode
+
+    def log_to(self, filename: str | os.PathLike[str], offset: int | None = None) -> None:
+        """
+        Write episodes to a csv from now on.
+
+        :param filename: the csv; its name ends in ``monitor.csv`` (else that is appended)
+        :param offset: None begins a new file. A number of bytes, as found in :meth:`state`, keeps
+            that much of the file, drops the rows after it and goes on from there
+        :raises ValueError: the file is shorter than ``offset``
+        """
+        if self.results_writer is not None:
+            self.results_writer.close()
+        path = os.fspath(filename)
+        if offset is not None:
+            size = os.path.getsize(path)
+            if size < offset:
+                raise ValueError(
+                    f"{path} has {size} bytes but had {offset} when the run was saved: "
+                    "it was changed since, and the run can't be continued in this folder"
+                )
+            os.truncate(path, offset)
+        spec = getattr(self.venv, "spec", None)
+        self.results_writer = ResultsWriter(
+            path,
+            header={"t_start": self.t_start, "env_id": str(spec.id if spec else None)},
+            extra_keys=("c", *self._columns, *self.info_keywords),
+            override_existing=offset is None,
+        )
+
+    def state(self) -> dict[str, Any]:
+        """What :meth:`restore` needs to go on counting: sums under way, totals, csv length."""
+        writer = self.results_writer
+        return {
+            "returns": self.episode_returns.copy(),
+            "lengths": self.episode_lengths.copy(),
+            "costs": self.episode_costs.copy(),
+            "key_costs": self._key_costs.copy(),
+            "episode_count": self.episode_count,
+            "total_cost": self.total_cost,
+            "total_steps": self.total_steps,
+            "t_start": self.t_start,
+            "offset": None if writer is None else writer.file_handler.tell(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on counting from :meth:`state`; the csv is continued by :meth:`log_to`."""
+        self.episode_returns = state["returns"].copy()
+        self.episode_lengths = state["lengths"].copy()
+        self.episode_costs = state["costs"].copy()
+        self._key_costs = state["key_costs"].copy()
+        self.episode_count = state["episode_count"]
+        self.total_cost = state["total_cost"]
+        self.total_steps = state["total_steps"]
+        self.t_start = state["t_start"]

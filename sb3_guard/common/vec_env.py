@@ -1,0 +1,214 @@
+"""The bridge between the two worlds: our environments as a Stable-Baselines3 ``VecEnv``.
+
+:func:`make_vec_env` is what training, evaluation and notebooks call. For an environment of ours it
+makes a :class:`GuardVecEnv`, which steps all environments in one call on one batch of simulations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+import sb3_guard.envs as envs
+from sb3_guard.common.monitor import CostMonitor
+from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.envs.scenario import Scenario
+
+VEC_ENVS: dict[str, type[VecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
+_OURS = "sb3_guard.envs.gym_env:GuardEnv"
+
+
+def find_scenario(env_id: str | Scenario) -> Scenario | None:
+    """The scenario that an id stands for, or None for an environment that is not ours.
+
+    :param env_id: a registered id, an id of ours with or without ``-v0``, or a scenario
+    :raises ValueError: nothing of that name is known, with the nearest match
+    """
+    if isinstance(env_id, Scenario):
+        return env_id
+    for name in (env_id, f"{env_id}-v0"):
+        spec = gymnasium.registry.get(name)
+        if spec is not None:
+            if spec.entry_point != _OURS:
+                return None
+            what = spec.kwargs["scenario"]
+            return Scenario.parse(what) if isinstance(what, str) else Scenario(**what)
+    if ":" in env_id:  # "module:Env-v0" makes gymnasium import the module first
+        return None
+    try:
+        return Scenario.parse(env_id)
+    except ValueError as error:
+        if "is not an id of the form" not in str(error):
+            raise
+        known = [*envs.env_ids(), *gymnasium.registry]
+        hint = did_you_mean(env_id, known).split("allowed:")[0]
+        raise ValueError(
+            f"unknown environment {env_id!r}: {hint}allowed: ids of the form "
+            "Task_Robot_NConstraint-v0, such as 'Goal_Point_8Hazards-v0', and ids registered with "
+            "Gymnasium"
+        ) from None
+
+
+class GuardVecEnv(VecEnv):
+    """N environments of ours on one batch of simulations, for Stable-Baselines3.
+
+    Equal, bit for bit, to a ``DummyVecEnv`` of N lone environments with seeds s, s + 1, …, and many
+    times faster.
+
+    :param scenario: an id, a scenario or its plain data
+    :param num_envs: number of environments N
+    :param kwargs: as for :class:`~sb3_guard.envs.vector_env.GuardVectorEnv`
+    """
+
+    def __init__(
+        self, scenario: str | Mapping[str, Any] | Scenario, num_envs: int = 1, **kwargs: Any
+    ) -> None:
+        self.envs = envs.GuardVectorEnv(num_envs, scenario, **kwargs)
+        self.render_mode = self.envs.render_mode  # read by VecEnv.__init__
+        super().__init__(
+            num_envs, self.envs.single_observation_space, self.envs.single_action_space
+        )
+        self._actions = np.zeros((num_envs, *self.action_space.shape))  # type: ignore[misc]
+
+    def reset(self) -> Any:
+        obs = self.envs.begin(self._seeds)
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        return self._view(obs)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        t = self.envs.advance(self._actions)
+        out = t.outcome
+        # new dictionaries every step: Stable-Baselines3 keeps the ones it is given
+        names = ("cost", *out.costs)
+        table = np.stack([out.cost, *out.costs.values()], axis=1).tolist()
+        infos: list[dict[str, Any]] = [dict(zip(names, row, strict=True)) for row in table]
+        for name, rows in (
+            ("goal_met", out.goal_met),
+            ("goal_unplaced", out.unplaced),
+            ("physics_error", out.physics_error),
+        ):
+            if rows.any():
+                for row in np.flatnonzero(rows).tolist():
+                    infos[row][name] = True
+        if t.done.any():
+            for row in np.flatnonzero(t.done).tolist():
+                infos[row]["terminal_observation"] = self._view(out.obs[row])
+                infos[row]["TimeLimit.truncated"] = bool(t.truncated[row] & ~out.terminated[row])
+        return self._view(t.obs), out.reward.astype(np.float32), t.done, infos
+
+    def _view(self, obs: np.ndarray) -> Any:
+        if self.envs.flatten:
+            return obs
+        return {n: obs[..., where] for n, where in self.envs.observation_layout.items()}
+
+    def close(self) -> None:
+        self.envs.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        return [self.envs.frame(row) for row in range(self.num_envs)]
+
+    def state(self) -> dict[str, Any]:
+        """Everything the coming steps depend on, the generators included."""
+        return self.envs.state()
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a :meth:`state` bit for bit, whatever the number of threads."""
+        self.envs.restore(state)
+
+    def observe(self) -> Any:
+        """The current observation of every row, as the last step returned it."""
+        return self._view(self.envs.engine.observe())
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        raise AttributeError(
+            f"cannot set {attr_name!r} on environments that share one batch of simulations; make them "
+            "with the parameter changed, or use make_vec_env(..., vec_env='dummy')"
+        )
+
+    def env_method(
+        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
+    ) -> list[Any]:
+        raise AttributeError(
+            f"cannot call {method_name!r} on one of the environments that share a batch of "
+            "simulations; use make_vec_env(..., vec_env='dummy')"
+        )
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
+
+
+def make_vec_env(
+    env_id: str | Scenario,
+    n_envs: int = 1,
+    seed: int | None = None,
+    *,
+    vec_env: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    monitor_path: str | None = None,
+    max_episode_steps: int | None = None,
+    num_threads: int | None = None,
+    render_mode: str | None = None,
+    wrapper_class: Callable[[gymnasium.Env], gymnasium.Env] | None = None,
+) -> VecEnv:
+    """Make environments for Stable-Baselines3, with episode statistics that include the cost.
+
+    :param env_id: an id of ours (the version may be left out), a scenario, or any id registered with
+        Gymnasium
+    :param n_envs: how many; 30 is a good number for training
+    :param seed: the environments get seed, seed + 1, …
+    :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"`` (one
+        by one; the default for others) or ``"subproc"`` (a process each)
+    :param env_kwargs: parameters of the environment, such as ``{"hazards": {"num": 4}}``
+    :param monitor_path: csv file for the episode statistics
+    :param max_episode_steps: control steps after which an episode is cut, if not the id's own
+    :param num_threads: threads of the native vector environment; results do not depend on it
+    :param render_mode: as for :func:`gymnasium.make`
+    :param wrapper_class: wraps each environment (not with ``"native"``)
+    :return: the environments, wrapped in :class:`~sb3_guard.common.monitor.CostMonitor`
+    :raises ValueError: unknown names or bad values, with what is allowed
+    """
+    if isinstance(n_envs, bool) or not isinstance(n_envs, (int, np.integer)) or n_envs < 1:
+        raise ValueError(f"n_envs = {n_envs!r} must be an integer of at least 1")
+    kwargs = dict(env_kwargs or {})
+    if render_mode is not None:
+        kwargs["render_mode"] = render_mode
+    if max_episode_steps is not None:
+        kwargs["max_episode_steps"] = max_episode_steps
+    scenario = find_scenario(env_id)
+    vec_env = vec_env or ("dummy" if scenario is None or wrapper_class else "native")
+    if vec_env not in ("native", *VEC_ENVS):
+        raise ValueError(f"unknown vec_env {vec_env!r}: {did_you_mean(vec_env, ['native', *VEC_ENVS])}")
+    venv: VecEnv
+    if vec_env == "native":
+        if scenario is None:
+            raise ValueError(f"{env_id!r} is not an sb3_guard environment: use vec_env 'dummy' or 'subproc'")
+        if wrapper_class is not None:
+            raise ValueError("wrapper_class needs vec_env 'dummy' or 'subproc': native envs share one batch")
+        venv = GuardVecEnv(scenario, n_envs, num_threads=num_threads, **kwargs)
+    else:
+        # a spec, not an id: other processes may not have registered it
+        spec = gymnasium.spec(str(env_id)) if scenario is None else envs.env_spec(env_id)
+
+        def one() -> gymnasium.Env:
+            env = gymnasium.make(spec, **kwargs)
+            return env if wrapper_class is None else wrapper_class(env)
+
+        venv = VEC_ENVS[vec_env]([one] * int(n_envs))
+    if seed is not None:
+        venv.seed(seed)
+    return CostMonitor(venv, monitor_path)

@@ -1,0 +1,86 @@
+"""GUARD's environments: robots, tasks and constraints as batched parts on MuJoCo.
+
+Importing this package registers the named suites with Gymnasium.
+"""
+
+import os
+import sys
+
+if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    # MuJoCo chooses its OpenGL backend when it is imported; without a display only EGL can work
+    os.environ.setdefault("MUJOCO_GL", "egl")
+
+import gymnasium
+from gymnasium.envs.registration import EnvSpec, parse_env_id
+
+from sb3_guard.envs.gym_env import GuardEnv
+from sb3_guard.envs.registry import (
+    EPISODE_STEPS,
+    env_ids,
+    register_constraint,
+    register_robot,
+    register_task,
+)
+from sb3_guard.envs.scenario import Scenario
+from sb3_guard.envs.vector_env import GuardVectorEnv
+
+__all__ = [
+    "GuardEnv",
+    "GuardVectorEnv",
+    "Scenario",
+    "env_ids",
+    "env_spec",
+    "make",
+    "register",
+    "register_constraint",
+    "register_robot",
+    "register_task",
+]
+
+
+def env_spec(name: str | Scenario) -> EnvSpec:
+    """Gymnasium's description of an environment, registered or not.
+
+    :param name: an id of ours, with or without its version, or a scenario
+    :raises ValueError: the id cannot be read
+    """
+    if isinstance(name, Scenario):
+        env_id, what = "Guard-v0", name.to_dict()
+    else:
+        env_id = name if name.rpartition("-v")[2].isdigit() else f"{name}-v0"
+        if env_id in gymnasium.registry:
+            return gymnasium.registry[env_id]
+        Scenario.parse(name)
+        what = name
+    return EnvSpec(
+        env_id,
+        entry_point="sb3_guard.envs.gym_env:GuardEnv",
+        vector_entry_point="sb3_guard.envs.vector_env:GuardVectorEnv",
+        max_episode_steps=EPISODE_STEPS,
+        kwargs={"scenario": what},
+    )
+
+
+def register(name: str, scenario: Scenario | None = None) -> str:
+    """Make an environment known to :func:`gymnasium.make`.
+
+    :param name: an id such as ``Goal_Point_3Hazards-v0``; with a scenario, any name
+    :param scenario: what it is, if the name does not say it
+    :return: the id, with its version
+    :raises ValueError: the name cannot be read
+    """
+    spec = env_spec(name if scenario is None else scenario)
+    if scenario is not None:
+        spec.id = name if name.rpartition("-v")[2].isdigit() else f"{name}-v0"
+        spec.namespace, spec.name, spec.version = parse_env_id(spec.id)
+    gymnasium.registry[spec.id] = spec
+    return spec.id
+
+
+def make(name: str, **kwargs: object) -> gymnasium.Env:
+    """:func:`gymnasium.make` for any id of ours, registered or not, with or without its version."""
+    return gymnasium.make(env_spec(name), **kwargs)
+
+
+for _env_id in env_ids():
+    register(_env_id)

@@ -1,0 +1,193 @@
+"""One environment with Gymnasium's interface: the batch of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from sb3_guard.envs.engine import Engine, Outcome
+from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.envs.rendering import CAMERAS, Renderer
+from sb3_guard.envs.scenario import Scenario
+
+Array = np.ndarray
+ROW = np.zeros(1, dtype=np.int32)
+
+
+def as_scenario(scenario: str | Mapping[str, Any] | Scenario, params: Mapping[str, Any]) -> Scenario:
+    """A scenario from an id, plain data or a scenario, with parameters of its parts changed."""
+    if isinstance(scenario, str):
+        scenario = Scenario.parse(scenario)
+    elif isinstance(scenario, Mapping):
+        scenario = Scenario(**scenario)
+    return scenario.override(**params) if params else scenario
+
+
+def observation_space(engine: Engine, flatten: bool) -> spaces.Box | spaces.Dict:
+    """The space of one row's observation, with the true bounds of each component."""
+    boxes = {
+        name: spaces.Box(c.low, c.high, (c.size,), np.float32)
+        for name, c in engine.channels.items()
+    }
+    if not flatten:
+        return spaces.Dict(boxes)
+    low = np.concatenate([b.low for b in boxes.values()])
+    high = np.concatenate([b.high for b in boxes.values()])
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def action_space(engine: Engine) -> spaces.Box:
+    """Actions of one row, scaled to the actuators' ranges by the robot."""
+    return spaces.Box(-1.0, 1.0, (engine.robot.action_size,), np.float32)
+
+
+def check_render_mode(render_mode: str | None, allowed: list[str]) -> str | None:
+    """Refuse an unknown render mode."""
+    if render_mode is not None and render_mode not in allowed:
+        raise ValueError(f"unknown render_mode {render_mode!r}: {did_you_mean(render_mode, allowed)}")
+    return render_mode
+
+
+def step_info(outcome: Outcome, row: int) -> dict[str, Any]:
+    """The info of one row: its costs, and what happened if something did."""
+    info: dict[str, Any] = {"cost": float(outcome.cost[row])}
+    for name, cost in outcome.costs.items():
+        info[name] = float(cost[row])
+    if outcome.goal_met[row]:
+        info["goal_met"] = True
+    if outcome.unplaced[row]:
+        info["goal_unplaced"] = True
+    if outcome.physics_error[row]:
+        info["physics_error"] = True
+    return info
+
+
+class GuardEnv(gymnasium.Env[Any, Array]):
+    """A safe-RL environment: a robot with a task among constraints.
+
+    ``step`` returns the cost of the step as ``info["cost"]``, and per constraint type as
+    ``info["cost_<type>"]``; ``info["goal_met"]`` is there, and True, only when the goal was reached.
+    Episodes are cut by the time limit of :func:`gymnasium.make`.
+
+    :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario` or its plain data
+    :param render_mode: ``"rgb_array"``, ``"human"`` or None
+    :param flatten: False for a Dict observation with the components by name
+    :param width: width of rendered frames, pixels
+    :param height: height of rendered frames, pixels
+    :param camera: ``"fixed"``, ``"track"`` or ``"top"``
+    :param params: parameters of parts to change, such as ``hazards={"num": 4}``
+    :raises ValueError: unknown names or bad values
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: str | Mapping[str, Any] | Scenario = "Goal_Point_8Hazards",
+        render_mode: str | None = None,
+        flatten: bool = True,
+        width: int = 480,
+        height: int = 480,
+        camera: str = "fixed",
+        **params: Any,
+    ) -> None:
+        self.scenario = as_scenario(scenario, params)
+        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
+        if camera not in CAMERAS:
+            raise ValueError(f"unknown camera {camera!r}: {did_you_mean(camera, CAMERAS)}")
+        self.flatten = flatten
+        self.width, self.height, self.camera = width, height, camera
+        self.engine = self.scenario.build()
+        self.observation_space = observation_space(self.engine, flatten)
+        self.action_space = action_space(self.engine)
+        control_step = 10 * self.engine.model.opt.timestep
+        self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
+        self._renderer: Renderer | None = None
+
+    @property
+    def observation_layout(self) -> dict[str, slice]:
+        """Where each named component lies in the flat observation."""
+        return self.engine.observation_layout
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; the same seed gives the same episodes, whatever else runs."""
+        super().reset(seed=seed)
+        if seed is not None or self.engine.rngs[0] is not self.np_random:
+            self.engine.seed(0, self.np_random)
+        self.engine.reset(ROW)
+        if self.render_mode == "human":
+            self.render()
+        return self._view(self.engine.observe()), {}
+
+    def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Advance by one control step of ten physics steps.
+
+        :param action: [action size], clipped to [−1, 1]
+        :raises ValueError: the action has the wrong shape or is not finite
+        """
+        action = np.asarray(action, dtype=float)
+        if action.shape != self.action_space.shape:
+            raise ValueError(
+                f"action has shape {action.shape}, expected {self.action_space.shape}"
+            )
+        outcome = self.engine.step(action[None])
+        if self.render_mode == "human":
+            self.render()
+        return (
+            self._view(outcome.obs),
+            float(outcome.reward[0]),
+            bool(outcome.terminated[0]),
+            bool(outcome.unplaced[0]),
+            step_info(outcome, 0),
+        )
+
+    def _view(self, obs: Array) -> Any:
+        if self.flatten:
+            return obs[0]
+        return {name: obs[0, where] for name, where in self.engine.observation_layout.items()}
+
+    def render(self) -> Array | None:
+        """A frame, [height, width, 3] uint8, or a look at the window; never advances physics."""
+        if self.render_mode is None:
+            gymnasium.logger.warn(
+                "render() needs a render_mode: gymnasium.make(id, render_mode='rgb_array')"
+            )
+            return None
+        if self._renderer is None:
+            self._renderer = Renderer(
+                self.engine, self.width, self.height, self.camera, self.render_mode
+            )
+        return self._renderer.render(0)
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def state(self) -> dict[str, Any]:
+        """Everything the coming steps depend on; :meth:`restore` continues from it bit for bit."""
+        return self.engine.state()
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a :meth:`state` of the same scenario."""
+        self.engine.restore(state)
+        self._np_random = self.engine.rngs[0]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # a Batch cannot be pickled: the scenario and the engine's state make it again
+        out = {k: v for k, v in self.__dict__.items() if k not in ("engine", "_renderer")}
+        return {**out, "state": self.state()}
+
+    def __setstate__(self, out: dict[str, Any]) -> None:
+        state = out.pop("state")
+        self.__dict__.update(out)
+        self._renderer = None
+        self.engine = self.scenario.build()
+        self.restore(state)

@@ -1,0 +1,208 @@
+"""Where things stand when an episode begins: clear places for discs of given radii.
+
+The rule is GUARD's: two objects keep at least the sum of their keep-outs between their centres, and a
+centre keeps its own keep-out from the border of its rectangle. GUARD draws blindly and starts over
+whenever one object finds no room, which for ten wide objects in a small arena takes hundreds of
+restarts. Here an object that finds no room among 128 draws takes the place where it disturbs the
+fewest others, and those are drawn again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+Array = np.ndarray
+Rectangle = tuple[float, float, float, float]
+
+ARENA: tuple[Rectangle, ...] = ((-2.0, -2.0, 2.0, 2.0),)
+DRAWS = 128
+PATIENCE = 4000  # placements before a layout is called impossible
+
+
+class LayoutError(RuntimeError):
+    """No clear layout was found; the message names the crowded part."""
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What one group of like objects needs of the floor.
+
+    :param name: whose places these are
+    :param num: how many objects
+    :param keepout: radius kept clear of others' radii, m
+    :param placements: rectangles (x low, y low, x high, y high) to draw from, m; empty: the arena's
+    :param locations: fixed places, (x, y) m, for the first objects of the group
+    :param margin: extra distance kept from every other object, m
+    :param height: z, m, or a range to draw z from, after x and y
+    :param reach: greatest distance of (x, y, z) from the origin, m
+    :param mover: whether it moves by itself, so that a new goal may ignore it in need
+    """
+
+    name: str
+    num: int
+    keepout: float
+    placements: tuple[Rectangle, ...] = ()
+    locations: tuple[tuple[float, float], ...] = ()
+    margin: float = 0.0
+    height: float | tuple[float, float] = 0.0
+    reach: float = math.inf
+    mover: bool = False
+
+    def __post_init__(self) -> None:
+        for r in self.placements:
+            if len(r) != 4 or not (r[0] < r[2] and r[1] < r[3]):
+                raise ValueError(
+                    f"{self.name}: a placement must be (x low, y low, x high, y high), got {r}"
+                )
+            if min(r[2] - r[0], r[3] - r[1]) < 2 * self.keepout and not self.locations:
+                raise ValueError(
+                    f"{self.name}: keepout {self.keepout} does not fit the placement {r}; "
+                    "make the placement larger or the keepout smaller"
+                )
+        if len(self.locations) > self.num:
+            raise ValueError(
+                f"{self.name}: {len(self.locations)} locations for {self.num} objects; "
+                "give at most one each"
+            )
+
+    def draw(self, rng: np.random.Generator, n: int) -> Array:
+        """``n`` uniform centres, [n, 2] m."""
+        u = rng.random((n, 2))
+        k = self.keepout
+        if len(self.placements) == 1:
+            (x0, y0, x1, y1) = self.placements[0]
+            low, span = np.array([x0 + k, y0 + k]), np.array([x1 - x0 - 2 * k, y1 - y0 - 2 * k])
+            return low + u * span
+        boxes = np.array(self.placements)
+        low = boxes[:, :2] + k
+        span = boxes[:, 2:] - boxes[:, :2] - 2 * k
+        area = span[:, 0] * span[:, 1]
+        which = rng.choice(len(boxes), size=n, p=area / area.sum())
+        return low[which] + u * span[which]
+
+    def elevate(self, rng: np.random.Generator, xy: Array) -> Array:
+        """Heights for centres [n, 2]: [n] m, within reach."""
+        if not isinstance(self.height, tuple):
+            return np.full(len(xy), self.height)
+        low, high = self.height
+        if math.isfinite(self.reach):
+            room = np.sqrt(np.maximum(self.reach**2 - xy[:, 0] ** 2 - xy[:, 1] ** 2, 0.0))
+            high = np.maximum(np.minimum(high, room), low)
+        return low + rng.random(len(xy)) * (high - low)
+
+    @property
+    def planar_reach(self) -> float:
+        """Greatest horizontal distance from the origin that leaves a height within reach, m."""
+        low = self.height[0] if isinstance(self.height, tuple) else self.height
+        return math.sqrt(max(self.reach**2 - low**2, 0.0))
+
+
+def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[str, Array]:
+    """Draw a clear layout.
+
+    :param footprints: what to place, in order
+    :param rng: the only source of randomness
+    :return: centres by footprint name, [num, 3] m
+    :raises LayoutError: no layout was found, naming the part that found no room most often
+    """
+    owner = [f for f in footprints for _ in range(f.num)]
+    keepout = np.array([f.keepout + f.margin for f in owner])
+    xy = np.full((len(owner), 2), np.inf)  # an object not yet placed is out of everyone's way
+    fixed = np.zeros(len(owner), dtype=bool)
+    k = 0
+    for f in footprints:
+        for j, place in enumerate(f.locations):
+            xy[k + j], fixed[k + j] = place, True
+        k += f.num
+    _check_fixed(owner, keepout, xy, fixed)
+    queue = deque(np.flatnonzero(~fixed).tolist())
+    failures: dict[str, int] = {}
+    for _ in range(PATIENCE):
+        if not queue:
+            break
+        k = queue.popleft()
+        f = owner[k]
+        draws = f.draw(rng, DRAWS)
+        dx = draws[:, :1] - xy[:, 0]  # [DRAWS, K]
+        dy = draws[:, 1:] - xy[:, 1]
+        clash = dx * dx + dy * dy < (keepout[k] + keepout) ** 2
+        trouble = clash.sum(axis=1) + len(owner) * (clash & fixed).sum(axis=1)
+        if math.isfinite(f.reach):
+            out = draws[:, 0] ** 2 + draws[:, 1] ** 2 > f.planar_reach**2
+            trouble = trouble + len(owner) ** 2 * out
+        best = int(trouble.argmin())  # the first clear draw, else the least disturbing one
+        if trouble[best]:
+            failures[f.name] = failures.get(f.name, 0) + 1
+            if trouble[best] >= len(owner):
+                queue.append(k)
+                continue
+            ejected = np.flatnonzero(clash[best])
+            xy[ejected] = np.inf
+            queue.extend(ejected.tolist())
+        xy[k] = draws[best]
+    if queue:
+        crowded = max(failures, key=lambda name: failures[name])
+        f = next(f for f in footprints if f.name == crowded)
+        raise LayoutError(
+            f"{crowded} cannot be placed: {f.num} objects with keepout {f.keepout} m find no room in "
+            f"{list(f.placements)} beside the other parts; reduce num or keepout, or widen placements"
+        )
+    out, k = {}, 0
+    for f in footprints:
+        centres = xy[k : k + f.num]
+        out[f.name] = np.column_stack([centres, f.elevate(rng, centres)])
+        k += f.num
+    return out
+
+
+def _check_fixed(owner: list[Footprint], keepout: Array, xy: Array, fixed: Array) -> None:
+    """Refuse fixed locations that are closer than the sum of their keep-outs."""
+    ids = np.flatnonzero(fixed)
+    for a in range(len(ids)):
+        for b in range(a + 1, len(ids)):
+            i, j = ids[a], ids[b]
+            gap = math.dist(xy[i], xy[j])
+            if gap < keepout[i] + keepout[j]:
+                raise LayoutError(
+                    f"{owner[j].name} cannot be placed: its location {tuple(xy[j].tolist())} is "
+                    f"{gap:.2f} m from {owner[i].name} at {tuple(xy[i].tolist())}, and their keepouts "
+                    f"sum to {keepout[i] + keepout[j]:.2f} m"
+                )
+
+
+def redraw(
+    footprint: Footprint,
+    others: Mapping[Footprint, Array],
+    rng: np.random.Generator,
+    tries: int = 80,
+) -> Array | None:
+    """Draw one object anew among others that stand where they stand.
+
+    Movers are ignored when nothing is free with them.
+
+    :param footprint: what to place; its first object
+    :param others: the current centres [num, 3] m of every other footprint
+    :param tries: batches of 128 draws
+    :return: the new centre, [3] m, or None if there is no room
+    """
+    for movers in (True, False):
+        rest = [(f, p) for f, p in others.items() if movers or not f.mover]
+        xy = np.concatenate([p[:, :2] for _, p in rest]) if rest else np.zeros((0, 2))
+        radius = np.concatenate([np.full(f.num, f.keepout + f.margin) for f, _ in rest] or [[]])
+        reach = footprint.keepout + footprint.margin + radius
+        for _ in range(tries):
+            draws = footprint.draw(rng, DRAWS)
+            dx = draws[:, :1] - xy[:, 0]
+            dy = draws[:, 1:] - xy[:, 1]
+            clear = ~(dx * dx + dy * dy < reach**2).any(axis=1)
+            if math.isfinite(footprint.reach):
+                clear &= draws[:, 0] ** 2 + draws[:, 1] ** 2 <= footprint.planar_reach**2
+            if clear.any():
+                place = draws[clear.argmax()][None]
+                return np.append(place[0], footprint.elevate(rng, place)[0])
+    return None

@@ -1,0 +1,137 @@
+"""Parameters that check themselves: the dataclass fields of every part of an environment.
+
+A bad name, type or value fails where the part is made, in one line that names the parameter, the value
+and what is allowed. Plain JSON and YAML values are enough: lists become tuples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import field
+from typing import Any, ClassVar
+
+import numpy as np
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Say what ``name`` may have meant and what is allowed, for an error message."""
+    known = list(known)
+    folded = {k.lower(): k for k in known}
+    close = difflib.get_close_matches(str(name).lower(), folded, n=1, cutoff=0.5)
+    hint = f"did you mean {folded[close[0]]!r}? " if close else ""
+    return f"{hint}allowed: {', '.join(known)}"
+
+
+def param(
+    default: Any,
+    doc: str,
+    *,
+    above: float | None = None,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[Any, ...] | None = None,
+) -> Any:
+    """A dataclass field that is checked on construction and documents itself.
+
+    :param default: the default value
+    :param doc: what it is, with its unit
+    :param above: the value must be greater than this
+    :param low: the value must be at least this
+    :param high: the value must be at most this
+    :param choices: the value must be one of these
+    """
+    limits = {"doc": doc, "above": above, "low": low, "high": high, "choices": choices}
+    return field(default=default, metadata=limits)
+
+
+def _matches(value: Any, kind: Any) -> bool:
+    """Whether ``value`` is of the annotated type ``kind``; a bool is not a number."""
+    if kind is Any:
+        return True
+    if kind is None or kind is types.NoneType:
+        return value is None
+    origin = typing.get_origin(kind)
+    if origin in (typing.Union, types.UnionType):
+        return any(_matches(value, k) for k in typing.get_args(kind))
+    if origin is tuple:
+        args = typing.get_args(kind)
+        if not isinstance(value, tuple):
+            return False
+        if len(args) == 2 and args[1] is Ellipsis:
+            return all(_matches(v, args[0]) for v in value)
+        return len(value) == len(args) and all(map(_matches, value, args))
+    if kind is float:
+        return (
+            isinstance(value, (int, float, np.integer, np.floating))
+            and not isinstance(value, bool)
+            and math.isfinite(value)
+        )
+    if kind is int:
+        return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    return isinstance(value, origin or kind)
+
+
+def _plain(kind: Any) -> str:
+    """How an error message calls a type."""
+    if typing.get_origin(kind) is None and isinstance(kind, type):
+        return {"float": "a number", "int": "an integer", "bool": "true or false"}.get(
+            kind.__name__, kind.__name__
+        )
+    return str(kind).replace("typing.", "").replace("NoneType", "None")
+
+
+def _tuples(value: Any) -> Any:
+    """Lists as tuples, since JSON and YAML have only lists."""
+    return tuple(map(_tuples, value)) if isinstance(value, (list, tuple)) else value
+
+
+class Parameters:
+    """A dataclass of parameters that are checked when it is made.
+
+    :raises ValueError: a value of the wrong type or out of range, in one line that names the
+        parameter, the value and what is allowed
+    """
+
+    name: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        hints = typing.get_type_hints(type(self))
+        for f in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = _tuples(getattr(self, f.name))
+            object.__setattr__(self, f.name, value)
+            label = f"{self.name or type(self).__name__}.{f.name}"
+            if not _matches(value, hints[f.name]):
+                raise ValueError(f"{label} = {value!r} must be {_plain(hints[f.name])}")
+            m = f.metadata
+            if m.get("choices") is not None and value not in m["choices"]:
+                raise ValueError(f"{label} = {value!r}: {did_you_mean(value, m['choices'])}")
+            numbers = value if isinstance(value, tuple) else (value,)
+            for v in numbers:
+                if not isinstance(v, (int, float)):
+                    continue
+                if m.get("above") is not None and not v > m["above"]:
+                    raise ValueError(f"{label} = {value!r} must be greater than {m['above']}")
+                if m.get("low") is not None and not v >= m["low"]:
+                    raise ValueError(f"{label} = {value!r} must be at least {m['low']}")
+                if m.get("high") is not None and not v <= m["high"]:
+                    raise ValueError(f"{label} = {value!r} must be at most {m['high']}")
+
+    @classmethod
+    def from_params(cls, params: Mapping[str, Any]) -> typing.Self:
+        """Make one from a mapping of parameter names to values.
+
+        :raises ValueError: an unknown name, with the nearest match
+        """
+        label = cls.name or cls.__name__
+        if not isinstance(params, Mapping):
+            raise ValueError(f"{label} = {params!r} must be a mapping of parameters to values")
+        known = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
+        for key in params:
+            if key not in known:
+                raise ValueError(f"{label} has no parameter {key!r}: {did_you_mean(key, known)}")
+        return cls(**params)

@@ -1,0 +1,74 @@
+"""Which robots, tasks and constraints there are, and the suites that they make.
+
+Adding one to its table here, or with :func:`register_robot`, :func:`register_task` or
+:func:`register_constraint` from outside, is all it takes to use it in ids, scenarios and commands.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from sb3_guard.envs import constraints, robots, tasks
+from sb3_guard.envs.part import Constraint, Robot, Task
+from sb3_guard.envs.robots.robot import MJCFRobot
+
+ROBOTS: dict[str, type[Robot]] = {"Point": robots.Point}
+TASKS: dict[str, type[Task]] = {"Goal": tasks.Goal}
+CONSTRAINTS: dict[str, type[Constraint]] = {"Hazards": constraints.Hazards}
+
+EPISODE_STEPS = 1000  # control steps
+# The named suites: every combination of these, each with eight constraint objects.
+SUITE_ROBOTS = ("Point",)
+SUITE_TASKS = ("Goal",)
+SUITE_CONSTRAINTS = ("Hazards",)
+
+
+def env_ids() -> list[str]:
+    """The ids of the named suites."""
+    return [
+        f"{task}_{robot}_8{constraint}-v0"
+        for task, robot, constraint in product(SUITE_TASKS, SUITE_ROBOTS, SUITE_CONSTRAINTS)
+    ]
+
+
+def register_robot(
+    name: str, robot: type[Robot] | None = None, *, xml: str | Path | None = None, **attributes: Any
+) -> None:
+    """Make a robot known under ``name``.
+
+    :param name: what ids and scenarios call it
+    :param robot: a :class:`~sb3_guard.envs.part.Robot` class
+    :param xml: or the robot's MJCF file, by the conventions of
+        :class:`~sb3_guard.envs.robots.robot.MJCFRobot`
+    :param attributes: with ``xml``, class attributes such as ``timestep`` and ``workspace``
+    :raises ValueError: neither or both of ``robot`` and ``xml`` are given, or the name is not usable
+    """
+    if (robot is None) == (xml is None):
+        raise ValueError(f"robot {name!r} needs a class or an xml file, not both and not neither")
+    if robot is None:
+        file = Path(str(xml)).resolve()
+        if not file.is_file():
+            raise ValueError(f"robot {name!r}: there is no file {str(xml)!r}")
+        body = {"asset": "", "timestep": 0.002, **attributes, "path": classmethod(lambda cls: file)}
+        robot = type(name, (MJCFRobot,), body)
+    _add(ROBOTS, name, robot)
+
+
+def register_task(name: str, task: type[Task]) -> None:
+    """Make a task known under ``name`` to ids, scenarios and commands."""
+    _add(TASKS, name, task)
+
+
+def register_constraint(name: str, constraint: type[Constraint]) -> None:
+    """Make a constraint known under ``name`` to ids, scenarios and commands."""
+    _add(CONSTRAINTS, name, constraint)
+
+
+def _add(table: dict[str, Any], name: str, part: type) -> None:
+    if not name.isidentifier() or "_" in name or name[0].isdigit():
+        raise ValueError(
+            f"{name!r} cannot be part of an id: use letters and digits, a letter first, no underscore"
+        )
+    table[name] = part

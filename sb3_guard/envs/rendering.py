@@ -1,0 +1,253 @@
+"""Pictures of one simulation: its bodies, and what is not a body drawn over them.
+
+Zones, goals, lidar halos and the tint of a cost are not in the physics model. They are added to the
+abstract scene of each frame, so that drawing costs nothing when nobody looks and never changes the
+physics: a frame is made from a copy of one row's state.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+if TYPE_CHECKING:
+    from sb3_guard.envs.engine import Engine
+    from sb3_guard.envs.part import Robot
+
+Array = np.ndarray
+CAMERAS = ("fixed", "track", "top")
+COST_COLOR = (1.0, 0.1, 0.1)
+_SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
+_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
+
+
+class RenderingError(RuntimeError):
+    """No OpenGL backend works on this machine."""
+
+
+def _has_display() -> bool:
+    return sys.platform != "linux" or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
+
+
+@functools.cache
+def gl_backend() -> str:
+    """The OpenGL backend that works here: glfw, egl or osmesa.
+
+    ``MUJOCO_GL`` decides if it is set. Each candidate is tried in a process of its own, since a
+    failed GLFW followed by EGL in one process aborts Python.
+
+    :raises RenderingError: none works
+    """
+    wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if wanted in ("glfw", "egl", "osmesa", "cgl"):
+        candidates = [wanted]
+    elif sys.platform == "linux":
+        candidates = ["glfw", "egl", "osmesa"] if _has_display() else ["egl", "osmesa"]
+    else:
+        candidates = ["glfw"]
+    reasons = []
+    for name in candidates:
+        probe = f"import mujoco.{name} as gl; c = gl.GLContext(8, 8); c.make_current(); c.free()"
+        run = subprocess.run(
+            [sys.executable, "-c", probe],
+            env={**os.environ, "MUJOCO_GL": name},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if run.returncode == 0:
+            return name
+        lines = run.stderr.strip().splitlines()
+        reasons.append(f"{name} ({lines[-1] if lines else f'exit status {run.returncode}'})")
+    raise RenderingError(
+        f"no OpenGL backend works here, tried {', '.join(reasons)}; install EGL (Debian: libegl1 and "
+        "libegl-mesa0) or OSMesa (libosmesa6), or set MUJOCO_GL to one that works"
+    )
+
+
+class ScenePainter:
+    """Adds see-through shapes to a scene, for :meth:`sb3_guard.envs.part.Part.draw`."""
+
+    def __init__(self, scene: mujoco.MjvScene, engine: Engine, row: int) -> None:
+        self._scene = scene
+        self._row = row
+        self._robot = engine.robot
+        self._halos = 0
+
+    def zone(self, center: Array, radius: float, half_height: float, color: tuple[float, ...]) -> None:
+        """A cylinder, or a sphere if ``half_height`` is 0, at ``center``, [3] m."""
+        kind = _CYLINDER if half_height else _SPHERE
+        self._add(kind, (radius, half_height or radius, half_height or radius), center, (*color, 0.3))
+
+    def halo(self, closeness: Array, azimuth: int, color: tuple[float, ...]) -> None:
+        """Beads around each lidar body, the more solid the closer what they show.
+
+        :param closeness: [bodies · azimuth · elevation]
+        :param azimuth: bins around
+        :param color: red, green, blue
+        """
+        origin, rotation = self._robot.frames
+        planar = self._robot.workspace == "planar"
+        radius = 0.15 + 0.06 * self._halos
+        self._halos += 1
+        beads = np.asarray(closeness).reshape(origin.shape[1], azimuth, -1)
+        for b, a, e in np.ndindex(*beads.shape):
+            turn = (a + 0.5) * 2 * math.pi / azimuth
+            rise = (e + 0.5) * math.pi / beads.shape[2] - math.pi / 2
+            ray = np.array(
+                [math.cos(turn) * math.cos(rise), math.sin(turn) * math.cos(rise), math.sin(rise)]
+            )
+            at = origin[self._row, b] + rotation[self._row, b] @ (radius * ray)
+            if planar:  # above the robot, where it can be seen
+                at = at + np.array([0, 0, 0.25])
+            self._add(_SPHERE, (0.02,) * 3, at, (*color, 0.08 + 0.92 * float(beads[b, a, e])))
+
+    def glow(self, center: Array) -> None:
+        """The tint of a robot that pays a cost."""
+        self._add(_SPHERE, (0.25,) * 3, center, (*COST_COLOR, 0.5))
+
+    def _add(self, kind: Any, size: tuple[float, ...], center: Array, rgba: tuple[float, ...]) -> None:
+        scene = self._scene
+        if scene.ngeom >= scene.maxgeom:
+            return
+        mujoco.mjv_initGeom(
+            scene.geoms[scene.ngeom],
+            kind,
+            np.asarray(size, dtype=float),
+            np.asarray(center, dtype=float),
+            np.eye(3).reshape(-1),
+            np.asarray(rgba, dtype=np.float32),
+        )
+        scene.ngeom += 1
+
+
+class Renderer:
+    """Draws rows of an engine, off screen or in MuJoCo's viewer.
+
+    :param engine: whose rows to draw
+    :param width: pixels
+    :param height: pixels
+    :param camera: ``"fixed"``, ``"track"`` (follows the robot) or ``"top"``
+    :param mode: ``"rgb_array"`` or ``"human"``
+    :raises RenderingError: no OpenGL backend works, or there is no display for ``"human"``
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        width: int = 480,
+        height: int = 480,
+        camera: str = "fixed",
+        mode: str = "rgb_array",
+    ) -> None:
+        self._engine = engine
+        self._data = mujoco.MjData(engine.model)
+        self._human = mode == "human"
+        self._camera = mujoco.MjvCamera()
+        self._follows = camera == "track"
+        if self._follows:
+            self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+            self._camera.distance, self._camera.azimuth, self._camera.elevation = 3.0, 90.0, -35.0
+        else:
+            self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            self._camera.fixedcamid = engine.model.camera(camera).id
+        if self._human:
+            if not _has_display():
+                raise RenderingError(
+                    "render_mode 'human' needs a display, and DISPLAY is not set; "
+                    "use render_mode='rgb_array', or record a video"
+                )
+            from mujoco import viewer
+
+            self._viewer = viewer.launch_passive(
+                engine.model, self._data, show_left_ui=False, show_right_ui=False
+            )
+            return
+        self._option = mujoco.MjvOption()
+        self._scene = mujoco.MjvScene(engine.model, maxgeom=4000)
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._pixels = np.zeros((height, width, 3), dtype=np.uint8)
+        gl = importlib.import_module(f"mujoco.{gl_backend()}")
+        self._gl = gl.GLContext(width, height)
+        self._gl.make_current()
+        visual = engine.model.vis.global_
+        visual.offwidth, visual.offheight = max(width, 1920), max(height, 1440)
+        self._context = mujoco.MjrContext(engine.model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+
+    def render(self, row: int) -> Array | None:
+        """Draw one row: a frame [height, width, 3] uint8, or None when shown in a window."""
+        engine = self._engine
+        engine.batch.get_data(row, self._data)
+        if self._follows:
+            self._camera.lookat[:] = engine.robot.position[row]
+        if self._human:
+            with self._viewer.lock():
+                self._viewer.user_scn.ngeom = 0
+                self._paint(self._viewer.user_scn, row)
+            self._viewer.sync()
+            return None
+        self._gl.make_current()
+        mujoco.mjv_updateScene(
+            engine.model,
+            self._data,
+            self._option,
+            None,
+            self._camera,
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
+        self._paint(self._scene, row)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
+        return self._pixels[::-1].copy()
+
+    def _paint(self, scene: mujoco.MjvScene, row: int) -> None:
+        painter = ScenePainter(scene, self._engine, row)
+        for part in self._engine.parts:
+            part.draw(painter, row)
+        if any(c.cost()[row] > 0 for c in self._engine.constraints):
+            painter.glow(self._engine.robot.position[row])
+
+    def close(self) -> None:
+        """Free the window or the OpenGL context."""
+        if self._human:
+            self._viewer.close()
+        else:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
+
+
+def show_robot(robot: Robot) -> None:
+    """Open a robot in MuJoCo's viewer, or write ``<robot>.png`` where there is no display."""
+    from sb3_guard.envs.engine import Engine
+    from sb3_guard.envs.tasks.goal import Goal
+
+    engine = Engine(robot, Goal())
+    engine.reset(np.zeros(1, dtype=np.int32))
+    if _has_display():
+        from mujoco import viewer
+
+        viewer.launch(engine.model, engine.batch.get_data(0))
+        return
+    renderer = Renderer(engine, camera="track")
+    path = Path(f"{type(robot).__name__.lower()}.png")
+    frame = renderer.render(0)
+    assert frame is not None
+    from matplotlib import image
+
+    image.imsave(path, frame)
+    renderer.close()
+    print(f"no display: wrote {path}")

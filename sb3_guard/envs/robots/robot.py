@@ -1,0 +1,185 @@
+"""A robot from an MJCF file: everything that the other parts ask of it is read from the file.
+
+The file holds the robot alone: no floor, no options, no light. Its conventions:
+
+* the outermost body is called ``robot``; it either begins with a free joint or, for robots that move
+  at a fixed height, with its own slides and hinges; these then hang under a mocap body that carries
+  the place and heading of an episode's start;
+* every sensor in the file is observed under its own name; ``jointpos`` as (sin θ, cos θ), ball joints
+  as a rotation matrix; sensors whose names begin with ``_`` are not observed;
+* actions in [−1, 1] are scaled linearly to the control range of the actuators, in their order;
+* a keyframe named ``start`` holds the pose in which an episode begins.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs import geometry
+from sb3_guard.envs.layout import Footprint, Rectangle
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array, Generators, Robot, Simulation, World
+from sb3_guard.envs.sensors import Channel
+
+PREFIX = "robot/"
+_SENSOR = mujoco.mjtSensor
+
+# unit and bounds of the sensors that a robot may carry
+_CHANNELS = {
+    _SENSOR.mjSENS_ACCELEROMETER: (-math.inf, math.inf, "m/s²"),
+    _SENSOR.mjSENS_VELOCIMETER: (-math.inf, math.inf, "m/s"),
+    _SENSOR.mjSENS_GYRO: (-math.inf, math.inf, "rad/s"),
+    _SENSOR.mjSENS_MAGNETOMETER: (-math.inf, math.inf, "T"),
+    _SENSOR.mjSENS_TOUCH: (0.0, math.inf, "N"),
+    _SENSOR.mjSENS_JOINTVEL: (-math.inf, math.inf, "rad/s"),
+    _SENSOR.mjSENS_BALLANGVEL: (-math.inf, math.inf, "rad/s"),
+}
+
+
+@dataclass
+class MJCFRobot(Robot):
+    """A robot described by an MJCF file.
+
+    Subclasses name their file and time step; a user's own robot is made with one line,
+    ``register_robot("Crawler", xml="crawler.xml")``.
+    """
+
+    asset: ClassVar[str]
+    timestep: ClassVar[float]  # s, one physics step; a control step is ten
+    workspace: ClassVar[str] = "planar"
+    lidar_bodies: ClassVar[tuple[str, ...]] = ("robot",)
+
+    name = "robot"
+    keepout: float = param(0.4, "radius kept clear around the robot at the start, m", low=0)
+    locations: tuple[tuple[float, float], ...] = param((), "fixed start, one (x, y), m")
+    placements: tuple[Rectangle, ...] = param((), "rectangles to start in, m; empty: the arena")
+    heading: float | None = param(None, "start heading, rad; null: uniformly random")
+
+    root: ClassVar[str] = PREFIX + "robot"
+
+    @classmethod
+    def path(cls) -> Path:
+        """The robot's MJCF file."""
+        return Path(str(importlib.resources.files("sb3_guard.envs.robots") / "assets" / cls.asset))
+
+    def footprints(self) -> tuple[Footprint, ...]:
+        return (
+            Footprint("robot", 1, self.keepout, self.placements, self.locations),
+        )
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        robot = mujoco.MjSpec.from_file(str(self.path()))
+        joints = robot.body("robot").joints
+        self._free = bool(joints) and joints[0].type == mujoco.mjtJoint.mjJNT_FREE
+        if self._free:
+            frame = world.spec.worldbody.add_frame()
+        else:
+            frame = world.spec.worldbody.add_body(name="spawn", mocap=True).add_frame()
+        self._height = float(robot.body("robot").pos[2])
+        world.spec.attach(robot, prefix=PREFIX, frame=frame)
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        model, batch = sim.model, sim.batch
+        self.action_size = model.nu
+        low, high = model.actuator_ctrlrange.T
+        self._center, self._half = (low + high) / 2, (high - low) / 2
+        self._ctrl = batch.bind("ctrl")
+        self._qpos = batch.bind("qpos")
+        start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, PREFIX + "start")
+        self._start = model.key_qpos[start] if start >= 0 else model.qpos0
+        body = model.body(self.root).id
+        self._position = batch.bind("xpos")[:, body]
+        if self._free:
+            address = int(model.jnt_qposadr[model.body_jntadr[body]])
+            self._place = self._qpos[:, address : address + 3]
+            self._turn = self._qpos[:, address + 3 : address + 7]
+        else:
+            spawn = int(model.body_mocapid[model.body("spawn").id])
+            self._place = batch.bind("mocap_pos")[:, spawn]
+            self._turn = batch.bind("mocap_quat")[:, spawn]
+        ids = [model.body(PREFIX + name).id for name in self.lidar_bodies]
+        rotation = batch.bind("xmat")  # [N, nbody, 9]
+        # one lidar body, the usual case, stays a view: fancy indexing would copy at every look
+        self._bodies = slice(ids[0], ids[0] + 1) if len(ids) == 1 else ids
+        self._xpos, self._xmat = batch.bind("xpos"), rotation.reshape(*rotation.shape[:2], 3, 3)
+        self._sensors = list(self._read_sensors(model))
+        self._data = batch.bind("sensordata")
+
+    def _read_sensors(self, model: mujoco.MjModel) -> Any:
+        """(name, type, slice of sensordata) of every observed sensor of the robot."""
+        for i in range(model.nsensor):
+            name = model.sensor(i).name
+            if not name.startswith(PREFIX) or name.startswith(PREFIX + "_"):
+                continue
+            first = int(model.sensor_adr[i])
+            where = slice(first, first + int(model.sensor_dim[i]))
+            yield name.removeprefix(PREFIX), _SENSOR(int(model.sensor_type[i])), where
+
+    @property
+    def position(self) -> Array:
+        return self._position
+
+    @property
+    def frames(self) -> tuple[Array, Array]:
+        return self._xpos[:, self._bodies], self._xmat[:, self._bodies]
+
+    def positions(self, footprint: str) -> Array:
+        return self.position[:, None]
+
+    def clearance(self, points: Array, planar: bool) -> Array:
+        """Distance of points from the robot's origin, [N, K] m."""
+        return geometry.distance(self.position[:, None], points, planar)
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        places = self.sim.places("robot")
+        self._qpos[ids, : len(self._start)] = self._start
+        for i in ids.tolist():
+            heading = rngs[i].uniform(0, 2 * math.pi) if self.heading is None else self.heading
+            self._turn[i] = geometry.yaw_quaternion(np.asarray(heading))
+        self._place[ids, :2] = places[ids, 0, :2]
+        if not self._free:
+            self._place[ids, 2] = 0.0
+
+    def act(self, actions: Array) -> None:
+        self._ctrl[:] = self._center + self._half * actions
+
+    def observe(self) -> dict[str, Array]:
+        out = {}
+        for name, kind, where in self._sensors:
+            value = self._data[:, where]
+            if kind == _SENSOR.mjSENS_JOINTPOS:
+                value = np.concatenate([np.sin(value), np.cos(value)], axis=1)
+            elif kind == _SENSOR.mjSENS_BALLQUAT:
+                value = geometry.rotation_matrix(value)
+            out[name] = value
+        return out
+
+    def channels(self) -> dict[str, Channel]:
+        out = {}
+        for name, kind, where in self._sensors:
+            if kind == _SENSOR.mjSENS_JOINTPOS:
+                out[name] = Channel(2, -1.0, 1.0, "sin, cos")
+            elif kind == _SENSOR.mjSENS_BALLQUAT:
+                out[name] = Channel(9, -1.0, 1.0, "rotation matrix")
+            elif kind in _CHANNELS:
+                low, high, unit = _CHANNELS[kind]
+                out[name] = Channel(where.stop - where.start, low, high, unit)
+            else:
+                out[name] = Channel(where.stop - where.start)
+        return out
+
+    @classmethod
+    def show(cls) -> None:
+        """Open the robot in MuJoCo's viewer, or write a picture where there is no display."""
+        from sb3_guard.envs.rendering import show_robot
+
+        show_robot(cls())

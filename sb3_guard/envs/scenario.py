@@ -1,0 +1,172 @@
+"""A scenario says what an environment is: its robot, task and constraints with their parameters.
+
+It is plain data: an id string, a dictionary, a YAML file and keyword arguments all become the same
+:class:`Scenario`, and every environment is made from one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from sb3_guard.envs.engine import Engine, Layout
+from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.envs.sensors import Lidar
+
+_ID = re.compile(
+    r"(?P<task>[A-Za-z][A-Za-z0-9]*)_(?P<robot>[A-Za-z][A-Za-z0-9]*)"
+    r"_(?P<num>\d+)(?P<constraint>[A-Za-z][A-Za-z0-9]*)(?P<noconti>_noconti)?(-v0)?"
+)
+Params = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A robot, a task and constraints, each with parameters that differ from their defaults.
+
+    :param robot: a name in :data:`~sb3_guard.envs.registry.ROBOTS`
+    :param task: a name in :data:`~sb3_guard.envs.registry.TASKS`
+    :param constraints: parameters by constraint, the constraint's name in lower case; a constraint
+        under another name states its ``type``
+    :param robot_params: parameters of the robot
+    :param task_params: parameters of the task
+    :param lidar: parameters of the pseudo-lidar
+    :param layout: parameters of the layout
+    :raises ValueError: an unknown name or a bad value, with what is allowed
+    """
+
+    robot: str = "Point"
+    task: str = "Goal"
+    constraints: Mapping[str, Params] = field(default_factory=dict)
+    robot_params: Params = field(default_factory=dict)
+    task_params: Params = field(default_factory=dict)
+    lidar: Params = field(default_factory=dict)
+    layout: Params = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind, name, table in (("robot", self.robot, ROBOTS), ("task", self.task, TASKS)):
+            if name not in table:
+                raise ValueError(f"unknown {kind} {name!r}: {did_you_mean(name, table)}")
+        self.parts()
+
+    @classmethod
+    def parse(cls, name: str) -> Scenario:
+        """The scenario of an id such as ``Goal_Point_8Hazards-v0``; the version may be left out.
+
+        :raises ValueError: the id does not follow ``{Task}_{Robot}_{N}{Constraint}[_noconti]``
+        """
+        match = _ID.fullmatch(name)
+        if match is None:
+            raise ValueError(
+                f"{name!r} is not an id of the form Task_Robot_NConstraint-v0, "
+                "such as 'Goal_Point_8Hazards-v0'"
+            )
+        known = {"robot": ROBOTS, "task": TASKS, "constraint": CONSTRAINTS}
+        for kind, table in known.items():
+            if match[kind] not in table:
+                raise ValueError(
+                    f"unknown {kind} {match[kind]!r} in {name!r}: {did_you_mean(match[kind], table)}"
+                )
+        return cls(
+            robot=match["robot"],
+            task=match["task"],
+            constraints={match["constraint"].lower(): {"num": int(match["num"])}},
+            task_params={"ends": True} if match["noconti"] else {},
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scenario:
+        """The scenario in a YAML file with the fields of this class as keys.
+
+        :raises ValueError: the file is missing, is not YAML or holds unknown keys
+        """
+        import yaml
+
+        try:
+            data = yaml.safe_load(Path(path).read_text())
+        except (OSError, yaml.YAMLError) as error:
+            detail = " ".join(str(error).split())
+            raise ValueError(f"cannot read scenario {str(path)!r}: {detail}") from None
+        if not isinstance(data, dict):
+            raise ValueError(f"scenario {str(path)!r} must be a mapping, found {type(data).__name__}")
+        known = list(cls.__dataclass_fields__)
+        for key in data:
+            if key not in known:
+                raise ValueError(f"scenario {str(path)!r} has no key {key!r}: {did_you_mean(key, known)}")
+        return cls(**data)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data from which ``Scenario(**data)`` makes this scenario again."""
+        return {
+            "robot": self.robot,
+            "task": self.task,
+            "constraints": {k: dict(v) for k, v in self.constraints.items()},
+            "robot_params": dict(self.robot_params),
+            "task_params": dict(self.task_params),
+            "lidar": dict(self.lidar),
+            "layout": dict(self.layout),
+        }
+
+    def override(self, **params: Params | None) -> Scenario:
+        """This scenario with parameters of its parts changed or constraints added.
+
+        ``override(hazards={"size": 0.2}, goal={"size": 0.3}, lidar={"bins": 32})``: a keyword is
+        ``robot``, ``lidar``, ``layout``, the task's name in lower case, or a constraint's; None
+        removes a constraint.
+
+        :raises ValueError: an unknown keyword or parameter
+        """
+        fields: dict[str, Any] = {"constraints": dict(self.constraints)}
+        own = {
+            "robot": "robot_params",
+            self.task.lower(): "task_params",
+            "task": "task_params",
+            "lidar": "lidar",
+            "layout": "layout",
+        }
+        kinds = {name.lower() for name in CONSTRAINTS}
+        for key, value in params.items():
+            if value is not None and not isinstance(value, Mapping):
+                raise ValueError(
+                    f"{key} = {value!r} must be a mapping of parameters, such as {key}={{'size': 0.3}}"
+                )
+            if key in own:
+                name = own[key]
+                fields[name] = {**fields.get(name, getattr(self, name)), **(value or {})}
+            elif value is None and key in fields["constraints"]:
+                del fields["constraints"][key]
+            elif key in kinds or key in fields["constraints"] or (value and "type" in value):
+                old = fields["constraints"].get(key, {})
+                fields["constraints"][key] = {**old, **(value or {})}
+            else:
+                known = [*own, *sorted(kinds)]
+                raise ValueError(f"unknown parameter {key!r}: {did_you_mean(key, known)}")
+        return replace(self, **fields)
+
+    def parts(self) -> dict[str, Any]:
+        """New, unbound parts: the keyword arguments of an :class:`Engine`."""
+        by_name = {name.lower(): cls for name, cls in CONSTRAINTS.items()}
+        constraints = []
+        for name, params in self.constraints.items():
+            params = dict(params)
+            kind = str(params.pop("type", name)).lower()
+            if kind not in by_name:
+                raise ValueError(f"unknown constraint {kind!r}: {did_you_mean(kind, by_name)}")
+            constraint = by_name[kind].from_params(params)
+            constraint.name = name  # type: ignore[misc]
+            constraints.append(constraint)
+        return {
+            "robot": ROBOTS[self.robot].from_params(self.robot_params),
+            "task": TASKS[self.task].from_params(self.task_params),
+            "constraints": constraints,
+            "lidar": Lidar.from_params(self.lidar),
+            "layout": Layout.from_params(self.layout),
+        }
+
+    def build(self, num_envs: int = 1, num_threads: int | None = None) -> Engine:
+        """Run ``num_envs`` simulations of this scenario."""
+        return Engine(**self.parts(), num_envs=num_envs, num_threads=num_threads)

@@ -1,0 +1,212 @@
+"""Many environments with Gymnasium's vector interface, on one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from sb3_guard.envs.engine import Outcome
+from sb3_guard.envs.gym_env import (
+    action_space,
+    as_scenario,
+    check_render_mode,
+    observation_space,
+    step_info,
+)
+from sb3_guard.envs.registry import EPISODE_STEPS
+from sb3_guard.envs.rendering import Renderer
+from sb3_guard.envs.scenario import Scenario
+
+Array = np.ndarray
+
+
+@dataclass
+class Transition:
+    """A control step of every row, after which finished rows have begun anew.
+
+    :param obs: the next observation, [N, D]: of the new episode where one began
+    :param outcome: what the step brought, with the observation before the new episode
+    :param truncated: cut by the time limit or for want of a next goal, [N] bool
+    :param done: terminated or truncated, [N] bool
+    """
+
+    obs: Array
+    outcome: Outcome
+    truncated: Array
+    done: Array
+
+
+class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
+    """N environments stepped together; row i is a lone environment with seed + i, bit for bit.
+
+    A row that ends is reset in the same step (``AutoresetMode.SAME_STEP``): its last observation and
+    info are in ``infos["final_obs"]`` and ``infos["final_info"]``. ``infos["cost"]`` and
+    ``infos["cost_<type>"]`` hold the costs of the step for every row.
+
+    :param num_envs: number of environments N
+    :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario` or its plain data
+    :param max_episode_steps: control steps after which an episode is cut
+    :param num_threads: threads that step the physics; by default one per CPU, at most N. The results
+        do not depend on it
+    :param render_mode: ``"rgb_array"`` (one frame per row) or None
+    :param flatten: False for a Dict observation with the components by name
+    :param params: parameters of parts to change, such as ``hazards={"num": 4}``
+    :raises ValueError: unknown names or bad values
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "render_modes": ["rgb_array"],
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: str | Mapping[str, Any] | Scenario = "Goal_Point_8Hazards",
+        max_episode_steps: int = EPISODE_STEPS,
+        num_threads: int | None = None,
+        render_mode: str | None = None,
+        flatten: bool = True,
+        width: int = 480,
+        height: int = 480,
+        camera: str = "fixed",
+        **params: Any,
+    ) -> None:
+        if isinstance(max_episode_steps, bool) or max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps = {max_episode_steps!r} must be at least 1")
+        self.scenario = as_scenario(scenario, params)
+        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
+        self.engine = self.scenario.build(num_envs, num_threads)
+        self.num_envs = self.engine.num_envs
+        self.max_episode_steps = max_episode_steps
+        self.flatten = flatten
+        self.single_observation_space = observation_space(self.engine, flatten)
+        self.single_action_space = action_space(self.engine)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        control_step = 10 * self.engine.model.opt.timestep
+        self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
+        self._view_size = (width, height, camera)
+        self._renderer: Renderer | None = None
+        self._everyone = np.arange(self.num_envs, dtype=np.int32)
+
+    @property
+    def observation_layout(self) -> dict[str, slice]:
+        """Where each named component lies in the flat observation."""
+        return self.engine.observation_layout
+
+    def begin(self, seeds: Sequence[int | None], ids: Array | None = None) -> Array:
+        """Begin episodes in rows ``ids`` (by default all); a seed renews a row's generator.
+
+        :return: flat observations of every row, [N, D]
+        """
+        for row, seed in enumerate(seeds):
+            if seed is not None:
+                self.engine.seed(row, seeding.np_random(int(seed))[0])
+        self.engine.reset(self._everyone if ids is None else ids)
+        return self.engine.observe()
+
+    def advance(self, actions: Array) -> Transition:
+        """One control step of every row; rows that end begin anew."""
+        outcome = self.engine.step(actions)
+        truncated = outcome.unplaced | (self.engine.steps >= self.max_episode_steps)
+        done = outcome.terminated | truncated
+        obs = outcome.obs
+        if done.any():
+            self.engine.reset(np.flatnonzero(done))
+            obs = self.engine.observe()
+        return Transition(obs, outcome, truncated, done)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in every row, or in the rows of ``options["reset_mask"]``.
+
+        :param seed: row i gets seed + i; or one seed (or None) per row
+        """
+        seeds: Sequence[int | None]
+        if seed is None:
+            seeds = [None] * self.num_envs
+        elif isinstance(seed, (int, np.integer)):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments")
+        ids = None
+        if options is not None and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"], dtype=bool)
+            if mask.shape != (self.num_envs,) or not mask.any():
+                raise ValueError(f"reset_mask must be [{self.num_envs}] bool with a True in it")
+            ids = np.flatnonzero(mask)
+            seeds = [s if m else None for s, m in zip(seeds, mask, strict=True)]
+        return self._view(self.begin(seeds, ids)), {}
+
+    def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """Advance every row by one control step of ten physics steps."""
+        t = self.advance(actions)
+        out = t.outcome
+        everyone = np.ones(self.num_envs, dtype=bool)
+        infos: dict[str, Any] = {"cost": out.cost, "_cost": everyone}
+        for name, cost in out.costs.items():
+            infos[name], infos[f"_{name}"] = cost, everyone
+        happened = {
+            "goal_met": out.goal_met,
+            "goal_unplaced": out.unplaced,
+            "physics_error": out.physics_error,
+        }
+        for name, rows in happened.items():
+            if rows.any():
+                infos[name] = infos[f"_{name}"] = rows
+        if t.done.any():
+            final = np.full(self.num_envs, None, dtype=object)
+            details: dict[str, Any] = {}
+            for row in np.flatnonzero(t.done).tolist():
+                final[row] = self._view(out.obs[row])
+                details = self._add_info(details, step_info(out, row), row)
+            infos["final_obs"], infos["_final_obs"] = final, t.done
+            infos["final_info"], infos["_final_info"] = details, t.done
+        return self._view(t.obs), out.reward, out.terminated, t.truncated, infos
+
+    def _view(self, obs: Array) -> Any:
+        if self.flatten:
+            return obs
+        return {name: obs[..., where] for name, where in self.engine.observation_layout.items()}
+
+    def render(self) -> tuple[Array, ...] | None:
+        """One frame per row, [height, width, 3] uint8; never advances physics."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.frame(row) for row in range(self.num_envs))
+
+    def frame(self, row: int) -> Array:
+        """A picture of one row, [height, width, 3] uint8."""
+        if self._renderer is None:
+            self._renderer = Renderer(self.engine, *self._view_size)
+        frame = self._renderer.render(row)
+        assert frame is not None
+        return frame
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def state(self) -> dict[str, Any]:
+        """Everything the coming steps depend on; :meth:`restore` continues from it bit for bit."""
+        return self.engine.state()
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a :meth:`state` of the same scenario and number of rows."""
+        self.engine.restore(state)

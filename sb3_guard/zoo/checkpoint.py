@@ -1,0 +1,225 @@
+"""Checkpoints from which a killed run continues bit for bit as if it had not been killed.
+
+A checkpoint is taken between an update and the next rollout, the one moment when everything that
+training depends on is in few places: model, random generators, environments, logger, callbacks. The
+file is a model file of SB3's with one more member, so ``CPO.load("checkpoint.zip")`` works on it.
+"""
+
+import io
+import pickle
+import random
+import time
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_guard.common.files import replacing
+from sb3_guard.zoo.logger import RunLogger
+from sb3_guard.zoo.resumable import capture, restore
+from sb3_guard.zoo.usage import UsageError, one_line
+
+MEMBER = "run_state.pkl"
+FORMAT = 1  # increased when the content changes so that older files can't be continued
+
+
+class Interrupted(Exception):
+    """Training was asked to stop, and stopped with a checkpoint of where it was."""
+
+
+def random_state() -> tuple[Any, Any, th.Tensor]:
+    """The states of Python's, NumPy's and torch's global generators."""
+    return random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
+
+
+def set_random_state(state: tuple[Any, Any, th.Tensor]) -> None:
+    """Put the global generators where :func:`random_state` found them."""
+    python, numpy, torch = state
+    random.setstate(python)
+    np.random.set_state(numpy)  # noqa: NPY002
+    th.set_rng_state(torch)
+
+
+class Checkpoints(BaseCallback):
+    """
+    Write ``checkpoint.zip`` at rollout boundaries.
+
+    :param path: the file
+    :param others: the run's other callbacks, whose counters and states belong to the checkpoint
+    :param every: least time between two checkpoints, seconds; the first one is taken at once
+    :param log_interval: rollouts per logged row; checkpoints fall on logged rollouts, since SB3
+        counts rollouts from the start of each ``learn``
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        others: Sequence[BaseCallback],
+        every: float = 10.0,
+        log_interval: int = 1,
+    ):
+        super().__init__()
+        self.path = path
+        self.others = list(others)
+        self.every = every
+        self.log_interval = max(log_interval, 1)
+        #: set from a signal handler: stop with a checkpoint at the next boundary
+        self.stop = False
+        self.rollouts = 0  # all of the run's
+        self._elapsed = 0.0  # seconds of training before this process
+        self._start = 0  # steps at which the run, not this process, began
+        self._last = -np.inf
+        self._between = True
+        self._warned = False
+
+    def _on_training_start(self) -> None:
+        # SB3 measures time and speed since `learn` was called; here they are the whole run's.
+        self.model.start_time -= int(self._elapsed * 1e9)
+        self.model._num_timesteps_at_start = self._start
+
+    def _on_rollout_start(self) -> None:
+        due = time.monotonic() - self._last >= self.every
+        if self.stop or (due and self.rollouts % self.log_interval == 0):
+            # gSDE has drawn its noise by now; the algorithm remembers how things were before.
+            self.write(getattr(self.model, "_rng_at_rollout", None) or random_state())
+        if self.stop:
+            raise Interrupted
+        self._between = False
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.rollouts += 1
+        self._between = True
+
+    def _on_training_end(self) -> None:
+        # A callback may have stopped training within a rollout: then the last boundary stands.
+        if self._between:
+            self.write(random_state())
+
+    def write(self, generators: tuple[Any, Any, th.Tensor]) -> None:
+        """
+        Write the checkpoint, replacing the one before in one step.
+
+        :param generators: see :func:`random_state`
+        """
+        assert isinstance(self.logger, RunLogger)
+        environments = capture(self.training_env)
+        if environments is None and not self._warned:
+            self._warned = True
+            print(
+                "The environment can't save its state: a resumed run will begin new episodes "
+                "(it is exact only for environments that can be pickled or have state())."
+            )
+        state = {
+            "format": FORMAT,
+            "num_timesteps": self.model.num_timesteps,
+            "generators": generators,
+            "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+            "environments": environments,
+            "callbacks": [
+                (type(one).__name__, one.n_calls, one.state() if hasattr(one, "state") else None)
+                for one in self.others
+            ],
+            "logger": self.logger.state(self.rollouts),
+            "rollouts": self.rollouts,
+            "elapsed": (time.time_ns() - self.model.start_time) / 1e9,
+            "start": self.model._num_timesteps_at_start,
+        }
+        buffer = io.BytesIO()
+        self.model.save(buffer)
+        with zipfile.ZipFile(buffer, "a") as archive:
+            archive.writestr(MEMBER, pickle.dumps(state))
+        with replacing(self.path) as file:
+            file.write(buffer.getvalue())
+        self._last = time.monotonic()
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue the counts of a checkpoint, here and in the other callbacks."""
+        self.rollouts = state["rollouts"]
+        self._elapsed = state["elapsed"]
+        self._start = state["start"]
+        names = [name for name, _, _ in state["callbacks"]]
+        if names != [type(one).__name__ for one in self.others]:
+            raise UsageError(f"{self.path} was written with other callbacks: {', '.join(names)}")
+        for one, (_, n_calls, own) in zip(self.others, state["callbacks"], strict=True):
+            one.n_calls = n_calls
+            if own is not None:
+                one.restore(own)  # type: ignore[attr-defined]
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """
+    The run's state in a checkpoint, without the model.
+
+    :raises UsageError: the file is absent, damaged, not a checkpoint, or of another version
+    """
+    if not path.is_file():
+        raise UsageError(
+            f"there is no {path}: the run was stopped before its first rollout; "
+            "start it again without -i"
+        )
+    try:
+        with zipfile.ZipFile(path) as archive:
+            state = pickle.loads(archive.read(MEMBER))
+        version = state["format"]
+    except KeyError:
+        raise UsageError(f"{path} is a model, not a checkpoint") from None
+    except Exception as error:
+        # A damaged pickle can raise anything.
+        raise UsageError(f"{path} is damaged and can't be read: {one_line(error)}") from error
+    if version != FORMAT:
+        raise UsageError(f"{path} has format {version}; this version reads format {FORMAT} only")
+    return state
+
+
+def is_checkpoint(path: Path) -> bool:
+    """Whether a file is a checkpoint rather than a plain model."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return MEMBER in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def load_model(
+    algorithm: type[BaseAlgorithm], path: Path, env: VecEnv | None, device: str, **changes: Any
+) -> BaseAlgorithm:
+    """
+    The model in a model file or checkpoint, as it was.
+
+    :param env: environment to go on training in; None: to predict only
+    :raises UsageError: the file is damaged, of another algorithm, or does not fit the environment
+    """
+    try:
+        return algorithm.load(path, env=env, device=device, force_reset=False, **changes)
+    except Exception as error:
+        raise UsageError(
+            f"can't load {path} as {algorithm.__name__}: {one_line(error)}"
+        ) from error
+
+
+def restore_run(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+    """
+    Put environments and generators where the checkpoint found them; the last thing before `learn`.
+
+    :param model: as loaded from the same checkpoint, with its environment
+    """
+    env = model.get_env()
+    assert env is not None
+    observations = env.reset()
+    if state["environments"] is None:
+        model._last_obs = observations  # type: ignore[assignment]
+        model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
+    else:
+        restore(env, state["environments"])
+    set_random_state(state["generators"])
+    if state["cuda"] and th.cuda.is_available():
+        th.cuda.set_rng_state_all(state["cuda"])

@@ -1,0 +1,365 @@
+"""Hyper-parameters as data: found, merged, checked, and turned into what constructors take.
+
+They are RL-Zoo's files: ``hyperparams/<algo>.yml`` with a ``default`` entry, entries for single
+environments and YAML anchors. What is read stays plain data, so that the run folder's
+``config.yml`` says exactly what was used; only :func:`build` makes objects of it.
+"""
+
+import importlib
+import inspect
+import math
+import runpy
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_guard.zoo.usage import UsageError, one_line, suggest
+
+# What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
+# `selection_limit` is ours (see CostEvalCallback).
+RUN_KEYS: dict[str, Any] = {
+    "n_timesteps": int,
+    "n_envs": int,
+    "normalize": bool | str | dict,
+    "frame_stack": int | None,
+    "env_kwargs": dict | None,
+    "env_wrapper": str | list | dict | None,
+    "vec_env_wrapper": str | list | dict | None,
+    "callback": str | list | dict | None,
+    "monitor_kwargs": dict | str,
+    "selection_limit": float | list[float] | None,
+}
+# Arguments of an algorithm that are flags of the command.
+FLAGS = {"env": "--env", "seed": "--seed", "device": "--device", "verbose": "--verbose"}
+NOT_HYPERPARAMETERS = {*FLAGS, "self", "tensorboard_log", "_init_setup_model", "policy_base"}
+
+
+def hyperparams_folder() -> Path:
+    """Where the shipped files are: inside an installed package, beside it in a checkout."""
+    package = Path(__file__).parent.parent
+    inside = package / "hyperparams"
+    return inside if inside.is_dir() else package.parent / "hyperparams"
+
+
+def read_file(path: str | Path) -> dict[str, Any]:
+    """
+    The content of a hyper-parameter file: environment (or ``default``) to hyper-parameters.
+
+    :param path: a YAML file, or a Python file or module that has a dictionary ``hyperparams``
+    :raises UsageError: it is absent, not readable or not of that form
+    """
+    name = str(path)
+    if name.endswith((".yml", ".yaml")):
+        content = _read_yaml(Path(path))
+    else:
+        try:
+            if name.endswith(".py"):
+                content = runpy.run_path(name).get("hyperparams")
+            else:
+                content = getattr(importlib.import_module(name), "hyperparams", None)
+        except Exception as error:
+            raise UsageError(f"can't read hyper-parameters from {name}: {one_line(error)}") from error
+    if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
+        raise UsageError(
+            f"{name} must map environments, or 'default', to hyper-parameters "
+            "('default:' and below it lines such as '  n_steps: 1000')"
+        )
+    return content
+
+
+def _read_yaml(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text())
+    except FileNotFoundError:
+        raise UsageError(f"there is no hyper-parameter file {path}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"can't read {path}: {one_line(error)}") from error
+    except yaml.YAMLError as error:
+        raise UsageError(f"{path} is not valid YAML: {one_line(error)}") from error
+
+
+def read_hyperparams(
+    algo: str, env_id: str, conf_file: str | None = None, overrides: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """
+    The hyper-parameters of an algorithm on an environment, sorted by name, not yet checked.
+
+    :param algo: key of the algorithm, names the shipped file
+    :param env_id: its own entry is taken, with or without a version, else ``default``
+    :param conf_file: file to read instead of the shipped one
+    :param overrides: what the command line says
+    :raises UsageError: the file can't be read, or has no entry that fits
+    """
+    path = conf_file or hyperparams_folder() / f"{algo}.yml"
+    content = read_file(path)
+    for entry in (env_id, env_id.rsplit("-v", 1)[0], "default"):
+        if entry in content:
+            return dict(sorted({**content[entry], **(overrides or {})}.items()))
+    raise UsageError(f"{path} has no entry for {env_id!r} and no 'default'; {suggest(env_id, content)}")
+
+
+def arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
+    """The hyper-parameters an algorithm takes, from its constructor: name to type annotation."""
+    hints: dict[str, Any] = {}
+    for cls in algorithm.__mro__:
+        constructor = cls.__dict__.get("__init__")
+        if constructor is None:
+            continue
+        annotations = typing.get_type_hints(constructor)
+        parameters = inspect.signature(constructor).parameters.values()
+        for one in parameters:
+            if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD):
+                hints.setdefault(one.name, annotations.get(one.name, Any))
+        if all(one.kind is not one.VAR_KEYWORD for one in parameters):
+            break
+    return {name: hint for name, hint in hints.items() if name not in NOT_HYPERPARAMETERS}
+
+
+def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    The same hyper-parameters with numbers in their proper type, or an error that says what to mend.
+
+    :raises UsageError: a name the algorithm does not know, a value of the wrong type, a NaN, a
+        missing ``n_timesteps``, or a count below 1
+    """
+    known = {**arguments(algorithm), **RUN_KEYS}
+    checked = {}
+    for name, value in values.items():
+        if name in FLAGS:
+            raise UsageError(f"{name!r} is not a hyper-parameter; use the flag {FLAGS[name]}")
+        if name not in known:
+            raise UsageError(f"{algo} has no hyper-parameter {name!r}; {suggest(name, sorted(known))}")
+        try:
+            checked[name] = _coerce(value, known[name])
+        except TypeError:
+            raise UsageError(
+                f"hyper-parameter {name}: {value!r} is not allowed; "
+                f"it must be {_describe(known[name])}"
+            ) from None
+    checked.setdefault("n_envs", 1)
+    checked.setdefault("policy", "MlpPolicy")
+    if "n_timesteps" not in checked:
+        raise UsageError(f"n_timesteps of {algo} is not given; use the flag -n, e.g. -n 1e6")
+    for name in ("n_envs", "n_timesteps", "n_steps", "batch_size"):
+        value = checked.get(name)
+        if isinstance(value, int) and value < 1:
+            raise UsageError(f"hyper-parameter {name}: {value} is not allowed; it must be at least 1")
+    return dict(sorted(checked.items()))
+
+
+def _coerce(value: Any, hint: Any) -> Any:
+    """``value`` as a ``hint``; numbers that YAML reads as text (``1e-3``) and whole floats fit."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        # The arm that fits without change wins: 1 stays an int where int and float are allowed.
+        for arm in args:
+            if _is_exactly(value, arm):
+                return _coerce(value, arm)
+        for arm in args:
+            try:
+                return _coerce(value, arm)
+            except TypeError:
+                continue
+        raise TypeError
+    if hint is None or hint is type(None):
+        if value is None:
+            return None
+        raise TypeError
+    if origin is typing.Literal:
+        if value in args:
+            return value
+        raise TypeError
+    if hint is bool or hint is str:
+        if isinstance(value, hint):
+            return value
+        raise TypeError
+    if hint is int or hint is float:
+        return _number(value, hint)
+    container = origin or hint
+    if isinstance(container, type) and issubclass(container, Mapping):
+        # Text is evaluated when the model is made: `dict(activation_fn=nn.ReLU)`.
+        if isinstance(value, Mapping) or (isinstance(value, str) and value.startswith("dict(")):
+            return value
+        raise TypeError
+    if container in (list, tuple, Sequence):
+        if not isinstance(value, (list, tuple)):
+            raise TypeError
+        inner = args[0] if args else Any
+        return [_coerce(one, inner) for one in value]
+    if hint is Any or isinstance(hint, (str, typing.TypeVar)):
+        return value
+    if type in (origin, hint) or Callable in (origin, hint):
+        # A class by its dotted name, or a schedule such as lin_0.001.
+        if isinstance(value, str) and ("." in value or value.startswith("lin_")):
+            return value
+        raise TypeError
+    if isinstance(value, (str, bool, int, float)) and isinstance(hint, type):
+        raise TypeError
+    return value
+
+
+def _number(value: Any, kind: type) -> int | float:
+    if isinstance(value, str):
+        try:
+            value = float(value)
+        except ValueError:
+            raise TypeError from None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        raise TypeError
+    if kind is int:
+        if not float(value).is_integer():
+            raise TypeError
+        return int(value)
+    return float(value)
+
+
+def _is_exactly(value: Any, hint: Any) -> bool:
+    return isinstance(hint, type) and type(value) is hint and value == value
+
+
+def _describe(hint: Any) -> str:
+    """A type annotation in words."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        words = [_describe(arm) for arm in args]
+        return " or ".join(dict.fromkeys(words))
+    if origin is typing.Literal:
+        return " or ".join(repr(one) for one in args)
+    names = {int: "a whole number", float: "a number", bool: "True or False", str: "text"}
+    if hint in names:
+        return names[hint]
+    if hint is None or hint is type(None):
+        return "None"
+    container = origin or hint
+    if isinstance(container, type) and issubclass(container, Mapping):
+        return "a mapping"
+    if container in (list, tuple, Sequence):
+        return f"a list{f' ({_describe(args[0])} each)' if args and args[0] is not ... else ''}"
+    if type in (origin, hint):
+        return "the dotted name of a class"
+    if Callable in (origin, hint):
+        return "a schedule such as lin_0.001"
+    return getattr(hint, "__name__", str(hint))
+
+
+@dataclass
+class Setup:
+    """
+    Hyper-parameters as objects, ready for the constructors.
+
+    :param model: arguments of the algorithm
+    :param n_envs: number of parallel environments
+    :param n_timesteps: length of training, steps of all environments together
+    :param normalize: arguments of VecNormalize; None: not used
+    :param frame_stack: number of stacked observations; None: not used
+    :param env_kwargs: arguments of the environment
+    :param env_wrapper: wraps each single environment; None: not used
+    :param vec_env_wrapper: wraps the vectorised environment; None: not used
+    :param monitor_kwargs: arguments of the monitor
+    :param callbacks: callbacks named in the file
+    :param selection_limit: see CostEvalCallback
+    """
+
+    model: dict[str, Any]
+    n_envs: int
+    n_timesteps: int
+    normalize: dict[str, Any] | None
+    frame_stack: int | None
+    env_kwargs: dict[str, Any]
+    env_wrapper: Callable[[gym.Env], gym.Env] | None
+    vec_env_wrapper: Callable[[VecEnv], VecEnv] | None
+    monitor_kwargs: dict[str, Any]
+    callbacks: list[BaseCallback]
+    selection_limit: float | list[float] | None
+
+
+def build(values: Mapping[str, Any]) -> Setup:
+    """
+    Make objects of checked hyper-parameters: schedules, classes, wrappers, callbacks.
+
+    :raises UsageError: text that should name a class or be an expression does not
+    """
+    from rl_zoo3.utils import get_callback_list, get_wrapper_class
+
+    model = {name: value for name, value in values.items() if name not in RUN_KEYS}
+    for name, value in model.items():
+        if name == "policy":
+            if "." in value:
+                model[name] = _import_class(name, value)
+        elif isinstance(value, str) and value.startswith("lin_"):
+            model[name] = _schedule(name, value)
+        elif isinstance(value, str) and value.startswith("dict("):
+            model[name] = _evaluate(name, value)
+        elif isinstance(value, str) and name.endswith("_class"):
+            model[name] = _import_class(name, value)
+    normalize = values.get("normalize") or None
+    if isinstance(normalize, str):
+        normalize = _evaluate("normalize", normalize)
+    if normalize is True:
+        normalize = {}
+    if normalize is not None and "gamma" in values:
+        # Returns are scaled by the discount they are learned with.
+        normalize = {"gamma": values["gamma"], **normalize}
+    monitor_kwargs = values.get("monitor_kwargs") or {}
+    if isinstance(monitor_kwargs, str):
+        monitor_kwargs = _evaluate("monitor_kwargs", monitor_kwargs)
+    try:
+        env_wrapper = get_wrapper_class(dict(values))
+        vec_env_wrapper = get_wrapper_class(dict(values), "vec_env_wrapper")
+        callbacks = get_callback_list(dict(values))
+    except Exception as error:
+        raise UsageError(f"a wrapper or callback can't be made: {one_line(error)}") from error
+    return Setup(
+        model=model,
+        n_envs=values["n_envs"],
+        n_timesteps=values["n_timesteps"],
+        normalize=normalize,
+        frame_stack=values.get("frame_stack"),
+        env_kwargs=dict(values.get("env_kwargs") or {}),
+        env_wrapper=env_wrapper,
+        vec_env_wrapper=vec_env_wrapper,
+        monitor_kwargs=monitor_kwargs,
+        callbacks=callbacks,
+        selection_limit=values.get("selection_limit"),
+    )
+
+
+def _schedule(name: str, value: str) -> Callable[[float], float]:
+    from rl_zoo3 import linear_schedule
+
+    try:
+        return linear_schedule(value.removeprefix("lin_"))
+    except ValueError:
+        raise UsageError(
+            f"hyper-parameter {name}: {value!r} is not a schedule; write e.g. lin_0.001"
+        ) from None
+
+
+def _evaluate(name: str, text: str) -> Any:
+    """The value of an expression such as ``dict(activation_fn=nn.ReLU)``."""
+    import torch as th
+
+    try:
+        return eval(text, {"th": th, "torch": th, "nn": th.nn})
+    except Exception as error:
+        raise UsageError(
+            f"hyper-parameter {name}: {text!r} can't be evaluated: {one_line(error)}"
+        ) from error
+
+
+def _import_class(name: str, path: str) -> type:
+    from rl_zoo3.utils import get_class_by_name
+
+    try:
+        return get_class_by_name(path)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(f"{name}: there is no class {path!r}: {one_line(error)}") from error

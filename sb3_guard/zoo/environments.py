@@ -1,0 +1,181 @@
+"""Environments for the commands: found, made, and wrapped as a run's hyper-parameters say."""
+
+import importlib
+import signal
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import (
+    is_image_space,
+    is_image_space_channels_first,
+)
+from stable_baselines3.common.vec_env import (
+    VecEnv,
+    VecFrameStack,
+    VecNormalize,
+    VecTransposeImage,
+    is_vecenv_wrapped,
+)
+
+from sb3_guard.common.monitor import CostMonitor
+from sb3_guard.common.vec_env import find_scenario, make_vec_env
+from sb3_guard.zoo.config import Setup
+from sb3_guard.zoo.resumable import ResumableEnv
+from sb3_guard.zoo.usage import UsageError, one_line
+
+VEC_ENVS = ("native", "dummy", "subproc")
+# What constructors of environments and models raise when their arguments are wrong.
+BAD_ARGUMENTS = (ValueError, TypeError, AssertionError, KeyError, ImportError, gym.error.Error)
+
+
+def import_packages(names: Sequence[str]) -> None:
+    """
+    Import modules that register environments (``--gym-packages``).
+
+    :raises UsageError: one can't be imported
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise UsageError(f"--gym-packages: can't import {name!r}: {one_line(error)}") from error
+
+
+def canonical_id(env_id: str) -> tuple[str, bool]:
+    """
+    The full id of an environment, and whether it is one of ours.
+
+    :param env_id: an id, whose version may be left out if the environment is ours
+    :raises UsageError: it is unknown
+    """
+    try:
+        ours = find_scenario(env_id) is not None
+        if not ours and ":" not in env_id:
+            gym.spec(env_id)
+    except (ValueError, gym.error.Error) as error:
+        raise UsageError(one_line(error)) from error
+    if ours and not env_id.rpartition("-v")[2].isdigit():
+        env_id = f"{env_id}-v0"
+    return env_id, ours
+
+
+def choose_vec_env(wanted: str | None, ours: bool, wrapped: bool) -> str:
+    """
+    The kind of vectorised environment: native where it is possible, unless asked otherwise.
+
+    :param wanted: what the flag says, None if it says nothing
+    :param ours: the environment is one of ours
+    :param wrapped: single environments get a wrapper, which native ones can't
+    :raises UsageError: native is asked for and not possible
+    """
+    if wanted == "native" and not ours:
+        raise UsageError(
+            "--vec-env native works for sb3_guard's own environments only; "
+            "use --vec-env dummy or subproc"
+        )
+    if wanted == "native" and wrapped:
+        raise UsageError(
+            "--vec-env native can't apply env_wrapper, since its environments are one batch; "
+            "use --vec-env dummy or subproc"
+        )
+    return wanted or ("native" if ours and not wrapped else "dummy")
+
+
+@contextmanager
+def _interrupts_left_to_us() -> Iterator[None]:
+    """Let worker processes ignore Ctrl-C, so that the rollout under way can be finished."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def make_envs(
+    env_id: str,
+    setup: Setup,
+    *,
+    n_envs: int,
+    seed: int | None,
+    vec_env: str,
+    env_kwargs: Mapping[str, Any],
+    cost_keys: Sequence[str] = ("cost",),
+    num_threads: int | None = None,
+    evaluation: bool = False,
+    normalizer: Path | None = None,
+    render_mode: str | None = None,
+) -> VecEnv:
+    """
+    Make environments and wrap them: monitor, ``vec_env_wrapper``, VecNormalize, frame stack.
+
+    :param env_id: full id
+    :param setup: the run's hyper-parameters
+    :param n_envs: how many
+    :param seed: the environments get seed, seed + 1, …
+    :param vec_env: native, dummy or subproc
+    :param env_kwargs: arguments of the environment
+    :param cost_keys: entries of info that are costs
+    :param num_threads: threads of the native engine; None: its own choice
+    :param evaluation: observations are normalised with given statistics, rewards not at all
+    :param normalizer: statistics to begin with, written by VecNormalize
+    :param render_mode: as for :func:`gymnasium.make`
+    :raises UsageError: the environment refuses an argument, or can't be made
+    """
+
+    def wrap(env: gym.Env) -> gym.Env:
+        return ResumableEnv(env if setup.env_wrapper is None else setup.env_wrapper(env))
+
+    try:
+        with _interrupts_left_to_us():
+            env = make_vec_env(
+                env_id,
+                n_envs,
+                seed,
+                vec_env=vec_env,
+                env_kwargs=dict(env_kwargs),
+                num_threads=num_threads,
+                render_mode=render_mode,
+                wrapper_class=None if vec_env == "native" else wrap,
+            )
+        assert isinstance(env, CostMonitor)
+        if tuple(cost_keys) != ("cost",) or setup.monitor_kwargs:
+            env = CostMonitor(env.venv, cost_keys=tuple(cost_keys), **setup.monitor_kwargs)
+    except (*BAD_ARGUMENTS, EOFError, ConnectionError) as error:
+        raise UsageError(f"can't make {env_id}: {one_line(error)}") from error
+    try:
+        return _wrap(env, setup, evaluation, normalizer)
+    except BAD_ARGUMENTS as error:
+        env.close()
+        raise UsageError(f"can't wrap {env_id}: {one_line(error)}") from error
+
+
+def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: Path | None) -> VecEnv:
+    if setup.vec_env_wrapper is not None:
+        env = setup.vec_env_wrapper(env)
+    if normalizer is not None:
+        env = VecNormalize.load(str(normalizer), env)
+    elif setup.normalize is not None:
+        env = VecNormalize(env, **setup.normalize)
+    if evaluation and isinstance(env, VecNormalize):
+        env.training = False
+        env.norm_reward = False
+    if setup.frame_stack is not None:
+        env = VecFrameStack(env, setup.frame_stack)
+    # SB3 would do this itself, but then training and evaluation would be wrapped differently.
+    space = env.observation_space
+    parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+    needs_transpose = any(
+        is_image_space(one) and not is_image_space_channels_first(one)  # type: ignore[arg-type]
+        for one in parts
+    )
+    if needs_transpose and not is_vecenv_wrapped(env, VecTransposeImage):
+        env = VecTransposeImage(env)
+    return env

@@ -1,0 +1,122 @@
+"""What a command says when it can't do what was asked: one line, exit status 2, no traceback."""
+
+import argparse
+import ast
+import difflib
+import re
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any, NoReturn
+
+
+class UsageError(Exception):
+    """Something the user can put right; the message names the value, what is allowed, the fix."""
+
+
+def suggest(name: str, allowed: Iterable[str]) -> str:
+    """What ``name`` was probably meant to be, where something is near, and all that is allowed."""
+    folded = {one.lower(): one for one in allowed}
+    near = difflib.get_close_matches(name.lower(), folded, n=1)
+    hint = f"did you mean {folded[near[0]]!r}? " if near else ""
+    return f"{hint}allowed: {', '.join(folded.values()) or 'none'}"
+
+
+def one_line(error: BaseException) -> str:
+    """An exception's message on one line, its type where the message alone says too little."""
+    text = " ".join(str(error).split())
+    if isinstance(error, (UsageError, ValueError)) and text:
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that raises :class:`UsageError` and knows which flag was meant."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs.setdefault("allow_abbrev", False)
+        super().__init__(*args, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise instead of printing the usage, which would bury the message."""
+        unknown = re.match(r"unrecognized arguments: (-\S+)", message)
+        if unknown:
+            flag = unknown[1].split("=")[0]
+            flags = [one for one in self._option_string_actions if one.startswith("--")]
+            near = difflib.get_close_matches(flag, flags, n=1)
+            hint = f"did you mean {near[0]}?" if near else "see --help"
+            raise UsageError(f"unknown flag {flag}; {hint}")
+        raise UsageError(" ".join(message.split()))
+
+
+def run(command: Callable[[], int]) -> int:
+    """
+    Run a command and turn what the user can put right into one line on stderr.
+
+    :return: the exit status: the command's own, 2 for a :class:`UsageError`
+    """
+    try:
+        return command()
+    except UsageError as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        return 2
+
+
+def steps(text: str) -> int:
+    """A number of steps: ``300000``, ``3e5``."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.5
+    if not value.is_integer():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 300000 or 3e5")
+    return int(value)
+
+
+def positive(text: str) -> int:
+    """A number of at least 1, ``3e5`` allowed."""
+    value = steps(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; it must be at least 1")
+    return value
+
+
+def parse_value(text: str) -> Any:
+    """
+    The value of ``key:value``: a Python literal or ``dict(a=1)``; anything else is text as it is.
+
+    So ``cost_limit:25``, ``policy:MlpPolicy``, ``hazards:{'num':4}`` and ``learning_rate:lin_1e-3``
+    need no further quotes, and ``policy_kwargs:dict(activation_fn=nn.ReLU)`` stays text until the
+    model is made, as it does in a YAML file.
+    """
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        pass
+    try:
+        return eval(text, {"__builtins__": {}, "dict": dict})
+    except Exception:
+        return text
+
+
+class KeyValues(argparse.Action):
+    """
+    ``key:value`` pairs, as RL-Zoo takes them: ``-params n_steps:512 cost_limit:25.0``.
+
+    The flag may be repeated; what comes later wins.
+    """
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the pairs to the dictionary; a pair without a colon is an error."""
+        pairs = dict(getattr(namespace, self.dest, None) or {})
+        for pair in values:
+            key, colon, value = pair.partition(":")
+            if not colon or not key:
+                raise UsageError(f"{option_string}: {pair!r} is not of the form key:value")
+            pairs[key] = parse_value(value)
+        setattr(namespace, self.dest, pairs)

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_guard.algorithms.common.natural_gradient import Case, constrained_step
-from sb3_guard.algorithms.common.trust_region import Region, TrustRegion, Trial
+from sb3_guard.algorithms.common.trust_region import Region, Trial, TrustRegion
 
 
 class CPO(TrustRegion):
@@ -26,6 +26,7 @@ class CPO(TrustRegion):
 
     :param policy: policy class or its alias
     :param env: environment or its id
+    :param learning_rate: of the critics
     :param cost_reduction: smallest decrease of a violated cost surrogate that the line search
         accepts, in cost per step; never more than the violation itself
 
@@ -36,13 +37,14 @@ class CPO(TrustRegion):
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        *args: Any,
+        learning_rate: float | Schedule = 1e-3,
+        *,
         cost_reduction: float = 0.0,
         **kwargs: Any,
     ) -> None:
         self.cost_reduction = cost_reduction
         self._case = Case.INACTIVE
-        super().__init__(policy, env, *args, **kwargs)
+        super().__init__(policy, env, learning_rate, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

@@ -3,7 +3,7 @@
 from typing import Any, ClassVar, Literal
 
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
@@ -19,6 +19,7 @@ class TRPO(TrustRegion):
 
     :param policy: policy class or its alias
     :param env: environment or its id; it need not report a cost
+    :param learning_rate: of the critics
     :param missing_cost: ``"zero"`` runs on any environment, ``"error"`` asks for the cost keys
 
     Other parameters are those of :class:`TrustRegion`.
@@ -31,8 +32,9 @@ class TRPO(TrustRegion):
         self,
         policy: str | type[ActorCriticPolicy],
         env: GymEnv | str,
-        *args: Any,
+        learning_rate: float | Schedule = 1e-3,
+        *,
         missing_cost: Literal["error", "zero"] = "zero",
         **kwargs: Any,
     ) -> None:
-        super().__init__(policy, env, *args, missing_cost=missing_cost, **kwargs)
+        super().__init__(policy, env, learning_rate, missing_cost=missing_cost, **kwargs)

@@ -1,4 +1,4 @@
-"""How good and how safe a policy is: returns and costs of whole episodes, with their uncertainty."""
+"""How good and how safe a policy is: returns and costs of episodes, with their uncertainty."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

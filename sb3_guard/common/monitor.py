@@ -25,11 +25,11 @@ def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) ->
 
 class CostMonitor(VecMonitor):
     """
-    Report return, length, time **and cost** of every episode, in ``info["episode"]`` and in a csv.
+    Report return, length, time **and cost** of every episode, in its last info and in a csv.
 
-    ``info["episode"]`` has ``r`` (return), ``l`` (steps), ``t`` (seconds since the start) and ``c``,
-    the undiscounted sum of ``info["cost"]`` over the episode. When an environment has several
-    costs, each of ``cost_keys`` is summed too, as ``c_<key>``. The csv is what
+    ``info["episode"]`` has ``r`` (return), ``l`` (steps), ``t`` (seconds since the start) and
+    ``c``, the undiscounted sum of ``info["cost"]`` over the episode. When an environment has
+    several costs, each of ``cost_keys`` is summed too, as ``c_<key>``. The csv is what
     :func:`stable_baselines3.common.monitor.load_results` reads.
 
     The sums of the episodes under way are part of :meth:`state`, so that a resumed training run
@@ -50,7 +50,9 @@ class CostMonitor(VecMonitor):
     ):
         super().__init__(venv, info_keywords=tuple(info_keywords))
         self.cost_keys = tuple(cost_keys)
-        self._columns = [f"c_{key}" for key in self.cost_keys] if self.cost_keys != ("cost",) else []
+        self._columns = (
+            [f"c_{key}" for key in self.cost_keys] if self.cost_keys != ("cost",) else []
+        )
         #: cost and number of all steps so far, episodes under way included
         self.total_cost = 0.0
         self.total_steps = 0

@@ -19,7 +19,10 @@ from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.envs.parameters import did_you_mean
 from sb3_guard.envs.scenario import Scenario
 
-VEC_ENVS: dict[str, type[VecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
+VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {
+    "dummy": DummyVecEnv,
+    "subproc": SubprocVecEnv,
+}
 _OURS = "sb3_guard.envs.gym_env:GuardEnv"
 
 
@@ -125,17 +128,13 @@ class GuardVecEnv(VecEnv):
         """Continue from a :meth:`state` bit for bit, whatever the number of threads."""
         self.envs.restore(state)
 
-    def observe(self) -> Any:
-        """The current observation of every row, as the last step returned it."""
-        return self._view(self.envs.engine.observe())
-
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         raise AttributeError(
-            f"cannot set {attr_name!r} on environments that share one batch of simulations; make them "
-            "with the parameter changed, or use make_vec_env(..., vec_env='dummy')"
+            f"cannot set {attr_name!r} on environments that share one batch of simulations; make "
+            "them with the parameter changed, or use make_vec_env(..., vec_env='dummy')"
         )
 
     def env_method(
@@ -167,12 +166,12 @@ def make_vec_env(
 ) -> VecEnv:
     """Make environments for Stable-Baselines3, with episode statistics that include the cost.
 
-    :param env_id: an id of ours (the version may be left out), a scenario, or any id registered with
-        Gymnasium
+    :param env_id: an id of ours (the version may be left out), a scenario, or any id registered
+        with Gymnasium
     :param n_envs: how many; 30 is a good number for training
     :param seed: the environments get seed, seed + 1, …
-    :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"`` (one
-        by one; the default for others) or ``"subproc"`` (a process each)
+    :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"``
+        (one by one; the default for others) or ``"subproc"`` (a process each)
     :param env_kwargs: parameters of the environment, such as ``{"hazards": {"num": 4}}``
     :param monitor_path: csv file for the episode statistics
     :param max_episode_steps: control steps after which an episode is cut, if not the id's own
@@ -192,13 +191,19 @@ def make_vec_env(
     scenario = find_scenario(env_id)
     vec_env = vec_env or ("dummy" if scenario is None or wrapper_class else "native")
     if vec_env not in ("native", *VEC_ENVS):
-        raise ValueError(f"unknown vec_env {vec_env!r}: {did_you_mean(vec_env, ['native', *VEC_ENVS])}")
+        raise ValueError(
+            f"unknown vec_env {vec_env!r}: {did_you_mean(vec_env, ['native', *VEC_ENVS])}"
+        )
     venv: VecEnv
     if vec_env == "native":
         if scenario is None:
-            raise ValueError(f"{env_id!r} is not an sb3_guard environment: use vec_env 'dummy' or 'subproc'")
+            raise ValueError(
+                f"{env_id!r} is not an sb3_guard environment: use vec_env 'dummy' or 'subproc'"
+            )
         if wrapper_class is not None:
-            raise ValueError("wrapper_class needs vec_env 'dummy' or 'subproc': native envs share one batch")
+            raise ValueError(
+                "wrapper_class needs vec_env 'dummy' or 'subproc': native envs share one batch"
+            )
         venv = GuardVecEnv(scenario, n_envs, num_threads=num_threads, **kwargs)
     else:
         # a spec, not an id: other processes may not have registered it

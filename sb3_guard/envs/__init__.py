@@ -5,6 +5,7 @@ Importing this package registers the named suites with Gymnasium.
 
 import os
 import sys
+from typing import Any
 
 if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
     # MuJoCo chooses its OpenGL backend when it is imported; without a display only EGL can work
@@ -44,6 +45,7 @@ def env_spec(name: str | Scenario) -> EnvSpec:
     :param name: an id of ours, with or without its version, or a scenario
     :raises ValueError: the id cannot be read
     """
+    what: str | dict[str, Any]
     if isinstance(name, Scenario):
         env_id, what = "Guard-v0", name.to_dict()
     else:
@@ -77,7 +79,7 @@ def register(name: str, scenario: Scenario | None = None) -> str:
     return spec.id
 
 
-def make(name: str, **kwargs: object) -> gymnasium.Env:
+def make(name: str, **kwargs: Any) -> gymnasium.Env:
     """:func:`gymnasium.make` for any id of ours, registered or not, with or without its version."""
     return gymnasium.make(env_spec(name), **kwargs)
 

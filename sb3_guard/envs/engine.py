@@ -1,9 +1,9 @@
 """The engine: a robot, a task and constraints become N running simulations.
 
-One compiled world, one :class:`mujoco.batch.Batch`; every control step is one call that advances all
-rows by ten physics steps on the batch's threads. The engine draws layouts, keeps the clock, the random
-generators and the arrays of the parts, and hands out what one control step brought. It knows no
-automatic reset and no time limit: those belong to the gymnasium classes above it.
+One compiled world, one :class:`mujoco.batch.Batch`; every control step is one call that advances
+all rows by ten physics steps on the batch's threads. The engine draws layouts, keeps the clock, the
+random generators and the arrays of the parts, and hands out what one control step brought. It
+knows no automatic reset and no time limit: those belong to the gymnasium classes above it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mujoco.batch import Batch, SimulationError
 from sb3_guard.envs import geometry, sensors
 from sb3_guard.envs.layout import ARENA, Footprint, LayoutError, Rectangle, arrange, redraw
 from sb3_guard.envs.parameters import Parameters, param
-from sb3_guard.envs.part import FLOOR, ROBOT, Array, Constraint, Part, Robot, Task
+from sb3_guard.envs.part import FLOOR, Array, Constraint, Part, Robot, Task
 from sb3_guard.envs.sensors import Channel, Lidar
 
 FRAME_SKIP = 10
@@ -30,13 +30,8 @@ STAGE = int(mujoco.mjtStage.mjSTAGE_ACC)  # touch, accelerometer and contacts de
 CLEAN_STARTS = 100  # layouts drawn before a start with a cost is an error
 REWARD_LIMIT = 10.0
 
-_BAD = [
-    int(mujoco.mjtWarning.mjWARN_BADQPOS),
-    int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
-    int(mujoco.mjtWarning.mjWARN_CNSTRFULL),
-    int(mujoco.mjtWarning.mjWARN_CONTACTFULL),
-]
+# CONTACTFULL, CNSTRFULL, BADQPOS, BADQVEL, BADQACC: the result is not to be trusted
+_BAD = slice(int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 
 
 @dataclass(frozen=True)
@@ -46,7 +41,8 @@ class Layout(Parameters):
     name = "layout"
 
     placements: tuple[Rectangle, ...] = param(
-        ARENA, "rectangles (x low, y low, x high, y high) that parts without their own are drawn in, m"
+        ARENA,
+        "rectangles (x low, y low, x high, y high) that parts without their own are drawn in, m",
     )
     margin: float = param(0.0, "extra distance between any two objects, m", low=0)
     randomize: bool = param(True, "false: the same layout in every episode of a row")
@@ -182,7 +178,11 @@ class Engine:
         lidar: Lidar | None = None,
         layout: Layout | None = None,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
+        if (
+            isinstance(num_envs, bool)
+            or not isinstance(num_envs, (int, np.integer))
+            or num_envs < 1
+        ):
             raise ValueError(f"num_envs = {num_envs!r} must be an integer of at least 1")
         if num_threads is not None and num_threads < 1:
             raise ValueError(f"num_threads = {num_threads!r} must be at least 1, or None")
@@ -234,12 +234,11 @@ class Engine:
             start += size
         self.observation_size = start
         self._before = self.array("before", task.measure().shape[1:])
-        self._bad = self.array("warnings", (len(_BAD),), dtype=np.int64)
-
-    # What the parts use ---------------------------------------------------------------------------
+        self._warnings = self.batch.warning[:, _BAD, 1]  # live counts since the batch was made
+        self._warned = self._warnings.copy()
 
     def array(self, name: str, shape: tuple[int, ...] = (), dtype: Any = float) -> Array:
-        """The array ``name``, [N, *shape], made of zeros when first asked for; part of the state."""
+        """The array ``name``, [N, *shape], zero when first asked for; part of the state."""
         if name not in self._arrays:
             self._arrays[name] = np.zeros((self.num_envs, *shape), dtype=dtype)
         return self._arrays[name]
@@ -307,8 +306,6 @@ class Engine:
     def _bodies(self) -> int:
         return self.robot.frames[0].shape[1]
 
-    # What the environments use --------------------------------------------------------------------
-
     @property
     def observation_layout(self) -> dict[str, slice]:
         """Where each named component lies in the flat observation, in alphabetical order."""
@@ -351,7 +348,7 @@ class Engine:
                 f"make {names} smaller or fewer, or their keepout larger"
             )
         self._before[ids] = self.task.measure()[ids]
-        self._bad[ids] = self.batch.warning[ids][:, _BAD, 1]
+        self._warned[ids] = self._warnings[ids]
 
     def _arrange(self, row: int) -> dict[str, Array]:
         """A layout for one row, from its own generator."""
@@ -388,19 +385,21 @@ class Engine:
         # every part moves from the positions last observed; nothing moves between physics steps
         for part in self.parts:
             part.before_step()
-        self.robot.act(np.clip(actions, -1.0, 1.0))
+        self.robot.act(np.minimum(np.maximum(actions, -1.0), 1.0))
         diverged = np.zeros(self.num_envs, dtype=bool)
         try:
             self.batch.step(nstep=FRAME_SKIP, stage=STAGE)
         except SimulationError as error:
             diverged[error.ids] = True
-        bad = self.batch.warning[:, _BAD, 1]
-        diverged |= (bad != self._bad).any(axis=1)
-        self._bad[:] = bad
+        changed = self._warnings != self._warned
+        if changed.any():  # MuJoCo has reset these rows by itself
+            diverged |= changed.any(axis=1)
+            self._warned[:] = self._warnings
         self.steps += 1
 
         now = self.task.measure()
-        reward = np.clip(self.task.reward(self._before, now), -REWARD_LIMIT, REWARD_LIMIT)
+        reward = self.task.reward(self._before, now)
+        reward = np.minimum(np.maximum(reward, -REWARD_LIMIT), REWARD_LIMIT)
         costs = {f"cost_{c.name}": c.cost() for c in self.constraints}
         met = self.task.succeeded(now)
         unplaced = np.zeros(self.num_envs, dtype=bool)
@@ -451,8 +450,7 @@ class Engine:
         self.rngs = [_generator(s) for s in state["rngs"]]
         self._frozen = {r: dict(f) for r, f in state["frozen"].items()}
         self.batch.forward(stage=STAGE)
-        # warnings are counted from the Batch's making, not the episode's
-        self._bad[:] = self.batch.warning[:, _BAD, 1]
+        self._warned[:] = self._warnings
 
 
 def _generator(state: Mapping[str, Any]) -> np.random.Generator:
@@ -471,16 +469,22 @@ def _ignore_warning(message: str) -> None:
     """Keep MuJoCo from writing MUJOCO_LOG.TXT: the engine reads the warning counters itself."""
 
 
-def _silence_profiler() -> None:
-    """Remove the clock that the Python bindings install, which slows short steps by 5 to 44 %.
-
-    Only the profiling timers of MjData lose their values. Where the symbol is missing, nothing is
-    done.
-    """
+def profiling_clock() -> ctypes.c_void_p | None:
+    """Where MuJoCo keeps the clock that its Python bindings install; None if it is not found."""
     for path in Path(mujoco.__file__).parent.glob("*mujoco*"):
         if path.name.startswith(("libmujoco", "mujoco.dll")):
             try:
-                ctypes.c_void_p.in_dll(ctypes.CDLL(str(path)), "mjcb_time").value = None
+                return ctypes.c_void_p.in_dll(ctypes.CDLL(str(path)), "mjcb_time")
             except (OSError, ValueError):
                 continue
+    return None
 
+
+def _silence_profiler() -> None:
+    """Remove the profiling clock, which slows short steps by 5 to 44 %.
+
+    Only the timers of MjData lose their values; the simulation is the same.
+    """
+    clock = profiling_clock()
+    if clock is not None:
+        clock.value = None

@@ -1,7 +1,7 @@
 """Where things are, seen from elsewhere: all the broadcasting of the environments lives here.
 
-Every function is elementwise along N, so that row i of a batch and a batch of one agree bit for bit:
-no matrix products, whose order of summation may change with the number of rows.
+Every function is elementwise along N, so that row i of a batch and a batch of one agree bit for
+bit: no matrix products, whose order of summation may change with the number of rows.
 """
 
 from __future__ import annotations
@@ -33,14 +33,10 @@ def into_frames(origin: Array, rotation: Array, points: Array, size: int = 3) ->
     :return: [N, B, K, size] m
     """
     offset = points[:, None] - origin[:, :, None]  # [N, B, K, 3]
-    out = np.empty((*offset.shape[:-1], size))
-    for j in range(size):
-        column = rotation[:, :, None, :, j]  # [N, B, 1, 3]
-        out[..., j] = (
-            offset[..., 0] * column[..., 0]
-            + offset[..., 1] * column[..., 1]
-            + offset[..., 2] * column[..., 2]
-        )
+    axes = rotation[:, :, None, :, :size]  # [N, B, 1, 3, size]
+    out = offset[..., 0:1] * axes[..., 0, :]  # [N, B, K, size]
+    out += offset[..., 1:2] * axes[..., 1, :]
+    out += offset[..., 2:3] * axes[..., 2, :]
     return out
 
 

@@ -18,7 +18,9 @@ Array = np.ndarray
 ROW = np.zeros(1, dtype=np.int32)
 
 
-def as_scenario(scenario: str | Mapping[str, Any] | Scenario, params: Mapping[str, Any]) -> Scenario:
+def as_scenario(
+    scenario: str | Mapping[str, Any] | Scenario, params: Mapping[str, Any]
+) -> Scenario:
     """A scenario from an id, plain data or a scenario, with parameters of its parts changed."""
     if isinstance(scenario, str):
         scenario = Scenario.parse(scenario)
@@ -29,14 +31,15 @@ def as_scenario(scenario: str | Mapping[str, Any] | Scenario, params: Mapping[st
 
 def observation_space(engine: Engine, flatten: bool) -> spaces.Box | spaces.Dict:
     """The space of one row's observation, with the true bounds of each component."""
-    boxes = {
+    boxes: dict[str, spaces.Space[Any]] = {
         name: spaces.Box(c.low, c.high, (c.size,), np.float32)
         for name, c in engine.channels.items()
     }
     if not flatten:
         return spaces.Dict(boxes)
-    low = np.concatenate([b.low for b in boxes.values()])
-    high = np.concatenate([b.high for b in boxes.values()])
+    channels = engine.channels.values()
+    low = np.concatenate([np.full(c.size, c.low, np.float32) for c in channels])
+    high = np.concatenate([np.full(c.size, c.high, np.float32) for c in channels])
     return spaces.Box(low, high, dtype=np.float32)
 
 
@@ -48,7 +51,9 @@ def action_space(engine: Engine) -> spaces.Box:
 def check_render_mode(render_mode: str | None, allowed: list[str]) -> str | None:
     """Refuse an unknown render mode."""
     if render_mode is not None and render_mode not in allowed:
-        raise ValueError(f"unknown render_mode {render_mode!r}: {did_you_mean(render_mode, allowed)}")
+        raise ValueError(
+            f"unknown render_mode {render_mode!r}: {did_you_mean(render_mode, allowed)}"
+        )
     return render_mode
 
 
@@ -70,7 +75,7 @@ class GuardEnv(gymnasium.Env[Any, Array]):
     """A safe-RL environment: a robot with a task among constraints.
 
     ``step`` returns the cost of the step as ``info["cost"]``, and per constraint type as
-    ``info["cost_<type>"]``; ``info["goal_met"]`` is there, and True, only when the goal was reached.
+    ``info["cost_<type>"]``; ``info["goal_met"]`` is there, and True, only if the goal was reached.
     Episodes are cut by the time limit of :func:`gymnasium.make`.
 
     :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario` or its plain data
@@ -133,9 +138,7 @@ class GuardEnv(gymnasium.Env[Any, Array]):
         """
         action = np.asarray(action, dtype=float)
         if action.shape != self.action_space.shape:
-            raise ValueError(
-                f"action has shape {action.shape}, expected {self.action_space.shape}"
-            )
+            raise ValueError(f"action has shape {action.shape}, expected {self.action_space.shape}")
         outcome = self.engine.step(action[None])
         if self.render_mode == "human":
             self.render()

@@ -1,10 +1,10 @@
 """Where things stand when an episode begins: clear places for discs of given radii.
 
-The rule is GUARD's: two objects keep at least the sum of their keep-outs between their centres, and a
-centre keeps its own keep-out from the border of its rectangle. GUARD draws blindly and starts over
-whenever one object finds no room, which for ten wide objects in a small arena takes hundreds of
-restarts. Here an object that finds no room among 128 draws takes the place where it disturbs the
-fewest others, and those are drawn again.
+The rule is GUARD's: two objects keep at least the sum of their keep-outs between their centres,
+and a centre keeps its own keep-out from the border of its rectangle. GUARD draws blindly and
+starts over whenever one object finds no room, which for ten wide objects in a small arena takes
+hundreds of restarts. Here an object that finds no room among 128 draws takes the place where it
+disturbs the fewest others, and those are drawn again.
 """
 
 from __future__ import annotations
@@ -149,8 +149,9 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         crowded = max(failures, key=lambda name: failures[name])
         f = next(f for f in footprints if f.name == crowded)
         raise LayoutError(
-            f"{crowded} cannot be placed: {f.num} objects with keepout {f.keepout} m find no room in "
-            f"{list(f.placements)} beside the other parts; reduce num or keepout, or widen placements"
+            f"{crowded} cannot be placed: {f.num} objects with keepout {f.keepout} m find no room "
+            f"in {list(f.placements)} beside the other parts; reduce num or keepout, or widen "
+            "placements"
         )
     out, k = {}, 0
     for f in footprints:
@@ -170,8 +171,8 @@ def _check_fixed(owner: list[Footprint], keepout: Array, xy: Array, fixed: Array
             if gap < keepout[i] + keepout[j]:
                 raise LayoutError(
                     f"{owner[j].name} cannot be placed: its location {tuple(xy[j].tolist())} is "
-                    f"{gap:.2f} m from {owner[i].name} at {tuple(xy[i].tolist())}, and their keepouts "
-                    f"sum to {keepout[i] + keepout[j]:.2f} m"
+                    f"{gap:.2f} m from {owner[i].name} at {tuple(xy[i].tolist())}, and their "
+                    f"keepouts sum to {keepout[i] + keepout[j]:.2f} m"
                 )
 
 
@@ -193,7 +194,7 @@ def redraw(
     for movers in (True, False):
         rest = [(f, p) for f, p in others.items() if movers or not f.mover]
         xy = np.concatenate([p[:, :2] for _, p in rest]) if rest else np.zeros((0, 2))
-        radius = np.concatenate([np.full(f.num, f.keepout + f.margin) for f, _ in rest] or [[]])
+        radius = np.array([f.keepout + f.margin for f, _ in rest for _ in range(f.num)])
         reach = footprint.keepout + footprint.margin + radius
         for _ in range(tries):
             draws = footprint.draw(rng, DRAWS)

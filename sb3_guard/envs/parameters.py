@@ -1,7 +1,7 @@
 """Parameters that check themselves: the dataclass fields of every part of an environment.
 
-A bad name, type or value fails where the part is made, in one line that names the parameter, the value
-and what is allowed. Plain JSON and YAML values are enough: lists become tuples.
+A bad name, type or value fails where the part is made, in one line that names the parameter, the
+value and what is allowed. Plain JSON and YAML values are enough: lists become tuples.
 """
 
 from __future__ import annotations

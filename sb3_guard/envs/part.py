@@ -11,13 +11,14 @@ engine calls the verbs in this order::
     observe()                   name -> [N, d]
 
 A task adds ``measure``, ``reward``, ``succeeded`` and ``advance``; a constraint adds ``cost``.
-``observe``, ``measure``, ``reward`` and ``cost`` only read. A part keeps no arrays of its own between
-steps: it takes them by name from the engine (:meth:`Simulation.array`), so that an engine's state can
-be saved and restored whole.
+``observe``, ``measure``, ``reward`` and ``cost`` only read. A part keeps no arrays of its own
+between steps: it takes them by name from the engine (:meth:`Simulation.array`), so that an
+engine's state can be saved and restored whole.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol
 
@@ -31,8 +32,8 @@ from sb3_guard.envs.sensors import Channel
 Array = np.ndarray
 Generators = Sequence[np.random.Generator]
 
-# Contact bits. A robot's geoms collide with bit ROBOT, the floor with bit FLOOR: a robot that hovers
-# or slides at a fixed height leaves FLOOR out and saves the pair.
+# Contact bits. A robot's geoms collide with bit ROBOT, the floor with bit FLOOR: a robot that
+# hovers or slides at a fixed height leaves FLOOR out and saves the pair.
 ROBOT, FLOOR = 1, 2
 
 
@@ -150,6 +151,9 @@ class Robot(Part):
     """What a robot answers to the other parts, none of which may ask its name."""
 
     workspace: ClassVar[str]  # "planar" or "spatial": the default space of every other part
+    timestep: ClassVar[float]  # s, of one physics step
+    root: ClassVar[str]  # name of the outermost body in the compiled world
+    reach: ClassVar[float] = math.inf  # m from the origin: where goals and hazards make sense
     action_size: int
 
     @property

@@ -14,13 +14,35 @@ from sb3_guard.envs import constraints, robots, tasks
 from sb3_guard.envs.part import Constraint, Robot, Task
 from sb3_guard.envs.robots.robot import MJCFRobot
 
-ROBOTS: dict[str, type[Robot]] = {"Point": robots.Point}
+ROBOTS: dict[str, type[Robot]] = {
+    "Point": robots.Point,
+    "Car": robots.Car,
+    "Doggo": robots.Doggo,
+    "Swimmer": robots.Swimmer,
+    "Ant": robots.Ant,
+    "Walker": robots.Walker,
+    "Humanoid": robots.Humanoid,
+    "Hopper": robots.Hopper,
+    "Arm3": robots.Arm3,
+    "Arm6": robots.Arm6,
+    "Drone": robots.Drone,
+}
 TASKS: dict[str, type[Task]] = {"Goal": tasks.Goal}
 CONSTRAINTS: dict[str, type[Constraint]] = {"Hazards": constraints.Hazards}
 
 EPISODE_STEPS = 1000  # control steps
 # The named suites: every combination of these, each with eight constraint objects.
-SUITE_ROBOTS = ("Point",)
+SUITE_ROBOTS = (
+    "Point",
+    "Swimmer",
+    "Ant",
+    "Walker",
+    "Humanoid",
+    "Hopper",
+    "Arm3",
+    "Arm6",
+    "Drone",
+)
 SUITE_TASKS = ("Goal",)
 SUITE_CONSTRAINTS = ("Hazards",)
 
@@ -43,7 +65,8 @@ def register_robot(
     :param xml: or the robot's MJCF file, by the conventions of
         :class:`~sb3_guard.envs.robots.robot.MJCFRobot`
     :param attributes: with ``xml``, class attributes such as ``timestep`` and ``workspace``
-    :raises ValueError: neither or both of ``robot`` and ``xml`` are given, or the name is not usable
+    :raises ValueError: neither or both of ``robot`` and ``xml`` are given, or the name is not
+        usable
     """
     if (robot is None) == (xml is None):
         raise ValueError(f"robot {name!r} needs a class or an xml file, not both and not neither")
@@ -69,6 +92,7 @@ def register_constraint(name: str, constraint: type[Constraint]) -> None:
 def _add(table: dict[str, Any], name: str, part: type) -> None:
     if not name.isidentifier() or "_" in name or name[0].isdigit():
         raise ValueError(
-            f"{name!r} cannot be part of an id: use letters and digits, a letter first, no underscore"
+            f"{name!r} cannot be part of an id: use letters and digits, a letter first and no "
+            "underscore"
         )
     table[name] = part

@@ -71,8 +71,8 @@ def gl_backend() -> str:
         lines = run.stderr.strip().splitlines()
         reasons.append(f"{name} ({lines[-1] if lines else f'exit status {run.returncode}'})")
     raise RenderingError(
-        f"no OpenGL backend works here, tried {', '.join(reasons)}; install EGL (Debian: libegl1 and "
-        "libegl-mesa0) or OSMesa (libosmesa6), or set MUJOCO_GL to one that works"
+        f"no OpenGL backend works here, tried {', '.join(reasons)}; install EGL (Debian: libegl1 "
+        "and libegl-mesa0) or OSMesa (libosmesa6), or set MUJOCO_GL to one that works"
     )
 
 
@@ -85,10 +85,14 @@ class ScenePainter:
         self._robot = engine.robot
         self._halos = 0
 
-    def zone(self, center: Array, radius: float, half_height: float, color: tuple[float, ...]) -> None:
+    def zone(
+        self, center: Array, radius: float, half_height: float, color: tuple[float, ...]
+    ) -> None:
         """A cylinder, or a sphere if ``half_height`` is 0, at ``center``, [3] m."""
         kind = _CYLINDER if half_height else _SPHERE
-        self._add(kind, (radius, half_height or radius, half_height or radius), center, (*color, 0.3))
+        self._add(
+            kind, (radius, half_height or radius, half_height or radius), center, (*color, 0.3)
+        )
 
     def halo(self, closeness: Array, azimuth: int, color: tuple[float, ...]) -> None:
         """Beads around each lidar body, the more solid the closer what they show.
@@ -117,7 +121,9 @@ class ScenePainter:
         """The tint of a robot that pays a cost."""
         self._add(_SPHERE, (0.25,) * 3, center, (*COST_COLOR, 0.5))
 
-    def _add(self, kind: Any, size: tuple[float, ...], center: Array, rgba: tuple[float, ...]) -> None:
+    def _add(
+        self, kind: Any, size: tuple[float, ...], center: Array, rgba: tuple[float, ...]
+    ) -> None:
         scene = self._scene
         if scene.ngeom >= scene.maxgeom:
             return

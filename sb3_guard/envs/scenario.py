@@ -48,9 +48,10 @@ class Scenario:
     layout: Params = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for kind, name, table in (("robot", self.robot, ROBOTS), ("task", self.task, TASKS)):
-            if name not in table:
-                raise ValueError(f"unknown {kind} {name!r}: {did_you_mean(name, table)}")
+        if self.robot not in ROBOTS:
+            raise ValueError(f"unknown robot {self.robot!r}: {did_you_mean(self.robot, ROBOTS)}")
+        if self.task not in TASKS:
+            raise ValueError(f"unknown task {self.task!r}: {did_you_mean(self.task, TASKS)}")
         self.parts()
 
     @classmethod
@@ -65,12 +66,11 @@ class Scenario:
                 f"{name!r} is not an id of the form Task_Robot_NConstraint-v0, "
                 "such as 'Goal_Point_8Hazards-v0'"
             )
-        known = {"robot": ROBOTS, "task": TASKS, "constraint": CONSTRAINTS}
-        for kind, table in known.items():
-            if match[kind] not in table:
-                raise ValueError(
-                    f"unknown {kind} {match[kind]!r} in {name!r}: {did_you_mean(match[kind], table)}"
-                )
+        known = {"robot": list(ROBOTS), "task": list(TASKS), "constraint": list(CONSTRAINTS)}
+        for kind, names in known.items():
+            if match[kind] not in names:
+                hint = did_you_mean(match[kind], names)
+                raise ValueError(f"unknown {kind} {match[kind]!r} in {name!r}: {hint}")
         return cls(
             robot=match["robot"],
             task=match["task"],
@@ -92,11 +92,15 @@ class Scenario:
             detail = " ".join(str(error).split())
             raise ValueError(f"cannot read scenario {str(path)!r}: {detail}") from None
         if not isinstance(data, dict):
-            raise ValueError(f"scenario {str(path)!r} must be a mapping, found {type(data).__name__}")
+            raise ValueError(
+                f"scenario {str(path)!r} must be a mapping, found {type(data).__name__}"
+            )
         known = list(cls.__dataclass_fields__)
         for key in data:
             if key not in known:
-                raise ValueError(f"scenario {str(path)!r} has no key {key!r}: {did_you_mean(key, known)}")
+                raise ValueError(
+                    f"scenario {str(path)!r} has no key {key!r}: {did_you_mean(key, known)}"
+                )
         return cls(**data)
 
     def to_dict(self) -> dict[str, Any]:
@@ -132,7 +136,8 @@ class Scenario:
         for key, value in params.items():
             if value is not None and not isinstance(value, Mapping):
                 raise ValueError(
-                    f"{key} = {value!r} must be a mapping of parameters, such as {key}={{'size': 0.3}}"
+                    f"{key} = {value!r} must be a mapping of parameters, such as "
+                    f"{key}={{'size': 0.3}}"
                 )
             if key in own:
                 name = own[key]

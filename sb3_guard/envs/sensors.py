@@ -6,6 +6,7 @@ Formulas: Ray et al. 2019 (Safety Gym) and, for the third dimension, Zhao et al.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -35,6 +36,12 @@ def compass(v: Array) -> Array:
     for j in range(1, v.shape[-1]):
         total = total + v[..., j] * v[..., j]
     return v / (np.sqrt(total) + 0.001)[..., None]
+
+
+@functools.lru_cache
+def _starts(n: int, bodies: int, columns: int, rows: int) -> Array:
+    """Flat index of bin (1, 0) of every body in an array [N, B, columns, rows]: [N, B, 1]."""
+    return np.arange(rows, n * bodies * columns * rows, columns * rows).reshape(n, bodies, 1)
 
 
 @dataclass(frozen=True)
@@ -67,43 +74,38 @@ class Lidar(Parameters):
         :return: [N, B, bins] or [N, B, azimuth · elevation], within [0, 1]
         """
         n, bodies, _, d = v.shape
-        size = self.size(d == 2)
-        out = np.zeros((n, bodies, size))
-        flat = out.reshape(-1)
+        columns, rows = (self.bins, 1) if d == 2 else (self.azimuth, self.elevation)
         x, y = v[..., 0], v[..., 1]
-        planar2 = x * x + y * y
-        length = np.sqrt(planar2 if d == 2 else planar2 + v[..., 2] * v[..., 2])
+        planar = np.sqrt(x * x + y * y)
+        length = planar if d == 2 else np.sqrt(x * x + y * y + v[..., 2] * v[..., 2])
         if self.max_distance is None:
             closeness = np.exp(-self.gain * length)
         else:
             closeness = np.maximum(0.0, self.max_distance - length) / self.max_distance
-        columns = self.bins if d == 2 else self.azimuth
-        turn = np.arctan2(y, x) * (columns / (2 * math.pi))
-        turn = np.where(turn < 0, turn + columns, turn)
+        # a ring of columns with a spare one at either end, folded onto the other end when all is
+        # in: neighbours need no wrapping
+        out = np.zeros((n, bodies, columns + 2, rows))
+        turn = np.arctan2(y, x) * (columns / (2 * math.pi)) % columns
         column = np.minimum(turn.astype(np.intp), columns - 1)
-        across = turn - column
-        base = (np.arange(n * bodies) * size).reshape(n, bodies, 1)
-        after = np.where(column + 1 == columns, 0, column + 1)
-        before = np.where(column == 0, columns - 1, column - 1)
-
-        def mark(index: Array, value: Array) -> None:
-            np.maximum.at(flat, index.reshape(-1), value.reshape(-1))
-
-        if d == 2:
-            mark(base + column, closeness)
-            if self.alias:
-                mark(base + after, across * closeness)
-                mark(base + before, (1 - across) * closeness)
-            return out
-        rows = self.elevation
-        tilt = (np.arctan2(v[..., 2], np.sqrt(planar2)) + math.pi / 2) * (rows / math.pi)
-        row = np.minimum(tilt.astype(np.intp), rows - 1)
-        up = tilt - row
-        mark(base + column * rows + row, closeness)
+        place = _starts(n, bodies, columns + 2, rows) + column * rows  # [N, B, K] index into out
+        if d == 3:
+            tilt = (np.arctan2(v[..., 2], planar) + math.pi / 2) * (rows / math.pi)
+            row = np.minimum(tilt.astype(np.intp), rows - 1)
+            place += row
+        places, values = [place], [closeness]
         if self.alias:
-            mark(base + after * rows + row, across * closeness)
-            mark(base + before * rows + row, (1 - across) * closeness)
-            # elevation does not wrap: the outermost bins keep their own neighbour's share
-            mark(base + column * rows + np.minimum(row + 1, rows - 1), up * closeness)
-            mark(base + column * rows + np.maximum(row - 1, 0), (1 - up) * closeness)
-        return out
+            turned = (turn - column) * closeness
+            places += [place + rows, place - rows]
+            values += [turned, closeness - turned]
+            if d == 3:
+                # elevation does not wrap: beyond the poles there is only the polar bin itself
+                raised = (tilt - row) * closeness
+                places += [place + (row < rows - 1), place - (row > 0)]
+                values += [raised, closeness - raised]
+        np.maximum.at(
+            out.reshape(-1), np.concatenate(places, axis=None), np.concatenate(values, axis=None)
+        )
+        if self.alias:
+            np.maximum(out[:, :, 1], out[:, :, -1], out=out[:, :, 1])
+            np.maximum(out[:, :, -2], out[:, :, 0], out=out[:, :, -2])
+        return out[:, :, 1:-1].reshape(n, bodies, columns * rows)

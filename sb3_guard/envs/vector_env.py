@@ -46,15 +46,15 @@ class Transition:
 class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
     """N environments stepped together; row i is a lone environment with seed + i, bit for bit.
 
-    A row that ends is reset in the same step (``AutoresetMode.SAME_STEP``): its last observation and
-    info are in ``infos["final_obs"]`` and ``infos["final_info"]``. ``infos["cost"]`` and
+    A row that ends is reset in the same step (``AutoresetMode.SAME_STEP``): its last observation
+    and info are in ``infos["final_obs"]`` and ``infos["final_info"]``. ``infos["cost"]`` and
     ``infos["cost_<type>"]`` hold the costs of the step for every row.
 
     :param num_envs: number of environments N
     :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario` or its plain data
     :param max_episode_steps: control steps after which an episode is cut
-    :param num_threads: threads that step the physics; by default one per CPU, at most N. The results
-        do not depend on it
+    :param num_threads: threads that step the physics; by default one per CPU, at most N. The
+        results do not depend on it
     :param render_mode: ``"rgb_array"`` (one frame per row) or None
     :param flatten: False for a Dict observation with the components by name
     :param params: parameters of parts to change, such as ``hazards={"num": 4}``

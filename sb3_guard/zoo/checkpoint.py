@@ -18,7 +18,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.logger import RunLogger
@@ -26,6 +26,7 @@ from sb3_guard.zoo.resumable import capture, restore
 from sb3_guard.zoo.usage import UsageError, one_line
 
 MEMBER = "run_state.pkl"
+NORMALIZER = "vecnormalize.pkl"
 FORMAT = 1  # increased when the content changes so that older files can't be continued
 
 
@@ -112,11 +113,11 @@ class Checkpoints(BaseCallback):
         """
         assert isinstance(self.logger, RunLogger)
         environments = capture(self.training_env)
-        if environments is None and not self._warned:
+        if environments[-1] is None and not self._warned:
             self._warned = True
             print(
-                "The environment can't save its state: a resumed run will begin new episodes "
-                "(it is exact only for environments that can be pickled or have state())."
+                "This environment can't save its state (it can't be pickled and has no state()): "
+                "if the run is resumed, its episodes begin anew."
             )
         state = {
             "format": FORMAT,
@@ -137,6 +138,10 @@ class Checkpoints(BaseCallback):
         self.model.save(buffer)
         with zipfile.ZipFile(buffer, "a") as archive:
             archive.writestr(MEMBER, pickle.dumps(state))
+            normalizer = self.model.get_vec_normalize_env()
+            if normalizer is not None:
+                # Once more, so that the agent can be played without the environment's state.
+                archive.writestr(NORMALIZER, pickle.dumps(normalizer))
         with replacing(self.path) as file:
             file.write(buffer.getvalue())
         self._last = time.monotonic()
@@ -189,6 +194,24 @@ def is_checkpoint(path: Path) -> bool:
         return False
 
 
+def read_normalizer(path: Path) -> VecNormalize:
+    """
+    Observation statistics from a pickle or a checkpoint, to be given an environment.
+
+    :raises UsageError: the file is absent or damaged, or there are none in it
+    """
+    try:
+        if path.suffix == ".zip":
+            with zipfile.ZipFile(path) as archive:
+                return pickle.loads(archive.read(NORMALIZER))
+        return pickle.loads(path.read_bytes())
+    except Exception as error:
+        # A damaged pickle can raise anything.
+        raise UsageError(
+            f"can't read the observation statistics of the agent from {path}: {one_line(error)}"
+        ) from error
+
+
 def load_model(
     algorithm: type[BaseAlgorithm], path: Path, env: VecEnv | None, device: str, **changes: Any
 ) -> BaseAlgorithm:
@@ -201,9 +224,7 @@ def load_model(
     try:
         return algorithm.load(path, env=env, device=device, force_reset=False, **changes)
     except Exception as error:
-        raise UsageError(
-            f"can't load {path} as {algorithm.__name__}: {one_line(error)}"
-        ) from error
+        raise UsageError(f"can't load {path} as {algorithm.__name__}: {one_line(error)}") from error
 
 
 def restore_run(model: BaseAlgorithm, state: dict[str, Any]) -> None:
@@ -214,12 +235,22 @@ def restore_run(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     """
     env = model.get_env()
     assert env is not None
-    observations = env.reset()
-    if state["environments"] is None:
-        model._last_obs = observations  # type: ignore[assignment]
-        model._last_episode_starts = np.ones((env.num_envs,), dtype=bool)
-    else:
-        restore(env, state["environments"])
+    env.reset()
+    restore(env, state["environments"])
+    if state["environments"][-1] is None:
+        # `learn` begins new episodes when there is no observation to go on from; not the first
+        # ones of the run again.
+        model._last_obs = None
+        env.seed((model.seed or 0) + state["num_timesteps"])
     set_random_state(state["generators"])
     if state["cuda"] and th.cuda.is_available():
         th.cuda.set_rng_state_all(state["cuda"])
+
+
+def monitor_offset(state: dict[str, Any]) -> int:
+    """How long the monitor's csv was when the checkpoint was taken, bytes."""
+    return next(
+        part["offset"]
+        for part in state["environments"]
+        if isinstance(part, dict) and "offset" in part
+    )

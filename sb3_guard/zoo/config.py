@@ -67,7 +67,9 @@ def read_file(path: str | Path) -> dict[str, Any]:
             else:
                 content = getattr(importlib.import_module(name), "hyperparams", None)
         except Exception as error:
-            raise UsageError(f"can't read hyper-parameters from {name}: {one_line(error)}") from error
+            raise UsageError(
+                f"can't read hyper-parameters from {name}: {one_line(error)}"
+            ) from error
     if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
         raise UsageError(
             f"{name} must map environments, or 'default', to hyper-parameters "
@@ -104,7 +106,9 @@ def read_hyperparams(
     for entry in (env_id, env_id.rsplit("-v", 1)[0], "default"):
         if entry in content:
             return dict(sorted({**content[entry], **(overrides or {})}.items()))
-    raise UsageError(f"{path} has no entry for {env_id!r} and no 'default'; {suggest(env_id, content)}")
+    raise UsageError(
+        f"{path} has no entry for {env_id!r} and no 'default'; {suggest(env_id, content)}"
+    )
 
 
 def arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
@@ -114,11 +118,11 @@ def arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
         constructor = cls.__dict__.get("__init__")
         if constructor is None:
             continue
-        annotations = typing.get_type_hints(constructor)
-        parameters = inspect.signature(constructor).parameters.values()
+        parameters = inspect.signature(constructor, eval_str=True).parameters.values()
         for one in parameters:
             if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD):
-                hints.setdefault(one.name, annotations.get(one.name, Any))
+                hint = Any if one.annotation is one.empty else one.annotation
+                hints.setdefault(one.name, hint)
         if all(one.kind is not one.VAR_KEYWORD for one in parameters):
             break
     return {name: hint for name, hint in hints.items() if name not in NOT_HYPERPARAMETERS}
@@ -137,7 +141,9 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
         if name in FLAGS:
             raise UsageError(f"{name!r} is not a hyper-parameter; use the flag {FLAGS[name]}")
         if name not in known:
-            raise UsageError(f"{algo} has no hyper-parameter {name!r}; {suggest(name, sorted(known))}")
+            raise UsageError(
+                f"{algo} has no hyper-parameter {name!r}; {suggest(name, sorted(known))}"
+            )
         try:
             checked[name] = _coerce(value, known[name])
         except TypeError:
@@ -152,7 +158,9 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     for name in ("n_envs", "n_timesteps", "n_steps", "batch_size"):
         value = checked.get(name)
         if isinstance(value, int) and value < 1:
-            raise UsageError(f"hyper-parameter {name}: {value} is not allowed; it must be at least 1")
+            raise UsageError(
+                f"hyper-parameter {name}: {value} is not allowed; it must be at least 1"
+            )
     return dict(sorted(checked.items()))
 
 

@@ -5,7 +5,6 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -110,7 +109,7 @@ def make_envs(
     cost_keys: Sequence[str] = ("cost",),
     num_threads: int | None = None,
     evaluation: bool = False,
-    normalizer: Path | None = None,
+    normalizer: VecNormalize | None = None,
     render_mode: str | None = None,
 ) -> VecEnv:
     """
@@ -125,7 +124,7 @@ def make_envs(
     :param cost_keys: entries of info that are costs
     :param num_threads: threads of the native engine; None: its own choice
     :param evaluation: observations are normalised with given statistics, rewards not at all
-    :param normalizer: statistics to begin with, written by VecNormalize
+    :param normalizer: statistics to begin with; it is given the environment
     :param render_mode: as for :func:`gymnasium.make`
     :raises UsageError: the environment refuses an argument, or can't be made
     """
@@ -157,11 +156,12 @@ def make_envs(
         raise UsageError(f"can't wrap {env_id}: {one_line(error)}") from error
 
 
-def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: Path | None) -> VecEnv:
+def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: VecNormalize | None) -> VecEnv:
     if setup.vec_env_wrapper is not None:
         env = setup.vec_env_wrapper(env)
     if normalizer is not None:
-        env = VecNormalize.load(str(normalizer), env)
+        normalizer.set_venv(env)
+        env = normalizer
     elif setup.normalize is not None:
         env = VecNormalize(env, **setup.normalize)
     if evaluation and isinstance(env, VecNormalize):

@@ -1,8 +1,8 @@
 """A training run from flags to result: checked in full first, then made, trained, and resumed.
 
-RL-Zoo's ``ExperimentManager`` makes the run folder before it has looked at the hyper-parameters and
-starts counters, seeds and environments anew when it continues; so its pieces are used here (wrapper,
-callback and schedule parsing, run numbers, file layout, flags) and its class is not.
+RL-Zoo's ``ExperimentManager`` makes the run folder before it has looked at the hyper-parameters,
+and starts counters, seeds and environments anew when it continues; so its pieces are used here
+(wrappers, callbacks and schedules, run numbers, file layout, flags) and its class is not.
 """
 
 import shlex
@@ -19,22 +19,23 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.common.callbacks import CostEvalCallback
-from sb3_guard.common.files import replacing
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import (
     Checkpoints,
     Interrupted,
+    is_checkpoint,
     load_model,
+    monitor_offset,
     read_checkpoint,
+    read_normalizer,
     restore_run,
 )
 from sb3_guard.zoo.config import Setup, build, check, read_hyperparams
 from sb3_guard.zoo.environments import (
     BAD_ARGUMENTS,
-    VEC_ENVS,
     canonical_id,
     choose_vec_env,
     import_packages,
@@ -42,7 +43,7 @@ from sb3_guard.zoo.environments import (
 )
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.progress import Epochs, find_monitor
-from sb3_guard.zoo.run_folder import RunFolder
+from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder
 from sb3_guard.zoo.usage import UsageError, one_line
 
 # Flags that say how to watch or host a run, not what it is: they may change when it is resumed.
@@ -57,8 +58,7 @@ class Experiment:
 
     :param args: all flags of the command, with their defaults
     :param hyperparams: hyper-parameters as data, checked
-    :param state: the checkpoint to continue from; None: a new run
-    :param folder: the run's folder, when it is continued
+    :param folder: the folder of the run to continue; None: a new run
     :raises UsageError: the environment, the algorithm or a wrapper refuses a value
     """
 
@@ -66,17 +66,16 @@ class Experiment:
         self,
         args: Mapping[str, Any],
         hyperparams: Mapping[str, Any],
-        state: dict[str, Any] | None = None,
         folder: RunFolder | None = None,
     ):
         self.args = dict(args)
         self.hyperparams = dict(hyperparams)
-        self.state = state
-        self.folder = folder
         self.algo: str = args["algo"]
         self.algorithm = algorithm(self.algo)
         self.setup: Setup = build(hyperparams)
-        self.env_kwargs = {**self.setup.env_kwargs, **(args["env_kwargs"] or {})}
+        #: the checkpoint to continue from
+        self.state = None if folder is None else read_checkpoint(folder.checkpoint)
+        self._saved = None if folder is None else folder.checkpoint
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
         self.vec_env = choose_vec_env(
             args["vec_env"], canonical_id(args["env"])[1], self.setup.env_wrapper is not None
@@ -90,13 +89,14 @@ class Experiment:
         self.env = self._make_envs(self.setup.n_envs, args["seed"])
         try:
             self.model = self._make_model()
+            self.model.verbose = max(args["verbose"] - 1, 0)
             self.eval_env = self._make_eval_envs() if args["eval_freq"] > 0 else None
         except BaseException:
             self.env.close()
             raise
 
     def _make_envs(self, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
-        kwargs = {"vec_env": self.vec_env, "env_kwargs": self.env_kwargs, **kwargs}
+        kwargs = {"vec_env": self.vec_env, "env_kwargs": self.setup.env_kwargs, **kwargs}
         return make_envs(
             self.args["env"],
             self.setup,
@@ -117,7 +117,9 @@ class Experiment:
             env.action_space.seed(self.args["seed"])
             info = env.step(np.array([env.action_space.sample()]))[3][0]
         except BAD_ARGUMENTS as error:
-            raise UsageError(f"{self.args['env']} fails at its first step: {one_line(error)}") from error
+            raise UsageError(
+                f"{self.args['env']} fails at its first step: {one_line(error)}"
+            ) from error
         finally:
             env.close()
         if not getattr(self.algorithm, "constrained", False):
@@ -134,11 +136,9 @@ class Experiment:
                 )
 
     def _make_model(self) -> BaseAlgorithm:
-        common = {"seed": self.args["seed"], "verbose": 0}
-        device = self.args["device"]
-        if self.state is not None:
-            assert self.folder is not None
-            return load_model(self.algorithm, self.folder.checkpoint, self.env, device)
+        seed, device = self.args["seed"], self.args["device"]
+        if self._saved is not None:
+            return load_model(self.algorithm, self._saved, self.env, device)
         arguments = dict(self.setup.model)
         try:
             if self.args["trained_agent"]:
@@ -146,17 +146,17 @@ class Experiment:
                 for name in ("policy", "policy_kwargs"):
                     arguments.pop(name, None)
                 path = Path(self.args["trained_agent"])
-                return load_model(self.algorithm, path, self.env, device, **arguments, **common)
-            return self.algorithm(env=self.env, device=device, **arguments, **common)
+                return load_model(self.algorithm, path, self.env, device, seed=seed, **arguments)
+            return self.algorithm(env=self.env, device=device, seed=seed, **arguments)
         except (*BAD_ARGUMENTS, RuntimeError) as error:
             raise UsageError(f"{self.algo} can't be made: {one_line(error)}") from error
 
-    def _warm_start_normalizer(self) -> Path | None:
+    def _warm_start_normalizer(self) -> VecNormalize | None:
         """Observation statistics that belong to the agent given by ``-i model.zip``."""
-        if self.state is not None or not self.args["trained_agent"]:
+        if self.state is not None or not self.args["trained_agent"] or self.setup.normalize is None:
             return None
         found = sorted(Path(self.args["trained_agent"]).parent.glob("*/vecnormalize.pkl"))
-        return found[0] if found else None
+        return read_normalizer(found[0]) if found else None
 
     def _make_eval_envs(self) -> VecEnv:
         number = self.args["n_eval_envs"]
@@ -168,7 +168,7 @@ class Experiment:
             number,
             self.args["seed"] + EVALUATION_SEED_OFFSET,
             evaluation=True,
-            env_kwargs=self.env_kwargs if kwargs is None else kwargs,
+            env_kwargs=self.setup.env_kwargs if kwargs is None else kwargs,
         )
 
     def _make_callbacks(self, folder: RunFolder) -> tuple[Checkpoints, Epochs, list[BaseCallback]]:
@@ -207,43 +207,32 @@ class Experiment:
 
     @property
     def _prints_tables(self) -> bool:
-        return self.args["verbose"] >= 2 or (self.args["verbose"] == 1 and not self.args["progress"])
+        # The progress bar shows the same live; two displays would be one too many.
+        return self.args["verbose"] > (1 if self.args["progress"] else 0)
 
-    def train(self) -> int:
+    def train(self, folder: RunFolder) -> int:
         """
         Train to the end, or to an interrupt, and report.
 
+        :param folder: the run's folder, owned by this process
         :return: exit status: 0, or 128 + the signal's number when interrupted
         """
-        folder = self.folder
-        if folder is None:
-            folder = RunFolder.create(
-                self.args["log_folder"],
-                self.algo,
-                self.args["env"],
-                self.args,
-                self.hyperparams,
-                shlex.join(sys.orig_argv),
-                unique=self.args["uuid"],
-            )
         try:
-            with folder.owned():
-                return self._train(folder)
+            return self._train(folder)
         finally:
-            self.env.close()
-            if self.eval_env is not None:
-                self.eval_env.close()
+            self.close()
+
+    def close(self) -> None:
+        """Release the environments."""
+        self.env.close()
+        if self.eval_env is not None:
+            self.eval_env.close()
 
     def _train(self, folder: RunFolder) -> int:
         verbose = self.args["verbose"] > 0
         if verbose:
             print(f"Run folder: {folder.path}")
-        if self.args["tensorboard_log"]:
-            run = folder.path.name.removeprefix(folder.name)
-            tensorboard = Path(self.args["tensorboard_log"]) / folder.name / f"{self.algo}{run}"
-        else:
-            tensorboard = None
-        state = self.state
+        state, tensorboard = self.state, self._tensorboard(folder)
         logger = RunLogger(
             folder.path,
             stdout=self._prints_tables,
@@ -264,7 +253,7 @@ class Experiment:
             except (OSError, ValueError) as error:
                 raise UsageError(one_line(error)) from error
         began = time.monotonic()
-        with interrupts(checkpoints, verbose) as received:
+        with self._tracked(folder), interrupts(checkpoints, verbose) as received:
             finished = self._learn(callbacks)
         self.model.save(str(folder.model))
         normalizer = self.model.get_vec_normalize_env()
@@ -278,6 +267,35 @@ class Experiment:
             print(summary(folder, result, time.monotonic() - began, finished))
         return 0 if finished else 128 + received[0]
 
+    def _tensorboard(self, folder: RunFolder) -> Path | None:
+        parent = self.args["tensorboard_log"] or ("runs" if self.args["track"] else None)
+        if not parent:
+            return None
+        # Of the run's own number, so that a resumed run finds it again.
+        return Path(parent) / folder.name / f"{self.algo}{folder.path.name[len(folder.name) :]}"
+
+    @contextmanager
+    def _tracked(self, folder: RunFolder) -> Iterator[None]:
+        """Send the run's TensorBoard events to Weights & Biases, if asked to."""
+        if not self.args["track"]:
+            yield
+            return
+        import wandb
+
+        run = wandb.init(
+            name=f"{self.args['env']}__{self.algo}__{self.args['seed']}__{int(time.time())}",
+            project=self.args["wandb_project_name"],
+            entity=self.args["wandb_entity"],
+            group=self.args["wandb_group"],
+            tags=self.args["wandb_tags"],
+            config={**self.args, "hyperparams": self.hyperparams, "folder": str(folder.path)},
+            sync_tensorboard=True,
+        )
+        try:
+            yield
+        finally:
+            run.finish()
+
     def _learn(self, callbacks: list[BaseCallback]) -> bool:
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
         interval = self.args["log_interval"]
@@ -288,19 +306,19 @@ class Experiment:
             )
         except Interrupted:
             return False
+        except (ValueError, FloatingPointError) as error:
+            # What an environment or algorithm refuses, e.g. a NaN: its message says it all.
+            if self.args["verbose"] > 1:
+                raise
+            raise UsageError(
+                f"training stopped at {self.model.num_timesteps} steps: {one_line(error)[:600]} "
+                "(--verbose 2 shows where)"
+            ) from error
         finally:
             for callback in callbacks:
                 if isinstance(callback, Epochs):
                     callback.on_training_end()  # leaves the terminal tidy
         return True
-
-
-def monitor_offset(state: Mapping[str, Any]) -> int | None:
-    """How long the monitor's csv was when a checkpoint was taken, bytes."""
-    for part in state["environments"] or []:
-        if isinstance(part, dict) and "offset" in part:
-            return part["offset"]
-    return state["monitor"]["offset"]
 
 
 @contextmanager
@@ -331,6 +349,126 @@ def interrupts(checkpoints: Checkpoints, verbose: bool) -> Iterator[list[int]]:
     finally:
         for one, handler in before.items():
             signal.signal(one, handler)
+
+
+def start(args: Mapping[str, Any]) -> int:
+    """
+    Start a new run.
+
+    :param args: all flags, with their defaults
+    :return: exit status
+    :raises UsageError: anything is wrong with them; nothing has been written then
+    """
+    args = dict(args)
+    algorithm(args["algo"])
+    import_packages(args["gym_packages"])
+    args["env"], _ = canonical_id(args["env"])
+    if args["seed"] < 0:
+        args["seed"] = int(np.random.default_rng().integers(2**31))
+    overrides = dict(args["hyperparams"] or {})
+    if args["n_timesteps"] > 0:
+        overrides["n_timesteps"] = args["n_timesteps"]
+    values = read_hyperparams(args["algo"], args["env"], args["conf_file"], overrides)
+    if args["env_kwargs"]:
+        values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **args["env_kwargs"]}
+    values = check(args["algo"], algorithm(args["algo"]), values)
+    experiment = Experiment(args, values)
+    try:
+        folder = RunFolder.create(
+            args["log_folder"],
+            args["algo"],
+            args["env"],
+            args,
+            values,
+            shlex.join(sys.orig_argv),
+            unique=args["uuid"],
+        )
+    except UsageError:
+        experiment.close()
+        raise
+    with folder.owned():
+        return experiment.train(folder)
+
+
+def continues_run(path: Path) -> bool:
+    """
+    Whether ``-i path`` means a run to continue, rather than a model to begin from.
+
+    :raises UsageError: it is neither
+    """
+    if path.is_dir() or path.name == CHECKPOINT or is_checkpoint(path):
+        return True
+    if not path.is_file():
+        raise UsageError(f"-i: there is no run folder or model {str(path)!r}")
+    return False
+
+
+def resume(given: Mapping[str, Any], defaults: Mapping[str, Any]) -> int:
+    """
+    Continue a run in its folder.
+
+    :param given: the flags given now; ``trained_agent`` is the run's folder or checkpoint
+    :param defaults: all flags with their defaults
+    :return: exit status
+    :raises UsageError: the run can't be continued, or a flag contradicts what it is
+    """
+    folder = RunFolder.open(given["trained_agent"])
+    with folder.owned():
+        saved = {**defaults, **folder.args()}
+        values = folder.hyperparams()
+        import_packages(saved["gym_packages"])
+        _refuse_contradictions(given, saved, values, folder)
+        args = {**saved, **{k: v for k, v in given.items() if k in FREE_FLAGS}}
+        args["trained_agent"] = saved["trained_agent"]
+        if "progress" not in given:
+            args["progress"] = defaults["progress"]
+        done = read_checkpoint(folder.checkpoint)["num_timesteps"]
+        wanted = given.get("n_timesteps", -1)
+        if 0 < wanted < done:
+            raise UsageError(
+                f"-n {wanted} is less than the {done} steps that {folder.path} has done"
+            )
+        if wanted > 0:
+            values["n_timesteps"] = args["n_timesteps"] = wanted
+        values = check(args["algo"], algorithm(args["algo"]), values)
+        if folder.result.exists() and done >= values["n_timesteps"]:
+            print(
+                f"{folder.path} is finished: {done} of {values['n_timesteps']} steps; "
+                "a larger -n continues it"
+            )
+            return 0
+        experiment = Experiment(args, values, folder)
+        folder.write_config(args, values)
+        return experiment.train(folder)
+
+
+def _refuse_contradictions(
+    given: Mapping[str, Any],
+    saved: Mapping[str, Any],
+    values: Mapping[str, Any],
+    folder: RunFolder,
+) -> None:
+    """Raise if a flag asks for something other than what the run is."""
+    for name, value in given.items():
+        own = saved[name]
+        if name == "log_folder":
+            value, own = Path(value).resolve(), folder.path.parent.parent.resolve()
+        elif name == "env":
+            value = canonical_id(value)[0]
+        elif name == "hyperparams":
+            for key, one in value.items():
+                if key not in values or one != values[key]:
+                    raise UsageError(
+                        f"-params {key}:{one} contradicts {key}:{values.get(key)} of "
+                        f"{folder.path}; leave it out, or start a new run without -i"
+                    )
+            continue
+        if name not in FREE_FLAGS and name != "n_timesteps" and value != own:
+            flag = "--" + name.replace("_", "-")
+            raise UsageError(
+                f"{flag} {value} contradicts {flag} {own} of {folder.path}; "
+                "leave it out, or start a new run without -i"
+            )
 
 
 def summary(folder: RunFolder, result: Mapping[str, Any], seconds: float, finished: bool) -> str:

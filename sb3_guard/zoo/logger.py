@@ -88,9 +88,7 @@ class RunLogger(Logger):
             self.name_to_excluded.update(state["excluded"])
             self._iterations_before = state["iterations"]
 
-    def record(
-        self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None
-    ) -> None:
+    def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
         """Log a value; the number of iterations goes on counting after a resume."""
         if key == "time/iterations":
             value += self._iterations_before

@@ -3,7 +3,7 @@
 import pickle
 from typing import Any
 
-import cloudpickle
+import cloudpickle  # type: ignore[import-untyped]
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
@@ -57,11 +57,11 @@ class ResumableEnv(gym.Wrapper):
             vars(base).update(last)
 
 
-def capture(venv: VecEnv) -> list[Any] | None:
+def capture(venv: VecEnv) -> list[Any]:
     """
     The state of a vectorised environment: of its wrappers from the outside in, then its own.
 
-    :return: plain picklable parts; None if the environment can't tell its state
+    :return: picklable parts; the last one is None if the environment itself can't tell its state
     """
     parts: list[Any] = []
     layer = venv
@@ -69,31 +69,29 @@ def capture(venv: VecEnv) -> list[Any] | None:
         parts.append(layer.state() if hasattr(type(layer), "state") else _attributes(layer))
         layer = layer.venv
     if hasattr(type(layer), "state"):
-        parts.append(layer.state())
-    else:
-        try:
-            states = layer.env_method("state")
-        except AttributeError:
-            return None
-        if any(state is None for state in states):
-            return None
-        parts.append(states)
-    return parts
+        return [*parts, layer.state()]
+    try:
+        states = layer.env_method("state")
+    except AttributeError:
+        return [*parts, None]
+    return [*parts, None if any(state is None for state in states) else states]
 
 
 def restore(venv: VecEnv, parts: list[Any]) -> None:
     """Put an environment that was made the same way, and reset, into a captured state."""
-    *parts, last = parts
+    *wrappers, own = parts
     layer = venv
-    for part in parts:
+    for part in wrappers:
         assert isinstance(layer, VecEnvWrapper)
         if hasattr(type(layer), "restore"):
             layer.restore(part)
         else:
             vars(layer).update(part)
         layer = layer.venv
+    if own is None:
+        return
     if hasattr(type(layer), "restore"):
-        layer.restore(last)
+        layer.restore(own)
     else:
-        for index, state in enumerate(last):
+        for index, state in enumerate(own):
             layer.env_method("restore", state, indices=index)

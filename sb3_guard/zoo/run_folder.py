@@ -85,14 +85,12 @@ class RunFolder:
                     number += 1
             params = path / name
             params.mkdir()
-            with replacing(params / "config.yml") as file:
-                file.write(yaml.safe_dump(dict(hyperparams)).encode())
             (params / "command.txt").write_text(command)
-            with replacing(params / "args.yml") as file:
-                file.write(yaml.safe_dump(dict(sorted(args.items()))).encode())
+            _write_config(params, args, hyperparams)
         except OSError as error:
             raise UsageError(
-                f"can't write to log folder {log_folder!r}: {error.strerror}; choose another with -f"
+                f"can't write to log folder {log_folder!r}: {error.strerror}; "
+                "choose another with -f"
             ) from error
         return cls(path)
 
@@ -151,10 +149,9 @@ class RunFolder:
             raise UsageError(f"{path} is damaged: it should be a mapping")
         return content
 
-    def write_args(self, args: Mapping[str, Any]) -> None:
-        """Replace the flags, e.g. when a finished run is to go on for longer."""
-        with replacing(self.params / "args.yml") as file:
-            file.write(yaml.safe_dump(dict(sorted(args.items()))).encode())
+    def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
+        """Replace what :meth:`create` wrote, e.g. when a finished run is to go on for longer."""
+        _write_config(self.params, args, hyperparams)
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Mark the run as complete."""
@@ -204,6 +201,12 @@ class RunFolder:
                 yield
             finally:
                 handle.truncate(0)
+
+
+def _write_config(params: Path, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
+    for name, content in (("config.yml", hyperparams), ("args.yml", args)):
+        with replacing(params / name) as file:
+            file.write(yaml.safe_dump(dict(content)).encode())
 
 
 def latest_run(parent: Path, name: str) -> int:

@@ -2,8 +2,8 @@
 
 Any ``ActorCriticPolicy`` works through autograd. Where the policy is a plain tanh network under a
 Gaussian, categorical or Bernoulli head, the same quantities come from the network's written-out
-passes: the Fisher matrix of such a policy is ``E[Jᵀ M J]``, with J the Jacobian of the head's inputs
-and M the Fisher matrix of the head, so a product takes one tangent and one adjoint pass.
+passes: the Fisher matrix of such a policy is ``E[Jᵀ M J]``, with J the Jacobian of the head's
+inputs and M the Fisher matrix of the head, so a product takes one tangent and one adjoint pass.
 """
 
 import copy
@@ -53,20 +53,20 @@ def kl(old: Distribution, new: Distribution) -> th.Tensor:
     return divergence.sum(dim=1) if divergence.ndim > 1 else divergence
 
 
-def _reached(output: th.Tensor, policy: ActorCriticPolicy) -> list[nn.Parameter]:
+def _reached(output: th.Tensor, policy: ActorCriticPolicy) -> list[th.Tensor]:
     parameters = [parameter for parameter in policy.parameters() if parameter.requires_grad]
     gradients = th.autograd.grad(output.sum(), parameters, allow_unused=True)
     return [p for p, gradient in zip(parameters, gradients, strict=True) if gradient is not None]
 
 
-def actor_parameters(policy: ActorCriticPolicy) -> list[nn.Parameter]:
+def actor_parameters(policy: ActorCriticPolicy) -> list[th.Tensor]:
     """The parameters that the action distribution depends on, found by differentiating it."""
     observation = _zero_observation(policy)
     distribution = policy.get_distribution(observation)
     return _reached(distribution.log_prob(distribution.get_actions(deterministic=True)), policy)
 
 
-def value_parameters(policy: ActorCriticPolicy) -> list[nn.Parameter]:
+def value_parameters(policy: ActorCriticPolicy) -> list[th.Tensor]:
     """The parameters of the value function that the actor does not share.
 
     A shared extractor belongs to the actor: moving it to please the critic would leave the trust
@@ -109,7 +109,7 @@ class Actor:
         kind = TanhActor if tanh_actor(policy) is not None else Actor
         return kind(policy, observations, actions)
 
-    def _parameters(self) -> list[nn.Parameter]:
+    def _parameters(self) -> list[th.Tensor]:
         return actor_parameters(self.policy)
 
     def _distribution(self, index: slice) -> Distribution:
@@ -200,7 +200,7 @@ def tanh_actor(policy: ActorCriticPolicy) -> list[nn.Linear] | None:
 class TanhActor(Actor):
     """:class:`Actor` of a tanh network: the same numbers from cached activations."""
 
-    def _parameters(self) -> list[nn.Parameter]:
+    def _parameters(self) -> list[th.Tensor]:
         layers = tanh_actor(self.policy)
         assert layers is not None
         self.network = TanhMlp(layers)
@@ -223,7 +223,7 @@ class TanhActor(Actor):
         if isinstance(distribution, DiagGaussianDistribution):
             log_std = self.policy.log_std
             return distribution.proba_distribution(inputs, log_std), [inputs, log_std]
-        return distribution.proba_distribution(inputs), [inputs]  # type: ignore[call-arg]
+        return distribution.proba_distribution(inputs), [inputs]
 
     def _curvature(self, index: int, change: th.Tensor) -> th.Tensor:
         """Product of the head's Fisher matrix with a change of its inputs, shape [n, k]."""

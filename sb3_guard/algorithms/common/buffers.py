@@ -108,7 +108,7 @@ class _Costs:
         )
 
 
-class CostRolloutBuffer(_Costs, RolloutBuffer):
+class CostRolloutBuffer(_Costs, RolloutBuffer):  # type: ignore[misc]
     """On-policy transitions with their costs, cost advantages and cost returns.
 
     ``costs`` [T, n_envs, m] are raw; ``cost_bootstraps`` hold what a time-out adds to them.
@@ -121,5 +121,5 @@ class CostRolloutBuffer(_Costs, RolloutBuffer):
     """
 
 
-class CostDictRolloutBuffer(_Costs, DictRolloutBuffer):
+class CostDictRolloutBuffer(_Costs, DictRolloutBuffer):  # type: ignore[misc]
     """:class:`CostRolloutBuffer` for dictionary observations."""

@@ -47,7 +47,7 @@ class CostCritic(nn.Module):
         self.to(policy.device)
         self.optimizer = policy.optimizer_class(
             self.parameters(),
-            lr=lr_schedule(1),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
             **policy.optimizer_kwargs,
         )
 
@@ -83,7 +83,7 @@ class Regression:
     def __init__(
         self,
         values: Callable[[PyTorchObs], th.Tensor],
-        parameters: Sequence[nn.Parameter],
+        parameters: Sequence[th.Tensor],
         optimizer: th.optim.Optimizer,
         features: Callable[[PyTorchObs], th.Tensor] | None = None,
         layers: Sequence[nn.Linear] | None = None,
@@ -155,9 +155,9 @@ class Regression:
                 self.optimizer.step()
                 continue
             loss = 0.0
-            for index in np.array_split(np.random.permutation(n), -(-n // batch_size)):
-                picked = th.as_tensor(index, device=targets.device)
-                part = gradients(rows(observations, picked), targets[picked])
+            # Equal parts, so that no step is taken on a small remainder.
+            for index in th.randperm(n).to(targets.device).tensor_split(-(-n // batch_size)):
+                part = gradients(rows(observations, index), targets[index])
                 loss += part * len(index) / n
                 self.optimizer.step()
         return loss

@@ -44,7 +44,7 @@ class TanhMlp:
     """
 
     def __init__(self, layers: Sequence[nn.Linear]) -> None:
-        self.parameters: list[nn.Parameter] = []
+        self.parameters: list[th.Tensor] = []
         for layer in layers:
             self.parameters += [layer.weight, layer.bias]
 

@@ -5,10 +5,10 @@ One convention holds throughout. The policy parameters move by ``x`` so as to
     maximise  gᵀx   subject to   c + Bx ≤ 0   and   ½ xᵀFx ≤ δ
 
 where ``g`` is the gradient of the reward surrogate (ascent), the rows of ``B`` are the gradients of
-the cost surrogates, ``c`` the violations of the limits by the old policy (positive: violated), ``F``
-the Fisher matrix and ``δ`` the trust-region radius. Only ``v = F⁻¹g`` and ``w_i = F⁻¹b_i`` are ever
-needed, and the answer lies in their span, so everything past the conjugate gradient happens in
-``m + 1`` dimensions, in float64.
+the cost surrogates, ``c`` the violations of the limits by the old policy (positive: violated),
+``F`` the Fisher matrix and ``δ`` the trust-region radius. Only ``v = F⁻¹g`` and ``w_i = F⁻¹b_i``
+are ever needed, and the answer lies in their span, so everything past the conjugate gradient
+happens in ``m + 1`` dimensions, in float64.
 """
 
 from collections.abc import Callable, Iterable, Sequence

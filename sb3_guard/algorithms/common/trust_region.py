@@ -204,7 +204,7 @@ class TrustRegion(OnPolicyAlgorithm):
     #: Whether a critic of the costs is built and trained.
     uses_cost_critic: ClassVar[bool] = True
 
-    rollout_buffer: CostRolloutBuffer | CostDictRolloutBuffer  # type: ignore[assignment]
+    rollout_buffer: CostRolloutBuffer | CostDictRolloutBuffer
 
     def __init__(
         self,
@@ -466,7 +466,8 @@ class TrustRegion(OnPolicyAlgorithm):
     ) -> bool:
         # Taken before anything is drawn: a checkpoint written at the start of a rollout restores
         # these to continue as if it had never been written.
-        self._rng_at_rollout = (random.getstate(), np.random.get_state(), th.get_rng_state())
+        legacy = np.random.get_state()  # noqa: NPY002 (the generator SB3 draws from)
+        self._rng_at_rollout = (random.getstate(), legacy, th.get_rng_state())
         started = time.perf_counter()
         self._begin_rollout_statistics()
         corrects = type(self).correct is not TrustRegion.correct
@@ -568,8 +569,8 @@ class TrustRegion(OnPolicyAlgorithm):
                 buffer.cost_gamma * self.cost_critic(terminal)[0].cpu().numpy()
             )
         self._timeouts = []
+        assert self._last_obs is not None and self._last_episode_starts is not None
         last = self.cost_critic(obs_as_tensor(self._last_obs, self.device)).cpu().numpy()
-        assert self._last_episode_starts is not None
         buffer.compute_cost_returns_and_advantage(last, self._last_episode_starts)
 
     def _estimate_costs(self) -> CostEstimate:
@@ -588,13 +589,12 @@ class TrustRegion(OnPolicyAlgorithm):
     def _horizon_before_any_episode(self) -> float:
         assert self.env is not None and self.running_lengths is not None
         try:
-            limits = [
-                getattr(spec, "max_episode_steps", None) for spec in self.env.get_attr("spec")
-            ]
+            specs = self.env.get_attr("spec")
         except (AttributeError, NotImplementedError):
-            limits = []
-        if limits and all(limits):
-            return float(np.mean(limits))
+            specs = []
+        limits = np.array([getattr(spec, "max_episode_steps", None) or np.nan for spec in specs])
+        if len(limits) and np.isfinite(limits).all():
+            return float(limits.mean())
         longest = float(self.running_lengths.max())
         if self.constrained:
             self._warn_once(
@@ -660,8 +660,9 @@ class TrustRegion(OnPolicyAlgorithm):
         assert self.costs is not None
         actor = Actor.of(self.policy, batch.observations, batch.actions)
         ratio = th.ones_like(batch.advantages).requires_grad_()
-        before = self.surrogate(batch, ratio)
-        (weights,) = th.autograd.grad(before, ratio)
+        objective = self.surrogate(batch, ratio)
+        (weights,) = th.autograd.grad(objective, ratio)
+        before = objective.item()
         region = Region(
             actor,
             batch,
@@ -671,9 +672,9 @@ class TrustRegion(OnPolicyAlgorithm):
             self.cg_damping,
             self.cg_max_steps,
         )
-        fraction, trial = self._line_search(region, self.step(region), float(before))
+        fraction, trial = self._line_search(region, self.step(region), before)
         logger = self.logger
-        logger.record("train/policy_objective", float(before) + trial.improvement)
+        logger.record("train/policy_objective", before + trial.improvement)
         logger.record("train/kl", trial.kl)
         logger.record("train/line_search_step", fraction)
         if self.constrained:

@@ -1,5 +1,27 @@
 """Robots: one small file and one MJCF file each."""
 
+from sb3_guard.envs.robots.ant import Ant
+from sb3_guard.envs.robots.arm3 import Arm3
+from sb3_guard.envs.robots.arm6 import Arm6
+from sb3_guard.envs.robots.car import Car
+from sb3_guard.envs.robots.doggo import Doggo
+from sb3_guard.envs.robots.drone import Drone
+from sb3_guard.envs.robots.hopper import Hopper
+from sb3_guard.envs.robots.humanoid import Humanoid
 from sb3_guard.envs.robots.point import Point
+from sb3_guard.envs.robots.swimmer import Swimmer
+from sb3_guard.envs.robots.walker import Walker
 
-__all__ = ["Point"]
+__all__ = [
+    "Ant",
+    "Arm3",
+    "Arm6",
+    "Car",
+    "Doggo",
+    "Drone",
+    "Hopper",
+    "Humanoid",
+    "Point",
+    "Swimmer",
+    "Walker",
+]

@@ -55,6 +55,7 @@ class MJCFRobot(Robot):
     timestep: ClassVar[float]  # s, one physics step; a control step is ten
     workspace: ClassVar[str] = "planar"
     lidar_bodies: ClassVar[tuple[str, ...]] = ("robot",)
+    center: ClassVar[str] = "robot"  # the body whose origin is the robot's position
 
     name = "robot"
     keepout: float = param(0.4, "radius kept clear around the robot at the start, m", low=0)
@@ -70,9 +71,7 @@ class MJCFRobot(Robot):
         return Path(str(importlib.resources.files("sb3_guard.envs.robots") / "assets" / cls.asset))
 
     def footprints(self) -> tuple[Footprint, ...]:
-        return (
-            Footprint("robot", 1, self.keepout, self.placements, self.locations),
-        )
+        return (Footprint("robot", 1, self.keepout, self.placements, self.locations),)
 
     def build(self, world: World) -> None:
         super().build(world)
@@ -83,7 +82,6 @@ class MJCFRobot(Robot):
             frame = world.spec.worldbody.add_frame()
         else:
             frame = world.spec.worldbody.add_body(name="spawn", mocap=True).add_frame()
-        self._height = float(robot.body("robot").pos[2])
         world.spec.attach(robot, prefix=PREFIX, frame=frame)
 
     def bind(self, sim: Simulation) -> None:
@@ -96,16 +94,18 @@ class MJCFRobot(Robot):
         self._qpos = batch.bind("qpos")
         start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, PREFIX + "start")
         self._start = model.key_qpos[start] if start >= 0 else model.qpos0
-        body = model.body(self.root).id
-        self._position = batch.bind("xpos")[:, body]
+        self._position = batch.bind("xpos")[:, model.body(PREFIX + self.center).id]
         if self._free:
+            body = model.body(self.root).id
             address = int(model.jnt_qposadr[model.body_jntadr[body]])
             self._place = self._qpos[:, address : address + 3]
             self._turn = self._qpos[:, address + 3 : address + 7]
+            self._attitude = self._start[address + 3 : address + 7]
         else:
             spawn = int(model.body_mocapid[model.body("spawn").id])
             self._place = batch.bind("mocap_pos")[:, spawn]
             self._turn = batch.bind("mocap_quat")[:, spawn]
+            self._attitude = np.array([1.0, 0.0, 0.0, 0.0])
         ids = [model.body(PREFIX + name).id for name in self.lidar_bodies]
         rotation = batch.bind("xmat")  # [N, nbody, 9]
         # one lidar body, the usual case, stays a view: fancy indexing would copy at every look
@@ -144,7 +144,8 @@ class MJCFRobot(Robot):
         self._qpos[ids, : len(self._start)] = self._start
         for i in ids.tolist():
             heading = rngs[i].uniform(0, 2 * math.pi) if self.heading is None else self.heading
-            self._turn[i] = geometry.yaw_quaternion(np.asarray(heading))
+            yaw = geometry.yaw_quaternion(np.asarray(heading))
+            mujoco.mju_mulQuat(self._turn[i], yaw, self._attitude)
         self._place[ids, :2] = places[ids, 0, :2]
         if not self._free:
             self._place[ids, 2] = 0.0

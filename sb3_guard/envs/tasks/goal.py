@@ -41,11 +41,7 @@ class Goal(Task):
 
     def footprints(self) -> tuple[Footprint, ...]:
         height = 0.0 if self.planar else self.height
-        return (
-            Footprint(
-                "goal", 1, self.keepout, self.placements, self.locations, height=height
-            ),
-        )
+        return (Footprint("goal", 1, self.keepout, self.placements, self.locations, height=height),)
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)

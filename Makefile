@@ -1,0 +1,47 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+ALGO ?= cpo
+ENV ?= Goal_Point_8Hazards
+STEPS ?= 1000000
+ARGS ?=
+
+.PHONY: train test test-slow check format type docs bench clean
+
+# torch goes first and alone: a requirement that another package leaves open would fetch CUDA builds
+$(VENV)/ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+train: $(VENV)/ready
+	$(BIN)/python -m sb3_guard.train --algo $(ALGO) --env $(ENV) -n $(STEPS) --progress $(ARGS)
+
+test: $(VENV)/ready
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow" $(ARGS)
+
+test-slow: $(VENV)/ready
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow $(ARGS)
+
+check: $(VENV)/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/ready
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+type: $(VENV)/ready
+	$(BIN)/mypy
+
+bench: $(VENV)/ready
+	$(BIN)/python scripts/bench_engine.py
+	$(BIN)/python scripts/bench_training.py
+
+docs: $(VENV)/ready
+	$(BIN)/python scripts/plot_learning.py
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,44 @@
+"""``sb3-guard <command>``: the same commands as ``python -m sb3_guard.<command>``."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from sb3_guard.zoo.usage import suggest
+
+COMMANDS = {
+    "train": "train an agent",
+    "enjoy": "play a trained agent, print return and cost, record a video",
+}
+
+
+def _usage() -> str:
+    rows = "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
+    return f"usage: sb3-guard <command> ...\n\n{rows}\n\nsb3-guard <command> --help says more"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run a command; its module is imported only then.
+
+    :param argv: arguments; None: those of the process
+    :return: exit status
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_usage())
+        return 0
+    name, *rest = arguments
+    if name == "--version":
+        from sb3_guard import __version__
+
+        print(__version__)
+        return 0
+    if name not in COMMANDS:
+        print(f"error: unknown command {name!r}; {suggest(name, COMMANDS)}", file=sys.stderr)
+        return 2
+    return importlib.import_module(f"sb3_guard.{name}").main(rest)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,24 @@
+"""Arm3: an arm of three hinges, each turned at a commanded speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sb3_guard.envs.robots.arm import Arm
+
+
+@dataclass
+class Arm3(Arm):
+    """An arm that reaches 2.5 m above its base.
+
+    Actions: the speeds of joints 1 to 3 (turn, shoulder, elbow), ±0.6 rad/s.
+    """
+
+    asset = "arm3.xml"
+    links = tuple(f"link_{k}" for k in range(1, 6))
+    lidar_bodies = links[::2]
+    center = links[-1]
+
+
+if __name__ == "__main__":
+    Arm3.show()

@@ -1,0 +1,24 @@
+"""Arm6: an arm of six hinges, each turned at a commanded speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sb3_guard.envs.robots.arm import Arm
+
+
+@dataclass
+class Arm6(Arm):
+    """An arm that reaches 3 m from its shoulder, with an elbow and a wrist.
+
+    Actions: the speeds of joints 1 to 6 (turn, shoulder, elbow, roll, wrist, roll), ±0.4 rad/s.
+    """
+
+    asset = "arm6.xml"
+    links = tuple(f"link_{k}" for k in range(1, 8))
+    lidar_bodies = links[::2]
+    center = links[-1]
+
+
+if __name__ == "__main__":
+    Arm6.show()

@@ -1,0 +1,23 @@
+"""Doggo: four legs of three hinges each under a loose waist."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sb3_guard.envs.robots.robot import MJCFRobot
+
+
+@dataclass
+class Doggo(MJCFRobot):
+    """A four-legged robot that must hold its weight up: its springs alone let it sink.
+
+    Actions: the hips' turn (z) of legs 1 to 4, the hips' swing (y), then the ankles. Legs are
+    numbered front left, rear left, rear right, front right. The waist is neither driven nor observed.
+    """
+
+    asset = "doggo.xml"
+    timestep = 0.01
+
+
+if __name__ == "__main__":
+    Doggo.show()

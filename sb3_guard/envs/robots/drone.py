@@ -1,0 +1,24 @@
+"""Drone: four propellers, the robot that moves freely in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sb3_guard.envs.robots.robot import MJCFRobot
+
+
+@dataclass
+class Drone(MJCFRobot):
+    """A quadrotor whose weight is balanced at every height: action 0 hovers.
+
+    Actions: the lift of propellers 1 to 4 (at +x, +y, −x, −y), a quarter of the weight ± 0.1 N each, in
+    the direction of the body's z axis. Drag limits the climb to 2 m/s and tilting to 0.3 rad/s.
+    """
+
+    asset = "drone.xml"
+    timestep = 0.008
+    workspace = "spatial"
+
+
+if __name__ == "__main__":
+    Drone.show()

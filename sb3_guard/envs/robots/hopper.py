@@ -1,0 +1,22 @@
+"""Hopper: a torso on one leg at a fixed height."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sb3_guard.envs.robots.robot import MJCFRobot
+
+
+@dataclass
+class Hopper(MJCFRobot):
+    """A one-legged robot of 12 kg that cannot fall; its leg pushes it along the floor.
+
+    Actions: hip x and z (±20°, actuators ±0.4), thigh, knee and foot: the five torques of the paper.
+    """
+
+    asset = "hopper.xml"
+    timestep = 0.005
+
+
+if __name__ == "__main__":
+    Hopper.show()

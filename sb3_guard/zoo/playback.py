@@ -1,0 +1,224 @@
+"""A trained agent found in its run folder, played, and filmed."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy
+from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.checkpoint import load_model, read_normalizer
+from sb3_guard.zoo.config import build, check
+from sb3_guard.zoo.environments import (
+    canonical_id,
+    choose_vec_env,
+    import_packages,
+    make_envs,
+)
+from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run
+from sb3_guard.zoo.usage import UsageError, one_line
+
+
+def find_run(folder: str, algo: str, env_id: str, number: int = 0) -> RunFolder:
+    """
+    The folder of a run.
+
+    :param folder: log folder
+    :param number: of the run; 0: the latest, -1: ``<folder>/<algo>`` itself, as in RL-Zoo
+    :raises UsageError: there is none
+    """
+    parent, name = Path(folder) / algo, folder_name(env_id)
+    if number == 0:
+        number = latest_run(parent, name)
+        if number == 0:
+            raise UsageError(
+                f"there is no run of {algo} on {env_id} in {folder!r}; train one with: "
+                f"python -m sb3_guard.train --algo {algo} --env {env_id} -f {folder}"
+            )
+    return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
+
+
+def find_model(run: RunFolder, args: Mapping[str, Any]) -> tuple[Path, Path]:
+    """
+    The model that the flags ask for, and where its observation statistics are, if it has any.
+
+    Without a flag: the final model, or the checkpoint of a run that has not come to its end.
+
+    :raises UsageError: the run has no such model
+    """
+    kept = sorted(run.path.glob("rl_model_*_steps.zip"), key=_steps)
+    if args["load_best"]:
+        return _existing(run.path / "best_model.zip"), run.path / "best_model_vecnormalize.pkl"
+    if args["load_checkpoint"] is not None:
+        steps = args["load_checkpoint"]
+        model = run.path / f"rl_model_{steps}_steps.zip"
+        if model not in kept:
+            known = ", ".join(str(_steps(one)) for one in kept) or "none"
+            raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {known}")
+        return model, run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
+    if args["load_last_checkpoint"] and kept:
+        steps = _steps(kept[-1])
+        return kept[-1], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
+    if args["load_last_checkpoint"] or not run.model.exists():
+        return _existing(run.checkpoint), run.checkpoint
+    return run.model, run.normalizer
+
+
+def _steps(kept: Path) -> int:
+    """The steps that ``rl_model_<steps>_steps.zip`` was kept at."""
+    return int(kept.stem.split("_")[2])
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise UsageError(f"there is no {path}: the run has not come so far")
+    return path
+
+
+def play(args: Mapping[str, Any], render_mode: str | None) -> int:
+    """
+    Play an agent and print what it gets and what it costs.
+
+    :param args: all flags of ``enjoy``, with their defaults
+    :param render_mode: None, ``"human"``, or ``"rgb_array"`` to record
+    :return: exit status
+    :raises UsageError: there is no such agent, or no picture can be made
+    """
+    cls = algorithm(args["algo"])
+    import_packages(args["gym_packages"])
+    env_id, ours = canonical_id(args["env"])
+    run = find_run(args["folder"], args["algo"], env_id, args["exp_id"])
+    path, normalizer = find_model(run, args)
+    values = check(args["algo"], cls, run.hyperparams())
+    setup = build(values)
+    if args["num_threads"] > 0:
+        import torch as th
+
+        th.set_num_threads(args["num_threads"])
+    model = load_model(cls, path, None, args["device"])
+    env = make_envs(
+        env_id,
+        setup,
+        n_envs=1,
+        seed=args["seed"],
+        vec_env=choose_vec_env(None, ours, setup.env_wrapper is not None),
+        env_kwargs={**setup.env_kwargs, **(args["env_kwargs"] or {})},
+        cost_keys=getattr(model, "cost_keys", ("cost",)),
+        evaluation=True,
+        normalizer=None if setup.normalize is None else read_normalizer(normalizer),
+        render_mode=render_mode,
+    )
+    if env.observation_space != model.observation_space:
+        raise UsageError(
+            f"{path} was trained on observations {model.observation_space}, "
+            f"but {env_id} has {env.observation_space}"
+        )
+    episodes = args["n_episodes"]
+    if episodes is None and args["n_timesteps"] is None:
+        episodes = 1 if args["record"] is not None else 5
+    video = None
+    if args["record"] is not None:
+        video = Path(args["record"] or path.with_suffix(".mp4"))
+    print(f"Playing {path} on {env_id}")
+    try:
+        with camera(env, video, render_mode) as shoot:
+            evaluation = evaluate_policy(
+                model,
+                env,
+                n_eval_episodes=episodes or args["n_timesteps"],
+                deterministic=not args["stochastic"],
+                seed=args["seed"],
+                max_steps=args["n_timesteps"],
+                on_step=shoot,
+                on_episode=_print_episode if args["verbose"] > 0 else None,
+            )
+    finally:
+        env.close()
+    print(_means(evaluation))
+    if video is not None:
+        print(f"Video: {video}")
+    return 0
+
+
+def _print_episode(episode_return: float, cost: float, length: int) -> None:
+    print(f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length} steps")
+
+
+def _means(evaluation: Evaluation) -> str:
+    count = len(evaluation)
+    if count == 0:
+        return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"
+    rows = [f"Mean ± std of {count} episode{'s' if count > 1 else ''}, 95 % interval of the mean:"]
+    for name, values in (
+        ("return", evaluation.returns),
+        ("cost", evaluation.costs),
+        ("length", evaluation.lengths),
+    ):
+        mean, std, low, high = evaluation.estimate(values)
+        interval = f"   [{low:.3f}, {high:.3f}]" if count > 1 else ""
+        rows.append(f"  {name:<7}{mean:9.3f} ± {std:.3f}{interval}")
+    return "\n".join(rows)
+
+
+@contextmanager
+def camera(env: VecEnv, video: Path | None, render_mode: str | None) -> Iterator[Any]:
+    """
+    What to call after each step: write a frame, show one, or nothing.
+
+    The first frame is taken at once, so that a machine that can't render says so before anything
+    is played, and nothing is written then.
+
+    :param env: one environment
+    :param video: mp4 to write; None: no recording
+    :param render_mode: the environment's
+    :raises UsageError: no frame can be rendered, or the file can't be written
+    """
+    if render_mode is None:
+        yield None
+        return
+    if video is None:
+        yield lambda: _render(env)
+        return
+    import imageio_ffmpeg
+
+    env.reset()
+    first = _render(env)
+    if first is None:
+        raise UsageError("this environment renders no rgb_array frames; it can't be recorded")
+    height, width = first.shape[:2]
+    video.parent.mkdir(parents=True, exist_ok=True)
+    partial = video.with_name(f".{video.name}.part.mp4")
+    try:
+        writer = imageio_ffmpeg.write_frames(
+            str(partial), (width, height), fps=_frames_per_second(env), macro_block_size=2
+        )
+        writer.send(None)
+        try:
+            yield lambda: writer.send(np.ascontiguousarray(_render(env)))
+        finally:
+            writer.close()
+        partial.replace(video)
+    except OSError as error:
+        raise UsageError(f"can't write {video}: {one_line(error)}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _render(env: VecEnv) -> np.ndarray | None:
+    if env.render_mode == "human":
+        env.render()
+        return None
+    try:
+        return env.get_images()[0]
+    except (RuntimeError, ImportError, AttributeError) as error:
+        raise UsageError(f"can't render: {one_line(error)}") from error
+
+
+def _frames_per_second(env: VecEnv) -> float:
+    try:
+        return float(env.get_attr("metadata")[0].get("render_fps", 30))
+    except AttributeError:
+        return 30.0

@@ -1,0 +1,143 @@
+"""Print how much of bare physics the environments keep, and what a reset costs.
+
+Every ratio is measured in one run: short slices of the full step and of a bare loop on the same
+model alternate, and the best slice of each counts. ``python scripts/bench_engine.py`` prints the
+marks for one suite, ``--all`` a table of every suite.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import gymnasium
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from sb3_guard.common.vec_env import GuardVecEnv
+from sb3_guard.envs import env_ids, env_spec
+from sb3_guard.envs.engine import FRAME_SKIP, STAGE, profiling_clock
+from sb3_guard.envs.vector_env import GuardVectorEnv
+
+CLOCK = profiling_clock()
+SHIPPED = CLOCK.value if CLOCK is not None else None
+
+
+def as_shipped(on: bool) -> None:
+    """Put MuJoCo's profiling clock back for the bare loops, or take it away."""
+    if CLOCK is not None:
+        CLOCK.value = SHIPPED if on else None
+
+
+def best(functions: dict[str, Callable[[], int]], seconds: float, slices: int) -> dict[str, float]:
+    """Env-steps/s of each function: the best of alternating slices."""
+    rates = dict.fromkeys(functions, 0.0)
+    for _ in range(slices):
+        for name, function in functions.items():
+            as_shipped(name == "bare")
+            start, steps = time.perf_counter(), 0
+            while time.perf_counter() - start < seconds / slices:
+                steps += function()
+            rates[name] = max(rates[name], steps / (time.perf_counter() - start))
+    return rates
+
+
+def batch_rates(env_id: str, n: int, seconds: float, slices: int) -> dict[str, float]:
+    """Full vector step against a bare loop of the same Batch, N = n."""
+    scenario = env_spec(env_id).kwargs["scenario"]
+    full = GuardVecEnv(scenario, n)
+    full.seed(0)
+    full.reset()
+    engine = full.envs.engine
+    bare = Batch(engine.model, nsim=n, nthread=engine.num_threads, persistent=True)
+    bare.state[:] = engine.batch.state
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (64, n, engine.robot.action_size)).astype(np.float32)
+    low, high = engine.model.actuator_ctrlrange.T
+    ctrls = low + (actions + 1) / 2 * (high - low)
+    ctrl = bare.bind("ctrl")
+    turn = iter(range(10**12))
+
+    def step_full() -> int:
+        for _ in range(4):
+            full.step(actions[next(turn) % 64])
+        return 4 * n
+
+    def step_bare() -> int:
+        for _ in range(4):
+            ctrl[:] = ctrls[next(turn) % 64]
+            bare.step(nstep=FRAME_SKIP)
+        return 4 * n
+
+    # staggered episodes, as in a long training
+    engine.steps[:] = np.arange(n) * (full.envs.max_episode_steps // n)
+    return best({"full": step_full, "bare": step_bare}, seconds, slices)
+
+
+def single_rates(env_id: str, seconds: float, slices: int) -> dict[str, float]:
+    """The lone environment against a bare mj_step loop."""
+    env = gymnasium.make(env_id)
+    env.reset(seed=0)
+    model = env.unwrapped.engine.model
+    data = mujoco.MjData(model)
+    actions = np.random.default_rng(0).uniform(-1, 1, (64, *env.action_space.shape))
+    turn = iter(range(10**12))
+
+    def step_full() -> int:
+        for _ in range(16):
+            *_, truncated, _ = env.step(actions[next(turn) % 64])
+            if truncated:
+                env.reset()
+        return 16
+
+    def step_bare() -> int:
+        for _ in range(16):
+            data.ctrl[:] = actions[next(turn) % 64]
+            mujoco.mj_step(model, data, nstep=FRAME_SKIP)
+        return 16
+
+    return best({"full": step_full, "bare": step_bare}, seconds, slices)
+
+
+def reset_seconds(env_id: str, n: int = 30, rounds: int = 5) -> float:
+    """Mean seconds of a reset: layout, state and first observation."""
+    vec = GuardVectorEnv(1, env_spec(env_id).kwargs["scenario"])
+    vec.begin([0])
+    start = time.perf_counter()
+    for _ in range(n * rounds):
+        vec.begin([None])
+    return (time.perf_counter() - start) / (n * rounds)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--env", default="Goal_Point_8Hazards-v0", help="the suite to measure")
+    parser.add_argument("--all", action="store_true", help="a table of all suites at N = 30")
+    parser.add_argument("--seconds", type=float, default=6.0, help="time for each figure")
+    parser.add_argument("--slices", type=int, default=20, help="slices that alternate")
+    args = parser.parse_args()
+    print(
+        f"mujoco {mujoco.__version__}, stage {STAGE}, {FRAME_SKIP} physics steps per control step"
+    )
+    if args.all:
+        print("| suite | env-steps/s | of bare physics | reset, ms |\n|---|---|---|---|")
+        for env_id in env_ids():
+            rates = batch_rates(env_id, 30, args.seconds / 6, args.slices)
+            ratio = rates["full"] / rates["bare"]
+            reset = 1e3 * reset_seconds(env_id)
+            print(f"| {env_id} | {rates['full']:,.0f} | {ratio:.2f} | {reset:.2f} |", flush=True)
+        return
+    print(f"{args.env}: env-steps/s, full step and bare loop, and their ratio")
+    rates = single_rates(args.env, args.seconds, args.slices)
+    for n in (1, 30, 128):
+        if n > 1:
+            rates = batch_rates(args.env, n, args.seconds, args.slices)
+        ratio = rates["full"] / rates["bare"]
+        print(f"N = {n:>3}  {rates['full']:>9,.0f}  {rates['bare']:>9,.0f}  {ratio:.2f}")
+    print(f"reset {1e3 * reset_seconds(args.env):.2f} ms, layout, state and first observation")
+
+
+if __name__ == "__main__":
+    main()

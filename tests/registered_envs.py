@@ -1,0 +1,58 @@
+"""Importing this registers toy environments, as a user's package would (``--gym-packages``)."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from cost_envs import CostPoint
+
+
+class Filmed(CostPoint):
+    """A point that can be filmed: frames are grey with a bright dot."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.render_mode = render_mode
+
+    def render(self) -> np.ndarray:
+        frame = np.full((64, 64, 3), 60, np.uint8)
+        x, y = (32 + 15 * self.position).astype(int)
+        frame[y - 2 : y + 2, x - 2 : x + 2] = 255
+        return frame
+
+
+class Unpicklable(CostPoint):
+    """An environment whose state nobody can save."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.stream = (i for i in range(10))
+
+
+class NoCost(CostPoint):
+    """A plain environment: its info says nothing about costs."""
+
+    def step(self, action: np.ndarray) -> Any:
+        *rest, info = super().step(action)
+        return *rest, {"depth": info["cost"]}
+
+
+class Flickering(CostPoint):
+    """Reports a cost that is not a number after a while."""
+
+    def step(self, action: np.ndarray) -> Any:
+        *rest, info = super().step(action)
+        return *rest, {"cost": float("nan") if self.steps > 20 else 0.0}
+
+
+for name, cls in {
+    "CostPoint": CostPoint,
+    "Filmed": Filmed,
+    "Unpicklable": Unpicklable,
+    "NoCost": NoCost,
+    "Flickering": Flickering,
+}.items():
+    if f"{name}-v0" not in gym.registry:
+        gym.register(f"{name}-v0", entry_point=f"{cls.__module__}:{name}")

@@ -1,0 +1,169 @@
+"""Evaluation during training: the best model is a safe one, and training does not notice."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_guard.algorithms import CPO, TRPO
+from sb3_guard.common.callbacks import CostEvalCallback
+from sb3_guard.common.evaluation import Evaluation
+from sb3_guard.common.monitor import CostMonitor
+
+
+def envs(n: int = 2, **kwargs) -> CostMonitor:
+    keys = kwargs.get("cost_keys", ("cost",))
+    make = [lambda: CostPoint(episode_length=10, **kwargs)] * n
+    return CostMonitor(DummyVecEnv(make), cost_keys=keys)
+
+
+def evaluation(mean_return: float, *costs: float) -> Evaluation:
+    """Two episodes around given means, one cost per key."""
+    returns = np.array([mean_return - 1, mean_return + 1])
+    key_costs = np.array([costs, costs])
+    return Evaluation(returns, key_costs[:, 0], np.array([10, 10]), key_costs)
+
+
+def callback(selection_limit=None, **model) -> CostEvalCallback:
+    result = CostEvalCallback(envs(1), selection_limit=selection_limit)
+    result.model = SimpleNamespace(**model)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("limit", "candidates", "best"),
+    [
+        # Among safe ones the return decides,
+        (10.0, [(1.0, 5.0), (3.0, 9.0), (2.0, 0.0)], 1),
+        # a safe one beats every unsafe one,
+        (10.0, [(99.0, 10.1), (-5.0, 9.9)], 1),
+        # among unsafe ones the violation,
+        (10.0, [(99.0, 40.0), (1.0, 12.0), (50.0, 13.0)], 1),
+        # the limit itself is safe,
+        (10.0, [(1.0, 10.0), (99.0, 10.5)], 0),
+        # and the default at d = 0 still chooses by return among those that cost at most 1.
+        (None, [(0.0, 0.0), (5.0, 0.9), (9.0, 1.1)], 1),
+    ],
+)
+def test_safe_first_then_good(limit, candidates, best):
+    judge = callback(limit, cost_limit=0.0)
+    scores = [judge.score(evaluation(*one)) for one in candidates]
+    assert scores.index(max(scores)) == best
+
+
+def test_several_costs_each_have_their_limit():
+    judge = callback(cost_limit=[0.0, 20.0], cost_keys=("a", "b"))
+    assert judge.limits().tolist() == [1.0, 20.0]
+    assert judge.score(evaluation(7.0, 0.5, 19.0)) == (True, 7.0)
+    # The violations add up.
+    assert judge.score(evaluation(7.0, 2.0, 23.0)) == (False, -4.0)
+
+
+def test_unconstrained_algorithms_are_judged_by_return():
+    judge = callback(cost_limit=0.0, constrained=False)
+    assert judge.score(evaluation(7.0, 1e9)) == (True, 7.0)
+    assert callback(5.0, cost_limit=0.0, constrained=False).score(evaluation(7.0, 9.0)) == (False, -4)
+
+
+def learn(tmp_path, algorithm=CPO, evaluate=True, env=None, steps=120, **kwargs):
+    model = algorithm("MlpPolicy", env or envs(), n_steps=20, n_critic_updates=2, seed=3)
+    watcher = CostEvalCallback(
+        kwargs.pop("eval_env", None) or envs(),
+        n_eval_episodes=4,
+        eval_freq=15,
+        log_path=tmp_path,
+        best_model_save_path=tmp_path,
+        verbose=0,
+        **kwargs,
+    )
+    model.learn(steps, callback=watcher if evaluate else None)
+    return model, watcher
+
+
+def test_history_has_costs(tmp_path):
+    learn(tmp_path)
+    history = np.load(tmp_path / "evaluations.npz")
+    assert history["timesteps"].tolist() == [30, 60, 90, 120]
+    for name in ("results", "costs", "ep_lengths"):
+        assert history[name].shape == (4, 4)
+    assert (history["costs"] >= 0).all()
+    assert not list(tmp_path.glob(".*"))  # nothing half-written
+
+
+def test_logs_the_cost(tmp_path):
+    rows = []
+
+    class Recorder(Logger):
+        def dump(self, step=0):
+            rows.append(dict(self.name_to_value))
+            super().dump(step)
+
+    model = CPO("MlpPolicy", envs(cost_keys=("cost", "heat")), n_steps=20, seed=3,
+                cost_keys=("cost", "heat"), n_critic_updates=2)  # fmt: skip
+    model.set_logger(Recorder(None, []))
+    watcher = CostEvalCallback(envs(cost_keys=("cost", "heat")), eval_freq=15, verbose=0)
+    model.learn(40, callback=watcher)
+    (row,) = [row for row in rows if "eval/mean_reward" in row]
+    assert row["eval/mean_ep_cost"] == row["eval/mean_ep_cost/cost"] == watcher.last_mean_cost
+    assert row["eval/mean_ep_cost/heat"] == pytest.approx(2 * row["eval/mean_ep_cost"])
+    assert row["time/total_timesteps"] == 30
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_training_does_not_notice(tmp_path, deterministic):
+    watched, _ = learn(tmp_path, deterministic=deterministic)
+    alone, _ = learn(tmp_path, evaluate=False)
+    for one, other in zip(watched.policy.parameters(), alone.policy.parameters(), strict=True):
+        assert th.equal(one, other)
+
+
+def test_best_model_is_the_best_evaluated(tmp_path):
+    model, watcher = learn(tmp_path, TRPO, steps=400)
+    history = np.load(tmp_path / "evaluations.npz")
+    means = history["results"].mean(axis=1)
+    assert watcher.best_score == (True, means.max())
+    best = TRPO.load(tmp_path / "best_model.zip")
+    assert best.num_timesteps == history["timesteps"][means.argmax()]
+    assert best.num_timesteps <= model.num_timesteps
+
+
+def test_normaliser_lies_beside_the_best_model(tmp_path):
+    env, eval_env = VecNormalize(envs()), VecNormalize(envs(), training=False, norm_reward=False)
+    learn(tmp_path, env=env, eval_env=eval_env)
+    saved = VecNormalize.load(str(tmp_path / "best_model_vecnormalize.pkl"), envs())
+    assert saved.obs_rms.count > 1
+    # Evaluation used training's statistics and did not add to them.
+    assert eval_env.obs_rms.count <= env.obs_rms.count
+
+
+def test_callbacks_on_new_best_and_after_eval(tmp_path):
+    class Count(BaseCallback):
+        def _on_step(self):
+            return True
+
+    class StopAtOnce(Count):
+        def _on_step(self):
+            return False
+
+    best, after = Count(), Count()
+    _, watcher = learn(tmp_path, callback_on_new_best=best, callback_after_eval=after)
+    assert after.n_calls == 4
+    assert 1 <= best.n_calls <= 4
+    model, _ = learn(tmp_path, callback_after_eval=StopAtOnce())
+    assert model.num_timesteps == 30
+
+
+def test_state_continues_the_history(tmp_path):
+    _, watcher = learn(tmp_path)
+    fresh = CostEvalCallback(envs(), log_path=tmp_path / "elsewhere", best_model_save_path=tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    fresh.restore(watcher.state())
+    assert fresh.state() == watcher.state()
+    one, other = (np.load(path / "evaluations.npz") for path in (tmp_path, tmp_path / "elsewhere"))
+    for name in one.files:
+        np.testing.assert_array_equal(one[name], other[name])

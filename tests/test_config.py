@@ -1,0 +1,247 @@
+"""Hyper-parameters: which entry is read, what is refused, what becomes of the values."""
+
+import gymnasium as gym
+import pytest
+import yaml
+from torch import nn
+
+from sb3_guard.algorithms import ALGORITHMS, CPO
+from sb3_guard.common.vec_env import make_vec_env
+from sb3_guard.zoo.config import arguments, build, check, hyperparams_folder, read_hyperparams
+from sb3_guard.zoo.usage import UsageError, parse_value
+
+FILE = """
+default: &default
+  n_timesteps: !!float 1e5
+  n_steps: 100
+Goal_Point_8Hazards-v0:
+  <<: *default
+  n_steps: 200
+Bare_Name:
+  n_steps: 300
+"""
+
+
+@pytest.fixture
+def conf(tmp_path):
+    path = tmp_path / "cpo.yml"
+    path.write_text(FILE)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "n_steps"),
+    [("Goal_Point_8Hazards-v0", 200), ("Bare_Name-v0", 300), ("Anything-v3", 100)],
+)
+def test_entry_of_the_environment_else_default(conf, env_id, n_steps):
+    assert read_hyperparams("cpo", env_id, conf)["n_steps"] == n_steps
+
+
+def test_command_line_wins(conf):
+    values = read_hyperparams("cpo", "Anything-v0", conf, {"n_steps": 7, "gamma": 0.9})
+    assert values == {"gamma": 0.9, "n_steps": 7, "n_timesteps": 1e5}
+
+
+def test_python_file_and_module(tmp_path, monkeypatch):
+    (tmp_path / "my_conf.py").write_text("hyperparams = {'default': {'n_steps': 5}}")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in (str(tmp_path / "my_conf.py"), "my_conf"):
+        assert read_hyperparams("cpo", "X-v0", name) == {"n_steps": 5}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("default: [1, 2", "is not valid YAML: .*line 1"),
+        ("- a\n- b\n", "must map environments"),
+        ("n_steps: 100\n", "must map environments"),
+        ("Goal_Point_8Hazards-v0: {}\n", "no entry for 'Goal_Point_8Hazard'.*did you mean"),
+        ("\x00\x01", "is not valid YAML"),
+    ],
+)
+def test_files_that_are_not_hyperparameters(tmp_path, content, message):
+    path = tmp_path / "bad.yml"
+    path.write_text(content)
+    with pytest.raises(UsageError, match=message) as error:
+        read_hyperparams("cpo", "Goal_Point_8Hazard", str(path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["absent.yml", "absent.py", "absent_module"])
+def test_absent_file(name):
+    with pytest.raises(UsageError, match=name.removesuffix(".py")):
+        read_hyperparams("cpo", "X-v0", name)
+
+
+def checked(**values):
+    return check("cpo", CPO, {"n_timesteps": 100, **values})
+
+
+def test_arguments_are_the_leafs_and_the_bases():
+    names = arguments(CPO)
+    assert {"cost_reduction", "target_kl", "n_steps", "policy_kwargs"} <= names.keys()
+    assert not {"env", "seed", "device", "verbose", "self", "kwargs", "_init_setup_model"} & names.keys()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("n_steps", 1e3, 1000),
+        ("n_steps", "1e3", 1000),
+        ("n_timesteps", 6e6, 6_000_000),
+        ("learning_rate", "1e-3", 0.001),
+        ("learning_rate", 1, 1.0),
+        ("learning_rate", "lin_0.01", "lin_0.01"),
+        ("batch_size", None, None),
+        ("batch_size", 64, 64),
+        ("cost_limit", 25, 25.0),
+        ("cost_limit", [1, 2.5], [1.0, 2.5]),
+        ("cost_keys", ["a", "b"], ["a", "b"]),
+        ("missing_cost", "zero", "zero"),
+        ("normalize_advantage", False, False),
+        ("policy_kwargs", "dict(log_std_init=-1)", "dict(log_std_init=-1)"),
+        ("normalize", True, True),
+        ("selection_limit", 3, 3.0),
+    ],
+)
+def test_values_in_their_proper_type(name, value, expected):
+    result = checked(**{name: value})[name]
+    assert result == expected and type(result) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("n_steps", "many", "a whole number"),
+        ("n_steps", 2.5, "a whole number"),
+        ("n_steps", True, "a whole number"),
+        ("n_steps", None, "a whole number"),
+        ("n_steps", [1], "a whole number"),
+        ("n_steps", 0, "at least 1"),
+        ("n_envs", -3, "at least 1"),
+        ("n_timesteps", 0, "at least 1"),
+        ("gamma", "high", "a number"),
+        ("gamma", float("nan"), "a number"),
+        ("learning_rate", "fast", "a number or a schedule such as lin_0.001"),
+        ("batch_size", 1.5, "a whole number or None"),
+        ("batch_size", 0, "at least 1"),
+        ("normalize_advantage", 1, "True or False"),
+        ("normalize_advantage", "yes", "True or False"),
+        ("missing_cost", "ignore", "'error' or 'zero'"),
+        ("cost_limit", "low", r"a number or a list \(a number each\)"),
+        ("cost_keys", "cost", r"a list \(text each\)"),
+        ("policy", 3, "text or the dotted name of a class"),
+        ("policy_kwargs", 3, "a mapping or None"),
+    ],
+)
+def test_values_of_the_wrong_type(name, value, allowed):
+    with pytest.raises(UsageError, match=rf"{name}.*not allowed; it must be {allowed}"):
+        checked(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "near"), [("n_step", "n_steps"), ("costlimit", "cost_limit"), ("Gamma", "gamma")]
+)
+def test_unknown_name_suggests_the_nearest(name, near):
+    with pytest.raises(UsageError, match=f"cpo has no hyper-parameter '{name}'; did you mean '{near}'"):
+        checked(**{name: 1})
+
+
+def test_names_that_are_flags():
+    with pytest.raises(UsageError, match="use the flag --seed"):
+        checked(seed=3)
+
+
+def test_n_timesteps_must_be_known():
+    with pytest.raises(UsageError, match="use the flag -n"):
+        check("cpo", CPO, {})
+
+
+def test_objects_are_made():
+    setup = build(
+        checked(
+            learning_rate="lin_0.01",
+            policy_kwargs="dict(activation_fn=nn.ReLU)",
+            policy="stable_baselines3.common.policies.ActorCriticPolicy",
+            normalize=True,
+            gamma=0.9,
+            env_wrapper="gymnasium.wrappers.FlattenObservation",
+            env_kwargs={"a": 1},
+        )
+    )
+    assert setup.model["learning_rate"](0.5) == pytest.approx(0.005)
+    assert setup.model["policy_kwargs"] == {"activation_fn": nn.ReLU}
+    assert setup.model["policy"].__name__ == "ActorCriticPolicy"
+    assert setup.normalize == {"gamma": 0.9}
+    assert isinstance(setup.env_wrapper(gym.make("CartPole-v1")), gym.wrappers.FlattenObservation)
+    assert setup.env_kwargs == {"a": 1}
+    assert (setup.n_envs, setup.n_timesteps, setup.callbacks) == (1, 100, [])
+    assert "env_kwargs" not in setup.model and "n_envs" not in setup.model
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("policy_kwargs", "dict(activation_fn=nn.Rellu)", "can't be evaluated.*Rellu"),
+        ("learning_rate", "lin_fast", "not a schedule"),
+        ("policy", "no.such.Policy", "there is no class 'no.such.Policy'"),
+        ("env_wrapper", "no.such.Wrapper", "wrapper or callback can't be made"),
+    ],
+)
+def test_text_that_names_nothing(name, value, message):
+    with pytest.raises(UsageError, match=message):
+        build(checked(**{name: value}))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 0.001),
+        ("[1, 2]", [1, 2]),
+        ("None", None),
+        ("{'num': 4}", {"num": 4}),
+        ("dict(num=4, more=dict(a=[1]))", {"num": 4, "more": {"a": [1]}}),
+        ("MlpPolicy", "MlpPolicy"),
+        ("lin_0.001", "lin_0.001"),
+        ("'quoted'", "quoted"),
+        ("dict(activation_fn=nn.ReLU)", "dict(activation_fn=nn.ReLU)"),
+        ("", ""),
+    ],
+)
+def test_values_on_the_command_line(text, value):
+    assert parse_value(text) == value
+
+
+PAPER = {
+    "n_timesteps": 6_000_000,
+    "gamma": 0.99,
+    "gae_lambda": 0.97,
+    "target_kl": 0.02,
+    "line_search_max_iter": 100,
+    "line_search_shrinking_factor": 0.8,
+    "learning_rate": 0.001,
+    "n_critic_updates": 80,
+    "batch_size": None,
+}
+
+
+@pytest.mark.parametrize("algo", sorted(ALGORITHMS))
+def test_shipped_files_are_the_papers_table(algo):
+    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
+    assert PAPER.items() <= values.items()
+    assert values["n_envs"] * values["n_steps"] == 30_000
+    model = ALGORITHMS[algo](env=make_vec_env("Goal_Point_8Hazards", 1), **build(values).model)
+    layers = [one for one in model.policy.mlp_extractor.policy_net if isinstance(one, nn.Linear)]
+    assert [one.out_features for one in layers] == [64, 64]
+    assert isinstance(model.policy.mlp_extractor.policy_net[1], nn.Tanh)
+    assert (model.policy.log_std == -0.5).all() and not model.policy.ortho_init
+    assert (model.cost_limit, model.cg_damping > 0) == (0.0, True)
+    for env_id in ("Goal_Ant_8Hazards-v0", "Defense_Walker_8Ghosts-v0"):
+        assert read_hyperparams(algo, env_id) == {**values, "n_timesteps": 3e7}
+
+
+def test_every_algorithm_has_a_file_and_every_file_an_algorithm():
+    files = {path.stem for path in hyperparams_folder().glob("*.yml")}
+    assert files == set(ALGORITHMS)
+    for path in hyperparams_folder().glob("*.yml"):
+        assert "default" in yaml.safe_load(path.read_text())

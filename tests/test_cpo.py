@@ -1,0 +1,227 @@
+"""CPO: its step, its line-search test, its units, and what it does where nothing is at stake."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint, LinearCostBandit
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_guard.algorithms import CPO, TRPO
+from sb3_guard.algorithms.common.natural_gradient import Case
+from sb3_guard.algorithms.common.trust_region import CostEstimate, Trial
+
+KEYS = ("cost", "cost_1")
+
+
+def make(env: Any = CostPoint, n_envs: int = 4, **kwargs: Any) -> CPO:
+    defaults: dict[str, Any] = {"n_steps": 100, "n_critic_updates": 5, "seed": 0, "device": "cpu"}
+    return CPO("MlpPolicy", make_vec_env(env, n_envs, seed=0), **{**defaults, **kwargs})
+
+
+@pytest.mark.parametrize(
+    ("violation", "case", "kl", "improvement", "cost_change", "accepted"),
+    [
+        # Feasible: reward must not fall, cost may rise up to the limit.
+        (-0.5, Case.BINDING, 0.01, 0.1, 0.4, True),
+        (-0.5, Case.BINDING, 0.01, 0.1, 0.6, False),
+        (-0.5, Case.BINDING, 0.01, -0.1, -0.4, False),
+        (-0.5, Case.INACTIVE, 0.01, 0.0, 0.0, True),
+        # Violated: cost must not rise, reward may fall.
+        (0.5, Case.RECOVERABLE, 0.01, -0.1, -0.1, True),
+        (0.5, Case.RECOVERABLE, 0.01, 0.1, 0.1, False),
+        (0.5, Case.LOST, 0.01, -9.0, -1e-6, True),
+        (0.5, Case.LOST, 0.01, 0.1, 1e-6, False),
+        # On the limit, and nothing to be gained or lost.
+        (0.0, Case.BINDING, 0.01, 0.1, 0.0, True),
+        (0.0, Case.NO_GRADIENT, 0.01, 0.1, 0.0, True),
+        (0.0, Case.BINDING, 0.01, 0.1, 1e-6, False),
+        # The trust region and numbers that are none.
+        (-0.5, Case.BINDING, 0.021, 0.1, 0.0, False),
+        (-0.5, Case.BINDING, np.nan, 0.1, 0.0, False),
+        (-0.5, Case.BINDING, 0.01, np.nan, 0.0, False),
+        (0.5, Case.LOST, 0.01, 0.1, np.nan, False),
+    ],
+)
+def test_line_search_test(
+    violation: float,
+    case: Case,
+    kl: float,
+    improvement: float,
+    cost_change: float,
+    accepted: bool,
+) -> None:
+    model = make(target_kl=0.02)
+    model.costs = CostEstimate(np.ones(1), 1.0, np.array([violation]))
+    model._case = case
+    assert model.accept(Trial(kl, improvement, np.array([cost_change]))) is accepted
+
+
+def test_cost_reduction_asks_for_less_cost() -> None:
+    model = make(cost_reduction=0.1)
+    model._case = Case.LOST
+    for violation, change, accepted in [
+        (0.5, -0.2, True),
+        (0.5, -0.05, False),
+        (0.02, -0.03, True),
+    ]:
+        model.costs = CostEstimate(np.ones(1), 1.0, np.array([violation]))
+        assert model.accept(Trial(0.01, 0.0, np.array([change]))) is accepted
+
+
+@pytest.mark.parametrize("limit", [0.0, 1.0, 3.0, 100.0])
+def test_the_step_solves_the_linearised_problem(limit: float) -> None:
+    """Within the region, and within the limit wherever the region reaches it."""
+    model = make(cost_limit=limit, cg_max_steps=60)
+    seen = []
+    step = model.step
+
+    def spy(region: Any) -> th.Tensor:
+        x = step(region)
+        reach = float(region.product(x) @ x) / (2 * region.delta)
+        seen.append((model._case, region.violation + (region.cost_gradients @ x).numpy(), reach))
+        return x
+
+    model.step = spy  # type: ignore[method-assign]
+    model.learn(2000)
+    assert len(seen) == 5
+    for case, residual, reach in seen:
+        assert reach <= 1.01
+        if case is not Case.LOST:
+            assert residual[0] <= 1e-4
+
+
+def test_violation_is_in_units_of_the_cost_surrogate() -> None:
+    """(J_C - d) / T, from the episodes that ended in this rollout and no others."""
+    model = make(lambda: CostPoint(episode_length=40), n_steps=100, cost_limit=0.7)
+    episodes: list[list[float]] = []
+
+    def record(local: dict, _: dict) -> bool:
+        for i, info in enumerate(local["infos"]):
+            while len(episodes) <= i:
+                episodes.append([])
+            episodes[i].append(info["cost"])
+        return True
+
+    estimates = []
+    train = model.train
+
+    def spy() -> None:
+        estimates.append(model.costs)
+        train()
+
+    model.train = spy  # type: ignore[method-assign]
+    model.learn(800, callback=record)
+    costs = np.array(episodes)  # [n_envs, 200]
+    first = costs[:, :80].reshape(4, 2, 40).sum(axis=2)
+    second = costs[:, 80:200].reshape(4, 3, 40).sum(axis=2)
+    for estimate, ended in zip(estimates, (first, second), strict=True):
+        assert estimate.horizon == 40
+        assert estimate.episode_cost[0] == pytest.approx(ended.mean(), rel=1e-6)
+        assert estimate.violation[0] == pytest.approx((ended.mean() - 0.7) / 40, rel=1e-6)
+    assert model.total_cost == pytest.approx(costs.sum(), rel=1e-6)
+    np.testing.assert_allclose(model.running_costs[:, 0], 0.0, atol=1e-12)
+
+
+def test_before_any_episode_ends_the_stated_length_counts() -> None:
+    model = make(lambda: TimeLimit(CostPoint(episode_length=10**6), 500), n_steps=10)
+    model.env.envs[0].spec = None
+    env = make_vec_env(lambda: CostPoint(episode_length=10**6), 1)
+    model = CPO("MlpPolicy", env, n_steps=20, cost_limit=0.5, n_critic_updates=1, seed=0)
+
+    class Spec:
+        max_episode_steps = 500
+
+    env.envs[0].unwrapped.spec = Spec()
+    model.learn(20)
+    assert model.costs is not None
+    rate = model.rollout_buffer.costs.mean()
+    assert model.costs.horizon == 500
+    assert model.costs.violation[0] == pytest.approx(rate - 0.5 / 500, rel=1e-5)
+
+
+def test_without_a_stated_length_the_longest_episode_counts_and_one_warning_says_so() -> None:
+    env = make_vec_env(lambda: CostPoint(episode_length=10**6), 1)
+    model = CPO("MlpPolicy", env, n_steps=20, n_critic_updates=1, seed=0)
+    with pytest.warns(UserWarning, match="no episode has ended yet") as record:
+        model.learn(60)
+    assert len([w for w in record if "no episode" in str(w.message)]) == 1
+    assert model.costs is not None and model.costs.horizon == 20
+
+
+def test_the_horizon_outlives_a_rollout_in_which_nothing_ends() -> None:
+    model = make(lambda: CostPoint(episode_length=30), n_envs=1, n_steps=20)
+    model.learn(60)
+    assert model.costs is not None and model.costs.horizon == 30
+
+
+@pytest.mark.parametrize("cost_scale", [0.0, 1.0])
+@pytest.mark.parametrize("limit", [0.0, 5.0])
+def test_finite_wherever_nothing_is_at_stake(cost_scale: float, limit: float) -> None:
+    """d = 0, no cost ever, c = 0 and b = 0: parameters and logs stay numbers, learning goes on."""
+    model = make(lambda: CostPoint(cost_scale=cost_scale), cost_limit=limit)
+    before = [p.detach().clone() for p in model.policy.parameters()]
+    model.learn(1200)
+    for old, new in zip(before, model.policy.parameters(), strict=True):
+        assert th.isfinite(new).all() and not th.equal(old, new)
+    logged = model.logger.name_to_value
+    numbers = [value for value in logged.values() if isinstance(value, int | float)]
+    assert np.isfinite(numbers).all(), logged
+
+
+def test_without_cost_it_takes_trpos_steps() -> None:
+    """Cost identically zero, and a fresh critic that says so: the natural step, in full."""
+    steps = []
+    for cls in (TRPO, CPO):
+        env = make_vec_env(lambda: CostPoint(cost_scale=0.0), 2, seed=0)
+        model = cls("MlpPolicy", env, n_steps=100, n_critic_updates=1, seed=0)
+        if cls is CPO:
+            th.nn.init.zeros_(model.cost_critic.value_net.weight)
+            th.nn.init.zeros_(model.cost_critic.value_net.bias)
+            th.manual_seed(0)
+        else:
+            th.manual_seed(0)
+        step = model.step
+        model.step = lambda region, step=step: steps.append(step(region)) or steps[-1]
+        model.learn(200)
+        if cls is CPO:
+            assert model._case is Case.NO_GRADIENT
+    assert len(steps) == 2
+    th.testing.assert_close(steps[0], steps[1])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_bandit_ends_at_the_constrained_optimum(seed: int) -> None:
+    bandit = LinearCostBandit()
+    limit = 0.5
+    env = make_vec_env(LinearCostBandit, 8, seed=seed)
+    model = CPO(
+        "MlpPolicy",
+        env,
+        n_steps=64,
+        cost_limit=limit,
+        target_kl=0.05,
+        n_critic_updates=10,
+        seed=seed,
+        policy_kwargs={"net_arch": [8], "log_std_init": -1.0},
+    ).learn(512 * 60)
+    action, _ = model.predict(np.ones((1, 1), np.float32), deterministic=True)
+    assert float(bandit.normal @ action[0]) + bandit.offset <= 1.05 * limit
+    np.testing.assert_allclose(action[0], bandit.optimum(limit), atol=0.08)
+
+
+def test_several_costs_have_their_own_logs_and_limits() -> None:
+    model = make(lambda: CostPoint(cost_keys=KEYS), cost_keys=KEYS, cost_limit=[1.0, 100.0])
+    model.learn(400)
+    logged = model.logger.name_to_value
+    for name in ("train/nu", "train/constraint_violation", "train/cost_surrogate"):
+        assert {f"{name}/{key}" for key in KEYS} <= set(logged)
+    assert model.costs is not None
+    np.testing.assert_allclose(model.costs.episode_cost[1], 2 * model.costs.episode_cost[0])
+    violations = [logged[f"train/constraint_violation/{key}"] for key in KEYS]
+    np.testing.assert_allclose(
+        violations, model.costs.episode_cost - np.array([1.0, 100.0]), rtol=1e-6
+    )
+    assert model.cost_critic.predict(th.zeros(3, 4)).shape == (3, 2)

@@ -1,0 +1,164 @@
+"""Whole episodes, counted fairly, with an honest interval."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_guard.algorithms import CPO
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy
+from sb3_guard.common.monitor import CostMonitor
+
+
+class Fixed(gym.Env):
+    """Episodes of a given length, reward 1 a step; the k-th step costs 10 k."""
+
+    def __init__(self, length: int) -> None:
+        self.observation_space = spaces.Box(-1, 1, (1,), np.float32)
+        self.action_space = spaces.Discrete(2)
+        self.length, self.k = length, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.k = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.k += 1
+        over = self.k == self.length
+        info = {"cost": 10.0 * self.k, "is_success": self.length == 1}
+        return np.zeros(1, np.float32), 1.0, over, False, info
+
+
+class Idle:
+    """A policy that does nothing, and remembers what it was given."""
+
+    def __init__(self, acts_on_cost: bool = False) -> None:
+        self.acts_on_cost = acts_on_cost
+        self.states: list = []
+        self.starts: list = []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        self.states.append(state)
+        self.starts.append(episode_start.copy())
+        return np.zeros(len(observation), int), "memory"
+
+
+def fixed(*lengths: int) -> DummyVecEnv:
+    return DummyVecEnv([lambda length=length: Fixed(length) for length in lengths])
+
+
+def test_short_episodes_get_no_more_than_their_share():
+    # Taking the first six episodes that end would take five of length 1.
+    result = evaluate_policy(Idle(), fixed(1, 5), n_eval_episodes=6)
+    assert sorted(result.lengths.tolist()) == [1, 1, 1, 5, 5, 5]
+
+
+def test_sums_by_hand():
+    result = evaluate_policy(Idle(), fixed(3), n_eval_episodes=2)
+    assert result.returns.tolist() == [3, 3]
+    assert result.costs.tolist() == [60, 60]
+    assert result.key_costs.tolist() == [[60], [60]]
+    assert result.successes.tolist() == [False, False]
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 3, 7])
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_as_many_episodes_as_asked(episodes, rows):
+    assert len(evaluate_policy(Idle(), fixed(*[2] * rows), n_eval_episodes=episodes)) == episodes
+
+
+def test_single_environment():
+    assert evaluate_policy(Idle(), Fixed(4), n_eval_episodes=1).lengths.tolist() == [4]
+
+
+def test_stops_after_max_steps():
+    result = evaluate_policy(Idle(), fixed(2, 5), n_eval_episodes=100, max_steps=4)
+    assert result.lengths.tolist() == [2, 2]
+
+
+def test_callbacks():
+    steps, episodes = [], []
+    evaluate_policy(
+        Idle(),
+        fixed(2),
+        n_eval_episodes=2,
+        on_step=lambda: steps.append(1),
+        on_episode=lambda *outcome: episodes.append(outcome),
+    )
+    assert len(steps) == 4
+    assert episodes == [(2.0, 30.0, 2)] * 2
+
+
+def test_nonsense_number_of_episodes():
+    with pytest.raises(ValueError, match="n_eval_episodes must be at least 1, not 0"):
+        evaluate_policy(Idle(), fixed(1), n_eval_episodes=0)
+
+
+def test_a_policy_that_acts_on_costs_gets_the_last_ones():
+    model = Idle(acts_on_cost=True)
+    evaluate_policy(model, fixed(2, 3), n_eval_episodes=4)
+    seen = [state[0][:, 0].tolist() for state in model.states]
+    # Row 0 starts anew at steps 2 and 4, row 1 at step 3: no cost then.
+    assert seen[:5] == [[0, 0], [10, 10], [0, 20], [10, 0], [0, 10]]
+
+
+def test_other_policies_keep_their_own_state_and_see_where_episodes_start():
+    model = Idle()
+    evaluate_policy(model, fixed(2), n_eval_episodes=2)
+    assert model.states == [None, "memory", "memory", "memory"]
+    assert [one[0] for one in model.starts] == [True, False, True, False]
+
+
+def test_reward_normalisation_does_not_show_through_a_monitor():
+    env = VecNormalize(CostMonitor(fixed(3)))
+    assert evaluate_policy(Idle(), env, n_eval_episodes=2).returns.tolist() == [3, 3]
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_seeded_evaluation_repeats_and_leaves_training_alone(deterministic):
+    env = CostMonitor(DummyVecEnv([lambda: CostPoint(episode_length=10)] * 2))
+    model = CPO("MlpPolicy", env, n_steps=20, seed=1)
+    before = th.get_rng_state()
+    first = evaluate_policy(model, env, 4, deterministic, seed=7)
+    assert th.equal(before, th.get_rng_state())
+    th.rand(3)
+    again = evaluate_policy(model, env, 4, deterministic, seed=7)
+    other = evaluate_policy(model, env, 4, deterministic, seed=8)
+    np.testing.assert_array_equal(first.returns, again.returns)
+    np.testing.assert_array_equal(first.costs, again.costs)
+    assert not np.array_equal(first.returns, other.returns)
+
+
+def evaluation(values) -> Evaluation:
+    values = np.asarray(values, float)
+    return Evaluation(values, values, values, values[:, None])
+
+
+def test_estimate_by_hand():
+    mean, std, low, high = evaluation([1, 3]).estimate(np.array([1.0, 3.0]))
+    assert (mean, std) == (2.0, 1.0)
+    # Of two values a resample has mean 1, 2 or 3, with probabilities 1/4, 1/2, 1/4.
+    assert (low, high) == (1.0, 3.0)
+    same = evaluation([2, 2, 2]).estimate(np.full(3, 2.0))
+    assert same == (2.0, 0.0, 2.0, 2.0)
+
+
+def test_no_interval_from_one_episode_and_nothing_from_none():
+    one = evaluation([2.0]).estimate(np.array([2.0]))
+    assert one.mean == 2.0 and np.isnan(one.low) and np.isnan(one.high)
+    assert all(np.isnan(evaluation([]).estimate(np.zeros(0))))
+
+
+def test_interval_covers_the_mean_about_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    samples = rng.normal(5.0, 2.0, (400, 30))
+    hits = 0
+    for sample in samples:
+        _, _, low, high = evaluation(sample).estimate(sample, resamples=400)
+        hits += low <= 5.0 <= high
+    # Percentile intervals of 30 values cover a little less than 95 %.
+    assert 0.90 <= hits / len(samples) <= 0.97

@@ -1,0 +1,272 @@
+"""The step's linear algebra against direct solves and an independent optimiser."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch as th
+from scipy.optimize import minimize
+
+from sb3_guard.algorithms.common.natural_gradient import (
+    Case,
+    Step,
+    assign,
+    conjugate_gradient,
+    constrained_step,
+    flatten,
+    unflatten,
+)
+
+
+def _definite(rng: np.random.Generator, size: int) -> np.ndarray:
+    root = rng.normal(size=(size, size))
+    return root @ root.T + 0.3 * np.eye(size)
+
+
+def test_flat_round_trip() -> None:
+    tensors = [th.randn(2, 3), th.randn(4), th.randn(1, 1)]
+    vector = flatten(tensors)
+    assert vector.shape == (11,)
+    for piece, tensor in zip(unflatten(vector, tensors), tensors, strict=True):
+        th.testing.assert_close(piece, tensor, rtol=0, atol=0)
+    parameters = [th.nn.Parameter(th.zeros_like(tensor)) for tensor in tensors]
+    assign(parameters, vector)
+    th.testing.assert_close(flatten(parameters).detach(), vector, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("size", [1, 5, 40])
+def test_conjugate_gradient_equals_direct_solve(size: int) -> None:
+    rng = np.random.default_rng(size)
+    F, b = th.as_tensor(_definite(rng, size)), th.as_tensor(rng.normal(size=size))
+    x = conjugate_gradient(lambda vector: F @ vector, b, max_steps=10 * size, tolerance=1e-24)
+    th.testing.assert_close(x, th.linalg.solve(F, b), rtol=1e-8, atol=1e-8)
+
+
+def test_conjugate_gradient_stopped_early_still_knows_its_length() -> None:
+    rng = np.random.default_rng(0)
+    F, b = th.as_tensor(_definite(rng, 30)), th.as_tensor(rng.normal(size=30))
+    x = conjugate_gradient(lambda vector: F @ vector, b, max_steps=4)
+    assert float(x @ F @ x) == pytest.approx(float(b @ x), rel=1e-10)
+    again = conjugate_gradient(lambda vector: F @ vector, b, max_steps=4)
+    assert th.equal(x, again)
+
+
+def test_conjugate_gradient_of_nothing() -> None:
+    calls: list[int] = []
+
+    def product(vector: th.Tensor) -> th.Tensor:
+        calls.append(1)
+        return vector
+
+    assert not conjugate_gradient(product, th.zeros(3), 10).any() and not calls
+
+
+class Problem:
+    """A random step problem, and what an optimiser that knows none of our algebra says of it.
+
+    :param ratios: violation of each constraint as a share of what the trust region can change
+    """
+
+    def __init__(self, rng: np.random.Generator, ratios: np.ndarray, size: int = 6) -> None:
+        self.F = _definite(rng, size)
+        self.g = rng.normal(size=size)
+        self.B = rng.normal(size=(len(ratios), size))
+        self.delta = 10 ** rng.uniform(-3, -1)
+        self.inverse = np.linalg.inv(self.F)
+        reach = np.sqrt(2 * self.delta * np.einsum("ij,jk,ik->i", self.B, self.inverse, self.B))
+        self.c = reach * ratios
+
+    def solve(self) -> Step:
+        tensors = (self.g, self.B, self.inverse @ self.g, self.B @ self.inverse)
+        g, B, v, W = map(th.as_tensor, tensors)
+        return constrained_step(g, B, self.c, v, W, self.delta)
+
+    def reference(self, rng: np.random.Generator, lost: bool) -> float:
+        """The optimal value found by SLSQP in coordinates where the trust region is a unit ball."""
+        radius = np.sqrt(2 * self.delta)
+        root = np.linalg.inv(np.linalg.cholesky(self.F)).T * radius  # x = root @ y
+        g, B = self.g @ root, self.B @ root
+        scale = np.abs(B).max()
+        constraints = [{"type": "ineq", "fun": lambda y: 1 - y @ y, "jac": lambda y: -2 * y}]
+        if lost:
+
+            def objective(y: np.ndarray) -> tuple[float, np.ndarray]:
+                excess = np.maximum(0.0, (self.c + B @ y) / scale)
+                return float(excess @ excess), 2 * (B / scale).T @ excess
+
+        else:
+
+            def objective(y: np.ndarray) -> tuple[float, np.ndarray]:
+                return -float(g @ y) / np.linalg.norm(g), -g / np.linalg.norm(g)
+
+            constraints.append(
+                {
+                    "type": "ineq",
+                    "fun": lambda y: -(self.c + B @ y) / scale,
+                    "jac": lambda y: -B / scale,
+                }
+            )
+        # Near a constraint that only touches the ball, a start can strand: take the best of some.
+        values = []
+        for _ in range(6):
+            start = 0.3 * rng.normal(size=len(g))
+            answer = minimize(
+                objective,
+                start,
+                jac=True,
+                constraints=constraints,
+                method="SLSQP",
+                options={"ftol": 1e-13, "maxiter": 300},
+            )
+            y = answer.x
+            if y @ y <= 1 + 1e-7 and (lost or np.all((self.c + B @ y) / scale <= 1e-7)):
+                values.append(float(answer.fun))
+                if answer.success:
+                    break
+        assert values, "the reference found no feasible point"
+        return min(values)
+
+    def check(self, rng: np.random.Generator) -> Case:
+        step = self.solve()
+        x, lost = step.x.numpy(), step.case is Case.LOST
+        assert 0.5 * x @ self.F @ x <= self.delta * (1 + 1e-8)
+        radius = np.sqrt(2 * self.delta)
+        root = np.linalg.inv(np.linalg.cholesky(self.F)).T * radius
+        scale = np.abs(self.B @ root).max()
+        if lost:
+            value = float(np.sum(np.maximum(0.0, (self.c + self.B @ x) / scale) ** 2))
+            assert value > 0.0
+        else:
+            assert np.all((self.c + self.B @ x) / scale <= 1e-7)
+            value = -float(self.g @ x) / np.linalg.norm(self.g @ root)
+            # The multipliers explain the step: g = λ F x + Bᵀν with ν ≥ 0.
+            assert np.all(step.nu >= 0.0)
+            gap = self.g - step.lambda_kl * self.F @ x - self.B.T @ step.nu
+            assert np.linalg.norm(gap) <= 1e-6 * (
+                np.linalg.norm(self.g) + np.linalg.norm(self.B.T @ step.nu)
+            )
+        assert value <= self.reference(rng, lost) + 1e-6
+        return step.case
+
+
+def _ratios(case: Case, m: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    low, high = {
+        Case.INACTIVE: (-3.0, -1.01),
+        Case.BINDING: (-0.99, -0.01),
+        Case.RECOVERABLE: (0.01, 0.99),
+        Case.LOST: (1.01, 3.0),
+    }[case]
+    while True:
+        ratios = rng.uniform(-1.5, 1.5, size=m)
+        ratios[rng.integers(m)] = rng.uniform(low, high)
+        if case in (Case.INACTIVE, Case.BINDING):
+            ratios = -np.abs(ratios)
+        if case is Case.INACTIVE:
+            ratios = np.minimum(ratios, rng.uniform(low, high, size=m))
+        yield ratios
+
+
+@pytest.mark.parametrize("case", [Case.INACTIVE, Case.BINDING, Case.RECOVERABLE, Case.LOST])
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_constrained_step_against_an_optimiser(case: Case, m: int) -> None:
+    """Five hundred random problems per case and number of constraints."""
+    rng = np.random.default_rng(100 * m + case)
+    wanted, seen = 500, Counter[Case]()
+    for ratios in _ratios(case, m, rng):
+        problem = Problem(rng, ratios)
+        # With several constraints the geometry decides: keep drawing until the case comes up.
+        if problem.solve().case is case:
+            problem.check(rng)
+            seen[case] += 1
+        else:
+            assert m > 1, f"{ratios} is not {case.name}"
+        if seen[case] == wanted:
+            break
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_constrained_step_on_the_boundary(m: int) -> None:
+    """c = 0 exactly, the usual state at cost_limit = 0: feasible, and the boundary binds."""
+    rng = np.random.default_rng(m)
+    for _ in range(500):
+        assert Problem(rng, np.zeros(m)).check(rng) is Case.BINDING
+
+
+@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize("c", [-0.5, 0.0])
+def test_without_cost_gradient_a_feasible_policy_takes_the_trpo_step(m: int, c: float) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        problem = Problem(rng, np.zeros(m))
+        problem.B[:], problem.c[:] = 0.0, c
+        step = problem.solve()
+        v = problem.inverse @ problem.g
+        expected = np.sqrt(2 * problem.delta / (problem.g @ v)) * v
+        np.testing.assert_allclose(step.x.numpy(), expected, rtol=1e-10)
+        assert step.case is Case.NO_GRADIENT and not step.nu.any()
+        assert step.lambda_kl == pytest.approx(
+            np.sqrt(problem.g @ v / (2 * problem.delta)), rel=1e-10
+        )
+
+
+def test_without_cost_gradient_an_infeasible_policy_stays() -> None:
+    rng = np.random.default_rng(0)
+    problem = Problem(rng, np.array([1.0]))
+    problem.B[:] = 0.0
+    step = problem.solve()
+    assert step.case is Case.LOST and not step.x.any()
+
+
+def test_a_hopeless_constraint_does_not_stop_the_others() -> None:
+    """One violated constraint has no gradient; the other one is lowered as far as possible."""
+    rng = np.random.default_rng(0)
+    problem = Problem(rng, np.array([0.5, 1.5]))
+    problem.B[0] = 0.0
+    step = problem.solve()
+    w = problem.inverse @ problem.B[1]
+    expected = -np.sqrt(2 * problem.delta / (problem.B[1] @ w)) * w
+    assert step.case is Case.LOST
+    np.testing.assert_allclose(step.x.numpy(), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [-0.5, 0.0, 0.5, 1.5])
+def test_a_constraint_stated_twice_changes_nothing(ratio: float) -> None:
+    """m = 2 goes through the dual, m = 1 through the closed form: they agree."""
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        once = Problem(rng, np.array([ratio]))
+        single = once.solve()
+        once.B, once.c = np.repeat(once.B, 2, axis=0), np.repeat(once.c, 2)
+        double = once.solve()
+        assert single.case is double.case
+        np.testing.assert_allclose(double.x.numpy(), single.x.numpy(), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize("ratio", [-0.5, 0.0, 0.5, 1.5])
+def test_without_reward_gradient_the_step_is_recovery(m: int, ratio: float) -> None:
+    rng = np.random.default_rng(4)
+    problem = Problem(rng, np.full(m, ratio))
+    problem.g[:] = 0.0
+    x = problem.solve().x.numpy()
+    assert np.isfinite(x).all()
+    if ratio <= 0.0:
+        assert not x.any()
+    else:
+        assert np.all(problem.B @ x < 0.0) or m > 1
+        assert np.sum(np.maximum(0, problem.c + problem.B @ x) ** 2) < np.sum(problem.c**2)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_parallel_gradients(sign: float) -> None:
+    """Reward along the cost: the boundary is as far as it goes, and nothing divides by zero."""
+    rng = np.random.default_rng(5)
+    problem = Problem(rng, np.array([-0.5]))
+    problem.g = sign * problem.B[0]
+    x = problem.solve().x.numpy()
+    reached = float(problem.B[0] @ x)
+    if sign > 0:
+        assert reached == pytest.approx(-problem.c[0], rel=1e-8)
+    else:
+        assert 0.5 * x @ problem.F @ x == pytest.approx(problem.delta, rel=1e-8)

@@ -1,0 +1,169 @@
+"""Run folders: numbered, whole, and owned by one process."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+import yaml
+from huggingface_sb3 import EnvironmentName
+from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
+
+from sb3_guard.common.files import replacing
+from sb3_guard.zoo.logger import ProgressCSV, RunLogger
+from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run
+from sb3_guard.zoo.usage import UsageError
+
+
+def create(tmp_path, env_id="Goal_Point_8Hazards-v0", **kwargs) -> RunFolder:
+    args = {"algo": "cpo", "env": env_id, "env_kwargs": None}
+    return RunFolder.create(
+        str(tmp_path), "cpo", env_id, args, {"n_steps": 5, "normalize": True}, "train me", **kwargs
+    )
+
+
+def test_numbers_go_up_and_belong_to_one_environment(tmp_path):
+    names = [create(tmp_path).path.name for _ in range(3)]
+    assert names == [f"Goal_Point_8Hazards-v0_{k}" for k in (1, 2, 3)]
+    assert create(tmp_path, "Goal-v0").path.name == "Goal-v0_1"
+    assert create(tmp_path, unique=True).path.name.startswith("Goal_Point_8Hazards-v0_4_")
+    assert latest_run(tmp_path / "cpo", "Goal_Point_8Hazards-v0") == 3
+
+
+def test_a_number_taken_meanwhile_is_passed_over(tmp_path, monkeypatch):
+    create(tmp_path)
+    monkeypatch.setattr("sb3_guard.zoo.run_folder.latest_run", lambda *_: 0)
+    assert create(tmp_path).path.name.endswith("_2")
+
+
+@pytest.mark.parametrize("env_id", ["A-v0", "package:A-v0", "space/A-v0"])
+def test_names_are_rl_zoos(env_id):
+    assert folder_name(env_id) == EnvironmentName(env_id)
+
+
+def test_rl_zoo_reads_it(tmp_path):
+    run = create(tmp_path)
+    assert get_latest_run_id(str(tmp_path / "cpo"), run.name) == 1
+    values, _ = get_saved_hyperparams(str(run.params), test_mode=True)
+    assert values["n_steps"] == 5 and values["normalize"] is True
+    assert yaml.safe_load((run.params / "args.yml").read_text())["algo"] == "cpo"
+    assert (run.params / "command.txt").read_text() == "train me"
+
+
+def test_found_again_by_folder_and_by_checkpoint(tmp_path):
+    run = create(tmp_path)
+    run.checkpoint.touch()
+    for path in (run.path, run.checkpoint):
+        again = RunFolder.open(path)
+        assert (again.path, again.name) == (run.path, run.name)
+    assert again.args()["env"] == "Goal_Point_8Hazards-v0"
+    assert again.hyperparams() == {"n_steps": 5, "normalize": True}
+
+
+def test_not_a_run(tmp_path):
+    with pytest.raises(UsageError, match="is not a run folder"):
+        RunFolder.open(tmp_path)
+    with pytest.raises(UsageError, match="there is no run folder or file"):
+        RunFolder.open(tmp_path / "absent")
+
+
+@pytest.mark.parametrize("content", ["a: [", "just text"])
+def test_damaged_config(tmp_path, content):
+    run = create(tmp_path)
+    (run.params / "config.yml").write_text(content)
+    with pytest.raises(UsageError, match=r"config\.yml"):
+        run.hyperparams()
+
+
+def test_log_folder_that_can_not_be(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="can't write to log folder .* choose another with -f"):
+        create(tmp_path / "file")
+
+
+def test_one_owner_at_a_time(tmp_path):
+    run = create(tmp_path)
+    with run.owned():
+        with pytest.raises(UsageError, match=f"in use by process {os.getpid()} on"), run.owned():
+            pass
+    with run.owned():
+        pass
+
+
+def test_a_dead_owner_is_succeeded(tmp_path):
+    run = create(tmp_path)
+    script = (
+        "import os, pathlib, signal\n"
+        "from sb3_guard.zoo.run_folder import RunFolder\n"
+        f"with RunFolder(pathlib.Path({str(run.path)!r})).owned():\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == -9
+    assert json.loads((run.path / ".lock").read_text())["pid"] != os.getpid()
+    with run.owned():
+        assert json.loads((run.path / ".lock").read_text())["pid"] == os.getpid()
+
+
+def test_an_owner_elsewhere_may_be_alive(tmp_path):
+    run = create(tmp_path)
+    (run.path / ".lock").write_text(json.dumps({"host": "elsewhere", "pid": 1}))
+    with pytest.raises(UsageError, match="process 1 on elsewhere; if that is gone, remove"):
+        with run.owned():
+            pass
+    (run.path / ".lock").write_text(json.dumps({"host": socket.gethostname(), "pid": 1}))
+    with run.owned():
+        pass
+
+
+def test_files_appear_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "file"
+    with replacing(path) as file:
+        file.write(b"old")
+        assert not path.exists()
+    with pytest.raises(RuntimeError), replacing(path) as file:
+        file.write(b"half of the n")
+        raise RuntimeError
+    assert path.read_bytes() == b"old"
+    assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def rows(path) -> list[str]:
+    return (path / "progress.csv").read_text().splitlines()
+
+
+def test_progress_goes_on_where_it_was(tmp_path):
+    logger = RunLogger(tmp_path)
+    for k in range(3):
+        logger.record("a", k)
+        logger.dump(k)
+    logger.record("pending", 7)
+    state = logger.state(iterations=3)
+    logger.record("b", 9)
+    logger.dump(4)  # dropped
+    logger.close()
+
+    again = RunLogger(tmp_path, state=state)
+    again.record("a", 10)
+    again.record("time/iterations", 1)
+    again.dump(5)
+    again.close()
+    header, *lines = rows(tmp_path)
+    table = [dict(zip(header.split(","), line.split(","), strict=True)) for line in lines]
+    assert [row["a"] for row in table] == ["0", "1", "2", "10"]
+    assert (table[-1]["pending"], table[-1]["time/iterations"], table[-1]["b"]) == ("7", "4", "")
+
+
+def test_progress_of_no_rows_begins_anew(tmp_path):
+    logger = RunLogger(tmp_path)
+    state = logger.state(iterations=0)
+    logger.record("a", 1)
+    logger.dump()
+    logger.close()
+    again = RunLogger(tmp_path, state=state)
+    again.record("b", 2)
+    again.dump()
+    again.close()
+    assert rows(tmp_path) == ["b", "2"]
+    assert ProgressCSV(tmp_path / "progress.csv", rows=1).keys == ["b"]

@@ -158,10 +158,10 @@ class CostPoint(gym.Env):
     :param terminate: end episodes by ``terminated`` instead of ``truncated``
     :param cost_scale: multiplies the cost; 0 gives an env that never costs anything
     :param cost_keys: names under which ``info`` reports it; the i-th is (i + 1) times the first
+    :param hazard: centre of the hazard; episodes start near (-1, 0)
     """
 
     goal = np.array([1.0, 0.0])
-    hazard = np.array([0.0, 0.0])
     hazard_radius = 0.6
 
     def __init__(
@@ -170,7 +170,9 @@ class CostPoint(gym.Env):
         terminate: bool = False,
         cost_scale: float = 1.0,
         cost_keys: Sequence[str] = ("cost",),
+        hazard: Sequence[float] = (0.0, 0.0),
     ) -> None:
+        self.hazard = np.asarray(hazard, dtype=np.float64)
         self.episode_length = episode_length
         self.terminate = terminate
         self.cost_scale = cost_scale

@@ -67,7 +67,10 @@ def test_several_costs_each_have_their_limit():
 def test_unconstrained_algorithms_are_judged_by_return():
     judge = callback(cost_limit=0.0, constrained=False)
     assert judge.score(evaluation(7.0, 1e9)) == (True, 7.0)
-    assert callback(5.0, cost_limit=0.0, constrained=False).score(evaluation(7.0, 9.0)) == (False, -4)
+    assert callback(5.0, cost_limit=0.0, constrained=False).score(evaluation(7.0, 9.0)) == (
+        False,
+        -4,
+    )
 
 
 def learn(tmp_path, algorithm=CPO, evaluate=True, env=None, steps=120, **kwargs):

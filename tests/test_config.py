@@ -80,7 +80,10 @@ def checked(**values):
 def test_arguments_are_the_leafs_and_the_bases():
     names = arguments(CPO)
     assert {"cost_reduction", "target_kl", "n_steps", "policy_kwargs"} <= names.keys()
-    assert not {"env", "seed", "device", "verbose", "self", "kwargs", "_init_setup_model"} & names.keys()
+    assert (
+        not {"env", "seed", "device", "verbose", "self", "kwargs", "_init_setup_model"}
+        & names.keys()
+    )
 
 
 @pytest.mark.parametrize(
@@ -143,7 +146,9 @@ def test_values_of_the_wrong_type(name, value, allowed):
     ("name", "near"), [("n_step", "n_steps"), ("costlimit", "cost_limit"), ("Gamma", "gamma")]
 )
 def test_unknown_name_suggests_the_nearest(name, near):
-    with pytest.raises(UsageError, match=f"cpo has no hyper-parameter '{name}'; did you mean '{near}'"):
+    with pytest.raises(
+        UsageError, match=f"cpo has no hyper-parameter '{name}'; did you mean '{near}'"
+    ):
         checked(**{name: 1})
 
 

@@ -2,11 +2,11 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from cost_envs import CostPoint, LinearCostBandit
-from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_guard.algorithms import CPO, TRPO
@@ -126,20 +126,18 @@ def test_violation_is_in_units_of_the_cost_surrogate() -> None:
 
 
 def test_before_any_episode_ends_the_stated_length_counts() -> None:
-    model = make(lambda: TimeLimit(CostPoint(episode_length=10**6), 500), n_steps=10)
-    model.env.envs[0].spec = None
-    env = make_vec_env(lambda: CostPoint(episode_length=10**6), 1)
-    model = CPO("MlpPolicy", env, n_steps=20, cost_limit=0.5, n_critic_updates=1, seed=0)
-
-    class Spec:
-        max_episode_steps = 500
-
-    env.envs[0].unwrapped.spec = Spec()
-    model.learn(20)
-    assert model.costs is not None
-    rate = model.rollout_buffer.costs.mean()
-    assert model.costs.horizon == 500
-    assert model.costs.violation[0] == pytest.approx(rate - 0.5 / 500, rel=1e-5)
+    spec = gym.envs.registration.EnvSpec(
+        "CostPoint-v0", lambda: CostPoint(10**6, hazard=(-1, 0)), max_episode_steps=500
+    )
+    env = make_vec_env(lambda: gym.make(spec), 2, seed=0)
+    model = CPO("MlpPolicy", env, n_steps=200, cost_limit=0.5, n_critic_updates=1, seed=0)
+    rates = []
+    train = model.train
+    model.train = lambda: rates.append(model.rollout_buffer.costs.mean()) or train()
+    model.learn(400)
+    assert model.costs is not None and model.costs.horizon == 500 and rates[0] > 0.0
+    assert model.costs.violation[0] == pytest.approx(rates[0] - 0.5 / 500, rel=1e-5)
+    assert model.costs.episode_cost[0] == pytest.approx(500 * rates[0], rel=1e-5)
 
 
 def test_without_a_stated_length_the_longest_episode_counts_and_one_warning_says_so() -> None:
@@ -148,13 +146,17 @@ def test_without_a_stated_length_the_longest_episode_counts_and_one_warning_says
     with pytest.warns(UserWarning, match="no episode has ended yet") as record:
         model.learn(60)
     assert len([w for w in record if "no episode" in str(w.message)]) == 1
-    assert model.costs is not None and model.costs.horizon == 20
+    assert model.costs is not None and model.costs.horizon == 60
 
 
 def test_the_horizon_outlives_a_rollout_in_which_nothing_ends() -> None:
-    model = make(lambda: CostPoint(episode_length=30), n_envs=1, n_steps=20)
-    model.learn(60)
-    assert model.costs is not None and model.costs.horizon == 30
+    model = make(lambda: CostPoint(episode_length=30), n_envs=1, n_steps=25)
+    horizons = []
+    train = model.train
+    model.train = lambda: horizons.append(model.costs.horizon) or train()
+    with pytest.warns(UserWarning, match="no episode has ended yet"):
+        model.learn(125)
+    assert horizons == [25, 30, 30, 30, 30], "the fifth rollout sees steps 101 to 125: none ends"
 
 
 @pytest.mark.parametrize("cost_scale", [0.0, 1.0])

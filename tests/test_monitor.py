@@ -134,7 +134,9 @@ def test_continues_from_its_state(tmp_path):
     play(first, 5)  # these rows come to nothing
     first.close()
 
-    second = CostMonitor(DummyVecEnv([lambda: envs[0], lambda: envs[1]]), cost_keys=("cost", "heat"))
+    second = CostMonitor(
+        DummyVecEnv([lambda: envs[0], lambda: envs[1]]), cost_keys=("cost", "heat")
+    )
     second.restore(state)
     second.log_to(path, offset=state["offset"])
     after = play(second, 11)

@@ -115,7 +115,7 @@ class WorldSpec:
         world.add_camera(name="top", pos=[0, 0, 6.5], xyaxes=[1, 0, 0, 0, 1, 0], fovy=45)
 
     def feel(self, name: str, body: str) -> None:
-        """Count contacts between the robot and ``body``: sensor ``name``, 0 or 1.
+        """Count contacts between any part of the robot and ``body``; 0 if there are none.
 
         :param name: name of the sensor
         :param body: name of a body in the world
@@ -123,9 +123,9 @@ class WorldSpec:
         self.spec.add_sensor(
             name=name,
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_XBODY,
+            objtype=mujoco.mjtObj.mjOBJ_XBODY,  # in contact sensors: the body's whole subtree
             objname=self.robot.root,
-            reftype=mujoco.mjtObj.mjOBJ_XBODY,
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
             refname=body,
             intprm=[1, 0, 1],  # found, no reduction, one slot
         )

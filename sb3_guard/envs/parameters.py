@@ -109,7 +109,8 @@ class Parameters:
                 raise ValueError(f"{label} = {value!r} must be {_plain(hints[f.name])}")
             m = f.metadata
             if m.get("choices") is not None and value not in m["choices"]:
-                raise ValueError(f"{label} = {value!r}: {did_you_mean(value, m['choices'])}")
+                names = ["null" if c is None else str(c) for c in m["choices"]]
+                raise ValueError(f"{label} = {value!r}: {did_you_mean(value, names)}")
             numbers = value if isinstance(value, tuple) else (value,)
             for v in numbers:
                 if not isinstance(v, (int, float)):

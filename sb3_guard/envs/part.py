@@ -44,7 +44,7 @@ class World(Protocol):
     robot: Robot
 
     def feel(self, name: str, body: str) -> None:
-        """Add a contact sensor ``name`` that counts contacts of the robot with ``body``."""
+        """Add a sensor ``name`` of the robot's contacts with ``body``, 0 if there are none."""
 
 
 class Simulation(Protocol):
@@ -102,6 +102,8 @@ class Part(Parameters):
     space: str | None = None  # "planar" or "spatial"; None: the robot's workspace
     spaces: ClassVar[tuple[str, ...]] = ("planar", "spatial")
     planar: bool
+    height: tuple[float, float]  # m, range of z in space
+    solid: bool = False  # whether its objects are bodies that the robot bumps into
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
 
     def footprints(self) -> tuple[Footprint, ...]:
@@ -182,9 +184,9 @@ class Robot(Part):
 class Task(Part):
     """What the robot is rewarded for."""
 
-    interactive: ClassVar[bool]  # the taxonomy of the paper's task table
-    contact: ClassVar[bool]
-    targets: ClassVar[str]  # "one" or "many"
+    interactive: bool  # the taxonomy of the paper's task table
+    contact: bool
+    targets: str  # "one" or "many"
     bonus: float = 0.0  # reward for success, added after the dense reward is clipped
     ends: bool = False  # whether success ends the episode instead of drawing a new goal
 
@@ -204,12 +206,16 @@ class Task(Part):
         """Set the next goal in rows ``ids``; returns the rows, [n], where none could be placed."""
         return ids[:0]
 
+    def mistakes(self) -> Array:
+        """How many objects of the task are touched that should not be, [N]."""
+        return np.zeros(self.sim.num_envs)
+
 
 class Constraint(Part):
     """What the robot pays for."""
 
-    trespassable: ClassVar[bool]  # the taxonomy of the paper's constraint table
-    movable: ClassVar[str]  # "no", "passive" or "active"
+    trespassable: bool  # the taxonomy of the paper's constraint table
+    movable: str  # "no", "passive" or "active"
 
     def cost(self) -> Array:
         """The cost of this step, [N], at least 0."""

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from sb3_guard.envs.engine import Engine, Layout
 from sb3_guard.envs.parameters import did_you_mean
@@ -22,6 +24,15 @@ _ID = re.compile(
     r"_(?P<num>\d+)(?P<constraint>[A-Za-z][A-Za-z0-9]*)(?P<noconti>_noconti)?(-v0)?"
 )
 Params = Mapping[str, Any]
+
+
+def _plain(value: Any) -> Any:
+    """The same as JSON would give back: lists for tuples, dictionaries for mappings."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 @dataclass(frozen=True)
@@ -52,6 +63,8 @@ class Scenario:
             raise ValueError(f"unknown robot {self.robot!r}: {did_you_mean(self.robot, ROBOTS)}")
         if self.task not in TASKS:
             raise ValueError(f"unknown task {self.task!r}: {did_you_mean(self.task, TASKS)}")
+        for f in fields(self):
+            object.__setattr__(self, f.name, _plain(getattr(self, f.name)))
         self.parts()
 
     @classmethod
@@ -124,7 +137,7 @@ class Scenario:
 
         :raises ValueError: an unknown keyword or parameter
         """
-        fields: dict[str, Any] = {"constraints": dict(self.constraints)}
+        changes: dict[str, Any] = {"constraints": dict(self.constraints)}
         own = {
             "robot": "robot_params",
             self.task.lower(): "task_params",
@@ -141,16 +154,16 @@ class Scenario:
                 )
             if key in own:
                 name = own[key]
-                fields[name] = {**fields.get(name, getattr(self, name)), **(value or {})}
-            elif value is None and key in fields["constraints"]:
-                del fields["constraints"][key]
-            elif key in kinds or key in fields["constraints"] or (value and "type" in value):
-                old = fields["constraints"].get(key, {})
-                fields["constraints"][key] = {**old, **(value or {})}
+                changes[name] = {**changes.get(name, getattr(self, name)), **(value or {})}
+            elif value is None and key in changes["constraints"]:
+                del changes["constraints"][key]
+            elif key in kinds or key in changes["constraints"] or (value and "type" in value):
+                old = changes["constraints"].get(key, {})
+                changes["constraints"][key] = {**old, **(value or {})}
             else:
                 known = [*own, *sorted(kinds)]
                 raise ValueError(f"unknown parameter {key!r}: {did_you_mean(key, known)}")
-        return replace(self, **fields)
+        return replace(self, **changes)
 
     def parts(self) -> dict[str, Any]:
         """New, unbound parts: the keyword arguments of an :class:`Engine`."""

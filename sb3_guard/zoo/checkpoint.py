@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.common.files import replacing
@@ -125,6 +125,8 @@ class Checkpoints(BaseCallback):
             "generators": generators,
             "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
             "environments": environments,
+            # Seeded anew for each evaluation, but a wrapper may remember more than its episode.
+            "evaluation": [capture(env) for env in self._evaluation_envs()],
             "callbacks": [
                 (type(one).__name__, one.n_calls, one.state() if hasattr(one, "state") else None)
                 for one in self.others
@@ -146,6 +148,9 @@ class Checkpoints(BaseCallback):
             file.write(buffer.getvalue())
         self._last = time.monotonic()
 
+    def _evaluation_envs(self) -> list[VecEnv]:
+        return [one.eval_env for one in self.others if isinstance(one, EvalCallback)]
+
     def restore(self, state: dict[str, Any]) -> None:
         """Continue the counts of a checkpoint, here and in the other callbacks."""
         self.rollouts = state["rollouts"]
@@ -158,6 +163,9 @@ class Checkpoints(BaseCallback):
             one.n_calls = n_calls
             if own is not None:
                 one.restore(own)  # type: ignore[attr-defined]
+        for env, parts in zip(self._evaluation_envs(), state["evaluation"], strict=True):
+            env.reset()
+            restore(env, parts)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

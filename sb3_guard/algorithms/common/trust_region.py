@@ -329,10 +329,9 @@ class TrustRegion(OnPolicyAlgorithm):
                 raise ValueError(
                     f"{name}={value!r}: must be a number in {ends[0]}{low:g}, {high:g}{ends[1]}"
                 )
-        if not callable(self.learning_rate) and not self.learning_rate > 0.0:
-            raise ValueError(
-                f"learning_rate={self.learning_rate!r}: must be a positive number or a schedule"
-            )
+        rate = self.learning_rate
+        if not callable(rate) and not (isinstance(rate, int | float | np.number) and rate > 0.0):
+            raise ValueError(f"learning_rate={rate!r}: must be a positive number or a schedule")
         if self.missing_cost not in ("error", "zero"):
             raise ValueError(f"missing_cost={self.missing_cost!r}: must be 'error' or 'zero'")
         if (
@@ -576,15 +575,14 @@ class TrustRegion(OnPolicyAlgorithm):
     def _estimate_costs(self) -> CostEstimate:
         """J_C, T and the violations from the episodes that ended in this rollout."""
         if self._ended_costs:
-            self.horizon = float(np.mean(self._ended_lengths))
+            self.horizon = horizon = float(np.mean(self._ended_lengths))
             episode_cost = np.mean(self._ended_costs, axis=0)
         else:
-            if self.horizon is None:
-                self.horizon = self._horizon_before_any_episode()
+            horizon = self.horizon or self._horizon_before_any_episode()
             # Nothing ended: what an episode would cost at the rate of this rollout.
-            episode_cost = self.rollout_buffer.costs.mean(axis=(0, 1)) * self.horizon
-        violation = (episode_cost - self.cost_limits) / self.horizon
-        return CostEstimate(episode_cost, self.horizon, violation)
+            episode_cost = self.rollout_buffer.costs.mean(axis=(0, 1)) * horizon
+        violation = (episode_cost - self.cost_limits) / horizon
+        return CostEstimate(episode_cost, horizon, violation)
 
     def _horizon_before_any_episode(self) -> float:
         assert self.env is not None and self.running_lengths is not None

@@ -1,0 +1,40 @@
+"""Buttons: what must not be pressed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs.constraints.obstacles import Obstacles
+from sb3_guard.envs.objects import SPHERE
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array
+
+
+@dataclass
+class Buttons(Obstacles):
+    """Buttons that are all wrong to press (Ray et al. 2019).
+
+    Cost: the number touched, and the wrong buttons that a task of its own has (Button). With that
+    task, ``num=0`` makes its wrong buttons the only ones.
+    """
+
+    name = "buttons"
+    color = (1.0, 0.5, 0.1)
+    trespassable = False
+    movable = "no"
+    space = "planar"
+    spaces = ("planar",)
+    solid = True
+
+    size: float = param(0.1, "radius of a button, m", above=0)
+    keepout: float = param(0.3, "radius kept clear around a button, m", low=0)
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        self.add_geom(body, SPHERE, (self.size,), lift=self.size)
+
+    def amounts(self) -> Array:
+        own = super().amounts()
+        return np.column_stack([own, self.weight * self.sim.task.mistakes()])

@@ -1,0 +1,35 @@
+"""Ghosts: zones that come after the robot, or bodies that bump into it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sb3_guard.envs import motion
+from sb3_guard.envs.constraints.obstacles import Obstacles
+from sb3_guard.envs.objects import Movers
+from sb3_guard.envs.parameters import param
+
+
+@dataclass
+class Ghosts(Movers, Obstacles):
+    """Zones that follow the robot until they are within r1 of it (Zhao et al. 2024, §4.3).
+
+    Beyond r0 of the origin a ghost goes home at v0; else, beyond r1 of the robot, it comes at v1;
+    within r1 it waits. Cost: Σ max(0, size − distance) over the ghosts; of solid ones, the number
+    touched.
+    """
+
+    name = "ghosts"
+    color = (1.0, 0.1, 0.5)
+    trespassable = True
+    movable = "active"
+
+    v1: float | None = param(None, "speed towards the robot; null: speed", low=0)
+    r1: float = param(1.5, "distance to the robot at which they wait, m", low=0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.trespassable = not self.solid
+
+    def law(self) -> motion.Law:
+        return self._law(far=self.speed if self.v1 is None else self.v1, r1=self.r1)

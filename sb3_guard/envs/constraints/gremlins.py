@@ -1,0 +1,54 @@
+"""Gremlins: boxes that go round in circles whatever the robot does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs.constraints.obstacles import Obstacles
+from sb3_guard.envs.objects import BOX
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array, Generators, Simulation
+
+
+@dataclass
+class Gremlins(Obstacles):
+    """Boxes that circle around their places by the simulated clock (Ray et al. 2019).
+
+    At time t a gremlin is at travel · (sin ωt, cos ωt) from its place, and moves once per control
+    step. Cost: the number touched.
+    """
+
+    name = "gremlins"
+    color = (0.55, 0.1, 0.9)
+    trespassable = False
+    movable = "active"
+    space = "planar"
+    spaces = ("planar",)
+    solid = True
+    mover = True
+
+    size: float = param(0.1, "half of an edge, m", above=0)
+    keepout: float = param(0.5, "radius kept clear around the middle of a circle, m", low=0)
+    travel: float = param(0.3, "radius of the circles, m", low=0)
+    rate: float = param(1.0, "angular speed ω, rad per simulated second", low=0)
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        self.add_geom(body, BOX, (self.size, self.size, self.size), lift=self.size)
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self._time = sim.batch.bind("time")  # [N] s since the episode began
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        super().reset(ids, rngs)
+        self.before_step()
+
+    def before_step(self) -> None:
+        phase = self.rate * self._time
+        places = self.sim.places(self.group).copy()  # [N, num, 3]
+        places[..., 0] += (self.travel * np.sin(phase))[:, None]
+        places[..., 1] += (self.travel * np.cos(phase))[:, None]
+        self.bodies.move(places)

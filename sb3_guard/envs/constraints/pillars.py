@@ -1,0 +1,31 @@
+"""Pillars: columns that stand in the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+
+from sb3_guard.envs.constraints.obstacles import Obstacles
+from sb3_guard.envs.objects import CYLINDER
+from sb3_guard.envs.parameters import param
+
+
+@dataclass
+class Pillars(Obstacles):
+    """Columns that do not yield (Ray et al. 2019). Cost: the number touched."""
+
+    name = "pillars"
+    color = (0.5, 0.5, 1.0)
+    trespassable = False
+    movable = "no"
+    space = "planar"
+    spaces = ("planar",)
+    solid = True
+
+    size: float = param(0.2, "radius of a pillar, m", above=0)
+    keepout: float = param(0.3, "radius kept clear around a pillar, m", low=0)
+    half_height: float = param(0.5, "half of a pillar's height, m", above=0)
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        self.add_geom(body, CYLINDER, (self.size, self.half_height), lift=self.half_height)

@@ -1,0 +1,308 @@
+"""Groups of like objects: placed together, seen by one lidar, felt if solid, moving if they move.
+
+What the robot can pass through is plain places, no bodies: it costs the physics nothing. Solid
+objects are bodies, mocap ones where only their part moves them, free ones where the robot may.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs import geometry, motion
+from sb3_guard.envs.layout import Footprint, Rectangle
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import (
+    FLOOR,
+    ROBOT,
+    Array,
+    Generators,
+    Painter,
+    Part,
+    Simulation,
+    World,
+)
+from sb3_guard.envs.sensors import Channel
+
+BOX = mujoco.mjtGeom.mjGEOM_BOX
+CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
+SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
+
+
+class Bodies:
+    """Solid objects as bodies of the world, each with a sensor for the robot's touch.
+
+    :param world: the world under construction
+    :param name: what the bodies are called, followed by their number
+    :param num: how many
+    :param shape: adds the geoms of one body
+    :param free: whether they can be pushed; otherwise they are where :meth:`put` puts them
+    """
+
+    def __init__(
+        self,
+        world: World,
+        name: str,
+        num: int,
+        shape: Callable[[mujoco.MjsBody], None],
+        free: bool = False,
+    ) -> None:
+        self.name, self.num, self.free = name, num, free
+        self._height = resting_height(shape, world.spec.option.timestep) if free and num else 0.0
+        for i in range(num):
+            body = world.spec.worldbody.add_body(name=f"{name}/{i}", mocap=not free)
+            if free:
+                body.add_freejoint()
+            shape(body)
+            world.feel(f"{name}/{i}", body=f"{name}/{i}")
+
+    def bind(self, sim: Simulation) -> None:
+        """Take live views: ``positions`` [N, num, 3] m, free bodies' ``velocities`` [N, num, 3] m/s."""
+        model, batch, k = sim.model, sim.batch, self.num
+        if k == 0:
+            self.positions, self._found = np.zeros((sim.num_envs, 0, 3)), np.zeros((sim.num_envs, 0))
+            return
+        body = model.body(f"{self.name}/0")
+        self.positions = batch.bind("xpos")[:, body.id : body.id + k]
+        first = int(model.sensor(f"{self.name}/0").adr[0])
+        self._found = batch.bind("sensordata")[:, first : first + k]
+        if self.free:
+            first = int(body.jntadr[0])
+            q, v = int(model.jnt_qposadr[first]), int(model.jnt_dofadr[first])
+            pose = batch.bind("qpos")[:, q : q + 7 * k].reshape(-1, k, 7)
+            self._places, self._turns = pose[..., :3], pose[..., 3:]
+            self.velocities = batch.bind("qvel")[:, v : v + 6 * k].reshape(-1, k, 6)[..., :3]
+        else:
+            first = int(model.body_mocapid[body.id])
+            self._places = batch.bind("mocap_pos")[:, first : first + k]
+            self._turns = batch.bind("mocap_quat")[:, first : first + k]
+
+    @property
+    def touched(self) -> Array:
+        """Which bodies the robot touches, [N, num] bool."""
+        return self._found > 0
+
+    def put(self, ids: Array, places: Array, rngs: Generators) -> None:
+        """Set bodies down in rows ``ids`` at [n, num, 3] m, each with a random heading."""
+        self._places[ids] = places
+        self._places[ids, :, 2] += self._height
+        for i in ids.tolist():
+            heading = rngs[i].uniform(0, 2 * math.pi, self.num)
+            self._turns[i] = geometry.yaw_quaternion(heading)
+
+    def move(self, places: Array) -> None:
+        """Move bodies that cannot be pushed to [N, num, 3] m."""
+        self._places[:] = places
+
+
+def resting_height(shape: Callable[[mujoco.MjsBody], None], timestep: float) -> float:
+    """Height at which a free body lies still on the floor, m.
+
+    Contacts are soft: set down a little higher or lower, it would bounce when an episode begins.
+
+    :param shape: adds the geoms of the body
+    :param timestep: s; softness depends on it
+    """
+    spec = mujoco.MjSpec()
+    spec.option.timestep = timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    add_floor(spec)
+    body = spec.worldbody.add_body()
+    body.add_freejoint()
+    shape(body)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    # down to the first touch: the lowest point of the body's bounding boxes is near enough
+    mujoco.mj_step(model, data, nstep=500)
+    return float(data.qpos[2])
+
+
+@dataclass
+class Spatial(Part):
+    """A part whose objects lie on the floor or hang in the air, as its ``space`` says."""
+
+    space: str | None = param(
+        None, "planar or spatial; null: the robot's workspace", choices=(None, "planar", "spatial")
+    )
+    height: tuple[float, float] = param((0.5, 1.5), "range of z in space, m")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.height[0] > self.height[1]:
+            raise ValueError(f"{self.name}.height = {self.height!r} must be (low, high), in metres")
+
+
+@dataclass
+class Objects(Part):
+    """Like objects, all of one size.
+
+    A subclass says whether they are ``solid`` and, if so, gives them a ``shape``. An object that
+    can be crossed is a disc on the floor or a sphere in the air.
+    """
+
+    num: int = param(8, "number of objects", low=0)
+    size: float = param(0.3, "radius of an object, m", above=0)
+    keepout: float = param(0.4, "radius kept clear around an object, m", low=0)
+    locations: tuple[tuple[float, float], ...] = param((), "fixed places (x, y), m")
+    placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
+
+    free: ClassVar[bool] = False  # whether solid objects can be pushed
+    mover: ClassVar[bool] = False  # whether they leave their places
+    reachable: ClassVar[bool] = False  # whether they lie within the robot's reach
+
+    @property
+    def group(self) -> str:
+        """What the objects are called in layouts, observations and bodies."""
+        return self.name
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        """Add the geoms of a solid object, whose frame is its place."""
+        raise NotImplementedError(f"{self.name} cannot be solid")
+
+    def footprints(self) -> tuple[Footprint, ...]:
+        return (
+            Footprint(
+                self.group,
+                self.num,
+                self.keepout,
+                self.placements,
+                self.locations,
+                height=0.0 if self.planar else self.height,
+                reach=self._reach,
+                mover=self.mover,
+            ),
+        )
+
+    def positions(self, footprint: str) -> Array:
+        return self.centers
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        self._reach = world.robot.reach if self.reachable else math.inf
+        self.bodies = Bodies(
+            world, self.group, self.num if self.solid else 0, self.shape, self.free
+        )
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self.bodies.bind(sim)
+        # where they are now, [N, num, 3] m
+        self.centers = self.bodies.positions if self.solid else sim.places(self.group)
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        if self.solid:
+            self.bodies.put(ids, self.sim.places(self.group)[ids], rngs)
+
+    def observe(self) -> dict[str, Array]:
+        return {f"{self.group}_lidar": self.sim.lidar(self.centers, self.planar)}
+
+    def channels(self) -> dict[str, Channel]:
+        return {f"{self.group}_lidar": self.sim.lidar_channel(self.planar)}
+
+    def draw(self, painter: Painter, row: int) -> None:
+        if not self.solid:
+            for center in self.centers[row]:
+                painter.zone(center, self.size, 0.01 if self.planar else 0.0, self.color)
+        lidar = self.sim.lidar(self.centers, self.planar)[row]
+        painter.halo(lidar, self.sim.lidar_azimuth(self.planar), self.color)
+
+    def add_geom(
+        self, body: mujoco.MjsBody, kind: mujoco.mjtGeom, size: tuple[float, ...], lift: float = 0.0
+    ) -> mujoco.MjsGeom:
+        """Add a geom of this part's colour, ``lift`` m above the frame of ``body``."""
+        return add_geom(body, kind, size, self.color, lift, self.free)
+
+
+def add_geom(
+    body: mujoco.MjsBody,
+    kind: mujoco.mjtGeom,
+    size: tuple[float, ...],
+    color: tuple[float, float, float],
+    lift: float = 0.0,
+    free: bool = False,
+) -> mujoco.MjsGeom:
+    """Add a geom that robots bump into.
+
+    :param body: whose geom
+    :param kind: its shape
+    :param size: MuJoCo's sizes of this shape, m
+    :param color: red, green, blue
+    :param lift: height over the frame of ``body``, m
+    :param free: whether it lies on the floor, too
+    """
+    bits = ROBOT | FLOOR if free else ROBOT
+    return body.add_geom(
+        type=kind,
+        size=[*size, 0.0, 0.0][:3],
+        pos=[0.0, 0.0, lift],
+        rgba=[*color, 1.0],
+        contype=bits,
+        conaffinity=bits,
+        condim=3,
+    )
+
+
+@dataclass
+class Movers(Spatial, Objects):
+    """Objects that chase the robot or flee from it (Zhao et al. 2024, §4).
+
+    Speeds are metres per control step under ``speed_law="unit"`` and, with the paper's equations,
+    ``"proportional"``, fractions of the distance per control step. A subclass states its
+    :meth:`law` of motion. Their z stays within ``height``.
+    """
+
+    keepout: float = param(0.5, "radius kept clear around an object, m", low=0)
+    solid: bool = param(False, "whether they are bodies that push; false: the robot passes through")
+    speed: float = param(1e-3, "the speed that all others default to multiples of", low=0)
+    speed_law: str = param(
+        "unit", "along unit vectors, or proportional to distance", choices=("unit", "proportional")
+    )
+    v0: float | None = param(None, "speed home from beyond r0; null: speed", low=0)
+    r0: float = param(2.5, "radius around the origin that they do not leave, m", low=0)
+    origin: tuple[float, float, float] = param((0.0, 0.0, 0.0), "where home is, (x, y, z) m")
+
+    mover = True
+
+    def law(self) -> motion.Law:
+        """How they move."""
+        raise NotImplementedError
+
+    def _law(self, **speeds: float) -> motion.Law:
+        """A law of motion with what all movers have in common."""
+        return motion.Law(
+            home=self.speed if self.v0 is None else self.v0,
+            apart=self.speed,
+            gap=2 * self.size,
+            r0=self.r0,
+            origin=self.origin,
+            unit=self.speed_law == "unit",
+            **speeds,
+        )
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        if self.planar:
+            self.add_geom(body, CYLINDER, (self.size, self.size / 2), lift=self.size / 2)
+        else:
+            self.add_geom(body, SPHERE, (self.size,))
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self.centers = sim.places(self.group)
+        self.motion = self.law()
+
+    def before_step(self) -> None:
+        robot, centers = self.sim.robot.position, self.centers
+        step = motion.displacement(centers, robot, self.motion, self.planar)
+        if self.planar:
+            centers[..., :2] += step
+        else:
+            centers += step
+            np.clip(centers[..., 2], *self.height, out=centers[..., 2])
+        if self.solid:
+            self.bodies.move(centers)

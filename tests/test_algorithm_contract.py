@@ -1,0 +1,561 @@
+"""Stable-Baselines3's contract, for every algorithm: spaces, saving, resuming, errors, silence."""
+
+import copy
+import pickle
+import random
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint, RandomCostEnv
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+    VecFrameStack,
+    VecNormalize,
+)
+
+from sb3_guard.algorithms import ALGORITHMS, CPO, TRPO, TrustRegion
+from sb3_guard.algorithms.common.buffers import CostRolloutBuffer
+from sb3_guard.algorithms.common.critics import CostCritic
+
+CLASSES = list(ALGORITHMS.values())
+BOX = spaces.Box(-1.0, 1.0, (3,), np.float32)
+IMAGE = spaces.Box(0, 255, (36, 36, 1), np.uint8)
+
+
+def small(cls: type[TrustRegion], env: Any, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
+    defaults = {"n_steps": 40, "n_critic_updates": 3, "seed": 0, "device": "cpu"}
+    return cls(policy, env, **{**defaults, **kwargs})
+
+
+def points(n_envs: int = 2, **kwargs: Any) -> VecEnv:
+    return make_vec_env(lambda: CostPoint(**{"episode_length": 30, **kwargs}), n_envs, seed=0)
+
+
+def parameters(model: Any) -> dict[str, Any]:
+    return copy.deepcopy(model.get_parameters())
+
+
+def assert_equal(a: Any, b: Any) -> None:
+    """Nested state dicts, bit for bit."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_equal(a[key], b[key])
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_equal(x, y)
+    elif isinstance(a, th.Tensor):
+        assert th.equal(a, b)
+    else:
+        assert a == b
+
+
+# Spaces
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize(
+    "action_space",
+    [
+        spaces.Box(-2.0, 2.0, (2,), np.float32),
+        spaces.Discrete(3),
+        spaces.MultiDiscrete([2, 3]),
+        spaces.MultiBinary(3),
+    ],
+    ids=lambda space: type(space).__name__,
+)
+@pytest.mark.parametrize(
+    ("policy", "observation_space"),
+    [
+        ("MlpPolicy", BOX),
+        ("MlpPolicy", spaces.Box(-1.0, 1.0, (2, 2), np.float64)),
+        ("MlpPolicy", spaces.Discrete(4)),
+        ("MlpPolicy", spaces.MultiDiscrete([2, 3])),
+        ("MlpPolicy", spaces.MultiBinary(3)),
+        ("MultiInputPolicy", spaces.Dict({"a": BOX, "b": spaces.Discrete(3)})),
+    ],
+    ids=["box", "matrix", "discrete", "multidiscrete", "multibinary", "dict"],
+)
+def test_spaces(
+    cls: type[TrustRegion],
+    policy: str,
+    observation_space: spaces.Space,
+    action_space: spaces.Space,
+    tmp_path: Path,
+) -> None:
+    """Train, save, load, and act as before."""
+    env = make_vec_env(lambda: RandomCostEnv(observation_space, action_space), 2, seed=0)
+    model = small(cls, env, policy).learn(160)
+    observation = env.reset()
+    action, _ = model.predict(observation, deterministic=True)
+    model.save(tmp_path / "model")
+    again = cls.load(tmp_path / "model", device="cpu")
+    np.testing.assert_array_equal(again.predict(observation, deterministic=True)[0], action)
+    assert_equal(parameters(model), parameters(again))
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize(
+    ("policy", "observation_space", "kwargs"),
+    [
+        ("CnnPolicy", IMAGE, {}),
+        ("CnnPolicy", IMAGE, {"share_features_extractor": False}),
+        ("MultiInputPolicy", spaces.Dict({"image": IMAGE, "vector": BOX}), {}),
+        ("MlpPolicy", BOX, {"activation_fn": th.nn.ReLU}),
+        ("MlpPolicy", BOX, {"net_arch": {"pi": [8], "vf": []}}),
+        ("MlpPolicy", BOX, {"net_arch": []}),
+        ("MlpPolicy", BOX, {"share_features_extractor": False}),
+        ("MlpPolicy", BOX, {"ortho_init": False, "log_std_init": -0.5}),
+        ("MlpPolicy", BOX, {"optimizer_class": th.optim.SGD}),
+    ],
+)
+def test_policies(
+    cls: type[TrustRegion], policy: str, observation_space: spaces.Space, kwargs: dict[str, Any]
+) -> None:
+    env = make_vec_env(lambda: RandomCostEnv(observation_space, BOX), 2, seed=0)
+    model = small(cls, env, policy, n_steps=20, policy_kwargs=kwargs)
+    before = parameters(model)["policy"]
+    model.learn(80)
+    after = parameters(model)["policy"]
+    moved = [name for name in before if not th.equal(before[name], after[name])]
+    assert any("value_net" in name for name in moved)
+    assert any("action_net" in name for name in moved)
+    assert all(th.isfinite(value).all() for value in after.values())
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("squash", [False, True])
+def test_gsde(cls: type[TrustRegion], squash: bool) -> None:
+    model = small(
+        cls, points(), use_sde=True, sde_sample_freq=7, policy_kwargs={"squash_output": squash}
+    )
+    before = parameters(model)["policy"]["action_net.weight"]
+    model.learn(240)
+    assert model.logger.name_to_value["train/kl"] <= model.target_kl
+    assert not th.equal(before, parameters(model)["policy"]["action_net.weight"])
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_what_a_model_is(cls: type[TrustRegion]) -> None:
+    model = small(cls, points())
+    assert isinstance(model, OnPolicyAlgorithm)
+    assert isinstance(model.rollout_buffer, CostRolloutBuffer)
+    assert hasattr(model, "cost_critic") is cls.uses_cost_critic
+    assert cls.uses_cost_critic is (cls is not TRPO)
+    if cls.uses_cost_critic:
+        assert isinstance(model.cost_critic, CostCritic)
+        optimizers = {id(model.policy.optimizer), id(model.cost_critic.optimizer)}
+        assert len(optimizers) == 2
+
+
+# Environments
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize(
+    ("n_envs", "episode_length", "n_steps"), [(1, 30, 40), (3, 10**6, 20), (2, 45, 20), (2, 1, 10)]
+)
+def test_episodes_and_rollouts_of_any_length(
+    cls: type[TrustRegion], n_envs: int, episode_length: int, n_steps: int
+) -> None:
+    """One env, no episode ever ending, episodes longer than a rollout, episodes of one step."""
+    model = small(cls, points(n_envs, episode_length=episode_length), n_steps=n_steps)
+    model._warned = {"no episode has ended yet and the environment states no max_episode_steps"}
+    model.learn(4 * n_envs * n_steps)
+    numbers = [v for v in model.logger.name_to_value.values() if isinstance(v, int | float)]
+    assert np.isfinite(numbers).all()
+    steps = 4 * n_steps
+    np.testing.assert_array_equal(model.running_lengths, steps % episode_length)
+    assert len(model.ep_cost_buffer) == min(100, n_envs * (steps // episode_length))
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_episode_costs_are_sums_of_raw_costs_across_rollouts(cls: type[TrustRegion]) -> None:
+    model = small(cls, points(2, episode_length=40))
+    steps: list[list[float]] = []
+
+    def record(local: dict, _: dict) -> bool:
+        steps.append([info["cost"] for info in local["infos"]])
+        return True
+
+    model.learn(400, callback=record)
+    costs = np.array(steps)  # [200, 2]
+    sums = costs.reshape(5, 40, 2).sum(axis=1)
+    np.testing.assert_allclose(np.array(model.ep_cost_buffer)[:, 0], sums.ravel(), rtol=1e-9)
+    assert model.total_cost == pytest.approx(costs.sum())
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_vec_normalize_leaves_costs_raw(cls: type[TrustRegion], tmp_path: Path) -> None:
+    raw: list[float] = []
+
+    def record(local: dict, _: dict) -> bool:
+        raw.extend(info["cost"] for info in local["infos"])
+        return True
+
+    env = VecNormalize(points(2, cost_scale=1000.0, hazard=(-1.0, 0.0)))
+    model = small(cls, env)
+    kept = {}
+    train = model.train
+
+    def spy() -> None:
+        kept["costs"] = model.rollout_buffer.costs.copy()
+        train()
+
+    model.train = spy
+    model.learn(80, callback=record)
+    np.testing.assert_allclose(kept["costs"].ravel(), raw, rtol=1e-5)
+    assert np.mean(raw) > 50.0
+    del model.train
+    model.save(tmp_path / "model")
+    cls.load(tmp_path / "model", env=env, device="cpu").learn(80)
+
+
+def test_subprocesses_and_frame_stacks() -> None:
+    env = VecFrameStack(SubprocVecEnv([lambda: CostPoint(episode_length=30)] * 2), 2)
+    model = small(CPO, env).learn(160)
+    assert model.num_timesteps == 160
+    env.close()
+
+
+def test_an_env_that_is_no_vec_env_and_an_id() -> None:
+    small(CPO, CostPoint(episode_length=30)).learn(40)
+    gym.register("CostPointForTests-v0", CostPoint, max_episode_steps=25)
+    try:
+        model = small(CPO, "CostPointForTests-v0").learn(20)
+    finally:
+        del gym.registry["CostPointForTests-v0"]
+    assert model.costs is not None and model.costs.horizon == 25
+
+
+# Costs in info
+
+
+class _Info(CostPoint):
+    """Reports what it is told to."""
+
+    def __init__(self, report: dict[str, Any]) -> None:
+        super().__init__(episode_length=10)
+        self.report = report
+
+    def step(self, action: np.ndarray) -> Any:
+        *rest, _ = super().step(action)
+        return (*rest, dict(self.report))
+
+
+def info_env(**report: Any) -> VecEnv:
+    return DummyVecEnv([lambda: _Info(report)])
+
+
+@pytest.mark.parametrize("cost", [1, 1.0, True, np.float32(1), np.int64(1), np.array(1.0)])
+def test_numbers_of_any_kind_are_costs(cost: Any) -> None:
+    model = small(CPO, info_env(cost=cost)).learn(40)
+    assert model.total_cost == 40.0
+
+
+@pytest.mark.parametrize("cost", [np.nan, np.inf, "much", None, [1.0, 2.0]])
+def test_anything_else_is_not(cost: Any) -> None:
+    with pytest.raises(ValueError, match=r"info\['cost'\] of environment 0 is .*finite number"):
+        small(CPO, info_env(cost=cost)).learn(40)
+
+
+def test_a_missing_cost_is_an_error_that_says_how_to_go_on() -> None:
+    with pytest.raises(ValueError) as caught:
+        small(CPO, info_env(costs=1.0)).learn(40)
+    message = str(caught.value)
+    for part in ("'cost'", "'costs'", "nearest", "cost_keys", "missing_cost='zero'"):
+        assert part in message
+
+
+def test_a_missing_cost_may_mean_zero() -> None:
+    with pytest.warns(UserWarning, match="no info had a cost key") as record:
+        model = small(CPO, info_env(), missing_cost="zero").learn(120)
+    assert len([w for w in record if "no info had" in str(w.message)]) == 1
+    assert model.total_cost == 0.0
+
+
+def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -> None:
+    model = small(TRPO, info_env()).learn(80)
+    assert not [w for w in recwarn if "cost" in str(w.message)]
+    assert not [key for key in model.logger.name_to_value if "cost" in key]
+    with pytest.raises(ValueError, match="no cost key"):
+        small(TRPO, info_env(), missing_cost="error").learn(40)
+
+
+# Bad values
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_steps": 0}, "n_steps=0"),
+        ({"n_steps": 2.5}, "n_steps=2.5"),
+        ({"n_steps": 1}, "at least two steps"),
+        ({"batch_size": 0}, "batch_size=0"),
+        ({"n_critic_updates": -1}, "n_critic_updates=-1"),
+        ({"cg_max_steps": 0}, "cg_max_steps=0"),
+        ({"line_search_max_iter": 0}, "line_search_max_iter=0"),
+        ({"line_search_shrinking_factor": 1.0}, r"line_search_shrinking_factor=1.0.*\(0, 1\)"),
+        ({"gamma": 1.1}, r"gamma=1.1.*\[0, 1\]"),
+        ({"gae_lambda": -0.1}, "gae_lambda=-0.1"),
+        ({"cost_gamma": 2.0}, "cost_gamma=2.0"),
+        ({"target_kl": 0.0}, r"target_kl=0.0.*\(0, inf\)"),
+        ({"target_kl": None}, "target_kl=None"),
+        ({"target_kl": float("nan")}, "target_kl=nan"),
+        ({"cg_damping": -1.0}, "cg_damping=-1.0"),
+        ({"learning_rate": 0.0}, "learning_rate=0.0"),
+        ({"learning_rate": "fast"}, "learning_rate='fast'"),
+        ({"missing_cost": "ignore"}, "missing_cost='ignore'"),
+        ({"cost_keys": "cost"}, r"cost_keys='cost'.*sequence"),
+        ({"cost_keys": ()}, "cost_keys="),
+        ({"cost_keys": ("a", "a")}, "different names"),
+        ({"cost_limit": [1.0, 2.0]}, r"cost_limit=\[1.0, 2.0\].*one for each of the 1"),
+        ({"cost_limit": [1.0], "cost_keys": ("a", "b")}, r"one for each of the 2.*'a', 'b'"),
+        ({"cost_limit": float("nan")}, "cost_limit=nan"),
+        ({"cost_limit": "low"}, "cost_limit='low'"),
+        ({"rollout_buffer_class": dict}, "rollout_buffer_class=dict"),
+    ],
+)
+def test_bad_values_are_named(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        small(CPO, points(1), **kwargs)
+
+
+def test_a_bad_cost_reduction_is_named() -> None:
+    with pytest.raises(ValueError, match="cost_reduction=-1"):
+        small(CPO, points(1), cost_reduction=-1)
+
+
+def test_an_unknown_argument_is_an_error() -> None:
+    with pytest.raises(TypeError, match="n_step"):
+        small(CPO, points(1), n_step=3)
+
+
+# Saving, loading, resuming
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_save_and_load_keep_everything(cls: type[TrustRegion], tmp_path: Path) -> None:
+    keys = ("cost", "cost_1")
+    env = points(2, cost_keys=keys)
+    model = small(cls, env, cost_keys=keys, cost_limit=(1.0, 2.0), target_kl=0.013)
+    model.learn(200)
+    model.save(tmp_path / "model")
+    again = cls.load(tmp_path / "model", env=env, device="cpu")
+    assert_equal(parameters(model), parameters(again))
+    for name in (
+        "target_kl",
+        "num_timesteps",
+        "total_cost",
+        "horizon",
+        "missing_cost",
+        "cost_keys",
+    ):
+        assert getattr(model, name) == getattr(again, name), name
+    for name in ("cost_limits", "total_costs", "running_costs", "running_lengths"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(again, name), err_msg=name)
+    np.testing.assert_array_equal(np.array(model.ep_cost_buffer), np.array(again.ep_cost_buffer))
+    if cls.uses_cost_critic:
+        observation = th.randn(5, 4)
+        assert th.equal(
+            model.cost_critic.predict(observation), again.cost_critic.predict(observation)
+        )
+    again.learn(80, reset_num_timesteps=False)
+    assert again.num_timesteps == model.num_timesteps + 80
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_parameters_travel(cls: type[TrustRegion]) -> None:
+    a, b = small(cls, points()).learn(80), small(cls, points(), seed=1)
+    b.set_parameters(parameters(a))
+    assert_equal(parameters(a), parameters(b))
+    assert ("cost_critic" in parameters(a)) is cls.uses_cost_critic
+    with pytest.raises(ValueError, match="do not match"):
+        b.set_parameters({"policy": parameters(a)["policy"]})
+
+
+def test_load_with_another_number_of_envs(tmp_path: Path) -> None:
+    small(CPO, points(2)).learn(100).save(tmp_path / "model")
+    model = CPO.load(tmp_path / "model", env=points(3), device="cpu")
+    model.learn(120, reset_num_timesteps=False)
+    assert model.running_costs.shape == (3, 1)
+
+
+def test_set_env_starts_new_episodes() -> None:
+    model = small(CPO, points(2, episode_length=1000))
+    with pytest.warns(UserWarning, match="no episode has ended"):
+        model.learn(80)
+    assert (model.running_lengths == 40).all()
+    model.set_env(points(2))
+    model.learn(80, reset_num_timesteps=False)
+    assert (model.running_lengths == 10).all()
+
+
+class _Checkpoint(BaseCallback):
+    """At the start of a rollout keep the model, the env and the generators, as a file would."""
+
+    def __init__(self, path: Path, at: int) -> None:
+        super().__init__()
+        self.path, self.at = path, at
+        self.rest: Any = None
+
+    def _on_rollout_start(self) -> None:
+        if self.num_timesteps == self.at:
+            self.model.save(self.path)
+            env = pickle.dumps([wrapped.unwrapped for wrapped in self.training_env.envs])
+            self.rest = pickle.dumps((env, self.model._rng_at_rollout))
+
+    def _on_step(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("kwargs", [{}, {"use_sde": True}, {"batch_size": 16}], ids=str)
+def test_resumed_equals_uninterrupted(
+    cls: type[TrustRegion], kwargs: dict[str, Any], tmp_path: Path
+) -> None:
+    """Bit for bit: networks, optimizers, counters, running episodes, logs."""
+
+    def env(envs: list[gym.Env] | None = None) -> VecEnv:
+        made = envs or [CostPoint(episode_length=33) for _ in range(2)]
+        return DummyVecEnv([lambda each=each: each for each in made])
+
+    def learn(model: Any, steps: int, **more: Any) -> Any:
+        return model.learn(steps, **more)
+
+    checkpoint = _Checkpoint(tmp_path / "model", at=160)
+    schedule = {"learning_rate": lambda remaining: 1e-3 * remaining + 1e-4}
+    whole = small(cls, env(), **kwargs, **schedule)
+    learn(whole, 400, callback=checkpoint)
+
+    envs, generators = pickle.loads(checkpoint.rest)
+    resumed_env = env(pickle.loads(envs))
+    resumed = cls.load(tmp_path / "model", env=resumed_env, device="cpu", force_reset=False)
+    python, numpy, torch = generators
+    random.setstate(python)
+    np.random.set_state(numpy)  # noqa: NPY002
+    th.set_rng_state(torch)
+    for each, state in zip(resumed_env.envs, pickle.loads(envs), strict=True):
+        each.__dict__.update(state.__dict__)
+    learn(resumed, 400 - 160, reset_num_timesteps=False)
+
+    assert resumed.num_timesteps == whole.num_timesteps == 400
+    assert_equal(parameters(whole), parameters(resumed))
+    assert whole.total_cost == resumed.total_cost
+    np.testing.assert_array_equal(whole.running_costs, resumed.running_costs)
+    np.testing.assert_array_equal(whole.running_lengths, resumed.running_lengths)
+    np.testing.assert_array_equal(np.array(whole.ep_cost_buffer), np.array(resumed.ep_cost_buffer))
+    for key, value in whole.logger.name_to_value.items():
+        if key.startswith(("train/", "rollout/")):
+            assert resumed.logger.name_to_value[key] == value, key
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_same_seed_same_training(cls: type[TrustRegion]) -> None:
+    runs = [parameters(small(cls, points(), seed=seed).learn(160)) for seed in (3, 3, 4)]
+    assert_equal(runs[0], runs[1])
+    with pytest.raises(AssertionError):
+        assert_equal(runs[0], runs[2])
+
+
+# Logging
+
+
+class _Dumps(BaseCallback):
+    """Keeps what each dump contained."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.dumps: list[dict[str, Any]] = []
+
+    def _on_training_start(self) -> None:
+        dump = self.logger.dump
+
+        def spy(step: int = 0) -> None:
+            self.dumps.append(dict(self.logger.name_to_value))
+            dump(step)
+
+        self.logger.dump = spy  # type: ignore[method-assign]
+
+    def _on_step(self) -> bool:
+        return True
+
+
+SB3_KEYS = {
+    "rollout/ep_rew_mean",
+    "rollout/ep_len_mean",
+    "time/fps",
+    "time/total_timesteps",
+    "train/value_loss",
+    "train/explained_variance",
+    "train/std",
+    "train/n_updates",
+    "train/learning_rate",
+    "train/policy_objective",
+    "train/kl",
+    "train/line_search_step",
+    "rollout/ep_cost_mean",
+    "rollout/cost_rate",
+}
+COST_KEYS = {
+    "train/cost_value_loss",
+    "train/cost_surrogate",
+    "train/constraint_violation",
+    "train/cpo_case",
+    "train/nu",
+    "train/lambda_kl",
+}
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_logs(cls: type[TrustRegion]) -> None:
+    callback = _Dumps()
+    model = small(cls, points()).learn(240, callback=callback)
+    dump = callback.dumps[-1]
+    assert SB3_KEYS <= set(dump)
+    assert (COST_KEYS <= set(dump)) is (cls is CPO)
+    assert dump["rollout/ep_cost_mean"] == pytest.approx(np.mean(model.ep_cost_buffer))
+    assert dump["rollout/cost_rate"] == pytest.approx(model.total_cost / model.num_timesteps)
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_silent_unless_asked(
+    cls: type[TrustRegion], capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    small(cls, points()).learn(80)
+    captured = capfd.readouterr()
+    assert captured.out == "" and captured.err == ""
+    small(cls, points(), verbose=1, tensorboard_log=str(tmp_path)).learn(80)
+    assert "ep_cost_mean" in capfd.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == [f"{cls.__name__}_1"]
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_learning_rate_schedules_reach_every_critic(cls: type[TrustRegion]) -> None:
+    model = small(cls, points(), learning_rate=lambda remaining: 0.01 * remaining).learn(160)
+    assert model.logger.name_to_value["train/learning_rate"] == 0.0
+    critics = [model.policy] + ([model.cost_critic] if cls.uses_cost_critic else [])
+    for critic in critics:
+        assert critic.optimizer.param_groups[0]["lr"] == 0.0
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_a_callback_may_stop_and_training_go_on(cls: type[TrustRegion]) -> None:
+    model = small(cls, points())
+    model.learn(400, callback=lambda local, _: local["self"].num_timesteps < 120)
+    assert model.num_timesteps == 120
+    model.learn(160, reset_num_timesteps=False)
+    assert model.num_timesteps == 280
+    model.learn(80)
+    assert model.num_timesteps == 80 and (model.running_lengths == 10).all()

@@ -1,0 +1,321 @@
+"""The engine's promises: bit-exact rows, whole states, honest steps."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from sb3_guard.envs import GuardVectorEnv, Scenario, env_ids, env_spec
+from sb3_guard.envs.layout import LayoutError
+
+IDS = env_ids()
+
+
+def actions_for(env, steps, n, seed=0):
+    rng = np.random.default_rng(seed)
+    size = env.single_action_space.shape[0] if hasattr(env, "single_action_space") else None
+    size = size or env.action_space.shape[0]
+    return rng.uniform(-1.2, 1.2, (steps, n, size)).astype(np.float32)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_row_of_a_batch_is_a_lone_environment_bit_for_bit(env_id):
+    n, length = 3, 40
+    batch = gymnasium.make_vec(env_id, num_envs=n, max_episode_steps=length)
+    lone = [gymnasium.make(env_id, max_episode_steps=length) for _ in range(n)]
+    obs, _ = batch.reset(seed=10)
+    for i, env in enumerate(lone):
+        np.testing.assert_array_equal(obs[i], env.reset(seed=10 + i)[0])
+    # staggered: row 0 begins anew in mid-episode
+    obs, _ = batch.reset(options={"reset_mask": np.array([True, False, False])})
+    np.testing.assert_array_equal(obs[0], lone[0].reset()[0])
+    ends = 0
+    for action in actions_for(batch, 100, n):
+        obs, reward, terminated, truncated, info = batch.step(action)
+        for i, env in enumerate(lone):
+            o, r, term, trunc, inf = env.step(action[i])
+            assert (r, term, trunc) == (reward[i], terminated[i], truncated[i])
+            assert all(inf[k] == info[k][i] for k in inf if k.startswith("cost"))
+            if term or trunc:
+                ends += 1
+                np.testing.assert_array_equal(o, info["final_obs"][i])
+                assert inf["cost"] == info["final_info"]["cost"][i]
+                o, _ = env.reset()
+            np.testing.assert_array_equal(o, obs[i])
+    assert ends >= 2 * n
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_threads_change_nothing(env_id):
+    what = env_spec(env_id).kwargs["scenario"]
+    envs = [GuardVectorEnv(5, what, max_episode_steps=30, num_threads=k) for k in (1, 2)]
+    first = [env.reset(seed=0)[0] for env in envs]
+    np.testing.assert_array_equal(*first)
+    for action in actions_for(envs[0], 70, 5):
+        steps = [env.step(action) for env in envs]
+        for a, b in zip(steps[0][:4], steps[1][:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_full_episode_is_cut_after_a_thousand_steps_and_repeats_with_its_seed():
+    env = gymnasium.make("Goal_Point_8Hazards-v0")
+    runs = []
+    for _ in range(2):
+        obs, _ = env.reset(seed=7)
+        trace = [obs]
+        for t, action in enumerate(actions_for(env, 1000, 1)[:, 0]):
+            obs, reward, terminated, truncated, info = env.step(action)
+            trace.append(np.append(obs, [reward, info["cost"]]))
+            assert not terminated
+            assert truncated == (t == 999)
+        runs.append(np.concatenate([np.ravel(x) for x in trace]))
+    np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_a_restored_state_continues_bit_for_bit_on_other_threads(env_id):
+    what = env_spec(env_id).kwargs["scenario"]
+    a = GuardVectorEnv(4, what, max_episode_steps=25, num_threads=1)
+    b = GuardVectorEnv(4, what, max_episode_steps=25, num_threads=2)
+    a.reset(seed=3)
+    b.reset(seed=99)
+    actions = actions_for(a, 60, 4)
+    for action in actions[:20]:
+        a.step(action)
+    b.restore(a.state())
+    for action in actions[20:]:  # past two automatic resets, so the generators matter
+        for x, y in zip(a.step(action)[:4], b.step(action)[:4], strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+def test_a_state_of_another_world_is_refused():
+    a = GuardVectorEnv(2, "Goal_Point_8Hazards")
+    b = GuardVectorEnv(3, "Goal_Point_8Hazards")
+    with pytest.raises(ValueError, match="the state has shape"):
+        b.restore(a.state())
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_episodes_begin_without_a_cost_and_inside_the_layout_rule(env_id):
+    env = GuardVectorEnv(20, env_spec(env_id).kwargs["scenario"])
+    env.reset(seed=1)
+    engine = env.engine
+    for _ in range(3):
+        env.reset()
+        assert not any(c.cost().any() for c in engine.constraints)
+        groups = [(f, engine._owners[f.name].positions(f.name)) for f in engine.footprints.values()]
+        xy = np.concatenate([p[..., :2] for _, p in groups], axis=1)
+        keep = np.concatenate([np.full(f.num, f.keepout) for f, _ in groups])
+        robot = np.arange(len(keep)) == 0  # an arm's position is its hand, not its place
+        gap = np.linalg.norm(xy[:, :, None] - xy[:, None], axis=-1)
+        need = keep[:, None] + keep[None]
+        ignore = np.eye(len(keep), dtype=bool)
+        if engine.robot.workspace == "spatial":
+            ignore |= robot[:, None] | robot[None]
+        assert (gap - need)[:, ~ignore].min() > -1e-6
+
+
+def test_actions_that_are_not_finite_never_reach_the_physics():
+    env = GuardVectorEnv(3, "Goal_Point_8Hazards")
+    env.reset(seed=0)
+    before = env.engine.batch.state.copy()
+    with pytest.raises(ValueError, match=r"rows \[1\] are not finite"):
+        env.step(np.array([[0, 0], [0, np.nan], [0, 0]]))
+    np.testing.assert_array_equal(env.engine.batch.state, before)
+    with pytest.raises(ValueError, match=r"shape \(3, 3\), expected \(3, 2\)"):
+        env.step(np.zeros((3, 3)))
+
+
+def test_actions_outside_the_box_are_clipped():
+    envs = [gymnasium.make("Goal_Point_8Hazards-v0") for _ in range(2)]
+    for env in envs:
+        env.reset(seed=0)
+    for _ in range(5):
+        a, b = envs[0].step(np.array([5.0, -7.0])), envs[1].step(np.array([1.0, -1.0]))
+        np.testing.assert_array_equal(a[0], b[0])
+
+
+def test_diverged_physics_ends_the_episode_and_says_so():
+    env = GuardVectorEnv(3, "Goal_Point_8Hazards")
+    env.reset(seed=0)
+    env.engine.batch.bind("qvel")[1] = 1e12
+    obs, reward, terminated, truncated, info = env.step(np.zeros((3, 2)))
+    assert terminated.tolist() == [False, True, False]
+    assert not truncated.any()
+    assert reward[1] == 0 and info["cost"][1] == 0
+    assert info["physics_error"].tolist() == [False, True, False]
+    assert info["final_info"]["physics_error"][1]
+    assert np.isfinite(obs).all()
+    _, _, terminated, *_ = env.step(np.zeros((3, 2)))  # reported once
+    assert not terminated.any()
+
+
+def test_a_reached_goal_pays_and_moves_clear_of_everything():
+    env = GuardVectorEnv(2, "Goal_Point_8Hazards")
+    env.reset(seed=0)
+    engine = env.engine
+    old = engine.places("goal")[0, 0].copy()
+    engine.places("goal")[0, 0, :2] = engine.robot.position[0, :2]
+    engine._before[0] = 0.0
+    _, reward, terminated, _, info = env.step(np.zeros((2, 2)))
+    assert info["goal_met"].tolist() == [True, False]
+    assert reward[0] == pytest.approx(1.0, abs=0.01)
+    assert not terminated.any()
+    new = engine.places("goal")[0, 0]
+    assert not np.array_equal(new, old)
+    hazards = engine.places("hazards")[0, :, :2]
+    assert np.linalg.norm(hazards - new[:2], axis=1).min() >= 0.8
+    assert np.linalg.norm(engine.robot.position[0, :2] - new[:2]) >= 0.8
+    # the next reward counts from the new goal
+    d0 = np.linalg.norm(engine.robot.position[0, :2] - new[:2])
+    _, reward, *_ = env.step(np.ones((2, 2)))
+    assert reward[0] == pytest.approx(
+        d0 - np.linalg.norm(engine.robot.position[0, :2] - new[:2]), abs=1e-12
+    )
+
+
+def test_noconti_ends_the_episode_at_the_goal():
+    env = GuardVectorEnv(1, "Goal_Point_8Hazards_noconti")
+    env.reset(seed=0)
+    env.engine.places("goal")[0, 0, :2] = env.engine.robot.position[0, :2]
+    _, _, terminated, truncated, info = env.step(np.zeros((1, 2)))
+    assert terminated[0] and not truncated[0] and info["goal_met"][0]
+
+
+def test_a_goal_without_room_cuts_the_episode():
+    env = GuardVectorEnv(1, "Goal_Point_8Hazards")
+    env.reset(seed=0)
+    engine = env.engine
+    grid = np.stack(np.meshgrid([-1.5, 0.0, 1.5], [-1.5, 0.0, 1.5]), -1).reshape(-1, 2)
+    engine.places("hazards")[0, :, :2] = grid[[0, 1, 2, 3, 5, 6, 7, 8]] * 0.7
+    engine.batch.bind("mocap_pos")[0, 0, :2] = 0.0
+    engine.batch.forward()
+    engine.places("goal")[0, 0, :2] = 0.0
+    _, _, terminated, truncated, info = env.step(np.zeros((1, 2)))
+    assert truncated[0] and not terminated[0]
+    assert info["goal_unplaced"][0]
+
+
+def test_rewards_and_costs_equal_scalar_loops():
+    env = GuardVectorEnv(6, "Goal_Point_8Hazards")
+    env.reset(seed=4)
+    engine = env.engine
+    paid = 0
+    for t in range(900):
+        before = [
+            float(np.hypot(*(p[:2] - g[0, :2])))
+            for p, g in zip(engine.robot.position.copy(), engine.places("goal").copy(), strict=True)
+        ]
+        goals = engine.places("goal").copy()
+        action = np.tile([1.0, 0.2 * np.sin(t / 30)], (6, 1))
+        _, reward, _, _, info = env.step(action)
+        for i in range(6):
+            p = engine.robot.position[i]
+            d = float(np.hypot(*(p[:2] - goals[i, 0, :2])))
+            want = before[i] - d + (1.0 if d <= 0.5 else 0.0)
+            assert reward[i] == pytest.approx(want, abs=1e-12)
+            cost = 0.0
+            for h in engine.places("hazards")[i]:
+                gap = 0.3 - float(np.hypot(*(p[:2] - h[:2])))
+                cost += max(0.0, gap)
+            assert info["cost"][i] == pytest.approx(cost, abs=1e-12)
+            assert info["cost_hazards"][i] == info["cost"][i]
+            paid += cost > 0
+    assert paid > 10
+
+
+def test_indicator_costs_are_zero_or_one():
+    dense = GuardVectorEnv(4, "Goal_Point_8Hazards", hazards={"weight": 2.0})
+    binary = GuardVectorEnv(4, "Goal_Point_8Hazards", hazards={"indicator": True})
+    dense.reset(seed=2)
+    binary.reset(seed=2)
+    seen = set()
+    for _ in range(300):
+        a, b = (env.step(np.tile([1.0, 0.05], (4, 1)))[4]["cost"] for env in (dense, binary))
+        np.testing.assert_array_equal(b, (a > 0).astype(float))
+        seen |= set(b.tolist())
+    assert seen == {0.0, 1.0}
+
+
+def test_a_fixed_layout_repeats_within_a_row():
+    env = GuardVectorEnv(2, "Goal_Point_8Hazards", layout={"randomize": False})
+    env.reset(seed=0)
+    first = env.engine.places("hazards").copy()
+    env.reset()
+    np.testing.assert_array_equal(env.engine.places("hazards"), first)
+    assert not np.array_equal(first[0], first[1])
+    env.reset(seed=5)
+    assert not np.array_equal(env.engine.places("hazards"), first)
+
+
+def test_fixed_places_and_rectangles_are_used():
+    env = GuardVectorEnv(
+        3,
+        "Goal_Point_8Hazards",
+        hazards={"locations": [[1.5, 1.5]], "placements": [[-2, -2, 2, 0], [-2, 0, 0, 2]]},
+        robot={"locations": [[0, 0]], "heading": 0.0},
+        goal={"placements": [[0, 0, 2, 1.2]], "keepout": 0.1},
+    )
+    env.reset(seed=0)
+    hazards = env.engine.places("hazards")
+    np.testing.assert_array_equal(hazards[:, 0, :2], [[1.5, 1.5]] * 3)
+    assert ((hazards[:, 1:, 1] <= -0.4 + 1e-9) | (hazards[:, 1:, 0] <= -0.4 + 1e-9)).all()
+    np.testing.assert_allclose(env.engine.robot.position[:, :2], 0, atol=1e-12)
+    goal = env.engine.places("goal")[:, 0]
+    assert (goal[:, :2] >= 0.1 - 1e-9).all() and (goal[:, 1] <= 1.1 + 1e-9).all()
+
+
+def test_an_impossible_layout_names_the_crowded_part():
+    env = GuardVectorEnv(1, "Goal_Point_8Hazards", hazards={"num": 60})
+    with pytest.raises(LayoutError, match="hazards cannot be placed: 60 objects"):
+        env.reset(seed=0)
+    with pytest.raises(LayoutError, match="hazards cannot be placed: its location"):
+        GuardVectorEnv(
+            1,
+            "Goal_Point_8Hazards",
+            hazards={"locations": [[1, 1], [1.2, 1]]},
+        ).reset(seed=0)
+
+
+def test_infos_and_observations_are_not_reused():
+    from sb3_guard import make_vec_env
+
+    env = make_vec_env("Goal_Point_8Hazards", 2, seed=0, max_episode_steps=20)
+    kept, copies = [], []
+    obs = env.reset()
+    for action in actions_for(env, 50, 2):
+        obs, rewards, dones, infos = env.step(action)
+        kept.append((obs, rewards, dones, infos))
+        copies.append((obs.copy(), rewards.copy(), dones.copy(), [dict(i) for i in infos]))
+    for a, b in zip(kept, copies, strict=True):
+        for x, y in zip(a[:3], b[:3], strict=True):
+            np.testing.assert_array_equal(x, y)
+        for i, j in zip(a[3], b[3], strict=True):
+            assert i.keys() == j.keys() and i["cost"] == j["cost"]
+
+
+def test_the_observation_is_laid_out_as_guard_does():
+    env = gymnasium.make("Goal_Point_8Hazards-v0").unwrapped
+    layout = {k: (v.start, v.stop) for k, v in env.observation_layout.items()}
+    assert layout == {
+        "accelerometer": (0, 3),
+        "goal_compass": (3, 5),
+        "gyro": (5, 8),
+        "hazards_lidar": (8, 24),
+        "magnetometer": (24, 27),
+        "velocimeter": (27, 30),
+    }
+    obs, _ = env.reset(seed=0)
+    engine = env.engine
+    heading = np.arctan2(engine.robot.frames[1][0, 0, 1, 0], engine.robot.frames[1][0, 0, 0, 0])
+    # magnetometer: the field (0, -0.5, 0) in the robot's frame; accelerometer: gravity's reaction
+    np.testing.assert_allclose(
+        obs[24:27], [-0.5 * np.sin(heading), -0.5 * np.cos(heading), 0], atol=1e-6
+    )
+    np.testing.assert_allclose(obs[0:3], [0, 0, 9.81], atol=1e-4)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_world_keeps_the_robots_time_step(env_id):
+    engine = Scenario.parse(env_id).build()
+    assert engine.model.opt.timestep == engine.robot.timestep
+    assert engine.model.geom("floor").margin == 0

@@ -1,0 +1,143 @@
+"""Who may know whom: the layers of the package, read from its imports."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sb3_guard
+
+ROOT = Path(sb3_guard.__file__).parent
+MODULES = {
+    ".".join(("sb3_guard", *p.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__"): p
+    for p in ROOT.rglob("*.py")
+}
+
+
+def imports(path: Path, name: str) -> set[str]:
+    """Modules that a file imports, also inside functions; type-checking blocks do not count."""
+    tree = ast.parse(path.read_text())
+    skip = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and "TYPE_CHECKING" in ast.dump(block.test)
+        for node in ast.walk(block)
+    }
+    found = set()
+    for node in ast.walk(tree):
+        if id(node) in skip:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name} imports relatively"
+            found.add(node.module)
+            found |= {f"{node.module}.{a.name}" for a in node.names}
+    return found
+
+
+def touches(name: str, *packages: str) -> set[str]:
+    return {
+        i
+        for i in imports(MODULES[name], name)
+        if any(i == p or i.startswith(p + ".") for p in packages)
+    }
+
+
+def below(package: str) -> list[str]:
+    return sorted(m for m in MODULES if m == package or m.startswith(package + "."))
+
+
+@pytest.mark.parametrize("name", below("sb3_guard.envs"))
+def test_envs_know_no_learning(name):
+    assert not touches(
+        name, "torch", "stable_baselines3", "sb3_contrib", "rl_zoo3", "optuna", "pandas",
+        "sb3_guard.algorithms", "sb3_guard.common", "sb3_guard.zoo",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", below("sb3_guard.algorithms"))
+def test_algorithms_know_no_simulator(name):
+    assert not touches(
+        name, "mujoco", "rl_zoo3", "sb3_contrib",
+        "sb3_guard.envs", "sb3_guard.common", "sb3_guard.zoo",
+    )  # fmt: skip
+
+
+def test_no_leaf_imports_a_leaf():
+    leaves = [
+        m for m in below("sb3_guard.algorithms") if m.count(".") == 2 and not m.endswith(".common")
+    ]
+    assert "sb3_guard.algorithms.cpo" in leaves
+    for leaf in leaves:
+        assert not touches(leaf, *(set(leaves) - {leaf})), leaf
+
+
+@pytest.mark.parametrize("name", ["geometry", "layout", "sensors", "motion", "parameters"])
+def test_the_pure_modules_know_only_numpy(name):
+    module = f"sb3_guard.envs.{name}"
+    if module not in MODULES:
+        pytest.skip("this module does not exist yet")
+    pure = {f"sb3_guard.envs.{n}" for n in ("geometry", "layout", "sensors", "parameters")}
+    assert touches(module, "sb3_guard") <= {
+        i for i in imports(MODULES[module], module) if any(i.startswith(p) for p in pure)
+    }
+    assert not touches(module, "mujoco", "gymnasium")
+
+
+def test_parts_do_not_know_each_other_nor_the_engine():
+    kinds = ("robots", "tasks", "constraints")
+    for kind in kinds:
+        others = [f"sb3_guard.envs.{k}" for k in kinds if k != kind]
+        for module in below(f"sb3_guard.envs.{kind}"):
+            assert not touches(module, "sb3_guard.envs.engine", *others), module
+
+
+def test_only_the_bridge_imports_both_worlds():
+    both = [
+        m
+        for m in MODULES
+        if not m.startswith(("sb3_guard.zoo",))
+        and touches(m, "sb3_guard.envs")
+        and touches(m, "stable_baselines3", "torch")
+    ]
+    assert both == ["sb3_guard.common.vec_env"]
+
+
+def test_nothing_imports_the_zoo_but_the_commands():
+    commands = {f"sb3_guard.{c}" for c in ("train", "enjoy", "cli", "tune", "benchmark", "plot")}
+    for module in MODULES:
+        if module.startswith("sb3_guard.zoo") or module in commands:
+            continue
+        assert not touches(module, "sb3_guard.zoo"), module
+
+
+@pytest.mark.parametrize(
+    ("statement", "absent"),
+    [
+        ("import sb3_guard.envs", ["torch", "stable_baselines3", "rl_zoo3"]),
+        ("import sb3_guard", ["torch", "rl_zoo3", "optuna"]),
+        ("from sb3_guard import CPO", ["rl_zoo3", "optuna"]),
+    ],
+)
+def test_imports_stay_light(statement, absent):
+    code = f"{statement}\nimport sys\nprint([m for m in {absent!r} if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_algorithms_import_where_mujoco_is_missing():
+    code = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "from sb3_guard import CPO, TRPO; import sb3_guard.algorithms"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_public_name_exists():
+    for name in sb3_guard.__all__:
+        assert getattr(sb3_guard, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'PPO'"):
+        _ = sb3_guard.PPO

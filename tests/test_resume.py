@@ -1,0 +1,266 @@
+"""A run that was killed and resumed is, bit for bit, the run that was not."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch as th
+
+from sb3_guard import train
+from sb3_guard.zoo.progress import Epochs
+
+TESTS = Path(__file__).parent
+# Checkpoints at every rollout; models kept and evaluations at steps that are no rollout's end.
+SMALL = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3", "--seed", "3", "--save-freq", "70",
+         "--eval-freq", "50", "--eval-episodes", "3", "--n-eval-envs", "2", "--checkpoint-every", "0",
+         "--verbose", "0", "--device", "cpu"]  # fmt: skip
+TOY = ["--gym-packages", "registered_envs", "--env", "CostPoint-v0"]
+SHORT = ["--env-kwargs", "episode_length:25"]  # no divisor of a rollout
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing catches it, nothing is written any more."""
+
+
+def kill_at(monkeypatch, steps: int) -> None:
+    """Let the next run die when it has taken so many steps."""
+    with monkeypatch.context() as patch:
+        whole = Epochs._on_step
+
+        def step(self):
+            if self.model.num_timesteps >= steps:
+                raise Killed
+            return whole(self)
+
+        patch.setattr(Epochs, "_on_step", step)
+        yield
+
+
+def runs_of(folder: Path) -> Path:
+    (run,) = folder.glob("*/*_1")
+    return run
+
+
+def tensors(archive: Path) -> dict[str, object]:
+    """All state dicts in a model file."""
+    with zipfile.ZipFile(archive) as file:
+        return {
+            name: th.load(io.BytesIO(file.read(name)), weights_only=True)
+            for name in file.namelist()
+            if name.endswith(".pth")
+        }
+
+
+def assert_equal(one, other) -> None:
+    if isinstance(one, th.Tensor):
+        assert th.equal(one, other)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_equal(one[key], other[key])
+    elif isinstance(one, (list, tuple)):
+        for a, b in zip(one, other, strict=True):
+            assert_equal(a, b)
+    else:
+        assert one == other
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """Models, monitor, log, evaluations and result are equal; clocks may differ."""
+    one, other = runs_of(one), runs_of(other)
+    names = {path.name for path in one.iterdir()}
+    assert names == {path.name for path in other.iterdir()}
+    for name in names:
+        if name.endswith(".zip"):
+            assert_equal(tensors(one / name), tensors(other / name))
+    clocks = ["t", "time/fps", "time/time_elapsed"]
+    for name, skip in (("0.monitor.csv", 1), ("progress.csv", 0)):
+        a, b = (pd.read_csv(run / name, skiprows=skip) for run in (one, other))
+        a, b = (table.drop(columns=clocks, errors="ignore") for table in (a, b))
+        assert len(a) > 0
+        pd.testing.assert_frame_equal(a[sorted(a)], b[sorted(b)], check_exact=True)
+    if "evaluations.npz" in names:
+        a, b = (np.load(run / "evaluations.npz") for run in (one, other))
+        for name in a.files:
+            np.testing.assert_array_equal(a[name], b[name])
+    assert json.loads((one / "result.json").read_text()) == json.loads(
+        (other / "result.json").read_text()
+    )
+
+
+def crash(monkeypatch, arguments: list[str], steps: int) -> None:
+    for _ in kill_at(monkeypatch, steps):
+        with pytest.raises(Killed):
+            train.main(arguments)
+
+
+VARIANTS = {
+    "plain": [],
+    "trpo": ["--algo", "trpo"],
+    "normalised": ["-params", "normalize:True"],
+    "stacked": ["-params", "frame_stack:3", "normalize:True"],
+    "gSDE": ["-params", "use_sde:True"],
+    "schedule": ["-params", "learning_rate:lin_0.01"],
+    "wrapped": ["-params", "env_wrapper:gymnasium.wrappers.NormalizeObservation"],
+    "several costs": [
+        "--env-kwargs",
+        "cost_keys:('cost', 'heat')",
+        "-params",
+        "cost_keys:['cost', 'heat']",
+    ],  # fmt: skip
+    "rare logs": ["--log-interval", "2"],
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_killed_and_resumed(variant, tmp_path, monkeypatch):
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "300", *VARIANTS[variant]]
+    assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
+    # Once within the second rollout, and once more after being resumed.
+    crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], 100)
+    crash(monkeypatch, ["-i", str(runs_of(tmp_path / "cut"))], 206)
+    assert train.main(["-i", str(runs_of(tmp_path / "cut") / "checkpoint.zip")]) == 0
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+
+
+@pytest.mark.parametrize("steps", [2, 60, 62, 120, 298, 300])
+def test_killed_at_any_moment(steps, tmp_path, monkeypatch):
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "300"]
+    assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
+    crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], steps)
+    assert train.main(["-i", str(runs_of(tmp_path / "cut"))]) == 0
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+
+
+def test_worker_processes(tmp_path, monkeypatch):
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "180", "--vec-env", "subproc", "--eval-freq", "-1"]
+    assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
+    crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], 130)
+    assert train.main(["-i", str(runs_of(tmp_path / "cut"))]) == 0
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+
+
+@pytest.mark.parametrize("vec_env", ["native", "dummy"])
+def test_our_own_environments(vec_env, tmp_path, monkeypatch):
+    arguments = ["--env", "Goal_Point_3Hazards", *SMALL, "-n", "300", "--vec-env", vec_env,
+                 "--env-kwargs", "goal:{'size': 0.6}", "--eval-freq", "140",
+                 "--eval-episodes", "1", "--n-eval-envs", "1"]  # fmt: skip
+    assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
+    crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], 150)
+    assert train.main(["-i", str(runs_of(tmp_path / "cut"))]) == 0
+    one, other = runs_of(tmp_path / "whole"), runs_of(tmp_path / "cut")
+    for name in ("checkpoint.zip", "Goal_Point_3Hazards-v0.zip", "best_model.zip"):
+        if (one / name).exists():
+            assert_equal(tensors(one / name), tensors(other / name))
+    assert (one / "result.json").read_text() == (other / "result.json").read_text()
+
+
+def test_finished_run_goes_on_as_a_longer_one(tmp_path, capsys):
+    arguments = [*TOY, *SHORT, *SMALL]
+    assert train.main([*arguments, "-n", "300", "-f", str(tmp_path / "long")]) == 0
+    assert train.main([*arguments, "-n", "120", "-f", str(tmp_path / "short")]) == 0
+    run = runs_of(tmp_path / "short")
+    capsys.readouterr()
+    assert train.main(["-i", str(run)]) == 0
+    assert "is finished: 120 of 120 steps" in capsys.readouterr().out
+    assert train.main(["-i", str(run), "-n", "300"]) == 0
+    assert_same_run(tmp_path / "long", tmp_path / "short")
+
+
+def test_time_goes_on(tmp_path, monkeypatch):
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "300", "-f", str(tmp_path)]
+    crash(monkeypatch, arguments, 100)
+    assert train.main(["-i", str(runs_of(tmp_path))]) == 0
+    log = pd.read_csv(runs_of(tmp_path) / "progress.csv")
+    log = log[log["time/iterations"].notna()]
+    assert log["time/iterations"].tolist() == [1, 2, 3, 4, 5]
+    assert log["time/time_elapsed"].is_monotonic_increasing
+
+
+def test_environments_that_can_not_be_saved_begin_anew(tmp_path, monkeypatch, capsys):
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "300", "-f", str(tmp_path), "--env", "Unpicklable-v0"]
+    crash(monkeypatch, arguments, 206)
+    assert "This environment can't save its state" in capsys.readouterr().out
+    assert train.main(["-i", str(runs_of(tmp_path))]) == 0
+    result = json.loads((runs_of(tmp_path) / "result.json").read_text())
+    assert result["n_timesteps"] == 300
+    episodes = pd.read_csv(runs_of(tmp_path) / "0.monitor.csv", skiprows=1)
+    assert (episodes["l"] == 25).all()
+
+
+def test_a_checkpoint_is_a_model(tmp_path, monkeypatch):
+    from sb3_guard import CPO
+
+    crash(monkeypatch, [*TOY, *SMALL, "-n", "300", "-f", str(tmp_path)], 100)
+    model = CPO.load(runs_of(tmp_path) / "checkpoint.zip")
+    assert model.num_timesteps == 60
+    model.predict(model.observation_space.sample())
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "sb3_guard.train", *arguments]
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(TESTS), "OMP_NUM_THREADS": "1"}
+
+
+def wait_for(condition, process: subprocess.Popen, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def lines(path: Path) -> int:
+    return path.read_text().count("\n") if path.exists() else 0
+
+
+def test_kill_minus_nine(tmp_path):
+    """The same with real processes and a real kill, at whatever moment it comes."""
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "3000"]
+    assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
+    folder = tmp_path / "cut"
+    folder.mkdir()
+    start = command(*arguments, "-f", str(folder))
+    for episodes in (15, 60):
+        with subprocess.Popen(start, env=environment(), stderr=subprocess.PIPE) as process:
+            wait_for(lambda: any(lines(one) > episodes for one in folder.rglob("*.csv")), process)  # noqa: B023
+            process.kill()
+        assert process.returncode == -signal.SIGKILL
+        start = command("-i", str(runs_of(folder)))
+    subprocess.run(start, env=environment(), check=True, timeout=120)
+    assert_same_run(tmp_path / "whole", folder)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_asked_to_stop(number, tmp_path):
+    """A polite stop finishes the rollout, leaves a checkpoint and a model, and is resumed."""
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "1800", "--verbose", "1"]
+    arguments += ["--checkpoint-every", "1000"]
+    start = command(*arguments, "-f", str(tmp_path / "cut"))
+    (tmp_path / "cut").mkdir()
+    with subprocess.Popen(
+        start, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        wait_for(lambda: any(lines(one) > 20 for one in tmp_path.rglob("0.*.csv")), process)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert "Stopping after this rollout" in err and "Traceback" not in err
+    run = runs_of(tmp_path / "cut")
+    assert f"continue with      -i {run}" in out
+    assert (run / "CostPoint-v0.zip").exists() and not (run / "result.json").exists()
+    assert train.main(["-i", str(run), "--verbose", "0"]) == 0
+    assert train.main([*arguments, "--verbose", "0", "-f", str(tmp_path / "whole")]) == 0
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")

@@ -1,0 +1,165 @@
+"""Ids, scenarios, files and keyword arguments, and what they say of bad values."""
+
+import pytest
+
+from sb3_guard.envs import Scenario, env_ids, registry
+from sb3_guard.envs.constraints import Hazards
+from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.envs.tasks import Goal
+
+
+@pytest.mark.parametrize("env_id", env_ids())
+def test_ids_name_their_parts(env_id):
+    task, robot, constraint = env_id.removesuffix("-v0").split("_")
+    scenario = Scenario.parse(env_id)
+    assert (scenario.task, scenario.robot) == (task, robot)
+    assert scenario.constraints == {constraint[1:].lower(): {"num": 8}}
+    assert Scenario(**scenario.to_dict()) == scenario
+
+
+def test_other_numbers_and_single_goals():
+    scenario = Scenario.parse("Goal_Point_3Hazards_noconti-v0")
+    assert scenario.constraints == {"hazards": {"num": 3}}
+    assert scenario.task_params == {"ends": True}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Goal_Pont_8Hazards", "unknown robot 'Pont' .*did you mean 'Point'"),
+        ("Gaol_Point_8Hazards-v0", "unknown task 'Gaol' .*did you mean 'Goal'"),
+        ("Goal_Point_8Hazard", "unknown constraint 'Hazard' .*did you mean 'Hazards'"),
+        ("Goal_Point", "not an id of the form Task_Robot_NConstraint-v0"),
+        ("Goal_Point_-3Hazards", "not an id of the form"),
+        ("Goal_Point_8Hazards-v1", "not an id of the form"),
+    ],
+)
+def test_bad_ids_say_what_is_wrong(name, message):
+    with pytest.raises(ValueError, match=message):
+        Scenario.parse(name)
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"hazards": {"nmu": 3}}, "hazards has no parameter 'nmu': did you mean 'num'"),
+        ({"hazards": {"num": -1}}, "hazards.num = -1 must be at least 0"),
+        ({"hazards": {"num": 2.5}}, "hazards.num = 2.5 must be an integer"),
+        ({"hazards": {"size": -0.1}}, "hazards.size = -0.1 must be greater than 0"),
+        ({"hazards": {"size": "big"}}, "hazards.size = 'big' must be a number"),
+        ({"hazards": {"size": float("nan")}}, "hazards.size = nan must be a number"),
+        ({"hazards": {"indicator": 1}}, "hazards.indicator = 1 must be true or false"),
+        ({"hazards": {"keepout": 3}}, "keepout 3 does not fit the placement"),
+        ({"hazards": {"space": "flat"}}, "hazards.space = 'flat': "),
+        ({"hazards": 4}, "hazards = 4 must be a mapping of parameters"),
+        ({"hazzards": {"num": 4}}, "unknown parameter 'hazzards': did you mean 'hazards'"),
+        ({"goal": {"size": 0}}, "goal.size = 0 must be greater than 0"),
+        ({"lidar": {"bins": 0}}, "lidar.bins = 0 must be at least 1"),
+        ({"layout": {"margin": -1}}, "layout.margin = -1 must be at least 0"),
+        ({"layout": {"placements": [[0, 0, 0, 1]]}}, "a placement must be"),
+        ({"robot": {"heading": "north"}}, "robot.heading = 'north' must be"),
+        ({"hazards": {"num": 1, "locations": [[0, 1], [1, 0]]}}, "2 locations for 1 objects"),
+    ],
+)
+def test_bad_parameters_fail_where_the_world_is_made(params, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        Scenario.parse("Goal_Point_8Hazards").override(**params).build()
+    assert "\n" not in str(caught.value)
+
+
+def test_overrides_change_add_and_remove_parts():
+    base = Scenario.parse("Goal_Point_8Hazards")
+    changed = base.override(
+        hazards={"size": 0.2}, goal={"size": 0.3}, lidar={"bins": 32},
+        danger={"type": "hazards", "num": 2},
+    )  # fmt: skip
+    assert changed.constraints == {
+        "hazards": {"num": 8, "size": 0.2},
+        "danger": {"type": "hazards", "num": 2},
+    }
+    assert base.constraints == {"hazards": {"num": 8}}
+    engine = changed.build()
+    assert engine.observation_layout["danger_lidar"].stop == 3 + 32
+    assert [c.name for c in engine.constraints] == ["hazards", "danger"]
+    assert engine.task.size == 0.3
+    assert base.override(hazards=None).build().constraints == ()
+
+
+def test_two_constraints_of_a_type_are_charged_apart():
+    import numpy as np
+
+    engine = (
+        Scenario.parse("Goal_Point_0Hazards")
+        .override(
+            robot={"locations": [[0, 0]]},
+            near={"type": "hazards", "num": 1, "keepout": 0, "weight": 2.0, "size": 0.3},
+            far={"type": "hazards", "num": 1},
+        )
+        .build()
+    )
+    engine.reset(np.zeros(1, dtype=int))
+    engine.places("near")[0, 0, :2] = [0.1, 0]
+    outcome = engine.step(np.zeros((1, 2)))
+    assert outcome.costs["cost_near"][0] == pytest.approx(0.4, abs=1e-3)
+    assert outcome.costs["cost_far"][0] == 0.0
+    assert outcome.cost[0] == outcome.costs["cost_near"][0]
+
+
+def test_scenarios_from_files(tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text("robot: Point\ntask: Goal\nconstraints:\n  hazards: {num: 2, size: 0.4}\n")
+    assert Scenario.load(path).constraints == {"hazards": {"num": 2, "size": 0.4}}
+    path.write_text("robots: Point\n")
+    with pytest.raises(ValueError, match="has no key 'robots': did you mean 'robot'"):
+        Scenario.load(path)
+    path.write_text("robot: [")
+    with pytest.raises(ValueError, match="cannot read scenario"):
+        Scenario.load(path)
+    path.write_text("- 1")
+    with pytest.raises(ValueError, match="must be a mapping, found list"):
+        Scenario.load(path)
+    with pytest.raises(ValueError, match="cannot read scenario"):
+        Scenario.load(tmp_path / "none.yml")
+
+
+def test_registered_parts_are_used_by_ids(tmp_path):
+    class Home(Goal):
+        """Go home."""
+
+        name = "home"
+
+    class Puddles(Hazards):
+        """Wet."""
+
+        name = "puddles"
+
+    xml = tmp_path / "sled.xml"
+    xml.write_text(registry.ROBOTS["Point"].path().read_text())
+    try:
+        registry.register_task("Home", Home)
+        registry.register_constraint("Puddles", Puddles)
+        registry.register_robot("Sled", xml=xml, timestep=0.004)
+        engine = Scenario.parse("Home_Sled_2Puddles").build()
+        assert engine.model.opt.timestep == 0.004
+        assert "puddles_lidar" in engine.observation_layout
+    finally:
+        for table, name in (
+            (registry.TASKS, "Home"),
+            (registry.CONSTRAINTS, "Puddles"),
+            (registry.ROBOTS, "Sled"),
+        ):
+            table.pop(name, None)
+
+
+def test_bad_registrations_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="needs a class or an xml file"):
+        registry.register_robot("X")
+    with pytest.raises(ValueError, match="there is no file"):
+        registry.register_robot("X", xml=tmp_path / "none.xml")
+    with pytest.raises(ValueError, match="cannot be part of an id"):
+        registry.register_task("My_Task", Goal)
+
+
+def test_hints_name_the_nearest_match_whatever_its_case():
+    assert did_you_mean("pOINT", ["Point", "Ant"]).startswith("did you mean 'Point'?")
+    assert did_you_mean("zzz", ["Point", "Ant"]) == "allowed: Point, Ant"

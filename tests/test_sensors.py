@@ -1,0 +1,112 @@
+"""Lidar and compass against scalar loops written from their formulas."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sb3_guard.envs import geometry
+from sb3_guard.envs.sensors import Lidar, compass
+
+
+def lidar_2d(points, bins, gain, reach, alias):
+    """One body, points [K][2] in its frame."""
+    out = [0.0] * bins
+    for x, y in points:
+        d = math.hypot(x, y)
+        phi = math.atan2(y, x) % (2 * math.pi)
+        width = 2 * math.pi / bins
+        k = min(int(phi / width), bins - 1)
+        s = math.exp(-gain * d) if reach is None else max(0.0, reach - d) / reach
+        out[k] = max(out[k], s)
+        if alias:
+            share = (phi - k * width) / width
+            after, before = (k + 1) % bins, (k - 1) % bins
+            out[after] = max(out[after], share * s)
+            out[before] = max(out[before], (1 - share) * s)
+    return out
+
+
+def lidar_3d(points, azimuth, elevation, gain, alias):
+    """One body, points [K][3] in its frame; bins in order azimuth, elevation."""
+    out = [[0.0] * elevation for _ in range(azimuth)]
+    for x, y, z in points:
+        s = math.exp(-gain * math.sqrt(x * x + y * y + z * z))
+        around, up = 2 * math.pi / azimuth, math.pi / elevation
+        phi = math.atan2(y, x) % (2 * math.pi)
+        psi = math.atan2(z, math.hypot(x, y)) + math.pi / 2
+        a = min(int(phi / around), azimuth - 1)
+        e = min(int(psi / up), elevation - 1)
+        out[a][e] = max(out[a][e], s)
+        if alias:
+            share = (phi - a * around) / around
+            rise = (psi - e * up) / up
+            for column, value in (((a + 1) % azimuth, share), ((a - 1) % azimuth, 1 - share)):
+                out[column][e] = max(out[column][e], value * s)
+            for row, value in ((min(e + 1, elevation - 1), rise), (max(e - 1, 0), 1 - rise)):
+                out[a][row] = max(out[a][row], value * s)
+    return [value for column in out for value in column]
+
+
+@pytest.mark.parametrize("bins", [1, 2, 3, 16])
+@pytest.mark.parametrize(("gain", "reach"), [(1.0, None), (0.5, None), (1.0, 2.5)])
+@pytest.mark.parametrize("alias", [True, False])
+def test_planar_lidar_equals_the_scalar_loop(bins, gain, reach, alias):
+    rng = np.random.default_rng(bins)
+    v = rng.uniform(-3, 3, (7, 2, 5, 2))
+    v[0, 0, :4] = [[1, 0], [0, 1], [-1, 0], [0, -1]]  # on the edges between bins
+    v[1, 0, :2] = [[0, 0], [-1, -1e-300]]  # on the spot, and an angle that rounds up to 2 pi
+    scan = Lidar(bins=bins, gain=gain, max_distance=reach, alias=alias).scan(v)
+    for n, b in np.ndindex(7, 2):
+        np.testing.assert_allclose(
+            scan[n, b], lidar_2d(v[n, b].tolist(), bins, gain, reach, alias), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("alias", [True, False])
+@pytest.mark.parametrize(("azimuth", "elevation"), [(10, 6), (1, 1), (4, 3)])
+def test_spatial_lidar_equals_the_scalar_loop(azimuth, elevation, alias):
+    rng = np.random.default_rng(1)
+    v = rng.uniform(-3, 3, (6, 3, 4, 3))
+    v[0, 0, :3] = [[0, 0, 2], [0, 0, -2], [0, 0, 0]]  # the poles, and on the spot
+    scan = Lidar(azimuth=azimuth, elevation=elevation, alias=alias).scan(v)
+    for n, b in np.ndindex(6, 3):
+        want = lidar_3d(v[n, b].tolist(), azimuth, elevation, 1.0, alias)
+        np.testing.assert_allclose(scan[n, b], want, atol=1e-12)
+
+
+def test_lidar_of_nothing_is_empty():
+    assert not Lidar().scan(np.zeros((3, 1, 0, 2))).any()
+    assert Lidar().scan(np.zeros((3, 1, 0, 2))).shape == (3, 1, 16)
+
+
+def test_compass_equals_the_formula_and_is_zero_on_the_spot():
+    v = np.array([[3.0, 4.0], [0.0, 0.0], [-1e-3, 0.0]])
+    np.testing.assert_allclose(
+        compass(v), [[3 / 5.001, 4 / 5.001], [0, 0], [-1e-3 / 2e-3, 0]], atol=1e-15
+    )
+
+
+def test_points_in_frames_equal_the_matrix_product():
+    rng = np.random.default_rng(2)
+    rotation = np.linalg.qr(rng.normal(size=(4, 2, 3, 3)))[0]
+    origin, points = rng.normal(size=(4, 2, 3)), rng.normal(size=(4, 5, 3))
+    got = geometry.into_frames(origin, rotation, points)
+    for n, b, k in np.ndindex(4, 2, 5):
+        want = rotation[n, b].T @ (points[n, k] - origin[n, b])
+        np.testing.assert_allclose(got[n, b, k], want, atol=1e-14)
+    np.testing.assert_array_equal(geometry.into_frames(origin, rotation, points, 2), got[..., :2])
+
+
+def test_distance_to_segments():
+    start, end = np.array([[[0.0, 0, 0]]]), np.array([[[2.0, 0, 0]]])
+    points = np.array([[[1.0, 3, 4], [-3, 0, 4], [5, 4, 0], [1, 0, 0]]])
+    np.testing.assert_allclose(geometry.segment_distance(start, end, points)[0, 0], [5, 5, 5, 0])
+
+
+def test_turns_by_quaternion_and_by_matrix_agree():
+    headings = np.array([0.0, 0.3, -2.0])
+    matrices = geometry.rotation_matrix(geometry.yaw_quaternion(headings)).reshape(3, 3, 3)
+    for heading, matrix in zip(headings, matrices, strict=True):
+        c, s = math.cos(heading), math.sin(heading)
+        np.testing.assert_allclose(matrix, [[c, -s, 0], [s, c, 0], [0, 0, 1]], atol=1e-15)

@@ -1,0 +1,108 @@
+"""The native vector environment of Stable-Baselines3, against one environment after the other."""
+
+import cloudpickle
+import gymnasium
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from sb3_guard import CostMonitor, Scenario, make_vec_env
+from sb3_guard.common.vec_env import GuardVecEnv, find_scenario
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+@pytest.mark.parametrize("flatten", [True, False])
+def test_native_equals_one_by_one(vec_env, flatten):
+    kwargs = {"seed": 3, "max_episode_steps": 30, "env_kwargs": {"flatten": flatten}}
+    native = make_vec_env("Goal_Point_8Hazards-v0", 3, **kwargs)
+    other = make_vec_env("Goal_Point_8Hazards-v0", 3, vec_env=vec_env, **kwargs)
+    assert isinstance(native, CostMonitor) and isinstance(native.unwrapped, GuardVecEnv)
+    rng = np.random.default_rng(0)
+    pick = (lambda o: o) if flatten else (lambda o: np.concatenate(list(o.values()), axis=-1))
+    np.testing.assert_array_equal(pick(native.reset()), pick(other.reset()))
+    for _ in range(70):
+        action = rng.uniform(-1, 1, (3, 2)).astype(np.float32)
+        a, b = native.step(action), other.step(action)
+        np.testing.assert_array_equal(pick(a[0]), pick(b[0]))
+        np.testing.assert_array_equal(a[1], b[1].astype(np.float32))
+        np.testing.assert_array_equal(a[2], b[2])
+        for i, j in zip(a[3], b[3], strict=True):
+            assert {k for k in i} - {"TimeLimit.truncated"} == {k for k in j} - {
+                "TimeLimit.truncated"
+            }
+            assert i["cost"] == j["cost"] and i["cost_hazards"] == j["cost_hazards"]
+            if "terminal_observation" in i:
+                np.testing.assert_array_equal(
+                    pick(i["terminal_observation"]), pick(j["terminal_observation"])
+                )
+                assert i["TimeLimit.truncated"] is j["TimeLimit.truncated"] is True
+                for key in "rlc":  # the subprocess one sums rewards of double precision
+                    assert i["episode"][key] == pytest.approx(j["episode"][key], abs=1e-6)
+    native.close()
+    other.close()
+
+
+def test_states_of_wrapped_environments_survive_pickling():
+    env = make_vec_env("Goal_Point_8Hazards", 2, seed=0, max_episode_steps=20)
+    env.reset()
+    env.step(np.ones((2, 2)))
+    state = cloudpickle.loads(cloudpickle.dumps(env.unwrapped.state()))
+    other = make_vec_env("Goal_Point_8Hazards", 2, seed=9, num_threads=1, max_episode_steps=20)
+    other.reset()
+    other.unwrapped.restore(state)
+    for _ in range(30):
+        np.testing.assert_array_equal(env.step(np.ones((2, 2)))[0], other.step(np.ones((2, 2)))[0])
+
+
+def test_foreign_environments_go_through_gymnasium():
+    env = make_vec_env("CartPole-v1", 2, seed=0)
+    assert env.reset().shape == (2, 4)
+    *_, infos = env.step(np.zeros(2, dtype=int))
+    assert "cost" not in infos[0]
+    assert find_scenario("CartPole-v1") is None
+    assert find_scenario("Goal_Point_2Hazards") == Scenario.parse("Goal_Point_2Hazards")
+
+
+def test_wrappers_and_normalisation_work():
+    env = make_vec_env(
+        "Goal_Point_8Hazards", 2, wrapper_class=gymnasium.wrappers.ClipAction, seed=0
+    )
+    assert env.env_is_wrapped(gymnasium.wrappers.ClipAction) == [True, True]
+    native: VecEnv = VecNormalize(make_vec_env("Goal_Point_8Hazards", 2, seed=0))
+    native.reset()
+    assert native.env_is_wrapped(gymnasium.wrappers.ClipReward) == [False, False]
+    costs = [info["cost"] for _ in range(50) for info in native.step(np.ones((2, 2)))[3]]
+    assert np.isfinite(costs).all()
+    assert native.get_attr("scenario", 0) == [Scenario.parse("Goal_Point_8Hazards")]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "message"),
+    [
+        ("CartPole-v2", {}, "unknown environment 'CartPole-v2': did you mean 'CartPole-v1'"),
+        ("Goal_Point_8Hazard", {}, "unknown constraint 'Hazard'"),
+        ("Goal_Point_8Hazards-v3", {}, "did you mean 'Goal_Point_8Hazards-v0'"),
+        ("CartPole-v1", {"vec_env": "native"}, "not an sb3_guard environment"),
+        ("CartPole-v1", {"vec_env": "sub"}, "unknown vec_env 'sub': did you mean 'subproc'"),
+        ("Goal_Point_8Hazards", {"n_envs": 0}, "n_envs = 0 must be an integer of at least 1"),
+        ("Goal_Point_8Hazards", {"num_threads": 0}, "num_threads = 0 must be at least 1"),
+        (
+            "Goal_Point_8Hazards",
+            {"vec_env": "native", "wrapper_class": gymnasium.wrappers.ClipReward},
+            "wrapper_class needs",
+        ),
+        ("Goal_Point_8Hazards", {"env_kwargs": {"hazards": {"num": -1}}}, "must be at least 0"),
+    ],
+)
+def test_bad_requests_are_refused_in_one_line(env_id, kwargs, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        make_vec_env(env_id, **kwargs)
+    assert "\n" not in str(caught.value)
+
+
+def test_single_rows_cannot_be_reached_and_the_error_says_what_to_do():
+    env = make_vec_env("Goal_Point_8Hazards", 2)
+    with pytest.raises(AttributeError, match="vec_env='dummy'"):
+        env.set_attr("camera", "top")
+    with pytest.raises(AttributeError, match="vec_env='dummy'"):
+        env.env_method("render")

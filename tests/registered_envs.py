@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from cost_envs import CostPoint
+from stable_baselines3.common.callbacks import BaseCallback
 
 
 class Filmed(CostPoint):
@@ -43,8 +44,19 @@ class Flickering(CostPoint):
     """Reports a cost that is not a number after a while."""
 
     def step(self, action: np.ndarray) -> Any:
-        *rest, info = super().step(action)
+        *rest, _ = super().step(action)
         return *rest, {"cost": float("nan") if self.steps > 20 else 0.0}
+
+
+class StopAt(BaseCallback):
+    """A user's callback that ends training."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps < self.steps
 
 
 for name, cls in {

@@ -106,10 +106,10 @@ def test_logs_the_cost(tmp_path):
             rows.append(dict(self.name_to_value))
             super().dump(step)
 
-    model = CPO("MlpPolicy", envs(cost_keys=("cost", "heat")), n_steps=20, seed=3,
-                cost_keys=("cost", "heat"), n_critic_updates=2)  # fmt: skip
+    keys = ("cost", "heat")
+    model = CPO("MlpPolicy", envs(cost_keys=keys), n_steps=20, cost_keys=keys, n_critic_updates=2)
     model.set_logger(Recorder(None, []))
-    watcher = CostEvalCallback(envs(cost_keys=("cost", "heat")), eval_freq=15, verbose=0)
+    watcher = CostEvalCallback(envs(cost_keys=keys), eval_freq=15, verbose=0)
     model.learn(40, callback=watcher)
     (row,) = [row for row in rows if "eval/mean_reward" in row]
     assert row["eval/mean_ep_cost"] == row["eval/mean_ep_cost/cost"] == watcher.last_mean_cost
@@ -154,7 +154,7 @@ def test_callbacks_on_new_best_and_after_eval(tmp_path):
             return False
 
     best, after = Count(), Count()
-    _, watcher = learn(tmp_path, callback_on_new_best=best, callback_after_eval=after)
+    learn(tmp_path, callback_on_new_best=best, callback_after_eval=after)
     assert after.n_calls == 4
     assert 1 <= best.n_calls <= 4
     model, _ = learn(tmp_path, callback_after_eval=StopAtOnce())

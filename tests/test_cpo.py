@@ -227,3 +227,25 @@ def test_several_costs_have_their_own_logs_and_limits() -> None:
         violations, model.costs.episode_cost - np.array([1.0, 100.0]), rtol=1e-6
     )
     assert model.cost_critic.predict(th.zeros(3, 4)).shape == (3, 2)
+    model.logger.dump = lambda step=0: None  # type: ignore[method-assign]
+    model.dump_logs()
+    means = [logged[f"rollout/ep_cost_mean/{key}"] for key in KEYS]
+    assert means[1] == pytest.approx(2 * means[0])
+    assert logged["rollout/cost_rate/cost"] == pytest.approx(model.total_costs[0] / 400)
+
+
+def test_cost_advantages_are_centred_and_not_scaled() -> None:
+    """They share the limit's units, so only their mean may go; the reward's are standardised."""
+    model = make(lambda: CostPoint(cost_scale=100.0, hazard=(-1.0, 0.0)))
+    raw, batches = [], []
+    surrogate, train = model.surrogate, model.train
+    model.surrogate = lambda batch, ratio: batches.append(batch) or surrogate(batch, ratio)
+    model.train = lambda: raw.append(model.rollout_buffer.cost_advantages.copy()) or train()
+    model.learn(400)
+    advantages, expected = batches[0].cost_advantages.numpy().ravel(), raw[0].ravel()
+    assert abs(expected.mean()) > 1.0
+    np.testing.assert_allclose(
+        np.sort(advantages), np.sort(expected - expected.mean()), rtol=1e-3, atol=1e-3
+    )
+    assert batches[0].advantages.mean().item() == pytest.approx(0.0, abs=1e-5)
+    assert batches[0].advantages.std().item() == pytest.approx(1.0, rel=1e-4)

@@ -240,7 +240,8 @@ def test_a_fixed_layout_repeats_within_a_row():
     env = GuardVectorEnv(2, "Goal_Point_8Hazards", layout={"randomize": False})
     env.reset(seed=0)
     first = env.engine.places("hazards").copy()
-    env.reset()
+    obs, _ = env.reset()
+    np.testing.assert_array_equal(env.reset()[0], obs)  # the heading too
     np.testing.assert_array_equal(env.engine.places("hazards"), first)
     assert not np.array_equal(first[0], first[1])
     env.reset(seed=5)

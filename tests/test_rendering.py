@@ -103,3 +103,24 @@ def test_no_backend_is_a_clear_error(monkeypatch):
     monkeypatch.setattr(rendering.sys, "executable", "/bin/false")
     with pytest.raises(rendering.RenderingError, match=r"tried osmesa .*install EGL"):
         rendering.gl_backend.__wrapped__()
+
+
+def test_the_robots_own_camera_can_be_observed():
+    options = {"flatten": False, "observe": {"camera": [32, 24]}}
+    env = gymnasium.make("Goal_Point_8Hazards-v0", max_episode_steps=2, **options)
+    obs, _ = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    assert obs["camera"].shape == (24, 32, 3) and obs["camera"].std() > 1
+    batch = make_vec_env("Goal_Point_8Hazards", 2, seed=0, max_episode_steps=2, env_kwargs=options)
+    np.testing.assert_array_equal(batch.reset()["camera"][0], obs["camera"])
+    action = np.array([[0.5, 1.0], [0.5, 1.0]])
+    for _ in range(2):
+        obs, *_ = env.step(action[0])
+        after, _, dones, infos = batch.step(action)
+    assert dones.all()
+    np.testing.assert_array_equal(infos[0]["terminal_observation"]["camera"], obs["camera"])
+    assert not np.array_equal(after["camera"][0], obs["camera"])
+    with pytest.raises(ValueError, match="needs flatten=False"):
+        gymnasium.make("Goal_Point_8Hazards-v0", observe={"camera": [32, 24]})
+    env.close()
+    batch.close()

@@ -16,14 +16,16 @@ import pytest
 import torch as th
 
 from sb3_guard import train
+from sb3_guard.zoo.checkpoint import read_checkpoint
 from sb3_guard.zoo.progress import Epochs
 
 TESTS = Path(__file__).parent
 # Checkpoints at every rollout; models kept and evaluations at steps that are no rollout's end.
-SMALL = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3", "--seed", "3", "--save-freq", "70",
-         "--eval-freq", "50", "--eval-episodes", "3", "--n-eval-envs", "2", "--checkpoint-every", "0",
-         "--verbose", "0", "--device", "cpu"]  # fmt: skip
-TOY = ["--gym-packages", "registered_envs", "--env", "CostPoint-v0"]
+SMALL = (
+    "-params n_envs:2 n_steps:30 n_critic_updates:3 --seed 3 --save-freq 70 --checkpoint-every 0 "
+    "--eval-freq 50 --eval-episodes 3 --n-eval-envs 2 --verbose 0 --device cpu"
+).split()
+TOY = "--gym-packages registered_envs --env CostPoint-v0".split()
 SHORT = ["--env-kwargs", "episode_length:25"]  # no divisor of a rollout
 
 
@@ -116,7 +118,7 @@ VARIANTS = {
         "cost_keys:('cost', 'heat')",
         "-params",
         "cost_keys:['cost', 'heat']",
-    ],  # fmt: skip
+    ],
     "rare logs": ["--log-interval", "2"],
 }
 
@@ -179,7 +181,11 @@ def test_finished_run_goes_on_as_a_longer_one(tmp_path, capsys):
 def test_time_goes_on(tmp_path, monkeypatch):
     arguments = [*TOY, *SHORT, *SMALL, "-n", "300", "-f", str(tmp_path)]
     crash(monkeypatch, arguments, 100)
+    before = read_checkpoint(runs_of(tmp_path) / "checkpoint.zip")
     assert train.main(["-i", str(runs_of(tmp_path))]) == 0
+    after = read_checkpoint(runs_of(tmp_path) / "checkpoint.zip")
+    assert after["elapsed"] > before["elapsed"]
+    assert after["start"] == 0  # speed is that of the whole run
     log = pd.read_csv(runs_of(tmp_path) / "progress.csv")
     log = log[log["time/iterations"].notna()]
     assert log["time/iterations"].tolist() == [1, 2, 3, 4, 5]
@@ -195,6 +201,14 @@ def test_environments_that_can_not_be_saved_begin_anew(tmp_path, monkeypatch, ca
     assert result["n_timesteps"] == 300
     episodes = pd.read_csv(runs_of(tmp_path) / "0.monitor.csv", skiprows=1)
     assert (episodes["l"] == 25).all()
+
+
+def test_a_run_stopped_within_a_rollout_keeps_the_checkpoint_before(tmp_path):
+    stop = ["-params", "callback:{'registered_envs.StopAt': {'steps': 100}}"]
+    assert train.main([*TOY, *SMALL, *stop, "-n", "300", "-f", str(tmp_path)]) == 0
+    run = runs_of(tmp_path)
+    assert json.loads((run / "result.json").read_text())["n_timesteps"] == 100
+    assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 60
 
 
 def test_a_checkpoint_is_a_model(tmp_path, monkeypatch):

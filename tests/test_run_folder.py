@@ -79,7 +79,7 @@ def test_damaged_config(tmp_path, content):
 
 def test_log_folder_that_can_not_be(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="can't write to log folder .* choose another with -f"):
+    with pytest.raises(UsageError, match=r"can't write to log folder .* choose another with -f"):
         create(tmp_path / "file")
 
 
@@ -126,6 +126,11 @@ def test_files_appear_whole_or_not_at_all(tmp_path):
         file.write(b"half of the n")
         raise RuntimeError
     assert path.read_bytes() == b"old"
+    with open(path, "rb") as reader:
+        with replacing(path) as file:
+            file.write(b"new")
+        # Who had opened the old file still has all of it.
+        assert (reader.read(), path.read_bytes()) == (b"old", b"new")
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
 
 

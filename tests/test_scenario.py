@@ -163,3 +163,21 @@ def test_bad_registrations_are_refused(tmp_path):
 def test_hints_name_the_nearest_match_whatever_its_case():
     assert did_you_mean("pOINT", ["Point", "Ant"]).startswith("did you mean 'Point'?")
     assert did_you_mean("zzz", ["Point", "Ant"]) == "allowed: Point, Ant"
+
+
+def test_extra_observations_join_the_layout_in_alphabetical_order():
+    import numpy as np
+
+    options = {"remaining": True, "horizon": 10, "qpos": True, "qvel": True, "ctrl": True}
+    engine = Scenario.parse("Goal_Point_8Hazards").override(observe={**options, "com": True}).build()
+    layout = engine.observation_layout
+    assert list(layout) == sorted(layout)
+    assert {"remaining", "qpos", "qvel", "ctrl", "com"} <= set(layout)
+    engine.reset(np.zeros(1, dtype=int))
+    obs = engine.step(np.array([[0.5, -0.25]])).obs[0]
+    assert obs[layout["remaining"]] == pytest.approx(0.9)
+    np.testing.assert_allclose(obs[layout["ctrl"]], [0.5, -0.25])
+    np.testing.assert_allclose(obs[layout["qpos"]], engine.batch.bind("qpos")[0], rtol=1e-6)
+    np.testing.assert_allclose(obs[layout["qvel"]], engine.batch.bind("qvel")[0], rtol=1e-6)
+    com = engine.robot.position[0] + 0.019 * engine.robot.frames[1][0, 0, :, 0]
+    np.testing.assert_allclose(obs[layout["com"]], com, atol=1e-3)

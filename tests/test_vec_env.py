@@ -73,6 +73,7 @@ def test_wrappers_and_normalisation_work():
     assert native.env_is_wrapped(gymnasium.wrappers.ClipReward) == [False, False]
     costs = [info["cost"] for _ in range(50) for info in native.step(np.ones((2, 2)))[3]]
     assert np.isfinite(costs).all()
+    assert native.get_attr("spec")[1].max_episode_steps == 1000
     assert native.get_attr("scenario", 0) == [Scenario.parse("Goal_Point_8Hazards")]
 
 

@@ -1,6 +1,5 @@
 """Evaluation during training that knows about costs, and the model worth keeping."""
 
-import io
 import os
 import pickle
 from collections.abc import Mapping, Sequence
@@ -92,7 +91,7 @@ class CostEvalCallback(EvalCallback):
         """Episode cost up to which a model counts as safe, one per cost key, shape [m]."""
         limit: Any = self.selection_limit
         if limit is None:
-            cost_limit = getattr(self.model, "cost_limit", None)
+            cost_limit: Any = getattr(self.model, "cost_limit", None)
             constrained = cost_limit is not None and getattr(self.model, "constrained", True)
             limit = np.maximum(cost_limit, 1.0) if constrained else np.inf
         return np.broadcast_to(np.asarray(limit, dtype=np.float64), (len(self.cost_keys),))
@@ -168,10 +167,8 @@ class CostEvalCallback(EvalCallback):
         if self.best_model_save_path is None:
             return
         folder = Path(self.best_model_save_path)
-        model = io.BytesIO()
-        self.model.save(model)
         with replacing(folder / "best_model.zip") as file:
-            file.write(model.getvalue())
+            self.model.save(file)
         normalizer = self.model.get_vec_normalize_env()
         if normalizer is not None:
             with replacing(folder / "best_model_vecnormalize.pkl") as file:

@@ -61,7 +61,7 @@ class CostMonitor(VecMonitor):
             self.log_to(filename)
 
     def _clear(self) -> None:
-        self.episode_returns = np.zeros(self.num_envs)
+        self.episode_returns: np.ndarray = np.zeros(self.num_envs)
         self.episode_lengths = np.zeros(self.num_envs, dtype=np.int64)
         self.episode_costs = np.zeros(self.num_envs)
         self._key_costs = np.zeros((len(self._columns), self.num_envs))
@@ -86,7 +86,7 @@ class CostMonitor(VecMonitor):
         if dones.any():
             # Infos may be the environment's own objects: a copy gets the new entry.
             infos = list(infos)
-            for i in np.flatnonzero(dones):
+            for i in np.flatnonzero(dones).tolist():
                 infos[i] = {**infos[i], "episode": self._end_episode(i, infos[i])}
         return obs, rewards, dones, infos
 

@@ -72,6 +72,9 @@ class GuardVecEnv(VecEnv):
         self, scenario: str | Mapping[str, Any] | Scenario, num_envs: int = 1, **kwargs: Any
     ) -> None:
         self.envs = envs.GuardVectorEnv(num_envs, scenario, **kwargs)
+        # algorithms read the length of an episode from it
+        self.envs.spec = envs.env_spec(self.envs.scenario)
+        self.envs.spec.max_episode_steps = self.envs.max_episode_steps
         self.render_mode = self.envs.render_mode  # read by VecEnv.__init__
         super().__init__(
             num_envs, self.envs.single_observation_space, self.envs.single_action_space
@@ -83,7 +86,7 @@ class GuardVecEnv(VecEnv):
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
-        return self._view(obs)
+        return self.envs.view(obs, self.envs.look())
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -105,14 +108,10 @@ class GuardVecEnv(VecEnv):
                     infos[row][name] = True
         if t.done.any():
             for row in np.flatnonzero(t.done).tolist():
-                infos[row]["terminal_observation"] = self._view(out.obs[row])
+                last = self.envs.view(out.obs, t.final_images, row)
+                infos[row]["terminal_observation"] = last
                 infos[row]["TimeLimit.truncated"] = bool(t.truncated[row] & ~out.terminated[row])
-        return self._view(t.obs), out.reward.astype(np.float32), t.done, infos
-
-    def _view(self, obs: np.ndarray) -> Any:
-        if self.envs.flatten:
-            return obs
-        return {n: obs[..., where] for n, where in self.envs.observation_layout.items()}
+        return self.envs.view(t.obs, t.images), out.reward.astype(np.float32), t.done, infos
 
     def close(self) -> None:
         self.envs.close()

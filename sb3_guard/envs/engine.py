@@ -20,6 +20,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from sb3_guard.envs import geometry, sensors
+from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import ARENA, Footprint, LayoutError, Rectangle, arrange, redraw
 from sb3_guard.envs.parameters import Parameters, param
 from sb3_guard.envs.part import FLOOR, Array, Constraint, Part, Robot, Task
@@ -45,7 +46,7 @@ class Layout(Parameters):
         "rectangles (x low, y low, x high, y high) that parts without their own are drawn in, m",
     )
     margin: float = param(0.0, "extra distance between any two objects, m", low=0)
-    randomize: bool = param(True, "false: the same layout in every episode of a row")
+    randomize: bool = param(True, "false: every episode of a row begins and goes on alike")
 
 
 @dataclass
@@ -165,6 +166,7 @@ class Engine:
     :param num_threads: threads that step them; by default one per CPU, at most N
     :param lidar: settings of the pseudo-lidar
     :param layout: options of the layout
+    :param extras: what else is observed
     :raises ValueError: parts that do not go together
     """
 
@@ -177,6 +179,7 @@ class Engine:
         num_threads: int | None = None,
         lidar: Lidar | None = None,
         layout: Layout | None = None,
+        extras: Extras | None = None,
     ) -> None:
         if (
             isinstance(num_envs, bool)
@@ -187,12 +190,17 @@ class Engine:
         if num_threads is not None and num_threads < 1:
             raise ValueError(f"num_threads = {num_threads!r} must be at least 1, or None")
         self.robot, self.task, self.constraints = robot, task, tuple(constraints)
-        self.parts: tuple[Part, ...] = (robot, task, *self.constraints)
+        self.extras = extras or Extras()
+        self.parts: tuple[Part, ...] = (robot, task, *self.constraints, self.extras)
         self.num_envs = int(num_envs)
         self.num_threads = min(num_threads or _cpus(), self.num_envs)
         self._lidar = lidar or Lidar()
         self._layout = layout or Layout()
 
+        names = [part.name for part in self.parts]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"two parts are called {name!r}; give one of them another name")
         world = WorldSpec(robot)
         for part in self.parts:
             part.build(world)
@@ -206,13 +214,15 @@ class Engine:
         self.rngs = [np.random.default_rng() for _ in range(self.num_envs)]
         self._arrays: dict[str, Array] = {}
         self.steps = self.array("steps", dtype=np.int64)
-        repeated = [p.name for p in self.parts if [q.name for q in self.parts].count(p.name) > 1]
-        if repeated:
-            raise ValueError(f"two parts are called {repeated[0]!r}; give one of them another name")
         self.footprints: dict[str, Footprint] = {}
         self._owners: dict[str, Part] = {}
         for part in self.parts:
             for f in part.footprints():
+                if f.name in self.footprints:
+                    raise ValueError(
+                        f"{part.name} and {self._owners[f.name].name} both place {f.name!r}; "
+                        "give the constraint another name"
+                    )
                 self.footprints[f.name] = replace(
                     f,
                     placements=f.placements or self._layout.placements,
@@ -220,7 +230,8 @@ class Engine:
                 )
                 self._owners[f.name] = part
                 self.array(f"places/{f.name}", (f.num, 3))
-        self._frozen: dict[int, dict[str, Array]] = {}  # layouts that randomize=False keeps
+        # where the generators begin every episode of rows whose layout is not to change
+        self._origins: dict[int, Any] = {}
         for part in self.parts:
             part.bind(self)
         self._channels: dict[str, Channel] = {}
@@ -319,44 +330,43 @@ class Engine:
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Give one row its generator; its layouts and its movers draw from nothing else."""
         self.rngs[row] = rng
-        self._frozen.pop(row, None)
+        self._origins.pop(row, None)
 
     def reset(self, ids: Array) -> None:
-        """Begin an episode in rows ``ids``, sorted, without a cost at the start.
+        """Begin an episode in rows ``ids``, sorted, with no cost and no goal reached at the start.
 
-        :raises LayoutError: a part finds no room, or every layout starts with a cost
+        :raises LayoutError: a part finds no room, or no start is without a cost
         """
         ids = np.asarray(ids, dtype=np.int32)
         self.steps[ids] = 0
+        footprints = list(self.footprints.values())
+        if not self._layout.randomize:
+            for row in ids.tolist():
+                bits = self.rngs[row].bit_generator
+                bits.state = self._origins.setdefault(row, bits.state)
         pending = ids
         for _ in range(CLEAN_STARTS):
             self.batch.reset(pending, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
             for row in pending.tolist():
-                for name, places in self._arrange(row).items():
+                for name, places in arrange(footprints, self.rngs[row]).items():
                     self.places(name)[row] = places
             for part in self.parts:
                 part.reset(pending, self.rngs)
             self.batch.forward(pending, stage=STAGE)
-            costs = [c.cost()[pending] for c in self.constraints]
-            pending = pending[sum(costs, np.zeros(len(pending))) > 0]
+            blemish = self.task.succeeded(self.task.measure())
+            for constraint in self.constraints:
+                blemish = blemish | (constraint.cost() > 0)
+            pending = pending[blemish[pending]]
             if not len(pending):
                 break
         else:
-            names = ", ".join(c.name for c in self.constraints)
+            names = ", ".join(part.name for part in (self.task, *self.constraints))
             raise LayoutError(
-                f"no layout without a cost at the start in {CLEAN_STARTS} draws: "
+                f"every start of {CLEAN_STARTS} has a cost or its goal reached: "
                 f"make {names} smaller or fewer, or their keepout larger"
             )
         self._before[ids] = self.task.measure()[ids]
         self._warned[ids] = self._warnings[ids]
-
-    def _arrange(self, row: int) -> dict[str, Array]:
-        """A layout for one row, from its own generator."""
-        if self._layout.randomize:
-            return arrange(list(self.footprints.values()), self.rngs[row])
-        if row not in self._frozen:
-            self._frozen[row] = arrange(list(self.footprints.values()), self.rngs[row])
-        return self._frozen[row]
 
     def observe(self) -> Array:
         """The flat observation of every row, [N, D] float32, a new array."""
@@ -429,7 +439,7 @@ class Engine:
             "batch": self.batch.state.copy(),
             "arrays": {name: a.copy() for name, a in self._arrays.items()},
             "rngs": [rng.bit_generator.state for rng in self.rngs],
-            "frozen": {r: {n: p.copy() for n, p in f.items()} for r, f in self._frozen.items()},
+            "origins": dict(self._origins),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -448,7 +458,7 @@ class Engine:
         for name, value in state["arrays"].items():
             self._arrays[name][:] = value
         self.rngs = [_generator(s) for s in state["rngs"]]
-        self._frozen = {r: dict(f) for r, f in state["frozen"].items()}
+        self._origins = dict(state["origins"])
         self.batch.forward(stage=STAGE)
         self._warned[:] = self._warnings
 

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_guard.envs.engine import Engine, Outcome
+from sb3_guard.envs.extras import EYE
 from sb3_guard.envs.parameters import did_you_mean
 from sb3_guard.envs.rendering import CAMERAS, Renderer
 from sb3_guard.envs.scenario import Scenario
@@ -30,13 +31,21 @@ def as_scenario(
 
 
 def observation_space(engine: Engine, flatten: bool) -> spaces.Box | spaces.Dict:
-    """The space of one row's observation, with the true bounds of each component."""
+    """The space of one row's observation, with the true bounds of each component.
+
+    :raises ValueError: an image cannot be part of a flat vector
+    """
+    camera = engine.extras.camera
     boxes: dict[str, spaces.Space[Any]] = {
         name: spaces.Box(c.low, c.high, (c.size,), np.float32)
         for name, c in engine.channels.items()
     }
     if not flatten:
+        if camera is not None:
+            boxes["camera"] = spaces.Box(0, 255, (camera[1], camera[0], 3), np.uint8)
         return spaces.Dict(boxes)
+    if camera is not None:
+        raise ValueError(f"observe.camera = {camera!r} needs flatten=False, a Dict observation")
     channels = engine.channels.values()
     low = np.concatenate([np.full(c.size, c.low, np.float32) for c in channels])
     high = np.concatenate([np.full(c.size, c.high, np.float32) for c in channels])
@@ -112,6 +121,7 @@ class GuardEnv(gymnasium.Env[Any, Array]):
         control_step = 10 * self.engine.model.opt.timestep
         self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
         self._renderer: Renderer | None = None
+        self._eye: Renderer | None = None  # the robot's own camera, if it is observed
 
     @property
     def observation_layout(self) -> dict[str, slice]:
@@ -153,7 +163,12 @@ class GuardEnv(gymnasium.Env[Any, Array]):
     def _view(self, obs: Array) -> Any:
         if self.flatten:
             return obs[0]
-        return {name: obs[0, where] for name, where in self.engine.observation_layout.items()}
+        out = {name: obs[0, where] for name, where in self.engine.observation_layout.items()}
+        if self.engine.extras.camera is not None:
+            if self._eye is None:
+                self._eye = Renderer(self.engine, *self.engine.extras.camera, EYE)
+            out["camera"] = self._eye.frame(0)
+        return out
 
     def render(self) -> Array | None:
         """A frame, [height, width, 3] uint8, or a look at the window; never advances physics."""
@@ -169,10 +184,11 @@ class GuardEnv(gymnasium.Env[Any, Array]):
         return self._renderer.render(0)
 
     def close(self) -> None:
-        """Free the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        """Free the renderers."""
+        for renderer in (self._renderer, self._eye):
+            if renderer is not None:
+                renderer.close()
+        self._renderer = self._eye = None
 
     def state(self) -> dict[str, Any]:
         """Everything the coming steps depend on; :meth:`restore` continues from it bit for bit."""
@@ -185,12 +201,12 @@ class GuardEnv(gymnasium.Env[Any, Array]):
 
     def __getstate__(self) -> dict[str, Any]:
         # a Batch cannot be pickled: the scenario and the engine's state make it again
-        out = {k: v for k, v in self.__dict__.items() if k not in ("engine", "_renderer")}
+        out = {k: v for k, v in self.__dict__.items() if k not in ("engine", "_renderer", "_eye")}
         return {**out, "state": self.state()}
 
     def __setstate__(self, out: dict[str, Any]) -> None:
         state = out.pop("state")
         self.__dict__.update(out)
-        self._renderer = None
+        self._renderer = self._eye = None
         self.engine = self.scenario.build()
         self.restore(state)

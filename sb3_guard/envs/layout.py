@@ -9,6 +9,7 @@ disturbs the fewest others, and those are drawn again.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -70,20 +71,25 @@ class Footprint:
                 "give at most one each"
             )
 
-    def draw(self, rng: np.random.Generator, n: int) -> Array:
-        """``n`` uniform centres, [n, 2] m."""
-        u = rng.random((n, 2))
-        k = self.keepout
-        if len(self.placements) == 1:
-            (x0, y0, x1, y1) = self.placements[0]
-            low, span = np.array([x0 + k, y0 + k]), np.array([x1 - x0 - 2 * k, y1 - y0 - 2 * k])
-            return low + u * span
+    @functools.cached_property
+    def _room(self) -> tuple[Array, Array, Array]:
+        """Low corners [n, 2] and spans [n, 2] of where centres may be, m, and their shares [n]."""
         boxes = np.array(self.placements)
-        low = boxes[:, :2] + k
-        span = boxes[:, 2:] - boxes[:, :2] - 2 * k
-        area = span[:, 0] * span[:, 1]
-        which = rng.choice(len(boxes), size=n, p=area / area.sum())
-        return low[which] + u * span[which]
+        low = boxes[:, :2] + self.keepout
+        span = np.maximum(boxes[:, 2:] - self.keepout - low, 0.0)
+        area = span[:, 0] * span[:, 1] + 1e-12
+        return low, span, area / area.sum()
+
+    def draw(self, rng: np.random.Generator, n: int) -> Array:
+        """``n`` uniform centres, [2, n] m."""
+        low, span, share = self._room
+        if len(low) > 1:
+            which = rng.choice(len(low), size=n, p=share)
+            low, span = low[which], span[which]
+        draws = np.ascontiguousarray(rng.random((n, 2)).T)
+        draws *= span.T
+        draws += low.T
+        return draws
 
     def elevate(self, rng: np.random.Generator, xy: Array) -> Array:
         """Heights for centres [n, 2]: [n] m, within reach."""
@@ -112,14 +118,15 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
     """
     owner = [f for f in footprints for _ in range(f.num)]
     keepout = np.array([f.keepout + f.margin for f in owner])
-    xy = np.full((len(owner), 2), np.inf)  # an object not yet placed is out of everyone's way
+    apart = (keepout[:, None] + keepout)[..., None] ** 2  # [K, K, 1] m²
+    xy = np.full((2, len(owner), 1), np.inf)  # what is not yet placed is out of everyone's way
     fixed = np.zeros(len(owner), dtype=bool)
     k = 0
     for f in footprints:
         for j, place in enumerate(f.locations):
-            xy[k + j], fixed[k + j] = place, True
+            xy[:, k + j, 0], fixed[k + j] = place, True
         k += f.num
-    _check_fixed(owner, keepout, xy, fixed)
+    _check_fixed(owner, keepout, xy[..., 0].T, fixed)
     queue = deque(np.flatnonzero(~fixed).tolist())
     failures: dict[str, int] = {}
     for _ in range(PATIENCE):
@@ -128,23 +135,23 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         k = queue.popleft()
         f = owner[k]
         draws = f.draw(rng, DRAWS)
-        dx = draws[:, :1] - xy[:, 0]  # [DRAWS, K]
-        dy = draws[:, 1:] - xy[:, 1]
-        clash = dx * dx + dy * dy < (keepout[k] + keepout) ** 2
-        trouble = clash.sum(axis=1) + len(owner) * (clash & fixed).sum(axis=1)
+        clash = _square_distance(draws, xy) < apart[k]  # [K, DRAWS]
+        trouble = clash.sum(axis=0)
+        if fixed.any():
+            trouble += len(owner) * clash[fixed].sum(axis=0)
         if math.isfinite(f.reach):
-            out = draws[:, 0] ** 2 + draws[:, 1] ** 2 > f.planar_reach**2
-            trouble = trouble + len(owner) ** 2 * out
+            out = draws[0] ** 2 + draws[1] ** 2 > f.planar_reach**2
+            trouble += len(owner) ** 2 * out
         best = int(trouble.argmin())  # the first clear draw, else the least disturbing one
         if trouble[best]:
             failures[f.name] = failures.get(f.name, 0) + 1
             if trouble[best] >= len(owner):
                 queue.append(k)
                 continue
-            ejected = np.flatnonzero(clash[best])
-            xy[ejected] = np.inf
+            ejected = np.flatnonzero(clash[:, best])
+            xy[:, ejected] = np.inf
             queue.extend(ejected.tolist())
-        xy[k] = draws[best]
+        xy[:, k, 0] = draws[:, best]
     if queue:
         crowded = max(failures, key=lambda name: failures[name])
         f = next(f for f in footprints if f.name == crowded)
@@ -155,10 +162,20 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         )
     out, k = {}, 0
     for f in footprints:
-        centres = xy[k : k + f.num]
+        centres = xy[:, k : k + f.num, 0].T
         out[f.name] = np.column_stack([centres, f.elevate(rng, centres)])
         k += f.num
     return out
+
+
+def _square_distance(draws: Array, xy: Array) -> Array:
+    """Squared distances, [K, n] m², of [2, n] draws to [2, K, 1] places."""
+    dx = draws[0] - xy[0]
+    dy = draws[1] - xy[1]
+    dx *= dx
+    dy *= dy
+    dx += dy
+    return dx
 
 
 def _check_fixed(owner: list[Footprint], keepout: Array, xy: Array, fixed: Array) -> None:
@@ -193,17 +210,15 @@ def redraw(
     """
     for movers in (True, False):
         rest = [(f, p) for f, p in others.items() if movers or not f.mover]
-        xy = np.concatenate([p[:, :2] for _, p in rest]) if rest else np.zeros((0, 2))
-        radius = np.array([f.keepout + f.margin for f, _ in rest for _ in range(f.num)])
-        reach = footprint.keepout + footprint.margin + radius
+        xy = np.concatenate([np.zeros((0, 2)), *(p[:, :2] for _, p in rest)]).T[..., None]
+        keepout = np.array([f.keepout + f.margin for f, _ in rest for _ in range(f.num)])
+        apart = (footprint.keepout + footprint.margin + keepout)[:, None] ** 2  # [K, 1] m²
         for _ in range(tries):
             draws = footprint.draw(rng, DRAWS)
-            dx = draws[:, :1] - xy[:, 0]
-            dy = draws[:, 1:] - xy[:, 1]
-            clear = ~(dx * dx + dy * dy < reach**2).any(axis=1)
+            clear = ~(_square_distance(draws, xy) < apart).any(axis=0)
             if math.isfinite(footprint.reach):
-                clear &= draws[:, 0] ** 2 + draws[:, 1] ** 2 <= footprint.planar_reach**2
+                clear &= draws[0] ** 2 + draws[1] ** 2 <= footprint.planar_reach**2
             if clear.any():
-                place = draws[clear.argmax()][None]
+                place = draws[:, clear.argmax()][None]
                 return np.append(place[0], footprint.elevate(rng, place)[0])
     return None

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_guard.envs.geometry import norm
-
 Array = np.ndarray
 TINY = 1e-12  # m: the unit vector of a zero offset is zero
 
@@ -49,47 +47,60 @@ class Law:
     unit: bool = True
 
 
-def displacement(points: Array, robot: Array, law: Law, planar: bool) -> Array:
-    """How far movers go in one control step.
+def advance(points: Array, robot: Array, law: Law, planar: bool) -> None:
+    """Move by one control step, in place.
 
-    :param points: where they are, [N, K, 3] m
+    Coordinates are kept apart, [N, K] each: loops over a last axis of 2 or 3 would be slow.
+
+    :param points: where the movers are, [N, K, 3] m
     :param robot: where the robot is, [N, 3] m
     :param law: their law of motion
     :param planar: whether they move and measure in the plane
-    :return: [N, K, 2] m in the plane, [N, K, 3] m in space
     """
-    size = 2 if planar else 3
-    here = points[..., :size]
-    to_robot = robot[:, None, :size] - here  # [N, K, size]
-    to_origin = law.origin[:size] - here
-    if law.unit and not planar:
-        to_origin[..., 2] = 0.0
-    robot_distance, origin_distance = norm(to_robot), norm(to_origin)  # [N, K]
+    here = [points[..., j] for j in range(2 if planar else 3)]
+    to_robot = [robot[:, j, None] - x for j, x in enumerate(here)]
+    to_origin = [law.origin[j] - x for j, x in enumerate(here[:2] if law.unit else here)]
+    robot_distance, origin_distance = _length(to_robot), _length(to_origin)
     outside, near = origin_distance > law.r0, robot_distance <= law.r1
-    pull = np.where(outside, 0.0, np.where(near, law.near, law.far))
-    draw = np.where(outside, law.home, np.where(near, 0.0, law.settle))
+    pull = np.where(near, law.near, law.far)
+    draw = np.where(near, 0.0, law.settle)
+    pull[outside] = 0.0
+    draw[outside] = law.home
     if law.unit:
         pull /= np.maximum(robot_distance, TINY)
         draw /= np.maximum(origin_distance, TINY)
-    to_robot *= pull[..., None]
-    to_origin *= draw[..., None]
-    to_robot += to_origin
-    if law.unit and law.apart > 0:
-        to_robot += repulsion(here, law.gap, law.apart)
-    return to_robot
+    pushes = _repulsion(here, law.gap, law.apart) if law.unit and law.apart else None
+    for j, x in enumerate(here):
+        move = pull * to_robot[j]
+        if j < len(to_origin):
+            move += draw * to_origin[j]
+        if pushes is not None:
+            move += pushes[j]
+        x += move
 
 
-def repulsion(points: Array, gap: float, speed: float) -> Array:
-    """Push points apart: ``speed`` away from each other point of the row that is closer than ``gap``.
+def _length(offset: list[Array]) -> Array:
+    """Euclidean length of offsets given by coordinate."""
+    total = offset[0] * offset[0]
+    for x in offset[1:]:
+        total += x * x
+    return np.sqrt(total)
 
-    :param points: [N, K, d] m
-    :return: [N, K, d] m
+
+def _repulsion(points: list[Array], gap: float, speed: float) -> list[Array] | None:
+    """How far points of a row part: ``speed`` away from each other one that is closer than ``gap``.
+
+    :param points: by coordinate, [N, K] m each
+    :return: by coordinate, [N, K] m each; None if all keep their distance
     """
-    offset = points[:, :, None] - points[:, None]  # [N, K, K, d], from the second to the first
-    distance = norm(offset)
-    close = distance < gap
-    if np.count_nonzero(close) == close.shape[0] * close.shape[1]:  # each only to itself
-        return np.zeros(points.shape)
-    push = np.where(close, speed / np.maximum(distance, TINY), 0.0)
-    offset *= push[..., None]
-    return offset.sum(axis=2)
+    offset = [x[:, :, None] - x[:, None] for x in points]  # [N, K, K], from the second to the first
+    distance = _length(offset)
+    pairs = np.flatnonzero(distance < gap)
+    n, k = points[0].shape
+    if len(pairs) == n * k:  # each is close to itself alone
+        return None
+    push = speed / np.maximum(distance.reshape(-1)[pairs], TINY)
+    # summed in the order of the second points, whatever the number of rows
+    return [
+        np.bincount(pairs // k, push * d.reshape(-1)[pairs], n * k).reshape(n, k) for d in offset
+    ]

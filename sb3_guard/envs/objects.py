@@ -41,7 +41,7 @@ class Bodies:
     :param name: what the bodies are called, followed by their number
     :param num: how many
     :param shape: adds the geoms of one body
-    :param free: whether they can be pushed; otherwise they are where :meth:`put` puts them
+    :param free: half height of bodies that can be pushed, m; None: they stay where they are put
     """
 
     def __init__(
@@ -50,22 +50,25 @@ class Bodies:
         name: str,
         num: int,
         shape: Callable[[mujoco.MjsBody], None],
-        free: bool = False,
+        free: float | None = None,
     ) -> None:
-        self.name, self.num, self.free = name, num, free
-        self._height = resting_height(shape, world.spec.option.timestep) if free and num else 0.0
+        self.name, self.num, self.free = name, num, free is not None
+        self._height = 0.0
+        if free is not None:
+            self._height = resting_height(shape, free, world.spec.option.timestep)
         for i in range(num):
-            body = world.spec.worldbody.add_body(name=f"{name}/{i}", mocap=not free)
-            if free:
+            body = world.spec.worldbody.add_body(name=f"{name}/{i}", mocap=not self.free)
+            if self.free:
                 body.add_freejoint()
             shape(body)
             world.feel(f"{name}/{i}", body=f"{name}/{i}")
 
     def bind(self, sim: Simulation) -> None:
-        """Take live views: ``positions`` [N, num, 3] m, free bodies' ``velocities`` [N, num, 3] m/s."""
+        """Take live views: ``positions`` [N, num, 3] m, and ``velocities``, m/s, of free bodies."""
         model, batch, k = sim.model, sim.batch, self.num
         if k == 0:
-            self.positions, self._found = np.zeros((sim.num_envs, 0, 3)), np.zeros((sim.num_envs, 0))
+            self.positions = np.zeros((sim.num_envs, 0, 3))
+            self._found = np.zeros((sim.num_envs, 0))
             return
         body = model.body(f"{self.name}/0")
         self.positions = batch.bind("xpos")[:, body.id : body.id + k]
@@ -100,26 +103,29 @@ class Bodies:
         self._places[:] = places
 
 
-def resting_height(shape: Callable[[mujoco.MjsBody], None], timestep: float) -> float:
+def resting_height(
+    shape: Callable[[mujoco.MjsBody], None], half_height: float, timestep: float
+) -> float:
     """Height at which a free body lies still on the floor, m.
 
-    Contacts are soft: set down a little higher or lower, it would bounce when an episode begins.
+    Contacts are soft: set down anywhere else it would bounce when an episode begins.
 
     :param shape: adds the geoms of the body
-    :param timestep: s; softness depends on it
+    :param half_height: of the body, m
+    :param timestep: s; how soft depends on it
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    add_floor(spec)
-    body = spec.worldbody.add_body()
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=FLOOR, conaffinity=FLOOR
+    )
+    body = spec.worldbody.add_body(pos=[0, 0, half_height])
     body.add_freejoint()
     shape(body)
     model = spec.compile()
     data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    # down to the first touch: the lowest point of the body's bounding boxes is near enough
-    mujoco.mj_step(model, data, nstep=500)
+    mujoco.mj_step(model, data, nstep=1000)
     return float(data.qpos[2])
 
 
@@ -185,9 +191,8 @@ class Objects(Part):
     def build(self, world: World) -> None:
         super().build(world)
         self._reach = world.robot.reach if self.reachable else math.inf
-        self.bodies = Bodies(
-            world, self.group, self.num if self.solid else 0, self.shape, self.free
-        )
+        num, free = self.num if self.solid else 0, self.size if self.free else None
+        self.bodies = Bodies(world, self.group, num, self.shape, free)
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
@@ -297,12 +302,10 @@ class Movers(Spatial, Objects):
         self.motion = self.law()
 
     def before_step(self) -> None:
-        robot, centers = self.sim.robot.position, self.centers
-        step = motion.displacement(centers, robot, self.motion, self.planar)
-        if self.planar:
-            centers[..., :2] += step
-        else:
-            centers += step
-            np.clip(centers[..., 2], *self.height, out=centers[..., 2])
+        centers = self.centers
+        motion.advance(centers, self.sim.robot.position, self.motion, self.planar)
+        if not self.planar:
+            z, (low, high) = centers[..., 2], self.height
+            np.minimum(np.maximum(z, low), high, out=z)
         if self.solid:
             self.bodies.move(centers)

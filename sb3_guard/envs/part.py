@@ -56,6 +56,7 @@ class Simulation(Protocol):
     robot: Robot
     task: Task
     constraints: tuple[Constraint, ...]
+    rngs: list[np.random.Generator]  # one per row
     steps: Array  # [N] control steps since the episode began
 
     def array(self, name: str, shape: tuple[int, ...] = (), dtype: Any = float) -> Array:

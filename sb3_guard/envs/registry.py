@@ -27,8 +27,21 @@ ROBOTS: dict[str, type[Robot]] = {
     "Arm6": robots.Arm6,
     "Drone": robots.Drone,
 }
-TASKS: dict[str, type[Task]] = {"Goal": tasks.Goal}
-CONSTRAINTS: dict[str, type[Constraint]] = {"Hazards": constraints.Hazards}
+TASKS: dict[str, type[Task]] = {
+    "Goal": tasks.Goal,
+    "Push": tasks.Push,
+    "Chase": tasks.Chase,
+    "Defense": tasks.Defense,
+    "Button": tasks.Button,
+}
+CONSTRAINTS: dict[str, type[Constraint]] = {
+    "Hazards": constraints.Hazards,
+    "Ghosts": constraints.Ghosts,
+    "Vases": constraints.Vases,
+    "Pillars": constraints.Pillars,
+    "Buttons": constraints.Buttons,
+    "Gremlins": constraints.Gremlins,
+}
 
 EPISODE_STEPS = 1000  # control steps
 # The named suites: every combination of these, each with eight constraint objects.
@@ -43,8 +56,8 @@ SUITE_ROBOTS = (
     "Arm6",
     "Drone",
 )
-SUITE_TASKS = ("Goal",)
-SUITE_CONSTRAINTS = ("Hazards",)
+SUITE_TASKS = ("Goal", "Push", "Chase", "Defense")
+SUITE_CONSTRAINTS = ("Hazards", "Ghosts")
 
 
 def env_ids() -> list[str]:

@@ -194,16 +194,21 @@ class Renderer:
 
     def render(self, row: int) -> Array | None:
         """Draw one row: a frame [height, width, 3] uint8, or None when shown in a window."""
+        if not self._human:
+            return self.frame(row)
+        self._engine.batch.get_data(row, self._data)
+        with self._viewer.lock():
+            self._viewer.user_scn.ngeom = 0
+            self._paint(self._viewer.user_scn, row)
+        self._viewer.sync()
+        return None
+
+    def frame(self, row: int) -> Array:
+        """A picture of one row, [height, width, 3] uint8."""
         engine = self._engine
         engine.batch.get_data(row, self._data)
         if self._follows:
             self._camera.lookat[:] = engine.robot.position[row]
-        if self._human:
-            with self._viewer.lock():
-                self._viewer.user_scn.ngeom = 0
-                self._paint(self._viewer.user_scn, row)
-            self._viewer.sync()
-            return None
         self._gl.make_current()
         mujoco.mjv_updateScene(
             engine.model,
@@ -250,8 +255,7 @@ def show_robot(robot: Robot) -> None:
         return
     renderer = Renderer(engine, camera="track")
     path = Path(f"{type(robot).__name__.lower()}.png")
-    frame = renderer.render(0)
-    assert frame is not None
+    frame = renderer.frame(0)
     from matplotlib import image
 
     image.imsave(path, frame)

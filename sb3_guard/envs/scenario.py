@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from sb3_guard.envs.engine import Engine, Layout
+from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.parameters import did_you_mean
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.sensors import Lidar
@@ -47,6 +48,7 @@ class Scenario:
     :param task_params: parameters of the task
     :param lidar: parameters of the pseudo-lidar
     :param layout: parameters of the layout
+    :param observe: parameters of :class:`~sb3_guard.envs.extras.Extras`
     :raises ValueError: an unknown name or a bad value, with what is allowed
     """
 
@@ -57,6 +59,7 @@ class Scenario:
     task_params: Params = field(default_factory=dict)
     lidar: Params = field(default_factory=dict)
     layout: Params = field(default_factory=dict)
+    observe: Params = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.robot not in ROBOTS:
@@ -126,14 +129,15 @@ class Scenario:
             "task_params": dict(self.task_params),
             "lidar": dict(self.lidar),
             "layout": dict(self.layout),
+            "observe": dict(self.observe),
         }
 
     def override(self, **params: Params | None) -> Scenario:
         """This scenario with parameters of its parts changed or constraints added.
 
         ``override(hazards={"size": 0.2}, goal={"size": 0.3}, lidar={"bins": 32})``: a keyword is
-        ``robot``, ``lidar``, ``layout``, the task's name in lower case, or a constraint's; None
-        removes a constraint.
+        ``robot``, ``lidar``, ``layout``, ``observe``, the task's name in lower case, or a
+        constraint's; None removes a constraint.
 
         :raises ValueError: an unknown keyword or parameter
         """
@@ -144,6 +148,7 @@ class Scenario:
             "task": "task_params",
             "lidar": "lidar",
             "layout": "layout",
+            "observe": "observe",
         }
         kinds = {name.lower() for name in CONSTRAINTS}
         for key, value in params.items():
@@ -183,6 +188,7 @@ class Scenario:
             "constraints": constraints,
             "lidar": Lidar.from_params(self.lidar),
             "layout": Layout.from_params(self.layout),
+            "extras": Extras.from_params(self.observe),
         }
 
     def build(self, num_envs: int = 1, num_threads: int | None = None) -> Engine:

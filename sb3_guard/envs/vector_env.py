@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from sb3_guard.envs.engine import Outcome
+from sb3_guard.envs.extras import EYE
 from sb3_guard.envs.gym_env import (
     action_space,
     as_scenario,
@@ -35,12 +36,16 @@ class Transition:
     :param outcome: what the step brought, with the observation before the new episode
     :param truncated: cut by the time limit or for want of a next goal, [N] bool
     :param done: terminated or truncated, [N] bool
+    :param images: what the robots' cameras see next, [N, H, W, 3], if they are observed
+    :param final_images: the same before any new episode
     """
 
     obs: Array
     outcome: Outcome
     truncated: Array
     done: Array
+    images: Array | None = None
+    final_images: Array | None = None
 
 
 class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
@@ -95,6 +100,7 @@ class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
         self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
         self._view_size = (width, height, camera)
         self._renderer: Renderer | None = None
+        self._eye: Renderer | None = None
         self._everyone = np.arange(self.num_envs, dtype=np.int32)
 
     @property
@@ -119,10 +125,20 @@ class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
         truncated = outcome.unplaced | (self.engine.steps >= self.max_episode_steps)
         done = outcome.terminated | truncated
         obs = outcome.obs
+        images = final_images = self.look()
         if done.any():
             self.engine.reset(np.flatnonzero(done))
-            obs = self.engine.observe()
-        return Transition(obs, outcome, truncated, done)
+            obs, images = self.engine.observe(), self.look()
+        return Transition(obs, outcome, truncated, done, images, final_images)
+
+    def look(self) -> Array | None:
+        """What the robots' cameras see, [N, H, W, 3] uint8, or None if that is not observed."""
+        camera = self.engine.extras.camera
+        if camera is None:
+            return None
+        if self._eye is None:
+            self._eye = Renderer(self.engine, *camera, EYE)
+        return np.stack([self._eye.frame(row) for row in range(self.num_envs)])
 
     def reset(
         self,
@@ -150,7 +166,7 @@ class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
                 raise ValueError(f"reset_mask must be [{self.num_envs}] bool with a True in it")
             ids = np.flatnonzero(mask)
             seeds = [s if m else None for s, m in zip(seeds, mask, strict=True)]
-        return self._view(self.begin(seeds, ids)), {}
+        return self.view(self.begin(seeds, ids), self.look()), {}
 
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Advance every row by one control step of ten physics steps."""
@@ -172,16 +188,26 @@ class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
             final = np.full(self.num_envs, None, dtype=object)
             details: dict[str, Any] = {}
             for row in np.flatnonzero(t.done).tolist():
-                final[row] = self._view(out.obs[row])
+                final[row] = self.view(out.obs, t.final_images, row)
                 details = self._add_info(details, step_info(out, row), row)
             infos["final_obs"], infos["_final_obs"] = final, t.done
             infos["final_info"], infos["_final_info"] = details, t.done
-        return self._view(t.obs), out.reward, out.terminated, t.truncated, infos
+        return self.view(t.obs, t.images), out.reward, out.terminated, t.truncated, infos
 
-    def _view(self, obs: Array) -> Any:
+    def view(self, obs: Array, images: Array | None, row: int | None = None) -> Any:
+        """Observations as the space has them: the flat array, or its components by name.
+
+        :param obs: [N, D]
+        :param images: [N, H, W, 3], or None
+        :param row: one row instead of all
+        """
+        which = slice(None) if row is None else row
         if self.flatten:
-            return obs
-        return {name: obs[..., where] for name, where in self.engine.observation_layout.items()}
+            return obs[which]
+        out = {n: obs[which, where] for n, where in self.engine.observation_layout.items()}
+        if images is not None:
+            out["camera"] = images[which]
+        return out
 
     def render(self) -> tuple[Array, ...] | None:
         """One frame per row, [height, width, 3] uint8; never advances physics."""
@@ -193,15 +219,14 @@ class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
         """A picture of one row, [height, width, 3] uint8."""
         if self._renderer is None:
             self._renderer = Renderer(self.engine, *self._view_size)
-        frame = self._renderer.render(row)
-        assert frame is not None
-        return frame
+        return self._renderer.frame(row)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        """Free the renderers."""
+        for renderer in (self._renderer, self._eye):
+            if renderer is not None:
+                renderer.close()
+        self._renderer = self._eye = None
 
     def state(self) -> dict[str, Any]:
         """Everything the coming steps depend on; :meth:`restore` continues from it bit for bit."""

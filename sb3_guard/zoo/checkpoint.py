@@ -181,13 +181,16 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         )
     try:
         with zipfile.ZipFile(path) as archive:
-            state = pickle.loads(archive.read(MEMBER))
-        version = state["format"]
-    except KeyError:
-        raise UsageError(f"{path} is a model, not a checkpoint") from None
+            members = archive.namelist()
+            state = pickle.loads(archive.read(MEMBER)) if MEMBER in members else None
     except Exception as error:
         # A damaged pickle can raise anything.
         raise UsageError(f"{path} is damaged and can't be read: {one_line(error)}") from error
+    if state is None:
+        # The end of a cut file may look like one of the archives inside it.
+        whole = "data" in members
+        raise UsageError(f"{path} is {'a model, not a checkpoint' if whole else 'damaged'}")
+    version = state["format"]
     if version != FORMAT:
         raise UsageError(f"{path} has format {version}; this version reads format {FORMAT} only")
     return state

@@ -322,7 +322,7 @@ def build(values: Mapping[str, Any]) -> Setup:
         monitor_kwargs = _evaluate("monitor_kwargs", monitor_kwargs)
     try:
         env_wrapper = get_wrapper_class(dict(values))
-        vec_env_wrapper = get_wrapper_class(dict(values), "vec_env_wrapper")
+        vec_env_wrapper: Any = get_wrapper_class(dict(values), "vec_env_wrapper")
         callbacks = get_callback_list(dict(values))
     except Exception as error:
         raise UsageError(f"a wrapper or callback can't be made: {one_line(error)}") from error

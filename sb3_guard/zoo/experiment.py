@@ -16,12 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.common.callbacks import CostEvalCallback
+from sb3_guard.common.files import replacing
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import (
     Checkpoints,
@@ -229,33 +231,32 @@ class Experiment:
             self.eval_env.close()
 
     def _train(self, folder: RunFolder) -> int:
-        verbose = self.args["verbose"] > 0
+        state, verbose = self.state, self.args["verbose"] > 0
         if verbose:
-            print(f"Run folder: {folder.path}")
-        state, tensorboard = self.state, self._tensorboard(folder)
+            print(f"Run folder: {folder.path} (seed {self.args['seed']})")
+        try:
+            find_monitor(self.env).log_to(
+                folder.monitor, offset=None if state is None else monitor_offset(state)
+            )
+        except (OSError, ValueError) as error:
+            raise UsageError(one_line(error)) from error
         logger = RunLogger(
             folder.path,
             stdout=self._prints_tables,
-            tensorboard=tensorboard,
+            tensorboard=self._tensorboard(folder),
             state=None if state is None else state["logger"],
         )
         self.model.set_logger(logger)
         checkpoints, epochs, callbacks = self._make_callbacks(folder)
-        monitor = find_monitor(self.env)
-        if state is None:
-            monitor.log_to(folder.monitor)
-        else:
+        if state is not None:
             folder.result.unlink(missing_ok=True)
             checkpoints.restore(state)
             restore_run(self.model, state)
-            try:
-                monitor.log_to(folder.monitor, offset=monitor_offset(state))
-            except (OSError, ValueError) as error:
-                raise UsageError(one_line(error)) from error
         began = time.monotonic()
         with self._tracked(folder), interrupts(checkpoints, verbose) as received:
             finished = self._learn(callbacks)
-        self.model.save(str(folder.model))
+        with replacing(folder.model) as file:
+            self.model.save(file)
         normalizer = self.model.get_vec_normalize_env()
         if normalizer is not None:
             normalizer.save(str(folder.normalizer))
@@ -299,7 +300,9 @@ class Experiment:
     def _learn(self, callbacks: list[BaseCallback]) -> bool:
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
         interval = self.args["log_interval"]
-        kwargs = {} if interval == -1 else {"log_interval": interval if interval > 0 else None}
+        kwargs: dict[str, Any] = {}
+        if interval != -1:
+            kwargs["log_interval"] = interval if interval > 0 else None
         try:
             self.model.learn(
                 left, callback=callbacks, reset_num_timesteps=self.state is None, **kwargs
@@ -373,6 +376,7 @@ def start(args: Mapping[str, Any]) -> int:
         values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **args["env_kwargs"]}
     values = check(args["algo"], algorithm(args["algo"]), values)
     experiment = Experiment(args, values)
+    args["vec_env"] = experiment.vec_env
     try:
         folder = RunFolder.create(
             args["log_folder"],
@@ -449,24 +453,24 @@ def _refuse_contradictions(
     folder: RunFolder,
 ) -> None:
     """Raise if a flag asks for something other than what the run is."""
+    pairs = []
     for name, value in given.items():
-        own = saved[name]
-        if name == "log_folder":
-            value, own = Path(value).resolve(), folder.path.parent.parent.resolve()
-        elif name == "env":
-            value = canonical_id(value)[0]
-        elif name == "hyperparams":
-            for key, one in value.items():
-                if key not in values or one != values[key]:
-                    raise UsageError(
-                        f"-params {key}:{one} contradicts {key}:{values.get(key)} of "
-                        f"{folder.path}; leave it out, or start a new run without -i"
-                    )
+        flag, own = "--" + name.replace("_", "-") + " ", saved[name]
+        if name in FREE_FLAGS or name == "n_timesteps":
             continue
-        if name not in FREE_FLAGS and name != "n_timesteps" and value != own:
-            flag = "--" + name.replace("_", "-")
+        if name == "hyperparams":
+            asked = check(saved["algo"], algorithm(saved["algo"]), {**values, **value})
+            pairs += [(f"-params {key}:", asked[key], values.get(key)) for key in value]
+        elif name == "log_folder":
+            pairs.append((flag, Path(value).resolve(), folder.path.parent.parent.resolve()))
+        elif name == "env":
+            pairs.append((flag, canonical_id(value)[0], own))
+        else:
+            pairs.append((flag, yaml.safe_load(yaml.safe_dump(value)), own))
+    for flag, value, own in pairs:
+        if value != own:
             raise UsageError(
-                f"{flag} {value} contradicts {flag} {own} of {folder.path}; "
+                f"{flag}{value} contradicts {flag}{own} of {folder.path}; "
                 "leave it out, or start a new run without -i"
             )
 

@@ -24,9 +24,9 @@ class ResumableEnv(gym.Wrapper):
     by ``env_method`` even in another process.
     """
 
-    def layers(self) -> list[gym.Env]:
+    def layers(self) -> list[Any]:
         """The wrappers from the outside in, and the environment itself last."""
-        layers: list[gym.Env] = []
+        layers: list[Any] = []
         env: gym.Env = self.env
         while isinstance(env, gym.Wrapper):
             layers.append(env)
@@ -64,9 +64,10 @@ def capture(venv: VecEnv) -> list[Any]:
     :return: picklable parts; the last one is None if the environment itself can't tell its state
     """
     parts: list[Any] = []
-    layer = venv
+    layer: Any = venv
     while isinstance(layer, VecEnvWrapper):
-        parts.append(layer.state() if hasattr(type(layer), "state") else _attributes(layer))
+        own = hasattr(type(layer), "state")
+        parts.append(layer.state() if own else _attributes(layer))
         layer = layer.venv
     if hasattr(type(layer), "state"):
         return [*parts, layer.state()]
@@ -80,9 +81,8 @@ def capture(venv: VecEnv) -> list[Any]:
 def restore(venv: VecEnv, parts: list[Any]) -> None:
     """Put an environment that was made the same way, and reset, into a captured state."""
     *wrappers, own = parts
-    layer = venv
+    layer: Any = venv
     for part in wrappers:
-        assert isinstance(layer, VecEnvWrapper)
         if hasattr(type(layer), "restore"):
             layer.restore(part)
         else:

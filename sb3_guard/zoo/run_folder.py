@@ -67,9 +67,10 @@ class RunFolder:
         :param hyperparams: all hyper-parameters, plain data
         :param command: the command line
         :param unique: append a unique id to the name (``--uuid``)
-        :raises UsageError: the folder can't be written to
+        :raises UsageError: the folder can't be written to, or there is more than plain data
         """
         name = folder_name(env_id)
+        files = _dump(args, hyperparams)
         parent = Path(log_folder) / algo
         suffix = f"_{uuid.uuid4()}" if unique else ""
         try:
@@ -86,7 +87,7 @@ class RunFolder:
             params = path / name
             params.mkdir()
             (params / "command.txt").write_text(command)
-            _write_config(params, args, hyperparams)
+            _write(params, files)
         except OSError as error:
             raise UsageError(
                 f"can't write to log folder {log_folder!r}: {error.strerror}; "
@@ -151,7 +152,7 @@ class RunFolder:
 
     def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
         """Replace what :meth:`create` wrote, e.g. when a finished run is to go on for longer."""
-        _write_config(self.params, args, hyperparams)
+        _write(self.params, _dump(args, hyperparams))
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Mark the run as complete."""
@@ -203,10 +204,25 @@ class RunFolder:
                 handle.truncate(0)
 
 
-def _write_config(params: Path, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
+def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, bytes]:
+    """The configuration files, by name."""
+    files = {}
     for name, content in (("config.yml", hyperparams), ("args.yml", args)):
+        try:
+            files[name] = yaml.safe_dump(dict(content)).encode()
+        except yaml.YAMLError as error:
+            raise UsageError(
+                f"{name} can hold plain data only; write classes and calls as text, such as "
+                f"policy_kwargs: dict(activation_fn=nn.ReLU) ({one_line(error)})"
+            ) from error
+    return files
+
+
+def _write(params: Path, files: Mapping[str, bytes]) -> None:
+    # args.yml is what makes a folder a run, so it comes last.
+    for name, content in files.items():
         with replacing(params / name) as file:
-            file.write(yaml.safe_dump(dict(content)).encode())
+            file.write(content)
 
 
 def latest_run(parent: Path, name: str) -> int:

@@ -52,13 +52,15 @@ def run(command: Callable[[], int]) -> int:
     """
     Run a command and turn what the user can put right into one line on stderr.
 
-    :return: the exit status: the command's own, 2 for a :class:`UsageError`
+    :return: the exit status: the command's own, 2 for a :class:`UsageError`, 130 for Ctrl-C
     """
     try:
         return command()
     except UsageError as error:
         print(f"error: {one_line(error)}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        return 130
 
 
 def steps(text: str) -> int:
@@ -92,10 +94,12 @@ def parse_value(text: str) -> Any:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError):
         pass
-    try:
-        return eval(text, {"__builtins__": {}, "dict": dict})
-    except Exception:
-        return text
+    if text.startswith("dict("):
+        try:
+            return eval(text, {"__builtins__": {}, "dict": dict})
+        except Exception:
+            pass
+    return text
 
 
 class KeyValues(argparse.Action):

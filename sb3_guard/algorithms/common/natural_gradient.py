@@ -221,11 +221,12 @@ def _dual(gram: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) -> _
 
     The KL of that projection falls as λ rises, because the dual is convex in λ.
     """
-    # Without a reward gradient the same projection, of zero, is the shortest way to feasibility.
-    if gram[0, 0] <= 0.0:
+    rewarded = bool(gram[0, 0] > 0.0)
+    if not rewarded:
+        # Any direction across the constraints stands in: only the way to feasibility remains.
         gram = gram.copy()
         gram[0] = gram[:, 0] = 0.0
-        gram[0, 0] = np.finfo(np.float64).tiny
+        gram[0, 0] = 1.0
     mask = np.append(True, moves)
     points, lengths = _unit_normals(gram[np.ix_(mask, mask)])
     gradient, normals = points[0], points[1:]
@@ -249,6 +250,8 @@ def _dual(gram: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) -> _
     beta, nu = np.zeros(len(c)), np.zeros(len(c))
     beta[moves] = -mu * radius / lengths
     nu[moves] = mu * lam * size / lengths
+    if not rewarded:
+        return 0.0, beta, 0.0, np.zeros(len(c))
     return radius / (lam * size), beta, lam * size / radius, nu
 
 

@@ -44,7 +44,7 @@ class Gremlins(Obstacles):
 
     def reset(self, ids: Array, rngs: Generators) -> None:
         super().reset(ids, rngs)
-        self.before_step()
+        self.before_step()  # onto the circle; rows that go on stay where the clock puts them
 
     def before_step(self) -> None:
         phase = self.rate * self._time

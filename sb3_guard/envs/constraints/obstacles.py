@@ -1,4 +1,4 @@
-"""What constraints of many like objects have in common: the cost of being in them or touching them."""
+"""What constraints of many like objects have in common: a price for entering or touching them."""
 
 from __future__ import annotations
 

@@ -11,8 +11,8 @@ from sb3_guard.envs.robots.robot import MJCFRobot
 class Ant(MJCFRobot):
     """A small four-legged robot that starts on its feet.
 
-    Actions: hip and ankle of legs 1 to 4 in turn; legs are numbered front left, rear left, rear right,
-    front right.
+    Actions: hip and ankle of legs 1 to 4 in turn; legs are numbered front left, rear left, rear
+    right, front right.
     """
 
     asset = "ant.xml"

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
 from sb3_guard.envs import geometry
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Simulation
@@ -17,8 +15,8 @@ from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
 class Arm(MJCFRobot):
     """A robot arm on a fixed base; its position is the end effector's, the last link's.
 
-    A link is the capsule, or the sphere, around the segment from the origin of its body to that of the
-    next, with the radius of its geom.
+    A link is the capsule, or the sphere, around the segment from the origin of its body to that of
+    the next, with the radius of its geom.
     """
 
     timestep = 0.002
@@ -43,6 +41,6 @@ class Arm(MJCFRobot):
         start, end = self._xpos[:, self._starts], self._xpos[:, self._ends]  # [N, L, 3]
         if planar:
             start, end, points = start.copy(), end.copy(), points.copy()
-            start[..., 2] = end[..., 2] = points[..., 2] = 0.0
+            start[..., 2] = end[..., 2] = 0.0
         gap = geometry.segment_distance(start, end, points) - self._radii[:, None]  # [N, L, K]
         return gap.min(axis=1)

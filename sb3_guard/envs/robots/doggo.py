@@ -12,7 +12,8 @@ class Doggo(MJCFRobot):
     """A four-legged robot that must hold its weight up: its springs alone let it sink.
 
     Actions: the hips' turn (z) of legs 1 to 4, the hips' swing (y), then the ankles. Legs are
-    numbered front left, rear left, rear right, front right. The waist is neither driven nor observed.
+    numbered front left, rear left, rear right, front right. The waist is neither driven nor
+    observed.
     """
 
     asset = "doggo.xml"

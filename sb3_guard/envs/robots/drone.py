@@ -11,8 +11,8 @@ from sb3_guard.envs.robots.robot import MJCFRobot
 class Drone(MJCFRobot):
     """A quadrotor whose weight is balanced at every height: action 0 hovers.
 
-    Actions: the lift of propellers 1 to 4 (at +x, +y, −x, −y), a quarter of the weight ± 0.1 N each, in
-    the direction of the body's z axis. Drag limits the climb to 2 m/s and tilting to 0.3 rad/s.
+    Actions: the lift of propellers 1 to 4 (at +x, +y, −x, −y), a quarter of the weight ± 0.1 N
+    each, along the body's z axis. Drag limits the climb to 2 m/s and tilting to 0.3 rad/s.
     """
 
     asset = "drone.xml"

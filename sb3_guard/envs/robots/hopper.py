@@ -11,7 +11,8 @@ from sb3_guard.envs.robots.robot import MJCFRobot
 class Hopper(MJCFRobot):
     """A one-legged robot of 12 kg that cannot fall; its leg pushes it along the floor.
 
-    Actions: hip x and z (±20°, actuators ±0.4), thigh, knee and foot: the five torques of the paper.
+    Actions: hip x and z (±20°, actuators ±0.4), thigh, knee and foot: the five torques of the
+    paper.
     """
 
     asset = "hopper.xml"

@@ -1,0 +1,60 @@
+"""Observations that belong to no robot, task or constraint, all off by default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array, Part, Simulation, World
+from sb3_guard.envs.sensors import Channel
+
+EYE = "eye"
+
+
+@dataclass
+class Extras(Part):
+    """What else can be observed: the clock, the simulator's state, an image."""
+
+    name = "observe"
+
+    remaining: bool = param(False, "share of the episode's steps that is left")
+    horizon: int = param(1000, "steps of an episode, for remaining", low=1)
+    qpos: bool = param(False, "positions of all joints of the world")
+    qvel: bool = param(False, "velocities of all joints of the world")
+    ctrl: bool = param(False, "controls of all actuators")
+    com: bool = param(False, "centre of mass of the robot, m")
+    camera: tuple[int, int] | None = param(
+        None, "width and height, pixels, of an image from the robot; needs flatten=False", low=1
+    )
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        if self.camera is not None:
+            body = world.spec.body(world.robot.root)
+            body.add_camera(name=EYE, pos=[0, 0, 0.1], xyaxes=[0, -1, 0, 0, 0, 1], fovy=90)
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        batch, body = sim.batch, sim.model.body(sim.robot.root).id
+        sources: dict[str, tuple[bool, Array, str]] = {
+            "qpos": (self.qpos, batch.bind("qpos"), "m, rad"),
+            "qvel": (self.qvel, batch.bind("qvel"), "m/s, rad/s"),
+            "ctrl": (self.ctrl, batch.bind("ctrl"), "control"),
+        }
+        if self.com:
+            sources["com"] = (True, batch.bind("subtree_com")[:, body], "m")
+        self._sources = {name: (v, unit) for name, (on, v, unit) in sources.items() if on}
+
+    def observe(self) -> dict[str, Array]:
+        out = {name: value for name, (value, _) in self._sources.items()}
+        if self.remaining:
+            out["remaining"] = np.maximum(1 - self.sim.steps / self.horizon, 0.0)[:, None]
+        return out
+
+    def channels(self) -> dict[str, Channel]:
+        out = {name: Channel(v.shape[1], unit=unit) for name, (v, unit) in self._sources.items()}
+        if self.remaining:
+            out["remaining"] = Channel(1, 0.0, 1.0, "share")
+        return out

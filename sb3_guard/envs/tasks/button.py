@@ -1,0 +1,104 @@
+"""Button: press the one that is lit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs import geometry
+from sb3_guard.envs.objects import SPHERE, Objects
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array, Generators, Painter, Simulation, Task
+from sb3_guard.envs.sensors import Channel
+
+GREEN = (0.1, 0.75, 0.2)
+
+
+@dataclass
+class Button(Objects, Task):
+    """Press the right one of several buttons (Ray et al. 2019).
+
+    Reward: the distance gained on the lit button, times ``reward_distance``, plus ``bonus`` when it
+    is touched. Then another one becomes the right one, and for ``delay`` control steps none is lit,
+    none can be pressed rightly or wrongly, and the lidar shows none.
+    """
+
+    name = "button"
+    color = (1.0, 0.5, 0.1)
+    interactive = False
+    contact = True
+    targets = "one"
+    space = "planar"
+    spaces = ("planar",)
+    solid = True
+    reachable = True
+
+    num: int = param(4, "number of buttons", low=1)
+    size: float = param(0.1, "radius of a button, m", above=0)
+    keepout: float = param(0.3, "radius kept clear around a button, m", low=0)
+    delay: int = param(10, "control steps until the next button lights up", low=0)
+    reward_distance: float = param(1.0, "reward per metre gained")
+    bonus: float = param(1.0, "reward for pressing the lit button")
+    ends: bool = param(False, "whether pressing the lit button ends the episode")
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        self.add_geom(body, SPHERE, (self.size,), lift=self.size)
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self._flat = sim.robot.workspace == "planar"
+        self._rows = np.arange(sim.num_envs)
+        self.right = sim.array("button/right", dtype=np.int64)  # [N] which button is the right one
+        self.wait = sim.array("button/wait", dtype=np.int64)  # [N] control steps until one is lit
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        super().reset(ids, rngs)
+        self.wait[ids] = 0
+        for i in ids.tolist():
+            self.right[i] = rngs[i].integers(self.num)
+
+    def before_step(self) -> None:
+        np.maximum(self.wait - 1, 0, out=self.wait)
+
+    @property
+    def goal(self) -> Array:
+        """Where the right button is, [N, 3] m."""
+        return self.sim.places(self.group)[self._rows, self.right]
+
+    def measure(self) -> Array:
+        """Distance from the robot to the right button, [N, 1] m."""
+        return geometry.distance(self.sim.robot.position, self.goal, self._flat)[:, None]
+
+    def reward(self, before: Array, now: Array) -> Array:
+        return self.reward_distance * (before[:, 0] - now[:, 0])
+
+    def succeeded(self, now: Array) -> Array:
+        return self.bodies.touched[self._rows, self.right] & (self.wait == 0)
+
+    def advance(self, ids: Array) -> Array:
+        for i in ids.tolist():
+            if self.num > 1:
+                other = self.sim.rngs[i].integers(self.num - 1)
+                self.right[i] = other + (other >= self.right[i])
+            self.wait[i] = self.delay
+        return ids[:0]
+
+    def mistakes(self) -> Array:
+        wrong = self.bodies.touched.sum(axis=1) - self.bodies.touched[self._rows, self.right]
+        return np.where(self.wait == 0, wrong, 0).astype(float)
+
+    def observe(self) -> dict[str, Array]:
+        lidar = self.sim.lidar(self.centers, self.planar)
+        lidar[self.wait > 0] = 0.0
+        return {f"{self.group}_lidar": lidar, "goal_compass": self.sim.compass(self.goal)}
+
+    def channels(self) -> dict[str, Channel]:
+        return {**super().channels(), "goal_compass": self.sim.compass_channel()}
+
+    def draw(self, painter: Painter, row: int) -> None:
+        super().draw(painter, row)
+        if self.wait[row] == 0:
+            light = self.goal[row] + [0, 0, self.size]
+            painter.zone(light, 2 * self.size, 0.0, GREEN)

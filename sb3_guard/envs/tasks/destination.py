@@ -1,0 +1,73 @@
+"""What tasks with a place to reach have in common: the place, and a new one once it is reached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_guard.envs.layout import Footprint, Rectangle
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array, Painter, Simulation, Task, World
+from sb3_guard.envs.sensors import Channel
+
+REDRAWS = 20  # new places drawn before one that is reached already is accepted
+
+
+@dataclass
+class Destination(Task):
+    """A place that the robot, or what it pushes, has to reach."""
+
+    size: float = param(0.5, "radius within which the goal counts as reached, m", above=0)
+    keepout: float = param(0.4, "radius kept clear around the goal, m", low=0)
+    reward_distance: float = param(1.0, "reward per metre gained")
+    bonus: float = param(1.0, "reward for reaching the goal")
+    ends: bool = param(False, "whether reaching the goal ends the episode")
+    locations: tuple[tuple[float, float], ...] = param((), "fixed first goal, one (x, y), m")
+    placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
+
+    color = (0.1, 0.75, 0.2)
+    targets = "one"
+
+    def footprints(self) -> tuple[Footprint, ...]:
+        return (
+            Footprint(
+                "goal",
+                1,
+                self.keepout,
+                self.placements,
+                self.locations,
+                height=0.0 if self.planar else self.height,
+                reach=self._reach,
+            ),
+        )
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        self._reach = world.robot.reach
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self.place = sim.places("goal")[:, 0]  # [N, 3] m
+
+    def advance(self, ids: Array) -> Array:
+        return np.array([i for i in ids.tolist() if not self._redraw(i)], dtype=int)
+
+    def _redraw(self, row: int) -> bool:
+        """Draw a new goal in one row, one still to be reached: the robot may stand above it."""
+        for _ in range(REDRAWS):
+            if not self.sim.redraw("goal", row):
+                return False
+            if not self.succeeded(self.measure())[row]:
+                break
+        return True
+
+    def observe(self) -> dict[str, Array]:
+        return {"goal_compass": self.sim.compass(self.place)}
+
+    def channels(self) -> dict[str, Channel]:
+        return {"goal_compass": self.sim.compass_channel()}
+
+    def draw(self, painter: Painter, row: int) -> None:
+        lift = 0.25 if self.planar else 0.0
+        painter.zone(self.place[row] + [0, 0, lift], self.size, lift, self.color)

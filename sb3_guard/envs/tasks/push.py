@@ -1,0 +1,112 @@
+"""Push: bring a ball, or a box, to a place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs import geometry
+from sb3_guard.envs.layout import Footprint
+from sb3_guard.envs.objects import BOX, SPHERE, Bodies, add_geom
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array, Generators, Simulation, World
+from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.tasks.destination import Destination
+
+YELLOW = (0.95, 0.8, 0.1)
+BALL_MASS = 3.35e-5  # kg
+BOX_DENSITY = 1e-3  # kg/m³
+
+
+@dataclass
+class Push(Destination):
+    """Push an object to a place on the floor (Zhao et al. 2024, §4.2).
+
+    Reward: the distance gained on the object, while the robot is more than ``null_distance`` sizes
+    from it, and the distance that the object gained on the goal, in the plane; plus ``bonus`` when
+    the object's centre is within ``size`` of the goal.
+    """
+
+    name = "push"
+    interactive = True
+    contact = True
+    space = "planar"
+    spaces = ("planar",)
+
+    object: str = param(
+        "ball", "a ball that rolls, or a box with posts to catch it by", choices=("ball", "box")
+    )
+    object_size: float = param(0.2, "radius of the ball, half an edge of the box, m", above=0)
+    object_keepout: float = param(0.2, "radius kept clear around the object, m", low=0)
+    object_locations: tuple[tuple[float, float], ...] = param((), "fixed place, one (x, y), m")
+    null_distance: float = param(
+        2.0, "object sizes from which on nearing the object is not rewarded", low=0
+    )
+    reward_approach: float = param(1.0, "reward per metre gained on the object")
+
+    def footprints(self) -> tuple[Footprint, ...]:
+        return (
+            *super().footprints(),
+            Footprint(
+                self.object,
+                1,
+                self.object_keepout,
+                self.placements,
+                self.object_locations,
+                reach=self._reach,
+            ),
+        )
+
+    def positions(self, footprint: str) -> Array:
+        return super().positions(footprint) if footprint == "goal" else self.bodies.positions
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        self._flat = world.robot.workspace == "planar"
+        self.bodies = Bodies(world, self.object, 1, self.shape, self.object_size)
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        """The geoms of the object."""
+        r = self.object_size
+        if self.object == "ball":
+            ball = add_geom(body, SPHERE, (r,), YELLOW, free=True)
+            ball.mass = BALL_MASS
+            # it rolls on for metres, but comes to rest
+            ball.condim, ball.friction = 6, [1.0, 0.005, 0.005]
+            return
+        add_geom(body, BOX, (r, r, r), YELLOW, free=True).density = BOX_DENSITY
+        for x, y in ((r, r), (r, -r), (-r, r), (-r, -r)):
+            post = add_geom(body, BOX, (r / 4, r / 4, r), YELLOW)
+            post.pos = [x, y, 0.0]
+            post.density = BOX_DENSITY
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self.bodies.bind(sim)
+        self.center = self.bodies.positions[:, 0]  # [N, 3] m
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        self.bodies.put(ids, self.sim.places(self.object)[ids], rngs)
+
+    def measure(self) -> Array:
+        """Distances robot to object and object to goal, [N, 2] m."""
+        distances = np.empty((self.sim.num_envs, 2))
+        distances[:, 0] = geometry.distance(self.sim.robot.position, self.center, self._flat)
+        distances[:, 1] = geometry.distance(self.center, self.place, planar=True)
+        return distances
+
+    def reward(self, before: Array, now: Array) -> Array:
+        gain = before - now
+        far = before[:, 0] > self.null_distance * self.object_size
+        return self.reward_approach * gain[:, 0] * far + self.reward_distance * gain[:, 1]
+
+    def succeeded(self, now: Array) -> Array:
+        return now[:, 1] <= self.size
+
+    def observe(self) -> dict[str, Array]:
+        return {**super().observe(), "box_compass": self.sim.compass(self.center)}
+
+    def channels(self) -> dict[str, Channel]:
+        return {**super().channels(), "box_compass": self.sim.compass_channel()}

@@ -1,0 +1,97 @@
+"""Print what an update costs, where its time goes, and what that makes of the paper's runs.
+
+``python scripts/bench_training.py`` measures TRPO and CPO at the paper's settings (30,000 steps an
+update, 80 full-batch steps of each critic) beside a bare physics loop timed in the same run; the
+best of several updates counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import time
+
+import numpy as np
+import torch
+from mujoco.batch import Batch
+
+from sb3_guard import ALGORITHMS, make_vec_env
+from sb3_guard.envs.engine import FRAME_SKIP, profiling_clock
+from sb3_guard.zoo.config import build, check, read_hyperparams
+
+N_ENVS, N_STEPS = 30, 1000
+CLOCK = profiling_clock()
+SHIPPED = CLOCK.value if CLOCK is not None else None
+
+
+def bare_rate(engine: object, seconds: float = 2.0) -> float:
+    """Env-steps/s of a bare physics loop on the engine's model, with MuJoCo's clock as shipped."""
+    model, threads = engine.model, engine.num_threads  # type: ignore[attr-defined]
+    batch = Batch(model, nsim=N_ENVS, nthread=threads, persistent=True)
+    batch.bind("ctrl")[:] = np.random.default_rng(0).uniform(-1, 1, (N_ENVS, model.nu))
+    if CLOCK is not None:
+        CLOCK.value = SHIPPED
+    best = 0.0
+    for _ in range(10):
+        start, steps = time.perf_counter(), 0
+        while time.perf_counter() - start < seconds / 10:
+            batch.step(nstep=FRAME_SKIP)
+            steps += N_ENVS
+        best = max(best, steps / (time.perf_counter() - start))
+    if CLOCK is not None:
+        CLOCK.value = None
+    return best
+
+
+def start_seconds(*arguments: str) -> float:
+    """Wall time of a fresh interpreter with these arguments, the better of two."""
+    times = []
+    for _ in range(2):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, *arguments], check=True, capture_output=True)
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--algos", nargs="+", default=["trpo", "cpo"], choices=sorted(ALGORITHMS))
+    parser.add_argument("--env", default="Goal_Point_8Hazards-v0")
+    parser.add_argument("--updates", type=int, default=6, help="updates per algorithm")
+    parser.add_argument("--threads", type=int, default=None, help="torch and physics threads")
+    args = parser.parse_args()
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    print(f"{args.env}, {N_ENVS} envs x {N_STEPS} steps, torch threads {torch.get_num_threads()}")
+    header = "| algorithm | collect, s | actor, s | critics, s | update, s | collected steps/s | "
+    print(header + "of bare physics | minutes for 6e6 steps |\n|---|---|---|---|---|---|---|---|")
+    for algo in args.algos:
+        env = make_vec_env(args.env, N_ENVS, seed=0, num_threads=args.threads)
+        algorithm = ALGORITHMS[algo]
+        setup = build(check(algo, algorithm, read_hyperparams(algo, args.env)))
+        model = algorithm(env=env, seed=0, **setup.model)
+        best: dict[str, float] = {}
+        for _ in range(args.updates):
+            model.learn(N_ENVS * N_STEPS, reset_num_timesteps=False)
+            best = {k: min(best.get(k, 1e9), v) for k, v in model.timing.items()}
+        bare = bare_rate(env.unwrapped.envs.engine)
+        rate = N_ENVS * N_STEPS / best["collect"]
+        total = sum(best.values())
+        minutes = 6e6 / (N_ENVS * N_STEPS) * total / 60
+        print(
+            f"| {algo} | {best['collect']:.2f} | {best['actor']:.2f} | {best['critics']:.2f} "
+            f"| {total:.2f} | {rate:,.0f} | {rate / bare:.2f} | {minutes:.1f} |",
+            flush=True,
+        )
+        env.close()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"peak memory of this process {peak:,.0f} MB")
+    print(f"import sb3_guard {start_seconds('-c', 'import sb3_guard'):.2f} s")
+    seconds = start_seconds("-m", "sb3_guard.train", "--help")
+    print(f"python -m sb3_guard.train --help {seconds:.2f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,240 @@
+"""Whatever is typed wrongly: one line that helps, exit status 2, nothing written."""
+
+import os
+import shutil
+
+import pytest
+
+from sb3_guard import enjoy, train
+
+TOY = ["--gym-packages", "registered_envs", "--env", "CostPoint-v0"]
+SMALL = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3", "-n", "60", "--verbose", "0",
+         "--env-kwargs", "episode_length:20", "--eval-freq", "-1", "--seed", "1"]  # fmt: skip
+
+
+def refused(main, arguments, capsys, *parts: str) -> str:
+    """Run a command that must fail as it should; its message."""
+    status = main(arguments)
+    out, err = capsys.readouterr()
+    assert status == 2, out + err
+    message = err.splitlines()[-1]
+    assert message.startswith("error: ")
+    assert "Traceback" not in err + out
+    assert err.count("error:") == 1
+    for part in parts:
+        assert part in message, message
+    return message
+
+
+@pytest.fixture
+def empty(tmp_path, monkeypatch):
+    """A working folder that must still be empty afterwards."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    yield folder
+    assert list(folder.iterdir()) == []
+
+
+TRAIN = [
+    # algorithm
+    (["--algo", "cpp"], ["unknown algorithm 'cpp'", "did you mean 'cpo'?", "trpo"]),
+    # environment
+    (["--env", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
+    (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),
+    (["--env", "Goal_Point_8Hazzards-v0"], ["'Hazzards'", "'Hazards'"]),
+    (["--env", "CartPole-v99"], ["CartPole-v99"]),
+    (["--env", "Nonsense"], ["'Nonsense'"]),
+    (["--env", "no_such_module:Env-v0"], ["no_such_module"]),
+    (["--gym-packages", "no_such_package"], ["--gym-packages", "'no_such_package'"]),
+    (["--env-kwargs", "hazard:{}"], ["'hazard'", "hazards"]),
+    (["--env-kwargs", "hazards:{'num': -1}"], ["num", "-1"]),
+    (["--env-kwargs", "hazards:{'size': 'big'}"], ["size", "'big'"]),
+    (["--env-kwargs", "hazards"], ["'hazards' is not of the form key:value"]),
+    ([*TOY, "--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
+    (["--env", "CostPoint-v0", "--gym-packages", "registered_envs", "--vec-env", "native"],
+     ["--vec-env native", "dummy or subproc"]),
+    (["--vec-env", "fast"], ["--vec-env", "'fast'", "native"]),
+    (["-params", "env_wrapper:gymnasium.wrappers.FlattenObservation", "--vec-env", "native"],
+     ["--vec-env native can't apply env_wrapper"]),
+    # an environment without the cost key
+    ([*TOY, "--env", "NoCost-v0"], ["no cost 'cost'", "depth", "cost_keys", "missing_cost:zero"]),
+    ([*TOY, "-params", "cost_keys:['heat']"], ["no cost 'heat'"]),
+    # hyper-parameters
+    (["-params", "n_step:10"], ["no hyper-parameter 'n_step'", "did you mean 'n_steps'?"]),
+    (["-params", "n_steps:ten"], ["n_steps: 'ten'", "a whole number"]),
+    (["-params", "n_steps:-5"], ["n_steps: -5", "at least 1"]),
+    (["-params", "n_envs:0"], ["n_envs: 0", "at least 1"]),
+    (["-params", "n_envs"], ["'n_envs' is not of the form key:value"]),
+    (["-params", "gamma:1.5"], ["gamma", "1.5"]),
+    (["-params", "gamma:nan"], ["gamma: 'nan'", "a number"]),
+    (["-params", "target_kl:0"], ["target_kl"]),
+    (["-params", "learning_rate:-1"], ["learning_rate"]),
+    (["-params", "cost_limit:[1.0,2.0]"], ["cost_limit", "cost"]),
+    (["-params", "cost_limit:nan"], ["cost_limit: 'nan'"]),
+    (["-params", "policy:MlpPolcy"], ["MlpPolcy"]),
+    (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
+    (["-params", "seed:3"], ["use the flag --seed"]),
+    (["-conf", "absent.yml"], ["there is no hyper-parameter file absent.yml"]),
+    # flags
+    (["--sede", "3"], ["unknown flag --sede", "--seed"]),
+    (["-n", "0"], ["-n", "at least 1"]),
+    (["-n", "1.5"], ["'1.5' is not a whole number"]),
+    (["-n", "many"], ["'many' is not a whole number"]),
+    (["--seed", "one"], ["--seed", "'one'"]),
+    (["--seed", "4294967296"], ["--seed 4294967296", "2**32"]),
+    (["--eval-episodes", "0"], ["--eval-episodes", "at least 1"]),
+    (["--n-eval-envs", "-2"], ["--n-eval-envs", "at least 1"]),
+    (["--checkpoint-every", "nan"], ["--checkpoint-every nan"]),
+    (["--log-interval", "0"], ["--log-interval 0"]),
+    (["--device", "abacus"], ["abacus"]),
+    (["-i", "absent"], ["no run folder or model 'absent'"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "parts"), TRAIN, ids=lambda one: " ".join(one)[:40])
+def test_train(arguments, parts, capsys, empty):
+    refused(train.main, ["-n", "100", "--verbose", "0", *arguments], capsys, *parts)
+
+
+ENJOY = [
+    (["--algo", "cpp"], ["unknown algorithm 'cpp'"]),
+    (["--env", "Goal_Pint_8Hazards"], ["'Pint'"]),
+    ([], ["there is no run of cpo on Goal_Point_8Hazards-v0 in 'logs'", "sb3_guard.train"]),
+    (["--exp-id", "7"], ["there is no run folder", "_7"]),
+    (["-f", "nowhere"], ["'nowhere'"]),
+    (["--n-episodes", "0"], ["--n-episodes", "at least 1"]),
+    (["--n-episodes", "1", "-n", "5"], ["not allowed with"]),
+    (["--seed", "-1"], ["--seed -1"]),
+    (["--load-bets"], ["unknown flag --load-bets", "--load-best"]),
+]
+
+
+@pytest.mark.parametrize(("arguments", "parts"), ENJOY, ids=lambda one: " ".join(one)[:40])
+def test_enjoy(arguments, parts, capsys, empty):
+    refused(enjoy.main, ["--no-render", *arguments], capsys, *parts)
+
+
+def test_track_without_wandb(capsys, empty, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "wandb", None)
+    refused(train.main, ["--track"], capsys, "--track needs wandb", "pip install wandb")
+
+
+def test_corrupt_yaml(capsys, tmp_path):
+    (tmp_path / "bad.yml").write_text("default:\n  n_steps: [1, 2\nx: }")
+    arguments = ["-conf", str(tmp_path / "bad.yml"), "-f", str(tmp_path / "logs")]
+    refused(train.main, arguments, capsys, "bad.yml is not valid YAML", "line")
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_csv_that_was_changed(capsys, run):
+    csv = run / "0.monitor.csv"
+    csv.write_text(csv.read_text()[:-20])
+    before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "0.monitor.csv", "was changed since")
+    assert before == {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
+
+
+def test_more_than_plain_data(capsys, tmp_path):
+    conf = tmp_path / "conf.py"
+    conf.write_text(
+        "from torch import nn\n"
+        "hyperparams = {'default': {'policy_kwargs': {'activation_fn': nn.ReLU}, 'n_steps': 30}}\n"
+    )
+    arguments = [*TOY, "-n", "60", "-conf", str(conf), "-f", str(tmp_path / "logs")]
+    refused(train.main, arguments, capsys, "config.yml can hold plain data only", "nn.ReLU")
+    assert not (tmp_path / "logs").exists()
+
+
+def test_unwritable_log_folder(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    arguments = [*TOY, *SMALL, "-f", str(tmp_path / "file")]
+    refused(train.main, arguments, capsys, "can't write to log folder", "choose another with -f")
+    if os.getuid() != 0:  # nothing is forbidden to root
+        (tmp_path / "locked").mkdir(mode=0o500)
+        refused(train.main, [*TOY, *SMALL, "-f", str(tmp_path / "locked")], capsys, "locked")
+
+
+@pytest.fixture
+def run(tmp_path):
+    assert train.main([*TOY, *SMALL, "-f", str(tmp_path)]) == 0
+    return tmp_path / "cpo" / "CostPoint-v0_1"
+
+
+def test_a_cost_that_is_not_a_number(capsys, tmp_path):
+    arguments = [*TOY, *SMALL, "--env", "Flickering-v0", "-f", str(tmp_path)]
+    arguments += ["--env-kwargs", "episode_length:40"]
+    refused(train.main, arguments, capsys, "info['cost'] of environment 0 is nan", "42 steps")
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip at all", None])
+def test_corrupt_checkpoint(content, capsys, run):
+    if content is None:
+        content = run.joinpath("checkpoint.zip").read_bytes()[:-2000]
+    run.joinpath("checkpoint.zip").write_bytes(content)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    for path in (run, run / "checkpoint.zip"):
+        arguments = ["-i", str(path), "-n", "120"]
+        refused(train.main, arguments, capsys, "checkpoint.zip is damaged")
+    after = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    assert before == after
+
+
+def test_checkpoints_that_are_none(capsys, run):
+    run.joinpath("checkpoint.zip").unlink()
+    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "start it again without -i")
+    shutil.copy(run / "CostPoint-v0.zip", run / "checkpoint.zip")
+    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "is a model, not a checkpoint")
+
+
+def test_corrupt_model(capsys, run, tmp_path):
+    run.joinpath("CostPoint-v0.zip").write_bytes(b"no zip at all")
+    refused(
+        enjoy.main,
+        [*TOY, "-f", str(tmp_path), "--no-render"],
+        capsys,
+        "can't load",
+        "CostPoint-v0.zip",
+    )
+    warm = [*TOY, *SMALL, "-i", str(run / "CostPoint-v0.zip"), "-f", str(tmp_path / "new")]
+    refused(train.main, warm, capsys, "can't load")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--seed", "2"], ["--seed 2 contradicts --seed 1"]),
+        (["--algo", "trpo"], ["--algo trpo contradicts --algo cpo"]),
+        (["--env", "NoCost-v0"], ["--env NoCost-v0 contradicts --env CostPoint-v0"]),
+        (["-params", "n_steps:31"], ["-params n_steps:31 contradicts -params n_steps:30"]),
+        (["-params", "gama:1"], ["no hyper-parameter 'gama'", "'gamma'"]),
+        (["-f", "elsewhere"], ["contradicts"]),
+        (["-n", "30"], ["-n 30 is less than the 60 steps"]),
+    ],
+)
+def test_flags_that_contradict_the_run(arguments, parts, capsys, run):
+    refused(train.main, ["-i", str(run), *arguments], capsys, *parts)
+
+
+def test_the_runs_own_flags_may_be_repeated(run):
+    arguments = ["-i", str(run), *TOY, "-params", "n_steps:3e1", "cost_limit:0", "-n", "120"]
+    assert train.main([*arguments, "--env-kwargs", "episode_length:20", "--seed", "1"]) == 0
+
+
+def test_other_algorithms_agent(capsys, run, tmp_path):
+    warm = [*TOY, *SMALL, "--algo", "trpo", "-i", str(run / "CostPoint-v0.zip")]
+    refused(train.main, [*warm, "-f", str(tmp_path / "new")], capsys, "can't load", "as TRPO")
+
+
+def test_agent_of_another_environment(capsys, run, tmp_path):
+    warm = [*SMALL, "--env", "CartPole-v1", "-i", str(run / "CostPoint-v0.zip"), "--algo", "cpo"]
+    warm = [one for one in warm if one not in ("--env-kwargs", "episode_length:20")]
+    arguments = [*warm, "-params", "missing_cost:zero", "-f", str(tmp_path / "new")]
+    refused(train.main, arguments, capsys, "can't load")
+
+
+def test_kept_model_that_is_not_there(capsys, run, tmp_path):
+    play = [*TOY, "-f", str(tmp_path), "--no-render"]
+    refused(enjoy.main, [*play, "--load-checkpoint", "30"], capsys, "no model at 30 steps")
+    refused(enjoy.main, [*play, "--load-best"], capsys, "best_model.zip")

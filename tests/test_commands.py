@@ -1,0 +1,326 @@
+"""The commands as users type them."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from cost_envs import CostPoint
+from rl_zoo3.utils import EnvironmentName, get_model_path
+from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_guard import CPO, cli, enjoy, train
+from sb3_guard.zoo.config import build, check
+from sb3_guard.zoo.environments import make_envs
+
+TOY = "--gym-packages registered_envs --env CostPoint-v0".split()
+SMALL = (
+    "-params n_envs:2 n_steps:30 n_critic_updates:3 --seed 3 --device cpu "
+    "--eval-freq 60 --eval-episodes 2"
+).split()
+LENGTH = ["--env-kwargs", "episode_length:20"]
+
+
+def trained(folder, *arguments: str, algo: str = "cpo", env: str = "CostPoint-v0"):
+    """Train for two rollouts; the run folder."""
+    run = ["--algo", algo, *TOY, *SMALL, "-n", "120", "-f", str(folder), "--env", env, *arguments]
+    if "Hazards" not in env:
+        run += LENGTH
+    assert train.main([*run, "--verbose", "0"]) == 0
+    return max((folder / algo).glob(f"{env}_*"), key=lambda path: path.stat().st_mtime_ns)
+
+
+def test_run_folder_is_rl_zoos(tmp_path):
+    run = trained(tmp_path, "--save-freq", "60")
+    assert run.name == "CostPoint-v0_1"
+    assert {path.name for path in run.iterdir() if path.name[0] != "."} == {
+        "CostPoint-v0", "CostPoint-v0.zip", "0.monitor.csv", "progress.csv", "evaluations.npz",
+        "best_model.zip", "checkpoint.zip", "result.json", "rl_model_60_steps.zip",
+        "rl_model_120_steps.zip",
+    }  # fmt: skip
+    for flags in ({}, {"load_best": True}, {"load_last_checkpoint": True}):
+        name = EnvironmentName("CostPoint-v0")
+        assert get_model_path(0, str(tmp_path), "cpo", name, **flags)[2] == str(run)
+    args = yaml.safe_load((run / "CostPoint-v0" / "args.yml").read_text())
+    config = yaml.safe_load((run / "CostPoint-v0" / "config.yml").read_text())
+    assert (args["seed"], args["env"]) == (3, "CostPoint-v0")
+    assert (config["n_envs"], config["n_timesteps"], config["gamma"]) == (2, 120, 0.99)
+    assert (run / "CostPoint-v0" / "command.txt").read_text()
+    assert CPO.load(run / "CostPoint-v0.zip").num_timesteps == 120
+    assert trained(tmp_path).name == "CostPoint-v0_2"
+
+
+def test_costs_are_in_the_files(tmp_path):
+    run = trained(tmp_path)
+    episodes = load_results(str(run))
+    assert len(episodes) == 6 and (episodes["l"] == 20).all() and (episodes["c"] >= 0).all()
+    log = pd.read_csv(run / "progress.csv")
+    for key in ("rollout/ep_cost_mean", "rollout/cost_rate", "eval/mean_ep_cost", "train/kl"):
+        assert log[key].notna().any()
+    assert np.load(run / "evaluations.npz")["costs"].shape == (2, 2)
+    result = json.loads((run / "result.json").read_text())
+    # Of 20 steps each: one ended in the first rollout of 30 per environment, two in the second.
+    last = episodes.sort_values("t").tail(4)
+    assert result["episodes"] == 4
+    assert result["return"] == pytest.approx(last["r"].mean())
+    assert result["cost"] == pytest.approx(last["c"].mean())
+    assert result["cost_rate"] == pytest.approx(episodes["c"].sum() / 120)
+
+
+def test_same_seed_same_run(tmp_path):
+    one, other = trained(tmp_path), trained(tmp_path)
+    results = [(run / "result.json").read_text() for run in (one, other)]
+    assert results[0] == results[1]
+    assert (trained(tmp_path, "--seed", "4") / "result.json").read_text() != results[0]
+
+
+def test_summary_names_folder_and_figures(tmp_path, capsys):
+    trained(tmp_path)
+    assert capsys.readouterr() == ("", "")  # --verbose 0
+    assert train.main([*TOY, *SMALL, *LENGTH, "-n", "60", "-f", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    for text in (str(tmp_path / "cpo" / "CostPoint-v0_2"), "J_r", "M_c", "ρ_c", "ep_cost_mean"):
+        assert text in out
+
+
+def test_no_episode_ends(tmp_path, capsys):
+    arguments = [*TOY, *SMALL, "-n", "60", "-f", str(tmp_path), "--eval-freq", "-1"]
+    assert train.main([*arguments, "--env-kwargs", "episode_length:1000"]) == 0
+    assert "no episode has ended" in capsys.readouterr().out
+
+
+def test_progress_bar_shows_return_and_cost(tmp_path, capsys):
+    trained(tmp_path, "--progress", "--verbose", "1")
+    err = capsys.readouterr().err
+    assert "120/120" in err
+    assert all(word in err for word in ("return", "cost", "rate"))
+
+
+@pytest.mark.parametrize("vec_env", ["native", "dummy"])
+def test_our_environments(tmp_path, vec_env, capsys):
+    run = trained(
+        tmp_path, "--vec-env", vec_env, "--env-kwargs", "goal:dict(size=0.5)", "--eval-freq", "-1",
+        env="Goal_Point_3Hazards-v0",
+    )  # fmt: skip
+    config = yaml.safe_load((run / "Goal_Point_3Hazards-v0" / "config.yml").read_text())
+    assert config["env_kwargs"]["goal"] == {"size": 0.5}
+    capsys.readouterr()
+    play = ["--env", "Goal_Point_3Hazards", "-f", str(tmp_path), "--no-render", "-n", "20"]
+    assert enjoy.main(play) == 0
+    assert "No episode ended" in capsys.readouterr().out
+
+
+def test_trpo_on_an_environment_without_costs(tmp_path):
+    trained(tmp_path, "--env", "NoCost-v0", algo="trpo", env="NoCost-v0")
+
+
+def test_missing_costs_may_count_as_zero(tmp_path):
+    trained(tmp_path, "-params", "missing_cost:zero", "n_steps:30", env="NoCost-v0")
+
+
+def test_warm_start_begins_a_new_run_from_an_agent(tmp_path):
+    run = trained(tmp_path, "-params", "normalize:True")
+    second = trained(tmp_path, "-params", "normalize:True", "-i", str(run / "CostPoint-v0.zip"))
+    assert second.name == "CostPoint-v0_2"
+    assert CPO.load(second / "CostPoint-v0.zip").num_timesteps == 120
+    first, later = (np.load(one / "evaluations.npz")["results"] for one in (run, second))
+    assert not np.array_equal(first, later)
+
+
+def test_tensorboard_and_uuid(tmp_path):
+    run = trained(tmp_path / "logs", "-tb", str(tmp_path / "tb"), "-uuid")
+    assert len(run.name) > len("CostPoint-v0_1_") + 30
+    (events,) = (tmp_path / "tb").rglob("events.*")
+    assert events.parent.parent.name == "CostPoint-v0"
+
+
+def test_schedules_and_other_conf_file(tmp_path):
+    conf = tmp_path / "conf.yml"
+    conf.write_text("default: {n_timesteps: 60, n_envs: 1, n_steps: 60, learning_rate: lin_0.01}")
+    arguments = [
+        *TOY,
+        "-conf",
+        str(conf),
+        "-f",
+        str(tmp_path),
+        "--verbose",
+        "0",
+        "--eval-freq",
+        "-1",
+    ]
+    assert train.main([*arguments, "--env-kwargs", "episode_length:20"]) == 0
+    log = pd.read_csv(tmp_path / "cpo" / "CostPoint-v0_1" / "progress.csv")
+    assert log["time/total_timesteps"].tolist() == [60]
+
+
+# enjoy
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    trained(folder, "--save-freq", "60", "-params", "normalize:True", env="Filmed-v0")
+    return folder
+
+
+PLAY = ["--env", "Filmed-v0", "--gym-packages", "registered_envs", "--no-render"]
+
+
+@pytest.mark.parametrize(
+    "which",
+    [
+        [],
+        ["--load-best"],
+        ["--load-last-checkpoint"],
+        ["--load-checkpoint", "60"],
+        ["--exp-id", "1"],
+    ],
+)
+def test_enjoy_prints_return_and_cost(logs, which, capsys):
+    assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "3", *which]) == 0
+    out = capsys.readouterr().out
+    rows = [line for line in out.splitlines() if line.endswith("20 steps")]
+    assert len(rows) == 3 and all("return" in row and "cost" in row for row in rows)
+    assert "Mean ± std of 3 episodes" in out
+    returns = [float(row.split()[1]) for row in rows]
+    (mean,) = (line for line in out.splitlines() if line.startswith("  return") and "±" in line)
+    assert float(mean.split()[1]) == pytest.approx(np.mean(returns), abs=1e-3)
+
+
+def test_enjoy_is_seeded_and_deterministic_by_default(logs, capsys):
+    def play(*arguments):
+        assert enjoy.main([*PLAY, "-f", str(logs), *arguments]) == 0
+        return capsys.readouterr().out
+
+    assert play() == play("--deterministic", "--seed", "0") == play()
+    assert play("--seed", "1") != play() != play("--stochastic")
+    assert play("--stochastic") == play("--stochastic")
+
+
+def test_enjoy_uses_the_environment_of_training(logs, capsys):
+    assert enjoy.main([*PLAY, "-f", str(logs), "--env-kwargs", "episode_length:7"]) == 0
+    assert "7 steps" in capsys.readouterr().out
+
+
+def test_an_unfinished_run_is_played_from_its_checkpoint(logs, tmp_path, capsys):
+    run = trained(tmp_path, "-params", "normalize:True")
+    play = [*TOY, "-f", str(tmp_path), "--no-render"]
+
+    def table() -> list[str]:
+        assert enjoy.main(play) == 0
+        first, *rest = capsys.readouterr().out.splitlines()
+        return [first.split()[1], *rest]
+
+    final = table()
+    (run / "CostPoint-v0.zip").unlink()
+    (run / "CostPoint-v0" / "vecnormalize.pkl").unlink()
+    # The last checkpoint is the final agent, observation statistics included.
+    assert table() == [str(run / "checkpoint.zip"), *final[1:]]
+
+
+def test_enjoy_normalises_as_training_did(tmp_path, capsys):
+    run = trained(tmp_path, "-params", "normalize:True")
+    play = [*TOY, "-f", str(tmp_path), "--no-render"]
+    path = run / "CostPoint-v0" / "vecnormalize.pkl"
+    assert enjoy.main(play) == 0
+    before = capsys.readouterr().out
+    statistics = VecNormalize.load(str(path), DummyVecEnv([CostPoint]))
+    statistics.obs_rms.mean += 5.0
+    statistics.save(str(path))
+    assert enjoy.main(play) == 0
+    assert capsys.readouterr().out != before
+    path.unlink()
+    assert enjoy.main(play) == 2
+    assert "can't read the observation statistics" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("evaluation", [True, False])
+def test_only_training_adds_to_the_statistics(evaluation):
+    setup = build(check("cpo", CPO, {"n_timesteps": 1, "normalize": True}))
+    env = make_envs(
+        "CartPole-v1", setup, n_envs=2, seed=0, vec_env="dummy", env_kwargs={},
+        evaluation=evaluation,
+    )  # fmt: skip
+    assert (env.training, env.norm_reward) == (not evaluation, not evaluation)
+
+
+def test_record_writes_a_video(logs, tmp_path):
+    import imageio_ffmpeg
+
+    video = tmp_path / "made" / "film.mp4"
+    assert enjoy.main([*PLAY, "-f", str(logs), "-n", "12", "--record", str(video)]) == 0
+    assert [path.name for path in video.parent.iterdir()] == ["film.mp4"]
+    frames = imageio_ffmpeg.read_frames(str(video))
+    meta = next(frames)
+    assert meta["size"] == (64, 64) and meta["fps"] == 10
+    pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
+    assert len(pictures) == 12
+    assert pictures[0].max() > 200 and abs(int(np.median(pictures[0])) - 60) < 10
+
+
+def test_record_our_environment(tmp_path):
+    from sb3_guard.envs.rendering import RenderingError, gl_backend
+
+    try:
+        gl_backend()
+    except RenderingError as error:
+        pytest.skip(str(error))
+    trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
+    video = tmp_path / "film.mp4"
+    play = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3", "--record", str(video)]
+    assert enjoy.main(play) == 0
+    assert video.stat().st_size > 1000
+
+
+def test_no_backend_no_video(tmp_path, monkeypatch, capsys):
+    import sb3_guard.envs.rendering as rendering
+
+    def nothing() -> str:
+        raise rendering.RenderingError("no OpenGL backend works here, tried egl; install EGL")
+
+    monkeypatch.setattr(rendering, "gl_backend", nothing)
+    trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
+    video = tmp_path / "film.mp4"
+    play = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3", "--record", str(video)]
+    assert enjoy.main(play) == 2
+    assert "error: can't render: RenderingError: no OpenGL backend" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
+
+
+# help and the dispatcher
+
+
+@pytest.mark.parametrize("command", ["train", "enjoy"])
+def test_help_is_quick_and_loads_nothing_heavy(command):
+    script = (
+        "import sys\n"
+        f"from sb3_guard import {command}\n"
+        "try:\n"
+        f"    {command}.main(['--help'])\n"
+        "except SystemExit as end:\n"
+        "    assert end.code == 0\n"
+        "print(sorted({'torch', 'rl_zoo3', 'stable_baselines3'} & sys.modules.keys()))\n"
+    )
+    began = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert "--env" in done.stdout
+    # 0.5 s on an idle machine; generous, since tests run side by side.
+    assert time.monotonic() - began < 10
+
+
+def test_dispatcher(capsys, tmp_path):
+    assert cli.main([]) == cli.main(["--help"]) == 0
+    assert "train" in capsys.readouterr().out
+    assert cli.main(["--version"]) == 0
+    assert cli.main(["trian"]) == 2
+    assert "unknown command 'trian'; did you mean 'train'?" in capsys.readouterr().err
+    assert cli.main(["enjoy", "-f", str(tmp_path), "--no-render"]) == 2
+    assert "there is no run of cpo on Goal_Point_8Hazards-v0" in capsys.readouterr().err

@@ -62,22 +62,10 @@ def test_the_law_equals_the_scalar_loop(kind, planar, unit_law):
     )
     v1 = abs(speeds["near"] + speeds["far"])
     for _ in range(3):
+        settle = speeds["settle"]
+        rule = (planar, unit_law, 0.002, v1, settle, 0.003, 0.6, r0, r1, origin)
         expected = [
-            scalar_law(
-                kind,
-                p,
-                r,
-                planar,
-                unit_law,
-                0.002,
-                v1,
-                speeds["settle"],
-                0.003,
-                0.6,
-                r0,
-                r1,
-                origin,
-            )
+            scalar_law(kind, p, r, *rule)
             for p, r in zip(points.tolist(), robot.tolist(), strict=True)
         ]
         motion.advance(points, robot, law, planar)
@@ -197,7 +185,7 @@ def test_in_space_z_stays_within_its_range():
 
 def test_default_ghosts_wait_outside_a_passive_robot():
     """They stop at r1 = 1.5 m: a robot that does not move pays nothing."""
-    engine, _, part, places = movers("Goal_Point_8Ghosts")
+    engine, _, part, _ = movers("Goal_Point_8Ghosts")
     for _ in range(400):
         assert engine.step(np.zeros((3, 2))).cost.sum() == 0
     assert part.movable == "active"

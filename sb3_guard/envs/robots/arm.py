@@ -41,6 +41,6 @@ class Arm(MJCFRobot):
         start, end = self._xpos[:, self._starts], self._xpos[:, self._ends]  # [N, L, 3]
         if planar:
             start, end, points = start.copy(), end.copy(), points.copy()
-            start[..., 2] = end[..., 2] = 0.0
+            start[..., 2] = end[..., 2] = points[..., 2] = 0.0
         gap = geometry.segment_distance(start, end, points) - self._radii[:, None]  # [N, L, K]
         return gap.min(axis=1)

@@ -3,8 +3,8 @@
 The file holds the robot alone: no floor, no options, no light. Its conventions:
 
 * the outermost body is called ``robot``; it either begins with a free joint or, for robots that
-  move at a fixed height or not at all, with its own slides and hinges; these then hang under a mocap
-  body that carries the place and heading of an episode's start;
+  move at a fixed height or not at all, with its own slides and hinges; these then hang under a
+  mocap body that carries the place and heading of an episode's start;
 * every sensor in the file is observed under its own name; ``jointpos`` as (sin θ, cos θ), ball
   joints as a rotation matrix; sensors whose names begin with ``_`` are not observed;
 * actions in [−1, 1] are scaled linearly to the control range of the actuators, in their order;

@@ -1,0 +1,378 @@
+"""Tasks: rewards against scalar loops, what counts as success, and objects that behave."""
+
+import math
+
+import numpy as np
+import pytest
+from worlds import ROW, free_body, put_point, world
+
+from sb3_guard.envs import Scenario
+from sb3_guard.envs.registry import TASKS
+
+
+def actions(engine, steps, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1, 1, (steps, engine.num_envs, engine.robot.action_size))
+
+
+def gap(a, b, planar):
+    return math.dist(a[:2], b[:2]) if planar else math.dist(a, b)
+
+
+@pytest.mark.parametrize("robot", ["Point", "Humanoid", "Drone", "Arm3"])
+def test_push_rewards_equal_the_scalar_loop(robot):
+    """Every gate: the ball is set down beside the robot, then away from it."""
+    engine = world(f"Push_{robot}_2Hazards", 3, push={"reward_approach": 1.5})
+    planar = engine.robot.workspace == "planar"
+    ball, place = engine.batch.bind("xpos")[:, engine.model.body("ball/0").id], engine.task.place
+    pose, _ = free_body(engine, "ball/0")
+    gates = set()
+    for step, action in enumerate(actions(engine, 60)):
+        if step % 20 == 0:
+            beside = 0.3 if step == 20 else 1.1
+            pose[:, :2] = engine.robot.position[:, :2] + [beside, 0]
+            engine.batch.forward()
+            engine._before[:] = engine.task.measure()
+        old = [
+            (gap(engine.robot.position[i], ball[i], planar), gap(ball[i], place[i], True))
+            for i in range(3)
+        ]
+        goals = place.copy()
+        outcome = engine.step(action)
+        for i in range(3):
+            b = gap(engine.robot.position[i], ball[i], planar)
+            g = gap(ball[i], goals[i], True)
+            gate = old[i][0] > 0.4
+            gates.add(gate)
+            expected = 1.5 * (old[i][0] - b) * gate + (old[i][1] - g)
+            expected = min(max(expected, -10), 10) + (g <= 0.5)
+            assert outcome.reward[i] == pytest.approx(expected, abs=1e-12)
+            assert outcome.goal_met[i] == (g <= 0.5)
+    assert True in gates
+    if planar:
+        assert False in gates
+
+
+def test_a_ball_in_the_goal_pays_once_and_the_goal_moves_clear_of_it():
+    engine = world("Push_Point_4Ghosts")
+    pose, velocity = free_body(engine, "ball/0")
+    old = engine.task.place[0].copy()
+    pose[:, :2], velocity[:] = old[:2] + np.array([0.45, 0.0]), 0.0
+    engine.batch.forward()
+    engine._before[:] = engine.task.measure()
+    outcome = engine.step(np.zeros((1, 2)))
+    assert outcome.goal_met[0] and outcome.reward[0] == pytest.approx(1.0, abs=0.01)
+    new = engine.task.place[0]
+    assert math.dist(new[:2], pose[0, :2]) >= 0.6
+    outcome = engine.step(np.zeros((1, 2)))
+    assert not outcome.goal_met[0] and abs(outcome.reward[0]) < 0.01
+
+
+@pytest.mark.parametrize("robot", ["Point", "Swimmer"])
+def test_the_ball_lies_still_rolls_on_when_released_and_comes_to_rest(robot):
+    """Small and large time step. Without rolling it would slide to a stop within 3 cm."""
+    engine = world(f"Push_{robot}_0Hazards", push={"object_locations": [[-1.5, -1.5]]})
+    pose, velocity = free_body(engine, "ball/0")
+    still = np.zeros((1, engine.robot.action_size))
+    start = pose.copy()
+    for _ in range(20):
+        engine.step(still)
+    np.testing.assert_allclose(pose, start, atol=1e-6)
+    assert pose[0, 2] == pytest.approx(0.2, abs=2e-3)
+    velocity[0, 0] = 0.5
+    seconds = 10 * engine.model.opt.timestep
+    for _ in range(round(1 / seconds)):
+        engine.step(still)
+    assert 0.25 < pose[0, 0] + 1.5 < 0.5 and 0.2 < velocity[0, 0] < 0.4
+    spin = np.linalg.norm(velocity[0, 3:])
+    assert 0.2 * spin == pytest.approx(np.linalg.norm(velocity[0, :2]), rel=0.05)  # it rolls
+    for _ in range(round(12 / seconds)):
+        engine.step(still)
+    assert abs(velocity[0, 0]) < 0.02 and 0.5 < pose[0, 0] + 1.5 < 3
+
+
+def test_the_ball_bounces_off_a_pillar():
+    engine = world(
+        "Push_Point_1Pillars",
+        push={"object_locations": [[-1.5, 0.0]]},
+        pillars={"locations": [[0.0, 0.0]]},
+        robot={"locations": [[1.5, 1.5]]},
+    )
+    pose, velocity = free_body(engine, "ball/0")
+    velocity[0, 0] = 1.5
+    furthest = -2.0
+    for _ in range(150):
+        engine.step(np.zeros((1, 2)))
+        furthest = max(furthest, pose[0, 0])
+    assert -0.45 < furthest < -0.35  # radii 0.2 and 0.2
+    assert velocity[0, 0] < -0.05 and pose[0, 0] < -0.5
+    assert engine.constraints[0].cost()[0] == 0  # the ball's touch is not the robot's
+
+
+@pytest.mark.parametrize("kind", ["ball", "box"])
+def test_the_robot_pushes_the_object(kind):
+    engine = world("Push_Point_0Hazards", push={"object": kind, "object_locations": [[0.0, 0.0]]})
+    put_point(engine, -0.8, 0.0)
+    pose, _ = free_body(engine, f"{kind}/0")
+    start, felt = pose.copy(), False
+    assert "box_compass" in engine.channels
+    for _ in range(80):
+        engine.step(np.array([[1.0, 0.0]]))
+        felt |= bool(engine.task.bodies.touched[0, 0])
+    assert felt and pose[0, 0] > start[0, 0] + 0.3
+
+
+def test_a_box_has_posts_that_rest_on_nothing():
+    engine = world("Push_Point_0Hazards", push={"object": "box"})
+    body = engine.model.body("box/0")
+    assert body.geomnum[0] == 5
+    pose, velocity = free_body(engine, "box/0")
+    for _ in range(20):
+        engine.step(np.zeros((1, 2)))
+    assert np.abs(velocity).max() < 1e-4 and pose[0, 2] == pytest.approx(0.2, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("suite", "params"),
+    [
+        ("Chase_Point_2Hazards", {}),
+        ("Chase_Humanoid_0Hazards", {"chase": {"num": 4, "reward_distance": 2.0}}),
+        ("Chase_Drone_2Ghosts", {"chase": {"num": 1}}),
+        ("Chase_Drone_2Ghosts", {"chase": {"space": "planar"}}),
+        ("Chase_Point_2Ghosts", {"chase": {"solid": True}}),
+    ],
+    ids=str,
+)
+def test_chase_rewards_equal_the_scalar_loop_and_begin_with_nothing(suite, params):
+    engine = world(suite, 3, **params)
+    given = params.get("chase", {})
+    planar = given.get("space", engine.robot.workspace) == "planar"
+
+    def nearest(i):
+        return min(gap(engine.robot.position[i], p, planar) for p in engine.places("targets")[i])
+
+    for step, action in enumerate(actions(engine, 40)):
+        if step == 20:  # an episode begins in row 1 alone
+            engine.reset(np.array([1]))
+        old = [nearest(i) for i in range(3)]
+        reward = engine.step(action).reward
+        for i in range(3):
+            first = step == 0 or (step == 20 and i == 1)
+            expected = 0.0 if first else given.get("reward_distance", 1.0) * (old[i] - nearest(i))
+            assert reward[i] == pytest.approx(expected, abs=1e-12)
+
+
+def test_an_arm_chases_with_its_nearest_link():
+    engine = world("Chase_Arm3_0Hazards", 2)
+    for action in actions(engine, 15):
+        engine.step(action)
+        targets, measured = engine.places("targets"), engine.task.measure()
+        each = engine.robot.clearance(targets, False)
+        for i in range(2):
+            assert measured[i, 0] == each[i].min()
+            far = min(gap(engine.robot.position[i], p, False) for p in targets[i])
+            assert measured[i, 0] <= far
+
+
+@pytest.mark.parametrize(
+    ("suite", "params"),
+    [
+        ("Defense_Point_2Hazards", {}),
+        ("Defense_Point_2Ghosts", {"defense": {"num": 5, "radius": 1.0, "reward_outside": 0.3}}),
+        ("Defense_Drone_2Hazards", {"defense": {"origin": [0.2, -0.3, 1.0]}}),
+    ],
+    ids=str,
+)
+def test_defense_rewards_equal_the_scalar_loop(suite, params):
+    engine = world(suite, 3, **params)
+    given = params.get("defense", {})
+    origin = given.get("origin", [0.0, 0.0])
+    outside = set()
+    for action in actions(engine, 30):
+        engine.places("targets")[..., :2] *= 1.02  # across the circle's border
+        reward = engine.step(action).reward
+        for i in range(3):
+            expected = 0.0
+            for p in engine.places("targets")[i]:
+                depth = gap(p, origin, True) / given.get("radius", 1.5) - 1
+                expected += depth if depth < 0 else given.get("reward_outside", 0.1)
+                outside.add(depth >= 0)
+            assert reward[i] == pytest.approx(max(expected, -10), abs=1e-12)
+    assert outside == {True, False}
+
+
+@pytest.mark.parametrize("task", ["Chase", "Defense"])
+def test_solid_targets_stop_the_robot_and_others_do_not(task):
+    """Driven at a target that keeps still, a Point ends in front of it or on the far side."""
+    ends = {}
+    for solid in (True, False):
+        engine = world(
+            f"{task}_Point_0Hazards",
+            **{task.lower(): {"solid": solid, "speed": 0.0, "num": 1, "locations": [[0.0, 0.0]]}},
+        )
+        assert engine.task.contact == solid and engine.task.targets == "one"
+        put_point(engine, -1.0, 0.0)
+        touched = 0
+        for _ in range(120):
+            engine.step(np.array([[1.0, 0.0]]))
+            touched += int(solid and engine.task.bodies.touched[0, 0])
+        ends[solid] = float(engine.robot.position[0, 0])
+        assert (touched > 0) == solid
+    assert -0.6 < ends[True] < -0.35  # radius 0.3, the Point's nose 0.15
+    assert ends[False] > 0.3
+
+
+def press(engine, button):
+    """Set the Point down against a button, for one control step."""
+    x, y = engine.places("button")[0, button, :2]
+    put_point(engine, x - 0.19, y, math.pi)
+    return engine.step(np.zeros((1, 2)))
+
+
+def test_the_lit_button_pays_and_after_the_delay_another_one_is_lit():
+    engine = world("Button_Point_0Hazards", seed=1)
+    task = engine.task
+    lit = int(task.right[0])
+    assert (engine.observe()[0, engine.observation_layout["button_lidar"]] > 0).any()
+    for wrong in set(range(4)) - {lit}:
+        outcome = press(engine, wrong)
+        assert task.bodies.touched[0, wrong] and not outcome.goal_met[0]
+        assert task.mistakes()[0] == 1
+    outcome = press(engine, lit)
+    assert outcome.goal_met[0] and 0.9 < outcome.reward[0] < 1.1
+    assert task.right[0] != lit
+    lidar = engine.observation_layout["button_lidar"]
+    assert (outcome.obs[0, lidar] == 0).all()
+    for _ in range(9):  # resetting: pressing counts for nothing
+        outcome = press(engine, int(task.right[0]))
+        assert not outcome.goal_met[0] and task.mistakes()[0] == 0
+        assert (outcome.obs[0, lidar] == 0).all()
+    outcome = press(engine, int(task.right[0]))
+    assert outcome.goal_met[0]
+
+
+def test_button_rewards_equal_the_scalar_loop():
+    engine = world("Button_Point_2Hazards", 3, button={"num": 3, "reward_distance": 2.0})
+    for action in actions(engine, 40):
+        goal = engine.task.goal.copy()
+        old = [gap(engine.robot.position[i], goal[i], True) for i in range(3)]
+        outcome = engine.step(action)
+        for i in range(3):
+            new = gap(engine.robot.position[i], goal[i], True)
+            expected = 2.0 * (old[i] - new) + outcome.goal_met[i]
+            assert outcome.reward[i] == pytest.approx(expected, abs=1e-12)
+
+
+def test_pressing_the_lit_button_can_end_the_episode():
+    engine = world("Button_Point_0Hazards_noconti")
+    assert press(engine, int(engine.task.right[0])).terminated[0]
+
+
+def test_every_button_gets_its_turn():
+    engine = world("Button_Point_0Hazards")
+    seen = []
+    for _ in range(200):
+        old = int(engine.task.right[0])
+        engine.task.advance(ROW)
+        assert engine.task.right[0] != old
+        seen.append(int(engine.task.right[0]))
+    assert np.bincount(seen).min() > 25
+
+
+SIZES = {
+    "Goal_Point_8Hazards": 30,
+    "Push_Point_8Ghosts": 32,
+    "Chase_Point_8Ghosts": 44,
+    "Defense_Point_8Hazards": 44,
+    "Push_Drone_8Hazards": 86,
+    "Chase_Drone_8Ghosts": 140,
+    "Push_Arm3_8Ghosts": 268,
+    "Defense_Arm6_8Ghosts": 583,
+}
+
+
+@pytest.mark.parametrize("suite", SIZES)
+def test_observation_sizes(suite):
+    assert Scenario.parse(suite).build(1).observation_size == SIZES[suite]
+
+
+def test_observations_lie_in_alphabetical_order():
+    layout = Scenario.parse("Push_Point_8Ghosts").build(1).observation_layout
+    assert {k: (v.start, v.stop) for k, v in layout.items()} == {
+        "accelerometer": (0, 3),
+        "box_compass": (3, 5),
+        "ghosts_lidar": (5, 21),
+        "goal_compass": (21, 23),
+        "gyro": (23, 26),
+        "magnetometer": (26, 29),
+        "velocimeter": (29, 32),
+    }
+    layout = Scenario.parse("Chase_Drone_8Ghosts").build(1).observation_layout
+    assert layout["ghosts_lidar"] == slice(3, 63) and layout["targets_lidar"] == slice(69, 129)
+
+
+TAXONOMY = {  # interactive, contact, targets, spaces
+    "Goal": (False, False, "one", ("planar", "spatial")),
+    "Push": (True, True, "one", ("planar",)),
+    "Chase": (True, False, "many", ("planar", "spatial")),
+    "Defense": (True, False, "many", ("planar", "spatial")),
+    "Button": (False, True, "one", ("planar",)),
+}
+
+
+def test_tasks_state_the_papers_taxonomy():
+    stated = {n: (t.interactive, t.contact, t.targets, t.spaces) for n, t in TASKS.items()}
+    assert stated == TAXONOMY
+    for name, task in TASKS.items():
+        part = task()
+        assert (part.interactive, part.contact, part.targets) == TAXONOMY[name][:3]
+
+
+@pytest.mark.parametrize(
+    ("task", "params", "words"),
+    [
+        ("push", {"object": "cube"}, r"push.object = 'cube'.*ball"),
+        ("push", {"object_size": 0}, r"push.object_size = 0 must be greater than 0"),
+        ("push", {"space": "spatial"}, "no parameter 'space'"),
+        ("chase", {"num": 0}, r"chase.num = 0 must be at least 1"),
+        ("chase", {"v1": -1.0}, r"chase.v1 = -1.0 must be at least 0"),
+        ("chase", {"speed_law": "units"}, r"did you mean 'unit'\?"),
+        ("chase", {"v2": 0.1}, "no parameter 'v2'"),
+        ("defense", {"origin": [0, 0]}, "defense.origin"),
+        ("defense", {"height": [1.5, 0.5]}, r"height = \(1.5, 0.5\) must be \(low, high\)"),
+        ("button", {"delay": 1.5}, "button.delay = 1.5 must be an integer"),
+        ("goal", {"ends": 1}, "goal.ends = 1 must be true or false"),
+    ],
+)
+def test_bad_parameters_are_named(task, params, words):
+    with pytest.raises(ValueError, match=words):
+        Scenario(task=task.capitalize(), task_params=params)
+
+
+@pytest.mark.parametrize(
+    ("suite", "params"),
+    [
+        ("Push_Point_3Pillars", {"push": {"object": "box"}}),
+        ("Button_Point_3Buttons", {}),
+        ("Button_Ant_3Gremlins", {"button": {"delay": 2}}),
+        ("Chase_Point_3Ghosts", {"chase": {"solid": True}, "ghosts": {"solid": True}}),
+        ("Defense_Drone_3Ghosts", {"defense": {"solid": True, "speed_law": "proportional"}}),
+    ],
+    ids=str,
+)
+def test_rows_of_a_batch_are_lone_environments_bit_for_bit(suite, params):
+    n = 5
+    batches = [world(suite, n, num_threads=k, **params) for k in (1, 2)]
+    lone = [world(suite, 1, seed=i, **params) for i in range(n)]
+    for step, action in enumerate(actions(batches[0], 60)):
+        for engine in batches:
+            if step % 13 == 7:  # staggered
+                engine.reset(np.array([step % n]))
+        if step % 13 == 7:
+            lone[step % n].reset(ROW)
+        outcomes = [engine.step(action) for engine in batches]
+        for i, engine in enumerate(lone):
+            own = engine.step(action[i : i + 1])
+            for outcome in outcomes:
+                np.testing.assert_array_equal(outcome.obs[i], own.obs[0])
+                assert (outcome.reward[i], outcome.cost[i]) == (own.reward[0], own.cost[0])

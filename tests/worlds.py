@@ -1,0 +1,60 @@
+"""Small worlds for the tests of tasks and constraints."""
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs import Scenario
+from sb3_guard.envs.engine import Engine
+
+ROW = np.zeros(1, dtype=np.int32)
+
+
+def world(suite: str, n: int = 1, seed: int = 0, num_threads: int = 1, **params: object) -> Engine:
+    """A suite with changed parameters, its rows seeded and reset."""
+    engine = Scenario.parse(suite).override(**params).build(n, num_threads)
+    for i in range(n):
+        engine.seed(i, np.random.default_rng(seed + i))
+    engine.reset(np.arange(n))
+    return engine
+
+
+def put_point(engine: Engine, x: float, y: float, heading: float = 0.0) -> None:
+    """Set the Point of every row down at rest."""
+    model, batch = engine.model, engine.batch
+    spawn = int(model.body_mocapid[model.body("spawn").id])
+    batch.bind("mocap_pos")[:, spawn] = [x, y, 0.0]
+    batch.bind("mocap_quat")[:, spawn] = [np.cos(heading / 2), 0, 0, np.sin(heading / 2)]
+    root = int(model.jnt_qposadr[model.joint("robot/x").id])
+    batch.bind("qpos")[:, root : root + 3] = 0.0
+    batch.bind("qvel")[:] = 0.0
+    batch.forward()
+    engine._before[:] = engine.task.measure()
+
+
+def free_body(engine: Engine, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Live pose [N, 7] and velocity [N, 6] of a free body."""
+    joint = int(engine.model.body(name).jntadr[0])
+    q, v = int(engine.model.jnt_qposadr[joint]), int(engine.model.jnt_dofadr[joint])
+    return engine.batch.bind("qpos")[:, q : q + 7], engine.batch.bind("qvel")[:, v : v + 6]
+
+
+def contacts(engine: Engine, row: int) -> set[str]:
+    """Bodies that touch the robot, read off MuJoCo's list of contacts."""
+    model, data = engine.model, engine.batch.get_data(row)
+    touched = set()
+    for pair in data.contact.geom:
+        names = [model.body(int(model.geom_bodyid[g])).name for g in pair]
+        for mine, other in (names, names[::-1]):
+            if mine.startswith("robot/") and not other.startswith("robot/"):
+                touched.add(other)
+    return touched - {"world"}
+
+
+def touching(engine: Engine, row: int) -> set[str]:
+    """Bodies whose sensor feels the robot."""
+    sensors = [engine.model.sensor(i) for i in range(engine.model.nsensor)]
+    found = engine.batch.bind("sensordata")[row]
+    return {
+        s.name for s in sensors
+        if s.type == mujoco.mjtSensor.mjSENS_CONTACT and found[int(s.adr[0])] > 0
+    }  # fmt: skip

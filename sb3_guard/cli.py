@@ -4,11 +4,13 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from sb3_guard.zoo.usage import suggest
+from sb3_guard.envs.parameters import did_you_mean
 
 COMMANDS = {
     "train": "train an agent",
     "enjoy": "play a trained agent, print return and cost, record a video",
+    "list": "print suites, robots, tasks and constraints",
+    "show": "print an environment's scenario, observations and actions, write a picture",
 }
 
 
@@ -35,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(__version__)
         return 0
     if name not in COMMANDS:
-        print(f"error: unknown command {name!r}; {suggest(name, COMMANDS)}", file=sys.stderr)
+        print(f"error: unknown command {name!r}; {did_you_mean(name, COMMANDS)}", file=sys.stderr)
         return 2
     return importlib.import_module(f"sb3_guard.{name}").main(rest)
 

@@ -162,6 +162,7 @@ def make_vec_env(
     num_threads: int | None = None,
     render_mode: str | None = None,
     wrapper_class: Callable[[gymnasium.Env], gymnasium.Env] | None = None,
+    monitor_kwargs: Mapping[str, Any] | None = None,
 ) -> VecEnv:
     """Make environments for Stable-Baselines3, with episode statistics that include the cost.
 
@@ -177,6 +178,7 @@ def make_vec_env(
     :param num_threads: threads of the native vector environment; results do not depend on it
     :param render_mode: as for :func:`gymnasium.make`
     :param wrapper_class: wraps each environment (not with ``"native"``)
+    :param monitor_kwargs: further arguments of the monitor, such as ``{"cost_keys": ("a", "b")}``
     :return: the environments, wrapped in :class:`~sb3_guard.common.monitor.CostMonitor`
     :raises ValueError: unknown names or bad values, with what is allowed
     """
@@ -215,4 +217,4 @@ def make_vec_env(
         venv = VEC_ENVS[vec_env]([one] * int(n_envs))
     if seed is not None:
         venv.seed(seed)
-    return CostMonitor(venv, monitor_path)
+    return CostMonitor(venv, monitor_path, **(monitor_kwargs or {}))

@@ -67,8 +67,8 @@ class Bodies:
         """Take live views: ``positions`` [N, num, 3] m, and ``velocities``, m/s, of free bodies."""
         model, batch, k = sim.model, sim.batch, self.num
         if k == 0:
-            self.positions = np.zeros((sim.num_envs, 0, 3))
-            self._found = np.zeros((sim.num_envs, 0))
+            self.positions = self.velocities = self._places = np.zeros((sim.num_envs, 0, 3))
+            self._turns, self._found = np.zeros((sim.num_envs, 0, 4)), np.zeros((sim.num_envs, 0))
             return
         body = model.body(f"{self.name}/0")
         self.positions = batch.bind("xpos")[:, body.id : body.id + k]

@@ -2,7 +2,8 @@
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard.zoo.usage import UsageError, suggest
+from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.zoo.usage import UsageError
 
 
 def algorithms() -> dict[str, type[BaseAlgorithm]]:
@@ -20,5 +21,5 @@ def algorithm(key: str) -> type[BaseAlgorithm]:
     """
     table = algorithms()
     if key not in table:
-        raise UsageError(f"unknown algorithm {key!r}; {suggest(key, table)}")
+        raise UsageError(f"unknown algorithm {key!r}; {did_you_mean(key, table)}")
     return table[key]

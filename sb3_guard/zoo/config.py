@@ -22,7 +22,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.zoo.usage import UsageError, one_line, suggest
+from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.zoo.usage import UsageError, one_line
 
 # What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -107,7 +108,7 @@ def read_hyperparams(
         if entry in content:
             return dict(sorted({**content[entry], **(overrides or {})}.items()))
     raise UsageError(
-        f"{path} has no entry for {env_id!r} and no 'default'; {suggest(env_id, content)}"
+        f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
     )
 
 
@@ -142,7 +143,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
             raise UsageError(f"{name!r} is not a hyper-parameter; use the flag {FLAGS[name]}")
         if name not in known:
             raise UsageError(
-                f"{algo} has no hyper-parameter {name!r}; {suggest(name, sorted(known))}"
+                f"{algo} has no hyper-parameter {name!r}; {did_you_mean(name, sorted(known))}"
             )
         try:
             checked[name] = _coerce(value, known[name])

@@ -21,7 +21,6 @@ from stable_baselines3.common.vec_env import (
     is_vecenv_wrapped,
 )
 
-from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.common.vec_env import find_scenario, make_vec_env
 from sb3_guard.zoo.config import Setup
 from sb3_guard.zoo.resumable import ResumableEnv
@@ -143,10 +142,8 @@ def make_envs(
                 num_threads=num_threads,
                 render_mode=render_mode,
                 wrapper_class=None if vec_env == "native" else wrap,
+                monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
             )
-        assert isinstance(env, CostMonitor)
-        if tuple(cost_keys) != ("cost",) or setup.monitor_kwargs:
-            env = CostMonitor(env.venv, cost_keys=tuple(cost_keys), **setup.monitor_kwargs)
     except (*BAD_ARGUMENTS, EOFError, ConnectionError) as error:
         raise UsageError(f"can't make {env_id}: {one_line(error)}") from error
     try:

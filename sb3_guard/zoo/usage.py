@@ -5,20 +5,12 @@ import ast
 import difflib
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 
 class UsageError(Exception):
     """Something the user can put right; the message names the value, what is allowed, the fix."""
-
-
-def suggest(name: str, allowed: Iterable[str]) -> str:
-    """What ``name`` was probably meant to be, where something is near, and all that is allowed."""
-    folded = {one.lower(): one for one in allowed}
-    near = difflib.get_close_matches(name.lower(), folded, n=1)
-    hint = f"did you mean {folded[near[0]]!r}? " if near else ""
-    return f"{hint}allowed: {', '.join(folded.values()) or 'none'}"
 
 
 def one_line(error: BaseException) -> str:

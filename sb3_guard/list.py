@@ -1,0 +1,117 @@
+"""What there is: ``sb3-guard list`` prints suites, robots, tasks and constraints."""
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+
+from sb3_guard.envs import Scenario, env_ids
+from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.zoo.usage import Parser, UsageError, run
+
+EXAMPLES = """examples:
+  sb3-guard list
+  sb3-guard list robots
+  sb3-guard list --ladder Goal_Point Hazards
+"""
+LADDER = (1, 2, 4, 8, 16)
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown, aligned for the terminal."""
+    lines = [list(header), *map(list, rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    text = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |"
+            for line in lines]  # fmt: skip
+    return "\n".join([text[0], "|" + "|".join("-" * (w + 2) for w in widths) + "|", *text[1:]])
+
+
+def summary(part: type) -> str:
+    """The first line of a part's documentation."""
+    return (part.__doc__ or "").strip().splitlines()[0]
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+def suites() -> str:
+    """The named suites, a row per task and robot."""
+    ids = [env_id.removesuffix("-v0") for env_id in env_ids()]
+    stems = dict.fromkeys(env_id.rsplit("_", 1)[0] for env_id in ids)
+    rows = [[stem, *(env_id for env_id in ids if env_id.startswith(stem + "_"))] for stem in stems]
+    return table(["suite", *(["id"] * (len(rows[0]) - 1))], rows)
+
+
+def robots() -> str:
+    """The robots with their actions, workspaces and time steps."""
+    rows = []
+    for name, cls in ROBOTS.items():
+        actions = Scenario(robot=name).build().robot.action_size
+        rows.append([name, str(actions), cls.workspace, f"{10 * cls.timestep:g}", summary(cls)])
+    return table(["robot", "actions", "workspace", "control step, s", "what it is"], rows)
+
+
+def tasks() -> str:
+    """The tasks with their place in the paper's taxonomy."""
+    rows = [
+        [name, _yes(cls.interactive), _yes(cls.contact), cls.targets, ", ".join(cls.spaces),
+         summary(cls)]
+        for name, cls in TASKS.items()
+    ]  # fmt: skip
+    return table(["task", "interactive", "contact", "targets", "spaces", "what it asks"], rows)
+
+
+def constraints() -> str:
+    """The constraints with their place in the paper's taxonomy."""
+    rows = [
+        [name, cls.trespassable, cls.movable, ", ".join(cls.spaces), summary(cls)]
+        if isinstance(cls.trespassable, str)
+        else [name, _yes(cls.trespassable), cls.movable, ", ".join(cls.spaces), summary(cls)]
+        for name, cls in CONSTRAINTS.items()
+    ]
+    return table(["constraint", "trespassable", "moves", "spaces", "what it is"], rows)
+
+
+KINDS = {"suites": suites, "robots": robots, "tasks": tasks, "constraints": constraints}
+
+
+def _list(argv: Sequence[str] | None) -> int:
+    parser = Parser(
+        prog="sb3-guard list",
+        description="Print suites, robots, tasks and constraints.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("kind", nargs="?", choices=list(KINDS), help="only these")
+    parser.add_argument(
+        "--ladder",
+        nargs=2,
+        metavar=("TASK_ROBOT", "CONSTRAINT"),
+        help="ids of growing difficulty: more and more of a constraint",
+    )
+    args = parser.parse_args(argv)
+    if args.ladder:
+        ids = [f"{args.ladder[0]}_{num}{args.ladder[1]}-v0" for num in LADDER]
+        try:
+            for env_id in ids:
+                Scenario.parse(env_id)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        print("\n".join(ids))
+        return 0
+    print("\n\n".join(KINDS[kind]() for kind in ([args.kind] if args.kind else KINDS)))
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the command.
+
+    :param argv: arguments; None: those of the process
+    :return: exit status: 0, or 2 for wrong usage
+    """
+    return run(lambda: _list(argv))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""One environment in full: ``sb3-guard show Goal_Ant_8Ghosts`` prints it and writes a picture."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from sb3_guard.envs import GuardVectorEnv
+from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.envs.rendering import CAMERAS, RenderingError
+from sb3_guard.envs.scenario import Scenario
+from sb3_guard.list import table
+from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, one_line, run
+
+EXAMPLES = """examples:
+  sb3-guard show Goal_Ant_8Ghosts
+  sb3-guard show my_scenario.yml -o mine.png
+  sb3-guard show Goal_Drone_8Hazards --env-kwargs "ghosts:{'num': 4}" --camera track
+"""
+
+
+def observation_table(env: GuardVectorEnv) -> str:
+    """Name, slice, bounds and unit of every component of the observation."""
+    rows = []
+    for name, where in env.observation_layout.items():
+        channel = env.engine.channels[name]
+        bounds = f"[{channel.low:g}, {channel.high:g}]"
+        rows.append([name, f"{where.start}:{where.stop}", bounds, channel.unit])
+    return table(["observation", "slice", "bounds", "unit"], rows)
+
+
+def action_table(env: GuardVectorEnv) -> str:
+    """Index, actuator and control range of every action."""
+    model = env.engine.model
+    rows = []
+    for i in range(model.nu):
+        low, high = model.actuator_ctrlrange[i]
+        name = model.actuator(i).name.removeprefix("robot/")
+        rows.append([str(i), name, "[-1, 1]", f"[{low:g}, {high:g}]"])
+    return table(["action", "actuator", "range", "control"], rows)
+
+
+def _show(argv: Sequence[str] | None) -> int:
+    parser = Parser(
+        prog="sb3-guard show",
+        description="Print an environment's scenario, observations and actions; write a picture.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("env", help="an id of ours, or a scenario file (.yml)")
+    parser.add_argument(
+        "--env-kwargs", nargs="+", action=KeyValues, metavar="KEY:VALUE", help="change parameters"
+    )
+    parser.add_argument("-o", "--output", type=Path, help="picture to write (default: <env>.png)")
+    parser.add_argument("--camera", default="fixed", help=f"one of {', '.join(CAMERAS)}")
+    parser.add_argument("--seed", type=int, default=0, help="of the episode in the picture")
+    args = parser.parse_args(argv)
+    if args.camera not in CAMERAS:
+        raise UsageError(f"unknown camera {args.camera!r}: {did_you_mean(args.camera, CAMERAS)}")
+    file = Path(args.env)
+    kwargs: dict[str, Any] = args.env_kwargs or {}
+    try:
+        is_file = file.suffix in (".yml", ".yaml")
+        scenario = Scenario.load(file) if is_file else Scenario.parse(args.env)
+        env = GuardVectorEnv(
+            1, scenario, render_mode="rgb_array", camera=args.camera, flatten=True, **kwargs
+        )
+        env.reset(seed=args.seed)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise UsageError(one_line(error)) from None
+    data = {key: value for key, value in env.scenario.to_dict().items() if value}
+    print(yaml.safe_dump(data, sort_keys=False))
+    print(observation_table(env), action_table(env), sep="\n\n")
+    path = args.output or Path(f"{file.stem.removesuffix('-v0')}.png")
+    try:
+        frame = env.frame(0)
+        from matplotlib import image
+
+        image.imsave(path, np.ascontiguousarray(frame))
+    except (RenderingError, OSError, ValueError) as error:
+        raise UsageError(f"no picture: {one_line(error)}") from None
+    print(f"\nwrote {path}")
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the command.
+
+    :param argv: arguments; None: those of the process
+    :return: exit status: 0, or 2 for wrong usage
+    """
+    return run(lambda: _show(argv))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -3,11 +3,10 @@
 import gymnasium
 import numpy as np
 import pytest
+from suites import IDS
 
-from sb3_guard.envs import GuardVectorEnv, Scenario, env_ids, env_spec
+from sb3_guard.envs import GuardVectorEnv, Scenario, env_spec, make
 from sb3_guard.envs.layout import LayoutError
-
-IDS = env_ids()
 
 
 def actions_for(env, steps, n, seed=0):
@@ -17,11 +16,14 @@ def actions_for(env, steps, n, seed=0):
     return rng.uniform(-1.2, 1.2, (steps, n, size)).astype(np.float32)
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_row_of_a_batch_is_a_lone_environment_bit_for_bit(env_id):
-    n, length = 3, 40
-    batch = gymnasium.make_vec(env_id, num_envs=n, max_episode_steps=length)
-    lone = [gymnasium.make(env_id, max_episode_steps=length) for _ in range(n)]
+@pytest.mark.parametrize(
+    ("env_id", "length", "steps"),
+    [("Goal_Point_8Hazards-v0", 1000, 2100), *((env_id, 40, 100) for env_id in IDS)],
+)
+def test_row_of_a_batch_is_a_lone_environment_bit_for_bit(env_id, length, steps):
+    n = 3
+    batch = gymnasium.make_vec(env_spec(env_id), num_envs=n, max_episode_steps=length)
+    lone = [make(env_id, max_episode_steps=length) for _ in range(n)]
     obs, _ = batch.reset(seed=10)
     for i, env in enumerate(lone):
         np.testing.assert_array_equal(obs[i], env.reset(seed=10 + i)[0])
@@ -29,7 +31,7 @@ def test_row_of_a_batch_is_a_lone_environment_bit_for_bit(env_id):
     obs, _ = batch.reset(options={"reset_mask": np.array([True, False, False])})
     np.testing.assert_array_equal(obs[0], lone[0].reset()[0])
     ends = 0
-    for action in actions_for(batch, 100, n):
+    for action in actions_for(batch, steps, n):
         obs, reward, terminated, truncated, info = batch.step(action)
         for i, env in enumerate(lone):
             o, r, term, trunc, inf = env.step(action[i])

@@ -11,18 +11,18 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as sb3_check
+from suites import IDS
 
 import sb3_guard
 from sb3_guard.envs import env_ids, env_spec, make, register
 
-IDS = env_ids()
 INFINITE = {"minimum value is -infinity", "maximum value is infinity"}
 
 
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("flatten", [True, False])
 def test_both_checkers_find_nothing_but_infinite_bounds(env_id, flatten):
-    env = gymnasium.make(env_id, flatten=flatten)
+    env = make(env_id, flatten=flatten)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         gymnasium_check(env.unwrapped, skip_render_check=True)
@@ -33,7 +33,7 @@ def test_both_checkers_find_nothing_but_infinite_bounds(env_id, flatten):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_bounds_are_true_and_finite_where_they_can_be(env_id):
-    env = gymnasium.make_vec(env_id, num_envs=2).unwrapped
+    env = gymnasium.make_vec(env_spec(env_id), num_envs=2).unwrapped
     space, layout = env.single_observation_space, env.observation_layout
     for name, where in layout.items():
         low, high = space.low[where], space.high[where]
@@ -53,7 +53,7 @@ def test_bounds_are_true_and_finite_where_they_can_be(env_id):
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_pickled_and_copied_environments_continue_bit_for_bit(env_id):
-    env = gymnasium.make(env_id).unwrapped
+    env = make(env_id).unwrapped
     env.reset(seed=0)
     env.step(env.action_space.sample())
     twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
@@ -134,7 +134,7 @@ def test_unregistered_ids_work_in_make_and_after_register():
 
 
 def test_every_suite_is_registered_with_both_entry_points():
-    for env_id in IDS:
+    for env_id in env_ids():
         spec = gymnasium.spec(env_id)
         assert spec.entry_point and spec.vector_entry_point
         assert spec == env_spec(env_id)

@@ -246,3 +246,15 @@ def test_what_an_arm_has_to_reach_is_within_reach(suite):
             assert len(engine.task.advance(np.zeros(1, dtype=int))) == 0
             assert not engine.task.succeeded(engine.task.measure())[0]
             assert np.linalg.norm(engine.places("goal")[0, 0]) <= reach
+
+
+@pytest.mark.parametrize("suite", ["Goal_Point_0Hazards", "Goal_Arm3_0Hazards"])
+def test_goals_are_not_reached_when_they_appear(suite):
+    """A goal so wide that one place in three or so would be reached already."""
+    engine = Scenario.parse(suite).override(goal={"size": 1.4}).build(1)
+    for seed in range(15):
+        engine.seed(0, np.random.default_rng(seed))
+        engine.reset(np.zeros(1, dtype=np.int32))
+        for _ in range(3):
+            assert not engine.task.succeeded(engine.task.measure())[0]
+            assert len(engine.task.advance(np.zeros(1, dtype=int))) == 0

@@ -169,7 +169,8 @@ def test_extra_observations_join_the_layout_in_alphabetical_order():
     import numpy as np
 
     options = {"remaining": True, "horizon": 10, "qpos": True, "qvel": True, "ctrl": True}
-    engine = Scenario.parse("Goal_Point_8Hazards").override(observe={**options, "com": True}).build()
+    options["com"] = True
+    engine = Scenario.parse("Goal_Point_8Hazards").override(observe=options).build()
     layout = engine.observation_layout
     assert list(layout) == sorted(layout)
     assert {"remaining", "qpos", "qvel", "ctrl", "com"} <= set(layout)

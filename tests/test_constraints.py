@@ -4,18 +4,21 @@ import math
 
 import numpy as np
 import pytest
-from worlds import ROW, contacts, free_body, put_point, touching, world
+from worlds import (
+    actions,
+    assert_rows_are_lone_environments,
+    contacts,
+    free_body,
+    put_point,
+    touching,
+    world,
+)
 
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.constraints import Obstacles
 from sb3_guard.envs.registry import CONSTRAINTS
 
 FORWARD = np.array([[1.0, 0.0]])
-
-
-def actions(engine, steps, seed=0):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-1, 1, (steps, engine.num_envs, engine.robot.action_size))
 
 
 @pytest.mark.parametrize("indicator", [False, True])
@@ -330,20 +333,7 @@ def test_bad_parameters_are_named(name, params, words):
     ids=str,
 )
 def test_rows_of_a_batch_are_lone_environments_bit_for_bit(suite, params):
-    n = 5
-    batches = [world(suite, n, num_threads=k, **params) for k in (1, 2)]
-    lone = [world(suite, 1, seed=i, **params) for i in range(n)]
-    for step, action in enumerate(actions(batches[0], 50)):
-        if step % 13 == 7:  # staggered
-            for engine in batches:
-                engine.reset(np.array([step % n]))
-            lone[step % n].reset(ROW)
-        outcomes = [engine.step(action) for engine in batches]
-        for i, engine in enumerate(lone):
-            own = engine.step(action[i : i + 1])
-            for outcome in outcomes:
-                np.testing.assert_array_equal(outcome.obs[i], own.obs[0])
-                assert (outcome.reward[i], outcome.cost[i]) == (own.reward[0], own.cost[0])
+    assert_rows_are_lone_environments(suite, **params)
 
 
 def test_what_moves_continues_from_a_saved_state():

@@ -182,3 +182,32 @@ def test_extra_observations_join_the_layout_in_alphabetical_order():
     np.testing.assert_allclose(obs[layout["qvel"]], engine.batch.bind("qvel")[0], rtol=1e-6)
     com = engine.robot.position[0] + 0.019 * engine.robot.frames[1][0, 0, :, 0]
     np.testing.assert_allclose(obs[layout["com"]], com, atol=1e-3)
+
+
+def test_goal_and_object_can_be_seen_by_lidar_and_distance():
+    import numpy as np
+
+    base = Scenario.parse("Push_Point_2Hazards")
+    seen = base.override(push={"lidar": True, "distance": True, "object_lidar": True}).build()
+    size = base.build().observation_size
+    assert seen.observation_size == size + 16 + 1 + 16
+    seen.reset(np.zeros(1, dtype=int))
+    obs, layout = seen.observe()[0], seen.observation_layout
+    robot, goal = seen.robot.position[0, :2], seen.places("goal")[0, 0, :2]
+    gap = np.linalg.norm(robot - goal)
+    assert obs[layout["goal_distance"]] == pytest.approx(np.exp(-gap), abs=1e-6)
+    assert obs[layout["goal_lidar"]].max() == pytest.approx(np.exp(-gap), abs=1e-6)
+    ball = np.linalg.norm(robot - seen.places("ball")[0, 0, :2])
+    assert obs[layout["box_lidar"]].max() == pytest.approx(np.exp(-ball), abs=1e-6)
+
+
+def test_other_bodies_can_carry_lidar_and_compass():
+    base = Scenario.parse("Goal_Arm3_8Hazards")
+    engine = base.override(robot={"sensing": ["link_5"]}, lidar={"azimuth": 4}).build()
+    layout = engine.observation_layout
+    assert layout["hazards_lidar"].stop - layout["hazards_lidar"].start == 4 * 6
+    assert layout["goal_compass"].stop - layout["goal_compass"].start == 3
+    two = base.override(robot={"sensing": ["link_1", "link_5"]}).build()
+    assert two.channels["goal_compass"].size == 6 and two.channels["hazards_lidar"].size == 120
+    with pytest.raises(ValueError, match=r"robot.sensing names no body 'link_9'.*'link_"):
+        base.override(robot={"sensing": ["link_9"]}).build()

@@ -4,15 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from worlds import ROW, free_body, put_point, world
+from worlds import ROW, actions, assert_rows_are_lone_environments, free_body, put_point, world
 
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.registry import TASKS
-
-
-def actions(engine, steps, seed=0):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(-1, 1, (steps, engine.num_envs, engine.robot.action_size))
 
 
 def gap(a, b, planar):
@@ -361,18 +356,4 @@ def test_bad_parameters_are_named(task, params, words):
     ids=str,
 )
 def test_rows_of_a_batch_are_lone_environments_bit_for_bit(suite, params):
-    n = 5
-    batches = [world(suite, n, num_threads=k, **params) for k in (1, 2)]
-    lone = [world(suite, 1, seed=i, **params) for i in range(n)]
-    for step, action in enumerate(actions(batches[0], 60)):
-        for engine in batches:
-            if step % 13 == 7:  # staggered
-                engine.reset(np.array([step % n]))
-        if step % 13 == 7:
-            lone[step % n].reset(ROW)
-        outcomes = [engine.step(action) for engine in batches]
-        for i, engine in enumerate(lone):
-            own = engine.step(action[i : i + 1])
-            for outcome in outcomes:
-                np.testing.assert_array_equal(outcome.obs[i], own.obs[0])
-                assert (outcome.reward[i], outcome.cost[i]) == (own.reward[0], own.cost[0])
+    assert_rows_are_lone_environments(suite, **params)

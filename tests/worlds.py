@@ -18,6 +18,30 @@ def world(suite: str, n: int = 1, seed: int = 0, num_threads: int = 1, **params:
     return engine
 
 
+def actions(engine: Engine, steps: int, seed: int = 0) -> np.ndarray:
+    """Random actions, [steps, N, d]."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1, 1, (steps, engine.num_envs, engine.robot.action_size))
+
+
+def assert_rows_are_lone_environments(suite: str, **params: object) -> None:
+    """Five rows on one thread and on two against five lone engines, with staggered resets."""
+    n = 5
+    batches = [world(suite, n, num_threads=k, **params) for k in (1, 2)]
+    lone = [world(suite, seed=i, **params) for i in range(n)]
+    for step, action in enumerate(actions(batches[0], 60)):
+        if step % 13 == 7:
+            for engine in batches:
+                engine.reset(np.array([step % n]))
+            lone[step % n].reset(ROW)
+        outcomes = [engine.step(action) for engine in batches]
+        for i, engine in enumerate(lone):
+            own = engine.step(action[i : i + 1])
+            for outcome in outcomes:
+                np.testing.assert_array_equal(outcome.obs[i], own.obs[0])
+                assert (outcome.reward[i], outcome.cost[i]) == (own.reward[0], own.cost[0])
+
+
 def put_point(engine: Engine, x: float, y: float, heading: float = 0.0) -> None:
     """Set the Point of every row down at rest."""
     model, batch = engine.model, engine.batch

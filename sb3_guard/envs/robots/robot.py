@@ -26,7 +26,7 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
-from sb3_guard.envs.parameters import param
+from sb3_guard.envs.parameters import did_you_mean, param
 from sb3_guard.envs.part import Array, Generators, Robot, Simulation, World
 from sb3_guard.envs.sensors import Channel
 
@@ -64,6 +64,9 @@ class MJCFRobot(Robot):
     locations: tuple[tuple[float, float], ...] = param((), "fixed start, one (x, y), m")
     placements: tuple[Rectangle, ...] = param((), "rectangles to start in, m; empty: the arena")
     heading: float | None = param(None, "start heading, rad; null: uniformly random")
+    sensing: tuple[str, ...] | None = param(
+        None, "bodies that carry lidar and compass; null: the robot's own choice"
+    )
 
     root: ClassVar[str] = PREFIX + "robot"
 
@@ -108,7 +111,14 @@ class MJCFRobot(Robot):
             self._place = batch.bind("mocap_pos")[:, spawn]
             self._turn = batch.bind("mocap_quat")[:, spawn]
             self._attitude = np.array([1.0, 0.0, 0.0, 0.0])
-        ids = [model.body(PREFIX + name).id for name in self.lidar_bodies]
+        bodies = [model.body(i).name for i in range(model.nbody)]
+        known = [name.removeprefix(PREFIX) for name in bodies if name.startswith(PREFIX)]
+        for name in self.sensing or ():
+            if name not in known:
+                raise ValueError(
+                    f"robot.sensing names no body {name!r}: {did_you_mean(name, known)}"
+                )
+        ids = [model.body(PREFIX + name).id for name in self.sensing or self.lidar_bodies]
         rotation = batch.bind("xmat")  # [N, nbody, 9]
         # one lidar body, the usual case, stays a view: fancy indexing would copy at every look
         self._bodies = slice(ids[0], ids[0] + 1) if len(ids) == 1 else ids

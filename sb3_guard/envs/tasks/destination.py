@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Painter, Simulation, Task, World
@@ -25,6 +26,8 @@ class Destination(Task):
     ends: bool = param(False, "whether reaching the goal ends the episode")
     locations: tuple[tuple[float, float], ...] = param((), "fixed first goal, one (x, y), m")
     placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
+    lidar: bool = param(False, "whether the goal is also seen by a lidar")
+    distance: bool = param(False, "whether the goal's closeness exp(−distance) is observed")
 
     color = (0.1, 0.75, 0.2)
     targets = "one"
@@ -63,11 +66,25 @@ class Destination(Task):
         return True
 
     def observe(self) -> dict[str, Array]:
-        return {"goal_compass": self.sim.compass(self.place)}
+        out = {"goal_compass": self.sim.compass(self.place)}
+        if self.lidar:
+            out["goal_lidar"] = self.sim.lidar(self.place[:, None], self.planar)
+        if self.distance:
+            gap = geometry.distance(self.sim.robot.position, self.place, self.planar)
+            out["goal_distance"] = np.exp(-gap)[:, None]
+        return out
 
     def channels(self) -> dict[str, Channel]:
-        return {"goal_compass": self.sim.compass_channel()}
+        out = {"goal_compass": self.sim.compass_channel()}
+        if self.lidar:
+            out["goal_lidar"] = self.sim.lidar_channel(self.planar)
+        if self.distance:
+            out["goal_distance"] = Channel(1, 0.0, 1.0, "closeness")
+        return out
 
     def draw(self, painter: Painter, row: int) -> None:
         lift = 0.25 if self.planar else 0.0
         painter.zone(self.place[row] + [0, 0, lift], self.size, lift, self.color)
+        if self.lidar:
+            closeness = self.sim.lidar(self.place[:, None], self.planar)[row]
+            painter.halo(closeness, self.sim.lidar_azimuth(self.planar), self.color)

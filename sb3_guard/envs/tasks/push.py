@@ -46,6 +46,7 @@ class Push(Destination):
         2.0, "object sizes from which on nearing the object is not rewarded", low=0
     )
     reward_approach: float = param(1.0, "reward per metre gained on the object")
+    object_lidar: bool = param(False, "whether the object is also seen by a lidar")
 
     def footprints(self) -> tuple[Footprint, ...]:
         return (
@@ -106,7 +107,13 @@ class Push(Destination):
         return now[:, 1] <= self.size
 
     def observe(self) -> dict[str, Array]:
-        return {**super().observe(), "box_compass": self.sim.compass(self.center)}
+        out = {**super().observe(), "box_compass": self.sim.compass(self.center)}
+        if self.object_lidar:
+            out["box_lidar"] = self.sim.lidar(self.center[:, None], self.planar)
+        return out
 
     def channels(self) -> dict[str, Channel]:
-        return {**super().channels(), "box_compass": self.sim.compass_channel()}
+        out = {**super().channels(), "box_compass": self.sim.compass_channel()}
+        if self.object_lidar:
+            out["box_lidar"] = self.sim.lidar_channel(self.planar)
+        return out

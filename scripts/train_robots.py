@@ -1,0 +1,75 @@
+"""Train TRPO briefly on every robot and compare it with random actions.
+
+``python scripts/train_robots.py`` trains on ``Goal_<Robot>_8Hazards`` and prints a row per robot: the
+mean return of 20 episodes of random actions and of the trained agent, each with its standard error,
+and how many standard errors of the difference lie between them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sb3_guard import TRPO, evaluate_policy, make_vec_env
+from sb3_guard.envs.registry import ROBOTS
+from sb3_guard.zoo.config import build, check, read_hyperparams
+
+EPISODES = 20
+SLOW = {"Doggo", "Ant", "Walker", "Humanoid"}  # twice the steps
+
+
+def random_returns(env_id: str, seed: int) -> np.ndarray:
+    """Returns of EPISODES episodes of uniformly random actions."""
+    env = make_vec_env(env_id, EPISODES, seed=seed)
+    env.action_space.seed(seed)
+    env.reset()
+    returns: list[float] = []
+    while len(returns) < EPISODES:
+        actions = np.stack([env.action_space.sample() for _ in range(EPISODES)])
+        *_, infos = env.step(actions)
+        returns += [info["episode"]["r"] for info in infos if "episode" in info]
+    env.close()
+    return np.array(returns)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=list(ROBOTS))
+    parser.add_argument("-n", "--n-timesteps", type=float, default=5e5, help="steps per robot")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=None, help="torch and physics threads")
+    parser.add_argument("-f", "--folder", type=Path, help="where to save the agents")
+    args = parser.parse_args()
+    if args.threads:
+        torch.set_num_threads(args.threads)
+    print(f"TRPO, seed {args.seed}, {EPISODES} episodes each, mean ± standard error")
+    print("| robot | steps | random | trained | apart, s.e. | episode cost |")
+    print("|---|---|---|---|---|---|")
+    for robot in args.robots:
+        env_id = f"Goal_{robot}_8Hazards-v0"
+        steps = int(args.n_timesteps) * (2 if robot in SLOW else 1)
+        setup = build(check("trpo", TRPO, read_hyperparams("trpo", env_id)))
+        env = make_vec_env(env_id, setup.n_envs, seed=args.seed, num_threads=args.threads)
+        model = TRPO(env=env, seed=args.seed, **setup.model).learn(steps)
+        if args.folder is not None:
+            model.save(args.folder / f"trpo_{robot}")
+        before = random_returns(env_id, args.seed + 10_000)
+        test = make_vec_env(env_id, EPISODES, seed=args.seed + 20_000, num_threads=args.threads)
+        result = evaluate_policy(model, test, n_eval_episodes=EPISODES)
+        errors = [x.std(ddof=1) / np.sqrt(len(x)) for x in (before, result.returns)]
+        apart = (result.returns.mean() - before.mean()) / np.hypot(*errors)
+        print(
+            f"| {robot} | {model.num_timesteps:,} | {before.mean():.2f} ± {errors[0]:.2f} "
+            f"| {result.returns.mean():.2f} ± {errors[1]:.2f} | {apart:.1f} "
+            f"| {result.costs.mean():.2f} |",
+            flush=True,
+        )
+        env.close()
+        test.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -30,8 +30,12 @@ def summary(part: type) -> str:
     return (part.__doc__ or "").strip().splitlines()[0]
 
 
-def _yes(value: bool) -> str:
-    return "yes" if value else "no"
+def yes(part: type, name: str) -> str:
+    """A column of the taxonomy; parts that can be made solid change it then."""
+    value = "yes" if getattr(part, name) else "no"
+    if name != "interactive" and "solid" in part.__dataclass_fields__:  # type: ignore[attr-defined]
+        return f"{value}; {'no' if value == 'yes' else 'yes'} if solid"
+    return value
 
 
 def suites() -> str:
@@ -54,7 +58,7 @@ def robots() -> str:
 def tasks() -> str:
     """The tasks with their place in the paper's taxonomy."""
     rows = [
-        [name, _yes(cls.interactive), _yes(cls.contact), cls.targets, ", ".join(cls.spaces),
+        [name, yes(cls, "interactive"), yes(cls, "contact"), cls.targets, ", ".join(cls.spaces),
          summary(cls)]
         for name, cls in TASKS.items()
     ]  # fmt: skip
@@ -64,9 +68,7 @@ def tasks() -> str:
 def constraints() -> str:
     """The constraints with their place in the paper's taxonomy."""
     rows = [
-        [name, cls.trespassable, cls.movable, ", ".join(cls.spaces), summary(cls)]
-        if isinstance(cls.trespassable, str)
-        else [name, _yes(cls.trespassable), cls.movable, ", ".join(cls.spaces), summary(cls)]
+        [name, yes(cls, "trespassable"), cls.movable, ", ".join(cls.spaces), summary(cls)]
         for name, cls in CONSTRAINTS.items()
     ]
     return table(["constraint", "trespassable", "moves", "spaces", "what it is"], rows)

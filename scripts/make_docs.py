@@ -14,7 +14,7 @@ from pathlib import Path
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.part import Part
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
-from sb3_guard.list import table
+from sb3_guard.list import table, yes
 from sb3_guard.show import action_table, observation_table
 
 
@@ -42,7 +42,7 @@ def taxonomy(part: type[Part]) -> str:
         if value is None or callable(value) or (name == "spaces" and hasattr(part, "workspace")):
             continue
         if isinstance(value, bool):
-            value = "yes" if value else "no"
+            value = yes(part, name)
         values.append(f"{name}: {', '.join(value) if isinstance(value, tuple) else value}")
     return " · ".join(values)
 

@@ -1,4 +1,4 @@
-"""Draw every robot, task and constraint: ``python scripts/render_gallery.py`` fills docs/images/."""
+"""Draw every robot, task and constraint: ``python scripts/render_gallery.py`` fills docs/images."""
 
 from __future__ import annotations
 

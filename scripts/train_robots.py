@@ -1,8 +1,8 @@
 """Train TRPO briefly on every robot and compare it with random actions.
 
-``python scripts/train_robots.py`` trains on ``Goal_<Robot>_8Hazards`` and prints a row per robot: the
-mean return of 20 episodes of random actions and of the trained agent, each with its standard error,
-and how many standard errors of the difference lie between them.
+``python scripts/train_robots.py`` trains on ``Goal_<Robot>_8Hazards`` and prints a row per robot:
+the mean return of 20 episodes of random actions and of the trained agent, each with its standard
+error, and how many standard errors of the difference lie between them.
 """
 
 from __future__ import annotations

@@ -32,6 +32,7 @@ def test_other_numbers_and_single_goals():
         ("Goal_Point", "not an id of the form Task_Robot_NConstraint-v0"),
         ("Goal_Point_-3Hazards", "not an id of the form"),
         ("Goal_Point_8Hazards-v1", "not an id of the form"),
+        ("Chase_Point_8Hazards_noconti", "Chase has no goal to end at"),
     ],
 )
 def test_bad_ids_say_what_is_wrong(name, message):

@@ -112,7 +112,7 @@ class WorldSpec:
             diffuse=[0.5, 0.5, 0.5],
             specular=[0.1, 0.1, 0.1],
         )
-        world.add_camera(name="fixed", pos=[0, -4.6, 4.4], xyaxes=[1, 0, 0, 0, 0.69, 0.72], fovy=45)
+        world.add_camera(name="fixed", pos=[0, -5.0, 4.6], xyaxes=[1, 0, 0, 0, 0.66, 0.75], fovy=45)
         world.add_camera(name="top", pos=[0, 0, 6.5], xyaxes=[1, 0, 0, 0, 1, 0], fovy=45)
 
     def feel(self, name: str, body: str) -> None:

@@ -164,7 +164,8 @@ class Renderer:
         self._follows = camera == "track"
         if self._follows:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-            self._camera.distance, self._camera.azimuth, self._camera.elevation = 3.0, 90.0, -35.0
+            self._camera.azimuth, self._camera.elevation = 90.0, -30.0
+            self._geoms = _geoms_below(engine.model, engine.robot.root)
         else:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self._camera.fixedcamid = engine.model.camera(camera).id
@@ -208,7 +209,10 @@ class Renderer:
         engine = self._engine
         engine.batch.get_data(row, self._data)
         if self._follows:
-            self._camera.lookat[:] = engine.robot.position[row]
+            places = self._data.geom_xpos[self._geoms]
+            low, high = places.min(axis=0), places.max(axis=0)
+            self._camera.lookat[:] = (low + high) / 2
+            self._camera.distance = 1.6 + 1.2 * float(np.linalg.norm(high - low))
         self._gl.make_current()
         mujoco.mjv_updateScene(
             engine.model,
@@ -239,6 +243,15 @@ class Renderer:
             self._gl.make_current()
             self._context.free()
             self._gl.free()
+
+
+def _geoms_below(model: mujoco.MjModel, body: str) -> list[int]:
+    """The geoms of a body and of all that hangs on it."""
+    below = {model.body(body).id}
+    for child in range(model.nbody):  # parents come before their children
+        if int(model.body_parentid[child]) in below:
+            below.add(child)
+    return [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in below]
 
 
 def show_robot(robot: Robot) -> None:

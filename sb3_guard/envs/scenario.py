@@ -87,6 +87,9 @@ class Scenario:
             if match[kind] not in names:
                 hint = did_you_mean(match[kind], names)
                 raise ValueError(f"unknown {kind} {match[kind]!r} in {name!r}: {hint}")
+        task = TASKS[match["task"]]
+        if match["noconti"] and "ends" not in {f.name for f in fields(task)}:  # type: ignore
+            raise ValueError(f"{match['task']} has no goal to end at: use {name!r} without _noconti")
         return cls(
             robot=match["robot"],
             task=match["task"],

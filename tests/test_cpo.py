@@ -180,8 +180,8 @@ def test_without_cost_it_takes_trpos_steps() -> None:
         env = make_vec_env(lambda: CostPoint(cost_scale=0.0), 2, seed=0)
         model = cls("MlpPolicy", env, n_steps=100, n_critic_updates=1, seed=0)
         if cls is CPO:
-            th.nn.init.zeros_(model.cost_critic.value_net.weight)
-            th.nn.init.zeros_(model.cost_critic.value_net.bias)
+            th.nn.init.zeros_(model.cost_critic.network[-1].weight)
+            th.nn.init.zeros_(model.cost_critic.network[-1].bias)
             th.manual_seed(0)
         else:
             th.manual_seed(0)

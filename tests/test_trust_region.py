@@ -202,12 +202,12 @@ def _ids(parameters: Any) -> set[int]:
 @pytest.mark.parametrize("batch_size", [None, 64])
 def test_regression_by_hand_equals_autograd(m: int, batch_size: int | None) -> None:
     policy = make_policy(HEADS["gaussian"])
-    critic = CostCritic(policy, m, lambda _: 1e-3)
+    critic = CostCritic(policy, m)
     twin = copy.deepcopy(critic)
     twin.optimizer = th.optim.Adam(twin.parameters(), **policy.optimizer_kwargs, lr=1e-3)
     n = 200 if batch_size else CHUNK + 100
     observations, targets = th.randn(n, 5), th.randn(n, m)
-    fast, plain = Regression.of_cost(critic), Regression.of_cost(twin)
+    fast, plain = Regression.of_network(critic), Regression.of_network(twin)
     assert fast.network is not None
     plain.network = None
     losses = []

@@ -89,7 +89,7 @@ class Scenario:
                 raise ValueError(f"unknown {kind} {match[kind]!r} in {name!r}: {hint}")
         task = TASKS[match["task"]]
         if match["noconti"] and "ends" not in {f.name for f in fields(task)}:  # type: ignore
-            raise ValueError(f"{match['task']} has no goal to end at: use {name!r} without _noconti")
+            raise ValueError(f"{match['task']} has no goal to end at: drop _noconti from {name!r}")
         return cls(
             robot=match["robot"],
             task=match["task"],

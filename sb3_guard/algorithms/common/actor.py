@@ -8,6 +8,7 @@ inputs and M the Fisher matrix of the head, so a product takes one tangent and o
 
 import copy
 from collections.abc import Sequence
+from typing import Any
 
 import gymnasium as gym
 import torch as th
@@ -33,11 +34,13 @@ from sb3_guard.algorithms.common.mlp import TanhMlp, chunks
 from sb3_guard.algorithms.common.natural_gradient import flatten, unflatten
 
 
-def rows(observations: PyTorchObs, index: slice | th.Tensor) -> PyTorchObs:
-    """Some rows of a batch of observations, dictionaries included."""
-    if isinstance(observations, dict):
-        return {key: value[index] for key, value in observations.items()}
-    return observations[index]
+def rows(batch: Any, index: slice | th.Tensor) -> Any:
+    """Some rows of a batch of tensors, or of dictionaries and tuples of them."""
+    if isinstance(batch, dict):
+        return {key: rows(value, index) for key, value in batch.items()}
+    if isinstance(batch, tuple):
+        return tuple(rows(value, index) for value in batch)
+    return batch[index]
 
 
 def n_rows(observations: PyTorchObs) -> int:

@@ -23,6 +23,11 @@ class CostRolloutBufferSamples(NamedTuple):
     costs: th.Tensor  # [B, m], raw
     cost_advantages: th.Tensor  # [B, m]
     cost_returns: th.Tensor  # [B, m]
+    previous_costs: th.Tensor  # [B, m], of the step before; 0 at the start of an episode
+    executed_actions: th.Tensor  # [B, action_dim], or [B, 0] where nothing corrects actions
+
+
+_FIELDS = CostRolloutBufferSamples._fields[6:]
 
 
 class _Costs:
@@ -30,6 +35,7 @@ class _Costs:
 
     buffer_size: int
     n_envs: int
+    action_dim: int
     gamma: float
     rewards: np.ndarray
     episode_starts: np.ndarray
@@ -41,11 +47,13 @@ class _Costs:
         n_costs: int = 1,
         cost_gamma: float = 0.99,
         cost_gae_lambda: float = 1.0,
+        keep_executed: bool = False,
         **kwargs: Any,
     ) -> None:
         self.n_costs = n_costs
         self.cost_gamma = cost_gamma
         self.cost_gae_lambda = cost_gae_lambda
+        self.keep_executed = keep_executed
         super().__init__(*args, **kwargs)
 
     def reset(self) -> None:
@@ -56,6 +64,9 @@ class _Costs:
         self.cost_values = np.zeros(shape, dtype=np.float32)
         self.cost_advantages = np.zeros(shape, dtype=np.float32)
         self.cost_returns = np.zeros(shape, dtype=np.float32)
+        self.previous_costs = np.zeros(shape, dtype=np.float32)
+        executed = self.action_dim if self.keep_executed else 0
+        self.executed_actions = np.zeros((*shape[:2], executed), dtype=np.float32)
         super().reset()  # type: ignore[misc]
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
@@ -93,18 +104,22 @@ class _Costs:
 
     def get(self, batch_size: int | None = None) -> Generator[CostRolloutBufferSamples, None, None]:
         if not self.generator_ready:
-            for name in ("costs", "cost_advantages", "cost_returns"):
+            for name in _FIELDS:
                 # [T, n, m] -> [n·T, m], in the order of SB3's swap_and_flatten.
-                array = getattr(self, name)
-                setattr(self, name, array.swapaxes(0, 1).reshape(-1, self.n_costs))
+                array = getattr(self, name).swapaxes(0, 1)
+                setattr(self, name, array.reshape(len(array) * self.buffer_size, array.shape[2]))
         yield from super().get(batch_size)  # type: ignore[misc]
 
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> CostRolloutBufferSamples:
+        # The whole rollout comes in order, one environment's steps after the other's: a learner
+        # may follow its episodes, and nothing else depends on the order.
+        if len(batch_inds) == self.buffer_size * self.n_envs:
+            batch_inds = np.arange(len(batch_inds))
         samples = super()._get_samples(batch_inds, env)  # type: ignore[misc]
-        costs = (self.costs, self.cost_advantages, self.cost_returns)
+        arrays = (getattr(self, name)[batch_inds] for name in _FIELDS)
         return CostRolloutBufferSamples(
             *samples,
-            *(self.to_torch(array[batch_inds]) for array in costs),  # type: ignore[attr-defined]
+            *(self.to_torch(array) for array in arrays),  # type: ignore[attr-defined]
         )
 
 
@@ -116,6 +131,7 @@ class CostRolloutBuffer(_Costs, RolloutBuffer):  # type: ignore[misc]
     :param n_costs: number m of cost signals
     :param cost_gamma: discount factor of the costs
     :param cost_gae_lambda: bias-variance trade-off of the cost advantages
+    :param keep_executed: whether there is room for executed actions beside the sampled ones
 
     Other parameters are those of SB3's ``RolloutBuffer``.
     """

@@ -1,14 +1,15 @@
-"""Critics of the cost, and the regression that fits every critic."""
+"""Networks beside the policy that learn from costs, and the regression that fits them."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
-from stable_baselines3.common.torch_layers import MlpExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.torch_layers import MlpExtractor, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.nn import functional as F
 
@@ -16,38 +17,34 @@ from sb3_guard.algorithms.common.actor import n_rows, parameterless, rows, value
 from sb3_guard.algorithms.common.mlp import TanhMlp, chunks
 
 
-class CostCritic(nn.Module):
-    """Expected discounted cost-to-go V_c(s), one output per constraint.
+class StateNetwork(nn.Module):
+    """A function of the observation that learns beside the policy.
 
     It is built like the policy's own critic (same kind of extractor, same ``net_arch``) but shares
     nothing with it, so any ``ActorCriticPolicy`` can have one.
 
     :param policy: the policy whose extractor, architecture and optimizer class are taken
-    :param n_costs: number m of constraints
-    :param lr_schedule: learning rate as a function of the remaining progress
+    :param n_outputs: number of outputs
+    :param n_extra: number of inputs beside the observation
     """
 
-    def __init__(self, policy: ActorCriticPolicy, n_costs: int, lr_schedule: Schedule) -> None:
+    def __init__(self, policy: ActorCriticPolicy, n_outputs: int, n_extra: int = 0) -> None:
         super().__init__()
         self.observation_space = policy.observation_space
         self.normalize_images = policy.normalize_images
         self.features_extractor = policy.make_features_extractor()
         arch = policy.net_arch if isinstance(policy.net_arch, list) else policy.net_arch["vf"]
-        self.mlp_extractor = MlpExtractor(
-            self.features_extractor.features_dim,
-            {"pi": [], "vf": arch},
-            policy.activation_fn,
-            device=policy.device,
-        )
-        self.value_net = nn.Linear(self.mlp_extractor.latent_dim_vf, n_costs)
+        features = self.features_extractor.features_dim
+        layers = create_mlp(features + n_extra, n_outputs, arch, policy.activation_fn)
+        self.network = nn.Sequential(*layers)
         if policy.ortho_init:
             self.features_extractor.apply(partial(policy.init_weights, gain=np.sqrt(2)))
-            self.mlp_extractor.apply(partial(policy.init_weights, gain=np.sqrt(2)))
-            self.value_net.apply(partial(policy.init_weights, gain=1.0))
+            self.network[:-1].apply(partial(policy.init_weights, gain=np.sqrt(2)))
+            self.network[-1].apply(partial(policy.init_weights, gain=1.0))
         self.to(policy.device)
         self.optimizer = policy.optimizer_class(
             self.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
+            lr=policy.optimizer.param_groups[0]["lr"],  # type: ignore[call-arg]
             **policy.optimizer_kwargs,
         )
 
@@ -58,41 +55,59 @@ class CostCritic(nn.Module):
         )
         return self.features_extractor(preprocessed)
 
-    def forward(self, observations: PyTorchObs) -> th.Tensor:
-        """Values of observations, shape [B, m]."""
+    def forward(self, observations: PyTorchObs, extra: th.Tensor | None = None) -> th.Tensor:
+        """Outputs, shape [B, n_outputs].
+
+        :param observations: batch of B observations
+        :param extra: the inputs beside them, shape [B, n_extra]
+        """
         features = self.extract_features(observations)
-        return self.value_net(self.mlp_extractor.forward_critic(features))
+        return self.network(features if extra is None else th.cat([features, extra], dim=1))
 
     @th.no_grad()
-    def predict(self, observations: PyTorchObs) -> th.Tensor:
+    def predict(self, observations: PyTorchObs, extra: th.Tensor | None = None) -> th.Tensor:
         """:meth:`forward` without gradients, in slices that bound the memory."""
         slices = chunks(n_rows(observations))
-        return th.cat([self(rows(observations, index)) for index in slices])
+        return th.cat(
+            [
+                self(rows(observations, index), None if extra is None else extra[index])
+                for index in slices
+            ]
+        )
+
+
+class CostCritic(StateNetwork):
+    """Expected discounted cost-to-go V_c(s), one output per constraint."""
 
 
 class Regression:
-    """Least-squares fit of a critic to a batch, full-batch by default.
+    """Least-squares fit of a network to a batch, full-batch by default.
 
-    :param values: maps observations to values, shape [B, m]
+    A batch is observations, or a tuple of observations and whatever else ``values`` takes.
+
+    :param values: maps a batch to predictions, shape [B, m]
     :param parameters: what may move
     :param optimizer: moves them, whatever else it could move
-    :param features: maps observations to a tanh network's input, if the critic is one
+    :param inputs: maps a batch to the input of a tanh network, where ``values`` is one
     :param layers: the layers of that network
+    :param readout: maps the network's outputs and the batch to predictions; None: they are equal
     """
 
     def __init__(
         self,
-        values: Callable[[PyTorchObs], th.Tensor],
+        values: Callable[[Any], th.Tensor],
         parameters: Sequence[th.Tensor],
         optimizer: th.optim.Optimizer,
-        features: Callable[[PyTorchObs], th.Tensor] | None = None,
+        inputs: Callable[[Any], th.Tensor] | None = None,
         layers: Sequence[nn.Linear] | None = None,
+        readout: Callable[[th.Tensor, Any], th.Tensor] | None = None,
     ) -> None:
         self.values = values
         self.parameters = list(parameters)
         self.optimizer = optimizer
-        self.features = features
+        self.inputs = inputs
         self.network = TanhMlp(layers) if layers is not None else None
+        self.readout = readout
 
     @classmethod
     def of_value(cls, policy: ActorCriticPolicy) -> "Regression":
@@ -115,66 +130,85 @@ class Regression:
         return cls(policy.predict_values, parameters, policy.optimizer, features, layers)
 
     @classmethod
-    def of_cost(cls, critic: CostCritic) -> "Regression":
-        """A cost critic."""
+    def of_network(
+        cls,
+        network: StateNetwork,
+        inputs: Callable[[Any], th.Tensor] | None = None,
+        readout: Callable[[th.Tensor, Any], th.Tensor] | None = None,
+    ) -> "Regression":
+        """A network beside the policy.
+
+        :param inputs: maps a batch to the input of ``network.network``; None: a batch is
+            observations
+        :param readout: see :class:`Regression`
+        """
+        first = inputs or network.extract_features
+        last = readout or (lambda outputs, batch: outputs)
         layers = None
-        if next(critic.parameters()).device.type == "cpu" and parameterless(
-            critic.features_extractor
+        if next(network.parameters()).device.type == "cpu" and parameterless(
+            network.features_extractor
         ):
-            layers = TanhMlp.layers([*critic.mlp_extractor.value_net, critic.value_net])
+            layers = TanhMlp.layers([*network.network])
         return cls(
-            critic, list(critic.parameters()), critic.optimizer, critic.extract_features, layers
+            lambda batch: last(network.network(first(batch)), batch),
+            list(network.parameters()),
+            network.optimizer,
+            first,
+            layers,
+            readout,
         )
 
     def fit(
         self,
-        observations: PyTorchObs,
+        batch: Any,
         targets: th.Tensor,
         n_epochs: int,
         batch_size: int | None = None,
     ) -> float:
         """Take ``n_epochs`` passes over the batch, one optimizer step per minibatch.
 
-        :param observations: N observations
+        :param batch: N rows
         :param targets: shape [N, m]
         :param n_epochs: passes
         :param batch_size: rows per step; None for all of them
         :return: mean squared error during the last pass
         """
-        n = len(targets)
-        gradients = self._gradients_by_hand if self.network is not None else self._gradients
-        with th.no_grad():
-            if self.network is not None:
-                assert self.features is not None
-                observations = self.features(observations)
+        n, inputs = len(targets), None
+        if self.network is not None:
+            assert self.inputs is not None
+            with th.no_grad():
+                inputs = self.inputs(batch)
         self.optimizer.zero_grad(set_to_none=True)
         loss = 0.0
         for _ in range(n_epochs):
             if batch_size is None or batch_size >= n:
-                loss = gradients(observations, targets)
+                loss = self._gradients(batch, targets, inputs)
                 self.optimizer.step()
                 continue
             loss = 0.0
             # Equal parts, so that no step is taken on a small remainder.
             for index in th.randperm(n).to(targets.device).tensor_split(-(-n // batch_size)):
-                part = gradients(rows(observations, index), targets[index])
-                loss += part * len(index) / n
+                part = None if inputs is None else inputs[index]
+                error = self._gradients(rows(batch, index), targets[index], part)
+                loss += error * len(index) / n
                 self.optimizer.step()
         return loss
 
-    def _gradients(self, observations: PyTorchObs, targets: th.Tensor) -> float:
+    def _gradients(self, batch: Any, targets: th.Tensor, inputs: th.Tensor | None) -> float:
         """Set the parameters' gradients of the mean squared error; return the error."""
+        if inputs is not None:
+            return self._gradients_by_hand(batch, targets, inputs)
         self.optimizer.zero_grad(set_to_none=True)
         total = 0.0
         for index in chunks(len(targets)):
-            values = self.values(rows(observations, index))
+            values = self.values(rows(batch, index))
             loss = F.mse_loss(values, targets[index], reduction="sum") / targets.numel()
             loss.backward(inputs=self.parameters)
             total += loss.item()
         return total
 
-    def _gradients_by_hand(self, features: PyTorchObs, targets: th.Tensor) -> float:
-        assert self.network is not None and isinstance(features, th.Tensor)
+    def _gradients_by_hand(self, batch: Any, targets: th.Tensor, inputs: th.Tensor) -> float:
+        assert self.network is not None
         gradients = []
         for parameter in self.network.parameters:
             if parameter.grad is None:
@@ -182,9 +216,17 @@ class Regression:
             gradients.append(parameter.grad.zero_())
         total = 0.0
         for index in chunks(len(targets)):
-            activations = self.network.forward(features[index])
-            error = activations[-1] - targets[index]
-            total += float(error.flatten() @ error.flatten())
-            error.mul_(2.0 / targets.numel())
-            self.network.adjoint(activations, error, gradients)
+            activations = self.network.forward(inputs[index])
+            outputs = activations[-1]
+            if self.readout is None:
+                error = outputs - targets[index]
+                total += float(error.flatten() @ error.flatten())
+                slope = error.mul_(2.0 / targets.numel())
+            else:
+                outputs.requires_grad_()
+                values = self.readout(outputs, rows(batch, index))
+                loss = F.mse_loss(values, targets[index], reduction="sum")
+                total += loss.item()
+                (slope,) = th.autograd.grad(loss / targets.numel(), outputs)
+            self.network.adjoint(activations, slope, gradients)
         return total / targets.numel()

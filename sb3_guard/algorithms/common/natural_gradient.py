@@ -146,6 +146,65 @@ def constrained_step(
     return Step(x, case, lambda_kl, nu)
 
 
+# Half-spaces count as contradictory if their nearest point lies 1/√ of this as far as the farthest
+# of them alone.
+_CONTRADICTION = 1e-10
+
+
+def projected_step(
+    g: th.Tensor,
+    B: th.Tensor,
+    c: np.ndarray,
+    v: th.Tensor,
+    W: th.Tensor,
+    delta: float,
+    euclidean: bool = False,
+) -> tuple[th.Tensor, np.ndarray]:
+    """The TRPO step, then the nearest point that satisfies the linearised constraints.
+
+    With ``y = √(2δ / gᵀF⁻¹g) F⁻¹g``, the point x of ``c + Bx ≤ 0`` that minimises
+    ``(x - y)ᵀL(x - y)`` (Yang et al., 2020); for one constraint
+
+        x = y - max(0, (bᵀy + c) / bᵀL⁻¹b) · L⁻¹b
+
+    It may lie outside the trust region. If no point satisfies the constraints, the step minimises
+    ``Σ max(0, c_i + b_iᵀx)²`` over the region, as :func:`constrained_step` does.
+
+    :param g: reward gradient, shape (P,)
+    :param B: cost gradients, shape (m, P)
+    :param c: violations, shape (m,), in the units of the cost surrogate
+    :param v: F⁻¹g, shape (P,)
+    :param W: F⁻¹b_i, shape (m, P)
+    :param delta: trust-region radius δ > 0
+    :param euclidean: measure distance by L = I instead of L = F, i.e. to first order by the KL
+    :return: the step, shape (P,), and how far it was pulled along each ``-L⁻¹b_i``, shape (m,)
+    """
+    c = np.asarray(c, dtype=np.float64)
+    rows, images = B.double(), W.double()
+    q = float(g.double() @ v.double())
+    y = v * (np.sqrt(2 * delta / q) if q > 0.0 else 0.0)
+    gram = (rows @ images.T).cpu().numpy()  # [m, m]
+    gram = (gram + gram.T) / 2
+    moves = np.sqrt(2 * delta * np.maximum(np.diag(gram), 0.0)) > _NO_REACH
+    excess = c + (rows @ y.double()).cpu().numpy()
+    pull = np.zeros(len(c))
+    possible = bool(np.all(moves | (c <= 0.0)))
+    if possible and np.any(excess[moves] > 0.0):
+        images = rows if euclidean else images
+        S = (rows @ images.T).cpu().numpy()[np.ix_(moves, moves)]
+        normals, lengths = _unit_normals(S)
+        offsets = excess[moves] / lengths
+        # In units in which the farthest half-space is one away.
+        scale = offsets.max()
+        u, phi = shortest(normals, offsets / scale)
+        possible = phi > _CONTRADICTION
+        if possible:
+            pull[moves] = u / phi * scale / lengths
+    if not possible:
+        y, images, pull = th.zeros_like(y), W.double(), _least_violation(gram, c, delta)
+    return y - (th.as_tensor(pull, device=W.device) @ images).to(W.dtype), pull
+
+
 _Solution = tuple[float, np.ndarray, float, np.ndarray]
 
 
@@ -197,9 +256,11 @@ def _unit_normals(S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vectors * np.sqrt(np.maximum(values, 0.0)), lengths
 
 
-def _project(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, float]:
+def shortest(normals: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, float]:
     """Shortest z with ``normals @ z + offsets ≤ 0`` (Lawson & Hanson, 1974, problem LDP).
 
+    :param normals: shape (m, n)
+    :param offsets: shape (m,)
     :return: (u, φ) such that the multipliers are u / φ, ``z = -normalsᵀu / φ`` and
         ``|z|² = 1/φ - 1``; φ is 0 if the half-spaces contradict each other
     """
@@ -212,7 +273,7 @@ def _reachable(S: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) ->
     """Whether some point of the trust region satisfies every constraint."""
     normals, lengths = _unit_normals(S[np.ix_(moves, moves)])
     # In units in which the trust region is the unit ball.
-    _, phi = _project(normals, c[moves] / (lengths * np.sqrt(2 * delta)))
+    _, phi = shortest(normals, c[moves] / (lengths * np.sqrt(2 * delta)))
     return phi >= 0.5
 
 
@@ -237,7 +298,7 @@ def _dual(gram: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) -> _
         """The projected point and its multipliers, where the trust region is the unit ball."""
         # Two scalings of one problem: each keeps its numbers near one in its range of λ.
         scale = max(1.0, lam)
-        u, phi = _project(normals, (lam * offsets + normals @ gradient) / scale)
+        u, phi = shortest(normals, (lam * offsets + normals @ gradient) / scale)
         mu = u / phi * scale / lam
         return gradient / lam - mu @ normals, mu
 

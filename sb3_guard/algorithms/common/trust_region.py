@@ -17,7 +17,6 @@ fit the critics. What an algorithm may replace:
     what else is learnt after the policy moved; nothing.
 """
 
-import difflib
 import random
 import time
 import warnings
@@ -49,24 +48,18 @@ from sb3_guard.algorithms.common.buffers import (
     CostRolloutBuffer,
     CostRolloutBufferSamples,
 )
+from sb3_guard.algorithms.common.checks import (
+    check_choice,
+    check_integer,
+    check_number,
+    check_per_cost,
+    is_number,
+)
+from sb3_guard.algorithms.common.costs import CostEstimate, read_costs
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
 
 SelfTrustRegion = TypeVar("SelfTrustRegion", bound="TrustRegion")
-
-
-class CostEstimate(NamedTuple):
-    """What a rollout says about the costs, m of them.
-
-    :param episode_cost: J_C, mean undiscounted cost of the episodes that ended, shape (m,)
-    :param horizon: T, the length of an episode, steps
-    :param violation: (J_C - d) / T, in the per-step units of mean(ratio · cost advantage),
-        shape (m,)
-    """
-
-    episode_cost: np.ndarray
-    horizon: float
-    violation: np.ndarray
 
 
 class Trial(NamedTuple):
@@ -143,7 +136,11 @@ class _CorrectedEnv(VecEnvWrapper):
         self.algorithm = algorithm
 
     def step_async(self, actions: np.ndarray) -> None:
-        self.venv.step_async(self.algorithm.correct(self.algorithm._last_obs, actions))
+        executed = self.algorithm.correct(self.algorithm._last_obs, actions)
+        # SB3 adds the transition, with the sampled action, after the step.
+        buffer = self.algorithm.rollout_buffer
+        buffer.executed_actions[buffer.pos] = executed.reshape(len(executed), -1)
+        self.venv.step_async(executed)
 
     def step_wait(self) -> VecEnvStepReturn:
         return self.venv.step_wait()
@@ -288,6 +285,8 @@ class TrustRegion(OnPolicyAlgorithm):
         # Running episodes outlive rollouts, and a run may be saved between two.
         self.running_costs: np.ndarray | None = None  # [n_envs, m]
         self.running_lengths: np.ndarray | None = None  # [n_envs]
+        # What the last step cost, 0 before the first one of an episode.
+        self.last_costs: np.ndarray | None = None  # [n_envs, m]
         self.total_costs: np.ndarray | None = None  # [m]
         self.ep_cost_buffer: deque[np.ndarray] | None = None
         self.horizon: float | None = None  # T of the last rollout in which an episode ended
@@ -305,38 +304,22 @@ class TrustRegion(OnPolicyAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         """Refuse values that could only fail later or silently do harm."""
-        positive_integers = ["n_steps", "cg_max_steps", "line_search_max_iter", "n_critic_updates"]
+        for name in ("n_steps", "cg_max_steps", "line_search_max_iter", "n_critic_updates"):
+            check_integer(name, getattr(self, name))
         if self.batch_size is not None:
-            positive_integers.append("batch_size")
-        for name in positive_integers:
+            check_integer("batch_size", self.batch_size)
+        for name in ("gamma", "gae_lambda", "cost_gamma", "cost_gae_lambda"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ValueError(f"{name}={value!r}: must be an integer of at least 1")
-        ranges = {
-            "gamma": (0.0, 1.0, "[]"),
-            "gae_lambda": (0.0, 1.0, "[]"),
-            "cost_gamma": (0.0, 1.0, "[]"),
-            "cost_gae_lambda": (0.0, 1.0, "[]"),
-            "target_kl": (0.0, np.inf, "()"),
-            "cg_damping": (0.0, np.inf, "[)"),
-            "line_search_shrinking_factor": (0.0, 1.0, "()"),
-        }
-        for name, (low, high, ends) in ranges.items():
-            value = getattr(self, name)
-            if value is None and name.startswith("cost_"):
-                continue
-            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            above = number and (value >= low if ends[0] == "[" else value > low)
-            below = number and (value <= high if ends[1] == "]" else value < high)
-            if not (above and below):
-                raise ValueError(
-                    f"{name}={value!r}: must be a number in {ends[0]}{low:g}, {high:g}{ends[1]}"
-                )
+            if value is not None or not name.startswith("cost_"):
+                check_number(name, value, 0.0, 1.0, "[]")
+        check_number("target_kl", self.target_kl, ends="()")
+        check_number("cg_damping", self.cg_damping)
+        factor = self.line_search_shrinking_factor
+        check_number("line_search_shrinking_factor", factor, 0.0, 1.0, "()")
         rate = self.learning_rate
-        if not callable(rate) and not (isinstance(rate, int | float | np.number) and rate > 0.0):
+        if not callable(rate) and not (is_number(rate) and rate > 0.0):
             raise ValueError(f"learning_rate={rate!r}: must be a positive number or a schedule")
-        if self.missing_cost not in ("error", "zero"):
-            raise ValueError(f"missing_cost={self.missing_cost!r}: must be 'error' or 'zero'")
+        check_choice("missing_cost", self.missing_cost, "error", "zero")
         if (
             isinstance(self.cost_keys, str)
             or len(self.cost_keys) < 1
@@ -347,14 +330,7 @@ class TrustRegion(OnPolicyAlgorithm):
                 f"cost_keys={self.cost_keys!r}: must be a sequence of one or more different names "
                 "of info entries, such as ('cost',)"
             )
-        limits = np.asarray(self.cost_limit)
-        if limits.ndim > 1 or (limits.ndim == 1 and len(limits) != len(self.cost_keys)):
-            raise ValueError(
-                f"cost_limit={self.cost_limit!r}: must be one number, or one for each of the "
-                f"{len(self.cost_keys)} cost keys {tuple(self.cost_keys)}"
-            )
-        if limits.dtype.kind not in "iuf" or not np.all(np.isfinite(limits)):
-            raise ValueError(f"cost_limit={self.cost_limit!r}: must be finite numbers")
+        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys))
         buffer_class = self.rollout_buffer_class
         if buffer_class is not None and not issubclass(
             buffer_class, CostRolloutBuffer | CostDictRolloutBuffer
@@ -385,12 +361,13 @@ class TrustRegion(OnPolicyAlgorithm):
             "n_costs": n_costs,
             "cost_gamma": self.gamma if gamma is None else gamma,
             "cost_gae_lambda": self.gae_lambda if gae_lambda is None else gae_lambda,
+            "keep_executed": self._corrects,
         }
         super()._setup_model()
         self._value_regression = Regression.of_value(self.policy)
         if self.uses_cost_critic:
-            self.cost_critic = CostCritic(self.policy, n_costs, self.lr_schedule)
-            self._cost_regression = Regression.of_cost(self.cost_critic)
+            self.cost_critic = CostCritic(self.policy, n_costs)
+            self._cost_regression = Regression.of_network(self.cost_critic)
 
     def _excluded_save_params(self) -> list[str]:
         return [
@@ -408,6 +385,10 @@ class TrustRegion(OnPolicyAlgorithm):
         return state_dicts, tensors
 
     # Collecting
+
+    @property
+    def _corrects(self) -> bool:
+        return type(self).correct is not TrustRegion.correct
 
     @property
     def total_cost(self) -> float:
@@ -430,6 +411,7 @@ class TrustRegion(OnPolicyAlgorithm):
         if reset_num_timesteps or self._last_obs is None:
             self.running_costs = np.zeros((self.n_envs, n_costs))
             self.running_lengths = np.zeros(self.n_envs, dtype=np.int64)
+            self.last_costs = np.zeros((self.n_envs, n_costs))
         return super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -472,9 +454,8 @@ class TrustRegion(OnPolicyAlgorithm):
         self._rng_at_rollout = (random.getstate(), legacy, th.get_rng_state())
         started = time.perf_counter()
         self._begin_rollout_statistics()
-        corrects = type(self).correct is not TrustRegion.correct
         full = super().collect_rollouts(
-            _CorrectedEnv(env, self) if corrects else env,
+            _CorrectedEnv(env, self) if self._corrects else env,
             callback,
             rollout_buffer,
             n_rollout_steps,
@@ -490,13 +471,17 @@ class TrustRegion(OnPolicyAlgorithm):
         super()._update_info_buffer(infos, dones)
         assert dones is not None and self.ep_cost_buffer is not None
         assert self.running_costs is not None and self.running_lengths is not None
-        costs = self._read_costs(infos)
+        assert self.last_costs is not None
+        costs, seen = read_costs(infos, self.cost_keys, self.missing_cost == "zero")
+        self._cost_seen_in_rollout |= seen
         # SB3 calls this just before it adds the transition.
         step = self.rollout_buffer.pos
         self.rollout_buffer.costs[step] = costs
+        self.rollout_buffer.previous_costs[step] = self.last_costs
         self.total_costs += costs.sum(axis=0)
         self.running_costs += costs
         self.running_lengths += 1
+        self.last_costs = np.where(dones[:, None], 0.0, costs)
         for i in np.flatnonzero(dones):
             self._ended_costs.append(self.running_costs[i].copy())
             self._ended_lengths.append(int(self.running_lengths[i]))
@@ -508,41 +493,6 @@ class TrustRegion(OnPolicyAlgorithm):
                 info.get("terminal_observation") is not None
             ):
                 self._timeouts.append((step, int(i), info["terminal_observation"]))
-
-    def _read_costs(self, infos: list[dict[str, Any]]) -> np.ndarray:
-        """Costs of one step of every environment, shape (n_envs, m)."""
-        try:
-            rows = [[info[key] for key in self.cost_keys] for info in infos]
-            self._cost_seen_in_rollout = True
-        except KeyError:
-            if self.missing_cost == "error":
-                raise self._missing_cost_error(infos) from None
-            rows = [[info.get(key, 0.0) for key in self.cost_keys] for info in infos]
-            self._cost_seen_in_rollout |= any(k in info for info in infos for k in self.cost_keys)
-        try:
-            costs = np.array(rows, dtype=np.float64).reshape(len(infos), len(self.cost_keys))
-        except (TypeError, ValueError):
-            costs = np.full((len(infos), len(self.cost_keys)), np.nan)
-        if not np.isfinite(costs).all():
-            i, j = np.argwhere(~np.isfinite(costs))[0]
-            raise ValueError(
-                f"info[{self.cost_keys[j]!r}] of environment {i} is {rows[i][j]!r}: "
-                "a cost must be a finite number"
-            )
-        return costs
-
-    def _missing_cost_error(self, infos: list[dict[str, Any]]) -> KeyError | ValueError:
-        i, key = next(
-            (i, key) for i, info in enumerate(infos) for key in self.cost_keys if key not in info
-        )
-        present = sorted(str(name) for name in infos[i])
-        nearest = difflib.get_close_matches(key, present, n=1, cutoff=0.4)
-        hint = f" (nearest: {nearest[0]!r})" if nearest else ""
-        return ValueError(
-            f"info of environment {i} has no cost key {key!r}; its keys are {present}{hint}. "
-            "Pass the right names as cost_keys=(...), or missing_cost='zero' if the key appears "
-            "only when there is a cost"
-        )
 
     @th.no_grad()
     def _finish_costs(self) -> None:

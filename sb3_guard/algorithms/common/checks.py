@@ -1,0 +1,57 @@
+"""Refusing bad hyper-parameters in one way: the name, the value, what is allowed."""
+
+from typing import Any
+
+import numpy as np
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a real number; booleans are not."""
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+def check_integer(name: str, value: Any, least: int = 1) -> None:
+    """
+    :raises ValueError: ``value`` is not an integer of at least ``least``
+    """
+    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (integer and value >= least):
+        raise ValueError(f"{name}={value!r}: must be an integer of at least {least}")
+
+
+def check_number(
+    name: str, value: Any, low: float = 0.0, high: float = np.inf, ends: str = "[)"
+) -> None:
+    """
+    :param ends: brackets of the interval from ``low`` to ``high``, such as ``"[)"``
+    :raises ValueError: ``value`` is not a number of the interval
+    """
+    above = is_number(value) and (value >= low if ends[0] == "[" else value > low)
+    below = is_number(value) and (value <= high if ends[1] == "]" else value < high)
+    if not (above and below):
+        raise ValueError(
+            f"{name}={value!r}: must be a number in {ends[0]}{low:g}, {high:g}{ends[1]}"
+        )
+
+
+def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
+    """
+    :raises ValueError: ``value`` is not one finite number, or one for each cost key
+    """
+    numbers = np.asarray(value)
+    if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != len(cost_keys)):
+        raise ValueError(
+            f"{name}={value!r}: must be one number, or one for each of the "
+            f"{len(cost_keys)} cost keys {cost_keys}"
+        )
+    if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):
+        raise ValueError(f"{name}={value!r}: must be finite numbers")
+
+
+def check_choice(name: str, value: Any, *allowed: str) -> None:
+    """
+    :raises ValueError: ``value`` is none of the allowed words
+    """
+    if value not in allowed:
+        words = " or ".join(repr(each) for each in allowed)
+        raise ValueError(f"{name}={value!r}: must be {words}")

@@ -1,0 +1,150 @@
+"""Hierarchical safety: TRPO learns as if alone, and a learned filter corrects what is executed."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import obs_as_tensor
+
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.checks import check_integer, check_number, check_per_cost
+from sb3_guard.algorithms.common.policies import (
+    FilteredCnnPolicy,
+    FilteredMultiInputPolicy,
+    FilteredPolicy,
+)
+from sb3_guard.algorithms.common.trust_region import TrustRegion
+
+
+class FilteredTrustRegion(TrustRegion):
+    """TRPO behind an action filter.
+
+    The surrogate uses the sampled actions and their probabilities, the environment executes the
+    corrected ones: the filter is part of the environment that the policy lives in. It learns from
+    the first rollout on and is switched on after a warm-up.
+
+    :param policy: policy class or its alias; a class of one's own derives from ``FilteredPolicy``
+    :param env: environment or its id; its actions are a Box
+    :param learning_rate: of the critic and the filter's network
+    :param warmup: share of the first ``learn`` before the filter is switched on; an integer is a
+        number of steps
+    :param threshold: cost, in the units of the filter's model, that is not corrected; one number or
+        one per cost key; None derives it from ``cost_limit``
+
+    Other parameters are those of :class:`TrustRegion`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": FilteredPolicy,
+        "CnnPolicy": FilteredCnnPolicy,
+        "MultiInputPolicy": FilteredMultiInputPolicy,
+    }
+    uses_cost_critic: ClassVar[bool] = False
+
+    policy: FilteredPolicy
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        *,
+        warmup: int | float = 1 / 3,
+        threshold: float | Sequence[float] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self.warmup = warmup
+        self.threshold = threshold
+        # Steps after which the filter is switched on; known once `learn` was called.
+        self.filter_from: int | None = None
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        name = type(self).__name__
+        if self.env is not None and not isinstance(self.action_space, spaces.Box):
+            raise ValueError(
+                f"{name} corrects actions of a Box, not of {self.action_space}; "
+                "for other actions use trpo_lag, cpo or pcpo"
+            )
+        if not issubclass(self.policy_class, FilteredPolicy):
+            own = self.policy_class.__name__
+            raise ValueError(
+                f"policy={own}: {name} needs a policy that carries an action filter; define "
+                f"class Filtered{own}(FilteredPolicy, {own}), with FilteredPolicy from "
+                "sb3_guard.algorithms.common.policies"
+            )
+        if isinstance(self.warmup, int):
+            check_integer("warmup", self.warmup, 0)
+        else:
+            check_number("warmup", self.warmup, 0.0, 1.0, "[]")
+        if self.threshold is not None:
+            check_per_cost("threshold", self.threshold, tuple(self.cost_keys))
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        return [*state_dicts, "policy.action_filter.optimizer"], tensors
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if self.filter_from is None:
+            steps = self.warmup
+            self.filter_from = (
+                steps if isinstance(steps, int) else math.ceil(steps * total_timesteps)
+            )
+        self._switch_on()
+        return prepared
+
+    def _switch_on(self) -> None:
+        """Activate the filter if its time has come; it stays active from then on."""
+        assert self.filter_from is not None
+        if self.num_timesteps >= self.filter_from:
+            self.policy.action_filter.active.fill_(True)
+
+    def _set_threshold(self, derived: np.ndarray) -> None:
+        """Set the filter's thresholds: the given ones, else those derived from the cost limit."""
+        chosen = derived if self.threshold is None else np.asarray(self.threshold, np.float64)
+        filter_threshold = self.policy.action_filter.threshold
+        filter_threshold.copy_(th.as_tensor(np.broadcast_to(chosen, derived.shape).copy()))
+
+    def correct(self, observations: Any, actions: np.ndarray) -> np.ndarray:
+        return self.policy.correct(
+            obs_as_tensor(observations, self.device), actions, self.last_costs
+        )
+
+    def _unit(self, actions: np.ndarray) -> th.Tensor:
+        """Actions of the environment in units of the action space, shape [B, k]."""
+        return th.as_tensor(self.policy.to_unit(actions), dtype=th.float32, device=self.device)
+
+    def _executed(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """The executed actions of a batch in units of the action space, shape [B, k]."""
+        return self._unit(batch.executed_actions.cpu().numpy())
+
+    def _sampled(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """The sampled actions likewise, clipped to the box, shape [B, k]."""
+        return self._unit(self.policy.executable(batch.actions.cpu().numpy()))
+
+    def fit(self, batch: CostRolloutBufferSamples) -> None:
+        """Log what was corrected; leaves then fit their model."""
+        lengths = (self._executed(batch) - self._sampled(batch)).norm(dim=1)
+        corrected = lengths > 1e-5
+        self.logger.record("train/corrected_fraction", corrected.float().mean().item())
+        norm = lengths[corrected].mean().item() if corrected.any() else 0.0
+        self.logger.record("train/correction_norm", norm)
+        self._update_learning_rate(self.policy.action_filter.optimizer)
+        self._switch_on()

@@ -1,0 +1,63 @@
+"""PCPO: a TRPO step, then a projection onto the cost limits."""
+
+from typing import Any, Literal
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_guard.algorithms.common.checks import check_choice
+from sb3_guard.algorithms.common.natural_gradient import projected_step
+from sb3_guard.algorithms.common.trust_region import Region, Trial, TrustRegion
+
+
+class PCPO(TrustRegion):
+    """Projection-based constrained policy optimisation (Yang et al., 2020, arXiv 2010.03152).
+
+    ::
+
+        y = argmax  gᵀy                subject to   ½ yᵀFy ≤ δ
+        x = argmin  (x - y)ᵀL(x - y)   subject to   c + Bx ≤ 0
+
+    g and B are the gradients of E[ratio · A] and E[ratio · A_C], c the violations (J_C - d) / T, F
+    the Fisher matrix, and L is F or I. The projection knows no trust region: it may ask for more
+    than δ. The line search therefore shortens x until KL ≤ δ, and asks for nothing else.
+
+    :param policy: policy class or its alias
+    :param env: environment or its id
+    :param learning_rate: of the critics
+    :param projection: ``"kl"`` for L = F, ``"l2"`` for L = I
+    :param line_search: whether to shorten steps that leave the trust region; False takes them
+        whole, as the paper does
+
+    Other parameters are those of :class:`TrustRegion`.
+    """
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        *,
+        projection: Literal["kl", "l2"] = "kl",
+        line_search: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        self.projection = projection
+        self.line_search = line_search
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        check_choice("projection", self.projection, "kl", "l2")
+
+    def step(self, region: Region) -> th.Tensor:
+        g, B, c, delta = region.gradient, region.cost_gradients, region.violation, region.delta
+        v, W = region.solve(g), th.stack([region.solve(b) for b in B])
+        x, pull = projected_step(g, B, c, v, W, delta, self.projection == "l2")
+        self._record_per_cost("train/projection", pull)
+        return x
+
+    def accept(self, trial: Trial) -> bool:
+        return trial.kl <= (self.target_kl if self.line_search else np.finfo(np.float64).max)

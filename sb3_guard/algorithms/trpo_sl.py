@@ -1,0 +1,75 @@
+"""TRPO-SL: TRPO behind a safety layer that keeps the predicted cost of the next step low."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from sb3_guard.algorithms.common.action_filters import SafetyLayer
+from sb3_guard.algorithms.common.actor import rows
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
+
+
+class TRPOSL(FilteredTrustRegion):
+    """TRPO with a safety layer (Dalal et al., 2018, arXiv 1801.08757).
+
+    ::
+
+        execute   argmin_x ½ |x - a|²   subject to   c_i + g_i(s) · x ≤ threshold_i,   x in the box
+
+    a is the sampled action, clipped to the box of the action space; c_i is what the last step cost
+    and g a network fitted to the costs of the executed actions, so that the constraint predicts
+    the cost of this step. Steps without cost are so many that as many of them are drawn, anew for
+    each step of the optimizer, as there are steps with a cost.
+
+    :param policy: policy class or its alias; a class of one's own derives from ``FilteredPolicy``
+    :param env: environment or its id; its actions are a Box
+    :param learning_rate: of the critic and the cost model
+    :param warmup: share of the first ``learn`` before the layer is switched on; an integer is a
+        number of steps
+    :param threshold: highest predicted cost of a step that is not corrected; one number or one per
+        cost key; None: d/T
+    :param drift: let the model add b_i(s), for cost that changes whatever the agent does, as when
+        a hazard moves
+
+    Other parameters are those of :class:`FilteredTrustRegion`.
+    """
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        *,
+        warmup: int | float = 1 / 3,
+        threshold: float | Sequence[float] | None = None,
+        drift: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        self.drift = drift
+        super().__init__(policy, env, learning_rate, warmup=warmup, threshold=threshold, **kwargs)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.policy.carry(SafetyLayer, {"n_costs": len(self.cost_keys), "drift": self.drift})
+
+    def fit(self, batch: CostRolloutBufferSamples) -> None:
+        super().fit(batch)
+        assert self.costs is not None and isinstance(self.policy.action_filter, SafetyLayer)
+        self._set_threshold(self.cost_limits / self.costs.horizon)
+        costly = (batch.costs != 0.0).any(dim=1)
+        some, none = costly.nonzero().flatten(), (~costly).nonzero().flatten()
+        if not len(some):
+            return
+        regression = self.policy.action_filter.regression()
+        data = (batch.observations, self._executed(batch), batch.previous_costs)
+        targets = th.cat([batch.costs, batch.previous_costs], dim=1)
+        loss = 0.0
+        for _ in range(self.n_critic_updates):
+            drawn = th.randperm(len(none))[: len(some)].to(none.device)
+            index = th.cat([some, none[drawn]])
+            loss = regression.fit(rows(data, index), targets[index], 1, self.batch_size)
+        self.logger.record("train/cost_model_loss", loss)

@@ -1,0 +1,149 @@
+"""TRPO-USL: TRPO behind a layer that descends the predicted cost to come."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
+from stable_baselines3.common.utils import obs_as_tensor
+
+from sb3_guard.algorithms.common.action_filters import UnrolledSafetyLayer
+from sb3_guard.algorithms.common.advantage import gae
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.checks import check_integer, check_number
+from sb3_guard.algorithms.common.costs import discounted_limit
+from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
+
+
+class TRPOUSL(FilteredTrustRegion):
+    """TRPO with an unrolled safety layer (Zhang et al., 2022, arXiv 2212.05727).
+
+    ::
+
+        execute   a after at most K steps   a ← clip(a - η ∇_a h / |∇_a h|_∞),   while h > 0
+                  where   h(s, a) = Σ max(0, Q_i(s, a) - threshold_i)
+
+    starting from the sampled action, clipped to the box of the action space. Q_i is the discounted
+    cost to come, a network with a softplus output fitted to ``c + γ Q(s', a')`` with a' the action
+    executed next. ``kappa`` adds the paper's exact penalty: the policy then ascends
+    ``E[ratio · (A - κ h(s, a))]``, whose gradient is that of the expected penalty of the sampled
+    actions.
+
+    :param policy: policy class or its alias; a class of one's own derives from ``FilteredPolicy``
+    :param env: environment or its id; its actions are a Box
+    :param learning_rate: of the critic and the cost Q-critic
+    :param warmup: share of the first ``learn`` before the layer is switched on; an integer is a
+        number of steps
+    :param threshold: highest discounted cost to come that is not corrected; one number or one per
+        cost key; None: the larger of ``tolerance`` and ``(d/T) (1 - γᵀ)/(1 - γ)``
+    :param tolerance: what the Q-critic may say of a state where nothing costs: a softplus never
+        is zero
+    :param steps: K
+    :param rate: η, in units of the action space, which runs from -1 to 1
+    :param kappa: weight of the exact penalty; 0 for none, as in GUARD
+
+    Other parameters are those of :class:`FilteredTrustRegion`.
+    """
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        *,
+        warmup: int | float = 1 / 3,
+        threshold: float | Sequence[float] | None = None,
+        tolerance: float = 0.01,
+        steps: int = 20,
+        rate: float = 0.05,
+        kappa: float = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        self.tolerance = tolerance
+        self.steps = steps
+        self.rate = rate
+        self.kappa = kappa
+        super().__init__(policy, env, learning_rate, warmup=warmup, threshold=threshold, **kwargs)
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        check_integer("steps", self.steps)
+        for name in ("tolerance", "kappa"):
+            check_number(name, getattr(self, name))
+        check_number("rate", self.rate, ends="()")
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.policy.carry(
+            UnrolledSafetyLayer,
+            {"n_costs": len(self.cost_keys), "steps": self.steps, "rate": self.rate},
+        )
+        self._set_threshold(np.full(len(self.cost_keys), self.tolerance))
+
+    @property
+    def _layer(self) -> UnrolledSafetyLayer:
+        layer = self.policy.action_filter
+        assert isinstance(layer, UnrolledSafetyLayer)
+        return layer
+
+    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
+        objective = super().surrogate(batch, ratio)
+        if self.kappa == 0.0:
+            return objective
+        values = self._layer.values(batch.observations, self._sampled(batch))
+        penalty = (values - self._layer.threshold.to(values)).clamp(min=0.0).sum(dim=1)
+        return objective - self.kappa * (ratio * (penalty - penalty.mean())).mean()
+
+    def fit(self, batch: CostRolloutBufferSamples) -> None:
+        super().fit(batch)
+        assert self.costs is not None
+        gamma = self.rollout_buffer.cost_gamma
+        limit = discounted_limit(self.cost_limits, self.costs.horizon, gamma)
+        actions = self._executed(batch)
+        targets = self._targets(batch, actions, gamma)
+        loss = self._layer.regression().fit(
+            (batch.observations, actions), targets, self.n_critic_updates, self.batch_size
+        )
+        self.logger.record("train/cost_model_loss", loss)
+        self._set_threshold(np.maximum(limit, self.tolerance))
+
+    def _targets(
+        self, batch: CostRolloutBufferSamples, actions: th.Tensor, gamma: float
+    ) -> th.Tensor:
+        """``c + γ Q(s', a')`` of every transition, shape [N, m]."""
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        buffer = self.rollout_buffer
+        shape = (buffer.n_envs, buffer.buffer_size, len(self.cost_keys))
+
+        def by_time(rows: th.Tensor) -> np.ndarray:
+            """The batch's rows, one environment after the other, as [T, n, m]."""
+            return rows.cpu().numpy().reshape(shape).swapaxes(0, 1)
+
+        values = by_time(self._layer.values(batch.observations, actions))
+        costs = by_time(batch.costs).copy()
+        for step, i, observation in self._timeouts:
+            tensor, _ = self.policy.obs_to_tensor(observation)
+            costs[step, i] += gamma * self._value_ahead(tensor)[0]
+        last = self._value_ahead(obs_as_tensor(self._last_obs, self.device))
+        # A one-step error plus the value it was measured from is the one-step target.
+        errors = gae(
+            costs,
+            values,
+            buffer.episode_starts,
+            last,
+            self._last_episode_starts,
+            gamma,
+            0.0,
+        )
+        targets = (values + errors).swapaxes(0, 1).reshape(-1, shape[2])
+        return th.as_tensor(targets, device=self.device)
+
+    @th.no_grad()
+    def _value_ahead(self, observations: PyTorchObs) -> np.ndarray:
+        """Costs to come of observations whose action was never taken, shape [B, m]."""
+        sampled = self.policy.get_distribution(observations).get_actions()
+        actions = self.policy.executable(sampled.cpu().numpy())
+        executed = self._unit(self.policy.correct(observations, actions))
+        return self._layer.values(observations, executed).cpu().numpy()

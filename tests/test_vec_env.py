@@ -107,3 +107,15 @@ def test_single_rows_cannot_be_reached_and_the_error_says_what_to_do():
         env.set_attr("camera", "top")
     with pytest.raises(AttributeError, match="vec_env='dummy'"):
         env.env_method("render")
+
+
+def test_diverged_episodes_are_counted():
+    env = make_vec_env("Goal_Point_8Hazards", 3, seed=0)
+    env.reset()
+    env.step(np.zeros((3, 2)))
+    assert env.physics_errors == 0
+    env.unwrapped.envs.engine.batch.bind("qvel")[1] = 1e12
+    _, _, dones, infos = env.step(np.zeros((3, 2)))
+    assert dones.tolist() == [False, True, False] and infos[1]["physics_error"]
+    assert infos[1]["TimeLimit.truncated"] is False and np.isfinite(infos[1]["episode"]["r"])
+    assert env.physics_errors == 1 and env.state()["physics_errors"] == 1

@@ -56,6 +56,8 @@ class CostMonitor(VecMonitor):
         #: cost and number of all steps so far, episodes under way included
         self.total_cost = 0.0
         self.total_steps = 0
+        #: episodes that ended because the physics diverged
+        self.physics_errors = 0
         self._clear()
         if filename is not None:
             self.log_to(filename)
@@ -100,6 +102,7 @@ class CostMonitor(VecMonitor):
         episode.update(zip(self._columns, self._key_costs[:, i].tolist(), strict=True))
         episode.update((key, info[key]) for key in self.info_keywords)
         self.episode_count += 1
+        self.physics_errors += bool(info.get("physics_error", False))
         for sums in (self.episode_returns, self.episode_lengths, self.episode_costs):
             sums[i] = 0
         self._key_costs[:, i] = 0.0
@@ -146,6 +149,7 @@ class CostMonitor(VecMonitor):
             "episode_count": self.episode_count,
             "total_cost": self.total_cost,
             "total_steps": self.total_steps,
+            "physics_errors": self.physics_errors,
             "t_start": self.t_start,
             "offset": None if writer is None else writer.file_handler.tell(),
         }
@@ -159,4 +163,5 @@ class CostMonitor(VecMonitor):
         self.episode_count = state["episode_count"]
         self.total_cost = state["total_cost"]
         self.total_steps = state["total_steps"]
+        self.physics_errors = state["physics_errors"]
         self.t_start = state["t_start"]

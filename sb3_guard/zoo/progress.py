@@ -67,6 +67,9 @@ class Epochs(BaseCallback):
         if self._episodes:
             self.last = np.array([(one["r"], one["c"], one["l"]) for one in self._episodes])
             self._describe()
+        errors = find_monitor(self.training_env).physics_errors
+        if errors:
+            self.logger.record("rollout/physics_errors", errors)
 
     def _on_training_end(self) -> None:
         if self.bar is not None:
@@ -85,8 +88,9 @@ class Epochs(BaseCallback):
         J_r, M_c and ρ_c as the paper defines them.
 
         :return: ``return``, ``cost`` and ``length``, means over the episodes of the last rollout in
-            which any ended (None if none did), their number ``episodes``, and ``cost_rate``,
-            cumulative cost ÷ steps of the whole run
+            which any ended (None if none did), their number ``episodes``, ``cost_rate``,
+            cumulative cost ÷ steps of the whole run, and ``physics_errors``, the number of episodes
+            that ended because the physics diverged
         """
         monitor = find_monitor(self.training_env)
         means = self.last.mean(axis=0).tolist() if len(self.last) else [None] * 3
@@ -96,6 +100,7 @@ class Epochs(BaseCallback):
             "cost_rate": rate,
             "episodes": len(self.last),
             "n_timesteps": self.model.num_timesteps,
+            "physics_errors": monitor.physics_errors,
         }
 
     def state(self) -> dict[str, Any]:

@@ -41,7 +41,8 @@ bench: $(VENV)/ready
 	$(BIN)/python scripts/bench_training.py
 
 docs: $(VENV)/ready
-	$(BIN)/python scripts/plot_learning.py
+	$(BIN)/python scripts/make_docs.py
+	$(BIN)/python scripts/render_gallery.py
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache

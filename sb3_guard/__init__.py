@@ -14,7 +14,13 @@ __version__ = "0.1.0"
 # public name -> the module that has it
 _EXPORTS = {
     "CPO": "sb3_guard.algorithms",
+    "PCPO": "sb3_guard.algorithms",
     "TRPO": "sb3_guard.algorithms",
+    "TRPOFAC": "sb3_guard.algorithms",
+    "TRPOIPO": "sb3_guard.algorithms",
+    "TRPOLag": "sb3_guard.algorithms",
+    "TRPOSL": "sb3_guard.algorithms",
+    "TRPOUSL": "sb3_guard.algorithms",
     "ALGORITHMS": "sb3_guard.algorithms",
     "CostEvalCallback": "sb3_guard.common.callbacks",
     "CostMonitor": "sb3_guard.common.monitor",

@@ -10,10 +10,10 @@ import numpy as np
 import yaml
 
 from sb3_guard.envs import GuardVectorEnv
-from sb3_guard.envs.parameters import did_you_mean
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.list import table
+from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, one_line, run
 
 EXAMPLES = """examples:

@@ -12,40 +12,46 @@ from scipy.optimize import linprog
 class LinearCostBandit(gym.Env):
     """One continuous decision: a quadratic reward under a linear cost, solved by projection.
 
-    Reward ``1 - |a - target|²``, cost ``normal · a + offset``; every episode is one step.
+    Reward ``1 - |a - target|²``, cost ``normal · a + offset``; every episode is one step. With
+    several offsets there are as many contexts, drawn at random and observed one-hot, which differ
+    in nothing else.
 
     :param target: action of highest reward, shape (n,), inside the box [-1, 1]ⁿ
     :param normal: cost gradient, shape (n,)
-    :param offset: cost of the zero action
+    :param offset: cost of the zero action, one number or one per context
     """
 
     def __init__(
         self,
         target: Sequence[float] = (0.6, 0.4),
         normal: Sequence[float] = (1.0, 1.0),
-        offset: float = 0.5,
+        offset: float | Sequence[float] = 0.5,
     ) -> None:
         self.target = np.asarray(target, dtype=np.float64)
         self.normal = np.asarray(normal, dtype=np.float64)
         self.offset = offset
-        self.observation_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.contexts = np.eye(np.size(offset), dtype=np.float32)
+        self.context = 0
+        self.observation_space = spaces.Box(-1.0, 1.0, (np.size(offset),), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, self.target.shape, np.float32)
 
-    def optimum(self, limit: float) -> np.ndarray:
+    def optimum(self, limit: float, context: int = 0) -> np.ndarray:
         """Action of highest reward whose cost is at most ``limit``, shape (n,)."""
-        excess = max(0.0, float(self.normal @ self.target) + self.offset - limit)
+        offset = np.ravel(self.offset)[context]
+        excess = max(0.0, float(self.normal @ self.target) + offset - limit)
         return self.target - excess / (self.normal @ self.normal) * self.normal
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
-        return np.ones(1, np.float32), {}
+        self.context = int(self.np_random.integers(len(self.contexts)))
+        return self.contexts[self.context], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         reward = 1.0 - float(np.sum((action - self.target) ** 2))
-        cost = float(self.normal @ action) + self.offset
-        return np.ones(1, np.float32), reward, True, False, {"cost": cost}
+        cost = float(self.normal @ action + np.ravel(self.offset)[self.context])
+        return self.contexts[self.context], reward, True, False, {"cost": cost}
 
 
 class TabularCMDP(gym.Env):
@@ -145,6 +151,37 @@ class TabularCMDP(gym.Env):
         # The observation that ends an episode is never acted on: any number of the space will do.
         observation = 0 if done else self._time * self.n_states + self._state
         return observation, reward, done, False, info
+
+
+class Wall(gym.Env):
+    """A point on a line that is paid to move right, until a wall makes it cost: state-wise safety.
+
+    Observation: position, metres; action: displacement in tenths of a metre. Reward: metres moved.
+    Cost: depth beyond the wall at 0. Episodes start between -1 and -0.5 and are cut after 30 steps,
+    in which an unconstrained agent gets 2 metres beyond the wall.
+    """
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-2.0, 3.0, (1,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.position = 0.0
+        self.steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.position = float(self.np_random.uniform(-1.0, -0.5))
+        self.steps = 0
+        return np.array([self.position], np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        moved = 0.1 * float(np.clip(action[0], -1.0, 1.0))
+        self.position = float(np.clip(self.position + moved, -2.0, 3.0))
+        self.steps += 1
+        cost = max(0.0, self.position)
+        observation = np.array([self.position], np.float32)
+        return observation, moved, False, self.steps >= 30, {"cost": cost}
 
 
 class CostPoint(gym.Env):

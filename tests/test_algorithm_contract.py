@@ -23,17 +23,21 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_guard.algorithms import ALGORITHMS, CPO, TRPO, TrustRegion
+from sb3_guard.algorithms import ALGORITHMS, CPO, TRPO, TRPOSL, TRPOUSL, TrustRegion
 from sb3_guard.algorithms.common.buffers import CostRolloutBuffer
 from sb3_guard.algorithms.common.critics import CostCritic
 
 CLASSES = list(ALGORITHMS.values())
+FILTERED = (TRPOSL, TRPOUSL)
 BOX = spaces.Box(-1.0, 1.0, (3,), np.float32)
 IMAGE = spaces.Box(0, 255, (36, 36, 1), np.uint8)
 
 
 def small(cls: type[TrustRegion], env: Any, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
     defaults = {"n_steps": 40, "n_critic_updates": 3, "seed": 0, "device": "cpu"}
+    if cls in FILTERED:
+        # Switched on after the first rollout, whatever its length: by then it has learnt something.
+        defaults["warmup"] = 1
     return cls(policy, env, **{**defaults, **kwargs})
 
 
@@ -64,38 +68,42 @@ def assert_equal(a: Any, b: Any) -> None:
 # Spaces
 
 
+MOVES = spaces.Box(-2.0, 2.0, (2,), np.float32)
+OBSERVATIONS: dict[str, spaces.Space] = {
+    "box": BOX,
+    "matrix": spaces.Box(-1.0, 1.0, (2, 2), np.float64),
+    "discrete": spaces.Discrete(4),
+    "multidiscrete": spaces.MultiDiscrete([2, 3]),
+    "multibinary": spaces.MultiBinary(3),
+    "dict": spaces.Dict({"a": BOX, "b": spaces.Discrete(3)}),
+}
+ACTIONS: dict[str, spaces.Space] = {
+    "matrix": spaces.Box(-1.0, 3.0, (2, 2), np.float32),
+    "discrete": spaces.Discrete(3),
+    "multidiscrete": spaces.MultiDiscrete([2, 3]),
+    "multibinary": spaces.MultiBinary(3),
+}
+
+
 @pytest.mark.parametrize("cls", CLASSES)
 @pytest.mark.parametrize(
-    "action_space",
-    [
-        spaces.Box(-2.0, 2.0, (2,), np.float32),
-        spaces.Discrete(3),
-        spaces.MultiDiscrete([2, 3]),
-        spaces.MultiBinary(3),
-    ],
-    ids=lambda space: type(space).__name__,
-)
-@pytest.mark.parametrize(
-    ("policy", "observation_space"),
-    [
-        ("MlpPolicy", BOX),
-        ("MlpPolicy", spaces.Box(-1.0, 1.0, (2, 2), np.float64)),
-        ("MlpPolicy", spaces.Discrete(4)),
-        ("MlpPolicy", spaces.MultiDiscrete([2, 3])),
-        ("MlpPolicy", spaces.MultiBinary(3)),
-        ("MultiInputPolicy", spaces.Dict({"a": BOX, "b": spaces.Discrete(3)})),
-    ],
-    ids=["box", "matrix", "discrete", "multidiscrete", "multibinary", "dict"],
+    ("observation_space", "action_space"),
+    [(each, MOVES) for each in OBSERVATIONS.values()] + [(BOX, each) for each in ACTIONS.values()],
+    ids=[f"of-{name}" for name in OBSERVATIONS] + [f"to-{name}" for name in ACTIONS],
 )
 def test_spaces(
     cls: type[TrustRegion],
-    policy: str,
     observation_space: spaces.Space,
     action_space: spaces.Space,
     tmp_path: Path,
 ) -> None:
     """Train, save, load, and act as before."""
+    policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
     env = make_vec_env(lambda: RandomCostEnv(observation_space, action_space), 2, seed=0)
+    if cls in FILTERED and not isinstance(action_space, spaces.Box):
+        with pytest.raises(ValueError, match=f"{cls.__name__} corrects actions of a Box, not of"):
+            small(cls, env, policy)
+        return
     model = small(cls, env, policy).learn(160)
     observation = env.reset()
     action, _ = model.predict(observation, deterministic=True)
@@ -152,7 +160,7 @@ def test_what_a_model_is(cls: type[TrustRegion]) -> None:
     assert isinstance(model, OnPolicyAlgorithm)
     assert isinstance(model.rollout_buffer, CostRolloutBuffer)
     assert hasattr(model, "cost_critic") is cls.uses_cost_critic
-    assert cls.uses_cost_critic is (cls is not TRPO)
+    assert cls.uses_cost_critic is (cls not in (TRPO, *FILTERED))
     if cls.uses_cost_critic:
         assert isinstance(model.cost_critic, CostCritic)
         optimizers = {id(model.policy.optimizer), id(model.cost_critic.optimizer)}
@@ -348,7 +356,7 @@ def test_an_unknown_argument_is_an_error() -> None:
 @pytest.mark.parametrize("cls", CLASSES)
 def test_save_and_load_keep_everything(cls: type[TrustRegion], tmp_path: Path) -> None:
     keys = ("cost", "cost_1")
-    env = points(2, cost_keys=keys)
+    env = points(2, cost_keys=keys, hazard=(-1.0, 0.0))
     model = small(cls, env, cost_keys=keys, cost_limit=(1.0, 2.0), target_kl=0.013)
     model.learn(200)
     model.save(tmp_path / "model")
@@ -363,7 +371,7 @@ def test_save_and_load_keep_everything(cls: type[TrustRegion], tmp_path: Path) -
         "cost_keys",
     ):
         assert getattr(model, name) == getattr(again, name), name
-    for name in ("cost_limits", "total_costs", "running_costs", "running_lengths"):
+    for name in ("cost_limits", "total_costs", "running_costs", "running_lengths", "last_costs"):
         np.testing.assert_array_equal(getattr(model, name), getattr(again, name), err_msg=name)
     np.testing.assert_array_equal(np.array(model.ep_cost_buffer), np.array(again.ep_cost_buffer))
     if cls.uses_cost_critic:
@@ -371,6 +379,15 @@ def test_save_and_load_keep_everything(cls: type[TrustRegion], tmp_path: Path) -
         assert th.equal(
             model.cost_critic.predict(observation), again.cost_critic.predict(observation)
         )
+    if cls in FILTERED:
+        assert model.policy.corrects and again.policy.corrects
+        assert model.policy.action_filter.optimizer.state
+    observation = env.reset()
+    for state in (None, (np.full((2, 2), 0.3),)):
+        actions = [
+            each.predict(observation, state, deterministic=True)[0] for each in (model, again)
+        ]
+        np.testing.assert_array_equal(*actions)
     again.learn(80, reset_num_timesteps=False)
     assert again.num_timesteps == model.num_timesteps + 80
 
@@ -381,6 +398,8 @@ def test_parameters_travel(cls: type[TrustRegion]) -> None:
     b.set_parameters(parameters(a))
     assert_equal(parameters(a), parameters(b))
     assert ("cost_critic" in parameters(a)) is cls.uses_cost_critic
+    assert ("multiplier" in parameters(a)) is (cls.__name__ in ("TRPOLag", "TRPOFAC"))
+    assert ("policy.action_filter.optimizer" in parameters(a)) is (cls in FILTERED)
     with pytest.raises(ValueError, match="do not match"):
         b.set_parameters({"policy": parameters(a)["policy"]})
 
@@ -428,7 +447,7 @@ def test_resumed_equals_uninterrupted(
     """Bit for bit: networks, optimizers, counters, running episodes, logs."""
 
     def env(envs: list[gym.Env] | None = None) -> VecEnv:
-        made = envs or [CostPoint(episode_length=33) for _ in range(2)]
+        made = envs or [CostPoint(episode_length=33, hazard=(-1.0, 0.0)) for _ in range(2)]
         return DummyVecEnv([lambda each=each: each for each in made])
 
     def learn(model: Any, steps: int, **more: Any) -> Any:
@@ -508,23 +527,33 @@ SB3_KEYS = {
     "rollout/ep_cost_mean",
     "rollout/cost_rate",
 }
-COST_KEYS = {
-    "train/cost_value_loss",
-    "train/cost_surrogate",
-    "train/constraint_violation",
-    "train/cpo_case",
-    "train/nu",
-    "train/lambda_kl",
+COST_CRITIC_KEYS = {"train/cost_value_loss", "train/cost_surrogate"}
+FILTER_KEYS = {"train/corrected_fraction", "train/correction_norm", "train/cost_model_loss"}
+OWN_KEYS: dict[str, set[str]] = {
+    "TRPO": set(),
+    "CPO": {"train/cpo_case", "train/nu", "train/lambda_kl"},
+    "PCPO": {"train/projection"},
+    "TRPOLag": {"train/multiplier"},
+    "TRPOFAC": {"train/multiplier", "train/multiplier_std"},
+    "TRPOIPO": {"train/multiplier"},
+    "TRPOSL": FILTER_KEYS,
+    "TRPOUSL": FILTER_KEYS,
 }
 
 
 @pytest.mark.parametrize("cls", CLASSES)
 def test_logs(cls: type[TrustRegion]) -> None:
     callback = _Dumps()
-    model = small(cls, points()).learn(240, callback=callback)
+    model = small(cls, points(2, hazard=(-1.0, 0.0))).learn(240, callback=callback)
     dump = callback.dumps[-1]
     assert SB3_KEYS <= set(dump)
-    assert (COST_KEYS <= set(dump)) is (cls is CPO)
+    expected = OWN_KEYS[cls.__name__]
+    if cls.uses_cost_critic:
+        expected = expected | COST_CRITIC_KEYS
+    if cls.constrained:
+        expected = expected | {"train/constraint_violation"}
+    found = {key for key in dump if key.startswith("train/")}
+    assert found == expected | {key for key in SB3_KEYS if key.startswith("train/")}
     assert dump["rollout/ep_cost_mean"] == pytest.approx(np.mean(model.ep_cost_buffer))
     assert dump["rollout/cost_rate"] == pytest.approx(model.total_cost / model.num_timesteps)
 
@@ -546,6 +575,8 @@ def test_learning_rate_schedules_reach_every_critic(cls: type[TrustRegion]) -> N
     model = small(cls, points(), learning_rate=lambda remaining: 0.01 * remaining).learn(160)
     assert model.logger.name_to_value["train/learning_rate"] == 0.0
     critics = [model.policy] + ([model.cost_critic] if cls.uses_cost_critic else [])
+    if cls in FILTERED:
+        critics.append(model.policy.action_filter)
     for critic in critics:
         assert critic.optimizer.param_groups[0]["lr"] == 0.0
 

@@ -4,8 +4,13 @@ import os
 import shutil
 
 import pytest
+import yaml
+from cost_envs import CostPoint
+from registered_envs import Filmed
 
-from sb3_guard import enjoy, train
+from sb3_guard import CPO, enjoy, train
+from sb3_guard.envs.rendering import RenderingError
+from sb3_guard.zoo import playback
 
 TOY = ["--gym-packages", "registered_envs", "--env", "CostPoint-v0"]
 SMALL = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3", "-n", "60", "--verbose", "0",
@@ -52,6 +57,8 @@ TRAIN = [
     (["--env-kwargs", "hazards:{'size': 'big'}"], ["size", "'big'"]),
     (["--env-kwargs", "hazards"], ["'hazards' is not of the form key:value"]),
     ([*TOY, "--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
+    (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError", "hazards"]),
+    (["--eval-env-kwargs", "hazards:{'num':200}"], ["LayoutError", "hazards"]),
     (["--env", "CostPoint-v0", "--gym-packages", "registered_envs", "--vec-env", "native"],
      ["--vec-env native", "dummy or subproc"]),
     (["--vec-env", "fast"], ["--vec-env", "'fast'", "native"]),
@@ -72,7 +79,14 @@ TRAIN = [
     (["-params", "learning_rate:-1"], ["learning_rate"]),
     (["-params", "cost_limit:[1.0,2.0]"], ["cost_limit", "cost"]),
     (["-params", "cost_limit:nan"], ["cost_limit: 'nan'"]),
-    (["-params", "policy:MlpPolcy"], ["MlpPolcy"]),
+    (["-params", "policy:MlpPolcy"], ["no policy 'MlpPolcy'", "did you mean 'MlpPolicy'?"]),
+    (["-params", "policy:Foo"], ["no policy 'Foo'", "allowed: ", "MlpPolicy", "dotted name"]),
+    (["-params", "policy:no.such.Policy"], ["there is no class 'no.such.Policy'"]),
+    (["-params", "selection_limit:[1,2]"],
+     ["selection_limit: [1.0, 2.0] has 2 entries", "one cost, cost", "give one number"]),
+    (["-params", "selection_limit:[]"], ["selection_limit: [] has 0 entries"]),
+    ([*TOY, "--env-kwargs", "cost_keys:('cost','heat')", "-params", "cost_keys:['cost','heat']",
+      "selection_limit:[1]"], ["selection_limit: [1.0]", "several costs, cost, heat"]),
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
     (["-conf", "absent.yml"], ["there is no hyper-parameter file absent.yml"]),
@@ -89,6 +103,8 @@ TRAIN = [
     (["--log-interval", "0"], ["--log-interval 0"]),
     (["--device", "abacus"], ["abacus"]),
     (["-i", "absent"], ["no run folder or model 'absent'"]),
+    ([*TOY, "-tb", "/dev/null"], ["--tensorboard-log", "'/dev/null'", "choose another"]),
+    ([*TOY, "-tb", "/proc/foo/bar"], ["--tensorboard-log", "'/proc/foo/bar'", "choose another"]),
 ]  # fmt: skip
 
 
@@ -113,6 +129,22 @@ ENJOY = [
 @pytest.mark.parametrize(("arguments", "parts"), ENJOY, ids=lambda one: " ".join(one)[:40])
 def test_enjoy(arguments, parts, capsys, empty):
     refused(enjoy.main, ["--no-render", *arguments], capsys, *parts)
+
+
+@pytest.mark.parametrize("error", [ValueError, TypeError])
+def test_constructor_of_an_environment(error, capsys, empty, monkeypatch):
+    """What a user's environment refuses is one line, however many its message has."""
+    whole = CostPoint.__init__
+
+    def refuse(self, kind="fine", **kwargs):
+        if kind != "fine":
+            raise error(f"{kind}\n  is allowed\n  nowhere")
+        whole(self, **kwargs)
+
+    monkeypatch.setattr(CostPoint, "__init__", refuse)
+    for flag in ("--env-kwargs", "--eval-env-kwargs"):
+        arguments = ["-n", "60", *TOY, flag, "kind:odd"]
+        refused(train.main, arguments, capsys, "can't make CostPoint-v0", "odd is allowed nowhere")
 
 
 def test_track_without_wandb(capsys, empty, monkeypatch):
@@ -232,6 +264,86 @@ def test_agent_of_another_environment(capsys, run, tmp_path):
     warm = [one for one in warm if one not in ("--env-kwargs", "episode_length:20")]
     arguments = [*warm, "-params", "missing_cost:zero", "-f", str(tmp_path / "new")]
     refused(train.main, arguments, capsys, "can't load")
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (lambda args: {"a": 1}, ["no proper", "algo", "seed"]),
+        (lambda args: {k: v for k, v in args.items() if k != "eval_freq"}, ["proper eval_freq;"]),
+        (lambda args: {**args, "seed": "one"}, ["proper seed;"]),
+    ],
+)
+def test_damaged_flags(change, parts, capsys, run):
+    path = run / "CostPoint-v0" / "args.yml"
+    path.write_text(yaml.safe_dump(change(yaml.safe_load(path.read_text()))))
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "args.yml is damaged", *parts)
+    assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("record", "parts"),
+    [
+        ("/proc/foo.mp4", ["--record", "'/proc'", "choose another"]),
+        ("/dev/null/foo.mp4", ["--record", "'/dev/null'", "choose another"]),
+        (".", ["'.' is a folder"]),
+    ],
+)
+def test_unwritable_video(record, parts, capsys, run, tmp_path, monkeypatch):
+    def nothing(*args, **kwargs):
+        raise AssertionError("played before the file was known to be writable")
+
+    monkeypatch.setattr(playback, "make_envs", nothing)
+    refused(enjoy.main, [*TOY, "-f", str(tmp_path), "--record", record], capsys, *parts)
+
+
+def test_playing_in_a_world_without_room(capsys, tmp_path):
+    ours = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path)]
+    small = [one for one in SMALL if one not in ("--env-kwargs", "episode_length:20")]
+    assert train.main([*ours, *small]) == 0
+    play = [*ours, "--no-render", "--env-kwargs", "hazards:{'num':200}"]
+    refused(enjoy.main, play, capsys, "Goal_Point_2Hazards-v0", "LayoutError", "hazards")
+
+
+@pytest.mark.parametrize("where", ["__init__", "reset", "render"])
+def test_no_backend_for_a_window(where, capsys, tmp_path, monkeypatch):
+    """Whatever needs OpenGL first says so on one line."""
+
+    def fail(self, *args, **kwargs):
+        raise RenderingError("no OpenGL backend works here")
+
+    filmed = [*TOY, "--env", "Filmed-v0", "-f", str(tmp_path)]
+    assert train.main([*filmed, *SMALL]) == 0
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setitem(Filmed.metadata, "render_modes", ["human"])
+    monkeypatch.setattr(Filmed, where, fail)
+    refused(enjoy.main, filmed, capsys, "RenderingError: no OpenGL backend works here")
+
+
+def test_an_update_that_is_not_a_number(capsys, tmp_path, monkeypatch):
+    """No result and no model of a run that diverged; a model that was there before stays."""
+    whole = CPO.train
+
+    def diverge(self) -> None:
+        if self.num_timesteps > 60:
+            raise FloatingPointError("value_loss is nan")
+        whole(self)
+
+    arguments = [*TOY, *SMALL, "-f", str(tmp_path)]
+    run = tmp_path / "cpo" / "CostPoint-v0_1"
+    with monkeypatch.context() as patch:
+        patch.setattr(CPO, "train", diverge)
+        refused(train.main, [*arguments, "-n", "180"], capsys, "120 steps: ", "value_loss is nan")
+        assert not (run / "result.json").exists() and not (run / "CostPoint-v0.zip").exists()
+        assert train.main(arguments) == 0
+        run = run.with_name("CostPoint-v0_2")
+        model = (run / "CostPoint-v0.zip").read_bytes()
+        refused(train.main, ["-i", str(run), "-n", "180"], capsys, "value_loss is nan")
+    assert not (run / "result.json").exists()
+    assert (run / "CostPoint-v0.zip").read_bytes() == model
+    assert train.main(["-i", str(run)]) == 0
+    assert (run / "result.json").exists()
 
 
 def test_kept_model_that_is_not_there(capsys, run, tmp_path):

@@ -1,36 +1,88 @@
-"""Both algorithms against a linear program's answer on a small finite-horizon CMDP."""
+"""Known optima: a bandit solved by projection, and a finite-horizon CMDP by a linear program."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import TabularCMDP
+from cost_envs import LinearCostBandit, TabularCMDP
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_guard.algorithms import CPO, TRPO, TrustRegion
+from sb3_guard.algorithms import CPO, PCPO, TRPO, TRPOFAC, TRPOIPO, TRPOLag, TrustRegion
 
 WORLD = 0
+# A price of the cost is a price in units of reward: as a policy settles, standardised advantages
+# would make those units ever smaller. And an episode costs about one here, so multipliers must
+# move faster than where it costs ten.
+RAW = {"normalize_advantage": False}
+SETTINGS: dict[type[TrustRegion], dict[str, Any]] = {
+    TRPO: {},
+    CPO: {},
+    PCPO: {},
+    TRPOLag: {**RAW, "lambda_lr": 0.5, "proportional_gain": 3.0},
+    TRPOIPO: {**RAW, "t": 100.0, "max_multiplier": 2.0},
+    TRPOFAC: {**RAW, "lambda_lr": 0.01, "lambda_init": 1.0},
+}
+CONSTRAINED = [CPO, PCPO, TRPOLag, TRPOIPO]
 
 
-def solve(cls: type[TrustRegion], n_costs: int, seed: int, **kwargs: Any) -> tuple[float, Any]:
+class Modes(BaseCallback):
+    """Keeps the mode of the policy, and the multipliers of TRPO-FAC, before each update."""
+
+    def __init__(self, contexts: np.ndarray) -> None:
+        super().__init__()
+        self.contexts = contexts
+        self.actions: list[np.ndarray] = []
+        self.prices: list[np.ndarray] = []
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.actions.append(self.model.predict(self.contexts, deterministic=True)[0])
+        if isinstance(self.model, TRPOFAC):
+            prices = self.model.multiplier.predict(th.as_tensor(self.contexts))
+            self.prices.append(prices[:, 0].numpy())
+
+
+def solve_bandit(
+    cls: type[TrustRegion], bandit: Any, seed: int, updates: int = 60, **kwargs: Any
+) -> Modes:
+    """Train on so many updates of 512 decisions each."""
+    settings = {
+        "n_steps": 64,
+        "target_kl": 0.05,
+        "n_critic_updates": 10,
+        "policy_kwargs": {"net_arch": [8], "log_std_init": -1.0},
+        "seed": seed,
+        **SETTINGS[cls],
+        **kwargs,
+    }
+    modes = Modes(bandit().contexts)
+    model = cls("MlpPolicy", make_vec_env(bandit, 8, seed=seed), **settings)
+    model.learn(512 * updates, callback=modes)
+    return modes
+
+
+def solve_tabular(cls: type[TrustRegion], n_costs: int, seed: int, **kwargs: Any) -> Any:
     """Train, and return the exact return and costs of the policy: no sampling error remains."""
     world = TabularCMDP(seed=WORLD, n_costs=n_costs)
     env = make_vec_env(lambda: TabularCMDP(seed=WORLD, n_costs=n_costs), 20, seed=seed)
-    model = cls(
-        "MlpPolicy",
-        env,
-        n_steps=50,
-        gamma=1.0,
-        gae_lambda=0.95,
-        target_kl=0.05,
-        learning_rate=1e-2,
-        n_critic_updates=20,
-        cost_keys=world.cost_keys,
-        seed=seed,
-        policy_kwargs={"net_arch": [32]},
+    settings = {
+        "n_steps": 50,
+        "gamma": 1.0,
+        "gae_lambda": 0.95,
+        "target_kl": 0.05,
+        "learning_rate": 1e-2,
+        "n_critic_updates": 20,
+        "cost_keys": world.cost_keys,
+        "seed": seed,
+        "policy_kwargs": {"net_arch": [32]},
+        **SETTINGS[cls],
         **kwargs,
-    ).learn(40_000)
+    }
+    model = cls("MlpPolicy", env, **settings).learn(40_000)
     with th.no_grad():
         states = th.arange(world.observation_space.n)
         policy = model.policy.get_distribution(states).distribution.probs
@@ -40,24 +92,83 @@ def solve(cls: type[TrustRegion], n_costs: int, seed: int, **kwargs: Any) -> tup
 @pytest.mark.parametrize("seed", [0, 1])
 def test_trpo_reaches_the_unconstrained_optimum(seed: int) -> None:
     best, costs = TabularCMDP(seed=WORLD).optimum()
-    value, cost = solve(TRPO, 1, seed)
+    value, cost = solve_tabular(TRPO, 1, seed)
     assert value >= 0.98 * best
     # The limit of the next test would be broken by a third.
     assert cost[0] >= 0.95 * costs[0]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize(("n_costs", "shares"), [(1, [0.75]), (2, [0.8, 0.85])])
-def test_cpo_reaches_the_constrained_optimum(seed: int, n_costs: int, shares: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("n_costs", "shares", "seed"),
+    [
+        (1, [0.75], 0),
+        (1, [0.75], 1),
+        (2, [0.8, 0.85], 0),
+        pytest.param(2, [0.8, 0.85], 1, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize("cls", CONSTRAINED)
+def test_the_constrained_optimum_is_reached(
+    cls: type[TrustRegion], n_costs: int, shares: list[float], seed: int
+) -> None:
     """Limits are shares of the unconstrained optimum's costs; each of them binds."""
     world = TabularCMDP(seed=WORLD, n_costs=n_costs)
     unconstrained, costs = world.optimum()
     limits = costs * shares
     best, _ = world.optimum(limits)
     assert best < 0.95 * unconstrained
-    value, cost = solve(CPO, n_costs, seed, cost_limit=list(limits))
+    value, cost = solve_tabular(cls, n_costs, seed, cost_limit=list(limits))
     assert value >= 0.95 * best
     assert np.all(cost <= 1.05 * limits)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("cls", CONSTRAINED)
+def test_the_bandit_ends_at_its_constrained_optimum(cls: type[TrustRegion], seed: int) -> None:
+    bandit, limit = LinearCostBandit(), 0.5
+    modes = solve_bandit(cls, LinearCostBandit, seed, cost_limit=limit)
+    (action,) = np.mean(modes.actions[-20:], axis=0)
+    best = 1 - np.sum((bandit.optimum(limit) - bandit.target) ** 2)
+    assert bandit.normal @ action + bandit.offset <= 1.05 * limit
+    assert 1 - np.sum((action - bandit.target) ** 2) >= 0.95 * best
+
+
+@pytest.mark.parametrize("t", [1.0, 10.0, 100.0])
+def test_the_barrier_keeps_its_distance(t: float) -> None:
+    """Where ``J + log(d - J_C) / t`` is greatest, and 1/t of return below the optimum.
+
+    Along the normal, from the target by s: J = 1 - 2 s² and d - J_C = 2 s - 1.
+    """
+    bandit, limit = LinearCostBandit(), 0.5
+    s = (4 * t + np.sqrt(16 * t**2 + 64 * t)) / (16 * t)
+    modes = solve_bandit(TRPOIPO, LinearCostBandit, 0, cost_limit=limit, t=t, max_multiplier=50.0)
+    cost = np.mean([bandit.normal @ action + bandit.offset for (action,) in modes.actions[-20:]])
+    assert cost == pytest.approx(1.5 - 2 * s, abs=0.02)
+    assert 0.5 / t <= 2 * s**2 - 0.5 <= 1.01 / t
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_fac_keeps_the_limit_in_every_context(seed: int) -> None:
+    """Its own optimum: where the limit holds by itself nothing is given up for it elsewhere.
+
+    Multiplier and policy circle the saddle point, once in a hundred updates; the mean of a turn
+    is at it. In the first context the price is that of the bandit, 1.
+    """
+
+    def make() -> LinearCostBandit:
+        return LinearCostBandit(offset=[1.0, -1.0])
+
+    bandit, limit = make(), 1.0
+    modes = solve_bandit(TRPOFAC, make, seed, updates=120, cost_limit=limit, n_critic_updates=30)
+    turn = slice(20, 120)
+    actions = np.array(modes.actions)[turn]  # [100, 2, 2]
+    costs = (actions @ bandit.normal + bandit.offset).mean(axis=0)
+    returns = (1 - np.sum((actions - bandit.target) ** 2, axis=2)).mean(axis=0)
+    best = [1 - np.sum((bandit.optimum(limit, i) - bandit.target) ** 2) for i in range(2)]
+    assert np.all(costs <= 1.05 * limit)
+    assert returns.mean() >= 0.95 * np.mean(best)
+    prices = np.array(modes.prices)[turn].mean(axis=0)
+    assert prices[0] == pytest.approx(1.0, abs=0.2) and prices[1] < 0.25
 
 
 def test_the_world_agrees_with_its_linear_program() -> None:

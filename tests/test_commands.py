@@ -1,6 +1,7 @@
 """The commands as users type them."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_guard import CPO, cli, enjoy, train
+from sb3_guard.zoo import usage
 from sb3_guard.zoo.config import build, check
 from sb3_guard.zoo.environments import make_envs
 
@@ -314,6 +316,13 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
     assert "--env" in done.stdout
     # 0.5 s on an idle machine; generous, since tests run side by side.
     assert time.monotonic() - began < 10
+
+
+def test_threads_wait_without_spinning(monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    assert usage.run(lambda: int(os.environ["OMP_WAIT_POLICY"] != "PASSIVE")) == 0
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    assert usage.run(lambda: int(os.environ["OMP_WAIT_POLICY"] != "ACTIVE")) == 0
 
 
 def test_dispatcher(capsys, tmp_path):

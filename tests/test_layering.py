@@ -81,6 +81,7 @@ def test_the_pure_modules_know_only_numpy(name):
     if module not in MODULES:
         pytest.skip("this module does not exist yet")
     pure = {f"sb3_guard.envs.{n}" for n in ("geometry", "layout", "sensors", "parameters")}
+    pure.add("sb3_guard.spelling")
     assert touches(module, "sb3_guard") <= {
         i for i in imports(MODULES[module], module) if any(i.startswith(p) for p in pure)
     }
@@ -96,10 +97,13 @@ def test_parts_do_not_know_each_other_nor_the_engine():
 
 
 def test_only_the_bridge_imports_both_worlds():
+    from sb3_guard.cli import COMMANDS
+
+    commands = tuple(f"sb3_guard.{command}" for command in COMMANDS)
     both = [
         m
         for m in MODULES
-        if not m.startswith(("sb3_guard.zoo",))
+        if not m.startswith(("sb3_guard.zoo", *commands))
         and touches(m, "sb3_guard.envs")
         and touches(m, "stable_baselines3", "torch")
     ]
@@ -107,7 +111,9 @@ def test_only_the_bridge_imports_both_worlds():
 
 
 def test_nothing_imports_the_zoo_but_the_commands():
-    commands = {f"sb3_guard.{c}" for c in ("train", "enjoy", "cli", "tune", "benchmark", "plot")}
+    from sb3_guard.cli import COMMANDS
+
+    commands = {"sb3_guard.cli", *(f"sb3_guard.{command}" for command in COMMANDS)}
     for module in MODULES:
         if module.startswith("sb3_guard.zoo") or module in commands:
             continue

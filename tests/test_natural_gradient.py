@@ -271,3 +271,11 @@ def test_parallel_gradients(sign: float) -> None:
         assert reached == pytest.approx(-problem.c[0], rel=1e-8)
     else:
         assert 0.5 * x @ problem.F @ x == pytest.approx(problem.delta, rel=1e-8)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-9])
+def test_a_violation_without_a_usable_gradient_gives_no_step(size):
+    g, b = th.tensor([1.0, -2.0, 0.5]), size * th.tensor([[0.3, 1.0, -1.0]])
+    for c, moves in ((0.5, False), (-0.5, True), (0.0, True)):
+        x, case, *_ = constrained_step(g, b, np.array([c]), g, b, 0.02)
+        assert bool(x.any()) == moves, (case, x)

@@ -124,3 +124,29 @@ def test_the_robots_own_camera_can_be_observed():
         gymnasium.make("Goal_Point_8Hazards-v0", observe={"camera": [32, 24]})
     env.close()
     batch.close()
+
+
+@pytest.mark.parametrize("backend", ["glfw", "foo", "osmesa"])
+def test_a_forced_backend_that_does_not_work_is_one_line(backend, tmp_path):
+    import os
+    import subprocess
+    import sys
+
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    code = (
+        "from sb3_guard.envs import make\n"
+        "env = make('Goal_Point_8Hazards', render_mode='rgb_array')\n"
+        "env.reset(seed=0); env.render()"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**environment, "MUJOCO_GL": backend},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if run.returncode == 0:
+        pytest.skip(f"{backend} works here")
+    last = run.stderr.strip().splitlines()[-1]
+    assert "MUJOCO_GL" in last and ("RenderingError" in last or "ImportError" in last), last

@@ -4,8 +4,8 @@ import pytest
 
 from sb3_guard.envs import Scenario, env_ids, registry
 from sb3_guard.envs.constraints import Hazards
-from sb3_guard.envs.parameters import did_you_mean
 from sb3_guard.envs.tasks import Goal
+from sb3_guard.spelling import did_you_mean
 
 
 @pytest.mark.parametrize("env_id", env_ids())

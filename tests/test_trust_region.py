@@ -462,3 +462,56 @@ def test_timing_is_split(cls: type[TrustRegion]) -> None:
     model = _toy(cls).learn(200)
     assert set(model.timing) == {"collect", "actor", "critics"}
     assert all(seconds > 0.0 for seconds in model.timing.values())
+
+
+class _StopAt(BaseCallback):
+    def __init__(self, step: int) -> None:
+        super().__init__()
+        self.step = step
+
+    def _on_step(self) -> bool:
+        return self.num_timesteps < self.step
+
+
+def test_a_callback_that_stops_a_rollout_loses_no_cost():
+    env = make_vec_env(lambda: CostPoint(episode_length=50), 2)
+    model = TRPO("MlpPolicy", env, n_steps=20, n_critic_updates=1, seed=0)
+    seen: list[float] = []
+
+    class Count(_StopAt):
+        def _on_step(self) -> bool:
+            seen.extend(info["cost"] for info in self.locals["infos"])
+            return super()._on_step()
+
+    model.learn(200, callback=Count(50))
+    assert model.num_timesteps == 50
+    assert model.running_lengths is not None and model.running_lengths.tolist() == [25, 25]
+    assert model.total_cost == pytest.approx(sum(seen))
+
+
+def test_numbers_that_are_not_finite_stop_the_training():
+    class Broken(CostPoint):
+        def step(self, action: np.ndarray) -> Any:
+            obs, _, *rest = super().step(action)
+            return obs, np.nan, *rest
+
+    model = TRPO("MlpPolicy", make_vec_env(Broken, 2), n_steps=20, n_critic_updates=2)
+    with pytest.raises(FloatingPointError, match="value_loss is nan after update 1: a reward"):
+        model.learn(40)
+    assert all(bool(th.isfinite(p).all()) for p in actor_parameters(model.policy))
+
+
+def test_the_horizon_of_the_last_ended_episode_is_remembered():
+    env = make_vec_env(lambda: CostPoint(episode_length=30), 1)
+    model = CPO("MlpPolicy", env, n_steps=20, n_critic_updates=1, cost_limit=3.0)
+    model.learn(40)  # the episode ends in the second rollout
+    assert model.costs is not None and model.costs.horizon == 30
+    model.learn(10, reset_num_timesteps=False)  # none ends in the third: steps 41 to 60 end one
+    model.learn(20, reset_num_timesteps=False)
+    assert model.costs.horizon == 30
+    rollout = make_vec_env(lambda: CostPoint(episode_length=1000), 1)
+    model.set_env(rollout)
+    model.learn(20, reset_num_timesteps=False)  # nothing ends
+    assert model.costs.horizon == 30
+    mean = model.rollout_buffer.costs.mean()
+    assert model.costs.violation[0] == pytest.approx(mean - 3.0 / 30)

@@ -86,7 +86,11 @@ def test_wrappers_and_normalisation_work():
         ("CartPole-v1", {"vec_env": "native"}, "not an sb3_guard environment"),
         ("CartPole-v1", {"vec_env": "sub"}, "unknown vec_env 'sub': did you mean 'subproc'"),
         ("Goal_Point_8Hazards", {"n_envs": 0}, "n_envs = 0 must be an integer of at least 1"),
-        ("Goal_Point_8Hazards", {"num_threads": 0}, "num_threads = 0 must be at least 1"),
+        (
+            "Goal_Point_8Hazards",
+            {"num_threads": 0},
+            "num_threads = 0 must be an integer of at least 1",
+        ),
         (
             "Goal_Point_8Hazards",
             {"vec_env": "native", "wrapper_class": gymnasium.wrappers.ClipReward},
@@ -119,3 +123,59 @@ def test_diverged_episodes_are_counted():
     assert dones.tolist() == [False, True, False] and infos[1]["physics_error"]
     assert infos[1]["TimeLimit.truncated"] is False and np.isfinite(infos[1]["episode"]["r"])
     assert env.physics_errors == 1 and env.state()["physics_errors"] == 1
+
+
+def test_an_episode_that_ends_at_its_goal_is_not_called_truncated():
+    env = make_vec_env("Goal_Point_8Hazards_noconti", 2, seed=0)
+    env.reset()
+    engine = env.unwrapped.envs.engine
+    engine.places("goal")[0, 0, :2] = engine.robot.position[0, :2]
+    _, _, dones, infos = env.step(np.zeros((2, 2)))
+    assert dones.tolist() == [True, False]
+    assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
+
+
+def test_a_seed_counts_for_one_reset():
+    env = make_vec_env("Goal_Point_8Hazards", 2, seed=0)
+    first = env.reset()
+    second = env.reset()
+    assert not np.array_equal(first, second)
+    env.seed(0)
+    np.testing.assert_array_equal(env.reset(), first)
+
+
+def test_everything_that_a_registration_says_is_honoured():
+    gymnasium.register(
+        "Registered-v0",
+        entry_point="sb3_guard.envs.gym_env:GuardEnv",
+        max_episode_steps=7,
+        kwargs={"scenario": "Goal_Point_8Hazards", "hazards": {"num": 2}, "flatten": False},
+    )
+    try:
+        native = make_vec_env("Registered-v0", 1)
+        assert native.get_attr("scenario")[0].constraints == {"hazards": {"num": 2}}
+        assert native.get_attr("max_episode_steps") == [7]
+        assert isinstance(native.observation_space, gymnasium.spaces.Dict)
+        assert native.unwrapped.spec.id == "Registered-v0"
+        assert make_vec_env("Registered-v0", 1, max_episode_steps=9).get_attr(
+            "max_episode_steps"
+        ) == [9]
+        assert gymnasium.spec("Registered-v0").max_episode_steps == 7
+    finally:
+        del gymnasium.registry["Registered-v0"]
+
+
+def test_native_environments_can_be_copied():
+    import copy
+
+    env = GuardVecEnv("Goal_Point_8Hazards", 2)
+    env.seed(0)
+    env.reset()
+    twin = copy.deepcopy(env)
+    for _ in range(3):
+        np.testing.assert_array_equal(env.step(np.ones((2, 2)))[0], twin.step(np.ones((2, 2)))[0])
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+        GuardVecEnv("Goal_Point_8Hazards", 2).step(np.zeros((2, 2)))

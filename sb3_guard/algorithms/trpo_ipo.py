@@ -1,5 +1,6 @@
 """TRPO-IPO: a logarithmic barrier keeps the policy away from the cost limits."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,8 @@ def barrier(excess: th.Tensor, t: float, slope: float) -> th.Tensor:
     """
     margin = 1.0 / (t * slope)
     inside = th.log((-excess).clamp(min=margin)) / t
-    return inside - slope * (excess + margin).clamp(min=0.0)
+    tangent = math.log(margin) / t - slope * (excess + margin)
+    return th.where(excess <= -margin, inside, tangent)
 
 
 class TRPOIPO(TrustRegion):

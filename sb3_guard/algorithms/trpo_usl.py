@@ -55,7 +55,7 @@ class TRPOUSL(FilteredTrustRegion):
         *,
         warmup: int | float = 1 / 3,
         threshold: float | Sequence[float] | None = None,
-        tolerance: float = 0.01,
+        tolerance: float = 0.05,
         steps: int = 20,
         rate: float = 0.05,
         kappa: float = 0.0,
@@ -112,7 +112,7 @@ class TRPOUSL(FilteredTrustRegion):
     def _targets(
         self, batch: CostRolloutBufferSamples, actions: th.Tensor, gamma: float
     ) -> th.Tensor:
-        """``c + γ Q(s', a')`` of every transition, shape [N, m]."""
+        """λ-returns of the costs along the executed actions, shape [N, m]."""
         assert self._last_obs is not None and self._last_episode_starts is not None
         buffer = self.rollout_buffer
         shape = (buffer.n_envs, buffer.buffer_size, len(self.cost_keys))
@@ -127,17 +127,17 @@ class TRPOUSL(FilteredTrustRegion):
             tensor, _ = self.policy.obs_to_tensor(observation)
             costs[step, i] += gamma * self._value_ahead(tensor)[0]
         last = self._value_ahead(obs_as_tensor(self._last_obs, self.device))
-        # A one-step error plus the value it was measured from is the one-step target.
-        errors = gae(
+        # An advantage plus the value it was measured from is the return it was estimated from.
+        advantages = gae(
             costs,
             values,
             buffer.episode_starts,
             last,
             self._last_episode_starts,
             gamma,
-            0.0,
+            buffer.cost_gae_lambda,
         )
-        targets = (values + errors).swapaxes(0, 1).reshape(-1, shape[2])
+        targets = (values + advantages).swapaxes(0, 1).reshape(-1, shape[2])
         return th.as_tensor(targets, device=self.device)
 
     @th.no_grad()

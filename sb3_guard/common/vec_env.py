@@ -2,22 +2,30 @@
 
 :func:`make_vec_env` is what training, evaluation and notebooks call. For an environment of ours it
 makes a :class:`GuardVecEnv`, which steps all environments in one call on one batch of simulations.
+Ours are imported where they are used: environments of others work where MuJoCo is older than 4.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-import sb3_guard.envs as envs
+from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
 from sb3_guard.common.monitor import CostMonitor
-from sb3_guard.envs.parameters import did_you_mean
-from sb3_guard.envs.scenario import Scenario
+from sb3_guard.spelling import did_you_mean
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from sb3_guard.envs.scenario import Scenario
 
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {
     "dummy": DummyVecEnv,
@@ -26,25 +34,41 @@ VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {
 _OURS = "sb3_guard.envs.gym_env:GuardEnv"
 
 
+def _our_envs(env_id: str | Scenario) -> ModuleType:
+    """``sb3_guard.envs``, or an error that says why ``env_id`` can't be looked up in it."""
+    try:
+        import sb3_guard.envs
+    except ImportError as error:
+        raise DependencyNotInstalled(
+            f"unknown environment {env_id!r}: it is not registered with Gymnasium, and sb3_guard's "
+            f"own environments need MuJoCo 4 or newer ({error})"
+        ) from error
+    return sb3_guard.envs
+
+
 def find_scenario(env_id: str | Scenario) -> Scenario | None:
     """The scenario that an id stands for, or None for an environment that is not ours.
 
-    :param env_id: a registered id, an id of ours with or without ``-v0``, or a scenario
+    :param env_id: a registered id, one of Safety-Gymnasium, an id of ours with or without ``-v0``,
+        or a scenario
     :raises ValueError: nothing of that name is known, with the nearest match
+    :raises gymnasium.error.DependencyNotInstalled: the package that has it is absent or too old
     """
-    if isinstance(env_id, Scenario):
+    if not isinstance(env_id, str):
         return env_id
     for name in (env_id, f"{env_id}-v0"):
         spec = gymnasium.registry.get(name)
         if spec is not None:
             if spec.entry_point != _OURS:
                 return None
+            scenario: type[Scenario] = _our_envs(env_id).Scenario
             what = spec.kwargs["scenario"]
-            return Scenario.parse(what) if isinstance(what, str) else Scenario(**what)
-    if ":" in env_id:  # "module:Env-v0" makes gymnasium import the module first
-        return None
+            return scenario.parse(what) if isinstance(what, str) else scenario(**what)
+    if ":" in env_id or is_safety_gymnasium(env_id):
+        return None  # of "module:Env-v0" gymnasium imports the module first
+    envs = _our_envs(env_id)
     try:
-        return Scenario.parse(env_id)
+        return envs.Scenario.parse(env_id)
     except ValueError as error:
         if "is not an id of the form" not in str(error):
             raise
@@ -65,16 +89,24 @@ class GuardVecEnv(VecEnv):
 
     :param scenario: an id, a scenario or its plain data
     :param num_envs: number of environments N
+    :param spec: what Gymnasium calls it, if it is registered
     :param kwargs: as for :class:`~sb3_guard.envs.vector_env.GuardVectorEnv`
     """
 
     def __init__(
-        self, scenario: str | Mapping[str, Any] | Scenario, num_envs: int = 1, **kwargs: Any
+        self,
+        scenario: str | Mapping[str, Any] | Scenario,
+        num_envs: int = 1,
+        spec: EnvSpec | None = None,
+        **kwargs: Any,
     ) -> None:
+        import sb3_guard.envs as envs
+
         self.envs = envs.GuardVectorEnv(num_envs, scenario, **kwargs)
-        # algorithms read the length of an episode from it
-        self.envs.spec = envs.env_spec(self.envs.scenario)
-        self.envs.spec.max_episode_steps = self.envs.max_episode_steps
+        # algorithms read the length of an episode from it; a registered one is not ours to change
+        self.spec = copy.deepcopy(spec or envs.env_spec(self.envs.scenario))
+        self.spec.max_episode_steps = self.envs.max_episode_steps
+        self.envs.spec = self.spec
         self.render_mode = self.envs.render_mode  # read by VecEnv.__init__
         super().__init__(
             num_envs, self.envs.single_observation_space, self.envs.single_action_space
@@ -95,9 +127,11 @@ class GuardVecEnv(VecEnv):
         t = self.envs.advance(self._actions)
         out = t.outcome
         # new dictionaries every step: Stable-Baselines3 keeps the ones it is given
-        names = ("cost", *out.costs)
+        names = ("cost", *out.costs, "TimeLimit.truncated")
         table = np.stack([out.cost, *out.costs.values()], axis=1).tolist()
-        infos: list[dict[str, Any]] = [dict(zip(names, row, strict=True)) for row in table]
+        infos: list[dict[str, Any]] = [
+            dict(zip(names, (*row, False), strict=True)) for row in table
+        ]
         for name, rows in (
             ("goal_met", out.goal_met),
             ("goal_unplaced", out.unplaced),
@@ -166,8 +200,8 @@ def make_vec_env(
 ) -> VecEnv:
     """Make environments for Stable-Baselines3, with episode statistics that include the cost.
 
-    :param env_id: an id of ours (the version may be left out), a scenario, or any id registered
-        with Gymnasium
+    :param env_id: an id of ours (the version may be left out), a scenario, any id registered with
+        Gymnasium, or one of Safety-Gymnasium where that package is installed
     :param n_envs: how many; 30 is a good number for training
     :param seed: the environments get seed, seed + 1, …
     :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"``
@@ -181,6 +215,7 @@ def make_vec_env(
     :param monitor_kwargs: further arguments of the monitor, such as ``{"cost_keys": ("a", "b")}``
     :return: the environments, wrapped in :class:`~sb3_guard.common.monitor.CostMonitor`
     :raises ValueError: unknown names or bad values, with what is allowed
+    :raises gymnasium.error.DependencyNotInstalled: the package that has the environment is absent
     """
     if isinstance(n_envs, bool) or not isinstance(n_envs, (int, np.integer)) or n_envs < 1:
         raise ValueError(f"n_envs = {n_envs!r} must be an integer of at least 1")
@@ -190,28 +225,39 @@ def make_vec_env(
     if max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
     scenario = find_scenario(env_id)
-    vec_env = vec_env or ("dummy" if scenario is None or wrapper_class else "native")
+    spec = None if scenario is None else _our_envs(env_id).env_spec(env_id)
+    wrapped = wrapper_class is not None or (spec is not None and spec.additional_wrappers)
+    vec_env = vec_env or ("dummy" if scenario is None or wrapped else "native")
     if vec_env not in ("native", *VEC_ENVS):
-        raise ValueError(
-            f"unknown vec_env {vec_env!r}: {did_you_mean(vec_env, ['native', *VEC_ENVS])}"
-        )
+        hint = did_you_mean(vec_env, ["native", *VEC_ENVS])
+        raise ValueError(f"unknown vec_env {vec_env!r}: {hint}")
     venv: VecEnv
     if vec_env == "native":
         if scenario is None:
             raise ValueError(
                 f"{env_id!r} is not an sb3_guard environment: use vec_env 'dummy' or 'subproc'"
             )
-        if wrapper_class is not None:
+        if wrapped:
             raise ValueError(
                 "wrapper_class needs vec_env 'dummy' or 'subproc': native envs share one batch"
             )
-        venv = GuardVecEnv(scenario, n_envs, num_threads=num_threads, **kwargs)
+        assert spec is not None
+        registered = {k: v for k, v in spec.kwargs.items() if k != "scenario"}
+        if spec.max_episode_steps is not None:
+            registered["max_episode_steps"] = spec.max_episode_steps
+        kwargs = {**registered, **kwargs}
+        venv = GuardVecEnv(scenario, n_envs, spec, num_threads=num_threads, **kwargs)
     else:
-        # a spec, not an id: other processes may not have registered it
-        spec = gymnasium.spec(str(env_id)) if scenario is None else envs.env_spec(env_id)
+        make: Callable[..., gymnasium.Env] = gymnasium.make
+        what: Any = env_id
+        if is_safety_gymnasium(str(env_id)):
+            make = make_safety_gymnasium
+        else:
+            # a spec, not an id: other processes may not have registered it
+            what = spec or gymnasium.spec(str(env_id))
 
         def one() -> gymnasium.Env:
-            env = gymnasium.make(spec, **kwargs)
+            env = make(what, **kwargs)
             return env if wrapper_class is None else wrapper_class(env)
 
         venv = VEC_ENVS[vec_env]([one] * int(n_envs))

@@ -11,6 +11,13 @@ if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get(
     # MuJoCo chooses its OpenGL backend when it is imported; without a display only EGL can work
     os.environ.setdefault("MUJOCO_GL", "egl")
 
+try:
+    import mujoco  # noqa: F401
+except (RuntimeError, AttributeError) as error:  # what a backend that is not there raises
+    raise ImportError(
+        f"mujoco does not import with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r} ({error}): "
+        "unset MUJOCO_GL, or set it to one of egl, glfw, osmesa that is installed"
+    ) from error
 import gymnasium
 from gymnasium.envs.registration import EnvSpec, parse_env_id
 

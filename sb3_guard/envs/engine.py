@@ -17,12 +17,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from gymnasium.error import ResetNeeded
 from mujoco.batch import Batch, SimulationError
 
 from sb3_guard.envs import geometry, sensors
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import ARENA, Footprint, LayoutError, Rectangle, arrange, redraw
-from sb3_guard.envs.parameters import Parameters, param
+from sb3_guard.envs.parameters import Parameters, check_count, param
 from sb3_guard.envs.part import FLOOR, Array, Constraint, Part, Robot, Task
 from sb3_guard.envs.sensors import Channel, Lidar
 
@@ -181,14 +182,9 @@ class Engine:
         layout: Layout | None = None,
         extras: Extras | None = None,
     ) -> None:
-        if (
-            isinstance(num_envs, bool)
-            or not isinstance(num_envs, (int, np.integer))
-            or num_envs < 1
-        ):
-            raise ValueError(f"num_envs = {num_envs!r} must be an integer of at least 1")
-        if num_threads is not None and num_threads < 1:
-            raise ValueError(f"num_threads = {num_threads!r} must be at least 1, or None")
+        check_count("num_envs", num_envs)
+        if num_threads is not None:
+            check_count("num_threads", num_threads)
         self.robot, self.task, self.constraints = robot, task, tuple(constraints)
         self.extras = extras or Extras()
         self.parts: tuple[Part, ...] = (robot, task, *self.constraints, self.extras)
@@ -214,6 +210,8 @@ class Engine:
         self.rngs = [np.random.default_rng() for _ in range(self.num_envs)]
         self._arrays: dict[str, Array] = {}
         self.steps = self.array("steps", dtype=np.int64)
+        self.steps[:] = -1  # no episode has begun
+        self._begun = False
         self.footprints: dict[str, Footprint] = {}
         self._owners: dict[str, Part] = {}
         for part in self.parts:
@@ -367,6 +365,7 @@ class Engine:
             )
         self._before[ids] = self.task.measure()[ids]
         self._warned[ids] = self._warnings[ids]
+        self._begun = self._begun or bool((self.steps >= 0).all())
 
     def observe(self) -> Array:
         """The flat observation of every row, [N, D] float32, a new array."""
@@ -381,7 +380,10 @@ class Engine:
 
         :param actions: [N, action_size]; values outside [−1, 1] are clipped
         :raises ValueError: actions of the wrong shape or not finite
+        :raises gymnasium.error.ResetNeeded: no episode has begun
         """
+        if not self._begun:
+            raise ResetNeeded("call reset() before step()")
         actions = np.asarray(actions, dtype=float)
         shape = (self.num_envs, self.robot.action_size)
         if actions.shape != shape:
@@ -461,6 +463,7 @@ class Engine:
         self._origins = dict(state["origins"])
         self.batch.forward(stage=STAGE)
         self._warned[:] = self._warnings
+        self._begun = bool((self.steps >= 0).all())
 
 
 def _generator(state: Mapping[str, Any]) -> np.random.Generator:

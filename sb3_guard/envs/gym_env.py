@@ -9,11 +9,12 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from sb3_guard.envs.engine import Engine, Outcome
+from sb3_guard.envs.engine import FRAME_SKIP, Engine, Outcome
 from sb3_guard.envs.extras import EYE
-from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.envs.parameters import check_count
 from sb3_guard.envs.rendering import CAMERAS, Renderer
 from sb3_guard.envs.scenario import Scenario
+from sb3_guard.spelling import did_you_mean
 
 Array = np.ndarray
 ROW = np.zeros(1, dtype=np.int32)
@@ -57,13 +58,113 @@ def action_space(engine: Engine) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (engine.robot.action_size,), np.float32)
 
 
-def check_render_mode(render_mode: str | None, allowed: list[str]) -> str | None:
-    """Refuse an unknown render mode."""
-    if render_mode is not None and render_mode not in allowed:
-        raise ValueError(
-            f"unknown render_mode {render_mode!r}: {did_you_mean(render_mode, allowed)}"
-        )
-    return render_mode
+class Simulated:
+    """What the lone environment and the vector environment share: an engine and ways to see it.
+
+    An engine cannot be pickled or copied; its scenario and state make it again.
+    """
+
+    scenario: Scenario
+    engine: Engine
+    render_mode: str | None
+    flatten: bool
+    metadata: dict[str, Any]
+
+    def _simulate(
+        self,
+        scenario: str | Mapping[str, Any] | Scenario,
+        params: Mapping[str, Any],
+        num_envs: int,
+        num_threads: int | None,
+        render_mode: str | None,
+        flatten: bool,
+        width: int,
+        height: int,
+        camera: str,
+    ) -> None:
+        """Check the options and run the scenario.
+
+        :raises ValueError: unknown names or bad values
+        """
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            hint = did_you_mean(render_mode, modes)
+            raise ValueError(f"unknown render_mode {render_mode!r}: {hint}")
+        if camera not in CAMERAS:
+            raise ValueError(f"unknown camera {camera!r}: {did_you_mean(camera, CAMERAS)}")
+        if not isinstance(flatten, bool):
+            raise ValueError(f"flatten = {flatten!r} must be true or false")
+        for name, value in (("width", width), ("height", height)):
+            check_count(name, value)
+        self.scenario = as_scenario(scenario, params)
+        self.render_mode, self.flatten = render_mode, flatten
+        self._num_threads = num_threads
+        self._window = (width, height, camera)
+        self._renderer: Renderer | None = None
+        self._eye: Renderer | None = None  # the robot's own camera, if it is observed
+        self.engine = self.scenario.build(num_envs, num_threads)
+        control_step = FRAME_SKIP * self.engine.model.opt.timestep
+        self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
+
+    @property
+    def observation_layout(self) -> dict[str, slice]:
+        """Where each named component lies in the flat observation."""
+        return self.engine.observation_layout
+
+    def look(self) -> Array | None:
+        """What the robots' cameras see, [N, H, W, 3] uint8, or None if that is not observed."""
+        camera = self.engine.extras.camera
+        if camera is None:
+            return None
+        if self._eye is None:
+            self._eye = Renderer(self.engine, *camera, EYE)
+        return np.stack([self._eye.frame(row) for row in range(self.engine.num_envs)])
+
+    def view(self, obs: Array, images: Array | None, row: int | None = None) -> Any:
+        """Observations as the space has them: the flat array, or its components by name.
+
+        :param obs: [N, D]
+        :param images: [N, H, W, 3], or None
+        :param row: one row instead of all
+        """
+        which = slice(None) if row is None else row
+        if self.flatten:
+            return obs[which]
+        out = {n: obs[which, where] for n, where in self.engine.observation_layout.items()}
+        if images is not None:
+            out["camera"] = images[which]
+        return out
+
+    def frame(self, row: int) -> Array:
+        """A picture of one row, [height, width, 3] uint8; never advances physics."""
+        if self._renderer is None:
+            self._renderer = Renderer(self.engine, *self._window)
+        return self._renderer.frame(row)
+
+    def _free_renderers(self) -> None:
+        for renderer in (self._renderer, self._eye):
+            if renderer is not None:
+                renderer.close()
+        self._renderer = self._eye = None
+
+    def state(self) -> dict[str, Any]:
+        """Everything the coming steps depend on; :meth:`restore` continues from it bit for bit."""
+        return self.engine.state()
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a :meth:`state` of the same scenario and number of rows."""
+        self.engine.restore(state)
+
+    def __getstate__(self) -> dict[str, Any]:
+        out = {k: v for k, v in self.__dict__.items() if k not in ("engine", "_renderer", "_eye")}
+        return {**out, "state": self.state(), "rows": self.engine.num_envs}
+
+    def __setstate__(self, out: dict[str, Any]) -> None:
+        state, rows = out.pop("state"), out.pop("rows")
+        self.__dict__.update(out)
+        self._renderer = self._eye = None
+        self.engine = self.scenario.build(rows, self._num_threads)
+        self.restore(state)
 
 
 def step_info(outcome: Outcome, row: int) -> dict[str, Any]:
@@ -80,7 +181,7 @@ def step_info(outcome: Outcome, row: int) -> dict[str, Any]:
     return info
 
 
-class GuardEnv(gymnasium.Env[Any, Array]):
+class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
     """A safe-RL environment: a robot with a task among constraints.
 
     ``step`` returns the cost of the step as ``info["cost"]``, and per constraint type as
@@ -109,24 +210,9 @@ class GuardEnv(gymnasium.Env[Any, Array]):
         camera: str = "fixed",
         **params: Any,
     ) -> None:
-        self.scenario = as_scenario(scenario, params)
-        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        if camera not in CAMERAS:
-            raise ValueError(f"unknown camera {camera!r}: {did_you_mean(camera, CAMERAS)}")
-        self.flatten = flatten
-        self.width, self.height, self.camera = width, height, camera
-        self.engine = self.scenario.build()
+        self._simulate(scenario, params, 1, None, render_mode, flatten, width, height, camera)
         self.observation_space = observation_space(self.engine, flatten)
         self.action_space = action_space(self.engine)
-        control_step = 10 * self.engine.model.opt.timestep
-        self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
-        self._renderer: Renderer | None = None
-        self._eye: Renderer | None = None  # the robot's own camera, if it is observed
-
-    @property
-    def observation_layout(self) -> dict[str, slice]:
-        """Where each named component lies in the flat observation."""
-        return self.engine.observation_layout
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -138,7 +224,7 @@ class GuardEnv(gymnasium.Env[Any, Array]):
         self.engine.reset(ROW)
         if self.render_mode == "human":
             self.render()
-        return self._view(self.engine.observe()), {}
+        return self.view(self.engine.observe(), self.look(), 0), {}
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by one control step of ten physics steps.
@@ -153,22 +239,12 @@ class GuardEnv(gymnasium.Env[Any, Array]):
         if self.render_mode == "human":
             self.render()
         return (
-            self._view(outcome.obs),
+            self.view(outcome.obs, self.look(), 0),
             float(outcome.reward[0]),
             bool(outcome.terminated[0]),
             bool(outcome.unplaced[0]),
             step_info(outcome, 0),
         )
-
-    def _view(self, obs: Array) -> Any:
-        if self.flatten:
-            return obs[0]
-        out = {name: obs[0, where] for name, where in self.engine.observation_layout.items()}
-        if self.engine.extras.camera is not None:
-            if self._eye is None:
-                self._eye = Renderer(self.engine, *self.engine.extras.camera, EYE)
-            out["camera"] = self._eye.frame(0)
-        return out
 
     def render(self) -> Array | None:
         """A frame, [height, width, 3] uint8, or a look at the window; never advances physics."""
@@ -178,35 +254,14 @@ class GuardEnv(gymnasium.Env[Any, Array]):
             )
             return None
         if self._renderer is None:
-            self._renderer = Renderer(
-                self.engine, self.width, self.height, self.camera, self.render_mode
-            )
+            self._renderer = Renderer(self.engine, *self._window, self.render_mode)
         return self._renderer.render(0)
 
     def close(self) -> None:
         """Free the renderers."""
-        for renderer in (self._renderer, self._eye):
-            if renderer is not None:
-                renderer.close()
-        self._renderer = self._eye = None
-
-    def state(self) -> dict[str, Any]:
-        """Everything the coming steps depend on; :meth:`restore` continues from it bit for bit."""
-        return self.engine.state()
+        self._free_renderers()
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a :meth:`state` of the same scenario."""
-        self.engine.restore(state)
+        super().restore(state)
         self._np_random = self.engine.rngs[0]
-
-    def __getstate__(self) -> dict[str, Any]:
-        # a Batch cannot be pickled: the scenario and the engine's state make it again
-        out = {k: v for k, v in self.__dict__.items() if k not in ("engine", "_renderer", "_eye")}
-        return {**out, "state": self.state()}
-
-    def __setstate__(self, out: dict[str, Any]) -> None:
-        state = out.pop("state")
-        self.__dict__.update(out)
-        self._renderer = self._eye = None
-        self.engine = self.scenario.build()
-        self.restore(state)

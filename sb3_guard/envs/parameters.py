@@ -7,24 +7,22 @@ value and what is allowed. Plain JSON and YAML values are enough: lists become t
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, ClassVar
 
 import numpy as np
 
+from sb3_guard.spelling import did_you_mean
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Say what ``name`` may have meant and what is allowed, for an error message."""
-    known = list(known)
-    folded = {k.lower(): k for k in known}
-    close = difflib.get_close_matches(str(name).lower(), folded, n=1, cutoff=0.5)
-    hint = f"did you mean {folded[close[0]]!r}? " if close else ""
-    return f"{hint}allowed: {', '.join(known)}"
+
+def check_count(name: str, value: Any) -> None:
+    """Refuse a value that is not an integer of at least 1."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name} = {value!r} must be an integer of at least 1")
 
 
 def param(

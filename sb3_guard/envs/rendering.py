@@ -31,7 +31,7 @@ _CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
 
 
 class RenderingError(RuntimeError):
-    """No OpenGL backend works on this machine."""
+    """No OpenGL backend works."""
 
 
 def _has_display() -> bool:
@@ -42,7 +42,7 @@ def _has_display() -> bool:
 
 @functools.cache
 def gl_backend() -> str:
-    """The OpenGL backend that works here: glfw, egl or osmesa.
+    """The OpenGL backend that works: glfw, egl or osmesa.
 
     ``MUJOCO_GL`` decides if it is set. Each candidate is tried in a process of its own, since a
     failed GLFW followed by EGL in one process aborts Python.
@@ -58,7 +58,10 @@ def gl_backend() -> str:
         candidates = ["glfw"]
     reasons = []
     for name in candidates:
-        probe = f"import mujoco.{name} as gl; c = gl.GLContext(8, 8); c.make_current(); c.free()"
+        probe = (
+            f"import mujoco, mujoco.{name} as gl; c = gl.GLContext(8, 8); c.make_current(); "
+            "mujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
+        )
         run = subprocess.run(
             [sys.executable, "-c", probe],
             env={**os.environ, "MUJOCO_GL": name},
@@ -71,7 +74,7 @@ def gl_backend() -> str:
         lines = run.stderr.strip().splitlines()
         reasons.append(f"{name} ({lines[-1] if lines else f'exit status {run.returncode}'})")
     raise RenderingError(
-        f"no OpenGL backend works here, tried {', '.join(reasons)}; install EGL (Debian: libegl1 "
+        f"no OpenGL backend works, tried {', '.join(reasons)}; install EGL (Debian: libegl1 "
         "and libegl-mesa0) or OSMesa (libosmesa6), or set MUJOCO_GL to one that works"
     )
 

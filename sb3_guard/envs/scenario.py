@@ -16,9 +16,9 @@ import numpy as np
 
 from sb3_guard.envs.engine import Engine, Layout
 from sb3_guard.envs.extras import Extras
-from sb3_guard.envs.parameters import did_you_mean
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.sensors import Lidar
+from sb3_guard.spelling import did_you_mean
 
 _ID = re.compile(
     r"(?P<task>[A-Za-z][A-Za-z0-9]*)_(?P<robot>[A-Za-z][A-Za-z0-9]*)"

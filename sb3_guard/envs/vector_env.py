@@ -13,16 +13,14 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from sb3_guard.envs.engine import Outcome
-from sb3_guard.envs.extras import EYE
 from sb3_guard.envs.gym_env import (
+    Simulated,
     action_space,
-    as_scenario,
-    check_render_mode,
     observation_space,
     step_info,
 )
+from sb3_guard.envs.parameters import check_count
 from sb3_guard.envs.registry import EPISODE_STEPS
-from sb3_guard.envs.rendering import Renderer
 from sb3_guard.envs.scenario import Scenario
 
 Array = np.ndarray
@@ -48,7 +46,7 @@ class Transition:
     final_images: Array | None = None
 
 
-class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
+class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
     """N environments stepped together; row i is a lone environment with seed + i, bit for bit.
 
     A row that ends is reset in the same step (``AutoresetMode.SAME_STEP``): its last observation
@@ -84,29 +82,17 @@ class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
         camera: str = "fixed",
         **params: Any,
     ) -> None:
-        if isinstance(max_episode_steps, bool) or max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps = {max_episode_steps!r} must be at least 1")
-        self.scenario = as_scenario(scenario, params)
-        self.render_mode = check_render_mode(render_mode, self.metadata["render_modes"])
-        self.engine = self.scenario.build(num_envs, num_threads)
+        check_count("max_episode_steps", max_episode_steps)
+        self._simulate(
+            scenario, params, num_envs, num_threads, render_mode, flatten, width, height, camera
+        )
         self.num_envs = self.engine.num_envs
         self.max_episode_steps = max_episode_steps
-        self.flatten = flatten
         self.single_observation_space = observation_space(self.engine, flatten)
         self.single_action_space = action_space(self.engine)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        control_step = 10 * self.engine.model.opt.timestep
-        self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
-        self._view_size = (width, height, camera)
-        self._renderer: Renderer | None = None
-        self._eye: Renderer | None = None
         self._everyone = np.arange(self.num_envs, dtype=np.int32)
-
-    @property
-    def observation_layout(self) -> dict[str, slice]:
-        """Where each named component lies in the flat observation."""
-        return self.engine.observation_layout
 
     def begin(self, seeds: Sequence[int | None], ids: Array | None = None) -> Array:
         """Begin episodes in rows ``ids`` (by default all); a seed renews a row's generator.
@@ -130,15 +116,6 @@ class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
             self.engine.reset(np.flatnonzero(done))
             obs, images = self.engine.observe(), self.look()
         return Transition(obs, outcome, truncated, done, images, final_images)
-
-    def look(self) -> Array | None:
-        """What the robots' cameras see, [N, H, W, 3] uint8, or None if that is not observed."""
-        camera = self.engine.extras.camera
-        if camera is None:
-            return None
-        if self._eye is None:
-            self._eye = Renderer(self.engine, *camera, EYE)
-        return np.stack([self._eye.frame(row) for row in range(self.num_envs)])
 
     def reset(
         self,
@@ -194,44 +171,12 @@ class GuardVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Array]):
             infos["final_info"], infos["_final_info"] = details, t.done
         return self.view(t.obs, t.images), out.reward, out.terminated, t.truncated, infos
 
-    def view(self, obs: Array, images: Array | None, row: int | None = None) -> Any:
-        """Observations as the space has them: the flat array, or its components by name.
-
-        :param obs: [N, D]
-        :param images: [N, H, W, 3], or None
-        :param row: one row instead of all
-        """
-        which = slice(None) if row is None else row
-        if self.flatten:
-            return obs[which]
-        out = {n: obs[which, where] for n, where in self.engine.observation_layout.items()}
-        if images is not None:
-            out["camera"] = images[which]
-        return out
-
     def render(self) -> tuple[Array, ...] | None:
         """One frame per row, [height, width, 3] uint8; never advances physics."""
         if self.render_mode is None:
             return None
         return tuple(self.frame(row) for row in range(self.num_envs))
 
-    def frame(self, row: int) -> Array:
-        """A picture of one row, [height, width, 3] uint8."""
-        if self._renderer is None:
-            self._renderer = Renderer(self.engine, *self._view_size)
-        return self._renderer.frame(row)
-
     def close_extras(self, **kwargs: Any) -> None:
         """Free the renderers."""
-        for renderer in (self._renderer, self._eye):
-            if renderer is not None:
-                renderer.close()
-        self._renderer = self._eye = None
-
-    def state(self) -> dict[str, Any]:
-        """Everything the coming steps depend on; :meth:`restore` continues from it bit for bit."""
-        return self.engine.state()
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a :meth:`state` of the same scenario and number of rows."""
-        self.engine.restore(state)
+        self._free_renderers()

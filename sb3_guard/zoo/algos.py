@@ -2,7 +2,7 @@
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import UsageError
 
 

@@ -22,7 +22,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.envs.parameters import did_you_mean
+from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import UsageError, one_line
 
 # What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
@@ -133,8 +133,8 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     """
     The same hyper-parameters with numbers in their proper type, or an error that says what to mend.
 
-    :raises UsageError: a name the algorithm does not know, a value of the wrong type, a NaN, a
-        missing ``n_timesteps``, or a count below 1
+    :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, a
+        NaN, a missing ``n_timesteps``, or a count below 1
     """
     known = {**arguments(algorithm), **RUN_KEYS}
     checked = {}
@@ -153,7 +153,13 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
                 f"it must be {_describe(known[name])}"
             ) from None
     checked.setdefault("n_envs", 1)
-    checked.setdefault("policy", "MlpPolicy")
+    policy = checked.setdefault("policy", "MlpPolicy")
+    aliases = algorithm.policy_aliases
+    if isinstance(policy, str) and "." not in policy and policy not in aliases:
+        raise UsageError(
+            f"{algo} has no policy {policy!r}; {did_you_mean(policy, aliases)}, "
+            "or the dotted name of a class"
+        )
     if "n_timesteps" not in checked:
         raise UsageError(f"n_timesteps of {algo} is not given; use the flag -n, e.g. -n 1e6")
     for name in ("n_envs", "n_timesteps", "n_steps", "batch_size"):

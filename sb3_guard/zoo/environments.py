@@ -21,14 +21,26 @@ from stable_baselines3.common.vec_env import (
     is_vecenv_wrapped,
 )
 
+from sb3_guard.common.adapters import is_safety_gymnasium
 from sb3_guard.common.vec_env import find_scenario, make_vec_env
+from sb3_guard.envs.layout import LayoutError
+from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.zoo.config import Setup
 from sb3_guard.zoo.resumable import ResumableEnv
 from sb3_guard.zoo.usage import UsageError, one_line
 
 VEC_ENVS = ("native", "dummy", "subproc")
 # What constructors of environments and models raise when their arguments are wrong.
-BAD_ARGUMENTS = (ValueError, TypeError, AssertionError, KeyError, ImportError, gym.error.Error)
+BAD_ARGUMENTS = (
+    ValueError,
+    TypeError,
+    AssertionError,
+    KeyError,
+    ImportError,
+    gym.error.Error,
+    LayoutError,
+    RenderingError,
+)
 
 
 def import_packages(names: Sequence[str]) -> None:
@@ -53,7 +65,9 @@ def canonical_id(env_id: str) -> tuple[str, bool]:
     """
     try:
         ours = find_scenario(env_id) is not None
-        if not ours and ":" not in env_id:
+        if not ours and is_safety_gymnasium(env_id):
+            env_id = env_id.removeprefix("safety_gymnasium:")
+        elif not ours and ":" not in env_id:
             gym.spec(env_id)
     except (ValueError, gym.error.Error) as error:
         raise UsageError(one_line(error)) from error

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.files import replacing
+from sb3_guard.envs.layout import LayoutError
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import (
     Checkpoints,
@@ -45,7 +46,7 @@ from sb3_guard.zoo.environments import (
 )
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.progress import Epochs, find_monitor
-from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder
+from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder, require_writable
 from sb3_guard.zoo.usage import UsageError, one_line
 
 # Flags that say how to watch or host a run, not what it is: they may change when it is resumed.
@@ -61,7 +62,8 @@ class Experiment:
     :param args: all flags of the command, with their defaults
     :param hyperparams: hyper-parameters as data, checked
     :param folder: the folder of the run to continue; None: a new run
-    :raises UsageError: the environment, the algorithm or a wrapper refuses a value
+    :raises UsageError: the environment, the algorithm or a wrapper refuses a value, or TensorBoard
+        events can't be written
     """
 
     def __init__(
@@ -79,6 +81,9 @@ class Experiment:
         self.state = None if folder is None else read_checkpoint(folder.checkpoint)
         self._saved = None if folder is None else folder.checkpoint
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
+        self._check_selection_limit()
+        if self._tensorboard_folder is not None:
+            require_writable(self._tensorboard_folder, "--tensorboard-log")
         self.vec_env = choose_vec_env(
             args["vec_env"], canonical_id(args["env"])[1], self.setup.env_wrapper is not None
         )
@@ -87,7 +92,9 @@ class Experiment:
 
             th.set_num_threads(args["num_threads"])
         set_random_seed(args["seed"])
-        self._try_environment()
+        self._try_environment(self.setup.env_kwargs)
+        if args["eval_freq"] > 0 and args["eval_env_kwargs"] is not None:
+            self._try_environment(args["eval_env_kwargs"])
         self.env = self._make_envs(self.setup.n_envs, args["seed"])
         try:
             self.model = self._make_model()
@@ -110,10 +117,19 @@ class Experiment:
             **kwargs,
         )
 
-    def _try_environment(self) -> None:
+    def _check_selection_limit(self) -> None:
+        limit = self.setup.selection_limit
+        if isinstance(limit, list) and len(limit) != len(self.cost_keys):
+            raise UsageError(
+                f"hyper-parameter selection_limit: {limit} has {len(limit)} entries, but there "
+                f"{'is one cost' if len(self.cost_keys) == 1 else 'are several costs'}, "
+                f"{', '.join(self.cost_keys)}; give one number, or a list of one per cost"
+            )
+
+    def _try_environment(self, env_kwargs: Mapping[str, Any]) -> None:
         """Make one environment and take a step, so that nothing fails later for want of a cost."""
         vec_env = "dummy" if self.vec_env == "subproc" else self.vec_env
-        env = self._make_envs(1, self.args["seed"], vec_env=vec_env)
+        env = self._make_envs(1, self.args["seed"], vec_env=vec_env, env_kwargs=env_kwargs)
         try:
             env.reset()
             env.action_space.seed(self.args["seed"])
@@ -268,12 +284,17 @@ class Experiment:
             print(summary(folder, result, time.monotonic() - began, finished))
         return 0 if finished else 128 + received[0]
 
+    @property
+    def _tensorboard_folder(self) -> Path | None:
+        name = self.args["tensorboard_log"] or ("runs" if self.args["track"] else None)
+        return Path(name) if name else None
+
     def _tensorboard(self, folder: RunFolder) -> Path | None:
-        parent = self.args["tensorboard_log"] or ("runs" if self.args["track"] else None)
-        if not parent:
+        parent = self._tensorboard_folder
+        if parent is None:
             return None
         # Of the run's own number, so that a resumed run finds it again.
-        return Path(parent) / folder.name / f"{self.algo}{folder.path.name[len(folder.name) :]}"
+        return parent / folder.name / f"{self.algo}{folder.path.name[len(folder.name) :]}"
 
     @contextmanager
     def _tracked(self, folder: RunFolder) -> Iterator[None]:
@@ -309,7 +330,7 @@ class Experiment:
             )
         except Interrupted:
             return False
-        except (ValueError, FloatingPointError) as error:
+        except (ValueError, FloatingPointError, LayoutError) as error:
             # What an environment or algorithm refuses, e.g. a NaN: its message says it all.
             if self.args["verbose"] > 1:
                 raise
@@ -418,7 +439,7 @@ def resume(given: Mapping[str, Any], defaults: Mapping[str, Any]) -> int:
     """
     folder = RunFolder.open(given["trained_agent"])
     with folder.owned():
-        saved = {**defaults, **folder.args()}
+        saved = _saved_flags(folder, defaults)
         values = folder.hyperparams()
         import_packages(saved["gym_packages"])
         _refuse_contradictions(given, saved, values, folder)
@@ -444,6 +465,22 @@ def resume(given: Mapping[str, Any], defaults: Mapping[str, Any]) -> int:
         experiment = Experiment(args, values, folder)
         folder.write_config(args, values)
         return experiment.train(folder)
+
+
+def _saved_flags(folder: RunFolder, defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """The flags a run was started with: all of them, since one guessed would be another run."""
+    saved = folder.args()
+    damaged = [
+        name
+        for name, default in defaults.items()
+        if name not in saved or (default is not None and type(saved[name]) is not type(default))
+    ]
+    if damaged:
+        raise UsageError(
+            f"{folder.params / 'args.yml'} is damaged: it has no proper {', '.join(damaged)}; "
+            "put the file back as it was, or start a new run without -i"
+        )
+    return saved
 
 
 def _refuse_contradictions(

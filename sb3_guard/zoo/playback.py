@@ -9,6 +9,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
+from sb3_guard.envs.layout import LayoutError
+from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.config import build, check
@@ -18,7 +20,7 @@ from sb3_guard.zoo.environments import (
     import_packages,
     make_envs,
 )
-from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run
+from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run, require_writable
 from sb3_guard.zoo.usage import UsageError, one_line
 
 
@@ -92,6 +94,12 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
     env_id, ours = canonical_id(args["env"])
     run = find_run(args["folder"], args["algo"], env_id, args["exp_id"])
     path, normalizer = find_model(run, args)
+    video = None
+    if args["record"] is not None:
+        video = Path(args["record"] or path.with_suffix(".mp4"))
+        if video.is_dir():
+            raise UsageError(f"--record: {str(video)!r} is a folder; name a file, such as a.mp4")
+        require_writable(video.parent, "--record")
     values = check(args["algo"], cls, run.hyperparams())
     setup = build(values)
     if args["num_threads"] > 0:
@@ -119,9 +127,6 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
     episodes = args["n_episodes"]
     if episodes is None and args["n_timesteps"] is None:
         episodes = 1 if args["record"] is not None else 5
-    video = None
-    if args["record"] is not None:
-        video = Path(args["record"] or path.with_suffix(".mp4"))
     print(f"Playing {path} on {env_id}")
     try:
         with camera(env, video, render_mode) as shoot:
@@ -135,6 +140,8 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
                 on_step=shoot,
                 on_episode=_print_episode if args["verbose"] > 0 else None,
             )
+    except (LayoutError, RenderingError) as error:
+        raise UsageError(f"can't play {env_id}: {one_line(error)}") from error
     finally:
         env.close()
     print(_means(evaluation))

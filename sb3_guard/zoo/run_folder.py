@@ -4,6 +4,7 @@ import glob
 import json
 import os
 import socket
+import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -26,6 +27,27 @@ CHECKPOINT = "checkpoint.zip"
 def folder_name(env_id: str) -> str:
     """An environment id as part of a path: no module prefix, no slashes (RL-Zoo's rule)."""
     return env_id.rsplit(":", 1)[-1].replace("/", "-")
+
+
+def require_writable(folder: Path, flag: str) -> None:
+    """
+    Find out whether a folder can be made or written to before work is lost; nothing is left there.
+
+    :param folder: it need not exist yet
+    :param flag: the flag that names it, for the message
+    :raises UsageError: no file can be made in it, or in what exists of the path to it
+    """
+    try:
+        existing = folder.absolute()
+        while not existing.exists():
+            existing = existing.parent
+        # Permission bits mean little to root and on special file systems: only trying tells.
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise UsageError(
+            f"{flag}: can't write to folder {str(folder)!r}: {error.strerror}; choose another"
+        ) from error
 
 
 class RunFolder:

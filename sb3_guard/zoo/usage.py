@@ -3,6 +3,7 @@
 import argparse
 import ast
 import difflib
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -44,11 +45,16 @@ def run(command: Callable[[], int]) -> int:
     """
     Run a command and turn what the user can put right into one line on stderr.
 
-    :return: the exit status: the command's own, 2 for a :class:`UsageError`, 130 for Ctrl-C
+    :return: the exit status: the command's own, 130 for Ctrl-C, 2 for a :class:`UsageError` or a
+        package that does not import
     """
+    # OpenMP's idle threads spin by default: on a machine shared with other work, torch's threads
+    # then wait for one another's time slices and training is ten times slower. Read when torch is
+    # imported, which the commands do later.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         return command()
-    except UsageError as error:
+    except (UsageError, ImportError) as error:  # an absent package, or no backend for MuJoCo
         print(f"error: {one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

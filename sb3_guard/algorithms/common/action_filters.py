@@ -5,6 +5,7 @@ the network's optimizer, its thresholds and whether it is switched on, so a poli
 acts the same wherever it is loaded.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.critics import Regression, StateNetwork
+from sb3_guard.algorithms.common.mlp import TanhMlp
 from sb3_guard.algorithms.common.natural_gradient import shortest
 
 
@@ -88,7 +90,7 @@ def clip_along(actions: np.ndarray, normals: np.ndarray, limits: np.ndarray) -> 
 
 
 # Weight of a squared violation against a squared change of the action, both as distances.
-_SLACK = 1e6
+_SLACK = 1e8
 
 
 def nearest_in_box(action: np.ndarray, normals: np.ndarray, limits: np.ndarray) -> np.ndarray:
@@ -219,16 +221,53 @@ class UnrolledSafetyLayer(ActionFilter):
     ) -> np.ndarray:
         with th.no_grad():
             features = self.network.extract_features(observations)
-        threshold = self.threshold.to(features)
-        a = th.as_tensor(actions).to(features).clamp(-1.0, 1.0)
+        slope = self._slope(features)
+        a = np.clip(actions, -1.0, 1.0).astype(np.float32)
         for _ in range(self.steps):
-            a.requires_grad_()
-            with th.enable_grad():
-                values = F.softplus(self.network.network(th.cat([features, a], dim=1)))
-                excess = (values - threshold).clamp(min=0.0)
-            if not excess.any():
+            down = slope(a)
+            if not down.any():
                 break
-            (slope,) = th.autograd.grad(excess.sum(), a)
-            length = slope.abs().amax(dim=1, keepdim=True)
-            a = (a.detach() - self.rate * slope / (length + 1e-8)).clamp_(-1.0, 1.0)
-        return a.detach().cpu().numpy()
+            length = np.abs(down).max(axis=1, keepdims=True)
+            a = np.clip(a - self.rate * down / (length + 1e-8), -1.0, 1.0)
+        return a
+
+    def _slope(self, features: th.Tensor) -> Callable[[np.ndarray], np.ndarray]:
+        """Gradient of ``Σ max(0, Q_i - threshold_i)`` in the actions, each [B, k].
+
+        A rollout asks for it twenty times a step: for a tanh network on the CPU it is written out,
+        which takes a quarter of autograd's time.
+        """
+        layers = TanhMlp.layers([*self.network.network])
+        threshold = self.threshold.to(features)
+        if layers is None or features.device.type != "cpu":
+
+            def differentiated(actions: np.ndarray) -> np.ndarray:
+                a = th.as_tensor(actions, device=features.device).requires_grad_()
+                with th.enable_grad():
+                    values = F.softplus(self.network.network(th.cat([features, a], dim=1)))
+                    excess = (values - threshold).clamp(min=0.0).sum()
+                return th.autograd.grad(excess, a)[0].cpu().numpy()
+
+            return differentiated
+
+        weights = [layer.weight.detach().numpy() for layer in layers]
+        biases = [layer.bias.detach().numpy() for layer in layers]
+        # The observation's share of the first layer stays the same.
+        weights[0], state = weights[0][:, -self.n_actions :], weights[0][:, : -self.n_actions]
+        biases[0] = biases[0] + features.numpy() @ state.T  # [B, hidden]
+        least = np.maximum(threshold.numpy(), 1e-30)
+        bound = least + np.log(-np.expm1(-least))  # where softplus is the threshold
+
+        def written_out(actions: np.ndarray) -> np.ndarray:
+            x, hidden = actions @ weights[0].T + biases[0], []
+            for weight, bias in zip(weights[1:], biases[1:], strict=True):
+                hidden.append(np.tanh(x, out=x))
+                x = x @ weight.T
+                x += bias
+            gradient = (x > bound) / (1.0 + np.exp(-np.maximum(x, bound)))
+            for weight, h in zip(reversed(weights[1:]), reversed(hidden), strict=True):
+                gradient = gradient @ weight
+                gradient *= 1.0 - h * h
+            return gradient @ weights[0]
+
+        return written_out

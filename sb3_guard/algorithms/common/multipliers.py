@@ -63,8 +63,8 @@ class Multiplier(nn.Module):
         :param cost: J_C, shape (m,)
         :param limit: d, shape (m,)
         """
-        now = th.as_tensor(cost)
-        violation = now - th.as_tensor(limit)
+        now = th.tensor(cost)
+        violation = now - th.tensor(limit)
         self.integral.grad = -violation
         self.optimizer.step()
         self.integral.clamp_(0.0, self.maximum)

@@ -201,7 +201,8 @@ def projected_step(
         if possible:
             pull[moves] = u / phi * scale / lengths
     if not possible:
-        y, images, pull = th.zeros_like(y), W.double(), _least_violation(gram, c, delta)
+        y, images = th.zeros_like(y), W.double()
+        pull = _least_violation(gram, c, delta, moves)
     return y - (th.as_tensor(pull, device=W.device) @ images).to(W.dtype), pull
 
 
@@ -229,7 +230,7 @@ def _solve(
     elif np.all(moves | satisfied) and _reachable(gram[1:, 1:], c, moves, delta):
         case = Case.RECOVERABLE
     else:
-        return 0.0, -_least_violation(gram[1:, 1:], c, delta), Case.LOST, 0.0, zero
+        return 0.0, -_least_violation(gram[1:, 1:], c, delta, moves), Case.LOST, 0.0, zero
     if np.all(c[moves] + trpo * gram[1:, 0][moves] <= 0.0):
         return trpo, zero, case, lambda_trpo, zero
     a, beta, lambda_kl, nu = (_closed_form if len(c) == 1 else _dual)(gram, c, moves, delta)
@@ -325,13 +326,13 @@ def _root(decreasing: Callable[[float], float], low: float, high: float) -> floa
     return float(brentq(decreasing, low, high, xtol=1e-12))
 
 
-def _least_violation(S: np.ndarray, c: np.ndarray, delta: float) -> np.ndarray:
+def _least_violation(S: np.ndarray, c: np.ndarray, delta: float, moves: np.ndarray) -> np.ndarray:
     """Weights p ≥ 0 of ``x = -Σ p_i w_i`` that minimise ``Σ max(0, c_i + b_iᵀx)²`` in the region.
 
     For a fixed multiplier μ of the trust region the dual is a non-negative least-squares problem
-    whose solution is p μ; μ by a scalar search, the KL of the step falls as it rises.
+    whose solution is p μ; μ by a scalar search, the KL of the step falls as it rises. Constraints
+    without a usable gradient, those not in ``moves``, are left alone.
     """
-    moves = np.diag(S) > 0.0
     if not moves.any():
         return np.zeros(len(c))
     normals, lengths = _unit_normals(S[np.ix_(moves, moves)])

@@ -462,6 +462,9 @@ class TrustRegion(OnPolicyAlgorithm):
         )
         if full:
             self._finish_costs()
+        else:
+            # A callback stopped training; SB3 has then counted the step but not read its infos.
+            self._update_info_buffer(callback.locals["infos"], callback.locals["dones"])
         self.timing["collect"] = time.perf_counter() - started
         return full
 
@@ -662,12 +665,24 @@ class TrustRegion(OnPolicyAlgorithm):
         loss = self._value_regression.fit(
             batch.observations, batch.returns[:, None], self.n_critic_updates, self.batch_size
         )
+        self._check_finite("value_loss", loss)
         self.logger.record("train/value_loss", loss)
         if self.uses_cost_critic:
             loss = self._cost_regression.fit(
                 batch.observations, batch.cost_returns, self.n_critic_updates, self.batch_size
             )
+            self._check_finite("cost_value_loss", loss)
             self.logger.record("train/cost_value_loss", loss)
+
+    def _check_finite(self, name: str, loss: float) -> None:
+        """
+        :raises FloatingPointError: a critic's loss is not finite, and so is what it learnt from
+        """
+        if not np.isfinite(loss):
+            raise FloatingPointError(
+                f"{name} is {loss} after update {self._n_updates + 1}: a reward or observation of "
+                f"the environment is not finite, or learning_rate={self.learning_rate!r} too high"
+            )
 
     # Logging
 

@@ -26,9 +26,10 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
-from sb3_guard.envs.parameters import did_you_mean, param
+from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Generators, Robot, Simulation, World
 from sb3_guard.envs.sensors import Channel
+from sb3_guard.spelling import did_you_mean
 
 PREFIX = "robot/"
 _SENSOR = mujoco.mjtSensor

@@ -1,0 +1,414 @@
+"""Anyone's environment: wherever it keeps its cost, here it ends up in ``info["cost"]``.
+
+Three wrappers find the cost: :class:`CostFromStep` in a sixth value of ``step``
+(Safety-Gymnasium), :class:`CostFromInfo` under other keys of ``info``, :class:`CostFromFunction`
+in a function of yours. Two use it: :class:`RemainingBudget` shows the agent what is left of a
+budget, :class:`EarlyTermination` ends the episode that overspends it. All are Gymnasium wrappers
+of single environments and need neither torch nor MuJoCo.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import pkgutil
+import re
+from collections.abc import Callable, Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import DependencyNotInstalled
+from gymnasium.utils import RecordConstructorArgs
+
+#: ``cost(obs, action, next_obs, info)``, see :class:`CostFromFunction`
+CostFunction = Callable[[Any, Any, Any, dict[str, Any]], Any]
+Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
+
+_SAFETY_GYMNASIUM_ID = re.compile(r"(safety_gymnasium:)?Safety\w+-v\d+")
+
+
+def is_safety_gymnasium(env_id: str) -> bool:
+    """Whether an id is one of Safety-Gymnasium's, to be made by :func:`make_safety_gymnasium`.
+
+    Who registered an id decides. Of one that nobody registered its form does, and if the package
+    can be imported, it has the last word. ``Safety…Gymnasium-v0``, the package's own conversion to
+    five values, belongs here too: adapting it twice changes nothing.
+
+    :raises gymnasium.error.DependencyNotInstalled: the id has the form, and the package is absent
+        or does not import
+    """
+    if env_id not in gym.registry and _SAFETY_GYMNASIUM_ID.fullmatch(env_id):
+        _import_safety_gymnasium(env_id)
+    spec = gym.registry.get(env_id.removeprefix("safety_gymnasium:"))
+    return spec is not None and str(spec.entry_point).startswith("safety_gymnasium.")
+
+
+def make_safety_gymnasium(env_id: str, **kwargs: Any) -> gym.Env:
+    """Make an environment of Safety-Gymnasium (Ji et al. 2023) that steps as Gymnasium's do.
+
+    Its registered ids can't go through :func:`gymnasium.make`, whose wrappers expect five values.
+
+    :param env_id: such as ``SafetyPointGoal1-v0``
+    :param kwargs: for ``safety_gymnasium.make``, such as ``render_mode`` or ``max_episode_steps``
+    :return: the environment; ``info["cost"]`` is the cost, its ``cost_<kind>`` entries stay
+    :raises gymnasium.error.DependencyNotInstalled: the package is absent or does not import
+    :raises gymnasium.error.NameNotFound: it has no such environment
+    """
+    package = _import_safety_gymnasium(env_id)
+    name = env_id.removeprefix("safety_gymnasium:")
+    spec = gym.registry.get(name)
+    if spec is None:
+        known = [key for key in gym.registry if _SAFETY_GYMNASIUM_ID.fullmatch(key)]
+        near = get_close_matches(name, known, n=1)
+        hint = f": did you mean {near[0]!r}?" if near else ""
+        raise gym.error.NameNotFound(f"Safety-Gymnasium has no environment {name!r}{hint}")
+    if str(spec.entry_point).endswith(":make_gymnasium_environment"):
+        return gym.make(name, **kwargs)
+    return CostFromStep(package.make(name, **kwargs))
+
+
+def _import_safety_gymnasium(env_id: str) -> Any:
+    try:
+        import safety_gymnasium  # type: ignore[import-not-found]
+    except ModuleNotFoundError as error:
+        if error.name != "safety_gymnasium":
+            raise _broken(env_id, error) from error
+        raise DependencyNotInstalled(
+            f"{env_id!r} needs the package safety-gymnasium, which is not installed. It wants "
+            "MuJoCo 2.3 and Gymnasium 0.29, so it lives in an environment of its own: "
+            "scripts/check_safety_gymnasium.py sets one up (docs/your_environment.md)"
+        ) from error
+    except Exception as error:
+        # Beside newer packages its import fails in many ways: attributes gone, dataclasses refused.
+        raise _broken(env_id, error) from error
+    return safety_gymnasium
+
+
+def _broken(env_id: str, error: Exception) -> DependencyNotInstalled:
+    reason = " ".join(str(error).split())
+    return DependencyNotInstalled(
+        f"{env_id!r} needs safety-gymnasium, which is installed but can't be imported here "
+        f"({type(error).__name__}: {reason}). It wants MuJoCo 2.3, Gymnasium 0.29 and a mended "
+        "source from Python 3.11 on: scripts/check_safety_gymnasium.py sets up an environment that "
+        "works (docs/your_environment.md)"
+    )
+
+
+def _number(value: Any, name: str) -> float:
+    """One cost as a float: an int, bool, NumPy scalar or array of one number will do."""
+    try:
+        number = float(value.item() if isinstance(value, np.ndarray) else value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, str) or not math.isfinite(number):
+        raise ValueError(f"{name} is {value!r}: a cost must be a finite number")
+    return number
+
+
+def _parts(value: Any, name: str) -> dict[str, float] | None:
+    """The costs in a dictionary, list, tuple or array by name or number; None for one number."""
+    if isinstance(value, Mapping):
+        return {str(key): _number(each, f"{name}[{key!r}]") for key, each in value.items()}
+    if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
+        return {str(i): _number(each, f"{name}[{i}]") for i, each in enumerate(value)}
+    return None
+
+
+def _charged(info: Mapping[str, Any], value: Any, name: str) -> dict[str, Any]:
+    """``info`` with the cost; several costs also one by one, as ``cost_<name or number>``."""
+    parts = _parts(value, name)
+    if parts is None:
+        return {**info, "cost": _number(value, name)}
+    named = {f"cost_{part}": cost for part, cost in parts.items()}
+    return {**info, **named, "cost": float(sum(parts.values()))}
+
+
+def _entry(info: Mapping[str, Any], key: str, missing_cost: str = "error") -> Any:
+    if key in info:
+        return info[key]
+    if missing_cost == "zero":
+        return 0.0
+    present = sorted(map(str, info))
+    near = get_close_matches(key, present, n=1)
+    hint = f" (nearest: {near[0]!r})" if near else ""
+    raise ValueError(
+        f"info has no cost key {key!r}; its keys are {present}{hint}. Name the right one; "
+        "CostFromInfo(..., missing_cost='zero') is for a key that is absent when nothing is charged"
+    )
+
+
+def _check(
+    name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, above: bool = False
+) -> float:
+    """
+    :param above: whether ``low`` itself is too low
+    :raises ValueError: ``value`` is not a finite number from ``low`` to ``high``
+    """
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    inside = number and math.isfinite(value) and low <= value <= high
+    if not inside or (above and value == low):
+        least = "" if low == -math.inf else f" above {low:g}" if above else f" of at least {low:g}"
+        most = "" if high == math.inf else f" and at most {high:g}"
+        raise ValueError(f"{name}={value!r}: must be a finite number{least}{most}")
+    return float(value)
+
+
+class CostFromStep(gym.Wrapper, RecordConstructorArgs):
+    """Turn a ``step`` of six values, the cost third, into Gymnasium's five.
+
+    That is Safety-Gymnasium's interface: ``obs, reward, cost, terminated, truncated, info``. The
+    cost becomes ``info["cost"]``; the other entries, such as ``cost_hazards`` and ``cost_sum``,
+    stay, so each of them can be limited by ``cost_keys``. A cost of several parts is split as in
+    :class:`CostFromInfo`.
+
+    :param env: an environment with the six values, made without Gymnasium's own wrappers
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: the step does not have six values, or the cost is not a number
+        """
+        values: tuple[Any, ...] = self.env.step(action)
+        if len(values) != 6:
+            raise ValueError(
+                f"step returned {len(values)} values, not six (obs, reward, cost, terminated, "
+                "truncated, info): if the cost is in info, use CostFromInfo or no adapter at all"
+            )
+        obs, reward, cost, terminated, truncated, info = values
+        return obs, reward, bool(terminated), bool(truncated), _charged(info, cost, "the cost")
+
+
+class CostFromInfo(gym.Wrapper, RecordConstructorArgs):
+    """Take the cost from other entries of ``info``, such as ``cost_sum`` or ``constraint_costs``.
+
+    ``info["cost"]`` becomes their sum. An entry may hold one number or several, in a dictionary, a
+    list or an array. Several are also reported one by one: ``{"speed": 1.0, "force": 0.5}`` as
+    ``cost_speed`` and ``cost_force``, ``[1.0, 0.5]`` as ``cost_0`` and ``cost_1``; with
+    ``cost_keys=("cost_speed", "cost_force")`` each has its own limit. With more than one key the
+    key comes first: ``cost_<key>_<name>``.
+
+    :param env: the environment
+    :param keys: entry of ``info`` that holds the cost, or several of them
+    :param missing_cost: ``"error"`` if every ``info`` must have the keys, ``"zero"`` if an absent
+        one means that nothing was charged
+    :raises ValueError: no key is given, or ``missing_cost`` is another word
+    """
+
+    def __init__(
+        self, env: gym.Env, keys: str | Sequence[str] = "cost_sum", missing_cost: str = "error"
+    ) -> None:
+        RecordConstructorArgs.__init__(self, keys=keys, missing_cost=missing_cost)
+        gym.Wrapper.__init__(self, env)
+        self.keys = (keys,) if isinstance(keys, str) else tuple(keys)
+        if not self.keys or not all(isinstance(key, str) for key in self.keys):
+            raise ValueError(f"keys={keys!r}: must be names of info entries, such as 'cost_sum'")
+        if missing_cost not in ("error", "zero"):
+            raise ValueError(f"missing_cost={missing_cost!r}: must be 'error' or 'zero'")
+        self.missing_cost = missing_cost
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: a key is missing and may not be, or its value is not a cost
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        values = {key: _entry(info, key, self.missing_cost) for key in self.keys}
+        if len(values) == 1:
+            [(key, value)] = values.items()
+            return obs, reward, terminated, truncated, _charged(info, value, f"info[{key!r}]")
+        costs: dict[str, float] = {}
+        total = 0.0
+        for key, value in values.items():
+            parts = _parts(value, f"info[{key!r}]")
+            if parts is None:
+                total += _number(value, f"info[{key!r}]")
+                continue
+            total += sum(parts.values())
+            costs.update((f"cost_{key}_{part}", cost) for part, cost in parts.items())
+        return obs, reward, terminated, truncated, {**info, **costs, "cost": total}
+
+
+class CostFromFunction(gym.Wrapper, RecordConstructorArgs):
+    """Charge what a function of yours says: any environment becomes a constrained one.
+
+    :param env: the environment
+    :param cost: ``cost(obs, action, next_obs, info)``, called after each step with the observation
+        before it, the action, the observation after it and the step's ``info``. It returns a
+        number, or several in a dictionary or list, which are reported as in :class:`CostFromInfo`.
+        Its name, ``"package.module:function"``, will do, so that a hyper-parameter file can say it
+    :raises ValueError: nothing of that name can be imported, or it can't be called
+    """
+
+    def __init__(self, env: gym.Env, cost: CostFunction | str) -> None:
+        RecordConstructorArgs.__init__(self, cost=cost)
+        gym.Wrapper.__init__(self, env)
+        if isinstance(cost, str):
+            try:
+                cost = pkgutil.resolve_name(cost)
+            except (ImportError, AttributeError, ValueError) as error:
+                raise ValueError(
+                    f"cost={cost!r}: must be a function or its name 'package.module:function' "
+                    f"({error})"
+                ) from error
+        if not callable(cost):
+            raise ValueError(f"cost={cost!r}: must be a function cost(obs, action, next_obs, info)")
+        self.cost: CostFunction = cost
+        self.last_observation: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        # a copy: the environment may write the next observation into the same array
+        self.last_observation = copy.deepcopy(obs)
+        return obs, info
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: the function did not return finite numbers
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        cost = self.cost(self.last_observation, action, obs, info)
+        self.last_observation = copy.deepcopy(obs)
+        return obs, reward, terminated, truncated, _charged(info, cost, "what cost(...) returned")
+
+
+class RemainingBudget(gym.Wrapper, RecordConstructorArgs):
+    """Show the agent what is left of its cost budget, so that it can spend it wisely.
+
+    A limit on the episode's cost depends on the past, which a policy of the observation alone does
+    not know. Sauté RL (Sootla et al., ICML 2022) adds the remaining share z of the budget to it:
+    z₀ = 1, z_{t+1} = (z_t - cost_t / budget) / discount, negative when the budget is overspent.
+    A flat observation gets z as its last number, a dictionary an entry ``"budget"`` of shape (1,);
+    any other becomes a dictionary of ``"observation"`` and ``"budget"``.
+
+    With ``unsafe_reward``, the reward of every step that ends with z < 0 is replaced, as in the
+    paper: then any algorithm for rewards alone learns to keep the budget. Evaluate without it to
+    see true returns.
+
+    :param env: an environment that reports its cost; adapters go inside
+    :param budget: what an episode may cost, above 0
+    :param discount: discount factor of the costs, in (0, 1]
+    :param unsafe_reward: reward of the steps after the budget is overspent; None leaves rewards
+    :param cost_key: entry of ``info`` that is counted
+    :raises ValueError: an argument is out of its range, or the observation has an entry
+        ``"budget"`` already
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        budget: float,
+        discount: float = 1.0,
+        unsafe_reward: float | None = None,
+        cost_key: str = "cost",
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, budget=budget, discount=discount, unsafe_reward=unsafe_reward, cost_key=cost_key
+        )
+        gym.Wrapper.__init__(self, env)
+        self.budget = _check("budget", budget, 0.0, above=True)
+        self.discount = _check("discount", discount, 0.0, 1.0, above=True)
+        if unsafe_reward is not None:
+            unsafe_reward = _check("unsafe_reward", unsafe_reward)
+        self.unsafe_reward = unsafe_reward
+        self.cost_key = cost_key
+        self.remaining = 1.0
+
+        space = env.observation_space
+        left = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        if isinstance(space, spaces.Dict):
+            if "budget" in space.spaces:
+                raise ValueError(
+                    "the observation has an entry 'budget' already: is the environment wrapped in "
+                    "RemainingBudget twice?"
+                )
+            self.observation_space = spaces.Dict({**space.spaces, "budget": left})
+        elif isinstance(space, spaces.Box) and len(space.shape) == 1:
+            dtype = space.dtype if space.dtype in (np.float32, np.float64) else np.float32
+            self.observation_space = spaces.Box(
+                np.append(space.low, -np.inf).astype(dtype),
+                np.append(space.high, np.inf).astype(dtype),
+                dtype=dtype,
+            )
+        else:
+            self.observation_space = spaces.Dict({"observation": space, "budget": left})
+
+    def _augmented(self, obs: Any) -> Any:
+        space = self.observation_space
+        if isinstance(space, spaces.Box):
+            return np.append(obs, self.remaining).astype(space.dtype)
+        budget = np.array([self.remaining], dtype=np.float32)
+        if isinstance(self.env.observation_space, spaces.Dict):
+            return {**obs, "budget": budget}
+        return {"observation": obs, "budget": budget}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.remaining = 1.0
+        return self._augmented(obs), info
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: ``info`` lacks the cost, or it is not a number
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        cost = _number(_entry(info, self.cost_key), f"info[{self.cost_key!r}]")
+        self.remaining = (self.remaining - cost / self.budget) / self.discount
+        if self.unsafe_reward is not None and self.remaining < 0.0:
+            reward = self.unsafe_reward
+        return self._augmented(obs), reward, terminated, truncated, info
+
+
+class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
+    """End an episode that costs more than its budget, so that nothing is earned by overspending.
+
+    The early-terminated MDP of Sun et al. (2021): with it an algorithm for rewards alone respects
+    a limit, if rewards are positive. Where they are not, ending early is tempting, and
+    ``final_reward`` must make up for it. The step that overspends is ``terminated`` and has
+    ``info["budget_exceeded"]``; to spend the budget exactly is allowed.
+
+    :param env: an environment that reports its cost; adapters go inside
+    :param budget: what an episode may cost, at least 0
+    :param final_reward: added to the reward of the step that overspends
+    :param cost_key: entry of ``info`` that is counted
+    :raises ValueError: an argument is out of its range
+    """
+
+    def __init__(
+        self, env: gym.Env, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, budget=budget, final_reward=final_reward, cost_key=cost_key
+        )
+        gym.Wrapper.__init__(self, env)
+        self.budget = _check("budget", budget, 0.0)
+        self.final_reward = _check("final_reward", final_reward)
+        self.cost_key = cost_key
+        self.episode_cost = 0.0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        self.episode_cost = 0.0
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: ``info`` lacks the cost, or it is not a number
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self.episode_cost += _number(_entry(info, self.cost_key), f"info[{self.cost_key!r}]")
+        if self.episode_cost > self.budget:
+            terminated = True
+            reward = float(reward) + self.final_reward
+            info = {**info, "budget_exceeded": True}
+        return obs, reward, terminated, truncated, info

@@ -1,0 +1,145 @@
+"""TRPO-IPO: its barrier, the weight it puts on the cost, and its line search."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
+
+from sb3_guard.algorithms import TRPOIPO
+from sb3_guard.algorithms.common.trust_region import CostEstimate, Trial
+from sb3_guard.algorithms.trpo_ipo import barrier
+
+
+def make(n_costs: int = 1, **kwargs: Any) -> Any:
+    keys = ("cost", "cost_1")[:n_costs]
+    env = make_vec_env(lambda: CostPoint(cost_keys=keys, hazard=(-1.0, 0.0)), 4, seed=0)
+    defaults: dict[str, Any] = {"n_steps": 100, "n_critic_updates": 5, "seed": 0, "device": "cpu"}
+    return TRPOIPO("MlpPolicy", env, cost_keys=keys, **{**defaults, **kwargs})
+
+
+@pytest.mark.parametrize(("t", "slope"), [(0.01, 0.5), (0.01, 10.0), (1.0, 3.0), (100.0, 20.0)])
+def test_barrier_is_the_logarithm_and_its_tangent(t: float, slope: float) -> None:
+    margin = 1.0 / (t * slope)
+    inside = -margin * th.tensor([1.0, 1.5, 3.0, 100.0], dtype=th.float64)
+    expected = np.log(-inside.numpy()) / t
+    np.testing.assert_allclose(barrier(inside, t, slope).numpy(), expected, rtol=1e-12)
+    outside = margin * th.tensor([-1.0, -0.3, 0.0, 1.0, 50.0], dtype=th.float64)
+    expected = np.log(margin) / t - slope * (outside.numpy() + margin)
+    np.testing.assert_allclose(barrier(outside, t, slope).numpy(), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("t", "slope"), [(0.01, 0.5), (1.0, 3.0), (100.0, 20.0)])
+def test_barrier_has_no_kink(t: float, slope: float) -> None:
+    margin = 1.0 / (t * slope)
+    x = margin * th.linspace(-3.0, 2.0, 4001, dtype=th.float64)
+    x.requires_grad_()
+    (derivative,) = th.autograd.grad(barrier(x, t, slope).sum(), x)
+    expected = np.minimum(1 / (t * np.maximum(-x.detach().numpy(), 1e-300)), slope)
+    np.testing.assert_allclose(-derivative.numpy(), expected, rtol=1e-9)
+
+
+def _estimate(model: Any, cost: list[float], horizon: float) -> None:
+    episode = np.array(cost)
+    model.costs = CostEstimate(episode, horizon, (episode - model.cost_limits) / horizon)
+
+
+@pytest.mark.parametrize(
+    ("cost", "weight"),
+    [(0.0, 1 / (2 * 5.0)), (4.0, 1 / 2), (4.9, 3.0), (5.0, 3.0), (80.0, 3.0)],
+)
+def test_weight_of_the_cost(cost: float, weight: float) -> None:
+    """The gradient's share of mean(ratio · A_C) is min(1 / (t (d - J_C)), max_multiplier)."""
+    model = make(cost_limit=5.0, t=2.0, max_multiplier=3.0)
+    _estimate(model, [cost], 40.0)
+
+    class Batch:
+        advantages = th.zeros(200)
+        cost_advantages = th.randn(200, 1)
+
+    Batch.cost_advantages -= Batch.cost_advantages.mean()
+    ratio = th.ones(200, requires_grad=True)
+    (found,) = th.autograd.grad(model.surrogate(Batch, ratio), ratio)
+    th.testing.assert_close(found, -weight * Batch.cost_advantages[:, 0] / 200)
+    model.set_logger(Logger(None, []))
+    model.fit(Batch)
+    assert model.logger.name_to_value["train/multiplier"] == pytest.approx(weight)
+
+
+def test_several_barriers_add_up() -> None:
+    model = make(2, cost_limit=[5.0, 9.0], t=2.0, max_multiplier=3.0)
+    _estimate(model, [4.0, 80.0], 40.0)
+
+    class Batch:
+        advantages = th.randn(200)
+        cost_advantages = th.randn(200, 2)
+
+    ratio = th.ones(200, requires_grad=True)
+    (found,) = th.autograd.grad(model.surrogate(Batch, ratio), ratio)
+    expected = Batch.advantages - 0.5 * Batch.cost_advantages[:, 0]
+    expected -= 3.0 * Batch.cost_advantages[:, 1]
+    th.testing.assert_close(found, expected / 200)
+
+
+@pytest.mark.parametrize(
+    ("cost", "kl", "improvement", "change", "accepted"),
+    [
+        (4.0, 0.01, 0.1, 0.02, True),  # 4 + 40 · 0.02 = 4.8 of 5
+        (4.0, 0.01, 9.0, 0.025, False),  # on the limit
+        (4.0, 0.01, 9.0, 0.1, False),
+        (4.0, 0.01, -0.1, -0.1, False),
+        (4.0, 0.03, 0.1, -0.1, False),
+        (6.0, 0.01, 0.1, 0.1, True),  # infeasible: the objective alone decides
+        (6.0, 0.01, -0.1, -0.1, False),
+        (5.0, 0.01, 0.1, 0.1, True),  # on the limit is not strictly feasible
+        (4.0, np.nan, 0.1, 0.0, False),
+        (4.0, 0.01, 0.1, np.nan, False),
+    ],
+)
+def test_line_search_test(
+    cost: float, kl: float, improvement: float, change: float, accepted: bool
+) -> None:
+    model = make(cost_limit=5.0, target_kl=0.02)
+    _estimate(model, [cost], 40.0)
+    assert model.accept(Trial(kl, improvement, np.array([change]))) is accepted
+
+
+def test_from_inside_no_step_reaches_the_limit() -> None:
+    """Over a training: whenever the estimate was feasible, the accepted step keeps it so."""
+    model = make(cost_limit=12.0, t=100.0, target_kl=0.2)
+    inside = []
+    search = model._line_search
+
+    def spy(region: Any, *args: Any) -> Any:
+        fraction, trial = search(region, *args)
+        if np.all(region.violation < 0.0):
+            inside.append(float((region.violation + trial.cost_change).max()))
+        return fraction, trial
+
+    model._line_search = spy
+    model.learn(6000)
+    assert len(inside) > 3 and max(inside) < 0.0
+
+
+@pytest.mark.parametrize("cost_scale", [0.0, 1.0])
+@pytest.mark.parametrize("limit", [0.0, 5.0])
+def test_finite_wherever_nothing_is_at_stake(cost_scale: float, limit: float) -> None:
+    env = make_vec_env(lambda: CostPoint(cost_scale=cost_scale), 4, seed=0)
+    model = TRPOIPO("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0, cost_limit=limit)
+    model.learn(1200)
+    numbers = [v for v in model.logger.name_to_value.values() if isinstance(v, int | float)]
+    assert np.isfinite(numbers).all()
+    weight = model.logger.name_to_value["train/multiplier"]
+    assert weight == 10.0, "0.01 makes the barrier steeper than that up to a margin of ten"
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [({"t": 0.0}, r"t=0.0.*\(0, inf\)"), ({"max_multiplier": -1}, "max_multiplier=-1")],
+)
+def test_bad_values_are_named(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(**kwargs)

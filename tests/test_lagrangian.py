@@ -1,0 +1,239 @@
+"""TRPO-Lagrangian and TRPO-FAC: multipliers by hand, and what they do to the objective."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_guard.algorithms import TRPO, TRPOFAC, TRPOLag, TrustRegion
+from sb3_guard.algorithms.common.costs import CostEstimate, discounted_limit
+from sb3_guard.algorithms.common.multipliers import Multiplier, StateMultiplier
+
+KEYS = ("cost", "cost_1")
+
+
+def make(cls: type[TrustRegion], n_costs: int = 1, **kwargs: Any) -> Any:
+    keys = KEYS[:n_costs]
+    env = make_vec_env(lambda: CostPoint(cost_keys=keys, hazard=(-1.0, 0.0)), 4, seed=0)
+    defaults: dict[str, Any] = {"n_steps": 100, "n_critic_updates": 5, "seed": 0, "device": "cpu"}
+    return cls("MlpPolicy", env, cost_keys=keys, **{**defaults, **kwargs})
+
+
+# The multiplier of TRPO-Lagrangian
+
+
+def follow(multiplier: Multiplier, costs: list[float], limit: float) -> list[float]:
+    values = []
+    for cost in costs:
+        multiplier.update(np.array([cost]), np.array([limit]))
+        values.append(float(multiplier.value[0]))
+    return values
+
+
+def test_ascent_by_hand() -> None:
+    """0 + 0.1·(7-5), then -0.1·3 stops at zero, then 0.1·10."""
+    values = follow(Multiplier(1, 0.1), [7.0, 2.0, 15.0, 4.0], 5.0)
+    np.testing.assert_allclose(values, [0.2, 0.0, 1.0, 0.9])
+
+
+def test_initial_value_and_bound_by_hand() -> None:
+    multiplier = Multiplier(1, 0.1, init=0.5, maximum=0.9)
+    assert float(multiplier.value[0]) == 0.5
+    # Bounded, and it comes down at once: nothing has wound up beyond the bound.
+    np.testing.assert_allclose(follow(multiplier, [8.0, 8.0, 8.0, 3.0], 5.0), [0.8, 0.9, 0.9, 0.7])
+
+
+def test_pid_by_hand() -> None:
+    """η = 0.1, K_P = 0.5, K_D = 0.25, d = 5.
+
+    J_C = 7: I = 0.2, P = 1, no rise before the second update: 1.2
+    J_C = 9: I = 0.6, P = 2, D = 0.5: 3.1
+    J_C = 4: I = 0.5, P = -0.5, a fall is no rise: 0
+    J_C = 6: I = 0.6, P = 0.5, D = 0.5: 1.6
+    """
+    multiplier = Multiplier(1, 0.1, proportional=0.5, derivative=0.25)
+    np.testing.assert_allclose(
+        follow(multiplier, [7.0, 9.0, 4.0, 6.0], 5.0), [1.2, 3.1, 0, 1.6], atol=1e-9
+    )
+
+
+def test_adam_first_moves_by_its_rate() -> None:
+    values = follow(Multiplier(1, 0.1, adam=True), [500.0, 500.0], 5.0)
+    np.testing.assert_allclose(values, [0.1, 0.2], rtol=1e-6)
+
+
+def test_each_cost_has_its_own_multiplier() -> None:
+    multiplier = Multiplier(2, 0.5)
+    multiplier.update(np.array([3.0, 1.0]), np.array([1.0, 4.0]))
+    np.testing.assert_allclose(multiplier.value.numpy(), [1.0, 0.0])
+
+
+def test_the_policy_uses_the_multiplier_of_before_its_step() -> None:
+    """λ of update k is η times the violations of the updates before it, in episode units."""
+    model = make(TRPOLag, cost_limit=2.0, lambda_lr=0.1)
+    prices, violations = [], []
+    step, fit = model.step, model.fit
+    model.step = lambda region: prices.append(float(model.multiplier.value[0])) or step(region)
+    model.fit = lambda batch: violations.append(model.costs.episode_cost[0] - 2.0) or fit(batch)
+    model.learn(2000)
+    expected = [0.0]
+    for violation in violations:
+        expected.append(max(0.0, expected[-1] + 0.1 * violation))
+    np.testing.assert_allclose(prices, expected[:-1], rtol=1e-6)
+    assert len(prices) == 5 and prices[-1] > 0.0
+    assert model.logger.name_to_value["train/multiplier"] == pytest.approx(expected[-1])
+
+
+def test_the_lagrangian_by_hand() -> None:
+    model = make(TRPOLag, n_costs=2)
+    model.multiplier.value.copy_(th.tensor([0.5, 2.0]))
+    batch = _batch(th.zeros(3, 4), [1.0, -1.0, 2.0], [[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]])
+    ratio = th.tensor([1.0, 2.0, 0.5])
+    # A - λ·A_C = (0.5, -3, 4.5); weighted (0.5, -6, 2.25); mean -13/12; divided by 1 + 2.5
+    assert float(model.surrogate(batch, ratio)) == pytest.approx(-13 / 12 / 3.5)
+
+
+def test_without_multiplier_it_is_trpo() -> None:
+    """λ stays zero under a limit that holds: the same trajectories, bit for bit."""
+    models = [make(cls, cost_limit=1e6) for cls in (TRPO, TRPOLag)]
+    for model in models:
+        th.manual_seed(0)  # building a cost critic has drawn numbers
+        model.learn(1200)
+    a, b = (model.policy.state_dict() for model in models)
+    assert float(models[1].multiplier.value[0]) == 0.0
+    for name in a:
+        assert th.equal(a[name], b[name]), name
+
+
+def _batch(observations: Any, advantages: list[float], cost_advantages: list[list[float]]) -> Any:
+    class Batch:
+        pass
+
+    batch: Any = Batch()
+    batch.observations = observations
+    batch.advantages = th.tensor(advantages)
+    batch.cost_advantages = th.tensor(cost_advantages)
+    return batch
+
+
+# The multipliers of TRPO-FAC
+
+
+def network(n_costs: int = 1, **kwargs: Any) -> StateMultiplier:
+    th.manual_seed(0)
+    return StateMultiplier(make(TRPO).policy, n_costs, **{"rate": 1e-2, **kwargs})
+
+
+def test_multipliers_of_states_are_positive_and_differ() -> None:
+    observations = 3 * th.randn(500, 4)
+    values = network(2).predict(observations)
+    assert values.shape == (500, 2) and bool((values > 0.0).all())
+    assert values.std(dim=0).min() > 0.01
+    assert not th.allclose(values[:, 0], values[:, 1]), "one network per constraint"
+
+
+@pytest.mark.parametrize("init", [1e-4, 0.5, 3.0, 50.0])
+def test_multipliers_start_where_they_are_told(init: float) -> None:
+    assert float(network(init=init).predict(th.zeros(1, 4))) == pytest.approx(init, rel=1e-4)
+    assert float(network().predict(th.zeros(1, 4))) == pytest.approx(np.log(2.0), abs=0.2)
+
+
+def test_ascent_raises_where_the_limit_is_broken_and_lowers_elsewhere() -> None:
+    multiplier = network()
+    observations = th.randn(2000, 4)
+    broken = observations[:, 0] > 0.0
+    before = multiplier.predict(observations)[:, 0]
+    for _ in range(100):
+        multiplier.ascend(observations, th.where(broken, 1.0, -1.0)[:, None])
+    after = multiplier.predict(observations)[:, 0]
+    assert (after > before)[broken].float().mean() > 0.95
+    assert (after < before)[~broken].float().mean() > 0.95
+
+
+def test_ascent_is_the_gradient_of_the_mean() -> None:
+    """Batches longer than a slice give the gradient of the whole, by plain autograd."""
+    multiplier = network(2)
+    observations, excess = th.randn(5000, 4), th.randn(5000, 2)
+    objective = (multiplier(observations) * excess).sum(dim=1).mean()
+    expected = th.autograd.grad(objective, list(multiplier.parameters()))
+    multiplier.ascend(observations, excess)
+    for parameter, gradient in zip(multiplier.parameters(), expected, strict=True):
+        th.testing.assert_close(parameter.grad, -gradient, rtol=1e-3, atol=1e-6)
+
+
+def test_limits_of_discounted_costs() -> None:
+    """25 per episode of 1000 steps is a cost of 0.025 a step: 2.5 at γ = 0.99, all of it at 1."""
+    limits = np.array([25.0, 0.0])
+    found = discounted_limit(limits, 1000.0, 0.99)
+    np.testing.assert_allclose(found, [0.025 * sum(0.99**k for k in range(1000)), 0.0])
+    np.testing.assert_allclose(discounted_limit(limits, 1000.0, 1.0), limits)
+
+
+@pytest.mark.parametrize("mode", ["statewise", "expected"])
+def test_what_the_multipliers_ascend_on(mode: Any) -> None:
+    model = make(TRPOFAC, cost_limit=2.0, mode=mode, lambda_epochs=3)
+    seen: list[Any] = []
+    model.multiplier.ascend = lambda observations, excess: seen.append(excess)
+    returns: list[Any] = []
+    fit = model.fit
+    model.fit = lambda batch: returns.append((batch.cost_returns, model.costs)) or fit(batch)
+    model.learn(400)
+    assert len(seen) == 3
+    cost_returns, costs = returns[0]
+    if mode == "statewise":
+        limit = 2.0 / 50 * (1 - 0.99**50) / (1 - 0.99)
+        th.testing.assert_close(seen[0], cost_returns - limit)
+    else:
+        assert isinstance(costs, CostEstimate)
+        expected = th.full_like(cost_returns, costs.episode_cost[0] - 2.0)
+        th.testing.assert_close(seen[0], expected)
+
+
+def test_the_state_wise_lagrangian_by_hand() -> None:
+    model = make(TRPOFAC, n_costs=2)
+    model.multiplier.predict = lambda observations: th.tensor([[0.5, 0.0], [2.0, 1.0], [0.0, 3.0]])
+    batch = _batch(th.zeros(3, 4), [1.0, -1.0, 2.0], [[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]])
+    # (1 - 0.5, -1 - 1, 2 + 3) times (1, 2, 0.5), mean of (0.5, -4, 2.5)
+    assert float(model.surrogate(batch, th.tensor([1.0, 2.0, 0.5]))) == pytest.approx(-1 / 3)
+
+
+@pytest.mark.parametrize("cls", [TRPOLag, TRPOFAC])
+@pytest.mark.parametrize("cost_scale", [0.0, 1.0])
+def test_at_a_limit_of_zero(cls: type[TrustRegion], cost_scale: float) -> None:
+    """Multipliers never fall there; without any cost TRPO-Lagrangian's stays zero."""
+    env = make_vec_env(lambda: CostPoint(cost_scale=cost_scale, hazard=(-1.0, 0.0)), 4, seed=0)
+    model: Any = cls("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0)
+    logged = []
+    fit = model.fit
+    model.fit = lambda batch: (fit(batch), logged.append(dict(model.logger.name_to_value)))
+    model.learn(2000)
+    prices = np.array([each["train/multiplier"] for each in logged])
+    assert np.isfinite(prices).all()
+    if cost_scale:
+        # States differ from rollout to rollout, so the mean of FAC's need not rise each time.
+        rises = np.diff(prices)
+        assert np.all(rises > 0.0) if cls is TRPOLag else prices[-1] > prices[0] + 0.01
+    elif cls is TRPOLag:
+        assert not prices.any()
+
+
+@pytest.mark.parametrize(
+    ("cls", "kwargs", "message"),
+    [
+        (TRPOLag, {"lambda_lr": -1.0}, "lambda_lr=-1.0"),
+        (TRPOLag, {"lambda_init": -0.5}, "lambda_init=-0.5"),
+        (TRPOLag, {"lambda_init": 2.0, "lambda_max": 1.0}, r"lambda_max=1.0.*\[2, inf\)"),
+        (TRPOLag, {"lambda_optimizer": "rmsprop"}, "lambda_optimizer='rmsprop'.*'adam'"),
+        (TRPOLag, {"derivative_gain": float("nan")}, "derivative_gain=nan"),
+        (TRPOFAC, {"lambda_lr": "fast"}, "lambda_lr='fast'"),
+        (TRPOFAC, {"lambda_epochs": 0}, "lambda_epochs=0"),
+        (TRPOFAC, {"lambda_init": 0.0}, r"lambda_init=0.0.*\(0, inf\)"),
+        (TRPOFAC, {"mode": "mean"}, "mode='mean'.*'statewise' or 'expected'"),
+    ],
+)
+def test_bad_values_are_named(cls: type[TrustRegion], kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(cls, **kwargs)

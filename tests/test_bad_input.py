@@ -269,7 +269,7 @@ def test_agent_of_another_environment(capsys, run, tmp_path):
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        (lambda args: {"a": 1}, ["no proper", "algo", "seed"]),
+        (lambda args: {"a": 1}, ["no proper algo, env, n_timesteps, seed, …;"]),
         (lambda args: {k: v for k, v in args.items() if k != "eval_freq"}, ["proper eval_freq;"]),
         (lambda args: {**args, "seed": "one"}, ["proper seed;"]),
     ],
@@ -302,7 +302,7 @@ def test_playing_in_a_world_without_room(capsys, tmp_path):
     ours = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path)]
     small = [one for one in SMALL if one not in ("--env-kwargs", "episode_length:20")]
     assert train.main([*ours, *small]) == 0
-    play = [*ours, "--no-render", "--env-kwargs", "hazards:{'num':200}"]
+    play = [*ours, "--env-kwargs", "hazards:{'num':200}", "--no-render"]
     refused(enjoy.main, play, capsys, "Goal_Point_2Hazards-v0", "LayoutError", "hazards")
 
 

@@ -279,6 +279,16 @@ def test_record_our_environment(tmp_path):
     assert video.stat().st_size > 1000
 
 
+def test_our_environment_has_a_window(tmp_path, monkeypatch):
+    frames = []
+    monkeypatch.setattr("sb3_guard.envs.GuardEnv.render", lambda self: frames.append(self))
+    monkeypatch.setenv("DISPLAY", ":0")
+    trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
+    play = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3"]
+    assert enjoy.main(play) == 0
+    assert len(frames) >= 3 and {env.render_mode for env in frames} == {"human"}
+
+
 def test_no_backend_no_video(tmp_path, monkeypatch, capsys):
     import sb3_guard.envs.rendering as rendering
 

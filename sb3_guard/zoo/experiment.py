@@ -476,8 +476,9 @@ def _saved_flags(folder: RunFolder, defaults: Mapping[str, Any]) -> dict[str, An
         if name not in saved or (default is not None and type(saved[name]) is not type(default))
     ]
     if damaged:
+        names = ", ".join(damaged[:4]) + (", …" if len(damaged) > 4 else "")
         raise UsageError(
-            f"{folder.params / 'args.yml'} is damaged: it has no proper {', '.join(damaged)}; "
+            f"{folder.params / 'args.yml'} is damaged: it has no proper {names}; "
             "put the file back as it was, or start a new run without -i"
         )
     return saved

@@ -112,7 +112,10 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
         setup,
         n_envs=1,
         seed=args["seed"],
-        vec_env=choose_vec_env(None, ours, setup.env_wrapper is not None),
+        # A batch has no window; a single environment has.
+        vec_env="dummy"
+        if render_mode == "human"
+        else choose_vec_env(None, ours, setup.env_wrapper is not None),
         env_kwargs={**setup.env_kwargs, **(args["env_kwargs"] or {})},
         cost_keys=getattr(model, "cost_keys", ("cost",)),
         evaluation=True,

@@ -40,6 +40,14 @@ def _has_display() -> bool:
     )
 
 
+def _window_opens() -> bool:
+    """Whether there is a display; tried in a process of its own, which GLFW may end."""
+    if not _has_display():
+        return False
+    probe = "import glfw, sys; sys.exit(0 if glfw.init() else 1)"
+    return subprocess.run([sys.executable, "-c", probe], capture_output=True).returncode == 0
+
+
 @functools.cache
 def gl_backend() -> str:
     """The OpenGL backend that works: glfw, egl or osmesa.
@@ -173,10 +181,11 @@ class Renderer:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self._camera.fixedcamid = engine.model.camera(camera).id
         if self._human:
-            if not _has_display():
+            if not _window_opens():
                 raise RenderingError(
-                    "render_mode 'human' needs a display, and DISPLAY is not set; "
-                    "use render_mode='rgb_array', or record a video"
+                    f"render_mode 'human' needs a display, and none opens (DISPLAY is "
+                    f"{os.environ.get('DISPLAY') or 'not set'}); use render_mode='rgb_array', or "
+                    "record a video"
                 )
             from mujoco import viewer
 

@@ -230,6 +230,20 @@ def test_vec_normalize_leaves_costs_raw(cls: type[TrustRegion], tmp_path: Path) 
     cls.load(tmp_path / "model", env=env, device="cpu").learn(80)
 
 
+@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cost_scale", [0.0, 1.0])
+def test_a_limit_of_zero_with_and_without_cost(cls: type[TrustRegion], cost_scale: float) -> None:
+    """c = 0 and no cost gradient, or c > 0 throughout: numbers stay numbers, policies move."""
+    model = small(cls, points(2, cost_scale=cost_scale, hazard=(-1.0, 0.0)))
+    before = parameters(model)["policy"]["action_net.weight"]
+    model.learn(400)
+    after = parameters(model)["policy"]
+    assert not th.equal(before, after["action_net.weight"])
+    assert all(th.isfinite(value).all() for value in after.values())
+    numbers = [v for v in model.logger.name_to_value.values() if isinstance(v, int | float)]
+    assert np.isfinite(numbers).all()
+
+
 def test_subprocesses_and_frame_stacks() -> None:
     env = VecFrameStack(SubprocVecEnv([lambda: CostPoint(episode_length=30)] * 2), 2)
     model = small(CPO, env).learn(160)

@@ -574,7 +574,7 @@ def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) ->
         make(cls, **kwargs)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("cls", CLASSES)
 def test_it_stops_before_the_wall(cls: type[FilteredTrustRegion], seed: int) -> None:
     """Cost near zero, a fiftieth of what the same policy costs unfiltered; most of the return."""

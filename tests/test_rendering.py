@@ -93,10 +93,10 @@ def test_a_window_needs_a_display(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     env = gymnasium.make("Goal_Point_8Hazards-v0", render_mode="human")
-    with pytest.raises(rendering.RenderingError, match="needs a display.*not set"):
+    with pytest.raises(rendering.RenderingError, match=r"needs a display.*not set"):
         env.reset(seed=0)
     monkeypatch.setenv("DISPLAY", ":77")  # there, but it does not open
-    with pytest.raises(rendering.RenderingError, match="needs a display.*:77"):
+    with pytest.raises(rendering.RenderingError, match=r"needs a display.*:77"):
         env.reset(seed=0)
 
 

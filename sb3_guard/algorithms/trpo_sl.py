@@ -72,4 +72,5 @@ class TRPOSL(FilteredTrustRegion):
             drawn = th.randperm(len(none))[: len(some)].to(none.device)
             index = th.cat([some, none[drawn]])
             loss = regression.fit(rows(data, index), targets[index], 1, self.batch_size)
+        self._check_finite("cost_model_loss", loss)
         self.logger.record("train/cost_model_loss", loss)

@@ -106,6 +106,7 @@ class TRPOUSL(FilteredTrustRegion):
         loss = self._layer.regression().fit(
             (batch.observations, actions), targets, self.n_critic_updates, self.batch_size
         )
+        self._check_finite("cost_model_loss", loss)
         self.logger.record("train/cost_model_loss", loss)
         self._set_threshold(np.maximum(limit, self.tolerance))
 

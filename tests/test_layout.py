@@ -258,3 +258,17 @@ def test_goals_are_not_reached_when_they_appear(suite):
         for _ in range(3):
             assert not engine.task.succeeded(engine.task.measure())[0]
             assert len(engine.task.advance(np.zeros(1, dtype=int))) == 0
+
+
+def test_a_part_can_keep_a_margin_of_its_own():
+    from sb3_guard.envs import Scenario
+
+    base = Scenario.parse("Goal_Point_2Hazards")
+    engine = base.override(goal={"margin": 1.0}, hazards={"height": [0.7, 0.7]}).build(20)
+    engine.reset(np.arange(20))
+    goal, hazards = engine.places("goal")[:, 0, :2], engine.places("hazards")[..., :2]
+    gap = np.linalg.norm(hazards - goal[:, None], axis=-1)
+    assert gap.min() >= 0.4 + 0.4 + 1.0
+    flying = base.override(hazards={"space": "spatial", "height": [0.7, 0.7]}).build(3)
+    flying.reset(np.arange(3))
+    np.testing.assert_array_equal(flying.places("hazards")[..., 2], 0.7)

@@ -157,6 +157,7 @@ class Objects(Part):
     keepout: float = param(0.4, "radius kept clear around an object, m", low=0)
     locations: tuple[tuple[float, float], ...] = param((), "fixed places (x, y), m")
     placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
+    margin: float = param(0.0, "extra distance to every other object, m", low=0)
 
     free: ClassVar[bool] = False  # whether solid objects can be pushed
     mover: ClassVar[bool] = False  # whether they leave their places
@@ -179,6 +180,7 @@ class Objects(Part):
                 self.keepout,
                 self.placements,
                 self.locations,
+                self.margin,
                 height=0.0 if self.planar else self.height,
                 reach=self._reach,
                 mover=self.mover,

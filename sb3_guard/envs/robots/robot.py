@@ -64,6 +64,7 @@ class MJCFRobot(Robot):
     keepout: float = param(0.4, "radius kept clear around the robot at the start, m", low=0)
     locations: tuple[tuple[float, float], ...] = param((), "fixed start, one (x, y), m")
     placements: tuple[Rectangle, ...] = param((), "rectangles to start in, m; empty: the arena")
+    margin: float = param(0.0, "extra distance to every other object, m", low=0)
     heading: float | None = param(None, "start heading, rad; null: uniformly random")
     sensing: tuple[str, ...] | None = param(
         None, "bodies that carry lidar and compass; null: the robot's own choice"
@@ -77,7 +78,7 @@ class MJCFRobot(Robot):
         return Path(str(importlib.resources.files("sb3_guard.envs.robots") / "assets" / cls.asset))
 
     def footprints(self) -> tuple[Footprint, ...]:
-        return (Footprint("robot", 1, self.keepout, self.placements, self.locations),)
+        return (Footprint("robot", 1, self.keepout, self.placements, self.locations, self.margin),)
 
     def build(self, world: World) -> None:
         super().build(world)

@@ -26,6 +26,7 @@ class Destination(Task):
     ends: bool = param(False, "whether reaching the goal ends the episode")
     locations: tuple[tuple[float, float], ...] = param((), "fixed first goal, one (x, y), m")
     placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
+    margin: float = param(0.0, "extra distance to every other object, m", low=0)
     lidar: bool = param(False, "whether the goal is also seen by a lidar")
     distance: bool = param(False, "whether the goal's closeness exp(−distance) is observed")
 
@@ -40,6 +41,7 @@ class Destination(Task):
                 self.keepout,
                 self.placements,
                 self.locations,
+                self.margin,
                 height=0.0 if self.planar else self.height,
                 reach=self._reach,
             ),

@@ -57,6 +57,7 @@ class Push(Destination):
                 self.object_keepout,
                 self.placements,
                 self.object_locations,
+                self.margin,
                 reach=self._reach,
             ),
         )

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sb3_guard.envs import Scenario, env_ids, registry
+from sb3_guard.envs import Scenario, env_ids, make, registry
 from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.tasks import Goal
 from sb3_guard.spelling import did_you_mean
@@ -121,6 +121,10 @@ def test_scenarios_from_files(tmp_path):
         Scenario.load(path)
     with pytest.raises(ValueError, match="cannot read scenario"):
         Scenario.load(tmp_path / "none.yml")
+    path.write_text("constraints:\n  hazards: {num: 2}\n")
+    assert make(str(path)).unwrapped.scenario.constraints == {"hazards": {"num": 2}}
+    with pytest.raises(ValueError, match="cannot read scenario"):
+        make(str(tmp_path / "none.yml"))
 
 
 def test_registered_parts_are_used_by_ids(tmp_path):
@@ -212,3 +216,25 @@ def test_other_bodies_can_carry_lidar_and_compass():
     assert two.channels["goal_compass"].size == 6 and two.channels["hazards_lidar"].size == 120
     with pytest.raises(ValueError, match=r"robot.sensing names no body 'link_9'.*'link_"):
         base.override(robot={"sensing": ["link_9"]}).build()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('<body name="robot"', '<body name="hull"', "has no body called 'robot'"),
+        ("</mujoco>", "", "sled.xml: "),
+        (' ctrlrange="-1 1"', "", "actuator 'thrust' of the robot has no ctrlrange"),
+        ("<sensor>", '<sensor><jointpos name="jx" joint="x"/>', "observes a slide's position"),
+        ('name="gyro"', 'name="hazards_lidar"', "both observe 'hazards_lidar'"),
+    ],
+)
+def test_bad_robot_files_say_what_is_wrong(tmp_path, old, new, message):
+    xml = tmp_path / "sled.xml"
+    xml.write_text(registry.ROBOTS["Point"].path().read_text().replace(old, new))
+    try:
+        registry.register_robot("Sled", xml=xml)
+        with pytest.raises(ValueError, match=message) as caught:
+            Scenario.parse("Goal_Sled_2Hazards").build()
+        assert "\n" not in str(caught.value)
+    finally:
+        registry.ROBOTS.pop("Sled", None)

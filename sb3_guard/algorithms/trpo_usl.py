@@ -26,8 +26,10 @@ class TRPOUSL(FilteredTrustRegion):
                   where   h(s, a) = Σ max(0, Q_i(s, a) - threshold_i)
 
     starting from the sampled action, clipped to the box of the action space. Q_i is the discounted
-    cost to come, a network with a softplus output fitted to ``c + γ Q(s', a')`` with a' the action
-    executed next. ``kappa`` adds the paper's exact penalty: the policy then ascends
+    cost to come of the executed actions, a network with a softplus output fitted to λ-returns with
+    λ = ``cost_gae_lambda``. With λ = 0 the target is ``c + γ Q(s', a')``, a' the action executed
+    next, as in GUARD; fitted once per update, such a critic needs hundreds of updates to forget
+    where it started. ``kappa`` adds the paper's exact penalty: the policy then ascends
     ``E[ratio · (A - κ h(s, a))]``, whose gradient is that of the expected penalty of the sampled
     actions.
 
@@ -39,7 +41,8 @@ class TRPOUSL(FilteredTrustRegion):
     :param threshold: highest discounted cost to come that is not corrected; one number or one per
         cost key; None: the larger of ``tolerance`` and ``(d/T) (1 - γᵀ)/(1 - γ)``
     :param tolerance: what the Q-critic may say of a state where nothing costs: a softplus never
-        is zero
+        is zero. On Goal_Point_8Hazards, after 8 updates, a twentieth of the states without any
+        later cost is below 0.05
     :param steps: K
     :param rate: η, in units of the action space, which runs from -1 to 1
     :param kappa: weight of the exact penalty; 0 for none, as in GUARD

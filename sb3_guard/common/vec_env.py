@@ -67,6 +67,9 @@ def find_scenario(env_id: str | Scenario) -> Scenario | None:
     if ":" in env_id or is_safety_gymnasium(env_id):
         return None  # of "module:Env-v0" gymnasium imports the module first
     envs = _our_envs(env_id)
+    if env_id.endswith((".yml", ".yaml")):
+        file: Scenario = envs.Scenario.load(env_id)
+        return file
     try:
         return envs.Scenario.parse(env_id)
     except ValueError as error:
@@ -200,8 +203,8 @@ def make_vec_env(
 ) -> VecEnv:
     """Make environments for Stable-Baselines3, with episode statistics that include the cost.
 
-    :param env_id: an id of ours (the version may be left out), a scenario, any id registered with
-        Gymnasium, or one of Safety-Gymnasium where that package is installed
+    :param env_id: an id of ours (the version may be left out), a scenario or its YAML file, any id
+        registered with Gymnasium, or one of Safety-Gymnasium where that package is installed
     :param n_envs: how many; 30 is a good number for training
     :param seed: the environments get seed, seed + 1, …
     :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"``

@@ -49,7 +49,7 @@ __all__ = [
 def env_spec(name: str | Scenario) -> EnvSpec:
     """Gymnasium's description of an environment, registered or not.
 
-    :param name: an id of ours, with or without its version, or a scenario
+    :param name: an id of ours, with or without its version, a scenario, or its YAML file
     :raises ValueError: the id cannot be read
     """
     what: str | dict[str, Any]
@@ -59,8 +59,11 @@ def env_spec(name: str | Scenario) -> EnvSpec:
         env_id = name if name.rpartition("-v")[2].isdigit() else f"{name}-v0"
         if env_id in gymnasium.registry:
             return gymnasium.registry[env_id]
-        Scenario.parse(name)
         what = name
+        if name.endswith((".yml", ".yaml")):
+            env_id, what = "Guard-v0", Scenario.load(name).to_dict()
+        else:
+            Scenario.parse(name)
     return EnvSpec(
         env_id,
         entry_point="sb3_guard.envs.gym_env:GuardEnv",

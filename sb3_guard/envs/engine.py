@@ -234,7 +234,13 @@ class Engine:
             part.bind(self)
         self._channels: dict[str, Channel] = {}
         for part in self.parts:
-            self._channels.update(part.channels())
+            for name, channel in part.channels().items():
+                if name in self._channels:
+                    raise ValueError(
+                        f"{part.name} and another part both observe {name!r}; give the constraint, "
+                        "or the robot's sensor, another name"
+                    )
+                self._channels[name] = channel
         self._slices: dict[str, slice] = {}
         start = 0
         for name in sorted(self._channels):

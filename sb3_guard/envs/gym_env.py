@@ -25,7 +25,8 @@ def as_scenario(
 ) -> Scenario:
     """A scenario from an id, plain data or a scenario, with parameters of its parts changed."""
     if isinstance(scenario, str):
-        scenario = Scenario.parse(scenario)
+        is_file = scenario.endswith((".yml", ".yaml"))
+        scenario = Scenario.load(scenario) if is_file else Scenario.parse(scenario)
     elif isinstance(scenario, Mapping):
         scenario = Scenario(**scenario)
     return scenario.override(**params) if params else scenario

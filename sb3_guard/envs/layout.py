@@ -38,7 +38,7 @@ class Footprint:
     :param keepout: radius kept clear of others' radii, m
     :param placements: rectangles (x low, y low, x high, y high) to draw from, m; empty: the arena's
     :param locations: fixed places, (x, y) m, for the first objects of the group
-    :param margin: extra distance kept from every other object, m
+    :param margin: extra distance to every other object, m; of two margins the greater counts
     :param height: z, m, or a range to draw z from, after x and y
     :param reach: greatest distance of (x, y, z) from the origin, m
     :param mover: whether it moves by itself, so that a new goal may ignore it in need
@@ -117,8 +117,10 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
     :raises LayoutError: no layout was found, naming the part that found no room most often
     """
     owner = [f for f in footprints for _ in range(f.num)]
-    keepout = np.array([f.keepout + f.margin for f in owner])
-    apart = (keepout[:, None] + keepout)[..., None] ** 2  # [K, K, 1] m²
+    keepout = np.array([f.keepout for f in owner])
+    margin = np.array([f.margin for f in owner])
+    gaps = keepout[:, None] + keepout + np.maximum(margin[:, None], margin)  # [K, K] m
+    apart = gaps[..., None] ** 2
     xy = np.full((2, len(owner), 1), np.inf)  # what is not yet placed is out of everyone's way
     fixed = np.zeros(len(owner), dtype=bool)
     k = 0
@@ -126,7 +128,7 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         for j, place in enumerate(f.locations):
             xy[:, k + j, 0], fixed[k + j] = place, True
         k += f.num
-    _check_fixed(owner, keepout, xy[..., 0].T, fixed)
+    _check_fixed(owner, gaps, xy[..., 0].T, fixed)
     queue = deque(np.flatnonzero(~fixed).tolist())
     failures: dict[str, int] = {}
     for _ in range(PATIENCE):
@@ -178,18 +180,18 @@ def _square_distance(draws: Array, xy: Array) -> Array:
     return dx
 
 
-def _check_fixed(owner: list[Footprint], keepout: Array, xy: Array, fixed: Array) -> None:
-    """Refuse fixed locations that are closer than the sum of their keep-outs."""
+def _check_fixed(owner: list[Footprint], gaps: Array, xy: Array, fixed: Array) -> None:
+    """Refuse fixed locations that are closer than their keep-outs and margins allow."""
     ids = np.flatnonzero(fixed)
     for a in range(len(ids)):
         for b in range(a + 1, len(ids)):
             i, j = ids[a], ids[b]
             gap = math.dist(xy[i], xy[j])
-            if gap < keepout[i] + keepout[j]:
+            if gap < gaps[i, j]:
                 raise LayoutError(
                     f"{owner[j].name} cannot be placed: its location {tuple(xy[j].tolist())} is "
                     f"{gap:.2f} m from {owner[i].name} at {tuple(xy[i].tolist())}, and their "
-                    f"keepouts sum to {keepout[i] + keepout[j]:.2f} m"
+                    f"keepouts and margin sum to {gaps[i, j]:.2f} m"
                 )
 
 
@@ -211,8 +213,12 @@ def redraw(
     for movers in (True, False):
         rest = [(f, p) for f, p in others.items() if movers or not f.mover]
         xy = np.concatenate([np.zeros((0, 2)), *(p[:, :2] for _, p in rest)]).T[..., None]
-        keepout = np.array([f.keepout + f.margin for f, _ in rest for _ in range(f.num)])
-        apart = (footprint.keepout + footprint.margin + keepout)[:, None] ** 2  # [K, 1] m²
+        gaps = [
+            footprint.keepout + f.keepout + max(footprint.margin, f.margin)
+            for f, _ in rest
+            for _ in range(f.num)
+        ]
+        apart = np.array(gaps)[:, None] ** 2  # [K, 1] m²
         for _ in range(tries):
             draws = footprint.draw(rng, DRAWS)
             clear = ~(_square_distance(draws, xy) < apart).any(axis=0)

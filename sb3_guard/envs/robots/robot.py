@@ -82,7 +82,12 @@ class MJCFRobot(Robot):
 
     def build(self, world: World) -> None:
         super().build(world)
-        robot = mujoco.MjSpec.from_file(str(self.path()))
+        try:
+            robot = mujoco.MjSpec.from_file(str(self.path()))
+        except ValueError as error:
+            raise ValueError(f"{self.path()}: {' '.join(str(error).split())}") from None
+        if robot.body("robot") is None:
+            raise ValueError(f"{self.path()} has no body called 'robot': call its outermost so")
         joints = robot.body("robot").joints
         self._free = bool(joints) and joints[0].type == mujoco.mjtJoint.mjJNT_FREE
         if self._free:
@@ -96,6 +101,13 @@ class MJCFRobot(Robot):
         model, batch = sim.model, sim.batch
         self.action_size = model.nu
         low, high = model.actuator_ctrlrange.T
+        for i in np.flatnonzero(~(high > low)).tolist():
+            raise ValueError(
+                f"actuator {model.actuator(i).name.removeprefix(PREFIX)!r} of the robot has no "
+                'ctrlrange: give it one, such as ctrlrange="-1 1"'
+            )
+        if not model.nu:
+            raise ValueError(f"{self.path()} has no actuators: the robot could not act")
         self._center, self._half = (low + high) / 2, (high - low) / 2
         self._ctrl = batch.bind("ctrl")
         self._qpos = batch.bind("qpos")
@@ -134,6 +146,14 @@ class MJCFRobot(Robot):
             name = model.sensor(i).name
             if not name.startswith(PREFIX) or name.startswith(PREFIX + "_"):
                 continue
+            joint = int(model.sensor_objid[i])
+            kind = int(model.sensor_type[i])
+            slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
+            if kind == int(_SENSOR.mjSENS_JOINTPOS) and int(model.jnt_type[joint]) == slide:
+                raise ValueError(
+                    f"sensor {name.removeprefix(PREFIX)!r} observes a slide's position as an "
+                    "angle: leave it out, or begin its name with '_'"
+                )
             first = int(model.sensor_adr[i])
             where = slice(first, first + int(model.sensor_dim[i]))
             yield name.removeprefix(PREFIX), _SENSOR(int(model.sensor_type[i])), where

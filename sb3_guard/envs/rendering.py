@@ -192,6 +192,8 @@ class Renderer:
             self._viewer = viewer.launch_passive(
                 engine.model, self._data, show_left_ui=False, show_right_ui=False
             )
+            eye = self._viewer.cam  # the whole arena at first; the mouse moves it
+            eye.lookat[:], eye.distance, eye.azimuth, eye.elevation = 0.0, 6.5, 90.0, -42.0
             return
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(engine.model, maxgeom=4000)

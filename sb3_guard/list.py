@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from sb3_guard.envs import Scenario, env_ids
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
-from sb3_guard.zoo.usage import Parser, UsageError, run
+from sb3_guard.zoo.usage import Parser, UsageError, import_packages, run
 
 EXAMPLES = """examples:
   sb3-guard list
@@ -91,7 +91,9 @@ def _list(argv: Sequence[str] | None) -> int:
         metavar=("TASK_ROBOT", "CONSTRAINT"),
         help="ids of growing difficulty: more and more of a constraint",
     )
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
     args = parser.parse_args(argv)
+    import_packages(args.gym_packages)
     if args.ladder:
         ids = [f"{args.ladder[0]}_{num}{args.ladder[1]}-v0" for num in LADDER]
         try:

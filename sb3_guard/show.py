@@ -14,7 +14,7 @@ from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.list import table
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, one_line, run
+from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, import_packages, one_line, run
 
 EXAMPLES = """examples:
   sb3-guard show Goal_Ant_8Ghosts
@@ -58,7 +58,9 @@ def _show(argv: Sequence[str] | None) -> int:
     parser.add_argument("-o", "--output", type=Path, help="picture to write (default: <env>.png)")
     parser.add_argument("--camera", default="fixed", help=f"one of {', '.join(CAMERAS)}")
     parser.add_argument("--seed", type=int, default=0, help="of the episode in the picture")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
     args = parser.parse_args(argv)
+    import_packages(args.gym_packages)
     if args.camera not in CAMERAS:
         raise UsageError(f"unknown camera {args.camera!r}: {did_you_mean(args.camera, CAMERAS)}")
     file = Path(args.env)

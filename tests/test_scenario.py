@@ -161,8 +161,26 @@ def test_bad_registrations_are_refused(tmp_path):
         registry.register_robot("X")
     with pytest.raises(ValueError, match="there is no file"):
         registry.register_robot("X", xml=tmp_path / "none.xml")
-    with pytest.raises(ValueError, match="cannot be part of an id"):
-        registry.register_task("My_Task", Goal)
+    for name in ("My_Task", "Käfer", "2Fast"):
+        with pytest.raises(ValueError, match="cannot be part of an id"):
+            registry.register_task(name, Goal)
+    xml = registry.ROBOTS["Point"].path()
+    for attributes, message in (
+        ({"timstep": 0.01}, "has no 'timstep': did you mean 'timestep'"),
+        ({"timestep": -1.0}, "must be a positive float"),
+        ({"workspace": "3d"}, "must be 'planar' or 'spatial'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            registry.register_robot("Sled", xml=xml, **attributes)
+    with pytest.raises(ValueError, match="go with xml"):
+        registry.register_robot("Sled", registry.ROBOTS["Ant"], timestep=0.1)
+    with pytest.raises(ValueError, match="'Point' is known already"):
+        registry.register_robot("point", xml=xml)
+    with pytest.raises(ValueError, match="must be a subclass of Constraint"):
+        registry.register_constraint("Homes", Goal)
+    with pytest.raises(ValueError, match="must be a subclass of Task"):
+        registry.register_task("Three", 3)
+    assert "Sled" not in registry.ROBOTS
 
 
 def test_hints_name_the_nearest_match_whatever_its_case():

@@ -13,6 +13,7 @@ from typing import Any
 from sb3_guard.envs import constraints, robots, tasks
 from sb3_guard.envs.part import Constraint, Robot, Task
 from sb3_guard.envs.robots.robot import MJCFRobot
+from sb3_guard.spelling import did_you_mean
 
 ROBOTS: dict[str, type[Robot]] = {
     "Point": robots.Point,
@@ -87,23 +88,44 @@ def register_robot(
         file = Path(str(xml)).resolve()
         if not file.is_file():
             raise ValueError(f"robot {name!r}: there is no file {str(xml)!r}")
+        known = ["timestep", "workspace", "lidar_bodies", "center", "reach"]
+        for key in attributes:
+            if key not in known:
+                raise ValueError(f"robot {name!r} has no {key!r}: {did_you_mean(key, known)}")
+        timestep = attributes.get("timestep", 0.002)
+        if not isinstance(timestep, float) or not timestep > 0:
+            raise ValueError(f"robot {name!r}: timestep = {timestep!r} must be a positive float, s")
+        if attributes.get("workspace", "planar") not in ("planar", "spatial"):
+            raise ValueError(
+                f"robot {name!r}: workspace = {attributes['workspace']!r} must be 'planar' or "
+                "'spatial'"
+            )
         body = {"asset": "", "timestep": 0.002, **attributes, "path": classmethod(lambda cls: file)}
         robot = type(name, (MJCFRobot,), body)
-    _add(ROBOTS, name, robot)
+    elif attributes:
+        raise ValueError(f"robot {name!r}: {sorted(attributes)} go with xml, not with a class")
+    _add(ROBOTS, name, robot, Robot)
 
 
 def register_task(name: str, task: type[Task]) -> None:
     """Make a task known under ``name`` to ids, scenarios and commands."""
-    _add(TASKS, name, task)
+    _add(TASKS, name, task, Task)
 
 
 def register_constraint(name: str, constraint: type[Constraint]) -> None:
     """Make a constraint known under ``name`` to ids, scenarios and commands."""
-    _add(CONSTRAINTS, name, constraint)
+    _add(CONSTRAINTS, name, constraint, Constraint)
 
 
-def _add(table: dict[str, Any], name: str, part: type) -> None:
-    if not name.isidentifier() or "_" in name or name[0].isdigit():
+def _add(table: dict[str, Any], name: str, part: type, kind: type) -> None:
+    if not isinstance(part, type) or not issubclass(part, kind):
+        raise ValueError(f"{name!r} = {part!r} must be a subclass of {kind.__name__}")
+    for other in table:
+        if name.lower() == other.lower() and table[other] is not part:
+            raise ValueError(
+                f"a {kind.__name__.lower()} called {other!r} is known already: use another name"
+            )
+    if not name.isidentifier() or not name.isascii() or "_" in name:
         raise ValueError(
             f"{name!r} cannot be part of an id: use letters and digits, a letter first and no "
             "underscore"

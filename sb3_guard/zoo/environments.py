@@ -1,6 +1,5 @@
 """Environments for the commands: found, made, and wrapped as a run's hyper-parameters say."""
 
-import importlib
 import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -41,19 +40,6 @@ BAD_ARGUMENTS = (
     LayoutError,
     RenderingError,
 )
-
-
-def import_packages(names: Sequence[str]) -> None:
-    """
-    Import modules that register environments (``--gym-packages``).
-
-    :raises UsageError: one can't be imported
-    """
-    for name in names:
-        try:
-            importlib.import_module(name)
-        except ImportError as error:
-            raise UsageError(f"--gym-packages: can't import {name!r}: {one_line(error)}") from error
 
 
 def canonical_id(env_id: str) -> tuple[str, bool]:

@@ -41,13 +41,12 @@ from sb3_guard.zoo.environments import (
     BAD_ARGUMENTS,
     canonical_id,
     choose_vec_env,
-    import_packages,
     make_envs,
 )
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.progress import Epochs, find_monitor
 from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder, require_writable
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, import_packages, one_line
 
 # Flags that say how to watch or host a run, not what it is: they may change when it is resumed.
 FREE_FLAGS = {"trained_agent", "progress", "verbose", "num_threads", "checkpoint_every", "track"}

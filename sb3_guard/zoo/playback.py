@@ -17,11 +17,10 @@ from sb3_guard.zoo.config import build, check
 from sb3_guard.zoo.environments import (
     canonical_id,
     choose_vec_env,
-    import_packages,
     make_envs,
 )
 from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run, require_writable
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, import_packages, one_line
 
 
 def find_run(folder: str, algo: str, env_id: str, number: int = 0) -> RunFolder:

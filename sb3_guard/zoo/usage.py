@@ -3,10 +3,11 @@
 import argparse
 import ast
 import difflib
+import importlib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 
@@ -20,6 +21,19 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, (UsageError, ValueError)) and text:
         return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def import_packages(names: Sequence[str]) -> None:
+    """
+    Import modules that register environments (``--gym-packages``).
+
+    :raises UsageError: one can't be imported
+    """
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise UsageError(f"--gym-packages: can't import {name!r}: {one_line(error)}") from error
 
 
 class Parser(argparse.ArgumentParser):

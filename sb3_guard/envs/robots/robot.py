@@ -127,7 +127,9 @@ class MJCFRobot(Robot):
             self._attitude = np.array([1.0, 0.0, 0.0, 0.0])
         bodies = [model.body(i).name for i in range(model.nbody)]
         known = [name.removeprefix(PREFIX) for name in bodies if name.startswith(PREFIX)]
-        for name in self.sensing or ():
+        if self.sensing == ():
+            raise ValueError("robot.sensing = () must name a body, or be null")
+        for name in (*(self.sensing or self.lidar_bodies), self.center):
             if name not in known:
                 raise ValueError(
                     f"robot.sensing names no body {name!r}: {did_you_mean(name, known)}"

@@ -78,8 +78,6 @@ def test_no_leaf_imports_a_leaf():
 @pytest.mark.parametrize("name", ["geometry", "layout", "sensors", "motion", "parameters"])
 def test_the_pure_modules_know_only_numpy(name):
     module = f"sb3_guard.envs.{name}"
-    if module not in MODULES:
-        pytest.skip("this module does not exist yet")
     pure = {f"sb3_guard.envs.{n}" for n in ("geometry", "layout", "sensors", "parameters")}
     pure.add("sb3_guard.spelling")
     assert touches(module, "sb3_guard") <= {

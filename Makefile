@@ -6,7 +6,7 @@ ENV ?= Goal_Point_8Hazards
 STEPS ?= 1000000
 ARGS ?=
 
-.PHONY: train test test-slow check format type docs bench clean
+.PHONY: train test test-slow test-lowest check format type docs bench clean
 
 # torch goes first and alone: a requirement that another package leaves open would fetch CUDA builds
 $(VENV)/ready: pyproject.toml constraints.txt
@@ -23,6 +23,14 @@ test: $(VENV)/ready
 
 test-slow: $(VENV)/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow $(ARGS)
+
+# The same tests with the oldest dependencies that pyproject.toml admits; torch stays pinned.
+test-lowest: $(VENV)/ready
+	$(BIN)/python scripts/lowest_versions.py > $(VENV)/lowest.txt
+	$(PYTHON) -m venv $(VENV)-lowest
+	$(VENV)-lowest/bin/python -m pip install --quiet --constraint $(VENV)/lowest.txt torch
+	$(VENV)-lowest/bin/python -m pip install --quiet --constraint $(VENV)/lowest.txt --editable ".[dev]"
+	OMP_NUM_THREADS=1 $(VENV)-lowest/bin/python -m pytest -n 2 -m "not slow" $(ARGS)
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .
@@ -45,4 +53,4 @@ docs: $(VENV)/ready
 	$(BIN)/python scripts/render_gallery.py
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-lowest build dist .pytest_cache .mypy_cache .ruff_cache

@@ -23,6 +23,7 @@ _EXPORTS = {
     "TRPOUSL": "sb3_guard.algorithms",
     "ALGORITHMS": "sb3_guard.algorithms",
     "CostEvalCallback": "sb3_guard.common.callbacks",
+    "LogCosts": "sb3_guard.common.callbacks",
     "CostMonitor": "sb3_guard.common.monitor",
     "GuardVecEnv": "sb3_guard.common.vec_env",
     "evaluate_policy": "sb3_guard.common.evaluation",

@@ -8,9 +8,14 @@ from sb3_guard.spelling import did_you_mean
 
 COMMANDS = {
     "train": "train an agent",
+    "tune": "search hyper-parameters under a cost limit",
+    "benchmark": "train a grid of suites, algorithms and seeds",
     "enjoy": "play a trained agent, print return and cost, record a video",
+    "plot": "tables, figures and a page of trained runs",
+    "hub": "upload a trained agent to the Hugging Face hub, or download one",
     "list": "print suites, robots, tasks and constraints",
     "show": "print an environment's scenario, observations and actions, write a picture",
+    "completion": "print what completes the commands' flags in a shell",
 }
 
 

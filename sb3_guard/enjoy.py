@@ -29,6 +29,7 @@ DEFAULTS: dict[str, Any] = {
     "seed": 0,
     "env_kwargs": None,
     "record": None,
+    "json": None,
     "no_render": False,
     "device": "auto",
     "num_threads": -1,
@@ -99,6 +100,7 @@ def parser() -> Parser:
         metavar="FILE.mp4",
         help="write a video; no display is needed (default: beside the model)",
     )
+    output.add_argument("--json", metavar="FILE", help="write the statistics there as JSON")
     output.add_argument("--no-render", action="store_true", help="open no window")
     output.add_argument("--device", help="torch device (default: auto)")
     output.add_argument("--num-threads", type=int, metavar="N", help="threads of torch")

@@ -2,10 +2,11 @@
 
 import argparse
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from sb3_guard.envs import Scenario, env_ids
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.zoo.tables import table
 from sb3_guard.zoo.usage import Parser, UsageError, import_packages, run
 
 EXAMPLES = """examples:
@@ -14,15 +15,6 @@ EXAMPLES = """examples:
   sb3-guard list --ladder Goal_Point Hazards
 """
 LADDER = (1, 2, 4, 8, 16)
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown, aligned for the terminal."""
-    lines = [list(header), *map(list, rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    text = ["| " + " | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) + " |"
-            for line in lines]  # fmt: skip
-    return "\n".join([text[0], "|" + "|".join("-" * (w + 2) for w in widths) + "|", *text[1:]])
 
 
 def summary(part: type) -> str:
@@ -77,22 +69,27 @@ def constraints() -> str:
 KINDS = {"suites": suites, "robots": robots, "tasks": tasks, "constraints": constraints}
 
 
-def _list(argv: Sequence[str] | None) -> int:
-    parser = Parser(
+def parser() -> Parser:
+    """The flags."""
+    result = Parser(
         prog="sb3-guard list",
         description="Print suites, robots, tasks and constraints.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("kind", nargs="?", choices=list(KINDS), help="only these")
-    parser.add_argument(
+    result.add_argument("kind", nargs="?", choices=list(KINDS), help="only these")
+    result.add_argument(
         "--ladder",
         nargs=2,
         metavar=("TASK_ROBOT", "CONSTRAINT"),
         help="ids of growing difficulty: more and more of a constraint",
     )
-    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
-    args = parser.parse_args(argv)
+    result.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
+    return result
+
+
+def _list(argv: Sequence[str] | None) -> int:
+    args = parser().parse_args(argv)
     import_packages(args.gym_packages)
     if args.ladder:
         ids = [f"{args.ladder[0]}_{num}{args.ladder[1]}-v0" for num in LADDER]

@@ -12,8 +12,8 @@ import yaml
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.envs.scenario import Scenario
-from sb3_guard.list import table
 from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.tables import table
 from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, import_packages, one_line, run
 
 EXAMPLES = """examples:
@@ -44,22 +44,27 @@ def action_table(env: GuardVectorEnv) -> str:
     return table(["action", "actuator", "range", "control"], rows)
 
 
-def _show(argv: Sequence[str] | None) -> int:
-    parser = Parser(
+def parser() -> Parser:
+    """The flags."""
+    result = Parser(
         prog="sb3-guard show",
         description="Print an environment's scenario, observations and actions; write a picture.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("env", help="an id of ours, or a scenario file (.yml)")
-    parser.add_argument(
+    result.add_argument("env", help="an id of ours, or a scenario file (.yml)")
+    result.add_argument(
         "--env-kwargs", nargs="+", action=KeyValues, metavar="KEY:VALUE", help="change parameters"
     )
-    parser.add_argument("-o", "--output", type=Path, help="picture to write (default: <env>.png)")
-    parser.add_argument("--camera", default="fixed", help=f"one of {', '.join(CAMERAS)}")
-    parser.add_argument("--seed", type=int, default=0, help="of the episode in the picture")
-    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
-    args = parser.parse_args(argv)
+    result.add_argument("-o", "--output", type=Path, help="picture to write (default: <env>.png)")
+    result.add_argument("--camera", default="fixed", help=f"one of {', '.join(CAMERAS)}")
+    result.add_argument("--seed", type=int, default=0, help="of the episode in the picture")
+    result.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
+    return result
+
+
+def _show(argv: Sequence[str] | None) -> int:
+    args = parser().parse_args(argv)
     import_packages(args.gym_packages)
     if args.camera not in CAMERAS:
         raise UsageError(f"unknown camera {args.camera!r}: {did_you_mean(args.camera, CAMERAS)}")

@@ -2,12 +2,13 @@
 
 Every ratio is measured in one run: short slices of the full step and of a bare loop on the same
 model alternate, and the best slice of each counts. ``python scripts/bench_engine.py`` prints the
-marks for one suite, ``--all`` a table of every suite.
+marks for one suite, ``--all`` a table of every suite, ``--suites`` one of those whose ids match.
 """
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import time
 from collections.abc import Callable
 
@@ -114,16 +115,27 @@ def reset_seconds(env_id: str, n: int = 30, rounds: int = 5) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="Goal_Point_8Hazards-v0", help="the suite to measure")
-    parser.add_argument("--all", action="store_true", help="a table of all suites at N = 30")
+    table = parser.add_mutually_exclusive_group()
+    table.add_argument("--all", action="store_true", help="a table of all suites at N = 30")
+    table.add_argument(
+        "--suites",
+        nargs="+",
+        metavar="PATTERN",
+        help="a table of the suites whose ids match, such as '*_Arm?_*'",
+    )
     parser.add_argument("--seconds", type=float, default=6.0, help="time for each figure")
     parser.add_argument("--slices", type=int, default=20, help="slices that alternate")
     args = parser.parse_args()
+    patterns = ["*"] if args.all else args.suites or []
+    suites = [i for i in env_ids() if any(fnmatch.fnmatch(i, p) for p in patterns)]
+    if patterns and not suites:
+        parser.error(f"no id matches {' '.join(patterns)}; ids look like {args.env}")
     print(
         f"mujoco {mujoco.__version__}, stage {STAGE}, {FRAME_SKIP} physics steps per control step"
     )
-    if args.all:
+    if suites:
         print("| suite | env-steps/s | of bare physics | reset, ms |\n|---|---|---|---|")
-        for env_id in env_ids():
+        for env_id in suites:
             rates = batch_rates(env_id, 30, args.seconds / 6, args.slices)
             ratio = rates["full"] / rates["bare"]
             reset = 1e3 * reset_seconds(env_id)

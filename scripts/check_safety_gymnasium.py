@@ -1,7 +1,8 @@
 """Train CPO on Safety-Gymnasium's own SafetyPointGoal1-v0, beside the old packages it needs.
 
 ``python3.11 scripts/check_safety_gymnasium.py`` sets up ``.venv-mujoco-2.3.3`` from PyPI, about a
-gigabyte, and trains a few thousand steps there. It must be Python 3.11: MuJoCo 2.3 has no wheels
+gigabyte, and trains a few thousand steps there, from Python and by ``python -m sb3_guard.train
+--algo cpo --env SafetyPointGoal1-v0``. It must be Python 3.11: MuJoCo 2.3 has no wheels
 for a newer one, and sb3_guard needs at least that. ``--mujoco 3.3.7`` takes another MuJoCo, and
 ``--mujoco none`` none at all, each in its own folder; they train on a CartPole with a cost, since
 Safety-Gymnasium is not for them.
@@ -11,6 +12,8 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import json
+import math
 import os
 import re
 import subprocess
@@ -43,11 +46,15 @@ def set_up(folder: Path, mujoco: str) -> Path:
     install("torch==2.13.0")
     # MuJoCo 2.3 was compiled for NumPy 1
     install("numpy<2", "gymnasium==0.29.1", "stable_baselines3==2.9.2", "scipy")
+    # for the commands; RL-Zoo's own pins ask for a newer Gymnasium
+    install("huggingface_hub", "pyyaml", "rich", "tqdm", "wasabi")
+    zoo = ("rl_zoo3==2.9.2", "sb3_contrib==2.9.2", "sb3-team-hf-integration==3.2")
+    install("--no-deps", *zoo)
     if mujoco != "none":
         install(f"mujoco=={mujoco}")
     if mujoco == MUJOCO:
         # its own pins, such as Gymnasium 0.28.1, can't be kept: only what it really imports
-        install("xmltodict", "pyyaml", "imageio", "pygame")
+        install("xmltodict", "imageio", "pygame")
         install("--no-deps", "gymnasium-robotics==1.2.2", "pettingzoo==1.24.3")
         install("--no-deps", "safety-gymnasium==1.0.0")
         mend(next(folder.glob("lib/python*/site-packages/safety_gymnasium")))
@@ -131,6 +138,22 @@ def train(steps: int, plain: bool) -> None:
             f"evaluated: return {played.returns.mean():.2f}, cost {played.costs.mean():.1f}"
         )
         env.close()
+    by_command(env_id, steps, plain)
+
+
+def by_command(env_id: str, steps: int, plain: bool) -> None:
+    """Train by one command and play by another."""
+    with tempfile.TemporaryDirectory() as folder:
+        what = ["--algo", "cpo", "--env", env_id, "-f", folder]
+        params = ["n_envs:2", "n_steps:1000", "cost_limit:25.0", "n_critic_updates:20"]
+        params += ["missing_cost:zero"] if plain else []
+        flags = ["-n", str(steps), "--seed", "0", "--eval-freq", str(steps), "--eval-episodes", "1"]
+        train = [sys.executable, "-m", "sb3_guard.train", *what, *flags, "-params", *params]
+        subprocess.run(train, check=True)
+        result = json.loads((Path(folder) / "cpo" / f"{env_id}_1" / "result.json").read_text())
+        assert result["n_timesteps"] == steps and math.isfinite(result["return"])
+        play = ["--no-render", "--n-episodes", "1"]
+        subprocess.run([sys.executable, "-m", "sb3_guard.enjoy", *what, *play], check=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -12,10 +12,13 @@ import inspect
 from pathlib import Path
 
 from sb3_guard.envs import GuardVectorEnv
+from sb3_guard.envs.engine import FRAME_SKIP
+from sb3_guard.envs.objects import Movers
 from sb3_guard.envs.part import Part
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
-from sb3_guard.list import table, yes
+from sb3_guard.list import yes
 from sb3_guard.show import action_table, observation_table
+from sb3_guard.zoo.tables import table
 
 
 def parameters(part: type[Part]) -> str:
@@ -47,6 +50,16 @@ def taxonomy(part: type[Part]) -> str:
     return " · ".join(values)
 
 
+def speeds(part: type[Movers]) -> str:
+    """What the default speed is by the second, which depends on the robot's time step."""
+    robots: dict[float, list[str]] = {}
+    for name, robot in ROBOTS.items():
+        second = part().speed / (FRAME_SKIP * robot.timestep)
+        robots.setdefault(second, []).append(name)
+    each = "; ".join(f"{', '.join(robots[v])} {v:.3g}" for v in sorted(robots, reverse=True))
+    return f"A `speed` of {part().speed:g} m per control step is, in m/s, with {each}."
+
+
 def page(kind: str, name: str, part: type[Part]) -> str:
     """The page of one part."""
     text = inspect.cleandoc(part.__doc__ or "").replace("``", "`")
@@ -58,6 +71,8 @@ def page(kind: str, name: str, part: type[Part]) -> str:
         f"Parameters, set with `{part.name or name.lower()}={{...}}`:",
         parameters(part),
     ]
+    if issubclass(part, Movers):
+        parts.append(speeds(part))
     if kind == "robot":
         env = GuardVectorEnv(1, f"Goal_{name}_8Hazards")
         parts += [action_table(env), f"In `Goal_{name}_8Hazards`:", observation_table(env)]

@@ -54,6 +54,17 @@ class LinearCostBandit(gym.Env):
         return self.contexts[self.context], reward, True, False, {"cost": cost}
 
 
+class TwoCostBandit(LinearCostBandit):
+    """:class:`LinearCostBandit` with a second cost, ``cost_1 = a_0 + 0.5``.
+
+    Under the limits 0.5 and 0.4 both bind: the best action is (-0.1, 0.1), its reward 0.42.
+    """
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        *rest, info = super().step(action)
+        return (*rest, {**info, "cost_1": float(action[0]) + 0.5})
+
+
 class TabularCMDP(gym.Env):
     """A random finite-horizon CMDP whose constrained optimum is a linear program's answer.
 

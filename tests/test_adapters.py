@@ -1,5 +1,6 @@
 """Anyone's environment: costs from wherever they are, budgets, Safety-Gymnasium's interface."""
 
+import json
 import pickle
 import re
 import subprocess
@@ -126,9 +127,8 @@ def make(id, max_episode_steps=None, disable_env_checker=None, **kwargs):
 safe_registry = {"SafetyPointGoal1-v0"}
 
 
-@pytest.fixture
-def package(monkeypatch):
-    """The stub installed: importable, its ids in Gymnasium's registry."""
+def install(monkeypatch):
+    """The stub of Safety-Gymnasium: importable, its ids in Gymnasium's registry."""
     stub = types.ModuleType("safety_gymnasium")
     stub.make = make
     conversion = types.ModuleType("safety_gymnasium.wrappers.gymnasium_conversion")
@@ -146,6 +146,11 @@ def package(monkeypatch):
     ):
         spec = EnvSpec(name, entry_point, max_episode_steps=40, kwargs=kwargs)
         monkeypatch.setitem(gym.registry, name, spec)
+
+
+@pytest.fixture
+def package(monkeypatch):
+    install(monkeypatch)
 
 
 def test_six_values_become_five_and_nothing_is_lost():
@@ -477,6 +482,27 @@ def test_environments_of_others_are_made_and_trained_on_without_mujoco_4(absent)
     assert run.returncode == 1
     error = run.stderr.strip().splitlines()[-1]
     assert "'Goal_Point_8Hazards-v0': it is not registered" in error and "MuJoCo 4" in error, run
+
+
+@pytest.mark.parametrize("absent", ["mujoco", "mujoco.batch"])
+def test_the_commands_train_and_play_on_six_values_without_mujoco_4(absent, tmp_path):
+    run = without(
+        absent,
+        code=f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import pytest, test_adapters\n"
+        "from sb3_guard import enjoy, train\n"
+        "test_adapters.install(pytest.MonkeyPatch())\n"
+        f"where = ['--env', 'SafetyPointGoal1-v0', '-f', {str(tmp_path)!r}]\n"
+        "small = ['n_envs:2', 'n_steps:40', 'n_critic_updates:2']\n"
+        "assert train.main([*where, '--algo', 'cpo', '-n', '160', '--eval-freq', '80',\n"
+        "    '--eval-episodes', '1', '-params', *small]) == 0\n"
+        "assert enjoy.main([*where, '--algo', 'cpo', '--no-render', '--n-episodes', '1']) == 0\n"
+        "assert train.main(['--env', 'Goal_Point_8Hazards', '-n', '10']) == 2\n",
+    )
+    assert run.returncode == 0, run.stderr
+    result = json.loads((tmp_path / "cpo" / "SafetyPointGoal1-v0_1" / "result.json").read_text())
+    assert result["n_timesteps"] == 160 and result["cost"] >= 0.0
+    assert "sb3_guard's own environments need MuJoCo 4" in run.stderr
 
 
 def test_the_pages_examples_run():

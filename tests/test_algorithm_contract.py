@@ -1,8 +1,11 @@
 """Stable-Baselines3's contract, for every algorithm: spaces, saving, resuming, errors, silence."""
 
 import copy
+import inspect
+import itertools
 import pickle
 import random
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +15,17 @@ import pytest
 import torch as th
 from cost_envs import CostPoint, RandomCostEnv
 from gymnasium import spaces
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
     VecEnv,
+    VecEnvWrapper,
     VecFrameStack,
     VecNormalize,
 )
@@ -122,6 +129,7 @@ def test_spaces(
         ("MultiInputPolicy", spaces.Dict({"image": IMAGE, "vector": BOX}), {}),
         ("MlpPolicy", BOX, {"activation_fn": th.nn.ReLU}),
         ("MlpPolicy", BOX, {"net_arch": {"pi": [8], "vf": []}}),
+        ("MlpPolicy", BOX, {"net_arch": {"pi": [8]}}),
         ("MlpPolicy", BOX, {"net_arch": []}),
         ("MlpPolicy", BOX, {"share_features_extractor": False}),
         ("MlpPolicy", BOX, {"ortho_init": False, "log_std_init": -0.5}),
@@ -140,6 +148,46 @@ def test_policies(
     assert any("value_net" in name for name in moved)
     assert any("action_net" in name for name in moved)
     assert all(th.isfinite(value).all() for value in after.values())
+
+
+class _Normed(FlattenExtractor):
+    """Layers that behave in another way while a network is fitted."""
+
+    def __init__(self, observation_space: spaces.Space) -> None:
+        super().__init__(observation_space)
+        self.norm = th.nn.BatchNorm1d(self.features_dim)
+        self.dropout = th.nn.Dropout(0.5)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.dropout(self.norm(super().forward(observations)))
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_batch_norm_and_dropout_act_while_fitting_alone(cls: type[TrustRegion]) -> None:
+    """A policy that drops features at random has no KL to itself: none would be accepted."""
+    kwargs = {"features_extractor_class": _Normed, "log_std_init": -1.0}
+    model = small(cls, points(2, hazard=(-1.0, 0.0)), policy_kwargs=kwargs)
+    statistics = []
+    train = model.train
+
+    def spy() -> None:
+        before = model.policy.features_extractor.norm.running_mean.clone()
+        train()
+        statistics.append((before, model.policy.features_extractor.norm.running_mean.clone()))
+        assert not any(module.training for module in model.policy.modules())
+        assert model.logger.name_to_value["train/line_search_step"] > 0.0
+
+    model.train = spy
+    model.learn(240)
+    for (before, after), (following, _) in itertools.pairwise(statistics):
+        assert not th.equal(before, after), "fitting the critics moves them"
+        assert th.equal(after, following), "collecting does not"
+    observation = np.ones((3, 4), np.float32)
+    actions = [model.predict(observation, deterministic=True)[0] for _ in range(2)]
+    np.testing.assert_array_equal(*actions)
+    if cls.uses_cost_critic:
+        values = [model.cost_critic.predict(th.ones(3, 4)) for _ in range(2)]
+        assert th.equal(*values)
 
 
 @pytest.mark.parametrize("cls", CLASSES)
@@ -244,11 +292,23 @@ def test_a_limit_of_zero_with_and_without_cost(cls: type[TrustRegion], cost_scal
     assert np.isfinite(numbers).all()
 
 
-def test_subprocesses_and_frame_stacks() -> None:
-    env = VecFrameStack(SubprocVecEnv([lambda: CostPoint(episode_length=30)] * 2), 2)
-    model = small(CPO, env).learn(160)
-    assert model.num_timesteps == 160
-    env.close()
+@pytest.mark.parametrize("cls", CLASSES)
+def test_frame_stacks(cls: type[TrustRegion]) -> None:
+    """With costs of time-outs in the last frames, and a filter that acts on stacked ones."""
+    model = small(cls, VecFrameStack(points(), 3)).learn(160)
+    assert model.observation_space.shape == (12,) and len(model.ep_cost_buffer) == 4
+
+
+@pytest.mark.parametrize("cls", [CPO, TRPOSL])
+def test_subprocesses_change_nothing(cls: type[TrustRegion]) -> None:
+    runs = []
+    for kind in (DummyVecEnv, SubprocVecEnv):
+        env = kind([lambda: CostPoint(episode_length=30, hazard=(-1.0, 0.0))] * 2)
+        env.seed(0)
+        runs.append(small(cls, env).learn(160))
+        env.close()
+    assert_equal(*(parameters(model) for model in runs))
+    assert runs[0].total_cost == runs[1].total_cost > 0.0
 
 
 def test_an_env_that_is_no_vec_env_and_an_id() -> None:
@@ -307,6 +367,22 @@ def test_a_missing_cost_may_mean_zero() -> None:
     assert model.total_cost == 0.0
 
 
+class _WithoutInfos(VecEnvWrapper):
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        *rest, _ = self.venv.step_wait()
+        return (*rest, [])
+
+
+def test_no_infos_at_all_are_no_costs() -> None:
+    env = _WithoutInfos(points(2, episode_length=10**6))
+    assert small(TRPO, env).learn(80).num_timesteps == 80
+    with pytest.raises(ValueError, match="info of environment 0 has no cost key 'cost'"):
+        small(CPO, env).learn(80)
+
+
 def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -> None:
     model = small(TRPO, info_env()).learn(80)
     assert not [w for w in recwarn if "cost" in str(w.message)]
@@ -338,6 +414,8 @@ def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -
         ({"cg_damping": -1.0}, "cg_damping=-1.0"),
         ({"learning_rate": 0.0}, "learning_rate=0.0"),
         ({"learning_rate": "fast"}, "learning_rate='fast'"),
+        ({"learning_rate": True}, "learning_rate=True"),
+        ({"learning_rate": float("inf")}, "learning_rate=inf"),
         ({"missing_cost": "ignore"}, "missing_cost='ignore'"),
         ({"cost_keys": "cost"}, r"cost_keys='cost'.*sequence"),
         ({"cost_keys": ()}, "cost_keys="),
@@ -345,6 +423,9 @@ def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -
         ({"cost_limit": [1.0, 2.0]}, r"cost_limit=\[1.0, 2.0\].*one for each of the 1"),
         ({"cost_limit": [1.0], "cost_keys": ("a", "b")}, r"one for each of the 2.*'a', 'b'"),
         ({"cost_limit": float("nan")}, "cost_limit=nan"),
+        ({"cost_limit": -3}, "cost_limit=-3: must be at least 0, as costs are"),
+        ({"cost_limit": [-0.5]}, r"cost_limit=\[-0.5\]: must be at least 0"),
+        ({"cost_limit": True}, "cost_limit=True"),
         ({"cost_limit": "low"}, "cost_limit='low'"),
         ({"rollout_buffer_class": dict}, "rollout_buffer_class=dict"),
     ],
@@ -414,6 +495,9 @@ def test_parameters_travel(cls: type[TrustRegion]) -> None:
     assert ("cost_critic" in parameters(a)) is cls.uses_cost_critic
     assert ("multiplier" in parameters(a)) is (cls.__name__ in ("TRPOLag", "TRPOFAC"))
     assert ("policy.action_filter.optimizer" in parameters(a)) is (cls in FILTERED)
+    # SB3's tools draw, average and compare whole state dictionaries: no booleans, no integers.
+    modules = [value for name, value in parameters(a).items() if "optimizer" not in name]
+    assert all(each.is_floating_point() for module in modules for each in module.values())
     with pytest.raises(ValueError, match="do not match"):
         b.set_parameters({"policy": parameters(a)["policy"]})
 
@@ -523,6 +607,61 @@ class _Dumps(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_callbacks_see_the_locals_of_sb3(cls: type[TrustRegion]) -> None:
+    seen: dict[type, tuple[dict[str, Any], dict[str, Any]]] = {}
+    for kind in (PPO, cls):
+        model = (
+            PPO("MlpPolicy", points(), n_steps=40, batch_size=40, device="cpu")
+            if kind is PPO
+            else small(cls, points())
+        )
+
+        def keep(local: dict[str, Any], glob: dict[str, Any], kind: type = kind) -> bool:
+            seen[kind] = dict(local), dict(glob)
+            return True
+
+        model.learn(160, callback=keep)
+    local = seen[cls][0]
+    assert seen[PPO][0].keys() <= local.keys()
+    assert seen[PPO][1].keys() <= seen[cls][1].keys()
+    assert local["self"] is not None and isinstance(local["env"], VecEnv)
+    assert local["actions"].shape == local["clipped_actions"].shape == (2, 2)
+    assert local["infos"][0]["cost"] >= 0.0
+
+
+def test_a_progress_bar_is_shown(capfd: pytest.CaptureFixture[str]) -> None:
+    small(CPO, points()).learn(80, progress_bar=True)
+    assert "80/80" in "".join(capfd.readouterr())
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_the_device_is_chosen_as_sb3_does(cls: type[TrustRegion]) -> None:
+    model = cls("MlpPolicy", points())
+    assert model.device == get_device("auto")
+    parts = [model.policy] + ([model.cost_critic] if cls.uses_cost_critic else [])
+    assert {each.device.type for part in parts for each in part.parameters()} == {model.device.type}
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_a_leaf_is_its_problem_and_its_hooks(cls: type[TrustRegion]) -> None:
+    """It names its paper, states its problem in a block, and replaces hooks and set-up alone."""
+    doc = inspect.getdoc(cls)
+    first, _, rest = doc.partition("\n\n")
+    assert re.search(r"\bet al\., \d{4}.*\d{4}\.\d{5}\)", first)
+    assert rest.startswith("::\n")
+    hooks = {"surrogate", "step", "accept", "correct", "fit"}
+    base = {name for name, value in vars(TrustRegion).items() if callable(value)}
+    replaced = {
+        name
+        for layer in cls.__mro__[: cls.__mro__.index(TrustRegion)]
+        for name, value in vars(layer).items()
+        if callable(value) and name in base
+    }
+    set_up = {"__init__", "_check_hyperparameters", "_setup_model", "_get_torch_save_params"}
+    assert replaced <= hooks | set_up | {"_setup_learn"}
 
 
 SB3_KEYS = {

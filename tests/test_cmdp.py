@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint, LinearCostBandit, TabularCMDP
+from cost_envs import CostPoint, LinearCostBandit, TabularCMDP, TwoCostBandit
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -141,6 +141,22 @@ def test_the_bandit_ends_at_its_constrained_optimum(cls: type[TrustRegion], seed
     best = 1 - np.sum((bandit.optimum(limit) - bandit.target) ** 2)
     assert bandit.normal @ action + bandit.offset <= 1.05 * limit
     assert 1 - np.sum((action - bandit.target) ** 2) >= 0.95 * best
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("cls", CONSTRAINED)
+def test_two_limits_that_both_bind(cls: type[TrustRegion], seed: int) -> None:
+    limits = np.array([0.5, 0.4])
+    # Two barriers are 2/t of return: at t = 100 that is all that may be lost.
+    sharper = {"t": 300.0, "max_multiplier": 1.2} if cls is TRPOIPO else {}
+    keys = ("cost", "cost_1")
+    modes = solve_bandit(
+        cls, TwoCostBandit, seed, cost_keys=keys, cost_limit=list(limits), **sharper
+    )
+    (action,) = np.mean(modes.actions[-20:], axis=0)
+    costs = np.array([action.sum() + 0.5, action[0] + 0.5])
+    assert np.all(costs <= 1.05 * limits)
+    assert 1 - np.sum((action - TwoCostBandit().target) ** 2) >= 0.95 * 0.42
 
 
 @pytest.mark.parametrize("t", [1.0, 10.0, 100.0])

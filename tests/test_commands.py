@@ -74,11 +74,15 @@ def test_costs_are_in_the_files(tmp_path):
     assert result["cost_rate"] == pytest.approx(episodes["c"].sum() / 120)
 
 
+def outcome(run):
+    """What a run came to, its duration aside."""
+    return json.loads((run / "result.json").read_text()) | {"seconds": None}
+
+
 def test_same_seed_same_run(tmp_path):
     one, other = trained(tmp_path), trained(tmp_path)
-    results = [(run / "result.json").read_text() for run in (one, other)]
-    assert results[0] == results[1]
-    assert (trained(tmp_path, "--seed", "4") / "result.json").read_text() != results[0]
+    assert outcome(one) == outcome(other)
+    assert outcome(trained(tmp_path, "--seed", "4")) != outcome(one)
 
 
 def test_summary_names_folder_and_figures(tmp_path, capsys):
@@ -194,6 +198,19 @@ def test_enjoy_prints_return_and_cost(logs, which, capsys):
     assert float(mean.split()[1]) == pytest.approx(np.mean(returns), abs=1e-3)
 
 
+def test_enjoy_writes_its_statistics(logs, tmp_path):
+    file = tmp_path / "made" / "played.json"
+    assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "3", "--json", str(file)]) == 0
+    played = json.loads(file.read_text())
+    assert played["episodes"] == 3 and played["algo"] == "cpo" and played["env"] == "Filmed-v0"
+    for name in ("return", "cost", "length"):
+        values = played[name]["values"]
+        assert len(values) == 3 and played[name]["mean"] == pytest.approx(np.mean(values))
+        assert played[name]["low"] <= played[name]["mean"] <= played[name]["high"]
+    assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "1", "--json", str(file)]) == 0
+    assert json.loads(file.read_text())["cost"]["low"] is None
+
+
 def test_enjoy_is_seeded_and_deterministic_by_default(logs, capsys):
     def play(*arguments):
         assert enjoy.main([*PLAY, "-f", str(logs), *arguments]) == 0
@@ -305,6 +322,39 @@ def test_no_backend_no_video(tmp_path, monkeypatch, capsys):
 
 
 # help and the dispatcher
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_help_shows_an_example(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main([command, "--help"])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    examples = text[text.index("examples:") :]
+    assert f"sb3_guard.{command} " in examples or f"sb3-guard {command}" in examples
+
+
+def test_completion_in_bash(tmp_path):
+    script = tmp_path / "completion.bash"
+    done = subprocess.run(
+        [sys.executable, "-m", "sb3_guard.completion", "bash"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    script.write_text(done.stdout)
+
+    def completed(line: str) -> set[str]:
+        words = line.split(" ")
+        ask = (
+            f"source {script}; COMP_WORDS=({' '.join(words[:-1])} '{words[-1]}'); "
+            f"COMP_CWORD={len(words) - 1}; _shtab_sb3_guard; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+        )
+        out = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=True)
+        return set(out.stdout.split())
+
+    assert completed("sb3-guard tr") == {"train"}
+    assert {"cpo", "pcpo", "trpo_lag", "ppo"} <= completed("sb3-guard train --algo ")
+    assert completed("sb3-guard enjoy --env Goal_Arm6_8G") == {"Goal_Arm6_8Ghosts-v0"}
+    assert "--record" in completed("sb3-guard enjoy --re")
 
 
 @pytest.mark.parametrize("command", ["train", "enjoy"])

@@ -1,7 +1,9 @@
 """Constraints: costs against scalar loops and MuJoCo's own contacts, and bodies that behave."""
 
 import math
+from functools import partial
 
+import gymnasium
 import numpy as np
 import pytest
 from worlds import (
@@ -244,6 +246,62 @@ def test_any_mixture_and_several_of_one_type():
         np.testing.assert_allclose(outcome.cost, sum(outcome.costs.values()), atol=1e-12)
 
 
+@pytest.mark.parametrize("lone", [True, False])
+def test_groups_of_one_type_are_charged_apart(lone):
+    """Two sizes of hazards and one of pillars: each its own cost, and the sum."""
+    groups = {
+        "hazards": {"num": 2, "size": 0.4, "weight": 3.0},
+        "pits": {"type": "hazards", "num": 2, "size": 0.2},
+        "posts": {"type": "pillars", "num": 1, "size": 0.05},
+    }
+    make = gymnasium.make if lone else partial(gymnasium.make_vec, num_envs=2)
+    env = make("Goal_Point_8Hazards-v0", **groups)
+    env.reset(seed=0)
+    engine = env.unwrapped.engine
+    assert list(engine.footprints) == ["robot", "goal", *groups]
+    for name, gaps in (("hazards", (0.25, 0.5)), ("pits", (0.15, 0.05))):
+        engine.places(name)[:, :, 1] = engine.robot.position[:, None, 1]
+        engine.places(name)[:, :, 0] = engine.robot.position[:, None, 0] + gaps
+    rest = np.zeros(env.action_space.shape, np.float32)
+    info = env.step(rest)[4]
+    expected = {"cost_hazards": 3.0 * 0.15, "cost_pits": 0.05 + 0.15, "cost_posts": 0.0}
+    for name, cost in {**expected, "cost": 0.65}.items():
+        np.testing.assert_allclose(info[name], cost, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("task", "params", "name"),
+    [
+        ("Push", {}, "ball"),
+        ("Push", {"object": "box"}, "box"),
+        ("Chase", {"solid": True}, "targets"),
+    ],
+)
+def test_names_of_bodies_are_not_given_twice(task, params, name):
+    scenario = Scenario(task=task, task_params=params, constraints={name: {"type": "pillars"}})
+    with pytest.raises(ValueError, match=f"two parts have bodies called '{name}'; give the con"):
+        scenario.build()
+
+
+def test_what_hangs_in_the_air_can_be_met():
+    """Zones that a robot on the floor would never enter, and bodies in the floor, are refused."""
+
+    def build(robot, **params):
+        Scenario(robot=robot, constraints={"ghosts": params}).build()
+
+    for kind in ("hazards", "ghosts"):
+        zones = {kind: {"space": "spatial", "height": [0.4, 1.0]}}
+        with pytest.raises(ValueError, match=rf"{kind}.height .* between 0.00 and 0.40 m count"):
+            Scenario(constraints=zones).build()
+        zones[kind]["height"] = [0.39, 1.0]
+        Scenario(constraints=zones).build()
+    build("Humanoid", space="spatial", height=[1.0, 2.0])
+    build("Point", space="spatial", solid=True)
+    build("Drone", height=[0.1, 1.0])
+    with pytest.raises(ValueError, match=r"would stick in the floor; .* at least 0\.3"):
+        build("Drone", height=[0.1, 1.0], solid=True)
+
+
 def test_parts_of_one_name_are_refused():
     from sb3_guard.envs.constraints import Hazards, Pillars
     from sb3_guard.envs.engine import Engine
@@ -310,6 +368,14 @@ def test_constraints_state_the_papers_taxonomy():
         ("ghosts", {"solid": "yes"}, r"ghosts.solid = 'yes' must be true or false"),
         ("ghosts", {"sped": 1.0}, r"no parameter 'sped': did you mean 'speed'\?"),
         ("ghosts", {"height": [2, 1]}, r"ghosts.height"),
+        ("ghosts", {"height": [-0.2, 1]}, r"ghosts.height = \(-0.2, 1\) must be at least 0"),
+        ("hazards", {"height": [-2, -1]}, r"hazards.height = \(-2, -1\) must be at least 0"),
+        ("a b/", {"type": "hazards"}, r"constraint 'a b/': .* letters, digits and underscores"),
+        ("", {"type": "hazards"}, r"constraint '': .* letters, digits and underscores"),
+        ("2pits", {"type": "hazards"}, r"constraint '2pits': .* no digit first"),
+        ("goal", {"type": "hazards"}, r"constraint 'goal': .* parameters of another part"),
+        ("lidar", {"type": "hazards"}, r"constraint 'lidar': .* parameters of another part"),
+        ("hazards", 8, r"constraint 'hazards' = 8 must be a mapping of parameters"),
         ("pillars", {"height": [0, 1]}, r"no parameter 'height': did you mean"),
         ("vases", {"density": 0}, r"vases.density = 0 must be greater than 0"),
         ("gremlins", {"travel": -0.1}, r"gremlins.travel = -0.1 must be at least 0"),

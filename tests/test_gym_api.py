@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 from suites import IDS
 
 import sb3_guard
-from sb3_guard.envs import env_ids, env_spec, make, register
+from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_ids, env_spec, make, register
 
 INFINITE = {"minimum value is -infinity", "maximum value is infinity"}
 
@@ -139,6 +139,11 @@ def test_every_suite_is_registered_with_both_entry_points():
         assert spec.entry_point and spec.vector_entry_point
         assert spec == env_spec(env_id)
         assert spec.max_episode_steps == 1000
+
+
+@pytest.mark.parametrize("cls", [GuardEnv, GuardVectorEnv])
+def test_what_a_refused_constructor_leaves_can_be_closed(cls):
+    cls.__new__(cls).close()  # Gymnasium closes vector environments when they are collected
 
 
 def test_bad_actions_and_modes_are_refused():

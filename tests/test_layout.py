@@ -51,7 +51,7 @@ def check(parts, layout):
             x0 + f.keepout <= x <= x1 - f.keepout and y0 + f.keepout <= y <= y1 - f.keepout
             for x0, y0, x1, y1 in f.placements
         )
-        assert math.hypot(x, y) <= f.planar_reach + 1e-12
+        assert not f.out_of_reach(np.array([[x], [y]]))[0]
 
 
 @pytest.mark.parametrize(
@@ -153,12 +153,8 @@ def test_fixed_locations_are_kept_and_others_yield():
     [
         ([Footprint("few", 2, 0.4, ARENA), Footprint("boulders", 9, 0.9, ARENA)], "boulders"),
         ([Footprint("far", 3, 0.5, ARENA, reach=0.4)], "far"),
-        (
-            [Footprint("a", 1, 0.5, ARENA, ((0, 0),)), Footprint("b", 1, 0.5, ARENA, ((0.5, 0),))],
-            r"b cannot be placed.*0\.50 m from a.*1\.00",
-        ),
     ],
-    ids=["crowded", "reach", "fixed"],
+    ids=["crowded", "reach"],
 )
 def test_what_cannot_be_placed_is_named(parts, words):
     with pytest.raises(LayoutError, match=words):
@@ -171,11 +167,38 @@ def test_what_cannot_be_placed_is_named(parts, words):
         ({"placements": ((0, 0, 0, 1),)}, "placement"),
         ({"placements": ((0, 0, 0.5, 1),)}, "keepout 0.4"),
         ({"num": 1, "locations": ((0, 0), (1, 1))}, "2 locations for 1"),
+        (
+            {"height": (2.5, 3.0), "reach": 2.0},
+            r"height is out of .* reach: 2\.50 m .* reaches 2\.0",
+        ),
+        (
+            {"locations": ((0, 0), (0, 1.5)), "base": (2, 1.5), "reach": 2.2, "height": (1, 2)},
+            r"location \(0, 0\) is out of .* reach: 2\.69 m from its base at \(2, 1\.5\)",
+        ),
     ],
 )
 def test_bad_footprints_are_refused(kwargs, words):
     with pytest.raises(ValueError, match=words):
         Footprint(**{"name": "x", "num": 3, "keepout": 0.4, **kwargs})
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        (
+            {"hazards": {"num": 2, "locations": [[1, 1], [1, 0.5]]}},
+            r"hazards\[0\] = \(1, 1\) and hazards\[1\] = \(1, 0\.5\) are 0\.50 m .* 0\.80 m",
+        ),
+        (
+            {"goal": {"locations": [[1, 1]]}, "robot": {"locations": [[1, 0]], "margin": 0.3}},
+            r"robot\[0\] = \(1, 0\) and goal\[0\] = \(1, 1\) are 1\.00 m .* 1\.10 m",
+        ),
+    ],
+)
+def test_fixed_locations_that_clash_fail_at_construction(parts, words):
+    scenario = Scenario.parse("Goal_Point_2Hazards").override(**parts)
+    with pytest.raises(ValueError, match=words):
+        scenario.build()
 
 
 GOAL = Footprint("goal", 1, 0.4, ARENA)
@@ -215,6 +238,17 @@ def test_new_goals_keep_clear_of_ghosts_that_have_moved():
         assert math.dist(goal[:2], engine.robot.position[0, :2]) >= 0.8
 
 
+def test_new_goals_keep_clear_of_the_circles_of_gremlins():
+    engine = Scenario.parse("Goal_Point_2Gremlins").override(gremlins={"rate": 3.0}).build()
+    engine.seed(0, np.random.default_rng(0))
+    engine.reset(np.zeros(1, dtype=np.int32))
+    for _ in range(150):
+        engine.step(np.zeros((1, 2)))
+        assert engine.redraw("goal", 0)
+        goal, middles = engine.places("goal")[0, 0, :2], engine.places("gremlins")[0, :, :2]
+        assert np.linalg.norm(goal - middles, axis=1).min() >= 0.9
+
+
 def test_new_goals_keep_clear_of_vases_and_balls_that_were_pushed():
     engine = Scenario.parse("Push_Point_3Vases").build(1)
     engine.seed(0, np.random.default_rng(0))
@@ -231,21 +265,33 @@ def test_new_goals_keep_clear_of_vases_and_balls_that_were_pushed():
         assert math.hypot(x, y + 1) >= 0.6
 
 
-@pytest.mark.parametrize("suite", ["Goal_Arm3_8Hazards", "Push_Arm6_8Ghosts", "Goal_Arm6_8Ghosts"])
-def test_what_an_arm_has_to_reach_is_within_reach(suite):
-    engine = Scenario.parse(suite).build(1)
+@pytest.mark.parametrize("base", [(0.0, 0.0), (1.2, -0.9)])
+@pytest.mark.parametrize("suite", ["Goal_Arm3_3Hazards", "Push_Arm6_8Ghosts", "Goal_Arm6_8Ghosts"])
+def test_what_an_arm_has_to_reach_is_within_reach_of_its_base(suite, base):
+    engine = Scenario.parse(suite).override(robot={"locations": [base]}).build(1)
     reach = engine.robot.reach
     assert math.isfinite(reach)
     for seed in range(10):
         engine.seed(0, np.random.default_rng(seed))
         engine.reset(np.zeros(1, dtype=np.int32))
         for name in {"goal", "ball", "hazards"} & set(engine.footprints):
-            assert np.linalg.norm(engine.places(name)[0], axis=1).max() <= reach
+            assert np.linalg.norm(engine.places(name)[0] - [*base, 0], axis=1).max() <= reach
         assert not engine.task.succeeded(engine.task.measure())[0]
         for _ in range(5):
             assert len(engine.task.advance(np.zeros(1, dtype=int))) == 0
             assert not engine.task.succeeded(engine.task.measure())[0]
-            assert np.linalg.norm(engine.places("goal")[0, 0]) <= reach
+            assert np.linalg.norm(engine.places("goal")[0, 0] - [*base, 0]) <= reach
+
+
+def test_a_robot_of_limited_reach_stands_at_a_fixed_place():
+    base = Scenario.parse("Goal_Arm3_2Hazards")
+    engine = base.override(robot={"locations": []}).build()
+    engine.reset(np.zeros(1, dtype=np.int32))
+    np.testing.assert_array_equal(engine.places("robot")[0, 0], 0.0)
+    with pytest.raises(ValueError, match="robot: 2 locations for 1 objects"):
+        base.override(robot={"locations": [[0, 0], [1, 1]]}).build()
+    with pytest.raises(ValueError, match=r"robot.placements = .* stands at a fixed place"):
+        base.override(robot={"placements": [[-1, -1, 1, 1]]})
 
 
 @pytest.mark.parametrize("suite", ["Goal_Point_0Hazards", "Goal_Arm3_0Hazards"])
@@ -264,11 +310,11 @@ def test_a_part_can_keep_a_margin_of_its_own():
     from sb3_guard.envs import Scenario
 
     base = Scenario.parse("Goal_Point_2Hazards")
-    engine = base.override(goal={"margin": 1.0}, hazards={"height": [0.7, 0.7]}).build(20)
+    engine = base.override(goal={"margin": 1.0}, hazards={"height": [0.3, 0.3]}).build(20)
     engine.reset(np.arange(20))
     goal, hazards = engine.places("goal")[:, 0, :2], engine.places("hazards")[..., :2]
     gap = np.linalg.norm(hazards - goal[:, None], axis=-1)
     assert 1.8 <= gap.min() < 2.2
-    flying = base.override(hazards={"space": "spatial", "height": [0.7, 0.7]}).build(3)
+    flying = base.override(hazards={"space": "spatial", "height": [0.3, 0.3]}).build(3)
     flying.reset(np.arange(3))
-    np.testing.assert_array_equal(flying.places("hazards")[..., 2], 0.7)
+    np.testing.assert_array_equal(flying.places("hazards")[..., 2], 0.3)

@@ -48,6 +48,11 @@ def lidar_3d(points, azimuth, elevation, gain, alias):
     return [value for column in out for value in column]
 
 
+def by_coordinate(v):
+    """[N, B, K, d] as [d, B, K, N]."""
+    return v.transpose(3, 1, 2, 0).copy()
+
+
 @pytest.mark.parametrize("bins", [1, 2, 3, 16])
 @pytest.mark.parametrize(("gain", "reach"), [(1.0, None), (0.5, None), (1.0, 2.5)])
 @pytest.mark.parametrize("alias", [True, False])
@@ -56,7 +61,7 @@ def test_planar_lidar_equals_the_scalar_loop(bins, gain, reach, alias):
     v = rng.uniform(-3, 3, (7, 2, 5, 2))
     v[0, 0, :4] = [[1, 0], [0, 1], [-1, 0], [0, -1]]  # on the edges between bins
     v[1, 0, :2] = [[0, 0], [-1, -1e-300]]  # on the spot, and an angle that rounds up to 2 pi
-    scan = Lidar(bins=bins, gain=gain, max_distance=reach, alias=alias).scan(v)
+    scan = Lidar(bins=bins, gain=gain, max_distance=reach, alias=alias).scan(by_coordinate(v))
     for n, b in np.ndindex(7, 2):
         np.testing.assert_allclose(
             scan[n, b], lidar_2d(v[n, b].tolist(), bins, gain, reach, alias), atol=1e-12
@@ -64,26 +69,26 @@ def test_planar_lidar_equals_the_scalar_loop(bins, gain, reach, alias):
 
 
 @pytest.mark.parametrize("alias", [True, False])
-@pytest.mark.parametrize(("azimuth", "elevation"), [(10, 6), (1, 1), (4, 3)])
+@pytest.mark.parametrize(("azimuth", "elevation"), [(10, 6), (1, 1), (4, 3), (5, 1), (2, 2)])
 def test_spatial_lidar_equals_the_scalar_loop(azimuth, elevation, alias):
     rng = np.random.default_rng(1)
     v = rng.uniform(-3, 3, (6, 3, 4, 3))
     v[0, 0, :3] = [[0, 0, 2], [0, 0, -2], [0, 0, 0]]  # the poles, and on the spot
-    scan = Lidar(azimuth=azimuth, elevation=elevation, alias=alias).scan(v)
+    scan = Lidar(azimuth=azimuth, elevation=elevation, alias=alias).scan(by_coordinate(v))
     for n, b in np.ndindex(6, 3):
         want = lidar_3d(v[n, b].tolist(), azimuth, elevation, 1.0, alias)
         np.testing.assert_allclose(scan[n, b], want, atol=1e-12)
 
 
 def test_lidar_of_nothing_is_empty():
-    assert not Lidar().scan(np.zeros((3, 1, 0, 2))).any()
-    assert Lidar().scan(np.zeros((3, 1, 0, 2))).shape == (3, 1, 16)
+    scan = Lidar().scan(np.zeros((2, 1, 0, 3)))
+    assert scan.shape == (3, 1, 16) and not scan.any()
 
 
 def test_compass_equals_the_formula_and_is_zero_on_the_spot():
     v = np.array([[3.0, 4.0], [0.0, 0.0], [-1e-3, 0.0]])
     np.testing.assert_allclose(
-        compass(v), [[3 / 5.001, 4 / 5.001], [0, 0], [-1e-3 / 2e-3, 0]], atol=1e-15
+        compass(v.T).T, [[3 / 5.001, 4 / 5.001], [0, 0], [-1e-3 / 2e-3, 0]], atol=1e-15
     )
 
 
@@ -91,17 +96,23 @@ def test_points_in_frames_equal_the_matrix_product():
     rng = np.random.default_rng(2)
     rotation = np.linalg.qr(rng.normal(size=(4, 2, 3, 3)))[0]
     origin, points = rng.normal(size=(4, 2, 3)), rng.normal(size=(4, 5, 3))
-    got = geometry.into_frames(origin, rotation, points)
+    by_axis = geometry.into_frames(origin, rotation, geometry.by_coordinate(points))
+    got = by_axis.transpose(3, 1, 2, 0)
     for n, b, k in np.ndindex(4, 2, 5):
         want = rotation[n, b].T @ (points[n, k] - origin[n, b])
         np.testing.assert_allclose(got[n, b, k], want, atol=1e-14)
-    np.testing.assert_array_equal(geometry.into_frames(origin, rotation, points, 2), got[..., :2])
+    flat = geometry.into_frames(origin, rotation, geometry.by_coordinate(points), 2)
+    np.testing.assert_array_equal(flat, by_axis[:2])
 
 
 def test_distance_to_segments():
-    start, end = np.array([[[0.0, 0, 0]]]), np.array([[[2.0, 0, 0]]])
-    points = np.array([[[1.0, 3, 4], [-3, 0, 4], [5, 4, 0], [1, 0, 0]]])
-    np.testing.assert_allclose(geometry.segment_distance(start, end, points)[0, 0], [5, 5, 5, 0])
+    start = np.array([[[0.0, 0, 0], [1, 3, 0]]]).T  # the second one has no length
+    end = np.array([[[2.0, 0, 0], [1, 3, 0]]]).T
+    points = np.array([[[1.0, 3, 4], [-3, 0, 4], [5, 4, 0], [1, 0, 0]]]).T
+    got = geometry.segment_distance(start, end, points)[..., 0]
+    np.testing.assert_allclose(got, [[5, 5, 5, 0], [4, np.sqrt(41), np.sqrt(17), 3]])
+    flat = geometry.segment_distance(start[:2], end[:2], points[:2])[..., 0]
+    np.testing.assert_allclose(flat, [[3, 3, 5, 0], [0, 5, np.sqrt(17), 3]])
 
 
 def test_turns_by_quaternion_and_by_matrix_agree():

@@ -117,6 +117,33 @@ def test_the_robot_pushes_the_object(kind):
     assert felt and pose[0, 0] > start[0, 0] + 0.3
 
 
+@pytest.mark.parametrize(("kind", "volume"), [("ball", 4 / 3 * math.pi), ("box", 10.0)])
+@pytest.mark.parametrize("size", [0.1, 0.2, 0.5])
+def test_the_objects_mass_follows_its_size(kind, volume, size):
+    """GUARD's ball: radius 0.2 m, 3.35e-5 kg. The box and its four posts: (8 + 4 / 2) size³."""
+    push = {"object": kind, "object_size": size}
+    for density in (1e-3, 0.02):
+        engine = Scenario(task="Push", task_params={**push, "object_density": density}).build()
+        mass = engine.model.body(f"{kind}/0").mass[0]
+        assert mass == pytest.approx(density * volume * size**3)
+        if (kind, size, density) == ("ball", 0.2, 1e-3):
+            assert mass == pytest.approx(3.35e-5, rel=1e-3)
+
+
+@pytest.mark.parametrize(("kind", "covers"), [("ball", 0.3), ("box", 0.3 * 1.25 * 2**0.5)])
+def test_the_object_keeps_clear_of_what_it_could_bump_into(kind, covers):
+    push = {"object": kind, "object_size": 0.3}
+    engine = Scenario(task="Push", task_params=push).build()
+    body = engine.model.body(f"{kind}/0")
+    model, outer = engine.model, 0.0
+    for g in np.flatnonzero(model.geom_bodyid == body.id):
+        half = model.geom_size[g, :2] if kind == "box" else [model.geom_size[g, 0], 0.0]
+        outer = max(outer, math.hypot(*(np.abs(model.geom_pos[g, :2]) + half)))
+    assert engine.footprints[kind].keepout == pytest.approx(outer) == pytest.approx(covers)
+    push["object_keepout"] = 0.1
+    assert Scenario(task="Push", task_params=push).build().footprints[kind].keepout == 0.1
+
+
 def test_a_box_has_posts_that_rest_on_nothing():
     engine = world("Push_Point_0Hazards", push={"object": "box"})
     body = engine.model.body("box/0")
@@ -196,6 +223,41 @@ def test_defense_rewards_equal_the_scalar_loop(suite, params):
     assert outside == {True, False}
 
 
+@pytest.mark.parametrize(
+    ("robot", "size", "height", "fine"),
+    [
+        ("Point", 0.5, [0.0, 0.59], True),
+        ("Point", 0.5, [0.5, 0.61], False),
+        ("Point", 0.5, [0.5, 1.5], False),
+        ("Humanoid", 0.5, [0.8, 1.4], True),
+        ("Humanoid", 0.5, [0.5, 1.4], False),
+        ("Ant", 0.2, [0.1, 0.2], True),
+        ("Ant", 0.2, [0.1, 0.4], False),
+    ],
+)
+def test_a_goal_in_space_hangs_where_a_robot_on_the_floor_gets_to(robot, size, height, fine):
+    goal = {"space": "spatial", "size": size, "height": height}
+    scenario = Scenario(robot=robot, task_params=goal)
+    if fine:
+        scenario.build()
+    else:
+        with pytest.raises(ValueError, match=r"goal.height .* out of reach: .* above the floor"):
+            scenario.build()
+
+
+@pytest.mark.parametrize(
+    ("robot", "space", "size"),
+    [("Point", "planar", 2), ("Point", "spatial", 3), ("Drone", "planar", 3)],
+)
+def test_compasses_tell_the_height_of_what_hangs_in_the_air(robot, space, size):
+    engine = world(f"Goal_{robot}_0Hazards", goal={"space": space, "height": [0.4, 0.5]})
+    compass = engine.observe()[0, engine.observation_layout["goal_compass"]]
+    origin, rotation = engine.robot.frames
+    offset = rotation[0, 0].T @ (engine.task.place[0] - origin[0, 0])
+    expected = offset[:size] / (np.linalg.norm(offset[:size]) + 0.001)
+    np.testing.assert_allclose(compass, expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("task", ["Chase", "Defense"])
 def test_solid_targets_stop_the_robot_and_others_do_not(task):
     """Driven at a target that keeps still, a Point ends in front of it or on the far side."""
@@ -215,6 +277,14 @@ def test_solid_targets_stop_the_robot_and_others_do_not(task):
         assert (touched > 0) == solid
     assert -0.6 < ends[True] < -0.35  # radius 0.3, the Point's nose 0.15
     assert ends[False] > 0.3
+
+
+def test_solid_targets_do_not_hang_in_an_arm_when_an_episode_begins():
+    """Low enough for the upper arm to cross: without a look at the contacts one in ten would."""
+    engine = world("Chase_Arm6_0Hazards", 8, chase={"solid": True, "height": [1.5, 1.8]})
+    for _ in range(10):
+        assert not engine.task.bodies.touched.any()
+        engine.reset(np.arange(8))
 
 
 def press(engine, button):
@@ -238,12 +308,30 @@ def test_the_lit_button_pays_and_after_the_delay_another_one_is_lit():
     assert task.right[0] != lit
     lidar = engine.observation_layout["button_lidar"]
     assert (outcome.obs[0, lidar] == 0).all()
-    for _ in range(9):  # resetting: pressing counts for nothing
-        outcome = press(engine, int(task.right[0]))
-        assert not outcome.goal_met[0] and task.mistakes()[0] == 0
-        assert (outcome.obs[0, lidar] == 0).all()
-    outcome = press(engine, int(task.right[0]))
-    assert outcome.goal_met[0]
+    outcome = press(engine, lit)  # pressing counts for nothing
+    assert not outcome.goal_met[0] and task.mistakes()[0] == 0
+    assert (outcome.obs[0, lidar] == 0).all()
+
+
+@pytest.mark.parametrize("delay", [0, 1, 10])
+def test_the_delay_is_counted_as_safety_gym_counts_it(delay):
+    """Safety Gym's step: charge by the timer, tick it, and set it when the button is pressed."""
+    engine = world("Button_Point_0Buttons", button={"delay": delay, "num": 2}, seed=1)
+    task, lidar = engine.task, engine.observation_layout["button_lidar"]
+    timer, uncounted, dark = 0, 0, 0
+    for step in range(4 * delay + 8):
+        right = int(task.right[0])
+        pressed = right if step % 2 else 1 - right
+        outcome = press(engine, pressed)
+        counts = timer == 0
+        timer = max(timer - 1, 0)
+        assert outcome.cost[0] == (counts and pressed != right)
+        assert outcome.goal_met[0] == (counts and pressed == right)
+        if outcome.goal_met[0]:
+            timer = delay
+        assert (outcome.obs[0, lidar] > 0).any() == (timer == 0)
+        uncounted, dark = uncounted + (not counts), dark + (timer > 0)
+    assert uncounted >= 2 * delay and dark >= 2 * delay
 
 
 def test_button_rewards_equal_the_scalar_loop():

@@ -13,6 +13,30 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import find_monitor
+
+
+class LogCosts(BaseCallback):
+    """
+    Log the costs of training an algorithm that knows none, such as SB3's PPO or SAC.
+
+    Logs ``rollout/ep_cost_mean``, over the episodes of SB3's window, and ``rollout/cost_rate``,
+    cost per step of the whole training, as this package's algorithms do themselves. The
+    environment must be wrapped in a :class:`~sb3_guard.common.monitor.CostMonitor`, as by
+    :func:`~sb3_guard.make_vec_env`.
+    """
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        monitor = find_monitor(self.training_env)
+        episodes = self.model.ep_info_buffer
+        if episodes:
+            costs = [episode["c"] for episode in episodes]
+            self.logger.record("rollout/ep_cost_mean", float(np.mean(costs)))
+        if monitor.total_steps:
+            self.logger.record("rollout/cost_rate", monitor.total_cost / monitor.total_steps)
 
 
 class CostEvalCallback(EvalCallback):

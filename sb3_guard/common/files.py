@@ -3,12 +3,12 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import BufferedWriter
+from io import BufferedRandom
 from pathlib import Path
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[BufferedWriter]:
+def replacing(path: str | os.PathLike[str]) -> Iterator[BufferedRandom]:
     """
     Write a file that appears whole or not at all, even if the process is killed meanwhile.
 
@@ -21,7 +21,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BufferedWriter]:
     path = Path(path)
     sibling = path.with_name(f".{path.name}.tmp")
     try:
-        with open(sibling, "wb") as handle:
+        with open(sibling, "w+b") as handle:
             yield handle
             handle.flush()
             os.fsync(handle.fileno())

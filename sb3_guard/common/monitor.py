@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.monitor import ResultsWriter
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 
@@ -165,3 +165,13 @@ class CostMonitor(VecMonitor):
         self.total_steps = state["total_steps"]
         self.physics_errors = state["physics_errors"]
         self.t_start = state["t_start"]
+
+
+def find_monitor(env: VecEnv) -> CostMonitor:
+    """The cost monitor among an environment's wrappers."""
+    layer = env
+    while isinstance(layer, VecEnvWrapper):
+        if isinstance(layer, CostMonitor):
+            return layer
+        layer = layer.venv
+    raise ValueError("the environment is not wrapped in a CostMonitor")

@@ -130,10 +130,10 @@ class GuardVecEnv(VecEnv):
         t = self.envs.advance(self._actions)
         out = t.outcome
         # new dictionaries every step: Stable-Baselines3 keeps the ones it is given
-        names = ("cost", *out.costs, "TimeLimit.truncated")
-        table = np.stack([out.cost, *out.costs.values()], axis=1).tolist()
+        columns = {"cost": out.cost.tolist(), **{k: v.tolist() for k, v in out.costs.items()}}
+        columns["TimeLimit.truncated"] = [False] * self.num_envs
         infos: list[dict[str, Any]] = [
-            dict(zip(names, (*row, False), strict=True)) for row in table
+            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
         ]
         for name, rows in (
             ("goal_met", out.goal_met),

@@ -22,7 +22,15 @@ from mujoco.batch import Batch, SimulationError
 
 from sb3_guard.envs import geometry, sensors
 from sb3_guard.envs.extras import Extras
-from sb3_guard.envs.layout import ARENA, Footprint, LayoutError, Rectangle, arrange, redraw
+from sb3_guard.envs.layout import (
+    ARENA,
+    Footprint,
+    LayoutError,
+    Rectangle,
+    arrange,
+    check_locations,
+    redraw,
+)
 from sb3_guard.envs.parameters import Parameters, check_count, param
 from sb3_guard.envs.part import FLOOR, Array, Constraint, Part, Robot, Task
 from sb3_guard.envs.sensors import Channel, Lidar
@@ -228,6 +236,7 @@ class Engine:
                 )
                 self._owners[f.name] = part
                 self.array(f"places/{f.name}", (f.num, 3))
+        check_locations(list(self.footprints.values()))
         # where the generators begin every episode of rows whose layout is not to change
         self._origins: dict[int, Any] = {}
         for part in self.parts:
@@ -286,11 +295,10 @@ class Engine:
         :param planar: whether the points lie in the plane: one ring of bins instead of a sphere
         :return: [N, bodies · bins]
         """
-        origin, rotation = self.robot.frames
+        points = geometry.by_coordinate(points)
         if planar:  # seen as lying on the floor, whatever their height
-            points = points.copy()
-            points[..., 2] = 0.0
-        v = geometry.into_frames(origin, rotation, points, 2 if planar else 3)
+            points[2] = 0.0
+        v = geometry.into_frames(*self.robot.frames, points, 2 if planar else 3)
         return self._lidar.scan(v).reshape(self.num_envs, -1)
 
     def lidar_azimuth(self, planar: bool) -> int:
@@ -301,21 +309,23 @@ class Engine:
         """What :meth:`lidar` returns."""
         return self._lidar.channel(self._bodies, planar)
 
-    def compass(self, point: Array) -> Array:
+    def compass(self, point: Array, planar: bool = True) -> Array:
         """Direction of a point in the frames of the robot's lidar bodies.
 
         :param point: [N, 3] m
-        :return: [N, bodies · 2] for planar robots, [N, bodies · 3] for spatial ones
+        :param planar: whether the point lies in the plane
+        :return: [N, bodies · 2] if robot and point are planar, else [N, bodies · 3]
         """
-        origin, rotation = self.robot.frames
-        size = 2 if self.robot.workspace == "planar" else 3
-        v = geometry.into_frames(origin, rotation, point[:, None], size)[:, :, 0]
-        return sensors.compass(v).reshape(self.num_envs, -1)
+        point = geometry.by_coordinate(point[:, None])
+        v = geometry.into_frames(*self.robot.frames, point, self._compass_size(planar))
+        return sensors.compass(v[:, :, 0]).T.reshape(self.num_envs, -1)
 
-    def compass_channel(self) -> Channel:
+    def compass_channel(self, planar: bool = True) -> Channel:
         """What :meth:`compass` returns."""
-        size = 2 if self.robot.workspace == "planar" else 3
-        return Channel(self._bodies * size, -1.0, 1.0, "direction")
+        return Channel(self._bodies * self._compass_size(planar), -1.0, 1.0, "direction")
+
+    def _compass_size(self, planar: bool) -> int:
+        return 2 if planar and self.robot.workspace == "planar" else 3
 
     @property
     def _bodies(self) -> int:
@@ -357,7 +367,7 @@ class Engine:
             for part in self.parts:
                 part.reset(pending, self.rngs)
             self.batch.forward(pending, stage=STAGE)
-            blemish = self.task.succeeded(self.task.measure())
+            blemish = self.task.blemished()
             for constraint in self.constraints:
                 blemish = blemish | (constraint.cost() > 0)
             pending = pending[blemish[pending]]
@@ -375,11 +385,10 @@ class Engine:
 
     def observe(self) -> Array:
         """The flat observation of every row, [N, D] float32, a new array."""
-        out = np.empty((self.num_envs, self.observation_size), dtype=np.float32)
+        seen: dict[str, Array] = {}
         for part in self.parts:
-            for name, value in part.observe().items():
-                out[:, self._slices[name]] = value
-        return out
+            seen.update(part.observe())
+        return np.concatenate([seen[name] for name in self._slices], axis=1, dtype=np.float32)
 
     def step(self, actions: Array) -> Outcome:
         """Advance every row by one control step.
@@ -410,7 +419,7 @@ class Engine:
         except SimulationError as error:
             diverged[error.ids] = True
         changed = self._warnings != self._warned
-        if changed.any():  # MuJoCo has reset these rows by itself
+        if np.count_nonzero(changed):  # MuJoCo has reset these rows by itself
             diverged |= changed.any(axis=1)
             self._warned[:] = self._warnings
         self.steps += 1
@@ -421,7 +430,7 @@ class Engine:
         costs = {f"cost_{c.name}": c.cost() for c in self.constraints}
         met = self.task.succeeded(now)
         unplaced = np.zeros(self.num_envs, dtype=bool)
-        if diverged.any():
+        if np.count_nonzero(diverged):  # any() takes three times as long
             met = met & ~diverged
             reward[diverged] = 0.0
             for cost in costs.values():
@@ -431,7 +440,7 @@ class Engine:
             total += cost
         terminated = diverged.copy()
         self._before[:] = now
-        if met.any():
+        if np.count_nonzero(met):
             reward[met] += self.task.bonus
             if self.task.ends:
                 terminated |= met

@@ -15,12 +15,21 @@ EYE = "eye"
 
 @dataclass
 class Extras(Part):
-    """What else can be observed: the clock, the simulator's state, an image."""
+    """What else can be observed: the clock, the simulator's state, an image.
+
+    The time limit is not the engine's: :func:`gymnasium.make` puts it around a lone environment,
+    which is not told. ``remaining`` therefore states the length of an episode itself, and a lone
+    environment and a row of a batch observe the same. Where it contradicts the limit it is refused:
+    by the vector environment when it is made, by a lone one in an episode that goes on longer.
+    """
 
     name = "observe"
 
-    remaining: bool = param(False, "share of the episode's steps that is left")
-    horizon: int = param(1000, "steps of an episode, for remaining", low=1)
+    remaining: int | None = param(
+        None,
+        "steps of an episode, the same as max_episode_steps: the share that is left is observed",
+        low=1,
+    )
     qpos: bool = param(False, "positions of all joints of the world")
     qvel: bool = param(False, "velocities of all joints of the world")
     ctrl: bool = param(False, "controls of all actuators")
@@ -28,6 +37,28 @@ class Extras(Part):
     camera: tuple[int, int] | None = param(
         None, "width and height, pixels, of an image from the robot; needs flatten=False", low=1
     )
+
+    def check_limit(self, steps: int) -> None:
+        """
+        :param steps: control steps after which episodes are cut
+        :raises ValueError: ``remaining`` counts to another number
+        """
+        if self.remaining is not None and self.remaining != steps:
+            raise ValueError(
+                f"observe.remaining = {self.remaining}, but episodes are cut after {steps} steps: "
+                "give remaining and max_episode_steps the same value"
+            )
+
+    def check_clock(self, steps: int) -> None:
+        """
+        :param steps: control steps of an episode that goes on
+        :raises ValueError: nothing remains
+        """
+        if self.remaining is not None and steps >= self.remaining:
+            raise ValueError(
+                f"observe.remaining = {self.remaining}, but the episode goes on after as many "
+                "steps: give remaining and max_episode_steps the same value"
+            )
 
     def build(self, world: World) -> None:
         super().build(world)
@@ -49,12 +80,12 @@ class Extras(Part):
 
     def observe(self) -> dict[str, Array]:
         out = {name: value for name, (value, _) in self._sources.items()}
-        if self.remaining:
-            out["remaining"] = np.maximum(1 - self.sim.steps / self.horizon, 0.0)[:, None]
+        if self.remaining is not None:
+            out["remaining"] = np.maximum(1 - self.sim.steps / self.remaining, 0.0)[:, None]
         return out
 
     def channels(self) -> dict[str, Channel]:
         out = {name: Channel(v.shape[1], unit=unit) for name, (v, unit) in self._sources.items()}
-        if self.remaining:
+        if self.remaining is not None:
             out["remaining"] = Channel(1, 0.0, 1.0, "share")
         return out

@@ -2,6 +2,9 @@
 
 Every function is elementwise along N, so that row i of a batch and a batch of one agree bit for
 bit: no matrix products, whose order of summation may change with the number of rows.
+
+What takes many operations is done on points by coordinate: [3, K, N] instead of [N, K, 3], so that
+NumPy's inner loops run along the rows and not along x, y, z, which is several times faster.
 """
 
 from __future__ import annotations
@@ -11,12 +14,26 @@ import numpy as np
 Array = np.ndarray
 
 
+def by_coordinate(points: Array) -> Array:
+    """A copy of points [N, ..., 3] whose first axis is xyz and whose last is the rows."""
+    return points.T.copy()
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Inner product over the first axis, of size 2 or 3, of vectors by coordinate."""
+    products = a * b
+    total = products[0] + products[1]
+    return total if len(products) == 2 else total + products[2]
+
+
+def length(v: Array) -> Array:
+    """Euclidean length over the first axis, of size 2 or 3, of vectors by coordinate."""
+    return np.sqrt(dot(v, v))
+
+
 def norm(v: Array) -> Array:
     """Euclidean length of the last axis, of size 2 or 3."""
-    total = v[..., 0] * v[..., 0] + v[..., 1] * v[..., 1]
-    if v.shape[-1] == 3:
-        total = total + v[..., 2] * v[..., 2]
-    return np.sqrt(total)
+    return length(v.T).T
 
 
 def distance(a: Array, b: Array, planar: bool) -> Array:
@@ -29,15 +46,12 @@ def into_frames(origin: Array, rotation: Array, points: Array, size: int = 3) ->
 
     :param origin: positions of the bodies, [N, B, 3] m
     :param rotation: rotations of the bodies, body to world, [N, B, 3, 3]
-    :param points: world points, [N, K, 3] m
-    :return: [N, B, K, size] m
+    :param points: world points by coordinate, [3, K, N] m
+    :return: by coordinate, [size, B, K, N] m
     """
-    offset = points[:, None] - origin[:, :, None]  # [N, B, K, 3]
-    axes = rotation[:, :, None, :, :size]  # [N, B, 1, 3, size]
-    out = offset[..., 0:1] * axes[..., 0, :]  # [N, B, K, size]
-    out += offset[..., 1:2] * axes[..., 1, :]
-    out += offset[..., 2:3] * axes[..., 2, :]
-    return out
+    offset = points[:, None] - by_coordinate(origin)[:, :, None]  # [3, B, K, N]
+    axes = rotation.transpose(2, 3, 1, 0)[:, :size].copy()  # [3, size, B, N]
+    return dot(offset[:, None], axes[..., None, :])
 
 
 def yaw_quaternion(heading: Array) -> Array:
@@ -49,23 +63,20 @@ def yaw_quaternion(heading: Array) -> Array:
 
 
 def segment_distance(start: Array, end: Array, points: Array) -> Array:
-    """Distance of points to segments.
+    """Distance of points to segments, all by coordinate, in the plane or in space.
 
-    :param start: one end of each segment, [N, L, 3] m
-    :param end: the other end, [N, L, 3] m
-    :param points: [N, K, 3] m
-    :return: [N, L, K] m
+    :param start: one end of each segment, [2 or 3, L, N] m
+    :param end: the other end, likewise
+    :param points: [2 or 3, K, N] m
+    :return: [L, K, N] m
     """
-    along = (end - start)[:, :, None]  # [N, L, 1, 3]
-    offset = points[:, None] - start[:, :, None]  # [N, L, K, 3]
-    length2 = along[..., 0] ** 2 + along[..., 1] ** 2 + along[..., 2] ** 2
-    dot = (
-        offset[..., 0] * along[..., 0]
-        + offset[..., 1] * along[..., 1]
-        + offset[..., 2] * along[..., 2]
-    )
-    t = np.clip(dot / np.maximum(length2, 1e-12), 0.0, 1.0)
-    return norm(offset - t[..., None] * along)
+    along = (end - start)[:, :, None]  # [3, L, 1, N]
+    offset = points[:, None] - start[:, :, None]  # [3, L, K, N]
+    share = dot(offset, along)
+    share /= np.maximum(dot(along, along), 1e-12)
+    np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
+    offset -= share * along
+    return length(offset)
 
 
 def rotation_matrix(quaternion: Array) -> Array:

@@ -70,6 +70,9 @@ class Simulated:
     render_mode: str | None
     flatten: bool
     metadata: dict[str, Any]
+    # None until first used, also after a refusal in the constructor: close() works then too.
+    _renderer: Renderer | None = None
+    _eye: Renderer | None = None  # the robot's own camera, if it is observed
 
     def _simulate(
         self,
@@ -101,8 +104,6 @@ class Simulated:
         self.render_mode, self.flatten = render_mode, flatten
         self._num_threads = num_threads
         self._window = (width, height, camera)
-        self._renderer: Renderer | None = None
-        self._eye: Renderer | None = None  # the robot's own camera, if it is observed
         self.engine = self.scenario.build(num_envs, num_threads)
         control_step = FRAME_SKIP * self.engine.model.opt.timestep
         self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
@@ -231,11 +232,13 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         """Advance by one control step of ten physics steps.
 
         :param action: [action size], clipped to [−1, 1]
-        :raises ValueError: the action has the wrong shape or is not finite
+        :raises ValueError: the action has the wrong shape or is not finite, or the episode goes on
+            for longer than ``observe={"remaining": ...}`` says
         """
         action = np.asarray(action, dtype=float)
         if action.shape != self.action_space.shape:
             raise ValueError(f"action has shape {action.shape}, expected {self.action_space.shape}")
+        self.engine.extras.check_clock(int(self.engine.steps[0]))
         outcome = self.engine.step(action[None])
         if self.render_mode == "human":
             self.render()

@@ -10,6 +10,7 @@ disturbs the fewest others, and those are drawn again.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -40,7 +41,8 @@ class Footprint:
     :param locations: fixed places, (x, y) m, for the first objects of the group
     :param margin: extra distance to every other object, m; of two margins the greater counts
     :param height: z, m, or a range to draw z from, after x and y
-    :param reach: greatest distance of (x, y, z) from the origin, m
+    :param reach: greatest distance of (x, y, z) from the robot's base, m
+    :param base: where that is, (x, y) m
     :param mover: whether it moves by itself, so that a new goal may ignore it in need
     """
 
@@ -53,6 +55,7 @@ class Footprint:
     height: float | tuple[float, float] = 0.0
     reach: float = math.inf
     mover: bool = False
+    base: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for r in self.placements:
@@ -70,6 +73,15 @@ class Footprint:
                 f"{self.name}: {len(self.locations)} locations for {self.num} objects; "
                 "give at most one each"
             )
+        low = self._lowest
+        for place in self.locations or (self.base,):
+            gap = math.hypot(math.dist(place, self.base), low)
+            if gap > self.reach:
+                where = f"location {place}" if self.locations else "height"
+                raise ValueError(
+                    f"{self.name}: {where} is out of the robot's reach: {gap:.2f} m from its base "
+                    f"at {self.base} even at the lowest height, {low} m; it reaches {self.reach} m"
+                )
 
     @functools.cached_property
     def _room(self) -> tuple[Array, Array, Array]:
@@ -95,17 +107,22 @@ class Footprint:
         """Heights for centres [n, 2]: [n] m, within reach."""
         if not isinstance(self.height, tuple):
             return np.full(len(xy), self.height)
+        high: float | Array
         low, high = self.height
         if math.isfinite(self.reach):
-            room = np.sqrt(np.maximum(self.reach**2 - xy[:, 0] ** 2 - xy[:, 1] ** 2, 0.0))
+            dx, dy = xy[:, 0] - self.base[0], xy[:, 1] - self.base[1]
+            room = np.sqrt(np.maximum(self.reach**2 - dx**2 - dy**2, 0.0))
             high = np.maximum(np.minimum(high, room), low)
         return low + rng.random(len(xy)) * (high - low)
 
     @property
-    def planar_reach(self) -> float:
-        """Greatest horizontal distance from the origin that leaves a height within reach, m."""
-        low = self.height[0] if isinstance(self.height, tuple) else self.height
-        return math.sqrt(max(self.reach**2 - low**2, 0.0))
+    def _lowest(self) -> float:
+        return self.height[0] if isinstance(self.height, tuple) else self.height
+
+    def out_of_reach(self, draws: Array) -> Array:
+        """Which centres, [2, n] m, leave no height within reach, [n] bool."""
+        dx, dy = draws[0] - self.base[0], draws[1] - self.base[1]
+        return dx**2 + dy**2 > self.reach**2 - self._lowest**2
 
 
 def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[str, Array]:
@@ -128,7 +145,6 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         for j, place in enumerate(f.locations):
             xy[:, k + j, 0], fixed[k + j] = place, True
         k += f.num
-    _check_fixed(owner, gaps, xy[..., 0].T, fixed)
     queue = deque(np.flatnonzero(~fixed).tolist())
     failures: dict[str, int] = {}
     for _ in range(PATIENCE):
@@ -142,8 +158,7 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         if fixed.any():
             trouble += len(owner) * clash[fixed].sum(axis=0)
         if math.isfinite(f.reach):
-            out = draws[0] ** 2 + draws[1] ** 2 > f.planar_reach**2
-            trouble += len(owner) ** 2 * out
+            trouble += len(owner) ** 2 * f.out_of_reach(draws)
         best = int(trouble.argmin())  # the first clear draw, else the least disturbing one
         if trouble[best]:
             failures[f.name] = failures.get(f.name, 0) + 1
@@ -180,19 +195,20 @@ def _square_distance(draws: Array, xy: Array) -> Array:
     return dx
 
 
-def _check_fixed(owner: list[Footprint], gaps: Array, xy: Array, fixed: Array) -> None:
-    """Refuse fixed locations that are closer than their keep-outs and margins allow."""
-    ids = np.flatnonzero(fixed)
-    for a in range(len(ids)):
-        for b in range(a + 1, len(ids)):
-            i, j = ids[a], ids[b]
-            gap = math.dist(xy[i], xy[j])
-            if gap < gaps[i, j]:
-                raise LayoutError(
-                    f"{owner[j].name} cannot be placed: its location {tuple(xy[j].tolist())} is "
-                    f"{gap:.2f} m from {owner[i].name} at {tuple(xy[i].tolist())}, and their "
-                    f"keepouts and margin sum to {gaps[i, j]:.2f} m"
-                )
+def check_locations(footprints: Sequence[Footprint]) -> None:
+    """Refuse fixed locations that are closer than their keep-outs and margins allow.
+
+    :raises ValueError: two are; names both, with their distance and the least that is allowed, m
+    """
+    fixed = [(f, i, place) for f in footprints for i, place in enumerate(f.locations)]
+    for (f, i, here), (g, j, there) in itertools.combinations(fixed, 2):
+        gap, least = math.dist(here, there), f.keepout + g.keepout + max(f.margin, g.margin)
+        if gap < least:
+            raise ValueError(
+                f"locations {f.name}[{i}] = {here} and {g.name}[{j}] = {there} are {gap:.2f} m "
+                f"apart, but their keepouts and margin sum to {least:.2f} m: move one of them, or "
+                "reduce keepout or margin"
+            )
 
 
 def redraw(
@@ -223,7 +239,7 @@ def redraw(
             draws = footprint.draw(rng, DRAWS)
             clear = ~(_square_distance(draws, xy) < apart).any(axis=0)
             if math.isfinite(footprint.reach):
-                clear &= draws[0] ** 2 + draws[1] ** 2 <= footprint.planar_reach**2
+                clear &= ~footprint.out_of_reach(draws)
             if clear.any():
                 place = draws[:, clear.argmax()][None]
                 return np.append(place[0], footprint.elevate(rng, place)[0])

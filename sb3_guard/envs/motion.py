@@ -7,9 +7,12 @@ depends on whether the robot is within r1 (Zhao et al. 2024, §4: ghosts, chase 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
+
+from sb3_guard.envs.geometry import length
 
 Array = np.ndarray
 TINY = 1e-12  # m: the unit vector of a zero offset is zero
@@ -50,17 +53,17 @@ class Law:
 def advance(points: Array, robot: Array, law: Law, planar: bool) -> None:
     """Move by one control step, in place.
 
-    Coordinates are kept apart, [N, K] each: loops over a last axis of 2 or 3 would be slow.
-
     :param points: where the movers are, [N, K, 3] m
     :param robot: where the robot is, [N, 3] m
     :param law: their law of motion
     :param planar: whether they move and measure in the plane
     """
-    here = [points[..., j] for j in range(2 if planar else 3)]
-    to_robot = [robot[:, j, None] - x for j, x in enumerate(here)]
-    to_origin = [law.origin[j] - x for j, x in enumerate(here[:2] if law.unit else here)]
-    robot_distance, origin_distance = _length(to_robot), _length(to_origin)
+    points = points.T[: 2 if planar else 3]
+    here = points.copy()  # by coordinate, [2 or 3, K, N]
+    to_robot = robot.T[: len(here), None] - here
+    size = 2 if law.unit else len(here)
+    to_origin = np.array(law.origin[:size])[:, None, None] - here[:size]
+    robot_distance, origin_distance = length(to_robot), length(to_origin)
     outside, near = origin_distance > law.r0, robot_distance <= law.r1
     pull = np.where(near, law.near, law.far)
     draw = np.where(near, 0.0, law.settle)
@@ -69,38 +72,36 @@ def advance(points: Array, robot: Array, law: Law, planar: bool) -> None:
     if law.unit:
         pull /= np.maximum(robot_distance, TINY)
         draw /= np.maximum(origin_distance, TINY)
-    pushes = _repulsion(here, law.gap, law.apart) if law.unit and law.apart else None
-    for j, x in enumerate(here):
-        move = pull * to_robot[j]
-        if j < len(to_origin):
-            move += draw * to_origin[j]
-        if pushes is not None:
-            move += pushes[j]
-        x += move
+    move = pull * to_robot
+    move[:size] += draw * to_origin
+    if law.unit and law.apart:
+        _part(move, here, law.gap, law.apart)
+    points += move
 
 
-def _length(offset: list[Array]) -> Array:
-    """Euclidean length of offsets given by coordinate."""
-    total = offset[0] * offset[0]
-    for x in offset[1:]:
-        total += x * x
-    return np.sqrt(total)
+@functools.lru_cache
+def _pairs(k: int) -> tuple[Array, Array]:
+    """Numbers of the first and of the second of every pair of K movers, in order."""
+    return np.triu_indices(k, 1)
 
 
-def _repulsion(points: list[Array], gap: float, speed: float) -> list[Array] | None:
-    """How far points of a row part: ``speed`` away from each other one that is closer than ``gap``.
+def _part(move: Array, points: Array, gap: float, speed: float) -> None:
+    """Add ``speed`` away from each other point of the row that is closer than ``gap``.
 
-    :param points: by coordinate, [N, K] m each
-    :return: by coordinate, [N, K] m each; None if all keep their distance
+    :param move: what to add to, by coordinate, [2 or 3, K, N] m
+    :param points: by coordinate, [2 or 3, K, N] m
     """
-    offset = [x[:, :, None] - x[:, None] for x in points]  # [N, K, K], from the second to the first
-    distance = _length(offset)
-    pairs = np.flatnonzero(distance < gap)
-    n, k = points[0].shape
-    if len(pairs) == n * k:  # each is close to itself alone
-        return None
-    push = speed / np.maximum(distance.reshape(-1)[pairs], TINY)
-    # summed in the order of the second points, whatever the number of rows
-    return [
-        np.bincount(pairs // k, push * d.reshape(-1)[pairs], n * k).reshape(n, k) for d in offset
-    ]
+    k, n = points.shape[1:]
+    first, second = _pairs(k)
+    offset = points.take(first, axis=1) - points.take(second, axis=1)  # [2 or 3, pairs, N]
+    distance = length(offset)
+    close = np.flatnonzero(distance < gap)
+    if not len(close):
+        return
+    pair, row = np.divmod(close, n)
+    push = offset.reshape(len(offset), -1)[:, close]
+    push *= speed / np.maximum(distance.reshape(-1)[close], TINY)
+    # each mover's pushes are summed in the order of the others, whatever the number of rows
+    moved = np.concatenate([second[pair] * n + row, first[pair] * n + row])
+    for x, away in zip(move, push, strict=True):
+        x += np.bincount(moved, np.concatenate([-away, away]), k * n).reshape(k, n)

@@ -42,6 +42,7 @@ class Bodies:
     :param num: how many
     :param shape: adds the geoms of one body
     :param free: half height of bodies that can be pushed, m; None: they stay where they are put
+    :raises ValueError: another part's bodies have this name
     """
 
     def __init__(
@@ -52,6 +53,10 @@ class Bodies:
         shape: Callable[[mujoco.MjsBody], None],
         free: float | None = None,
     ) -> None:
+        if num and world.spec.body(f"{name}/0") is not None:
+            raise ValueError(
+                f"two parts have bodies called {name!r}; give the constraint another name"
+            )
         self.name, self.num, self.free = name, num, free is not None
         self._height = 0.0
         if free is not None:
@@ -136,12 +141,31 @@ class Spatial(Part):
     space: str | None = param(
         None, "planar or spatial; null: the robot's workspace", choices=(None, "planar", "spatial")
     )
-    height: tuple[float, float] = param((0.5, 1.5), "range of z in space, m")
+    height: tuple[float, float] = param((0.5, 1.5), "range of z in space, m", low=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.height[0] > self.height[1]:
             raise ValueError(f"{self.name}.height = {self.height!r} must be (low, high), in metres")
+
+    def check_height(self, sim: Simulation, size: float, all_of_it: bool) -> None:
+        """Refuse to hang what a robot on the floor cannot get to.
+
+        :param size: how near to the objects the robot has to come, m
+        :param all_of_it: whether this has to be so at every height of the range, not only at one
+        :raises ValueError: names the heights that are near enough
+        """
+        if self.planar or sim.robot.workspace != "planar":
+            return
+        z, (low, high) = sim.robot.altitude, self.height
+        gap = max(z - low, high - z) if all_of_it else max(z - high, low - z)
+        if gap >= size:
+            raise ValueError(
+                f"{self.name}.height = {self.height!r} is out of reach: the robot's position is "
+                f"{z:.2f} m above the floor, and with size {size} only heights between "
+                f"{max(z - size, 0.0):.2f} and {z + size:.2f} m count; set {self.name}="
+                f"{{'height': [low, high]}} within these, or {{'space': 'planar'}}"
+            )
 
 
 @dataclass
@@ -184,6 +208,7 @@ class Objects(Part):
                 height=0.0 if self.planar else self.height,
                 reach=self._reach,
                 mover=self.mover,
+                base=self._base,
             ),
         )
 
@@ -193,6 +218,7 @@ class Objects(Part):
     def build(self, world: World) -> None:
         super().build(world)
         self._reach = world.robot.reach if self.reachable else math.inf
+        self._base = world.robot.base
         num, free = self.num if self.solid else 0, self.size if self.free else None
         self.bodies = Bodies(world, self.group, num, self.shape, free)
 
@@ -266,15 +292,27 @@ class Movers(Spatial, Objects):
 
     keepout: float = param(0.5, "radius kept clear around an object, m", low=0)
     solid: bool = param(False, "whether they are bodies that push; false: the robot passes through")
-    speed: float = param(1e-3, "the speed that all others default to multiples of", low=0)
+    speed: float = param(
+        1e-3, "m per control step; what the other speeds default to multiples of", low=0
+    )
     speed_law: str = param(
-        "unit", "along unit vectors, or proportional to distance", choices=("unit", "proportional")
+        "unit",
+        "speeds along unit vectors, or proportional: as shares of the distance per control step",
+        choices=("unit", "proportional"),
     )
     v0: float | None = param(None, "speed home from beyond r0; null: speed", low=0)
     r0: float = param(2.5, "radius around the origin that they do not leave, m", low=0)
     origin: tuple[float, float, float] = param((0.0, 0.0, 0.0), "where home is, (x, y, z) m")
 
     mover = True
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        if self.solid and not self.planar and self.height[0] < self.size:
+            raise ValueError(
+                f"{self.name}.height = {self.height!r}: solid ones of size {self.size} would stick "
+                f"in the floor; the lowest height must be at least {self.size}"
+            )
 
     def law(self) -> motion.Law:
         """How they move."""

@@ -47,6 +47,16 @@ def param(
     return field(default=default, metadata=limits)
 
 
+_WORDS = {  # what an error message calls one value of a type, and several
+    float: ("a number", "numbers"),
+    int: ("an integer", "integers"),
+    bool: ("true or false", "true or false"),
+    str: ("text", "texts"),
+    dict: ("a mapping", "mappings"),
+    types.NoneType: ("null", "null"),
+}
+
+
 def _matches(value: Any, kind: Any) -> bool:
     """Whether ``value`` is of the annotated type ``kind``; a bool is not a number."""
     if kind is Any:
@@ -74,13 +84,16 @@ def _matches(value: Any, kind: Any) -> bool:
     return isinstance(value, origin or kind)
 
 
-def _plain(kind: Any) -> str:
-    """How an error message calls a type."""
-    if typing.get_origin(kind) is None and isinstance(kind, type):
-        return {"float": "a number", "int": "an integer", "bool": "true or false"}.get(
-            kind.__name__, kind.__name__
-        )
-    return str(kind).replace("typing.", "").replace("NoneType", "None")
+def in_words(kind: Any, many: bool = False) -> str:
+    """What an error message calls an annotated type, in the words of JSON and YAML."""
+    origin, args = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(in_words(k, many) for k in args)
+    if origin is tuple:
+        count = "" if args[-1] is Ellipsis else f"{len(args)} "
+        return f"{'lists' if many else 'a list'} of {count}{in_words(args[0], many=True)}"
+    kind = origin or kind
+    return _WORDS[kind][many] if kind in _WORDS else getattr(kind, "__name__", str(kind))
 
 
 def _tuples(value: Any) -> Any:
@@ -104,7 +117,7 @@ class Parameters:
             object.__setattr__(self, f.name, value)
             label = f"{self.name or type(self).__name__}.{f.name}"
             if not _matches(value, hints[f.name]):
-                raise ValueError(f"{label} = {value!r} must be {_plain(hints[f.name])}")
+                raise ValueError(f"{label} = {value!r} must be {in_words(hints[f.name])}")
             m = f.metadata
             if m.get("choices") is not None and value not in m["choices"]:
                 names = ["null" if c is None else str(c) for c in m["choices"]]

@@ -71,7 +71,7 @@ class Simulation(Protocol):
     def lidar(self, points: Array, planar: bool) -> Array:
         """Lidar of [N, K, 3] points seen from the robot's lidar bodies: [N, size]."""
 
-    def compass(self, point: Array) -> Array:
+    def compass(self, point: Array, planar: bool = True) -> Array:
         """Direction of [N, 3] points in the frames of the robot's lidar bodies: [N, size]."""
 
     def lidar_azimuth(self, planar: bool) -> int:
@@ -80,7 +80,7 @@ class Simulation(Protocol):
     def lidar_channel(self, planar: bool) -> Channel:
         """What :meth:`lidar` returns."""
 
-    def compass_channel(self) -> Channel:
+    def compass_channel(self, planar: bool = True) -> Channel:
         """What :meth:`compass` returns."""
 
 
@@ -156,8 +156,14 @@ class Robot(Part):
     workspace: ClassVar[str]  # "planar" or "spatial": the default space of every other part
     timestep: ClassVar[float]  # s, of one physics step
     root: ClassVar[str]  # name of the outermost body in the compiled world
-    reach: ClassVar[float] = math.inf  # m from the origin: where goals and hazards make sense
+    reach: ClassVar[float] = math.inf  # m from its base: where goals and hazards make sense
+    altitude: float = 0.0  # m, z of its position when an episode begins
     action_size: int
+
+    @property
+    def base(self) -> tuple[float, float]:
+        """What ``reach`` is measured from, (x, y) m."""
+        return (0.0, 0.0)
 
     @property
     def position(self) -> Array:
@@ -202,6 +208,10 @@ class Task(Part):
     def succeeded(self, now: Array) -> Array:
         """Whether the goal is met, [N] bool."""
         return np.zeros(len(now), dtype=bool)
+
+    def blemished(self) -> Array:
+        """Whether an episode that begins now is drawn again, [N] bool."""
+        return self.succeeded(self.measure())
 
     def advance(self, ids: Array) -> Array:
         """Set the next goal in rows ``ids``; returns the rows, [n], where none could be placed."""

@@ -112,7 +112,8 @@ class Scenario:
             raise ValueError(f"cannot read scenario {str(path)!r}: {detail}") from None
         if not isinstance(data, dict):
             raise ValueError(
-                f"scenario {str(path)!r} must be a mapping, found {type(data).__name__}"
+                f"scenario {str(path)!r} must be a mapping with keys such as robot and task, "
+                f"found {'nothing' if data is None else repr(data)}"
             )
         known = list(cls.__dataclass_fields__)
         for key in data:
@@ -154,6 +155,7 @@ class Scenario:
             "observe": "observe",
         }
         kinds = {name.lower() for name in CONSTRAINTS}
+        tasks = {name.lower(): name for name in TASKS}
         for key, value in params.items():
             if value is not None and not isinstance(value, Mapping):
                 raise ValueError(
@@ -168,16 +170,42 @@ class Scenario:
             elif key in kinds or key in changes["constraints"] or (value and "type" in value):
                 old = changes["constraints"].get(key, {})
                 changes["constraints"][key] = {**old, **(value or {})}
+            elif key in tasks:
+                wanted = f"{tasks[key]}_{self.robot}_8Hazards-v0"
+                raise ValueError(
+                    f"{key} = {value!r}: this scenario's task is {self.task}, not {tasks[key]}: "
+                    f"set its parameters with {self.task.lower()}={{...}}, or choose the other "
+                    f"task with an id such as {wanted!r}"
+                )
             else:
                 known = [*own, *sorted(kinds)]
                 raise ValueError(f"unknown parameter {key!r}: {did_you_mean(key, known)}")
         return replace(self, **changes)
 
     def parts(self) -> dict[str, Any]:
-        """New, unbound parts: the keyword arguments of an :class:`Engine`."""
+        """New, unbound parts: the keyword arguments of an :class:`Engine`.
+
+        :raises ValueError: an unknown name, a bad value, or a constraint's name that cannot be used
+        """
         by_name = {name.lower(): cls for name, cls in CONSTRAINTS.items()}
+        taken = (self.task.lower(), "robot", "task", "lidar", "layout", "observe")
         constraints = []
         for name, params in self.constraints.items():
+            if not name.isidentifier() or not name.isascii():
+                raise ValueError(
+                    f"constraint {name!r}: its cost is called 'cost_<name>', so the name must be "
+                    "of letters, digits and underscores, no digit first"
+                )
+            if name in taken:
+                raise ValueError(
+                    f"constraint {name!r}: this is what the parameters of another part are called "
+                    f"({', '.join(taken)}); give it another name"
+                )
+            if not isinstance(params, Mapping):
+                raise ValueError(
+                    f"constraint {name!r} = {params!r} must be a mapping of parameters, such as "
+                    "{'num': 8}"
+                )
             params = dict(params)
             kind = str(params.pop("type", name)).lower()
             if kind not in by_name:

@@ -1,6 +1,7 @@
 """What a robot perceives of the other parts: pseudo-lidar and compass, as arrays.
 
-Both work on points already expressed in body frames (:func:`sb3_guard.envs.geometry.into_frames`).
+Both work on points already expressed in body frames, by coordinate, as
+:func:`sb3_guard.envs.geometry.into_frames` gives them.
 Formulas: Ray et al. 2019 (Safety Gym) and, for the third dimension, Zhao et al. 2024 (GUARD).
 """
 
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sb3_guard.envs.geometry import length
 from sb3_guard.envs.parameters import Parameters, param
 
 Array = np.ndarray
@@ -28,20 +30,31 @@ class Channel:
 
 
 def compass(v: Array) -> Array:
-    """Nearly unit vectors towards points, [..., d], from offsets in metres, [..., d].
+    """Nearly unit vectors towards points from offsets by coordinate, both [2 or 3, ...] m.
 
     The length is ‖v‖ / (‖v‖ + 1 mm): zero, not NaN, on the spot.
     """
-    total = v[..., 0] * v[..., 0]
-    for j in range(1, v.shape[-1]):
-        total = total + v[..., j] * v[..., j]
-    return v / (np.sqrt(total) + 0.001)[..., None]
+    return v / (length(v) + 0.001)
 
 
 @functools.lru_cache
-def _starts(n: int, bodies: int, columns: int, rows: int) -> Array:
-    """Flat index of bin (1, 0) of every body in an array [N, B, columns, rows]: [N, B, 1]."""
-    return np.arange(rows, n * bodies * columns * rows, columns * rows).reshape(n, bodies, 1)
+def _starts(n: int, bodies: int, bins: int) -> Array:
+    """Flat index of the first bin of every body in an array [N, B, bins]: [B, 1, N]."""
+    return np.arange(0, n * bodies * bins, bins).reshape(n, bodies).T[:, None].copy()
+
+
+@functools.lru_cache
+def _shown(columns: int, rows: int, alias: bool) -> Array:
+    """The bins in which an object in a bin shows: [1, bins], only there; with ``alias``, [3, bins],
+    also after and before it on the ring; with several rows, [5, bins], also above and below it.
+    """
+    column, row = np.divmod(np.arange(columns * rows), rows)
+    where = [(column, row)]
+    if alias:
+        where += [((column + 1) % columns, row), ((column - 1) % columns, row)]
+    if alias and rows > 1:  # beyond the poles there is only the polar bin itself
+        where += [(column, np.minimum(row + 1, rows - 1)), (column, np.maximum(row - 1, 0))]
+    return np.array([column * rows + row for column, row in where])
 
 
 @dataclass(frozen=True)
@@ -70,42 +83,36 @@ class Lidar(Parameters):
     def scan(self, v: Array) -> Array:
         """Closeness per bin and body.
 
-        :param v: objects in body frames, [N, B, K, 2] m in the plane, [N, B, K, 3] m in space
+        :param v: objects in body frames, by coordinate: [2, B, K, N] m in the plane, [3, B, K, N] m
+            in space
         :return: [N, B, bins] or [N, B, azimuth · elevation], within [0, 1]
         """
-        n, bodies, _, d = v.shape
+        d, bodies, _, n = v.shape
         columns, rows = (self.bins, 1) if d == 2 else (self.azimuth, self.elevation)
-        x, y = v[..., 0], v[..., 1]
-        planar = np.sqrt(x * x + y * y)
-        length = planar if d == 2 else np.sqrt(x * x + y * y + v[..., 2] * v[..., 2])
+        distance = length(v)
         if self.max_distance is None:
-            closeness = np.exp(-self.gain * length)
+            closeness = np.exp(-self.gain * distance)
         else:
-            closeness = np.maximum(0.0, self.max_distance - length) / self.max_distance
-        # a ring of columns with a spare one at either end, folded onto the other end when all is
-        # in: neighbours need no wrapping
-        out = np.zeros((n, bodies, columns + 2, rows))
-        turn = np.arctan2(y, x) * (columns / (2 * math.pi)) % columns
+            closeness = np.maximum(0.0, self.max_distance - distance) / self.max_distance
+        turn = np.arctan2(v[1], v[0])
+        turn *= columns / (2 * math.pi)
+        turn %= columns
         column = np.minimum(turn.astype(np.intp), columns - 1)
-        place = _starts(n, bodies, columns + 2, rows) + column * rows  # [N, B, K] index into out
-        if d == 3:
-            tilt = (np.arctan2(v[..., 2], planar) + math.pi / 2) * (rows / math.pi)
-            row = np.minimum(tilt.astype(np.intp), rows - 1)
-            place += row
-        places, values = [place], [closeness]
+        cell, values = column, [closeness]
         if self.alias:
             turned = (turn - column) * closeness
-            places += [place + rows, place - rows]
             values += [turned, closeness - turned]
-            if d == 3:
-                # elevation does not wrap: beyond the poles there is only the polar bin itself
+        if rows > 1:
+            tilt = np.arctan2(v[2], length(v[:2]))
+            tilt += math.pi / 2
+            tilt *= rows / math.pi
+            row = np.minimum(tilt.astype(np.intp), rows - 1)
+            cell = column * rows + row
+            if self.alias:
                 raised = (tilt - row) * closeness
-                places += [place + (row < rows - 1), place - (row > 0)]
                 values += [raised, closeness - raised]
-        np.maximum.at(
-            out.reshape(-1), np.concatenate(places, axis=None), np.concatenate(values, axis=None)
-        )
-        if self.alias:
-            np.maximum(out[:, :, 1], out[:, :, -1], out=out[:, :, 1])
-            np.maximum(out[:, :, -2], out[:, :, 0], out=out[:, :, -2])
-        return out[:, :, 1:-1].reshape(n, bodies, columns * rows)
+        places = _shown(columns, rows, self.alias).take(cell, axis=1)
+        places += _starts(n, bodies, columns * rows)
+        out = np.zeros((n, bodies, columns * rows))
+        np.maximum.at(out.reshape(-1), places.reshape(-1), np.concatenate(values, axis=None))
+        return out

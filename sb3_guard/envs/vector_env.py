@@ -86,6 +86,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         self._simulate(
             scenario, params, num_envs, num_threads, render_mode, flatten, width, height, camera
         )
+        self.engine.extras.check_limit(max_episode_steps)
         self.num_envs = self.engine.num_envs
         self.max_episode_steps = max_episode_steps
         self.single_observation_space = observation_space(self.engine, flatten)

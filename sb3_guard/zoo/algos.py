@@ -1,13 +1,24 @@
-"""The algorithms that the commands know, by key."""
+"""The algorithms that the commands know, by key: this package's, and RL-Zoo's as baselines."""
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import UsageError
 
+# ARS plays whole episodes in workers of its own, past the monitor that counts costs.
+NOT_HERE = {"ars": "its costs can't be counted; RL-Zoo's own rl_zoo3.train runs it"}
 
-def algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """Key to class. ``trpo`` is this package's, which logs and can filter by cost."""
+
+def baselines() -> dict[str, type[BaseAlgorithm]]:
+    """RL-Zoo's algorithms by key: unconstrained, with their costs logged."""
+    from rl_zoo3.utils import ALGOS
+
+    ours = safe_algorithms()
+    return {key: cls for key, cls in ALGOS.items() if key not in ours and key not in NOT_HERE}
+
+
+def safe_algorithms() -> dict[str, type[BaseAlgorithm]]:
+    """This package's algorithms by key; ``trpo`` is one of them, RL-Zoo's is not used."""
     from sb3_guard.algorithms import ALGORITHMS
 
     return dict(ALGORITHMS)
@@ -19,7 +30,11 @@ def algorithm(key: str) -> type[BaseAlgorithm]:
 
     :raises UsageError: there is none of that name
     """
-    table = algorithms()
+    table = safe_algorithms()
+    if key not in table:
+        if key in NOT_HERE:
+            raise UsageError(f"algorithm {key!r} is not available here: {NOT_HERE[key]}")
+        table |= baselines()
     if key not in table:
         raise UsageError(f"unknown algorithm {key!r}; {did_you_mean(key, table)}")
     return table[key]

@@ -5,7 +5,6 @@ training depends on is in few places: model, random generators, environments, lo
 file is a model file of SB3's with one more member, so ``CPO.load("checkpoint.zip")`` works on it.
 """
 
-import io
 import pickle
 import random
 import time
@@ -18,6 +17,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.common.files import replacing
@@ -27,6 +27,9 @@ from sb3_guard.zoo.usage import UsageError, one_line
 
 MEMBER = "run_state.pkl"
 NORMALIZER = "vecnormalize.pkl"
+REPLAY_BUFFER = "replay_buffer.pkl"
+# Checkpoints take at most this share of the time: those with a replay buffer are large.
+LARGEST_SHARE = 0.05
 FORMAT = 1  # increased when the content changes so that older files can't be continued
 
 
@@ -53,7 +56,8 @@ class Checkpoints(BaseCallback):
 
     :param path: the file
     :param others: the run's other callbacks, whose counters and states belong to the checkpoint
-    :param every: least time between two checkpoints, seconds; the first one is taken at once
+    :param every: least time between two checkpoints, seconds; the first one is taken at once.
+        0: one at every rollout; otherwise large ones are written less often
     :param log_interval: rollouts per logged row; checkpoints fall on logged rollouts, since SB3
         counts rollouts from the start of each ``learn``
     """
@@ -76,6 +80,7 @@ class Checkpoints(BaseCallback):
         self._elapsed = 0.0  # seconds of training before this process
         self._start = 0  # steps at which the run, not this process, began
         self._last = -np.inf
+        self._took = 0.0  # seconds to write the last one
         self._between = True
         self._warned = False
 
@@ -85,7 +90,8 @@ class Checkpoints(BaseCallback):
         self.model._num_timesteps_at_start = self._start
 
     def _on_rollout_start(self) -> None:
-        due = time.monotonic() - self._last >= self.every
+        pause = max(self.every, self._took / LARGEST_SHARE if self.every > 0 else 0.0)
+        due = time.monotonic() - self._last >= pause
         if self.stop or (due and self.rollouts % self.log_interval == 0):
             # gSDE has drawn its noise by now; the algorithm remembers how things were before.
             self.write(getattr(self.model, "_rng_at_rollout", None) or random_state())
@@ -112,6 +118,7 @@ class Checkpoints(BaseCallback):
         :param generators: see :func:`random_state`
         """
         assert isinstance(self.logger, RunLogger)
+        began = time.monotonic()
         environments = capture(self.training_env)
         if environments[-1] is None and not self._warned:
             self._warned = True
@@ -136,17 +143,19 @@ class Checkpoints(BaseCallback):
             "elapsed": (time.time_ns() - self.model.start_time) / 1e9,
             "start": self.model._num_timesteps_at_start,
         }
-        buffer = io.BytesIO()
-        self.model.save(buffer)
-        with zipfile.ZipFile(buffer, "a") as archive:
-            archive.writestr(MEMBER, pickle.dumps(state))
-            normalizer = self.model.get_vec_normalize_env()
-            if normalizer is not None:
-                # Once more, so that the agent can be played without the environment's state.
-                archive.writestr(NORMALIZER, pickle.dumps(normalizer))
         with replacing(self.path) as file:
-            file.write(buffer.getvalue())
+            self.model.save(file)
+            with zipfile.ZipFile(file, "a") as archive:
+                archive.writestr(MEMBER, pickle.dumps(state))
+                normalizer = self.model.get_vec_normalize_env()
+                if normalizer is not None:
+                    # Once more, so that the agent can be played without the environment's state.
+                    archive.writestr(NORMALIZER, pickle.dumps(normalizer))
+                if isinstance(self.model, OffPolicyAlgorithm):
+                    with archive.open(REPLAY_BUFFER, "w", force_zip64=True) as member:
+                        pickle.dump(self.model.replay_buffer, member, pickle.HIGHEST_PROTOCOL)
         self._last = time.monotonic()
+        self._took = self._last - began
 
     def _evaluation_envs(self) -> list[VecEnv]:
         return [one.eval_env for one in self.others if isinstance(one, EvalCallback)]
@@ -229,11 +238,20 @@ def load_model(
     """
     The model in a model file or checkpoint, as it was.
 
+    Loading alone does not touch the environment: the model goes on from its last observation
+    (`force_reset=False`), which fits only once `restore_run` has put the environment back.
+
     :param env: environment to go on training in; None: to predict only
     :raises UsageError: the file is damaged, of another algorithm, or does not fit the environment
     """
     try:
-        return algorithm.load(path, env=env, device=device, force_reset=False, **changes)
+        model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
+        if env is not None and isinstance(model, OffPolicyAlgorithm):
+            with zipfile.ZipFile(path) as archive:
+                if REPLAY_BUFFER in archive.namelist():
+                    with archive.open(REPLAY_BUFFER) as member:
+                        model.replay_buffer = pickle.load(member)
+        return model
     except Exception as error:
         raise UsageError(f"can't load {path} as {algorithm.__name__}: {one_line(error)}") from error
 

@@ -14,12 +14,18 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
+import numpy as np
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+)
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.spelling import did_you_mean
@@ -38,6 +44,11 @@ RUN_KEYS: dict[str, Any] = {
     "callback": str | list | dict | None,
     "monitor_kwargs": dict | str,
     "selection_limit": float | list[float] | None,
+}
+# RL-Zoo's two for the exploration noise of off-policy algorithms.
+NOISE_KEYS: dict[str, Any] = {
+    "noise_type": Literal["normal", "ornstein-uhlenbeck"] | None,
+    "noise_std": float,
 }
 # Arguments of an algorithm that are flags of the command.
 FLAGS = {"env": "--env", "seed": "--seed", "device": "--device", "verbose": "--verbose"}
@@ -90,6 +101,17 @@ def _read_yaml(path: Path) -> Any:
         raise UsageError(f"{path} is not valid YAML: {one_line(error)}") from error
 
 
+def shipped_file(algo: str) -> Path:
+    """The hyper-parameter file of an algorithm: ours, else RL-Zoo's."""
+    ours = hyperparams_folder() / f"{algo}.yml"
+    if ours.is_file():
+        return ours
+    import rl_zoo3
+
+    theirs = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
+    return theirs if theirs.is_file() else ours
+
+
 def read_hyperparams(
     algo: str, env_id: str, conf_file: str | None = None, overrides: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -102,7 +124,7 @@ def read_hyperparams(
     :param overrides: what the command line says
     :raises UsageError: the file can't be read, or has no entry that fits
     """
-    path = conf_file or hyperparams_folder() / f"{algo}.yml"
+    path = conf_file or shipped_file(algo)
     content = read_file(path)
     for entry in (env_id, env_id.rsplit("-v", 1)[0], "default"):
         if entry in content:
@@ -137,6 +159,8 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
         NaN, a missing ``n_timesteps``, or a count below 1
     """
     known = {**arguments(algorithm), **RUN_KEYS}
+    if "action_noise" in known:
+        known |= NOISE_KEYS
     checked = {}
     for name, value in values.items():
         if name in FLAGS:
@@ -153,8 +177,8 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
                 f"it must be {_describe(known[name])}"
             ) from None
     checked.setdefault("n_envs", 1)
-    policy = checked.setdefault("policy", "MlpPolicy")
     aliases = algorithm.policy_aliases
+    policy = checked.setdefault("policy", next(iter(aliases)))  # MlpPolicy, or its recurrent twin
     if isinstance(policy, str) and "." not in policy and policy not in aliases:
         raise UsageError(
             f"{algo} has no policy {policy!r}; {did_you_mean(policy, aliases)}, "
@@ -282,6 +306,8 @@ class Setup:
     :param monitor_kwargs: arguments of the monitor
     :param callbacks: callbacks named in the file
     :param selection_limit: see CostEvalCallback
+    :param noise_type: kind of exploration noise; None: none
+    :param noise_std: its standard deviation, in the units of the actions
     """
 
     model: dict[str, Any]
@@ -295,6 +321,21 @@ class Setup:
     monitor_kwargs: dict[str, Any]
     callbacks: list[BaseCallback]
     selection_limit: float | list[float] | None
+    noise_type: str | None = None
+    noise_std: float = 0.0
+
+    def action_noise(self, actions: int) -> ActionNoise | None:
+        """
+        Exploration noise, as the hyper-parameters ``noise_type`` and ``noise_std`` say.
+
+        :param actions: number of action dimensions
+        """
+        if self.noise_type is None:
+            return None
+        mean, std = np.zeros(actions), np.full(actions, self.noise_std)
+        if self.noise_type == "normal":
+            return NormalActionNoise(mean, std)
+        return OrnsteinUhlenbeckActionNoise(mean, std)
 
 
 def build(values: Mapping[str, Any]) -> Setup:
@@ -305,7 +346,8 @@ def build(values: Mapping[str, Any]) -> Setup:
     """
     from rl_zoo3.utils import get_callback_list, get_wrapper_class
 
-    model = {name: value for name, value in values.items() if name not in RUN_KEYS}
+    not_models = {**RUN_KEYS, **NOISE_KEYS}
+    model = {name: value for name, value in values.items() if name not in not_models}
     for name, value in model.items():
         if name == "policy":
             if "." in value:
@@ -345,6 +387,8 @@ def build(values: Mapping[str, Any]) -> Setup:
         monitor_kwargs=monitor_kwargs,
         callbacks=callbacks,
         selection_limit=values.get("selection_limit"),
+        noise_type=values.get("noise_type"),
+        noise_std=values.get("noise_std", 0.0),
     )
 
 

@@ -22,12 +22,22 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_guard.common.adapters import is_safety_gymnasium
 from sb3_guard.common.vec_env import find_scenario, make_vec_env
-from sb3_guard.envs.layout import LayoutError
-from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.zoo.config import Setup
 from sb3_guard.zoo.resumable import ResumableEnv
 from sb3_guard.zoo.usage import UsageError, one_line
 
+
+def _errors_of_ours() -> tuple[type[Exception], type[Exception]]:
+    """What our environments raise, also where MuJoCo is absent or too old for them."""
+    try:
+        from sb3_guard.envs.layout import LayoutError
+        from sb3_guard.envs.rendering import RenderingError
+    except ImportError:
+        return gym.error.DependencyNotInstalled, gym.error.DependencyNotInstalled
+    return LayoutError, RenderingError
+
+
+ERRORS_OF_OURS = _errors_of_ours()
 VEC_ENVS = ("native", "dummy", "subproc")
 # What constructors of environments and models raise when their arguments are wrong.
 BAD_ARGUMENTS = (
@@ -37,8 +47,7 @@ BAD_ARGUMENTS = (
     KeyError,
     ImportError,
     gym.error.Error,
-    LayoutError,
-    RenderingError,
+    *ERRORS_OF_OURS,
 )
 
 

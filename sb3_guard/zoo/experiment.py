@@ -5,6 +5,7 @@ and starts counters, seeds and environments anew when it continues; so its piece
 (wrappers, callbacks and schedules, run numbers, file layout, flags) and its class is not.
 """
 
+import copy
 import shlex
 import signal
 import sys
@@ -17,14 +18,17 @@ from typing import Any
 
 import numpy as np
 import yaml
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_guard.common.callbacks import CostEvalCallback
+from sb3_guard.algorithms.common.trust_region import TrustRegion
+from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
 from sb3_guard.common.files import replacing
-from sb3_guard.envs.layout import LayoutError
+from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import (
     Checkpoints,
@@ -39,17 +43,31 @@ from sb3_guard.zoo.checkpoint import (
 from sb3_guard.zoo.config import Setup, build, check, read_hyperparams
 from sb3_guard.zoo.environments import (
     BAD_ARGUMENTS,
+    ERRORS_OF_OURS,
     canonical_id,
     choose_vec_env,
     make_envs,
 )
 from sb3_guard.zoo.logger import RunLogger
-from sb3_guard.zoo.progress import Epochs, find_monitor
-from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder, require_writable
+from sb3_guard.zoo.progress import Epochs
+from sb3_guard.zoo.run_folder import (
+    CHECKPOINT,
+    RunFolder,
+    is_disk_error,
+    is_run,
+    lock,
+    require_writable,
+    run_path,
+)
 from sb3_guard.zoo.usage import UsageError, import_packages, one_line
 
 # Flags that say how to watch or host a run, not what it is: they may change when it is resumed.
 FREE_FLAGS = {"trained_agent", "progress", "verbose", "num_threads", "checkpoint_every", "track"}
+# Those that say what a run is, beside its hyper-parameters.
+IDENTITY = (
+    "algo", "env", "seed", "device", "vec_env", "eval_freq", "eval_episodes", "n_eval_envs",
+    "eval_env_kwargs", "save_freq", "log_interval",
+)  # fmt: skip
 # The evaluation episodes are not those of training: seeds this far apart don't meet.
 EVALUATION_SEED_OFFSET = 1_000_000
 
@@ -79,6 +97,8 @@ class Experiment:
         #: the checkpoint to continue from
         self.state = None if folder is None else read_checkpoint(folder.checkpoint)
         self._saved = None if folder is None else folder.checkpoint
+        #: training ends after the rollout under way when this file is gone
+        self.permit: Path | None = None
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
         self._check_selection_limit()
         if self._tensorboard_folder is not None:
@@ -156,7 +176,7 @@ class Experiment:
         seed, device = self.args["seed"], self.args["device"]
         if self._saved is not None:
             return load_model(self.algorithm, self._saved, self.env, device)
-        arguments = dict(self.setup.model)
+        arguments = copy.deepcopy(self.setup.model)  # some algorithms add to their policy_kwargs
         try:
             if self.args["trained_agent"]:
                 # What the networks are is for the saved agent to say.
@@ -164,9 +184,16 @@ class Experiment:
                     arguments.pop(name, None)
                 path = Path(self.args["trained_agent"])
                 return load_model(self.algorithm, path, self.env, device, seed=seed, **arguments)
+            noise = self._action_noise()
+            if noise is not None:
+                arguments["action_noise"] = noise
             return self.algorithm(env=self.env, device=device, seed=seed, **arguments)
         except (*BAD_ARGUMENTS, RuntimeError) as error:
             raise UsageError(f"{self.algo} can't be made: {one_line(error)}") from error
+
+    def _action_noise(self) -> ActionNoise | None:
+        space = self.env.action_space
+        return self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
 
     def _warm_start_normalizer(self) -> VecNormalize | None:
         """Observation statistics that belong to the agent given by ``-i model.zip``."""
@@ -192,6 +219,8 @@ class Experiment:
         args, n_envs = self.args, self.setup.n_envs
         epochs = Epochs(self.setup.n_timesteps, bar=args["progress"])
         others: list[BaseCallback] = [epochs]
+        if not isinstance(self.model, TrustRegion):
+            others.append(LogCosts())
         if args["save_freq"] > 0:
             others.append(
                 CheckpointCallback(
@@ -220,7 +249,8 @@ class Experiment:
             folder.checkpoint, others, every=args["checkpoint_every"], log_interval=log_interval
         )
         # The checkpoint comes first: it must see the others as the last rollout left them.
-        return checkpoints, epochs, [checkpoints, *others]
+        first = [] if self.permit is None else [Permit(self.permit, checkpoints)]
+        return checkpoints, epochs, [*first, checkpoints, *others]
 
     @property
     def _prints_tables(self) -> bool:
@@ -233,9 +263,17 @@ class Experiment:
 
         :param folder: the run's folder, owned by this process
         :return: exit status: 0, or 128 + the signal's number when interrupted
+        :raises UsageError: training can't go on, or the disk is full or read-only
         """
         try:
             return self._train(folder)
+        except OSError as error:
+            if not is_disk_error(error):
+                raise
+            raise UsageError(
+                f"can't write to {folder.path}: {error.strerror}; what was written before is "
+                f"intact: make room, then continue with -i {folder.path}"
+            ) from error
         finally:
             self.close()
 
@@ -254,6 +292,8 @@ class Experiment:
                 folder.monitor, offset=None if state is None else monitor_offset(state)
             )
         except (OSError, ValueError) as error:
+            if is_disk_error(error):
+                raise
             raise UsageError(one_line(error)) from error
         logger = RunLogger(
             folder.path,
@@ -281,7 +321,7 @@ class Experiment:
             folder.write_result({"algo": self.algo, "env": self.args["env"], **result})
         if verbose:
             print(summary(folder, result, time.monotonic() - began, finished))
-        return 0 if finished else 128 + received[0]
+        return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
     @property
     def _tensorboard_folder(self) -> Path | None:
@@ -329,7 +369,7 @@ class Experiment:
             )
         except Interrupted:
             return False
-        except (ValueError, FloatingPointError, LayoutError) as error:
+        except (ValueError, FloatingPointError, *ERRORS_OF_OURS) as error:
             # What an environment or algorithm refuses, e.g. a NaN: its message says it all.
             if self.args["verbose"] > 1:
                 raise
@@ -341,6 +381,30 @@ class Experiment:
             for callback in callbacks:
                 if isinstance(callback, Epochs):
                     callback.on_training_end()  # leaves the terminal tidy
+        return True
+
+
+class Permit(BaseCallback):
+    """
+    Let training end with a checkpoint when a file is gone, wherever on a cluster it runs.
+
+    :param path: the file; on a full disk files can still be removed
+    :param checkpoints: the run's; its turn comes after this one's
+    """
+
+    def __init__(self, path: Path, checkpoints: Checkpoints):
+        super().__init__()
+        self.path = path
+        self.checkpoints = checkpoints
+        self._looked = -np.inf
+
+    def _on_rollout_start(self) -> None:
+        # Rollouts of off-policy algorithms are a few steps long.
+        if time.monotonic() - self._looked > 1.0:
+            self._looked = time.monotonic()
+            self.checkpoints.stop |= not self.path.exists()
+
+    def _on_step(self) -> bool:
         return True
 
 
@@ -374,18 +438,18 @@ def interrupts(checkpoints: Checkpoints, verbose: bool) -> Iterator[list[int]]:
             signal.signal(one, handler)
 
 
-def start(args: Mapping[str, Any]) -> int:
+def prepare(args: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """
-    Start a new run.
+    What a new run is: all its flags and hyper-parameters, as its folder will state them.
 
     :param args: all flags, with their defaults
-    :return: exit status
-    :raises UsageError: anything is wrong with them; nothing has been written then
+    :return: flags and hyper-parameters, checked as far as that goes without making anything
+    :raises UsageError: anything is wrong with them
     """
     args = dict(args)
     algorithm(args["algo"])
     import_packages(args["gym_packages"])
-    args["env"], _ = canonical_id(args["env"])
+    args["env"], ours = canonical_id(args["env"])
     if args["seed"] < 0:
         args["seed"] = int(np.random.default_rng().integers(2**31))
     overrides = dict(args["hyperparams"] or {})
@@ -395,8 +459,21 @@ def start(args: Mapping[str, Any]) -> int:
     if args["env_kwargs"]:
         values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **args["env_kwargs"]}
     values = check(args["algo"], algorithm(args["algo"]), values)
+    wrapped = values.get("env_wrapper") is not None
+    args["vec_env"] = choose_vec_env(args["vec_env"], ours, wrapped)
+    return args, values
+
+
+def start(args: Mapping[str, Any]) -> int:
+    """
+    Start a new run.
+
+    :param args: all flags, with their defaults
+    :return: exit status
+    :raises UsageError: anything is wrong with them; nothing has been written then
+    """
+    args, values = prepare(args)
     experiment = Experiment(args, values)
-    args["vec_env"] = experiment.vec_env
     try:
         folder = RunFolder.create(
             args["log_folder"],
@@ -412,6 +489,69 @@ def start(args: Mapping[str, Any]) -> int:
         raise
     with folder.owned():
         return experiment.train(folder)
+
+
+def complete(
+    args: Mapping[str, Any],
+    values: Mapping[str, Any],
+    number: int,
+    command: str,
+    permit: Path,
+    grid: str = "",
+) -> int:
+    """
+    Bring a run of a given number to its end: start it, or go on from where it was cut.
+
+    :param args: its flags, as :func:`prepare` returns them
+    :param values: its hyper-parameters, likewise
+    :param number: of its folder
+    :param command: the command line it is part of
+    :param permit: a file; when it is gone, training ends after the rollout under way
+    :param grid: on whose behalf, for the run's lock
+    :return: exit status, 0 if it is complete, now or already before
+    :raises RunInUse: another process has the run
+    :raises UsageError: it can't be trained, or the folder holds another run
+    """
+    import_packages(args["gym_packages"])
+    path = run_path(args["log_folder"], args["algo"], args["env"], number)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"can't make folder {path}: {error.strerror}") from error
+    with lock(path, grid):
+        if is_run(path):
+            folder = RunFolder(path)
+            refuse_another(folder, args, values)
+        else:
+            folder = RunFolder.create(
+                args["log_folder"], args["algo"], args["env"], args, values, command, number=number
+            )
+        if folder.read_result() is not None:
+            return 0
+        # Without a checkpoint nothing of it is worth keeping, and it begins anew in its place.
+        begun = folder.checkpoint.exists()
+        quiet = {**args, "progress": False, "verbose": 0}
+        experiment = Experiment(quiet, values, folder if begun else None)
+        experiment.permit = permit
+        return experiment.train(folder)
+
+
+def refuse_another(folder: RunFolder, args: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """
+    Make sure that a folder holds the run that is asked for.
+
+    :raises UsageError: it holds another, or is damaged
+    """
+    own, asked = folder.args(), yaml.safe_load(yaml.safe_dump(dict(args)))
+    pairs = [(name, own.get(name), asked[name]) for name in IDENTITY]
+    own, asked = folder.hyperparams(), yaml.safe_load(yaml.safe_dump(dict(values)))
+    pairs += [(name, own.get(name), asked.get(name)) for name in sorted({*own, *asked})]
+    differences = [f"{name}: {a} there, {b} here" for name, a, b in pairs if a != b]
+    if differences:
+        raise UsageError(
+            f"{folder.path} holds another run ({'; '.join(differences[:3])}); "
+            "choose another folder with -f"
+        )
 
 
 def continues_run(path: Path) -> bool:

@@ -1,20 +1,23 @@
 """A trained agent found in its run folder, played, and filmed."""
 
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
-from sb3_guard.envs.layout import LayoutError
-from sb3_guard.envs.rendering import RenderingError
+from sb3_guard.common.files import replacing
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.config import build, check
 from sb3_guard.zoo.environments import (
+    ERRORS_OF_OURS,
     canonical_id,
     choose_vec_env,
     make_envs,
@@ -79,28 +82,39 @@ def _existing(path: Path) -> Path:
     return path
 
 
-def play(args: Mapping[str, Any], render_mode: str | None) -> int:
+@dataclass
+class Agent:
     """
-    Play an agent and print what it gets and what it costs.
+    A trained agent and an environment to play it in.
+
+    :param run: where it comes from
+    :param path: its model file
+    :param normalizer: its observation statistics; the file exists only if it has any
+    :param env_id: full id of the environment
+    """
+
+    run: RunFolder
+    path: Path
+    normalizer: Path
+    env_id: str
+    model: BaseAlgorithm
+    env: VecEnv
+
+
+def open_agent(args: Mapping[str, Any], render_mode: str | None) -> Agent:
+    """
+    Load an agent and make one environment for it, wrapped as in training.
 
     :param args: all flags of ``enjoy``, with their defaults
-    :param render_mode: None, ``"human"``, or ``"rgb_array"`` to record
-    :return: exit status
-    :raises UsageError: there is no such agent, or no picture can be made
+    :param render_mode: None, ``"human"``, or ``"rgb_array"``
+    :raises UsageError: there is no such agent, or it does not fit the environment
     """
     cls = algorithm(args["algo"])
     import_packages(args["gym_packages"])
     env_id, ours = canonical_id(args["env"])
     run = find_run(args["folder"], args["algo"], env_id, args["exp_id"])
     path, normalizer = find_model(run, args)
-    video = None
-    if args["record"] is not None:
-        video = Path(args["record"] or path.with_suffix(".mp4"))
-        if video.is_dir():
-            raise UsageError(f"--record: {str(video)!r} is a folder; name a file, such as a.mp4")
-        require_writable(video.parent, "--record")
-    values = check(args["algo"], cls, run.hyperparams())
-    setup = build(values)
+    setup = build(check(args["algo"], cls, run.hyperparams()))
     if args["num_threads"] > 0:
         import torch as th
 
@@ -126,15 +140,37 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
             f"{path} was trained on observations {model.observation_space}, "
             f"but {env_id} has {env.observation_space}"
         )
+    return Agent(run, path, normalizer, env_id, model, env)
+
+
+def play(args: Mapping[str, Any], render_mode: str | None) -> int:
+    """
+    Play an agent and print what it gets and what it costs.
+
+    :param args: all flags of ``enjoy``, with their defaults
+    :param render_mode: None, ``"human"``, or ``"rgb_array"`` to record
+    :return: exit status
+    :raises UsageError: there is no such agent, or no picture can be made
+    """
+    for flag in ("record", "json"):
+        if args[flag] and Path(args[flag]).is_dir():
+            raise UsageError(f"--{flag}: {args[flag]!r} is a folder; name a file")
+    if args["json"]:
+        require_writable(Path(args["json"]).parent, "--json")
+    agent = open_agent(args, render_mode)
+    video = None
+    if args["record"] is not None:
+        video = Path(args["record"] or agent.path.with_suffix(".mp4"))
+        require_writable(video.parent, "--record")
     episodes = args["n_episodes"]
     if episodes is None and args["n_timesteps"] is None:
         episodes = 1 if args["record"] is not None else 5
-    print(f"Playing {path} on {env_id}")
+    print(f"Playing {agent.path} on {agent.env_id}")
     try:
-        with camera(env, video, render_mode) as shoot:
+        with camera(agent.env, video, render_mode) as shoot:
             evaluation = evaluate_policy(
-                model,
-                env,
+                agent.model,
+                agent.env,
                 n_eval_episodes=episodes or args["n_timesteps"],
                 deterministic=not args["stochastic"],
                 seed=args["seed"],
@@ -142,14 +178,44 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
                 on_step=shoot,
                 on_episode=_print_episode if args["verbose"] > 0 else None,
             )
-    except (LayoutError, RenderingError) as error:
-        raise UsageError(f"can't play {env_id}: {one_line(error)}") from error
+    except ERRORS_OF_OURS as error:
+        raise UsageError(f"can't play {agent.env_id}: {one_line(error)}") from error
     finally:
-        env.close()
+        agent.env.close()
     print(_means(evaluation))
+    if args["json"]:
+        played = {key: args[key] for key in ("algo", "seed", "stochastic")}
+        content = {"model": str(agent.path), "env": agent.env_id, **played, **summary(evaluation)}
+        Path(args["json"]).parent.mkdir(parents=True, exist_ok=True)
+        with replacing(args["json"]) as file:
+            file.write(json.dumps(content, indent=2, allow_nan=False).encode())
     if video is not None:
         print(f"Video: {video}")
     return 0
+
+
+def summary(evaluation: Evaluation) -> dict[str, Any]:
+    """
+    Return, cost and length as plain data.
+
+    :return: the number of ``episodes``, and for ``return``, ``cost`` and ``length`` the ``mean``,
+        ``std``, the 95 % interval of the mean (``low``, ``high``) and the ``values``, one an
+        episode; None where there are too few episodes for it
+    """
+    out: dict[str, Any] = {"episodes": len(evaluation)}
+    for name, values in _columns(evaluation).items():
+        estimate = evaluation.estimate(values)._asdict()
+        known = {key: None if np.isnan(one) else one for key, one in estimate.items()}
+        out[name] = {**known, "values": values.tolist()}
+    return out
+
+
+def _columns(evaluation: Evaluation) -> dict[str, np.ndarray]:
+    return {
+        "return": evaluation.returns,
+        "cost": evaluation.costs,
+        "length": evaluation.lengths,
+    }
 
 
 def _print_episode(episode_return: float, cost: float, length: int) -> None:
@@ -161,11 +227,7 @@ def _means(evaluation: Evaluation) -> str:
     if count == 0:
         return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"
     rows = [f"Mean ± std of {count} episode{'s' if count > 1 else ''}, 95 % interval of the mean:"]
-    for name, values in (
-        ("return", evaluation.returns),
-        ("cost", evaluation.costs),
-        ("length", evaluation.lengths),
-    ):
+    for name, values in _columns(evaluation).items():
         mean, std, low, high = evaluation.estimate(values)
         interval = f"   [{low:.3f}, {high:.3f}]" if count > 1 else ""
         rows.append(f"  {name:<7}{mean:9.3f} ± {std:.3f}{interval}")

@@ -1,32 +1,66 @@
 """What a person watching a run wants to see: how far it is, how well it does, how safely."""
 
+import platform
+import subprocess
 import sys
+import time
+from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import tqdm
 
-from sb3_guard.common.monitor import CostMonitor
+import sb3_guard
+from sb3_guard.common.monitor import find_monitor
+
+# The epoch of algorithms whose rollouts are a few steps long: the paper's, in steps
+EPOCH = 30_000
+PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")
 
 
-def find_monitor(env: VecEnv) -> CostMonitor:
-    """The cost monitor among an environment's wrappers."""
-    layer = env
-    while isinstance(layer, VecEnvWrapper):
-        if isinstance(layer, CostMonitor):
-            return layer
-        layer = layer.venv
-    raise ValueError("the environment is not wrapped in a CostMonitor")
+def commit() -> str | None:
+    """
+    The git commit that this package's code is at, followed by ``-dirty`` if it was changed since.
+
+    :return: None if the code is not under git, as when it was installed
+    """
+    folder = Path(sb3_guard.__file__).parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(folder), *arguments],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=20,
+        ).stdout.strip()
+
+    try:
+        # A virtual environment inside somebody's checkout is not part of that checkout.
+        git("ls-files", "--error-unmatch", "__init__.py")
+        return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def provenance() -> dict[str, Any]:
+    """What a result was made with: ``versions`` by package, git ``commit``, ``platform``."""
+    versions = {"sb3_guard": sb3_guard.__version__, "python": platform.python_version()}
+    for package in PACKAGES:
+        versions[package] = metadata.version(package)
+    return {"versions": versions, "commit": commit(), "platform": platform.platform()}
 
 
 class Epochs(BaseCallback):
     """
-    Collect the episodes of each rollout, and show them on a progress bar.
+    Collect the episodes of each epoch, and show them on a progress bar.
 
-    The paper's figures of merit are means over the episodes that ended in the final rollout, its
-    *epoch*; :meth:`result` has them.
+    The paper's figures of merit are means over the episodes that ended in the final *epoch*, the
+    final rollout; :meth:`result` has them. Off-policy algorithms, whose rollouts are too short to
+    end many episodes, have epochs of 30,000 steps.
 
     :param total: steps at which training ends
     :param bar: show a progress bar on stderr
@@ -37,11 +71,17 @@ class Epochs(BaseCallback):
         self.total = total
         self.show = bar
         self.bar: Any = None
-        self._episodes: list[dict[str, Any]] = []
-        #: return, cost, length of the episodes of the last rollout in which any ended, [E, 3]
+        # step at which it ended, return, cost, length: the episodes of the epoch under way
+        self._episodes: list[tuple[float, float, float, float]] = []
+        #: return, cost, length of the episodes of the last epoch in which any ended, [E, 3]
         self.last = np.zeros((0, 3))
+        # Taken now: what lies on disk may change while the run goes on.
+        self._provenance = provenance()
+        self._seconds = 0.0  # of the processes before this one
+        self._began: float | None = None
 
     def _on_training_start(self) -> None:
+        self._began = time.monotonic()
         if self.show:
             self.bar = tqdm(
                 total=self.total,
@@ -54,18 +94,24 @@ class Epochs(BaseCallback):
             self._describe()
 
     def _on_rollout_start(self) -> None:
-        self._episodes = []
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            self._episodes = []
 
     def _on_step(self) -> bool:
         if np.any(self.locals["dones"]):
-            self._episodes += [i["episode"] for i in self.locals["infos"] if "episode" in i]
+            ended = [info["episode"] for info in self.locals["infos"] if "episode" in info]
+            now = self.model.num_timesteps
+            self._episodes += [(now, one["r"], one["c"], one["l"]) for one in ended]
         if self.bar is not None:
             self.bar.update(self.model.num_timesteps - self.bar.n)
         return True
 
     def _on_rollout_end(self) -> None:
+        if isinstance(self.model, OffPolicyAlgorithm):
+            begin = self.model.num_timesteps - EPOCH
+            self._episodes = [one for one in self._episodes if one[0] > begin]
         if self._episodes:
-            self.last = np.array([(one["r"], one["c"], one["l"]) for one in self._episodes])
+            self.last = np.array(self._episodes)[:, 1:]
             self._describe()
         errors = find_monitor(self.training_env).physics_errors
         if errors:
@@ -85,28 +131,39 @@ class Epochs(BaseCallback):
 
     def result(self) -> dict[str, Any]:
         """
-        J_r, M_c and ρ_c as the paper defines them.
+        J_r, M_c and ρ_c as the paper defines them, and what they were obtained with.
 
-        :return: ``return``, ``cost`` and ``length``, means over the episodes of the last rollout in
+        :return: ``return``, ``cost`` and ``length``, means over the episodes of the last epoch in
             which any ended (None if none did), their number ``episodes``, ``cost_rate``,
-            cumulative cost ÷ steps of the whole run, and ``physics_errors``, the number of episodes
-            that ended because the physics diverged
+            cumulative cost ÷ steps of the whole run, ``physics_errors``, the number of episodes
+            that ended because the physics diverged, ``cost_limit`` (None: unconstrained),
+            ``seconds`` of training, and :func:`provenance`
         """
         monitor = find_monitor(self.training_env)
         means = self.last.mean(axis=0).tolist() if len(self.last) else [None] * 3
         rate = monitor.total_cost / monitor.total_steps if monitor.total_steps else None
+        constrained = getattr(self.model, "constrained", False)
+        limit = getattr(self.model, "cost_limit", None) if constrained else None
         return {
             **dict(zip(("return", "cost", "length"), means, strict=True)),
             "cost_rate": rate,
             "episodes": len(self.last),
             "n_timesteps": self.model.num_timesteps,
             "physics_errors": monitor.physics_errors,
+            "cost_limit": limit,
+            "seconds": round(self._elapsed(), 3),
+            **self._provenance,
         }
+
+    def _elapsed(self) -> float:
+        return self._seconds + (0 if self._began is None else time.monotonic() - self._began)
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs to tell the same result."""
-        return {"last": self.last}
+        return {"last": self.last, "episodes": self._episodes, "seconds": self._elapsed()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state`."""
         self.last = state["last"]
+        self._episodes = list(state.get("episodes", []))
+        self._seconds = state.get("seconds", 0.0)

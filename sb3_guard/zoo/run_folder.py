@@ -1,13 +1,16 @@
 """One training run on disk, laid out as RL-Zoo lays it out, and owned by one process at a time."""
 
+import errno
 import glob
 import json
 import os
 import socket
+import sys
 import tempfile
+import threading
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +25,48 @@ except ImportError:  # Windows has no file locks of this kind: runs there are no
     fcntl = None  # type: ignore[assignment]
 
 CHECKPOINT = "checkpoint.zip"
+# What the system says when a disk is full, read-only or broken.
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
+BEAT = 10.0  # seconds between the signs of life that a lock gives
+SILENCE = 120.0  # seconds without one after which another host takes a lock over
+
+
+class RunInUse(UsageError):
+    """Another process has the run."""
+
+
+def is_disk_error(error: BaseException | None) -> bool:
+    """Whether an exception, or what caused it, is a full, read-only or broken disk."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+            return True
+        error = error.__cause__
+    return False
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain data, and the ordered mappings that RL-Zoo writes."""
+
+
+_Loader.add_constructor(
+    "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
+    lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0]),  # type: ignore[arg-type]
+)
 
 
 def folder_name(env_id: str) -> str:
     """An environment id as part of a path: no module prefix, no slashes (RL-Zoo's rule)."""
     return env_id.rsplit(":", 1)[-1].replace("/", "-")
+
+
+def run_path(log_folder: str, algo: str, env_id: str, number: int) -> Path:
+    """The folder of a run: ``<log folder>/<algo>/<env>_<number>``."""
+    return Path(log_folder) / algo / f"{folder_name(env_id)}_{number}"
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run, rather than nothing yet or what was left half made."""
+    return any(path.glob("*/args.yml"))
 
 
 def require_writable(folder: Path, flag: str) -> None:
@@ -81,14 +121,17 @@ class RunFolder:
         hyperparams: Mapping[str, Any],
         command: str,
         unique: bool = False,
+        number: int | None = None,
     ) -> "RunFolder":
         """
-        Take the next free number and write down what the run is.
+        Take a number and write down what the run is.
 
         :param args: all flags, plain data
         :param hyperparams: all hyper-parameters, plain data
         :param command: the command line
         :param unique: append a unique id to the name (``--uuid``)
+        :param number: the number to take, by a caller that has :func:`lock` on the folder, which
+            may exist but is no run yet; None: the next free one
         :raises UsageError: the folder can't be written to, or there is more than plain data
         """
         name = folder_name(env_id)
@@ -97,17 +140,20 @@ class RunFolder:
         suffix = f"_{uuid.uuid4()}" if unique else ""
         try:
             parent.mkdir(parents=True, exist_ok=True)
-            number = latest_run(parent, name) + 1
-            while True:
-                path = parent / f"{name}_{number}{suffix}"
-                try:
-                    # Making the folder is what claims the number: another process may be here too.
-                    path.mkdir()
-                    break
-                except FileExistsError:
-                    number += 1
+            if number is None:
+                number = latest_run(parent, name) + 1
+                while True:
+                    path = parent / f"{name}_{number}{suffix}"
+                    try:
+                        # Making the folder claims the number: another process may be here too.
+                        path.mkdir()
+                        break
+                    except FileExistsError:
+                        number += 1
+            else:
+                path = run_path(log_folder, algo, env_id, number)
             params = path / name
-            params.mkdir()
+            params.mkdir(parents=True, exist_ok=True)
             (params / "command.txt").write_text(command)
             _write(params, files)
         except OSError as error:
@@ -165,7 +211,7 @@ class RunFolder:
     def _read(self, name: str) -> dict[str, Any]:
         path = self.params / name
         try:
-            content = yaml.safe_load(path.read_text())
+            content = yaml.load(path.read_text(), Loader=_Loader)
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise UsageError(f"can't read {path}: {one_line(error)}") from error
         if not isinstance(content, dict):
@@ -181,49 +227,111 @@ class RunFolder:
         with replacing(self.result) as file:
             file.write(json.dumps(result, indent=2).encode())
 
+    def read_result(self) -> dict[str, Any] | None:
+        """The result of a complete run; None if there is none, or it is damaged."""
+        try:
+            result = json.loads(self.result.read_bytes())
+        except (OSError, ValueError):
+            return None
+        return result if isinstance(result, dict) and "n_timesteps" in result else None
+
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """
-        Hold the run's lock, so that no other process writes to it meanwhile.
-
-        The operating system drops the lock of a process that dies, however it dies; the file then
-        still names it, and the next process takes over.
-
-        :raises UsageError: another process has it, or a process on another host may have it
-        """
-        if fcntl is None:
+        """Hold the run's lock, see :func:`lock`."""
+        with lock(self.path):
             yield
-            return
-        path = self.path / ".lock"
-        me = {"host": socket.gethostname(), "pid": os.getpid()}
+
+
+@contextmanager
+def lock(folder: Path, grid: str = "") -> Iterator[None]:
+    """
+    Hold a run's lock, so that no other process writes to it meanwhile.
+
+    The operating system drops the lock of a process that dies, however it dies; the file then
+    still names it, and the next process takes over. Locks of the system may not reach other hosts,
+    so the file is also touched all the time: another host takes over after a long silence.
+
+    :param folder: it exists, and is a run or about to become one
+    :param grid: name of the grid on whose behalf, see :func:`owner`
+    :raises RunInUse: another process has it, or a process on another host may have it
+    :raises UsageError: the folder can't be written to
+    """
+    if fcntl is None:
+        yield
+        return
+    path = folder / ".lock"
+    me = {"host": socket.gethostname(), "pid": os.getpid(), "grid": grid}
+    try:
+        handle = open(path, "ab", buffering=0)
+    except OSError as error:
+        raise UsageError(f"can't write to {folder}: {error.strerror}") from error
+    with handle:
         try:
-            handle = open(path, "a+")
-        except OSError as error:
-            raise UsageError(f"can't write to {self.path}: {error.strerror}") from error
-        with handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                free = True
-            except OSError:
-                free = False
-            handle.seek(0)
-            try:
-                owner = json.loads(handle.read() or "{}")
-            except json.JSONDecodeError:
-                owner = {}
-            if not free or owner.get("host", me["host"]) != me["host"]:
-                # Locks may not reach other hosts: there, only a person can know.
-                raise UsageError(
-                    f"{self.path} is in use by process {owner.get('pid')} on {owner.get('host')}; "
-                    f"if that is gone, remove {path}"
-                )
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            free = True
+        except OSError:
+            free = False
+        holder = owner(folder)
+        elsewhere = holder.get("host", me["host"]) != me["host"]
+        if not free or (elsewhere and not _silent(path)):
+            raise RunInUse(
+                f"{folder} is in use by process {holder.get('pid')} on {holder.get('host')}; "
+                f"if that is gone, remove {path}, or try again in {SILENCE / 60:.0f} minutes"
+            )
+        try:
             handle.truncate(0)
-            handle.write(json.dumps(me))
-            handle.flush()
-            try:
-                yield
-            finally:
-                handle.truncate(0)
+            handle.write(json.dumps(me).encode())
+        except OSError as error:
+            raise UsageError(f"can't write to {folder}: {error.strerror}") from error
+        gone = threading.Event()
+        threading.Thread(target=_beat, args=(path, me, gone), daemon=True).start()
+        try:
+            yield
+        finally:
+            gone.set()
+            handle.truncate(0)
+
+
+def owner(folder: Path) -> dict[str, Any]:
+    """
+    Who has the lock of a run, or had it when it died: ``host``, ``pid``, ``grid``; empty: nobody.
+    """
+    try:
+        content = json.loads((folder / ".lock").read_bytes() or "{}")
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def in_use(folder: Path) -> bool:
+    """Whether another process has the lock of a run; it may be gone a moment later."""
+    try:
+        with lock(folder):
+            return False
+    except RunInUse:
+        return True
+
+
+def _silent(path: Path) -> bool:
+    """Whether a lock has given no sign of life for long, by the clock of its own disk."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".clock") as clock:
+        return os.fstat(clock.fileno()).st_mtime - path.stat().st_mtime > SILENCE
+
+
+def _beat(path: Path, me: dict[str, Any], gone: threading.Event) -> None:
+    """Give signs of life; end the process if it slept so long that another host took over."""
+    while not gone.wait(BEAT):
+        holder = owner(path.parent)
+        if holder and holder != me and not gone.is_set():
+            print(
+                f"{path.parent} was taken over by process {holder.get('pid')} on "
+                f"{holder.get('host')} while this one gave no sign of life; it ends here",
+                file=sys.stderr,
+                flush=True,
+            )
+            os._exit(1)
+        with suppress(OSError):
+            os.utime(path)
 
 
 def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, bytes]:

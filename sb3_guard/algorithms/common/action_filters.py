@@ -35,7 +35,8 @@ class ActionFilter(nn.Module):
         super().__init__()
         self.network = network
         self.register_buffer("threshold", th.zeros(n_costs, dtype=th.float64))
-        self.register_buffer("active", th.zeros((), dtype=th.bool))
+        # 0 or 1: a number, since SB3's tools draw, average and compare whole state dictionaries.
+        self.register_buffer("active", th.zeros(()))
 
     threshold: th.Tensor
     active: th.Tensor

@@ -64,6 +64,7 @@ def _reached(output: th.Tensor, policy: ActorCriticPolicy) -> list[th.Tensor]:
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.Tensor]:
     """The parameters that the action distribution depends on, found by differentiating it."""
+    policy.set_training_mode(False)  # of one observation there is nothing to normalise by
     observation = _zero_observation(policy)
     distribution = policy.get_distribution(observation)
     return _reached(distribution.log_prob(distribution.get_actions(deterministic=True)), policy)

@@ -6,8 +6,9 @@ import numpy as np
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a real number; booleans are not."""
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    """Whether a value is a finite number; booleans are not."""
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return number and bool(np.isfinite(value))
 
 
 def check_integer(name: str, value: Any, least: int = 1) -> None:
@@ -34,9 +35,10 @@ def check_number(
         )
 
 
-def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
+def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...], low: float = -np.inf) -> None:
     """
-    :raises ValueError: ``value`` is not one finite number, or one for each cost key
+    :raises ValueError: ``value`` is not one finite number of at least ``low``, or one for each cost
+        key
     """
     numbers = np.asarray(value)
     if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != len(cost_keys)):
@@ -46,6 +48,8 @@ def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
         )
     if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):
         raise ValueError(f"{name}={value!r}: must be finite numbers")
+    if (numbers < low).any():
+        raise ValueError(f"{name}={value!r}: must be at least {low:g}, as costs are")
 
 
 def check_choice(name: str, value: Any, *allowed: str) -> None:

@@ -33,7 +33,9 @@ class StateNetwork(nn.Module):
         self.observation_space = policy.observation_space
         self.normalize_images = policy.normalize_images
         self.features_extractor = policy.make_features_extractor()
-        arch = policy.net_arch if isinstance(policy.net_arch, list) else policy.net_arch["vf"]
+        arch = policy.net_arch
+        if isinstance(arch, dict):
+            arch = arch.get("vf", [])  # as SB3's extractor reads it
         features = self.features_extractor.features_dim
         layers = create_mlp(features + n_extra, n_outputs, arch, policy.activation_fn)
         self.network = nn.Sequential(*layers)
@@ -42,6 +44,7 @@ class StateNetwork(nn.Module):
             self.network[:-1].apply(partial(policy.init_weights, gain=np.sqrt(2)))
             self.network[-1].apply(partial(policy.init_weights, gain=1.0))
         self.to(policy.device)
+        self.train(False)  # but while it is fitted
         self.optimizer = policy.optimizer_class(
             self.parameters(),
             lr=policy.optimizer.param_groups[0]["lr"],  # type: ignore[call-arg]
@@ -83,8 +86,11 @@ class CostCritic(StateNetwork):
 class Regression:
     """Least-squares fit of a network to a batch, full-batch by default.
 
-    A batch is observations, or a tuple of observations and whatever else ``values`` takes.
+    A batch is observations, or a tuple of observations and whatever else ``values`` takes. Layers
+    that behave in another way during training, such as batch normalisation, do so here alone: the
+    policy that a trust region is about is the one that acted.
 
+    :param module: the policy or network that is fitted
     :param values: maps a batch to predictions, shape [B, m]
     :param parameters: what may move
     :param optimizer: moves them, whatever else it could move
@@ -95,6 +101,7 @@ class Regression:
 
     def __init__(
         self,
+        module: nn.Module,
         values: Callable[[Any], th.Tensor],
         parameters: Sequence[th.Tensor],
         optimizer: th.optim.Optimizer,
@@ -102,6 +109,7 @@ class Regression:
         layers: Sequence[nn.Linear] | None = None,
         readout: Callable[[th.Tensor, Any], th.Tensor] | None = None,
     ) -> None:
+        self.module = module
         self.values = values
         self.parameters = list(parameters)
         self.optimizer = optimizer
@@ -127,7 +135,8 @@ class Regression:
         def features(observations: PyTorchObs) -> th.Tensor:
             return super(ActorCriticPolicy, policy).extract_features(observations, extractor)
 
-        return cls(policy.predict_values, parameters, policy.optimizer, features, layers)
+        values = policy.predict_values
+        return cls(policy, values, parameters, policy.optimizer, features, layers)
 
     @classmethod
     def of_network(
@@ -150,6 +159,7 @@ class Regression:
         ):
             layers = TanhMlp.layers([*network.network])
         return cls(
+            network,
             lambda batch: last(network.network(first(batch)), batch),
             list(network.parameters()),
             network.optimizer,
@@ -179,6 +189,7 @@ class Regression:
             with th.no_grad():
                 inputs = self.inputs(batch)
         self.optimizer.zero_grad(set_to_none=True)
+        self.module.train(True)
         loss = 0.0
         for _ in range(n_epochs):
             if batch_size is None or batch_size >= n:
@@ -192,6 +203,7 @@ class Regression:
                 error = self._gradients(rows(batch, index), targets[index], part)
                 loss += error * len(index) / n
                 self.optimizer.step()
+        self.module.train(False)
         return loss
 
     def _gradients(self, batch: Any, targets: th.Tensor, inputs: th.Tensor | None) -> float:

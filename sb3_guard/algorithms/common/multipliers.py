@@ -117,7 +117,9 @@ class StateMultiplier(nn.Module):
         :param excess: how far each state's cost is above its limit, shape [N, m]
         """
         self.optimizer.zero_grad(set_to_none=True)
+        self.networks.train(True)
         for index in chunks(len(excess)):
             gain = (self(rows(observations, index)) * excess[index]).sum() / len(excess)
             (-gain).backward()
+        self.networks.train(False)
         self.optimizer.step()

@@ -330,7 +330,7 @@ class TrustRegion(OnPolicyAlgorithm):
                 f"cost_keys={self.cost_keys!r}: must be a sequence of one or more different names "
                 "of info entries, such as ('cost',)"
             )
-        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys))
+        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys), low=0.0)
         buffer_class = self.rollout_buffer_class
         if buffer_class is not None and not issubclass(
             buffer_class, CostRolloutBuffer | CostDictRolloutBuffer
@@ -475,6 +475,8 @@ class TrustRegion(OnPolicyAlgorithm):
         assert dones is not None and self.ep_cost_buffer is not None
         assert self.running_costs is not None and self.running_lengths is not None
         assert self.last_costs is not None
+        # A vectorised environment without anything to say may leave infos out.
+        infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
         costs, seen = read_costs(infos, self.cost_keys, self.missing_cost == "zero")
         self._cost_seen_in_rollout |= seen
         # SB3 calls this just before it adds the transition.
@@ -510,8 +512,6 @@ class TrustRegion(OnPolicyAlgorithm):
         if not self.uses_cost_critic:
             return
         buffer = self.rollout_buffer
-        self.policy.set_training_mode(False)
-        self.cost_critic.train(False)
         stored: Any = buffer.observations
         stored = {"": stored} if not isinstance(stored, dict) else stored
         flat = {key: value.reshape(-1, *value.shape[2:]) for key, value in stored.items()}
@@ -567,10 +567,9 @@ class TrustRegion(OnPolicyAlgorithm):
 
     def train(self) -> None:
         """One update from the rollout: the policy's step, what a leaf learns, the critics."""
-        self.policy.set_training_mode(True)
+        self.policy.set_training_mode(False)  # but while the critics are fitted
         optimizers = [self.policy.optimizer]
         if self.uses_cost_critic:
-            self.cost_critic.train(True)
             optimizers.append(self.cost_critic.optimizer)
         self._update_learning_rate(optimizers)
 

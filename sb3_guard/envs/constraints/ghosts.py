@@ -8,6 +8,7 @@ from sb3_guard.envs import motion
 from sb3_guard.envs.constraints.obstacles import Obstacles
 from sb3_guard.envs.objects import Movers
 from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Simulation
 
 
 @dataclass
@@ -15,8 +16,9 @@ class Ghosts(Movers, Obstacles):
     """Zones that follow the robot until they are within r1 of it (Zhao et al. 2024, §4.3).
 
     Beyond r0 of the origin a ghost goes home at v0; else, beyond r1 of the robot, it comes at v1;
-    within r1 it waits. Cost: Σ max(0, size − distance) over the ghosts; of solid ones, the number
-    touched.
+    within r1 it waits. Cost: Σ max(0, size − distance) over the ghosts, the distance from the
+    robot's position, or from the nearest link of an arm, to the ghost's centre, on the floor in the
+    plane; of solid ones, the number touched.
     """
 
     name = "ghosts"
@@ -30,6 +32,11 @@ class Ghosts(Movers, Obstacles):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.trespassable = not self.solid
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        if not self.solid:  # how far a robot's body reaches up is not known
+            self.check_height(sim, self.size, all_of_it=False)
 
     def law(self) -> motion.Law:
         return self._law(far=self.speed if self.v1 is None else self.v1, r1=self.r1)

@@ -38,6 +38,10 @@ class Gremlins(Obstacles):
     def shape(self, body: mujoco.MjsBody) -> None:
         self.add_geom(body, BOX, (self.size, self.size, self.size), lift=self.size)
 
+    def positions(self, footprint: str) -> Array:
+        """The middles of the circles, [N, num, 3] m, which ``keepout`` is about."""
+        return self.sim.places(footprint)
+
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self._time = sim.batch.bind("time")  # [N] s since the episode began

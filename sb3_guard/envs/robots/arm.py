@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
 from sb3_guard.envs import geometry
-from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Simulation
-from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
+from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot, as_slice
 
 
 @dataclass
@@ -24,23 +25,19 @@ class Arm(MJCFRobot):
     reach = 2.0
     links: ClassVar[tuple[str, ...]]
 
-    locations: tuple[tuple[float, float], ...] = param(
-        ((0.0, 0.0),), "fixed start, one (x, y), m; empty: anywhere in the placements"
-    )
-
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         model = sim.model
         bodies = [model.body(PREFIX + link).id for link in self.links]
-        # the end effector is a segment of no length
-        self._starts, self._ends = bodies, [*bodies[1:], bodies[-1]]
-        self._radii = model.geom_size[model.body_geomadr[bodies], 0]
+        self._links = as_slice(bodies)
+        self._radii = model.geom_size[model.body_geomadr[bodies], 0][:, None, None]
 
     def clearance(self, points: Array, planar: bool) -> Array:
         """Distance of points from the surface of the nearest link, [N, K] m; negative inside."""
-        start, end = self._xpos[:, self._starts], self._xpos[:, self._ends]  # [N, L, 3]
-        if planar:
-            start, end, points = start.copy(), end.copy(), points.copy()
-            start[..., 2] = end[..., 2] = points[..., 2] = 0.0
-        gap = geometry.segment_distance(start, end, points) - self._radii[:, None]  # [N, L, K]
-        return gap.min(axis=1)
+        size = 2 if planar else 3
+        start = geometry.by_coordinate(self._xpos[:, self._links])[:size]  # [2 or 3, L, N]
+        # the end effector is a segment of no length
+        end = np.concatenate([start[:, 1:], start[:, -1:]], axis=1)
+        gap = geometry.segment_distance(start, end, geometry.by_coordinate(points)[:size])
+        gap -= self._radii  # [L, K, N]
+        return gap.min(axis=0).T.copy()

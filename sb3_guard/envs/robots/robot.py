@@ -46,6 +46,13 @@ _CHANNELS = {
 }
 
 
+def as_slice(ids: list[int]) -> slice | list[int]:
+    """Evenly spaced rising indices as a slice, which takes a view; other ones as they are."""
+    step = ids[1] - ids[0] if len(ids) > 1 else 1
+    even = step > 0 and len(ids) > 0 and ids == list(range(ids[0], ids[-1] + 1, step))
+    return slice(ids[0], ids[-1] + 1, step) if even else ids
+
+
 @dataclass
 class MJCFRobot(Robot):
     """A robot described by an MJCF file.
@@ -62,7 +69,9 @@ class MJCFRobot(Robot):
 
     name = "robot"
     keepout: float = param(0.4, "radius kept clear around the robot at the start, m", low=0)
-    locations: tuple[tuple[float, float], ...] = param((), "fixed start, one (x, y), m")
+    locations: tuple[tuple[float, float], ...] = param(
+        (), "fixed start, one (x, y), m; empty: anywhere, of an arm the origin"
+    )
     placements: tuple[Rectangle, ...] = param((), "rectangles to start in, m; empty: the arena")
     margin: float = param(0.0, "extra distance to every other object, m", low=0)
     heading: float | None = param(None, "start heading, rad; null: uniformly random")
@@ -77,8 +86,21 @@ class MJCFRobot(Robot):
         """The robot's MJCF file."""
         return Path(str(importlib.resources.files("sb3_guard.envs.robots") / "assets" / cls.asset))
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if math.isfinite(self.reach) and self.placements:
+            raise ValueError(
+                f"robot.placements = {self.placements!r}: a robot of limited reach stands at a "
+                "fixed place; set robot={'locations': [[x, y]]}"
+            )
+
+    @property
+    def base(self) -> tuple[float, float]:
+        return self.locations[0] if self.locations else (0.0, 0.0)
+
     def footprints(self) -> tuple[Footprint, ...]:
-        return (Footprint("robot", 1, self.keepout, self.placements, self.locations, self.margin),)
+        places = self.locations or ((self.base,) if math.isfinite(self.reach) else ())
+        return (Footprint("robot", 1, self.keepout, self.placements, places, self.margin),)
 
     def build(self, world: World) -> None:
         super().build(world)
@@ -113,7 +135,12 @@ class MJCFRobot(Robot):
         self._qpos = batch.bind("qpos")
         start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, PREFIX + "start")
         self._start = model.key_qpos[start] if start >= 0 else model.qpos0
-        self._position = batch.bind("xpos")[:, model.body(PREFIX + self.center).id]
+        center = model.body(PREFIX + self.center).id
+        self._position = batch.bind("xpos")[:, center]
+        pose = mujoco.MjData(model)
+        pose.qpos[: len(self._start)] = self._start
+        mujoco.mj_kinematics(model, pose)
+        self.altitude = float(pose.xpos[center, 2])
         if self._free:
             body = model.body(self.root).id
             address = int(model.jnt_qposadr[model.body_jntadr[body]])
@@ -136,11 +163,14 @@ class MJCFRobot(Robot):
                 )
         ids = [model.body(PREFIX + name).id for name in self.sensing or self.lidar_bodies]
         rotation = batch.bind("xmat")  # [N, nbody, 9]
-        # one lidar body, the usual case, stays a view: fancy indexing would copy at every look
-        self._bodies = slice(ids[0], ids[0] + 1) if len(ids) == 1 else ids
+        self._bodies = as_slice(ids)
         self._xpos, self._xmat = batch.bind("xpos"), rotation.reshape(*rotation.shape[:2], 3, 3)
         self._sensors = list(self._read_sensors(model))
         self._data = batch.bind("sensordata")
+        kinds = {name: kind for name, kind, _ in self._sensors}
+        self._balls = [name for name in kinds if kinds[name] == _SENSOR.mjSENS_BALLQUAT]
+        self._hinges = [name for name in kinds if kinds[name] == _SENSOR.mjSENS_JOINTPOS]
+        self._angles = as_slice([w.start for n, _, w in self._sensors if n in self._hinges])
 
     def _read_sensors(self, model: mujoco.MjModel) -> Any:
         """(name, type, slice of sensordata) of every observed sensor of the robot."""
@@ -190,14 +220,13 @@ class MJCFRobot(Robot):
         self._ctrl[:] = self._center + self._half * actions
 
     def observe(self) -> dict[str, Array]:
-        out = {}
-        for name, kind, where in self._sensors:
-            value = self._data[:, where]
-            if kind == _SENSOR.mjSENS_JOINTPOS:
-                value = np.concatenate([np.sin(value), np.cos(value)], axis=1)
-            elif kind == _SENSOR.mjSENS_BALLQUAT:
-                value = geometry.rotation_matrix(value)
-            out[name] = value
+        out = {name: self._data[:, where] for name, _, where in self._sensors}
+        for name in self._balls:
+            out[name] = geometry.rotation_matrix(out[name])
+        if self._hinges:
+            angles = self._data[:, self._angles]
+            turns = np.stack([np.sin(angles), np.cos(angles)], axis=2)  # [N, hinges, 2]
+            out.update((name, turns[:, i]) for i, name in enumerate(self._hinges))
         return out
 
     def channels(self) -> dict[str, Channel]:

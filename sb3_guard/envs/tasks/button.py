@@ -21,8 +21,9 @@ class Button(Objects, Task):
     """Press the right one of several buttons (Ray et al. 2019).
 
     Reward: the distance gained on the lit button, times ``reward_distance``, plus ``bonus`` when it
-    is touched. Then another one becomes the right one, and for ``delay`` control steps none is lit,
-    none can be pressed rightly or wrongly, and the lidar shows none.
+    is touched. Then another one becomes the right one, and in the next ``delay`` control steps none
+    can be pressed rightly or wrongly; until the last of them is over, none is lit and the lidar
+    shows none.
     """
 
     name = "button"
@@ -38,7 +39,7 @@ class Button(Objects, Task):
     num: int = param(4, "number of buttons", low=1)
     size: float = param(0.1, "radius of a button, m", above=0)
     keepout: float = param(0.3, "radius kept clear around a button, m", low=0)
-    delay: int = param(10, "control steps until the next button lights up", low=0)
+    delay: int = param(10, "control steps in which no button counts after one was pressed", low=0)
     reward_distance: float = param(1.0, "reward per metre gained")
     bonus: float = param(1.0, "reward for pressing the lit button")
     ends: bool = param(False, "whether pressing the lit button ends the episode")
@@ -51,7 +52,8 @@ class Button(Objects, Task):
         self._flat = sim.robot.workspace == "planar"
         self._rows = np.arange(sim.num_envs)
         self.right = sim.array("button/right", dtype=np.int64)  # [N] which button is the right one
-        self.wait = sim.array("button/wait", dtype=np.int64)  # [N] control steps until one is lit
+        # [N] how many steps ahead the first is that counts; 0 during one that does
+        self.wait = sim.array("button/wait", dtype=np.int64)
 
     def reset(self, ids: Array, rngs: Generators) -> None:
         super().reset(ids, rngs)
@@ -66,6 +68,11 @@ class Button(Objects, Task):
     def goal(self) -> Array:
         """Where the right button is, [N, 3] m."""
         return self.sim.places(self.group)[self._rows, self.right]
+
+    @property
+    def lit(self) -> Array:
+        """Whether a button is lit, that is, whether the next step counts, [N] bool."""
+        return self.wait <= 1
 
     def measure(self) -> Array:
         """Distance from the robot to the right button, [N, 1] m."""
@@ -82,7 +89,7 @@ class Button(Objects, Task):
             if self.num > 1:
                 other = self.sim.rngs[i].integers(self.num - 1)
                 self.right[i] = other + (other >= self.right[i])
-            self.wait[i] = self.delay
+            self.wait[i] = self.delay + 1
         return ids[:0]
 
     def mistakes(self) -> Array:
@@ -91,14 +98,15 @@ class Button(Objects, Task):
 
     def observe(self) -> dict[str, Array]:
         lidar = self.sim.lidar(self.centers, self.planar)
-        lidar[self.wait > 0] = 0.0
-        return {f"{self.group}_lidar": lidar, "goal_compass": self.sim.compass(self.goal)}
+        lidar[~self.lit] = 0.0
+        compass = self.sim.compass(self.goal, self.planar)
+        return {f"{self.group}_lidar": lidar, "goal_compass": compass}
 
     def channels(self) -> dict[str, Channel]:
-        return {**super().channels(), "goal_compass": self.sim.compass_channel()}
+        return {**super().channels(), "goal_compass": self.sim.compass_channel(self.planar)}
 
     def draw(self, painter: Painter, row: int) -> None:
         super().draw(painter, row)
-        if self.wait[row] == 0:
+        if self.lit[row]:
             light = self.goal[row] + [0, 0, self.size]
             painter.zone(light, 2 * self.size, 0.0, GREEN)

@@ -44,12 +44,13 @@ class Destination(Task):
                 self.margin,
                 height=0.0 if self.planar else self.height,
                 reach=self._reach,
+                base=self._base,
             ),
         )
 
     def build(self, world: World) -> None:
         super().build(world)
-        self._reach = world.robot.reach
+        self._reach, self._base = world.robot.reach, world.robot.base
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
@@ -68,7 +69,7 @@ class Destination(Task):
         return True
 
     def observe(self) -> dict[str, Array]:
-        out = {"goal_compass": self.sim.compass(self.place)}
+        out = {"goal_compass": self.sim.compass(self.place, self.planar)}
         if self.lidar:
             out["goal_lidar"] = self.sim.lidar(self.place[:, None], self.planar)
         if self.distance:
@@ -77,7 +78,7 @@ class Destination(Task):
         return out
 
     def channels(self) -> dict[str, Channel]:
-        out = {"goal_compass": self.sim.compass_channel()}
+        out = {"goal_compass": self.sim.compass_channel(self.planar)}
         if self.lidar:
             out["goal_lidar"] = self.sim.lidar_channel(self.planar)
         if self.distance:

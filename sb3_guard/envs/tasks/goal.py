@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.objects import Spatial
-from sb3_guard.envs.part import Array
+from sb3_guard.envs.part import Array, Simulation
 from sb3_guard.envs.tasks.destination import Destination
 
 
@@ -21,6 +21,10 @@ class Goal(Spatial, Destination):
     name = "goal"
     interactive = False
     contact = False
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self.check_height(sim, self.size, all_of_it=True)
 
     def measure(self) -> Array:
         """Distance from the robot to the goal, [N, 1] m."""

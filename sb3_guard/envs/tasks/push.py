@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -16,9 +17,7 @@ from sb3_guard.envs.sensors import Channel
 from sb3_guard.envs.tasks.destination import Destination
 
 YELLOW = (0.95, 0.8, 0.1)
-BALL_MASS = 3.35e-5  # kg
 ROLLING = 0.005  # m, rolling friction: a kick of 0.5 m/s carries the ball 2 m
-BOX_DENSITY = 1e-3  # kg/m³
 
 
 @dataclass
@@ -28,6 +27,9 @@ class Push(Destination):
     Reward: the distance gained on the object, while the robot is more than ``null_distance`` sizes
     from it, and the distance that the object gained on the goal, in the plane; plus ``bonus`` when
     the object's centre is within ``size`` of the goal.
+
+    The ball rolls on when it is let go. The box slides; posts at its corners keep the robot from
+    slipping off its sides.
     """
 
     name = "push"
@@ -40,7 +42,10 @@ class Push(Destination):
         "ball", "a ball that rolls, or a box with posts to catch it by", choices=("ball", "box")
     )
     object_size: float = param(0.2, "radius of the ball, half an edge of the box, m", above=0)
-    object_keepout: float = param(0.2, "radius kept clear around the object, m", low=0)
+    object_density: float = param(1e-3, "density of the object, kg/m³", above=0)
+    object_keepout: float | None = param(
+        None, "radius kept clear around the object, m; null: what covers it", low=0
+    )
     object_locations: tuple[tuple[float, float], ...] = param((), "fixed place, one (x, y), m")
     null_distance: float = param(
         2.0, "object sizes from which on nearing the object is not rewarded", low=0
@@ -54,13 +59,19 @@ class Push(Destination):
             Footprint(
                 self.object,
                 1,
-                self.object_keepout,
+                self.object_radius if self.object_keepout is None else self.object_keepout,
                 self.placements,
                 self.object_locations,
                 self.margin,
                 reach=self._reach,
+                base=self._base,
             ),
         )
+
+    @property
+    def object_radius(self) -> float:
+        """Distance of the object's axis from its outermost point, m: a post's edge of a box."""
+        return self.object_size * (1.0 if self.object == "ball" else 1.25 * math.sqrt(2.0))
 
     def positions(self, footprint: str) -> Array:
         return super().positions(footprint) if footprint == "goal" else self.bodies.positions
@@ -75,14 +86,14 @@ class Push(Destination):
         r = self.object_size
         if self.object == "ball":
             ball = add_geom(body, SPHERE, (r,), YELLOW, free=True)
-            ball.mass = BALL_MASS
+            ball.density = self.object_density
             ball.condim, ball.friction = 6, [1.0, 0.005, ROLLING]
             return
-        add_geom(body, BOX, (r, r, r), YELLOW, free=True).density = BOX_DENSITY
+        add_geom(body, BOX, (r, r, r), YELLOW, free=True).density = self.object_density
         for x, y in ((r, r), (r, -r), (-r, r), (-r, -r)):
             post = add_geom(body, BOX, (r / 4, r / 4, r), YELLOW)
             post.pos = [x, y, 0.0]
-            post.density = BOX_DENSITY
+            post.density = self.object_density
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
@@ -108,13 +119,13 @@ class Push(Destination):
         return now[:, 1] <= self.size
 
     def observe(self) -> dict[str, Array]:
-        out = {**super().observe(), "box_compass": self.sim.compass(self.center)}
+        out = {**super().observe(), "box_compass": self.sim.compass(self.center, self.planar)}
         if self.object_lidar:
             out["box_lidar"] = self.sim.lidar(self.center[:, None], self.planar)
         return out
 
     def channels(self) -> dict[str, Channel]:
-        out = {**super().channels(), "box_compass": self.sim.compass_channel()}
+        out = {**super().channels(), "box_compass": self.sim.compass_channel(self.planar)}
         if self.object_lidar:
             out["box_lidar"] = self.sim.lidar_channel(self.planar)
         return out

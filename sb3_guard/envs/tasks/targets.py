@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sb3_guard.envs.objects import Movers
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Task
+from sb3_guard.envs.part import Array, Task
 
 
 @dataclass
@@ -30,6 +30,10 @@ class Targets(Movers, Task):
     @property
     def group(self) -> str:
         return "targets"
+
+    def blemished(self) -> Array:
+        """Whether a solid target is touched: it hangs in the link of an arm, [N] bool."""
+        return self.bodies.touched.sum(axis=1) > 0
 
     @property
     def flight(self) -> float:

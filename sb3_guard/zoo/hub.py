@@ -1,0 +1,254 @@
+"""Trained agents on the Hugging Face hub, in RL-Zoo's layout, with their costs on the card."""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_guard.common.evaluation import evaluate_policy
+from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
+from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run
+from sb3_guard.zoo.usage import UsageError, one_line
+
+CARD = """
+# {name} on {env}
+
+A **{name}** agent for **{env}**, trained with
+[sb3_guard](https://arxiv.org/abs/2305.13681) for Stable-Baselines3.
+
+| {episodes} episodes, {actions} actions | mean | std | 95 % interval of the mean |
+|---|---|---|---|
+{rows}
+
+Cost is the undiscounted sum of `info["cost"]` over an episode{limit}.
+
+## Play it
+
+```bash
+pip install sb3-guard
+sb3-guard hub load --repo-id {repo_id} --algo {algo} --env {env} -f logs
+sb3-guard enjoy --algo {algo} --env {env} -f logs
+```
+
+## Train it again
+
+```bash
+{command}
+```
+
+```yaml
+{hyperparams}```
+"""
+
+
+def model_name(algo: str, env_id: str) -> str:
+    """RL-Zoo's name of a model on the hub: ``cpo-Goal_Point_8Hazards-v0``."""
+    return f"{algo}-{folder_name(env_id)}"
+
+
+def push(args: Mapping[str, Any]) -> int:
+    """
+    Evaluate an agent, write its card, film it, and upload all to the hub.
+
+    :param args: all flags of ``hub push``, with their defaults
+    :return: exit status
+    :raises UsageError: there is no such agent, it can't be filmed, or the hub can't be reached
+    """
+    agent = open_agent(args, None if args["no_video"] else "rgb_array")
+    try:
+        organization = args["organization"]
+        name = args["repo_name"] or model_name(args["algo"], agent.env_id)
+        repo_id = f"{organization}/{name}"
+        folder = Path(args["folder_on_disk"] or tempfile.mkdtemp(prefix="sb3_guard_hub_"))
+        stage(agent, args, repo_id, folder)
+    finally:
+        agent.env.close()
+    print(f"Ready to upload: {folder}")
+    if args["dry_run"]:
+        return 0
+    from huggingface_hub import HfApi
+
+    with _network(f"the upload of {folder} to {repo_id}"):
+        api = HfApi()
+        api.create_repo(repo_id, private=args["private"], exist_ok=True)
+        url = api.upload_folder(
+            repo_id=repo_id, folder_path=folder, commit_message=args["commit_message"]
+        )
+    print(f"Uploaded: {url}")
+    return 0
+
+
+def stage(agent: Agent, args: Mapping[str, Any], repo_id: str, folder: Path) -> None:
+    """
+    Write everything that goes to the hub into a folder.
+
+    :param agent: the agent and its environment
+    :param args: all flags of ``hub push``
+    :param repo_id: ``organization/name``
+    :param folder: made if it is not there; files of the same names are replaced
+    :raises UsageError: the agent can't be filmed
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(agent.path, folder / f"{model_name(args['algo'], agent.env_id)}.zip")
+    for file in ("config.yml", "args.yml", "command.txt"):
+        source = agent.run.params / file
+        if source.is_file():
+            shutil.copyfile(source, folder / file)
+    if agent.normalizer.suffix == ".pkl" and agent.normalizer.is_file():
+        shutil.copyfile(agent.normalizer, folder / "vec_normalize.pkl")
+    if agent.run.monitor.is_file():
+        shutil.copyfile(agent.run.monitor, folder / agent.run.monitor.name)
+    results = summary(
+        evaluate_policy(
+            agent.model,
+            agent.env,
+            n_eval_episodes=args["n_episodes"],
+            deterministic=not args["stochastic"],
+            seed=args["seed"],
+        )
+    )
+    if not args["no_video"]:
+        with camera(agent.env, folder / "replay.mp4", "rgb_array") as shoot:
+            evaluate_policy(
+                agent.model,
+                agent.env,
+                n_eval_episodes=1,
+                deterministic=not args["stochastic"],
+                seed=args["seed"],
+                on_step=shoot,
+            )
+    results["is_deterministic"] = not args["stochastic"]
+    (folder / "results.json").write_text(json.dumps(results, indent=2))
+    (folder / "README.md").write_text(card(agent, args, repo_id, results))
+
+
+def card(agent: Agent, args: Mapping[str, Any], repo_id: str, results: Mapping[str, Any]) -> str:
+    """The model card: metadata that the hub reads, and a page that people read."""
+    from huggingface_hub import EvalResult, ModelCardData
+
+    name = type(agent.model).__name__
+    data = ModelCardData(
+        library_name="stable-baselines3",
+        tags=[
+            agent.env_id,
+            "reinforcement-learning",
+            "safe-reinforcement-learning",
+            "stable-baselines3",
+            "sb3-guard",
+        ],
+        model_name=name,
+        eval_results=[
+            EvalResult(
+                task_type="reinforcement-learning",
+                task_name="reinforcement-learning",
+                dataset_name=agent.env_id,
+                dataset_type=agent.env_id,
+                metric_type=kind,
+                metric_name=kind,
+                metric_value=f"{results[key]['mean']:.2f} +/- {results[key]['std']:.2f}",
+            )
+            for kind, key in (("mean_reward", "return"), ("mean_cost", "cost"))
+        ],
+    )
+    rows = []
+    for key in ("return", "cost", "length"):
+        one = results[key]
+        interval = "–" if one["low"] is None else f"{one['low']:.2f} to {one['high']:.2f}"
+        rows.append(f"| {key} | {one['mean']:.2f} | {one['std']:.2f} | {interval} |")
+    limit = getattr(agent.model, "cost_limit", None)
+    constrained = getattr(agent.model, "constrained", False) and limit is not None
+    file = agent.run.params / "command.txt"
+    command = file.read_text().strip() if file.is_file() else ""
+    interpreter, module, rest = command.partition(" -m ")
+    page = CARD.format(
+        name=name,
+        env=agent.env_id,
+        algo=args["algo"],
+        repo_id=repo_id,
+        episodes=results["episodes"],
+        actions="sampled" if args["stochastic"] else "most likely",
+        rows="\n".join(rows),
+        limit=f"; the agent was trained under a limit of {limit}" if constrained else "",
+        command=f"python -m {rest}" if module else interpreter,
+        hyperparams=yaml.safe_dump(agent.run.hyperparams()),
+    )
+    return f"---\n{data.to_yaml()}\n---\n{page}"
+
+
+def load(args: Mapping[str, Any]) -> int:
+    """
+    Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it.
+
+    :param args: all flags of ``hub load``, with their defaults
+    :return: exit status
+    :raises UsageError: the hub can't be reached, or has no such agent
+    """
+    name = model_name(args["algo"], args["env"])
+    repo_id = args["repo_id"] or f"{args['organization']}/{args['repo_name'] or name}"
+    from huggingface_hub import snapshot_download
+
+    with _network(f"the download of {repo_id}"):
+        downloaded = Path(snapshot_download(repo_id))
+    run = install(downloaded, name, args)
+    print(f"Run folder: {run.path}")
+    return 0
+
+
+def install(downloaded: Path, name: str, args: Mapping[str, Any]) -> RunFolder:
+    """
+    Make a run folder of what was downloaded.
+
+    :param downloaded: folder with the files that :func:`stage` writes
+    :param name: name of the model
+    :raises UsageError: the model or its settings are not there
+    """
+    model = downloaded / f"{name}.zip"
+    for needed in (model, downloaded / "config.yml", downloaded / "args.yml"):
+        if not needed.is_file():
+            found = ", ".join(sorted(one.name for one in downloaded.iterdir())) or "nothing"
+            raise UsageError(
+                f"the repository has no {needed.name}, but {found}; name the agent's own "
+                "--algo and --env"
+            )
+    env = folder_name(args["env"])
+    parent = Path(args["folder"]) / args["algo"]
+    parent.mkdir(parents=True, exist_ok=True)
+    path = parent / f"{env}_{latest_run(parent, env) + 1}"
+    (path / env).mkdir(parents=True)
+    shutil.copyfile(model, path / f"{env}.zip")
+    for file, target in {
+        "0.monitor.csv": path / "0.monitor.csv",
+        "config.yml": path / env / "config.yml",
+        "command.txt": path / env / "command.txt",
+        "vec_normalize.pkl": path / env / "vecnormalize.pkl",
+        "args.yml": path / env / "args.yml",  # last: it makes the folder a run
+    }.items():
+        if (downloaded / file).is_file():
+            shutil.copyfile(downloaded / file, target)
+    return RunFolder(path)
+
+
+@contextmanager
+def _network(what: str) -> Iterator[None]:
+    """Say in one line what the network, the hub or the lack of a login made impossible."""
+    from huggingface_hub.errors import HfHubHTTPError, LocalTokenNotFoundError
+
+    try:
+        yield
+    except LocalTokenNotFoundError as error:
+        raise UsageError(f"{what} needs a login: run `hf auth login` first") from error
+    except HfHubHTTPError as error:
+        raise UsageError(f"{what} failed: {one_line(error)[:300]}") from error
+    except Exception as error:
+        # The HTTP library's own errors: no route, no name, time-outs.
+        if not isinstance(error, OSError) and "httpx" not in type(error).__module__:
+            raise
+        raise UsageError(
+            f"{what} failed, the hub can't be reached: {one_line(error)[:300]}; "
+            "check the network, then run the command again"
+        ) from error

@@ -1,0 +1,97 @@
+"""RL-Zoo's own training command with this package registered.
+
+``python -m sb3_guard.zoo.rl_zoo3 train --algo cpo --env Goal_Point_8Hazards-v0`` takes all flags
+of ``python -m rl_zoo3.train``. In RL-Zoo's table ``trpo`` stays sb3-contrib's and ours is
+``guard_trpo``.
+"""
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_guard.common.callbacks import CostEvalCallback
+from sb3_guard.common.monitor import CostMonitor
+from sb3_guard.zoo.algos import safe_algorithms
+from sb3_guard.zoo.config import shipped_file
+from sb3_guard.zoo.usage import UsageError, run
+
+
+def key_in_rl_zoo(algo: str) -> str:
+    """The key of one of our algorithms in RL-Zoo's table."""
+    return "guard_trpo" if algo == "trpo" else algo
+
+
+def register() -> None:
+    """Add our algorithms to RL-Zoo's table; its environments are Gymnasium's, ours among them."""
+    import rl_zoo3
+
+    import sb3_guard  # noqa: F401  registers the environments
+
+    for algo, cls in safe_algorithms().items():
+        rl_zoo3.ALGOS[key_in_rl_zoo(algo)] = cls
+
+
+def make_vec_env(
+    env_id: Any, n_envs: int = 1, monitor_dir: str | None = None, **kwargs: Any
+) -> VecEnv:
+    """SB3's ``make_vec_env``, whose environments are monitored for cost as well."""
+    from stable_baselines3.common.env_util import make_vec_env as make
+
+    monitor_kwargs = kwargs.pop("monitor_kwargs", None) or {}
+    file = None if monitor_dir is None else f"{monitor_dir}/0.monitor.csv"
+    return CostMonitor(make(env_id, n_envs, **kwargs), file, **monitor_kwargs)
+
+
+def train(argv: Sequence[str]) -> int:
+    """
+    Run RL-Zoo's training command.
+
+    :param argv: its arguments; our algorithms read our hyper-parameter files unless told otherwise
+    :return: exit status
+    """
+    import rl_zoo3.exp_manager
+    import rl_zoo3.train
+
+    register()
+    arguments = list(argv)
+    ours = {key_in_rl_zoo(algo): algo for algo in safe_algorithms()}
+    named = _value_of(arguments, "--algo")
+    if named in ours and not {"-conf", "--conf-file"} & set(arguments):
+        arguments += ["-conf", str(shipped_file(ours[named]))]
+    # RL-Zoo has no hooks for these two, and names them in this module.
+    manager: Any = rl_zoo3.exp_manager
+    manager.make_vec_env, manager.EvalCallback = make_vec_env, CostEvalCallback
+    sys.argv = ["rl_zoo3.train", *arguments]
+    rl_zoo3.train.train()
+    return 0
+
+
+def _value_of(arguments: Sequence[str], flag: str) -> str | None:
+    for position, argument in enumerate(arguments):
+        if argument == flag:
+            return next(iter(arguments[position + 1 :]), None)
+        if argument.startswith(f"{flag}="):
+            return argument.partition("=")[2]
+    return None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the command.
+
+    :param argv: arguments, ``train`` first; None: those of the process
+    :return: exit status
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] != ["train"]:
+        raise UsageError(
+            f"the command is python -m sb3_guard.zoo.rl_zoo3 train ..., not {arguments[:1]}; "
+            "play agents with python -m sb3_guard.enjoy"
+        )
+    return train(arguments[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

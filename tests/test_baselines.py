@@ -1,0 +1,107 @@
+"""RL-Zoo's algorithms on cost environments, and RL-Zoo's own command with ours."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_resume import assert_same_run, crash, runs_of
+
+from sb3_guard import enjoy, train
+from sb3_guard.zoo.algos import algorithm, baselines
+from sb3_guard.zoo.config import shipped_file
+from sb3_guard.zoo.usage import UsageError
+
+TOY = "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:25".split()
+SMALL = "--seed 3 --checkpoint-every 0 --verbose 0 --device cpu --eval-episodes 2".split()
+ON_POLICY = ["n_envs:2", "n_steps:30"]
+OFF_POLICY = ["n_envs:2", "buffer_size:500", "learning_starts:40", "batch_size:16"]
+PARAMS = {
+    "a2c": ON_POLICY,
+    "ppo": [*ON_POLICY, "batch_size:20", "n_epochs:2"],
+    "ppo_lstm": [*ON_POLICY, "batch_size:20", "n_epochs:2"],
+    "sac": OFF_POLICY,
+    "td3": OFF_POLICY,
+    "ddpg": OFF_POLICY,
+    "tqc": OFF_POLICY,
+    "crossq": OFF_POLICY,
+}
+
+
+def arguments(algo: str, folder: Path) -> list[str]:
+    params = ["-params", *PARAMS[algo]]
+    return [*TOY, *SMALL, "--algo", algo, "-n", "180", *params, "-f", str(folder)]
+
+
+@pytest.mark.parametrize("algo", PARAMS)
+def test_trains_with_costs_logged(algo, tmp_path):
+    extra = ["--eval-freq", "60", "--log-interval", "1"]
+    assert train.main([*arguments(algo, tmp_path), *extra]) == 0
+    run = tmp_path / algo / "CostPoint-v0_1"
+    log = pd.read_csv(run / "progress.csv").dropna(subset=["rollout/ep_cost_mean"])
+    episodes = pd.read_csv(run / "0.monitor.csv", skiprows=1)
+    assert log["rollout/ep_cost_mean"].iloc[-1] == pytest.approx(episodes["c"].mean(), abs=1e-3)
+    assert log["rollout/cost_rate"].iloc[-1] > 0.0
+    assert np.isfinite(np.load(run / "evaluations.npz")["costs"]).all()
+    assert (run / "best_model.zip").is_file()
+    assert enjoy.main([*TOY[:4], "--algo", algo, "-f", str(tmp_path), "--n-episodes", "1"]) == 0
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac", "td3"])
+def test_killed_and_resumed(algo, tmp_path, monkeypatch):
+    assert train.main([*arguments(algo, tmp_path / "whole"), "--eval-freq", "50"]) == 0
+    crash(monkeypatch, [*arguments(algo, tmp_path / "cut"), "--eval-freq", "50"], 101)
+    assert train.main(["-i", str(runs_of(tmp_path / "cut"))]) == 0
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+
+
+def test_discrete_actions_with_rl_zoos_own_file(tmp_path):
+    command = "--algo dqn --env CartPole-v1 -n 300 --eval-freq -1 --verbose 0 -f".split()
+    assert train.main([*command, str(tmp_path)]) == 0
+    assert shipped_file("dqn").parent.parent.name == "rl_zoo3"
+
+
+def test_shipped_files_name_only_what_the_algorithms_take():
+    from sb3_guard.zoo.config import check, hyperparams_folder, read_hyperparams
+
+    shipped = {path.stem for path in hyperparams_folder().glob("*.yml")} & set(baselines())
+    assert shipped == {"a2c", "crossq", "ddpg", "ppo", "ppo_lstm", "sac", "td3", "tqc"}
+    for algo in shipped:
+        check(algo, algorithm(algo), read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
+
+
+def test_what_cannot_be_measured_is_refused():
+    with pytest.raises(UsageError, match=r"'ars' is not available here.*rl_zoo3\.train"):
+        algorithm("ars")
+    with pytest.raises(UsageError, match="unknown algorithm 'pppo'; did you mean 'ppo'"):
+        algorithm("pppo")
+
+
+def test_rl_zoos_command_with_our_algorithm(tmp_path):
+    command = (
+        "-m sb3_guard.zoo.rl_zoo3 train --algo guard_trpo --env Goal_Point_8Hazards-v0 -n 400 "
+        "--eval-freq 200 --eval-episodes 1 -f"
+    ).split()
+    params = ["-params", "n_envs:2", "n_steps:100", "n_critic_updates:2"]
+    done = subprocess.run(
+        [sys.executable, *command, str(tmp_path), *params], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "cost_rate" in done.stdout and "Evaluation after 200 steps" in done.stdout
+    run = tmp_path / "guard_trpo" / "Goal_Point_8Hazards-v0_1"
+    assert (run / "best_model.zip").is_file()
+    assert "c" in pd.read_csv(run / "0.monitor.csv", skiprows=1)
+    # Our player reads what RL-Zoo wrote, ordered mappings and all.
+    (tmp_path / "guard_trpo").rename(tmp_path / "trpo")
+    play = "--algo trpo --env Goal_Point_8Hazards --n-episodes 1 -f"
+    assert enjoy.main([*play.split(), str(tmp_path)]) == 0
+
+
+@pytest.mark.parametrize("arguments", [[], ["enjoy"]])
+def test_rl_zoos_other_commands_are_not_there(arguments):
+    from sb3_guard.zoo import rl_zoo3
+
+    with pytest.raises(UsageError, match=r"sb3_guard\.enjoy"):
+        rl_zoo3.main(arguments)

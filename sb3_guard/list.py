@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from sb3_guard.envs import Scenario, env_ids
-from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.envs.registry import CONSTRAINTS, LADDER, ROBOTS, TASKS
 from sb3_guard.zoo.tables import table
 from sb3_guard.zoo.usage import Parser, UsageError, import_packages, run
 
@@ -14,7 +14,6 @@ EXAMPLES = """examples:
   sb3-guard list robots
   sb3-guard list --ladder Goal_Point Hazards
 """
-LADDER = (1, 2, 4, 8, 16)
 
 
 def summary(part: type) -> str:

@@ -5,9 +5,16 @@ from collections.abc import Iterable
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Say what ``name`` may have meant and what is allowed, for an error message."""
+    """Say what ``name`` may have meant and what is allowed, for an error message.
+
+    :param known: allowed names; among equally near ones the first is meant
+    """
     known = list(known)
-    folded = {k.lower(): k for k in known}
-    close = difflib.get_close_matches(str(name).lower(), folded, n=1, cutoff=0.5)
-    hint = f"did you mean {folded[close[0]]!r}? " if close else ""
+    wrong = str(name).lower()
+
+    def likeness(one: str) -> float:
+        return difflib.SequenceMatcher(None, one.lower(), wrong).ratio()
+
+    close = max(known, key=likeness, default="")
+    hint = f"did you mean {close!r}? " if likeness(close) >= 0.5 else ""
     return f"{hint}allowed: {', '.join(known)}"

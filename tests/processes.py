@@ -1,16 +1,18 @@
 """Commands run as processes of their own that need not import everything again."""
 
+import multiprocessing
 import os
 import signal
 import sys
 import time
 from collections.abc import Callable
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 
 def fork(command: Callable[[list[str]], int], arguments: list[str], output: Path) -> int:
     """
-    Run a command in a child process.
+    Run a command in a child process that has all of this one's patches; it must not train.
 
     :param output: where its standard output and errors go
     :return: the child's process id
@@ -26,6 +28,29 @@ def fork(command: Callable[[list[str]], int], arguments: list[str], output: Path
             status = command(arguments)
     finally:
         os._exit(status)
+
+
+def fresh(command: Callable[[list[str]], int], arguments: list[str], output: Path) -> BaseProcess:
+    """
+    Run a command in a process that has none of this one's threads and locks.
+
+    A fork of a process that has trained may find locks taken that nobody will give back.
+
+    :param command: a function of a module, imported there
+    :param output: where its standard output and errors go
+    """
+    output.touch()
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["sb3_guard.zoo.tuning"])
+    process = context.Process(target=_run, args=(command, arguments, output))
+    process.start()
+    return process
+
+
+def _run(command: Callable[[list[str]], int], arguments: list[str], output: Path) -> None:
+    with open(output, "w", buffering=1) as handle:
+        sys.stdout = sys.stderr = handle
+        sys.exit(command(arguments))
 
 
 def join(pid: int, seconds: float = 120.0) -> int:

@@ -15,7 +15,7 @@ from matplotlib.colors import to_rgb
 from sb3_guard import cli, plot
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.registry import SUITE_ROBOTS
-from sb3_guard.zoo import figures, presets
+from sb3_guard.zoo import figures
 from sb3_guard.zoo.figures import FIGURES, INK, ROBOTS, Data, draw, inline_svg, pareto_front, save
 from sb3_guard.zoo.report import report
 from sb3_guard.zoo.results import CATEGORIES, LABELS, read_results, select
@@ -138,12 +138,6 @@ def test_q8_has_a_spider_per_algorithm(data):
 def test_robots_are_in_the_order_of_their_actions():
     actual = {robot: Scenario(robot=robot).build().robot.action_size for robot in SUITE_ROBOTS}
     assert actual == ROBOTS and list(ROBOTS.values()) == sorted(ROBOTS.values())
-
-
-@pytest.mark.parametrize("name", ["MAIN8", "RADAR4"])
-def test_the_presets_train_what_the_figures_show(name):
-    ids = {f"{suite}-v0" for suite in getattr(figures, name)}
-    assert ids == set(getattr(presets, name))
 
 
 @pytest.mark.parametrize(

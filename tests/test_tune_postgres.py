@@ -15,7 +15,7 @@ from pathlib import Path
 import optuna
 import pandas as pd
 import pytest
-from processes import fork, join, wait_for
+from processes import fresh, wait_for
 
 from sb3_guard import tune
 from sb3_guard.zoo import storages, tuning
@@ -107,16 +107,19 @@ def arguments(server: Server, folder: Path, *more: str) -> list[str]:
 
 def test_a_killed_workers_trial_is_done_by_the_other(server, tmp_path):
     command = arguments(server, tmp_path, "-n", "480", "--n-trials", "5")
-    first = fork(tune.main, command, tmp_path / "first.txt")
+    first = fresh(tune.main, command, tmp_path / "first.txt")
     wait_for(lambda: "Study" in (tmp_path / "first.txt").read_text())
-    second = fork(tune.main, command, tmp_path / "second.txt")
+    second = fresh(tune.main, command, tmp_path / "second.txt")
     study = load(server)
     running, done = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
-    wait_for(lambda: {first, second} <= {*owners(study, running), *owners(study, done)})
-    wait_for(lambda: first in owners(study, running))
-    os.kill(first, signal.SIGKILL)
-    assert join(first) == -signal.SIGKILL
-    assert join(second) == 0, (tmp_path / "second.txt").read_text()
+    both = {first.pid, second.pid}
+    wait_for(lambda: both <= {*owners(study, running), *owners(study, done)})
+    wait_for(lambda: first.pid in owners(study, running))
+    first.kill()
+    first.join(60)
+    second.join(120)
+    assert first.exitcode == -signal.SIGKILL
+    assert second.exitcode == 0, (tmp_path / "second.txt").read_text()
     states = Counter(one.state.name for one in study.trials)
     assert states == {"COMPLETE": 5, "FAIL": 1}
     (lost,) = (one for one in study.trials if one.state.name == "FAIL")

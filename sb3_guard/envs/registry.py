@@ -45,6 +45,7 @@ CONSTRAINTS: dict[str, type[Constraint]] = {
 }
 
 EPISODE_STEPS = 1000  # control steps
+LADDER = (1, 2, 4, 8, 16)  # numbers of a constraint's objects, by growing difficulty
 # The named suites: every combination of these, each with eight constraint objects.
 SUITE_ROBOTS = (
     "Point",

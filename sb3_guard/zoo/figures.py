@@ -24,7 +24,9 @@ from sb3_guard.common.files import replacing
 from sb3_guard.zoo.results import (
     CATEGORIES,
     LABELS,
+    MAIN8,
     METRICS,
+    RADAR4,
     SCORES,
     aggregate,
     by_category,
@@ -92,11 +94,6 @@ STYLE: dict[Any, Any] = {
     },
 }  # fmt: skip
 
-MAIN8 = (
-    "Goal_Point_8Hazards", "Goal_Walker_8Hazards", "Goal_Arm3_8Hazards", "Goal_Drone_8Hazards",
-    "Goal_Point_8Ghosts", "Push_Point_8Hazards", "Chase_Point_8Hazards", "Defense_Point_8Hazards",
-)  # fmt: skip
-RADAR4 = ("Goal_Point_8Hazards", "Goal_Point_8Ghosts", "Goal_Ant_8Hazards", "Goal_Ant_8Ghosts")
 # The paper's robots by degrees of freedom, the number of actions
 ROBOTS = {
     "Point": 2, "Swimmer": 2, "Arm3": 3, "Drone": 4, "Hopper": 5, "Arm6": 6, "Humanoid": 6,

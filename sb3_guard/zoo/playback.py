@@ -153,15 +153,13 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
     :raises UsageError: there is no such agent, or no picture can be made
     """
     for flag in ("record", "json"):
-        if args[flag] and Path(args[flag]).is_dir():
-            raise UsageError(f"--{flag}: {args[flag]!r} is a folder; name a file")
-    if args["json"]:
-        require_writable(Path(args["json"]).parent, "--json")
+        if args[flag]:
+            _require_file(Path(args[flag]), f"--{flag}")
     agent = open_agent(args, render_mode)
     video = None
     if args["record"] is not None:
         video = Path(args["record"] or agent.path.with_suffix(".mp4"))
-        require_writable(video.parent, "--record")
+        _require_file(video, "--record")
     episodes = args["n_episodes"]
     if episodes is None and args["n_timesteps"] is None:
         episodes = 1 if args["record"] is not None else 5
@@ -192,6 +190,13 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
     if video is not None:
         print(f"Video: {video}")
     return 0
+
+
+def _require_file(path: Path, flag: str) -> None:
+    """Raise if a file can't be written, before anything is played for it."""
+    if path.is_dir():
+        raise UsageError(f"{flag}: {str(path)!r} is a folder; name a file")
+    require_writable(path.parent, flag)
 
 
 def summary(evaluation: Evaluation) -> dict[str, Any]:

@@ -46,6 +46,12 @@ CATEGORIES = {
     "CPO-based": ("cpo", "pcpo"),
     "hierarchical": ("trpo_sl", "trpo_usl"),
 }
+# The paper's suites for its overview and for its radar charts
+MAIN8 = (
+    "Goal_Point_8Hazards", "Goal_Walker_8Hazards", "Goal_Arm3_8Hazards", "Goal_Drone_8Hazards",
+    "Goal_Point_8Ghosts", "Push_Point_8Hazards", "Chase_Point_8Hazards", "Defense_Point_8Hazards",
+)  # fmt: skip
+RADAR4 = ("Goal_Point_8Hazards", "Goal_Point_8Ghosts", "Goal_Ant_8Hazards", "Goal_Ant_8Ghosts")
 VERSIONS = ("sb3_guard", "mujoco", "gymnasium", "stable_baselines3", "torch", "numpy", "python")
 TEXTS = ("suite", "robot", "task", "constraint", "algo", "config", "commit", "platform", *VERSIONS)
 COLUMNS = (

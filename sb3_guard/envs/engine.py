@@ -464,13 +464,12 @@ class Engine:
 
         :raises ValueError: the state belongs to another world or another number of rows
         """
-        if state["batch"].shape != self.batch.state.shape or set(state["arrays"]) != set(
-            self._arrays
-        ):
-            raise ValueError(
-                f"the state has shape {state['batch'].shape} and arrays {sorted(state['arrays'])}; "
-                f"this engine has {self.batch.state.shape} and {sorted(self._arrays)}"
-            )
+        theirs = {"physics": state["batch"].shape}
+        theirs |= {name: array.shape for name, array in state["arrays"].items()}
+        own = {"physics": self.batch.state.shape}
+        own |= {name: array.shape for name, array in self._arrays.items()}
+        if theirs != own:
+            raise ValueError(f"the state has arrays {theirs}; those of this engine are {own}")
         self.batch.state[:] = state["batch"]
         for name, value in state["arrays"].items():
             self._arrays[name][:] = value

@@ -203,7 +203,7 @@ def check_locations(footprints: Sequence[Footprint]) -> None:
     fixed = [(f, i, place) for f in footprints for i, place in enumerate(f.locations)]
     for (f, i, here), (g, j, there) in itertools.combinations(fixed, 2):
         gap, least = math.dist(here, there), f.keepout + g.keepout + max(f.margin, g.margin)
-        if gap < least:
+        if gap < least - 1e-9:  # rounding
             raise ValueError(
                 f"locations {f.name}[{i}] = {here} and {g.name}[{j}] = {there} are {gap:.2f} m "
                 f"apart, but their keepouts and margin sum to {least:.2f} m: move one of them, or "

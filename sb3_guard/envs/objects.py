@@ -103,9 +103,9 @@ class Bodies:
             heading = rngs[i].uniform(0, 2 * math.pi, self.num)
             self._turns[i] = geometry.yaw_quaternion(heading)
 
-    def move(self, places: Array) -> None:
-        """Move bodies that cannot be pushed to [N, num, 3] m."""
-        self._places[:] = places
+    def move(self, places: Array, rows: Array | slice = slice(None)) -> None:
+        """Move bodies that cannot be pushed to [n, num, 3] m, in these rows."""
+        self._places[rows] = places
 
 
 def resting_height(
@@ -339,7 +339,13 @@ class Movers(Spatial, Objects):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self.centers = sim.places(self.group)
-        self.motion = self.law()
+        law = self.motion = self.law()
+        fastest = max(abs(law.near), abs(law.far), law.settle, law.home)
+        if not law.unit and fastest > 1.0:
+            raise ValueError(
+                f"{self.name}: under speed_law 'proportional' speeds are shares of the distance "
+                f"and must be at most 1, but the fastest is {fastest:g}: lower speed, or v0, v1, v2"
+            )
 
     def before_step(self) -> None:
         centers = self.centers

@@ -48,11 +48,15 @@ class Gremlins(Obstacles):
 
     def reset(self, ids: Array, rngs: Generators) -> None:
         super().reset(ids, rngs)
-        self.before_step()  # onto the circle; rows that go on stay where the clock puts them
+        self._turn(ids)
 
     def before_step(self) -> None:
-        phase = self.rate * self._time
-        places = self.sim.places(self.group).copy()  # [N, num, 3]
+        self._turn(slice(None))
+
+    def _turn(self, rows: Array | slice) -> None:
+        """Go where the clock of these rows says."""
+        phase = self.rate * self._time[rows]
+        places = self.sim.places(self.group)[rows].copy()  # [n, num, 3]
         places[..., 0] += (self.travel * np.sin(phase))[:, None]
         places[..., 1] += (self.travel * np.cos(phase))[:, None]
-        self.bodies.move(places)
+        self.bodies.move(places, rows)

@@ -186,7 +186,12 @@ class Database:
 
     def __init__(self, url: str, heartbeat: int = 60, patience: float = 300.0):
         from sqlalchemy.engine import make_url
-        from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+        from sqlalchemy.exc import (
+            ArgumentError,
+            IntegrityError,
+            ProgrammingError,
+            SQLAlchemyError,
+        )
 
         self._errors = (SQLAlchemyError, StorageInternalError)
         self.heartbeat, self.patience = heartbeat, patience
@@ -202,22 +207,31 @@ class Database:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)
-                self.storage = RDBStorage(
-                    parsed.render_as_string(hide_password=False),
-                    # Connections that a restart of the server has cut are renewed; a server that
-                    # no longer hears from a machine frees what that held.
-                    engine_kwargs={
-                        "pool_pre_ping": True,
-                        "connect_args": {
-                            "connect_timeout": 10,
-                            "options": "-c tcp_keepalives_idle=30 -c tcp_keepalives_interval=10 "
-                            "-c tcp_keepalives_count=3",
-                        },
-                    },
-                    heartbeat_interval=heartbeat,
-                    grace_period=3 * heartbeat,
-                    heartbeat_stale_trial_callback=_retry(),
-                )
+                for attempt in range(5):
+                    try:
+                        self.storage = RDBStorage(
+                            parsed.render_as_string(hide_password=False),
+                            # Connections that a restart has cut are renewed; a server that
+                            # no longer hears from a machine frees what that held.
+                            engine_kwargs={
+                                "pool_pre_ping": True,
+                                "connect_args": {
+                                    "connect_timeout": 10,
+                                    "options": "-c tcp_keepalives_idle=30 "
+                                    "-c tcp_keepalives_interval=10 "
+                                    "-c tcp_keepalives_count=3",
+                                },
+                            },
+                            heartbeat_interval=heartbeat,
+                            grace_period=3 * heartbeat,
+                            heartbeat_stale_trial_callback=_retry(),
+                        )
+                        break
+                    except (IntegrityError, ProgrammingError):
+                        # Another worker is making the tables of a new database at this moment.
+                        if attempt == 4:
+                            raise
+                        time.sleep(1.0)
         except ImportError as error:
             raise UsageError(
                 "--storage postgresql://… needs psycopg; install it with: "

@@ -6,7 +6,7 @@ ENV ?= Goal_Point_8Hazards
 STEPS ?= 1000000
 ARGS ?=
 
-.PHONY: train test test-slow test-lowest check format type docs bench clean
+.PHONY: train test test-slow test-lowest check format type docs gallery bench clean
 
 # torch goes first and alone: a requirement that another package leaves open would fetch CUDA builds
 $(VENV)/ready: pyproject.toml constraints.txt
@@ -21,7 +21,7 @@ train: $(VENV)/ready
 test: $(VENV)/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow" $(ARGS)
 
-test-slow: $(VENV)/ready
+test-slow: $(VENV)/docs-ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow $(ARGS)
 
 # The same tests with the oldest dependencies that pyproject.toml admits; torch stays pinned.
@@ -48,8 +48,17 @@ bench: $(VENV)/ready
 	$(BIN)/python scripts/bench_engine.py
 	$(BIN)/python scripts/bench_training.py
 
-docs: $(VENV)/ready
+$(VENV)/docs-ready: $(VENV)/ready
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $@
+
+# The generated pages, then the site, docs/_build/html/index.html; a warning is an error.
+docs: $(VENV)/docs-ready
 	$(BIN)/python scripts/make_docs.py
+	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
+
+# The pictures of the pages, which need a display or EGL.
+gallery: $(VENV)/ready
 	$(BIN)/python scripts/render_gallery.py
 
 clean:

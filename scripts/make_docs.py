@@ -1,14 +1,18 @@
 """Write a page for every robot, task and constraint from its code: ``python scripts/make_docs.py``.
 
 The pages hold what the code says of itself: the docstring, the place in the paper's taxonomy, the
-parameters with defaults and limits, and for robots the tables of actions and observations.
+parameters with defaults and limits, and the tables of actions and observations. Tasks and
+constraints have a page each that lists them all, and there is one of the files in ``examples/``.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import dataclasses
 import inspect
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from sb3_guard.envs import GuardVectorEnv
@@ -16,9 +20,21 @@ from sb3_guard.envs.engine import FRAME_SKIP
 from sb3_guard.envs.objects import Movers
 from sb3_guard.envs.part import Part
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
-from sb3_guard.list import yes
+from sb3_guard.list import KINDS, yes
 from sb3_guard.show import action_table, observation_table
 from sb3_guard.zoo.tables import table
+
+ROOT = Path(__file__).parents[1]
+# Robots that tell the sizes of an observation apart: in the plane, in space, with several lidars.
+SIZED = ("Point", "Drone", "Arm3", "Arm6")
+ABOUT = {
+    "task": "What a robot is rewarded for. Any task goes with any robot and any "
+    "[constraints](constraints.md), as the first word of an id: `Push_Ant_8Hazards-v0`.",
+    "constraint": "What costs. Any number of constraints goes with any [task](tasks.md) and any "
+    "[robot](robots.md): the first is named in the id, `Goal_Ant_8Ghosts-v0`, the others as "
+    "arguments, `vases={'num': 4}`. Each reports its own cost as `info['cost_<name>']`, and "
+    "`info['cost']` is their sum.",
+}
 
 
 def parameters(part: type[Part]) -> str:
@@ -60,6 +76,32 @@ def speeds(part: type[Movers]) -> str:
     return f"A `speed` of {part().speed:g} m per control step is, in m/s, with {each}."
 
 
+def perceived(kind: str, name: str) -> str:
+    """What a task or a constraint adds to the observation of some robots."""
+    rows: dict[str, list[str]] = {}
+    for robot in SIZED:
+        task, constraint = (name, "Hazards") if kind == "task" else ("Goal", name)
+        engine = GuardVectorEnv(1, f"{task}_{robot}_8{constraint}").engine
+        part = engine.task if kind == "task" else engine.constraints[0]
+        for what, channel in part.channels().items():
+            bounds = f"[{channel.low:g}, {channel.high:g}]"
+            rows.setdefault(what, [f"`{what}`", bounds, channel.unit]).append(str(channel.size))
+    return table(["observation", "bounds", "unit", *SIZED], list(rows.values()))
+
+
+def overview(kind: str, names: Iterable[str]) -> str:
+    """The page that lists all tasks or all constraints."""
+    listed = KINDS[f"{kind}s"]()
+    for name in names:
+        listed = re.sub(
+            rf"^\| {name} +\|", f"| [{name}]({kind}s/{name.lower()}.md) |", listed, flags=re.M
+        )
+    pictures = "\n".join(f"![{name}](images/{kind}_{name.lower()}.png)" for name in names)
+    tree = "\n".join(f"{kind}s/{name.lower()}" for name in names)
+    toctree = f"```{{toctree}}\n:hidden:\n\n{tree}\n```"
+    return "\n\n".join([f"# {kind.title()}s", ABOUT[kind], listed, pictures, toctree]) + "\n"
+
+
 def page(kind: str, name: str, part: type[Part]) -> str:
     """The page of one part."""
     text = inspect.cleandoc(part.__doc__ or "").replace("``", "`")
@@ -76,17 +118,37 @@ def page(kind: str, name: str, part: type[Part]) -> str:
     if kind == "robot":
         env = GuardVectorEnv(1, f"Goal_{name}_8Hazards")
         parts += [action_table(env), f"In `Goal_{name}_8Hazards`:", observation_table(env)]
+    else:
+        parts += ["What it adds to the observation, with its size for some robots:"]
+        parts += [perceived(kind, name)]
+    return "\n\n".join(parts) + "\n"
+
+
+def examples() -> str:
+    """The page of the files in ``examples/``: what each says of itself, and the file."""
+    parts = [
+        "# Examples",
+        "Each is a file in `examples/` that runs as it is; an argument sets the steps to train.",
+    ]
+    for file in sorted((ROOT / "examples").glob("*.py")):
+        says = (ast.get_docstring(ast.parse(file.read_text())) or "").splitlines()[0]
+        what = says.rpartition(": ")[0] or says
+        link = f"[examples/{file.name}](../examples/{file.name})"
+        code = f"```{{literalinclude}} ../examples/{file.name}\n:language: python\n```"
+        parts += [f"## {file.stem.replace('_', ' ').capitalize()}", f"{what}: {link}.", code]
     return "\n\n".join(parts) + "\n"
 
 
 def pages() -> dict[str, str]:
     """Every page by its path below docs/."""
     kinds = {"robot": ROBOTS, "task": TASKS, "constraint": CONSTRAINTS}
-    return {
+    singles = {
         f"{kind}s/{name.lower()}.md": page(kind, name, part)
         for kind, parts in kinds.items()
         for name, part in parts.items()
     }
+    overviews = {f"{kind}s.md": overview(kind, kinds[kind]) for kind in ABOUT}
+    return {**singles, **overviews, "examples.md": examples()}
 
 
 def main() -> None:

@@ -1,16 +1,38 @@
 """The documents are true: examples run, pages match the code, links lead somewhere."""
 
+import functools
 import importlib.util
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 
+import sb3_guard
+
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+DOCS = ROOT / "docs"
+PAGES = [path for path in sorted(DOCS.rglob("*.md")) if "_build" not in path.parts]
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *PAGES]
+GUIDES = [
+    ROOT / "README.md",
+    *(DOCS / f"{name}.md" for name in ("quickstart", "concepts", "writing_an_algorithm")),
+    *sorted((DOCS / "algorithms").glob("*.md")),
+]
+# The samples as written, but for the length of the training.
+SHORTER = {
+    "300_000": "40",
+    "n_steps=1000": "n_steps=20",
+    "n_envs=30": "n_envs=2",
+    "n_eval_episodes=30": "n_eval_episodes=2",
+    "progress_bar=True": "progress_bar=False",
+}
 
 
+@functools.cache
 def script(name):
     spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
@@ -18,31 +40,79 @@ def script(name):
     return module
 
 
-def test_the_readmes_examples_run(tmp_path, monkeypatch):
+@functools.cache
+def generated_pages():
+    return script("make_docs").pages()
+
+
+def python_blocks(document):
+    return re.findall(r"```python\n(.*?)```", document.read_text(), flags=re.DOTALL)
+
+
+def prose(document):
+    return re.sub(r"```.*?```", "", document.read_text(), flags=re.DOTALL)
+
+
+@functools.cache
+def anchors(document):
+    """What GitHub and the site call the headings of a document."""
+    headings = re.findall(r"^#+ (.*)$", prose(document), flags=re.MULTILINE)
+    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {heading.strip().replace(" ", "-") for heading in plain}
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.stem)
+def test_the_guides_samples_run_in_order(guide, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    text = (ROOT / "README.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    blocks = python_blocks(guide)
     assert blocks
+    names = {"gymnasium": gymnasium}
     for block in blocks:
-        # as written, but for the length of the training
-        code = block.replace("300_000", "1_000").replace("n_steps=1000", "n_steps=20")
-        code = code.replace("progress_bar=True", "progress_bar=False")
-        exec(compile("import gymnasium\n" + code, "README.md", "exec"), {})
+        for long, short in SHORTER.items():
+            block = block.replace(long, short)
+        exec(compile(block, guide.name, "exec"), names)
 
 
-@pytest.mark.parametrize("path", sorted(script("make_docs").pages()))
+@pytest.mark.parametrize("path", sorted(generated_pages()))
 def test_generated_pages_match_the_code(path):
-    assert (ROOT / "docs" / path).read_text() == script("make_docs").pages()[path], (
-        "run `python scripts/make_docs.py`"
-    )
+    assert (DOCS / path).read_text() == generated_pages()[path], "run `python scripts/make_docs.py`"
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
 def test_links_lead_somewhere(document):
-    text = re.sub(r"```.*?```", "", document.read_text(), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
-        if not target.startswith(("http://", "https://")):
-            assert (document.parent / target).exists(), f"{document.name} links to {target}"
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", prose(document)):
+        if target.startswith(("http://", "https://")):
+            continue
+        file = document.parent / target if target else document
+        assert file.exists(), f"{document.name} links to {target}"
+        if anchor:
+            assert anchor in anchors(file.resolve()), f"{document.name} links to {target}#{anchor}"
+
+
+def test_every_page_is_in_the_contents():
+    listed = {"index"}
+    for page in PAGES:
+        for tree in re.findall(r"```{toctree}\n(.*?)```", page.read_text(), flags=re.DOTALL):
+            names = [line for line in tree.split() if not line.startswith(":")]
+            folder = page.parent.relative_to(DOCS)
+            listed |= {(folder / name).as_posix() for name in names}
+    assert listed >= {page.relative_to(DOCS).with_suffix("").as_posix() for page in PAGES}
+
+
+def test_every_public_name_is_in_the_api_reference():
+    text = (DOCS / "api" / "index.md").read_text()
+    missing = [name for name in sb3_guard.__all__ if f"`{name}`" not in text]
+    assert missing == ["__version__"]
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", DOCS, tmp_path / "html"]
+    done = subprocess.run(
+        [*command, "-d", tmp_path / "doctrees"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "html" / "index.html").exists()
 
 
 def test_commands_named_in_the_readme_exist():

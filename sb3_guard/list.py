@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from sb3_guard.envs import Scenario, env_ids
 from sb3_guard.envs.registry import CONSTRAINTS, LADDER, ROBOTS, TASKS
+from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.tables import table
 from sb3_guard.zoo.usage import Parser, UsageError, import_packages, run
 
@@ -18,11 +19,19 @@ EXAMPLES = """examples:
 
 def summary(part: type) -> str:
     """The first line of a part's documentation."""
-    return (part.__doc__ or "").strip().splitlines()[0]
+    return (part.__doc__ or "").strip().partition("\n")[0]
+
+
+def stated(part: type, name: str) -> str:
+    """What a part says of itself; nothing where a user's own part does not."""
+    value = getattr(part, name, "")
+    return ", ".join(value) if isinstance(value, tuple) else str(value)
 
 
 def yes(part: type, name: str) -> str:
     """A column of the taxonomy; parts that can be made solid change it then."""
+    if not hasattr(part, name):
+        return ""
     value = "yes" if getattr(part, name) else "no"
     if name != "interactive" and "solid" in part.__dataclass_fields__:  # type: ignore[attr-defined]
         return f"{value}; {'no' if value == 'yes' else 'yes'} if solid"
@@ -49,8 +58,8 @@ def robots() -> str:
 def tasks() -> str:
     """The tasks with their place in the paper's taxonomy."""
     rows = [
-        [name, yes(cls, "interactive"), yes(cls, "contact"), cls.targets, ", ".join(cls.spaces),
-         summary(cls)]
+        [name, yes(cls, "interactive"), yes(cls, "contact"), stated(cls, "targets"),
+         stated(cls, "spaces"), summary(cls)]
         for name, cls in TASKS.items()
     ]  # fmt: skip
     return table(["task", "interactive", "contact", "targets", "spaces", "what it asks"], rows)
@@ -59,13 +68,20 @@ def tasks() -> str:
 def constraints() -> str:
     """The constraints with their place in the paper's taxonomy."""
     rows = [
-        [name, yes(cls, "trespassable"), cls.movable, ", ".join(cls.spaces), summary(cls)]
+        [name, yes(cls, "trespassable"), stated(cls, "movable"), stated(cls, "spaces"),
+         summary(cls)]
         for name, cls in CONSTRAINTS.items()
-    ]
+    ]  # fmt: skip
     return table(["constraint", "trespassable", "moves", "spaces", "what it is"], rows)
 
 
 KINDS = {"suites": suites, "robots": robots, "tasks": tasks, "constraints": constraints}
+
+
+def _kind(text: str) -> str:
+    if text not in KINDS:
+        raise argparse.ArgumentTypeError(f"there is no list {text!r}; {did_you_mean(text, KINDS)}")
+    return text
 
 
 def parser() -> Parser:
@@ -76,11 +92,11 @@ def parser() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("kind", nargs="?", choices=list(KINDS), help="only these")
+    result.add_argument("kind", nargs="?", type=_kind, choices=list(KINDS), help="only these")
     result.add_argument(
         "--ladder",
-        nargs=2,
-        metavar=("TASK_ROBOT", "CONSTRAINT"),
+        nargs="*",
+        metavar="TASK_ROBOT CONSTRAINT",
         help="ids of growing difficulty: more and more of a constraint",
     )
     result.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
@@ -90,7 +106,12 @@ def parser() -> Parser:
 def _list(argv: Sequence[str] | None) -> int:
     args = parser().parse_args(argv)
     import_packages(args.gym_packages)
-    if args.ladder:
+    if args.ladder is not None:
+        if len(args.ladder) != 2:
+            raise UsageError(
+                f"--ladder takes a task with a robot, and a constraint, not {len(args.ladder)} "
+                "values: for example --ladder Goal_Point Hazards"
+            )
         ids = [f"{args.ladder[0]}_{num}{args.ladder[1]}-v0" for num in LADDER]
         try:
             for env_id in ids:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from sb3_guard.envs import GuardVectorEnv
+from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
-from sb3_guard.envs.scenario import Scenario
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.tables import table
 from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, import_packages, one_line, run
@@ -71,10 +70,18 @@ def _show(argv: Sequence[str] | None) -> int:
     file = Path(args.env)
     kwargs: dict[str, Any] = args.env_kwargs or {}
     try:
-        is_file = file.suffix in (".yml", ".yaml")
-        scenario = Scenario.load(file) if is_file else Scenario.parse(args.env)
+        spec = env_spec(args.env)
+        if "scenario" not in spec.kwargs:
+            raise UsageError(
+                f"{args.env!r} is not an environment of sb3_guard's: see sb3-guard list"
+            )
         env = GuardVectorEnv(
-            1, scenario, render_mode="rgb_array", camera=args.camera, flatten=True, **kwargs
+            1,
+            spec.kwargs["scenario"],
+            render_mode="rgb_array",
+            camera=args.camera,
+            flatten=True,
+            **kwargs,
         )
         env.reset(seed=args.seed)
     except (ValueError, TypeError, RuntimeError) as error:

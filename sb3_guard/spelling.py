@@ -4,17 +4,26 @@ import difflib
 from collections.abc import Iterable
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Say what ``name`` may have meant and what is allowed, for an error message.
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The allowed name that ``name`` most likely meant, whatever its case; None: nothing is near.
 
     :param known: allowed names; among equally near ones the first is meant
     """
-    known = list(known)
     wrong = str(name).lower()
 
     def likeness(one: str) -> float:
         return difflib.SequenceMatcher(None, one.lower(), wrong).ratio()
 
     close = max(known, key=likeness, default="")
-    hint = f"did you mean {close!r}? " if likeness(close) >= 0.5 else ""
+    return close if likeness(close) >= 0.5 else None
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Say what ``name`` may have meant and what is allowed, for an error message.
+
+    :param known: allowed names; among equally near ones the first is meant
+    """
+    known = list(known)
+    close = nearest(name, known)
+    hint = "" if close is None else f"did you mean {close!r}? "
     return f"{hint}allowed: {', '.join(known)}"

@@ -4,6 +4,7 @@ import math
 from functools import partial
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from worlds import (
@@ -114,18 +115,19 @@ def test_sensors_agree_with_the_contacts_of_every_part_of_the_robot(robot):
     props = {
         "pillars": {"num": 3, "size": 0.1, "keepout": 0.1},
         "buttons": {"num": 3, "keepout": 0.1},
-        "gremlins": {"num": 3, "keepout": 0.15},
+        "gremlins": {"num": 3, "keepout": 0.2, "travel": 0.05},
         "vases": {"num": 3, "keepout": 0.15},
     }
     engine = world(
         f"Goal_{robot}_3Ghosts",
         3,
         robot={"keepout": 0.3},
-        ghosts={"solid": True, "r1": 0.0, "speed": 0.01, "space": "planar", "keepout": 0.2},
+        ghosts={"solid": True, "r1": 0.0, "speed": 0.01, "space": "planar", "size": 0.2,
+                "keepout": 0.2},
         layout={"placements": [[-1.2, -1.2, 1.2, 1.2]]},
         goal={"keepout": 0.1},
         **props,
-    )
+    )  # fmt: skip
     felt = 0
     for action in actions(engine, 120):
         if robot == "Point":
@@ -308,6 +310,60 @@ def test_names_of_bodies_are_not_given_twice(task, params, name):
         scenario.build()
 
 
+COVER = {  # parameters, and the radius that an object of that size takes up, m
+    "pillars": ({"size": 0.5}, 0.5),
+    "buttons": ({"size": 0.4}, 0.4),
+    "vases": ({"size": 0.2}, 0.2 * math.sqrt(2)),
+    "gremlins": ({"size": 0.2, "travel": 0.4}, 0.4 + 0.2 * math.sqrt(2)),
+    "ghosts": ({"size": 0.6, "solid": True}, 0.6),
+}
+
+
+@pytest.mark.parametrize("name", COVER)
+def test_solid_objects_never_begin_inside_each_other(name):
+    params, cover = COVER[name]
+    few = {"num": 3, **params}
+    engine = Scenario(constraints={name: few}).build()
+    assert engine.footprints[name].keepout == pytest.approx(cover)
+    for keepout in (0.0, cover - 0.001):
+        with pytest.raises(
+            ValueError, match=rf"{name}.keepout = .* begin inside .* at least 0\.\d"
+        ):
+            Scenario(constraints={name: {**few, "keepout": keepout}})
+    with pytest.raises(ValueError) as refused:
+        Scenario(constraints={name: {**few, "keepout": 0}})
+    least = float(str(refused.value).partition("at least ")[2].partition(";")[0])
+    Scenario(constraints={name: {**few, "keepout": least}})  # what it says is enough
+    engine.reset(np.zeros(1, dtype=int))
+    model, data = engine.model, engine.batch.get_data(0)
+    geoms = [model.body(f"{name}/{i}").geomadr[0] for i in range(3)]
+    for i in range(3):
+        for j in range(i):
+            assert mujoco.mj_geomDistance(model, data, geoms[i], geoms[j], 1.0, None) > 0
+
+
+def test_zones_may_overlap_and_usual_sizes_keep_their_usual_distance():
+    Scenario(constraints={"hazards": {"size": 1.0, "keepout": 0.0}, "ghosts": {"keepout": 0.1}})
+    usual = {"hazards": 0.4, "ghosts": 0.5, "vases": 0.15, "pillars": 0.3, "buttons": 0.3,
+             "gremlins": 0.5}  # fmt: skip
+    engine = Scenario(constraints={name: {"num": 1} for name in usual}).build()
+    assert {name: engine.footprints[name].keepout for name in usual} == usual
+
+
+def test_solid_ghosts_hang_where_some_part_of_the_robot_may_be():
+    """An Ant's position is 0.14 m up, its legs are 0.3 m long: 0.74 m with a ghost of 0.3 m."""
+
+    def build(robot, low, **params):
+        ghosts = {"solid": True, "space": "spatial", "height": [low, low + 1], **params}
+        Scenario(robot=robot, constraints={"ghosts": ghosts}).build()
+
+    build("Ant", 0.5)
+    with pytest.raises(ValueError, match=r"ghosts.height = \(2, 3\) is out of reach: .* 0\.74 m"):
+        build("Ant", 2)
+    build("Humanoid", 2)
+    build("Drone", 5)  # it flies
+
+
 def test_what_hangs_in_the_air_can_be_met():
     """Zones that a robot on the floor would never enter, and bodies in the floor, are refused."""
 
@@ -355,7 +411,7 @@ def test_wrong_buttons_of_a_button_task_cost():
 
 
 def test_indicator_counts_any_touch_once():
-    close = {"num": 2, "locations": [[0.0, 0.18], [0.0, -0.18]], "keepout": 0.1}
+    close = {"num": 2, "locations": [[0.0, 0.18], [0.0, -0.18]], "size": 0.17, "keepout": 0.17}
     engines = [
         world("Goal_Point_0Pillars", pillars={**close, "indicator": i}) for i in (False, True)
     ]

@@ -1,12 +1,19 @@
 """The engine's promises: bit-exact rows, whole states, honest steps."""
 
+from dataclasses import dataclass
+
 import gymnasium
 import numpy as np
 import pytest
 from suites import IDS
 
 from sb3_guard.envs import GuardVectorEnv, Scenario, env_spec, make
+from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.layout import LayoutError
+from sb3_guard.envs.part import Constraint, Task
+from sb3_guard.envs.robots import Point
+from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.tasks import Goal
 
 
 def actions_for(env, steps, n, seed=0):
@@ -271,6 +278,89 @@ def test_fixed_places_and_rectangles_are_used():
     np.testing.assert_allclose(env.engine.robot.position[:, :2], 0, atol=1e-12)
     goal = env.engine.places("goal")[:, 0]
     assert (goal[:, :2] >= 0.1 - 1e-9).all() and (goal[:, 1] <= 1.1 + 1e-9).all()
+
+
+def part(base, name, **verbs):
+    """A part as a user may write it, with these methods."""
+    return dataclass(type(name.capitalize(), (base,), {"name": name, **verbs}))()
+
+
+def seen(shape, channel="odd_eye"):
+    """A constraint that observes an array of this shape and announces one number."""
+    return {
+        "cost": lambda self: np.zeros(self.sim.num_envs),
+        "observe": lambda self: {"odd_eye": np.zeros(shape)},
+        "channels": lambda self: {channel: Channel(1)},
+    }
+
+
+@pytest.mark.parametrize(
+    ("verbs", "words"),
+    [
+        ({"cost": lambda self: np.zeros((2, 3))}, r"cost\(\) of odd has shape \(2, 3\), .* \(2,\)"),
+        ({"cost": lambda self: 0.0}, r"cost\(\) of odd has shape \(\), expected \(2,\): one row"),
+        ({"cost": lambda self: np.array([0.0, -0.5])}, r"cost_odd is -0\.5: .* at least 0"),
+        ({"cost": lambda self: np.full(2, np.nan)}, r"cost_odd is nan: .* at least 0"),
+        (seen((2, 3)), r"observe\(\)\['odd_eye'\] of odd has shape \(2, 3\), expected \(2, 1\)"),
+        (seen(2), r"observe\(\)\['odd_eye'\] of odd has shape \(2,\), expected \(2, 1\)"),
+        (seen((2, 1), "eye"), r"channels\(\) of odd names 'eye', but observe\(\) does not"),
+        (
+            {**seen((2, 1)), "channels": lambda self: {}},
+            r"observe\(\) of odd returns 'odd_eye', which has no channel: add 'odd_eye'",
+        ),
+        (
+            {**seen((2, 1)), "channels": lambda self: {"odd_eye": 1}},
+            r"channels\(\) of odd gives 'odd_eye' as 1: it must be a Channel",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_users_constraint_is_said(verbs, words):
+    with pytest.raises(ValueError, match=words):
+        engine = Engine(Point(), Goal(), [part(Constraint, "odd", **verbs)], num_envs=2)
+        engine.reset(np.arange(2))
+        engine.observe()
+        engine.step(np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("verb", "value", "words"),
+    [
+        ("reward", np.zeros((2, 1)), r"reward\(\) of odd has shape \(2, 1\), expected \(2,\)"),
+        ("reward", 1.0, r"reward\(\) of odd has shape \(\), expected \(2,\)"),
+        ("succeeded", np.zeros((2, 1)), r"succeeded\(\) of odd has shape \(2, 1\)"),
+        ("blemished", False, r"blemished\(\) of odd has shape \(\), expected \(2,\)"),
+        ("measure", np.zeros(3), r"measure\(\) of odd has shape \(3,\), expected \(2, M\)"),
+    ],
+)
+def test_what_is_wrong_with_a_users_task_is_said(verb, value, words):
+    verbs = {
+        "reward": lambda self, before, now: np.zeros(2),
+        "blemished": lambda self: np.zeros(2, dtype=bool),
+        verb: lambda self, *_: value,
+    }
+    with pytest.raises(ValueError, match=words):
+        engine = Engine(Point(), part(Task, "odd", **verbs), num_envs=2)
+        engine.reset(np.arange(2))
+        engine.step(np.zeros((2, 2)))
+
+
+def test_costs_of_a_users_constraint_may_be_whole_or_yes_and_no():
+    engine = Engine(
+        Point(),
+        Goal(),
+        [
+            part(Constraint, "whole", cost=lambda self: self.sim.steps),
+            part(Constraint, "often", cost=lambda self: self.sim.steps > 0),
+            part(Constraint, "kept", cost=lambda self: self.sim.array("kept")),
+        ],
+        num_envs=2,
+    )
+    engine.reset(np.arange(2))
+    engine.step(np.zeros((2, 2)))
+    outcome = engine.step(np.zeros((2, 2)))
+    assert outcome.cost.tolist() == [3.0, 3.0] and outcome.costs["cost_often"].dtype == float
+    engine.array("kept")[:] = 5.0  # the next step's, not this one's
+    assert outcome.costs["cost_kept"].tolist() == [0.0, 0.0]
 
 
 def test_an_impossible_layout_names_the_crowded_part():

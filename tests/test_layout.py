@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from sb3_guard.envs import Scenario
-from sb3_guard.envs.layout import ARENA, Footprint, LayoutError, arrange, redraw
+from sb3_guard.envs.layout import ARENA, Footprint, LayoutError, arrange, farthest, redraw
 
 
 def footprints(task="goal", ghosts=8):
@@ -166,6 +166,19 @@ def test_what_cannot_be_placed_is_named(parts, words):
     [
         ({"placements": ((0, 0, 0, 1),)}, "placement"),
         ({"placements": ((0, 0, 0.5, 1),)}, "keepout 0.4"),
+        ({"placements": ((0, 0, 0.5, 1),), "locations": ((3, 3),)}, "keepout 0.4 does not fit"),
+        (
+            {"num": 1, "placements": ((0, 0, 0.5, 1),), "locations": ((3, 3),), "redrawn": True},
+            "keepout 0.4 does not fit",
+        ),
+        (
+            {"placements": ((3, -1, 5, 1), (-6, 2, -5, 3)), "base": (0.5, 0), "reach": 2.2},
+            r"\(-6, 2, -5, 3\)\] are out of .* reach: with keepout 0.4 m .* 2\.90 m from its base",
+        ),
+        (
+            {"placements": ((1, -1, 2, 1),), "height": (2.0, 2.5), "reach": 2.2},
+            r"nearest point is 2\.44 m from its base at \(0\.0, 0\.0\); it reaches 2\.2 m",
+        ),
         ({"num": 1, "locations": ((0, 0), (1, 1))}, "2 locations for 1"),
         (
             {"height": (2.5, 3.0), "reach": 2.0},
@@ -180,6 +193,90 @@ def test_what_cannot_be_placed_is_named(parts, words):
 def test_bad_footprints_are_refused(kwargs, words):
     with pytest.raises(ValueError, match=words):
         Footprint(**{"name": "x", "num": 3, "keepout": 0.4, **kwargs})
+
+
+def test_places_that_are_all_fixed_need_no_rectangle():
+    Footprint("x", 1, 0.4, ((0, 0, 0.1, 0.1),), ((3.0, 3.0),))
+    base = Scenario.parse("Goal_Point_2Hazards")
+    small = {"locations": [[1, 1]], "placements": [[0.8, 0.8, 1.2, 1.2]]}
+    base.override(goal={**small, "ends": True}).build()  # the first goal is the only one
+    with pytest.raises(ValueError, match=r"goal: keepout 0\.4 does not fit the placement"):
+        base.override(goal=small).build()
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        {"goal": {"placements": [[5, 5, 6, 6]]}},
+        {"hazards": {"placements": [[1.2, 1.2, 2.0, 2.0]]}},
+        {"robot": {"locations": [[5, 5]]}},
+        {"layout": {"placements": [[3, 3, 5, 5]]}},
+        {"goal": {"locations": [[1.9, 1]]}},
+        {"goal": {"height": [2.5, 3.0]}},
+    ],
+    ids=str,
+)
+def test_what_an_arm_cannot_reach_is_refused_at_construction(params):
+    with pytest.raises(ValueError, match=r"out of the robot's reach: .*2\.0 m"):
+        Scenario.parse("Goal_Arm3_2Hazards").override(**params).build()
+
+
+def test_crowding_within_reach_speaks_of_it():
+    engine = Scenario.parse("Goal_Arm3_2Hazards").override(hazards={"height": [1.99, 2]}).build()
+    words = r"hazards cannot .* within the robot's reach, 2.0 m around .*; reduce num, .* height"
+    with pytest.raises(LayoutError, match=words):
+        engine.reset(np.zeros(1, dtype=int))
+
+
+def test_the_farthest_places_of_two_groups():
+    one = Footprint("one", 1, 0.5, ARENA)
+    assert farthest(one, one) == pytest.approx(math.hypot(3, 3))
+    fixed = Footprint("fixed", 1, 0.5, ARENA, ((0.0, 3.0),))
+    assert farthest(one, fixed) == pytest.approx(math.hypot(1.5, 4.5))
+    more = Footprint("more", 2, 0.5, ARENA, ((0.0, 3.0),))
+    assert farthest(more, fixed) == pytest.approx(math.hypot(1.5, 4.5))
+    assert farthest(Footprint("none", 0, 0.5, ARENA), fixed) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("suite", "params", "words"),
+    [
+        ("Goal_Point_8Hazards", {"goal": {"size": 5}}, r"goal.size = 5 holds .* most 4\.53 m"),
+        ("Goal_Drone_0Hazards", {"goal": {"size": 5}}, r"goal.size = 5 holds .* most 4\.55 m"),
+        ("Goal_Arm3_0Hazards", {"goal": {"size": 9}}, r"goal.size = 9 holds .* most 3\.51 m"),
+        ("Goal_Point_8Hazards", {"hazards": {"size": 5}}, "hazards.size = 5 holds the robot"),
+        ("Goal_Point_8Ghosts", {"ghosts": {"size": 5}}, "ghosts.size = 5 holds the robot"),
+        ("Push_Point_8Hazards", {"push": {"size": 5}}, "push.size = 5 holds the ball"),
+    ],
+)
+def test_sizes_that_spoil_every_start_are_refused(suite, params, words):
+    with pytest.raises(ValueError, match=words):
+        Scenario.parse(suite).override(**params).build()
+
+
+@pytest.mark.parametrize(
+    ("suite", "params", "reason"),
+    [
+        # all but a sliver of the layouts begin at the goal
+        ("Goal_Point_0Hazards", {"goal": {"size": 4.5}}, "goal: its goal is reached at once"),
+        (
+            "Goal_Point_2Hazards",
+            {"hazards": {"size": 4.2}},
+            "hazards: the robot pays for them at once",
+        ),
+        (
+            "Chase_Arm3_0Hazards",
+            {"chase": {"num": 1, "solid": True, "locations": [[0, 1]], "size": 0.6,
+                       "height": [1.5, 1.5]}, "robot": {"heading": 0.0}},
+            "chase: a solid target touches the robot at once",
+        ),
+    ],
+)  # fmt: skip
+def test_starts_that_are_never_clean_name_only_what_spoils_them(suite, params, reason):
+    engine = Scenario.parse(suite).override(**params).build()
+    engine.seed(0, np.random.default_rng(0))
+    with pytest.raises(LayoutError, match=rf"none of 100 layouts .* clean \({reason}\): make size"):
+        engine.reset(np.zeros(1, dtype=int))
 
 
 @pytest.mark.parametrize(
@@ -307,8 +404,6 @@ def test_goals_are_not_reached_when_they_appear(suite):
 
 
 def test_a_part_can_keep_a_margin_of_its_own():
-    from sb3_guard.envs import Scenario
-
     base = Scenario.parse("Goal_Point_2Hazards")
     engine = base.override(goal={"margin": 1.0}, hazards={"height": [0.3, 0.3]}).build(20)
     engine.reset(np.arange(20))

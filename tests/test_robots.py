@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 import pytest
+from matplotlib import image
+from worlds import own_parts
 
-from sb3_guard.envs import robots
+from sb3_guard.envs import register_robot, robots
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.part import FLOOR
 from sb3_guard.envs.registry import ROBOTS, SUITE_ROBOTS
@@ -303,6 +308,94 @@ def test_gait_covers_ground(robot: str) -> None:
     for name in engine.observation_layout:  # a Doggo's knees (a) stay off the floor
         if name.startswith("touch") and not (robot == "Doggo" and name.endswith("a")):
             assert look(engine, felt, name) > 0, name
+
+
+def test_point_thrusts_along_its_nose_and_turns_on_the_spot() -> None:
+    """F = 0.015 N against a drag of 0.01 N·s/m: x(t) = v (t − τ (1 − e^(−t/τ))), v = 1.5 m/s."""
+    engine = world("Point")
+    drive(engine, [1, 0], 75)
+    t, tau = 75 * 10 * FACTS["Point"].timestep, FACTS["Point"].mass / 0.01
+    reached = 1.5 * (t - tau * (1 - math.exp(-t / tau)))
+    assert reached > 1.0
+    x, y, _ = engine.robot.position[0]
+    assert x == pytest.approx(reached, rel=0.01) and abs(y) < 1e-6
+    engine = world("Point")
+    gyro = look(engine, drive(engine, [0, 1], 150), "gyro")  # to the left
+    np.testing.assert_allclose(gyro, [0, 0, 3.0], atol=0.03)  # 0.015 N·m over 0.005 N·m·s
+    assert np.abs(engine.robot.position[0, :2]).max() < 0.03  # its middle is beside its mass
+    gyro = look(engine, drive(engine, [0, -1], 150), "gyro")
+    np.testing.assert_allclose(gyro, [0, 0, -3.0], atol=0.03)
+    gyro = look(engine, drive(engine, 0.0, 10), "gyro")
+    assert abs(gyro[2]) < 0.1  # the servo brakes
+    nose, start = engine.robot.frames[1][0, 0, :2, 0].copy(), engine.robot.position[0, :2].copy()
+    drive(engine, [1, 0], 75)
+    moved = engine.robot.position[0, :2] - start
+    assert np.hypot(*moved) > 1.0 and moved @ nose > 0.999 * np.hypot(*moved)
+
+
+@pytest.mark.parametrize("robot", ["Point", "Ant", "Doggo", "Humanoid", "Walker", "Hopper"])
+def test_no_pose_reaches_beyond_the_extent(robot: str) -> None:
+    engine = world(robot)
+    model = engine.model
+    data = engine.batch.get_data(0)
+    mine = [g for g in range(model.ngeom) if model.geom(g).name != "floor"]
+    center = model.body(f"robot/{engine.robot.center}").id
+    root = model.body("robot/robot").id
+    hinges = [
+        j for j in range(model.njnt)
+        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and model.jnt_bodyid[j] != root
+    ]  # fmt: skip
+    rng = np.random.default_rng(0)
+    farthest = 0.0
+    for _ in range(300):
+        for j in hinges:
+            data.qpos[model.jnt_qposadr[j]] = rng.uniform(-math.pi, math.pi)
+        mujoco.mj_kinematics(model, data)
+        gaps = np.linalg.norm(data.geom_xpos[mine] - data.xpos[center], axis=1)
+        farthest = max(farthest, float((gaps + model.geom_size[mine].min(axis=1)).max()))
+    assert farthest <= engine.robot.extent + 1e-9
+    assert engine.robot.extent < 2 * farthest + 0.1  # and it says something
+
+
+@pytest.mark.parametrize(
+    ("joint", "extent"),
+    [
+        ('type="hinge" axis="0 0 1"', 0.2 + 0.1),
+        ('type="hinge" axis="0 0 1" pos="0.5 0 0"', 0.2 + 2 * 0.5 + 0.1),  # about 0.7 m off
+        ('type="slide" axis="0 0 1" range="-0.1 0.4"', 0.2 + 0.4 + 0.1),
+        ('type="slide" axis="0 0 1"', math.inf),
+    ],
+)
+def test_the_extent_counts_every_joint(joint: str, extent: float, tmp_path: Path) -> None:
+    """A ball of 0.1 m, 0.2 m from the middle, on one joint."""
+    (tmp_path / "crank.xml").write_text(f"""
+    <mujoco><compiler autolimits="true"/><worldbody><body name="robot" pos="0 0 0.5">
+      <joint name="x" type="slide" axis="1 0 0"/><geom size="0.05"/>
+      <body name="arm" pos="0.2 0 0"><joint name="j" {joint}/><geom size="0.1"/></body>
+    </body></worldbody><actuator><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>""")
+    with own_parts():
+        register_robot("Crank", xml=tmp_path / "crank.xml")
+        assert world("Crank").robot.extent == pytest.approx(extent)
+
+
+def test_a_robot_module_shows_its_robot(tmp_path: Path) -> None:
+    """``python -m sb3_guard.envs.robots.ant`` writes a picture where there is no display."""
+    displays = ("DISPLAY", "WAYLAND_DISPLAY")
+    run = subprocess.run(
+        [sys.executable, "-m", "sb3_guard.envs.robots.ant"],
+        env={k: v for k, v in os.environ.items() if k not in displays},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    if "no OpenGL backend works" in run.stderr:
+        pytest.skip("no OpenGL backend works")
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout == "no display: wrote ant.png\n"
+    picture = image.imread(tmp_path / "ant.png")
+    assert picture.shape[:2] == (480, 480) and picture[..., :3].std() > 0.05
 
 
 def test_car_drives_along_its_nose_and_turns_on_the_spot() -> None:

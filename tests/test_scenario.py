@@ -1,11 +1,16 @@
 """Ids, scenarios, files and keyword arguments, and what they say of bad values."""
 
+from dataclasses import dataclass
+
 import gymnasium
 import numpy as np
 import pytest
+from worlds import own_parts
 
-from sb3_guard.envs import Scenario, env_ids, make, registry
+from sb3_guard.envs import GuardEnv, Scenario, env_ids, make, registry
 from sb3_guard.envs.constraints import Hazards
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Constraint, Robot, Task
 from sb3_guard.envs.tasks import Goal
 from sb3_guard.spelling import did_you_mean
 
@@ -29,6 +34,10 @@ def test_other_numbers_and_single_goals():
     ("name", "message"),
     [
         ("Goal_Pont_8Hazards", "unknown robot 'Pont' .*did you mean 'Point'"),
+        ("goal_point_8hazards-v0", "unknown .* mean 'Goal_Point_8Hazards'.*allowed: Point, "),
+        ("goal_ant_3ghost_noconti", "did you mean 'Goal_Ant_3Ghosts_noconti'"),
+        ("Goal_zzz_8hazards", "unknown robot 'zzz' in .*: allowed: Point"),
+        ("Goal_Point_100000Hazards", "hazards.num = 100000 must be at most 1000"),
         ("Gaol_Point_8Hazards-v0", "unknown task 'Gaol' .*did you mean 'Goal'"),
         ("Goal_Point_8Hazard", "unknown constraint 'Hazard' .*did you mean 'Hazards'"),
         ("Goal_Point", "not an id of the form Task_Robot_NConstraint-v0"),
@@ -61,7 +70,7 @@ def test_bad_ids_say_what_is_wrong(name, message):
             "robot.sensing = 'robot' must be a list of texts or null$",
         ),
         ({"goal": {"ends": None}}, "goal.ends = None must be true or false$"),
-        ({"observe": {"remaining": True}}, "observe.remaining = True must be an integer or null$"),
+        ({"observe": {"remaining": True}}, "observe.remaining = True must be the number of steps"),
         ({"observe": {"camera": [8, 8.5]}}, "must be a list of 2 integers or null$"),
         (
             {"chase": {"num": 3}},
@@ -76,6 +85,14 @@ def test_bad_ids_say_what_is_wrong(name, message):
         ({"lidar": {"bins": 0}}, "lidar.bins = 0 must be at least 1"),
         ({"layout": {"margin": -1}}, "layout.margin = -1 must be at least 0"),
         ({"layout": {"placements": [[0, 0, 0, 1]]}}, "a placement must be"),
+        ({"layout": {"placements": []}}, r"layout.placements = \(\) must hold at least one rect"),
+        ({"lidar": {"bins": 10**9}}, "lidar.bins = 1000000000 must be at most 1000"),
+        ({"robot": "Ant"}, "robot = 'Ant' must be a mapping .* chosen by the id"),
+        (
+            {"hazards": {"type": "vases"}},
+            "constraint 'hazards' cannot be of type 'vases', .* hazards=None and vases={...}",
+        ),
+        ({"pillars": {"space": "spatial"}}, "pillars.space = 'spatial' cannot .* always planar"),
         ({"hazards": {"num": 1, "locations": [[0, 1], [1, 0]]}}, "2 locations for 1 objects"),
     ],
 )
@@ -142,6 +159,66 @@ def test_scenarios_from_files(tmp_path):
         make(str(tmp_path / "none.yml"))
 
 
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"constraints": ["hazards"]}, r"constraints = \['hazards'\] must be a mapping of names"),
+        ({"constraints": "hazards"}, "constraints = 'hazards' must be a mapping of names"),
+        ({"robot": ["Point"]}, r"robot = \['Point'\] must be a name, one of Point, .*robot_params"),
+        ({"task": {"Goal": {}}}, "task = {'Goal': {}} must be a name, one of Goal, .*task_params"),
+        ({"robot_params": [1]}, r"robot = \[1\] must be a mapping"),
+        ({"lidar": "wide"}, "lidar = 'wide' must be a mapping"),
+        ({"robt": "Ant"}, "scenario has no key 'robt': did you mean 'robot'"),
+    ],
+)
+def test_malformed_scenarios_say_what_is_wrong(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Scenario.from_dict(fields)
+
+
+def test_what_is_no_scenario_is_refused():
+    with pytest.raises(ValueError, match="scenario = 3 must be an id, a YAML file, a Scenario or"):
+        GuardEnv(3)
+    with pytest.raises(ValueError, match="scenario has no key 'robt'"):
+        GuardEnv({"robt": "Ant"})
+
+
+def test_what_is_left_blank_has_its_default(tmp_path):
+    path = tmp_path / "blank.yml"
+    path.write_text(
+        "robot: Ant\ntask:\nlidar:\nlayout: {margin: }\n"
+        "constraints:\n  hazards:\n  ghosts: {num: 2, size: }\n"
+    )
+    constraints = {"hazards": {}, "ghosts": {"num": 2}}
+    assert Scenario.load(path) == Scenario(robot="Ant", constraints=constraints)
+    path.write_text("constraints:\n")
+    assert Scenario.load(path) == Scenario(constraints=None, layout=None) == Scenario()
+
+
+def test_yaml_reads_numbers_with_an_exponent_as_text_and_they_are_numbers(tmp_path):
+    path = tmp_path / "slow.yml"
+    path.write_text("constraints:\n  ghosts: {speed: 2e-3, origin: [1e0, 0, -5E-1]}\n")
+    (ghosts,) = Scenario.load(path).parts()["constraints"]
+    assert (ghosts.speed, ghosts.origin) == (0.002, (1.0, 0, -0.5))
+    with pytest.raises(ValueError, match=r"ghosts.num = 1000\.0 must be an integer"):
+        Scenario(constraints={"ghosts": {"num": "1e3"}})
+
+
+def test_arrays_do_for_lists():
+    places = np.array([[0.0, 1.0], [1.0, 0.0]])
+    scenario = Scenario.parse("Goal_Point_8Hazards").override(hazards={"locations": places})
+    assert scenario.constraints["hazards"]["locations"] == [[0, 1], [1, 0]]
+    engine = scenario.build()
+    engine.reset(np.zeros(1, dtype=int))
+    np.testing.assert_array_equal(engine.places("hazards")[0, :2, :2], places)
+    assert Hazards(locations=places).locations == ((0, 1), (1, 0))
+
+
+def test_the_module_may_be_named_before_the_id():
+    env = make("sb3_guard:Goal_Ant_3Ghosts-v0")
+    assert env.unwrapped.scenario == Scenario.parse("Goal_Ant_3Ghosts")
+
+
 def test_registered_parts_are_used_by_ids(tmp_path):
     class Home(Goal):
         """Go home."""
@@ -155,20 +232,95 @@ def test_registered_parts_are_used_by_ids(tmp_path):
 
     xml = tmp_path / "sled.xml"
     xml.write_text(registry.ROBOTS["Point"].path().read_text())
-    try:
+    with own_parts():
         registry.register_task("Home", Home)
         registry.register_constraint("Puddles", Puddles)
         registry.register_robot("Sled", xml=xml, timestep=0.004)
         engine = Scenario.parse("Home_Sled_2Puddles").build()
         assert engine.model.opt.timestep == 0.004
         assert "puddles_lidar" in engine.observation_layout
-    finally:
-        for table, name in (
-            (registry.TASKS, "Home"),
-            (registry.CONSTRAINTS, "Puddles"),
-            (registry.ROBOTS, "Sled"),
+
+
+def speeding():
+    """A constraint as a user may write it: a cost and one parameter, no name, no taxonomy."""
+
+    @dataclass
+    class Speeding(Constraint):
+        limit: float = param(0.5, "m/s", above=0)
+
+        def cost(self):
+            return np.zeros(self.sim.num_envs)
+
+    return Speeding
+
+
+def test_what_is_registered_again_takes_its_place(tmp_path):
+    first, second = speeding(), speeding()
+    xml, other = tmp_path / "sled.xml", tmp_path / "other.xml"
+    for path in (xml, other):
+        path.write_text(registry.ROBOTS["Point"].path().read_text())
+    with own_parts():
+        for cls in (first, second):  # the same lines run again, as in a notebook
+            registry.register_constraint("Speeding", cls)
+        assert registry.CONSTRAINTS["Speeding"] is second
+        for timestep in (0.002, 0.004):
+            registry.register_robot("Sled", xml=xml, timestep=timestep)
+        assert registry.ROBOTS["Sled"].timestep == 0.004
+        for name, again in (
+            ("Speeding", lambda name: registry.register_constraint(name, Hazards)),
+            ("speeding", lambda name: registry.register_constraint(name, second)),
+            ("Sled", lambda name: registry.register_robot(name, xml=other)),
+            ("Sled", lambda name: registry.register_robot(name, registry.ROBOTS["Ant"])),
         ):
-            table.pop(name, None)
+            with pytest.raises(ValueError, match=f"'{name.capitalize()}' is known already.*other"):
+                again(name)
+
+
+def test_a_constraint_without_a_number_is_one():
+    with own_parts():
+        registry.register_constraint("Speeding", speeding())
+        scenario = Scenario.parse("Goal_Point_1Speeding")
+        assert scenario.constraints == {"speeding": {}}
+        (constraint,) = scenario.build().constraints
+        assert constraint.name == "speeding"
+        with pytest.raises(ValueError, match=r"Speeding has no parameter num, .* write 1Speeding"):
+            Scenario.parse("Goal_Point_8Speeding")
+
+
+def test_classes_that_cannot_be_parts_are_refused():
+    class Forgotten(Constraint):
+        limit: float = param(0.5, "m/s", above=0)
+
+        def cost(self):
+            return np.zeros(self.sim.num_envs)
+
+    class Wide(Hazards):
+        size: float = 1.0
+
+    class Plain(Hazards):
+        """No parameters of its own, so that the base's decorator does."""
+
+    @dataclass
+    class Free(Constraint):
+        """Costs nothing, not even a thought."""
+
+    @dataclass
+    class Idle(Task):
+        """No reward."""
+
+    with own_parts():
+        words = "class Forgotten is not a dataclass: its parameters limit .* write @dataclass"
+        with pytest.raises(ValueError, match=words):
+            registry.register_constraint("Forgotten", Forgotten)
+        with pytest.raises(ValueError, match="class Wide is not a dataclass: its parameters size"):
+            registry.register_constraint("Wide", Wide)
+        registry.register_constraint("Plain", Plain)
+        with pytest.raises(ValueError, match=r"class Free must define cost\(\)"):
+            registry.register_constraint("Free", Free)
+        with pytest.raises(ValueError, match=r"class Idle must define reward\(\)"):
+            registry.register_task("Idle", Idle)
+        with pytest.raises(ValueError, match="timestep = None must be a positive number"):
+            registry.register_robot("Vague", dataclass(type("Vague", (Robot,), {})))
 
 
 def test_bad_registrations_are_refused(tmp_path):
@@ -176,13 +328,20 @@ def test_bad_registrations_are_refused(tmp_path):
         registry.register_robot("X")
     with pytest.raises(ValueError, match="there is no file"):
         registry.register_robot("X", xml=tmp_path / "none.xml")
-    for name in ("My_Task", "Käfer", "2Fast"):
+    for name in ("My_Task", "Käfer", "2Fast", 3):
         with pytest.raises(ValueError, match="cannot be part of an id"):
             registry.register_task(name, Goal)
     xml = registry.ROBOTS["Point"].path()
     for attributes, message in (
         ({"timstep": 0.01}, "has no 'timstep': did you mean 'timestep'"),
-        ({"timestep": -1.0}, "must be a positive float"),
+        ({"timestep": -1.0}, "timestep = -1.0 must be a positive number of seconds"),
+        ({"timestep": float("inf")}, "timestep = inf must be a positive number of seconds"),
+        ({"timestep": "fast"}, "timestep = 'fast' must be a positive number of seconds"),
+        ({"reach": "far"}, "reach = 'far' must be a positive number of metres; leave it out"),
+        ({"reach": -1}, "reach = -1 must be a positive number of metres"),
+        ({"lidar_bodies": "tip"}, "lidar_bodies = 'tip' must be a list of names of bodies"),
+        ({"lidar_bodies": []}, r"lidar_bodies = \[\] must be a list of names of bodies"),
+        ({"center": 3}, "center = 3 must be the name of a body"),
         ({"workspace": "3d"}, "must be 'planar' or 'spatial'"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -239,6 +398,11 @@ def test_what_remains_must_agree_with_the_time_limit():
     words = "observe.remaining = 3, but .* give remaining and max_episode_steps the same value"
     with pytest.raises(ValueError, match=words):
         gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=2, **params)
+    longer = {"observe": {"remaining": 2000}}
+    with pytest.raises(ValueError, match=r"observe\.remaining = 2000, but .* after 1000 steps"):
+        make("Goal_Point_8Hazards", **longer)
+    make("Goal_Point_8Hazards", **longer, max_episode_steps=2000)
+    make("Goal_Point_8Hazards", **longer, max_episode_steps=-1)  # no limit
     lone = gymnasium.make("Goal_Point_8Hazards-v0", **params)
     lone.reset(seed=0)
     for _ in range(3):
@@ -274,6 +438,18 @@ def test_other_bodies_can_carry_lidar_and_compass():
         base.override(robot={"sensing": ["link_9"]}).build()
 
 
+def test_bodies_that_a_robot_does_not_have_are_named_where_they_are_given():
+    xml = registry.ROBOTS["Arm3"].path()
+    for key, value, message in (
+        ("center", "link9", "center names no body 'link9' of the robot: did you mean 'link_"),
+        ("lidar_bodies", ["link_1", "tip"], "lidar_bodies names no body 'tip' of the robot"),
+    ):
+        with own_parts():
+            registry.register_robot("Crane", xml=xml, **{key: value})
+            with pytest.raises(ValueError, match=message):
+                Scenario(robot="Crane").build()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -287,10 +463,8 @@ def test_other_bodies_can_carry_lidar_and_compass():
 def test_bad_robot_files_say_what_is_wrong(tmp_path, old, new, message):
     xml = tmp_path / "sled.xml"
     xml.write_text(registry.ROBOTS["Point"].path().read_text().replace(old, new))
-    try:
+    with own_parts():
         registry.register_robot("Sled", xml=xml)
         with pytest.raises(ValueError, match=message) as caught:
             Scenario.parse("Goal_Sled_2Hazards").build()
         assert "\n" not in str(caught.value)
-    finally:
-        registry.ROBOTS.pop("Sled", None)

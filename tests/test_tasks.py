@@ -140,8 +140,11 @@ def test_the_object_keeps_clear_of_what_it_could_bump_into(kind, covers):
         half = model.geom_size[g, :2] if kind == "box" else [model.geom_size[g, 0], 0.0]
         outer = max(outer, math.hypot(*(np.abs(model.geom_pos[g, :2]) + half)))
     assert engine.footprints[kind].keepout == pytest.approx(outer) == pytest.approx(covers)
+    push["object_keepout"] = 0.6
+    assert Scenario(task="Push", task_params=push).build().footprints[kind].keepout == 0.6
     push["object_keepout"] = 0.1
-    assert Scenario(task="Push", task_params=push).build().footprints[kind].keepout == 0.1
+    with pytest.raises(ValueError, match=r"push.object_keepout = 0.1 .* must be at least 0\.[35]"):
+        Scenario(task="Push", task_params=push)
 
 
 def test_a_box_has_posts_that_rest_on_nothing():
@@ -416,7 +419,8 @@ def test_tasks_state_the_papers_taxonomy():
     [
         ("push", {"object": "cube"}, r"push.object = 'cube'.*ball"),
         ("push", {"object_size": 0}, r"push.object_size = 0 must be greater than 0"),
-        ("push", {"space": "spatial"}, "no parameter 'space'"),
+        ("push", {"space": "spatial"}, r"push.space = 'spatial' cannot .* always planar, .* out$"),
+        ("chase", {"num": 10**6}, r"chase.num = 1000000 must be at most 1000"),
         ("chase", {"num": 0}, r"chase.num = 0 must be at least 1"),
         ("chase", {"v1": -1.0}, r"chase.v1 = -1.0 must be at least 0"),
         ("chase", {"speed_law": "units"}, r"did you mean 'unit'\?"),

@@ -1,12 +1,28 @@
 """Small worlds for the tests of tasks and constraints."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import mujoco
 import numpy as np
 
-from sb3_guard.envs import Scenario
+from sb3_guard.envs import Scenario, registry
 from sb3_guard.envs.engine import Engine
 
 ROW = np.zeros(1, dtype=np.int32)
+
+
+@contextmanager
+def own_parts() -> Iterator[None]:
+    """What is registered within is forgotten afterwards."""
+    tables = (registry.ROBOTS, registry.TASKS, registry.CONSTRAINTS)
+    before = [dict(table) for table in tables]
+    try:
+        yield
+    finally:
+        for table, known in zip(tables, before, strict=True):
+            table.clear()
+            table.update(known)
 
 
 def world(suite: str, n: int = 1, seed: int = 0, num_threads: int = 1, **params: object) -> Engine:

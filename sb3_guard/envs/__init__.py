@@ -56,6 +56,7 @@ def env_spec(name: str | Scenario) -> EnvSpec:
     if isinstance(name, Scenario):
         env_id, what = "Guard-v0", name.to_dict()
     else:
+        name = name.removeprefix("sb3_guard:")  # what gymnasium.make would have to import
         env_id = name if name.rpartition("-v")[2].isdigit() else f"{name}-v0"
         if env_id in gymnasium.registry:
             return gymnasium.registry[env_id]
@@ -89,9 +90,19 @@ def register(name: str, scenario: Scenario | None = None) -> str:
     return spec.id
 
 
-def make(name: str, **kwargs: Any) -> gymnasium.Env:
-    """:func:`gymnasium.make` for any id of ours, registered or not, with or without its version."""
-    return gymnasium.make(env_spec(name), **kwargs)
+def make(name: str | Scenario, **kwargs: Any) -> gymnasium.Env:
+    """:func:`gymnasium.make` for any id of ours, registered or not, with or without its version.
+
+    :param name: as for :func:`env_spec`
+    :raises ValueError: unknown names, bad values, or ``observe={"remaining": ...}`` is not the
+        time limit
+    """
+    env = gymnasium.make(env_spec(name), **kwargs)
+    limit = None if env.spec is None else env.spec.max_episode_steps
+    ours = env.unwrapped
+    if isinstance(ours, GuardEnv) and limit is not None:
+        ours.engine.extras.check_limit(limit)
+    return env
 
 
 for _env_id in env_ids():

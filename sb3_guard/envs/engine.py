@@ -29,6 +29,7 @@ from sb3_guard.envs.layout import (
     Rectangle,
     arrange,
     check_locations,
+    farthest,
     redraw,
 )
 from sb3_guard.envs.parameters import Parameters, check_count, param
@@ -56,6 +57,14 @@ class Layout(Parameters):
     )
     margin: float = param(0.0, "extra distance between any two objects, m", low=0)
     randomize: bool = param(True, "false: every episode of a row begins and goes on alike")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.placements:
+            raise ValueError(
+                "layout.placements = () must hold at least one rectangle, [x low, y low, x high, "
+                "y high] in m; leave it out for the arena, [[-2, -2, 2, 2]]"
+            )
 
 
 @dataclass
@@ -244,6 +253,11 @@ class Engine:
         self._channels: dict[str, Channel] = {}
         for part in self.parts:
             for name, channel in part.channels().items():
+                if not isinstance(channel, Channel):
+                    raise ValueError(
+                        f"channels() of {part.name} gives {name!r} as {channel!r}: it must be a "
+                        "Channel, such as Channel(1, low=0.0, high=1.0, unit='m')"
+                    )
                 if name in self._channels:
                     raise ValueError(
                         f"{part.name} and another part both observe {name!r}; give the constraint, "
@@ -257,7 +271,11 @@ class Engine:
             self._slices[name] = slice(start, start + size)
             start += size
         self.observation_size = start
-        self._before = self.array("before", task.measure().shape[1:])
+        self._observed = False  # whether the parts' observations have been found to be in order
+        measure = np.shape(task.measure())
+        if measure[:1] != (self.num_envs,):
+            raise ValueError(_misshapen(task, "measure()", measure, (self.num_envs, "M")))
+        self._before = self.array("before", measure[1:])
         self._warnings = self.batch.warning[:, _BAD, 1]  # live counts since the batch was made
         self._warned = self._warnings.copy()
 
@@ -270,6 +288,10 @@ class Engine:
     def places(self, name: str) -> Array:
         """The live places of footprint ``name``, [N, num, 3] m."""
         return self._arrays[f"places/{name}"]
+
+    def farthest(self, one: str, other: str) -> float:
+        """Greatest distance in the plane at which two footprints may begin, m."""
+        return farthest(self.footprints[one], self.footprints[other])
 
     def redraw(self, name: str, row: int) -> bool:
         """Draw the first object of footprint ``name`` anew in one row.
@@ -359,6 +381,7 @@ class Engine:
                 bits = self.rngs[row].bit_generator
                 bits.state = self._origins.setdefault(row, bits.state)
         pending = ids
+        spoilt = np.zeros(1 + len(self.constraints), dtype=int)  # starts, by who spoilt them
         for _ in range(CLEAN_STARTS):
             self.batch.reset(pending, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
             for row in pending.tolist():
@@ -367,17 +390,23 @@ class Engine:
             for part in self.parts:
                 part.reset(pending, self.rngs)
             self.batch.forward(pending, stage=STAGE)
-            blemish = self.task.blemished()
-            for constraint in self.constraints:
-                blemish = blemish | (constraint.cost() > 0)
-            pending = pending[blemish[pending]]
+            blemishes: Array = np.array(
+                [
+                    self._per_row(self.task, "blemished()", self.task.blemished(), bool),
+                    *(self._per_row(c, "cost()", c.cost()) > 0 for c in self.constraints),
+                ]
+            )  # [parts, N]
+            pending = pending[np.logical_or.reduce(blemishes)[pending]]
             if not len(pending):
                 break
+            spoilt += blemishes[:, pending].sum(axis=1)
         else:
-            names = ", ".join(part.name for part in (self.task, *self.constraints))
+            reasons = [f"{self.task.name}: {self.task.spoils}"]
+            reasons += [f"{c.name}: the robot pays for them at once" for c in self.constraints]
+            found = "; ".join(reasons[i] for i in np.argsort(-spoilt).tolist() if spoilt[i])
             raise LayoutError(
-                f"every start of {CLEAN_STARTS} has a cost or its goal reached: "
-                f"make {names} smaller or fewer, or their keepout larger"
+                f"none of {CLEAN_STARTS} layouts lets an episode begin clean ({found}): make size "
+                "or num smaller, or keepout or placements larger"
             )
         self._before[ids] = self.task.measure()[ids]
         self._warned[ids] = self._warnings[ids]
@@ -387,8 +416,44 @@ class Engine:
         """The flat observation of every row, [N, D] float32, a new array."""
         seen: dict[str, Array] = {}
         for part in self.parts:
-            seen.update(part.observe())
+            if self._observed:
+                seen.update(part.observe())
+            else:
+                seen.update(self._checked_observation(part))
+        self._observed = True
         return np.concatenate([seen[name] for name in self._slices], axis=1, dtype=np.float32)
+
+    def _checked_observation(self, part: Part) -> dict[str, Array]:
+        """What a part observes.
+
+        :raises ValueError: it is not what its ``channels`` say
+        """
+        seen, channels = part.observe(), part.channels()
+        for name in channels.keys() - seen.keys():
+            raise ValueError(
+                f"channels() of {part.name} names {name!r}, but observe() does not return it"
+            )
+        for name, value in seen.items():
+            if name not in channels:
+                raise ValueError(
+                    f"observe() of {part.name} returns {name!r}, which has no channel: add "
+                    f"{name!r}: Channel(size) to what its channels() returns"
+                )
+            expected = (self.num_envs, channels[name].size)
+            if np.shape(value) != expected:
+                verb = f"observe()[{name!r}]"
+                raise ValueError(_misshapen(part, verb, np.shape(value), expected))
+        return seen
+
+    def _per_row(self, part: Part, verb: str, value: Any, dtype: type = float) -> Array:
+        """What a verb of a part gave, [N], a copy: the part may keep and change its own.
+
+        :raises ValueError: it has another shape
+        """
+        out: Array = np.array(value, dtype=dtype)
+        if out.shape != (self.num_envs,):
+            raise ValueError(_misshapen(part, verb, out.shape, (self.num_envs,)))
+        return out
 
     def step(self, actions: Array) -> Outcome:
         """Advance every row by one control step.
@@ -425,10 +490,10 @@ class Engine:
         self.steps += 1
 
         now = self.task.measure()
-        reward = self.task.reward(self._before, now)
+        reward = self._per_row(self.task, "reward()", self.task.reward(self._before, now))
         reward = np.minimum(np.maximum(reward, -REWARD_LIMIT), REWARD_LIMIT)
-        costs = {f"cost_{c.name}": c.cost() for c in self.constraints}
-        met = self.task.succeeded(now)
+        costs = {f"cost_{c.name}": self._per_row(c, "cost()", c.cost()) for c in self.constraints}
+        met = self._per_row(self.task, "succeeded()", self.task.succeeded(now), bool)
         unplaced = np.zeros(self.num_envs, dtype=bool)
         if np.count_nonzero(diverged):  # any() takes three times as long
             met = met & ~diverged
@@ -436,7 +501,12 @@ class Engine:
             for cost in costs.values():
                 cost[diverged] = 0.0
         total = np.zeros(self.num_envs)
-        for cost in costs.values():
+        for name, cost in costs.items():
+            if np.count_nonzero(cost >= 0.0) < self.num_envs:
+                raise ValueError(
+                    f"{name} is {cost[~(cost >= 0.0)][0]}: a cost must be at least 0; what is "
+                    "good belongs into the task's reward"
+                )
             total += cost
         terminated = diverged.copy()
         self._before[:] = now
@@ -478,6 +548,15 @@ class Engine:
         self.batch.forward(stage=STAGE)
         self._warned[:] = self._warnings
         self._begun = bool((self.steps >= 0).all())
+
+
+def _misshapen(part: Part, verb: str, shape: tuple[Any, ...], expected: tuple[Any, ...]) -> str:
+    """An error message about what a part's verb gave."""
+    words = f"({', '.join(map(str, expected))}{',' * (len(expected) == 1)})"
+    return (
+        f"{verb} of {part.name} has shape {shape}, expected {words}: one row for each simulation "
+        "of the batch"
+    )
 
 
 def _generator(state: Mapping[str, Any]) -> np.random.Generator:

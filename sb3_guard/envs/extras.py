@@ -20,7 +20,8 @@ class Extras(Part):
     The time limit is not the engine's: :func:`gymnasium.make` puts it around a lone environment,
     which is not told. ``remaining`` therefore states the length of an episode itself, and a lone
     environment and a row of a batch observe the same. Where it contradicts the limit it is refused:
-    by the vector environment when it is made, by a lone one in an episode that goes on longer.
+    by the vector environment and by ``sb3_guard.make`` when they are made, by a lone one that
+    :func:`gymnasium.make` made in an episode that goes on longer.
     """
 
     name = "observe"
@@ -37,6 +38,14 @@ class Extras(Part):
     camera: tuple[int, int] | None = param(
         None, "width and height, pixels, of an image from the robot; needs flatten=False", low=1
     )
+
+    def __post_init__(self) -> None:
+        if isinstance(self.remaining, bool):
+            raise ValueError(
+                f"observe.remaining = {self.remaining!r} must be the number of steps of an "
+                "episode, the same as max_episode_steps, such as 1000; or null"
+            )
+        super().__post_init__()
 
     def check_limit(self, steps: int) -> None:
         """

@@ -28,7 +28,11 @@ def as_scenario(
         is_file = scenario.endswith((".yml", ".yaml"))
         scenario = Scenario.load(scenario) if is_file else Scenario.parse(scenario)
     elif isinstance(scenario, Mapping):
-        scenario = Scenario(**scenario)
+        scenario = Scenario.from_dict(scenario)
+    elif not isinstance(scenario, Scenario):
+        raise ValueError(
+            f"scenario = {scenario!r} must be an id, a YAML file, a Scenario or its plain data"
+        )
     return scenario.override(**params) if params else scenario
 
 

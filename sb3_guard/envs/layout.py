@@ -44,6 +44,7 @@ class Footprint:
     :param reach: greatest distance of (x, y, z) from the robot's base, m
     :param base: where that is, (x, y) m
     :param mover: whether it moves by itself, so that a new goal may ignore it in need
+    :param redrawn: whether the first object is drawn anew within an episode
     """
 
     name: str
@@ -56,14 +57,16 @@ class Footprint:
     reach: float = math.inf
     mover: bool = False
     base: tuple[float, float] = (0.0, 0.0)
+    redrawn: bool = False
 
     def __post_init__(self) -> None:
+        drawn = len(self.locations) < self.num or self.redrawn
         for r in self.placements:
             if len(r) != 4 or not (r[0] < r[2] and r[1] < r[3]):
                 raise ValueError(
                     f"{self.name}: a placement must be (x low, y low, x high, y high), got {r}"
                 )
-            if min(r[2] - r[0], r[3] - r[1]) < 2 * self.keepout and not self.locations:
+            if min(r[2] - r[0], r[3] - r[1]) < 2 * self.keepout and drawn:
                 raise ValueError(
                     f"{self.name}: keepout {self.keepout} does not fit the placement {r}; "
                     "make the placement larger or the keepout smaller"
@@ -82,6 +85,15 @@ class Footprint:
                     f"{self.name}: {where} is out of the robot's reach: {gap:.2f} m from its base "
                     f"at {self.base} even at the lowest height, {low} m; it reaches {self.reach} m"
                 )
+        if self.placements and drawn and math.isfinite(self.reach):
+            gap = math.hypot(self._nearest, low)
+            if gap > self.reach:
+                raise ValueError(
+                    f"{self.name}: placements {list(self.placements)} are out of the robot's "
+                    f"reach: with keepout {self.keepout} m their nearest point is {gap:.2f} m from "
+                    f"its base at {self.base}; it reaches {self.reach} m: move them nearer, or the "
+                    "base with robot={'locations': [[x, y]]}"
+                )
 
     @functools.cached_property
     def _room(self) -> tuple[Array, Array, Array]:
@@ -91,6 +103,23 @@ class Footprint:
         span = np.maximum(boxes[:, 2:] - self.keepout - low, 0.0)
         area = span[:, 0] * span[:, 1] + 1e-12
         return low, span, area / area.sum()
+
+    @property
+    def _nearest(self) -> float:
+        """Distance in the plane of the base from the nearest place to draw a centre in, m."""
+        low, span, _ = self._room
+        away = np.maximum(np.maximum(low - self.base, self.base - (low + span)), 0.0)
+        return float(np.hypot(*away.T).min())
+
+    @property
+    def corners(self) -> Array:
+        """The outermost places that a centre can have when an episode begins, [n, 2] m."""
+        fixed = np.array(self.locations).reshape(-1, 2)
+        if len(self.locations) == self.num:
+            return fixed
+        low, span, _ = self._room
+        drawn = [low + span * share for share in ((0, 0), (0, 1), (1, 0), (1, 1))]
+        return np.concatenate([fixed, *drawn])
 
     def draw(self, rng: np.random.Generator, n: int) -> Array:
         """``n`` uniform centres, [2, n] m."""
@@ -172,10 +201,13 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
     if queue:
         crowded = max(failures, key=lambda name: failures[name])
         f = next(f for f in footprints if f.name == crowded)
+        near = ""
+        if math.isfinite(f.reach):
+            near = f" within the robot's reach, {f.reach} m around its base at {f.base},"
         raise LayoutError(
             f"{crowded} cannot be placed: {f.num} objects with keepout {f.keepout} m find no room "
-            f"in {list(f.placements)} beside the other parts; reduce num or keepout, or widen "
-            "placements"
+            f"in {list(f.placements)}{near} beside the other parts; reduce "
+            f"{'num, keepout or height' if near else 'num or keepout, or widen placements'}"
         )
     out, k = {}, 0
     for f in footprints:
@@ -183,6 +215,12 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         out[f.name] = np.column_stack([centres, f.elevate(rng, centres)])
         k += f.num
     return out
+
+
+def farthest(one: Footprint, other: Footprint) -> float:
+    """Greatest distance in the plane at which two groups' objects may begin, m; 0 of none."""
+    offset = one.corners[:, None] - other.corners  # [n, m, 2] m
+    return float(np.hypot(offset[..., 0], offset[..., 1]).max(initial=0.0))
 
 
 def _square_distance(draws: Array, xy: Array) -> Array:

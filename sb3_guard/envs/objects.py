@@ -32,6 +32,22 @@ from sb3_guard.envs.sensors import Channel
 BOX = mujoco.mjtGeom.mjGEOM_BOX
 CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
 SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
+MOST = 1000  # objects in a group: layouts compare every pair
+
+
+def check_cover(label: str, keepout: float, cover: float) -> None:
+    """Refuse a keep-out that lets solid objects begin inside each other.
+
+    :param label: what the keep-out is called
+    :param keepout: m
+    :param cover: radius that a solid object takes up, m
+    :raises ValueError: names the least that is allowed
+    """
+    if keepout < cover - 1e-9:  # rounding
+        raise ValueError(
+            f"{label} = {keepout!r} lets solid objects begin inside each other: it must be at "
+            f"least {math.ceil(1000 * cover - 1e-6) / 1000:g}; or leave it out for what covers them"
+        )
 
 
 class Bodies:
@@ -148,10 +164,10 @@ class Spatial(Part):
         if self.height[0] > self.height[1]:
             raise ValueError(f"{self.name}.height = {self.height!r} must be (low, high), in metres")
 
-    def check_height(self, sim: Simulation, size: float, all_of_it: bool) -> None:
+    def check_height(self, sim: Simulation, near: float, all_of_it: bool) -> None:
         """Refuse to hang what a robot on the floor cannot get to.
 
-        :param size: how near to the objects the robot has to come, m
+        :param near: how near to the objects the robot's position has to come, m
         :param all_of_it: whether this has to be so at every height of the range, not only at one
         :raises ValueError: names the heights that are near enough
         """
@@ -159,12 +175,28 @@ class Spatial(Part):
             return
         z, (low, high) = sim.robot.altitude, self.height
         gap = max(z - low, high - z) if all_of_it else max(z - high, low - z)
-        if gap >= size:
+        if gap >= near:
             raise ValueError(
                 f"{self.name}.height = {self.height!r} is out of reach: the robot's position is "
-                f"{z:.2f} m above the floor, and with size {size} only heights between "
-                f"{max(z - size, 0.0):.2f} and {z + size:.2f} m count; set {self.name}="
-                f"{{'height': [low, high]}} within these, or {{'space': 'planar'}}"
+                f"{z:.2f} m above the floor, and only heights between {max(z - near, 0.0):.2f} and "
+                f"{z + near:.2f} m count; set {self.name}={{'height': [low, high]}} within these, "
+                "or {'space': 'planar'}"
+            )
+
+    def check_size(self, sim: Simulation, footprint: str, size: float) -> None:
+        """Refuse what would hold the robot wherever an episode began.
+
+        :param footprint: where the objects are placed
+        :param size: their radius, m
+        :raises ValueError: names the size below which it does not
+        """
+        z, (low, high) = sim.robot.altitude, self.height
+        rise = 0.0 if self.planar else max(abs(z - low), abs(z - high))
+        far = math.hypot(sim.farthest(footprint, "robot") + sim.robot.aside, rise)
+        if size >= far:
+            raise ValueError(
+                f"{self.name}.size = {size} holds the robot wherever an episode begins: it is at "
+                f"most {far:.2f} m away; make size smaller, or placements larger"
             )
 
 
@@ -176,21 +208,41 @@ class Objects(Part):
     can be crossed is a disc on the floor or a sphere in the air.
     """
 
-    num: int = param(8, "number of objects", low=0)
+    num: int = param(8, "number of objects", low=0, high=MOST)
     size: float = param(0.3, "radius of an object, m", above=0)
-    keepout: float = param(0.4, "radius kept clear around an object, m", low=0)
+    keepout: float | None = param(
+        None, "radius kept clear around an object, m; null: 0.4, or what covers a solid one", low=0
+    )
     locations: tuple[tuple[float, float], ...] = param((), "fixed places (x, y), m")
     placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
     margin: float = param(0.0, "extra distance to every other object, m", low=0)
 
+    usual_keepout: ClassVar[float] = 0.4  # m, of objects that it covers
     free: ClassVar[bool] = False  # whether solid objects can be pushed
     mover: ClassVar[bool] = False  # whether they leave their places
     reachable: ClassVar[bool] = False  # whether they lie within the robot's reach
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.solid and self.keepout is not None:
+            check_cover(f"{self.name}.keepout", self.keepout, self.cover)
 
     @property
     def group(self) -> str:
         """What the objects are called in layouts, observations and bodies."""
         return self.name
+
+    @property
+    def cover(self) -> float:
+        """Radius around its place that a solid object never leaves, m."""
+        return self.size
+
+    @property
+    def clear(self) -> float:
+        """Radius kept clear around an object when it is placed, m."""
+        if self.keepout is not None:
+            return self.keepout
+        return max(self.usual_keepout, self.cover) if self.solid else self.usual_keepout
 
     def shape(self, body: mujoco.MjsBody) -> None:
         """Add the geoms of a solid object, whose frame is its place."""
@@ -201,7 +253,7 @@ class Objects(Part):
             Footprint(
                 self.group,
                 self.num,
-                self.keepout,
+                self.clear,
                 self.placements,
                 self.locations,
                 self.margin,
@@ -290,7 +342,9 @@ class Movers(Spatial, Objects):
     :meth:`law` of motion. Their z stays within ``height``.
     """
 
-    keepout: float = param(0.5, "radius kept clear around an object, m", low=0)
+    keepout: float | None = param(
+        None, "radius kept clear around an object, m; null: 0.5, or what covers a solid one", low=0
+    )
     solid: bool = param(False, "whether they are bodies that push; false: the robot passes through")
     speed: float = param(
         1e-3, "m per control step; what the other speeds default to multiples of", low=0
@@ -304,6 +358,7 @@ class Movers(Spatial, Objects):
     r0: float = param(2.5, "radius around the origin that they do not leave, m", low=0)
     origin: tuple[float, float, float] = param((0.0, 0.0, 0.0), "where home is, (x, y, z) m")
 
+    usual_keepout = 0.5
     mover = True
 
     def build(self, world: World) -> None:

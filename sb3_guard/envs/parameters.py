@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -96,9 +97,16 @@ def in_words(kind: Any, many: bool = False) -> str:
     return _WORDS[kind][many] if kind in _WORDS else getattr(kind, "__name__", str(kind))
 
 
-def _tuples(value: Any) -> Any:
-    """Lists as tuples, since JSON and YAML have only lists."""
-    return tuple(map(_tuples, value)) if isinstance(value, (list, tuple)) else value
+_EXPONENT = re.compile(r"[-+]?\d+\.?\d*[eE][-+]?\d+")
+
+
+def _plain(value: Any) -> Any:
+    """Lists and arrays as tuples; text such as 2e-3, a number that YAML does not know, as one."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return tuple(map(_plain, value))
+    return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value
 
 
 class Parameters:
@@ -113,7 +121,7 @@ class Parameters:
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = _tuples(getattr(self, f.name))
+            value = _plain(getattr(self, f.name))
             object.__setattr__(self, f.name, value)
             label = f"{self.name or type(self).__name__}.{f.name}"
             if not _matches(value, hints[f.name]):

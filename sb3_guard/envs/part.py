@@ -19,8 +19,9 @@ engine's state can be saved and restored whole.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any, ClassVar, Protocol, Self
 
 import mujoco
 import numpy as np
@@ -65,6 +66,9 @@ class Simulation(Protocol):
     def places(self, name: str) -> Array:
         """The live places of footprint ``name``, [N, num, 3] m, redrawn at every reset."""
 
+    def farthest(self, one: str, other: str) -> float:
+        """Greatest distance in the plane at which two footprints may begin, m."""
+
     def redraw(self, name: str, row: int) -> bool:
         """Draw footprint ``name`` anew in one row, clear of everything's current place."""
 
@@ -106,6 +110,17 @@ class Part(Parameters):
     height: tuple[float, float]  # m, range of z in space
     solid: bool = False  # whether its objects are bodies that the robot bumps into
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
+
+    @classmethod
+    def from_params(cls, params: Mapping[str, Any]) -> Self:
+        known = {f.name for f in fields(cls)}  # type: ignore[arg-type]
+        if isinstance(params, Mapping) and "space" in params and "space" not in known:
+            if len(cls.spaces) == 1:
+                raise ValueError(
+                    f"{cls.name}.space = {params['space']!r} cannot be set: its space is always "
+                    f"{cls.spaces[0]}, whatever the robot's workspace; leave it out"
+                )
+        return super().from_params(params)
 
     def footprints(self) -> tuple[Footprint, ...]:
         """What has to be placed when an episode begins."""
@@ -158,6 +173,8 @@ class Robot(Part):
     root: ClassVar[str]  # name of the outermost body in the compiled world
     reach: ClassVar[float] = math.inf  # m from its base: where goals and hazards make sense
     altitude: float = 0.0  # m, z of its position when an episode begins
+    aside: float = 0.0  # m, distance of that position from its place in the plane
+    extent: float = math.inf  # m, how far from its position its body may reach in any pose
     action_size: int
 
     @property
@@ -196,6 +213,7 @@ class Task(Part):
     targets: str  # "one" or "many"
     bonus: float = 0.0  # reward for success, added after the dense reward is clipped
     ends: bool = False  # whether success ends the episode instead of drawing a new goal
+    spoils: ClassVar[str] = "its goal is reached at once"  # why an episode is drawn again
 
     def measure(self) -> Array:
         """The distances that the reward is made of, [N, M] m."""

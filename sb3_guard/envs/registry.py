@@ -6,6 +6,9 @@ Adding one to its table here, or with :func:`register_robot`, :func:`register_ta
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
+import math
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -79,10 +82,13 @@ def register_robot(
     :param robot: a :class:`~sb3_guard.envs.part.Robot` class
     :param xml: or the robot's MJCF file, by the conventions of
         :class:`~sb3_guard.envs.robots.robot.MJCFRobot`
-    :param attributes: with ``xml``, class attributes such as ``timestep`` and ``workspace``
-    :raises ValueError: neither or both of ``robot`` and ``xml`` are given, or the name is not
-        usable
+    :param attributes: with ``xml``, class attributes: ``timestep`` (s, of one physics step; 0.002),
+        ``workspace`` (``"planar"``), ``lidar_bodies`` (``("robot",)``), ``center`` (the body whose
+        origin is the robot's position; ``"robot"``), ``reach`` (m; infinite)
+    :raises ValueError: neither or both of ``robot`` and ``xml`` are given, an attribute is unknown
+        or bad, or the name is not usable
     """
+    _check_name(name)
     if (robot is None) == (xml is None):
         raise ValueError(f"robot {name!r} needs a class or an xml file, not both and not neither")
     if robot is None:
@@ -93,42 +99,114 @@ def register_robot(
         for key in attributes:
             if key not in known:
                 raise ValueError(f"robot {name!r} has no {key!r}: {did_you_mean(key, known)}")
-        timestep = attributes.get("timestep", 0.002)
-        if not isinstance(timestep, float) or not timestep > 0:
-            raise ValueError(f"robot {name!r}: timestep = {timestep!r} must be a positive float, s")
-        if attributes.get("workspace", "planar") not in ("planar", "spatial"):
-            raise ValueError(
-                f"robot {name!r}: workspace = {attributes['workspace']!r} must be 'planar' or "
-                "'spatial'"
-            )
         body = {"asset": "", "timestep": 0.002, **attributes, "path": classmethod(lambda cls: file)}
         robot = type(name, (MJCFRobot,), body)
     elif attributes:
         raise ValueError(f"robot {name!r}: {sorted(attributes)} go with xml, not with a class")
-    _add(ROBOTS, name, robot, Robot)
+    _check_class(name, robot, Robot)
+    _check_robot(name, robot)
+    _add(ROBOTS, name, robot)
+
+
+def _check_robot(name: str, robot: type[Robot]) -> None:
+    """Refuse attributes of a robot that are missing or that no robot can have."""
+
+    def positive(value: Any) -> bool:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0
+
+    timestep: Any = getattr(robot, "timestep", None)
+    if not positive(timestep) or math.isinf(timestep):
+        raise ValueError(
+            f"robot {name!r}: timestep = {timestep!r} must be a positive number of seconds, such "
+            "as 0.002"
+        )
+    workspace = getattr(robot, "workspace", None)
+    if workspace not in ("planar", "spatial"):
+        raise ValueError(f"robot {name!r}: workspace = {workspace!r} must be 'planar' or 'spatial'")
+    reach: Any = robot.reach
+    if not positive(reach):
+        raise ValueError(
+            f"robot {name!r}: reach = {reach!r} must be a positive number of metres; leave it out "
+            "for a robot that can go anywhere"
+        )
+    if not issubclass(robot, MJCFRobot):
+        return
+    bodies = robot.lidar_bodies
+    if not isinstance(bodies, (list, tuple)) or not bodies or not all(_is_text(b) for b in bodies):
+        raise ValueError(
+            f"robot {name!r}: lidar_bodies = {bodies!r} must be a list of names of bodies, such as "
+            "['robot']"
+        )
+    if not _is_text(robot.center):
+        raise ValueError(f"robot {name!r}: center = {robot.center!r} must be the name of a body")
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
 
 
 def register_task(name: str, task: type[Task]) -> None:
-    """Make a task known under ``name`` to ids, scenarios and commands."""
-    _add(TASKS, name, task, Task)
+    """Make a task known under ``name`` to ids, scenarios and commands.
+
+    :raises ValueError: the class is no task, or not a whole one, or the name is not usable
+    """
+    _check_name(name)
+    _check_class(name, task, Task, "reward")
+    _add(TASKS, name, task)
 
 
 def register_constraint(name: str, constraint: type[Constraint]) -> None:
-    """Make a constraint known under ``name`` to ids, scenarios and commands."""
-    _add(CONSTRAINTS, name, constraint, Constraint)
+    """Make a constraint known under ``name`` to ids, scenarios and commands.
+
+    :raises ValueError: the class is no constraint, or not a whole one, or the name is not usable
+    """
+    _check_name(name)
+    _check_class(name, constraint, Constraint, "cost")
+    _add(CONSTRAINTS, name, constraint)
 
 
-def _add(table: dict[str, Any], name: str, part: type, kind: type) -> None:
-    if not isinstance(part, type) or not issubclass(part, kind):
-        raise ValueError(f"{name!r} = {part!r} must be a subclass of {kind.__name__}")
-    for other in table:
-        if name.lower() == other.lower() and table[other] is not part:
-            raise ValueError(
-                f"a {kind.__name__.lower()} called {other!r} is known already: use another name"
-            )
-    if not name.isidentifier() or not name.isascii() or "_" in name:
+def _check_name(name: Any) -> None:
+    if not _is_text(name) or not name.isidentifier() or not name.isascii() or "_" in name:
         raise ValueError(
             f"{name!r} cannot be part of an id: use letters and digits, a letter first and no "
             "underscore"
         )
+
+
+def _check_class(name: str, part: Any, kind: type, verb: str = "") -> None:
+    """Refuse what cannot be used as a part of this kind.
+
+    :param verb: a method that it must have of its own
+    """
+    if not isinstance(part, type) or not issubclass(part, kind):
+        given = getattr(part, "__name__", repr(part))
+        raise ValueError(f"{name!r} = {given} must be a subclass of {kind.__name__}")
+    parameters = [
+        key for key, what in inspect.get_annotations(part).items() if "ClassVar" not in str(what)
+    ]
+    decorated = "__dataclass_params__" in vars(part)
+    if not dataclasses.is_dataclass(part) or (parameters and not decorated):
+        unread = f": its parameters {', '.join(parameters)} are not read" if parameters else ""
+        raise ValueError(
+            f"class {part.__name__} is not a dataclass{unread}; write @dataclass in the line above "
+            f"class {part.__name__}"
+        )
+    if verb and getattr(part, verb) is getattr(kind, verb):
+        raise ValueError(f"class {part.__name__} must define {verb}(), as every {kind.__name__}")
+
+
+def _add(table: dict[str, Any], name: str, part: type) -> None:
+    """Make a part known; one that is defined again, as by a notebook's cell, takes its place."""
+    for other, known in table.items():
+        if name.lower() == other.lower() and not (name == other and _same(part, known)):
+            raise ValueError(f"{other!r} is known already, as another class: use another name")
+    if not part.name:  # type: ignore[attr-defined]
+        part.name = name.lower()  # type: ignore[attr-defined]
     table[name] = part
+
+
+def _same(part: type, other: type) -> bool:
+    """Whether two classes have one source."""
+    if issubclass(part, MJCFRobot) and issubclass(other, MJCFRobot) and part.path() != other.path():
+        return False
+    return (part.__module__, part.__qualname__) == (other.__module__, other.__qualname__)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from sb3_guard.envs.engine import Engine, Layout
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.sensors import Lidar
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.spelling import did_you_mean, nearest
 
 _ID = re.compile(
     r"(?P<task>[A-Za-z][A-Za-z0-9]*)_(?P<robot>[A-Za-z][A-Za-z0-9]*)"
@@ -28,17 +28,28 @@ Params = Mapping[str, Any]
 
 
 def _plain(value: Any) -> Any:
-    """The same as JSON would give back: lists for tuples, dictionaries for mappings."""
+    """The same as JSON would give back: lists for tuples and arrays, dictionaries for mappings."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(v) for v in value]
-    return value.item() if isinstance(value, np.generic) else value
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def _filled(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Without the keys that a YAML file leaves blank, at any depth: they keep their defaults."""
+    return {
+        key: _filled(value) if isinstance(value, Mapping) else value
+        for key, value in data.items()
+        if value is not None
+    }
 
 
 @dataclass(frozen=True)
 class Scenario:
     """A robot, a task and constraints, each with parameters that differ from their defaults.
+
+    None instead of any field is its default.
 
     :param robot: a name in :data:`~sb3_guard.envs.registry.ROBOTS`
     :param task: a name in :data:`~sb3_guard.envs.registry.TASKS`
@@ -62,13 +73,38 @@ class Scenario:
     observe: Params = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.robot not in ROBOTS:
-            raise ValueError(f"unknown robot {self.robot!r}: {did_you_mean(self.robot, ROBOTS)}")
-        if self.task not in TASKS:
-            raise ValueError(f"unknown task {self.task!r}: {did_you_mean(self.task, TASKS)}")
         for f in fields(self):
-            object.__setattr__(self, f.name, _plain(getattr(self, f.name)))
+            value = _plain(getattr(self, f.name))
+            if value is None:
+                value = {} if f.default is MISSING else f.default
+            object.__setattr__(self, f.name, value)
+        for kind, name, known in (("robot", self.robot, ROBOTS), ("task", self.task, TASKS)):
+            if not isinstance(name, str):
+                raise ValueError(
+                    f"{kind} = {name!r} must be a name, one of {', '.join(known)}; parameters go "
+                    f"into {kind}_params"
+                )
+            if name not in known:
+                raise ValueError(f"unknown {kind} {name!r}: {did_you_mean(name, known)}")
+        if not isinstance(self.constraints, Mapping):
+            raise ValueError(
+                f"constraints = {self.constraints!r} must be a mapping of names to parameters, "
+                "such as {'hazards': {'num': 8}}"
+            )
         self.parts()
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], label: str = "scenario") -> Scenario:
+        """The scenario of plain data, with the fields of this class as keys.
+
+        :param label: what an error message calls the data
+        :raises ValueError: unknown keys or bad values
+        """
+        known = list(cls.__dataclass_fields__)
+        for key in data:
+            if key not in known:
+                raise ValueError(f"{label} has no key {key!r}: {did_you_mean(key, known)}")
+        return cls(**data)
 
     @classmethod
     def parse(cls, name: str) -> Scenario:
@@ -83,23 +119,39 @@ class Scenario:
                 "such as 'Goal_Point_8Hazards-v0'"
             )
         known = {"robot": list(ROBOTS), "task": list(TASKS), "constraint": list(CONSTRAINTS)}
-        for kind, names in known.items():
-            if match[kind] not in names:
-                hint = did_you_mean(match[kind], names)
-                raise ValueError(f"unknown {kind} {match[kind]!r} in {name!r}: {hint}")
+        wrong = [kind for kind, names in known.items() if match[kind] not in names]
+        if wrong:
+            kind = wrong[0]
+            hint = did_you_mean(match[kind], known[kind])
+            near = {k: nearest(match[k], names) for k, names in known.items()}
+            if len(wrong) > 1 and all(near.values()):
+                meant = "{task}_{robot}_".format(**near) + match["num"] + str(near["constraint"])
+                meant += match["noconti"] or ""
+                hint = f"did you mean {meant!r}? allowed: {', '.join(known[kind])}"
+            raise ValueError(f"unknown {kind} {match[kind]!r} in {name!r}: {hint}")
+        num = {"num": int(match["num"])}
+        if "num" not in CONSTRAINTS[match["constraint"]].__dataclass_fields__:  # type: ignore
+            if match["num"] != "1":
+                raise ValueError(
+                    f"{name!r}: {match['constraint']} has no parameter num, so that there is one "
+                    f"of it: write 1{match['constraint']}, or give its class a field num"
+                )
+            num = {}
         task = TASKS[match["task"]]
         if match["noconti"] and "ends" not in {f.name for f in fields(task)}:  # type: ignore
             raise ValueError(f"{match['task']} has no goal to end at: drop _noconti from {name!r}")
         return cls(
             robot=match["robot"],
             task=match["task"],
-            constraints={match["constraint"].lower(): {"num": int(match["num"])}},
+            constraints={match["constraint"].lower(): num},
             task_params={"ends": True} if match["noconti"] else {},
         )
 
     @classmethod
     def load(cls, path: str | Path) -> Scenario:
         """The scenario in a YAML file with the fields of this class as keys.
+
+        What is left blank has its default.
 
         :raises ValueError: the file is missing, is not YAML or holds unknown keys
         """
@@ -115,13 +167,10 @@ class Scenario:
                 f"scenario {str(path)!r} must be a mapping with keys such as robot and task, "
                 f"found {'nothing' if data is None else repr(data)}"
             )
-        known = list(cls.__dataclass_fields__)
-        for key in data:
-            if key not in known:
-                raise ValueError(
-                    f"scenario {str(path)!r} has no key {key!r}: {did_you_mean(key, known)}"
-                )
-        return cls(**data)
+        constraints = data.get("constraints")
+        if isinstance(constraints, dict):
+            data["constraints"] = {k: {} if v is None else v for k, v in constraints.items()}
+        return cls.from_dict(_filled(data), f"scenario {str(path)!r}")
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which ``Scenario(**data)`` makes this scenario again."""
@@ -158,9 +207,11 @@ class Scenario:
         tasks = {name.lower(): name for name in TASKS}
         for key, value in params.items():
             if value is not None and not isinstance(value, Mapping):
+                such = "{'size': 0.3}"
+                if key == "robot":
+                    such = "{'heading': 0.0}; the robot itself is chosen by the id"
                 raise ValueError(
-                    f"{key} = {value!r} must be a mapping of parameters, such as "
-                    f"{key}={{'size': 0.3}}"
+                    f"{key} = {value!r} must be a mapping of parameters, such as {key}={such}"
                 )
             if key in own:
                 name = own[key]
@@ -210,6 +261,12 @@ class Scenario:
             kind = str(params.pop("type", name)).lower()
             if kind not in by_name:
                 raise ValueError(f"unknown constraint {kind!r}: {did_you_mean(kind, by_name)}")
+            if name in by_name and kind != name:
+                raise ValueError(
+                    f"constraint {name!r} cannot be of type {kind!r}, since {name!r} is a type "
+                    f"itself: to have {kind} instead, write {name}=None and {kind}={{...}}; to "
+                    f"have both, {kind}={{...}}"
+                )
             constraint = by_name[kind].from_params(params)
             constraint.name = name  # type: ignore[misc]
             constraints.append(constraint)

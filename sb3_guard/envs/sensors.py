@@ -63,9 +63,9 @@ class Lidar(Parameters):
 
     name = "lidar"
 
-    bins: int = param(16, "directions in the plane", low=1)
-    azimuth: int = param(10, "directions around, in space", low=1)
-    elevation: int = param(6, "directions from down to up, in space", low=1)
+    bins: int = param(16, "directions in the plane", low=1, high=1000)
+    azimuth: int = param(10, "directions around, in space", low=1, high=1000)
+    elevation: int = param(6, "directions from down to up, in space", low=1, high=1000)
     gain: float = param(1.0, "decay of closeness exp(−gain · distance), 1/m", above=0)
     max_distance: float | None = param(
         None, "closeness falls linearly to 0 at this distance, m; null: exponentially", above=0

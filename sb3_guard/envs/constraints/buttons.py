@@ -28,9 +28,12 @@ class Buttons(Obstacles):
     space = "planar"
     spaces = ("planar",)
     solid = True
+    usual_keepout = 0.3
 
     size: float = param(0.1, "radius of a button, m", above=0)
-    keepout: float = param(0.3, "radius kept clear around a button, m", low=0)
+    keepout: float | None = param(
+        None, "radius kept clear around a button, m; null: 0.3, or what covers it", low=0
+    )
 
     def shape(self, body: mujoco.MjsBody) -> None:
         self.add_geom(body, SPHERE, (self.size,), lift=self.size)

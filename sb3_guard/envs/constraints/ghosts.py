@@ -35,8 +35,11 @@ class Ghosts(Movers, Obstacles):
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        if not self.solid:  # how far a robot's body reaches up is not known
-            self.check_height(sim, self.size, all_of_it=False)
+        self.check_height(
+            sim, self.size + (sim.robot.extent if self.solid else 0.0), all_of_it=False
+        )
+        if self.num and not self.solid:
+            self.check_size(sim, self.group, self.size)
 
     def law(self) -> motion.Law:
         return self._law(far=self.speed if self.v1 is None else self.v1, r1=self.r1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -29,11 +30,20 @@ class Gremlins(Obstacles):
     spaces = ("planar",)
     solid = True
     mover = True
+    usual_keepout = 0.5
 
     size: float = param(0.1, "half of an edge, m", above=0)
-    keepout: float = param(0.5, "radius kept clear around the middle of a circle, m", low=0)
+    keepout: float | None = param(
+        None,
+        "radius kept clear around the middle of a circle, m; null: 0.5, or what covers all of it",
+        low=0,
+    )
     travel: float = param(0.3, "radius of the circles, m", low=0)
     rate: float = param(1.0, "angular speed ω, rad per simulated second", low=0)
+
+    @property
+    def cover(self) -> float:
+        return self.travel + math.sqrt(2) * self.size
 
     def shape(self, body: mujoco.MjsBody) -> None:
         self.add_geom(body, BOX, (self.size, self.size, self.size), lift=self.size)

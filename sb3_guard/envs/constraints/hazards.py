@@ -26,3 +26,5 @@ class Hazards(Spatial, Obstacles):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self.check_height(sim, self.size, all_of_it=False)
+        if self.num:
+            self.check_size(sim, self.group, self.size)

@@ -22,9 +22,12 @@ class Pillars(Obstacles):
     space = "planar"
     spaces = ("planar",)
     solid = True
+    usual_keepout = 0.3
 
     size: float = param(0.2, "radius of a pillar, m", above=0)
-    keepout: float = param(0.3, "radius kept clear around a pillar, m", low=0)
+    keepout: float | None = param(
+        None, "radius kept clear around a pillar, m; null: 0.3, or what covers it", low=0
+    )
     half_height: float = param(0.5, "half of a pillar's height, m", above=0)
 
     def shape(self, body: mujoco.MjsBody) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -30,14 +31,21 @@ class Vases(Obstacles):
     spaces = ("planar",)
     solid = True
     free = True
+    usual_keepout = 0.15
 
     size: float = param(0.1, "half of an edge, m", above=0)
-    keepout: float = param(0.15, "radius kept clear around a vase, m", low=0)
+    keepout: float | None = param(
+        None, "radius kept clear around a vase, m; null: 0.15, or what covers it", low=0
+    )
     density: float = param(0.01, "kg/m³", above=0)
     displacement_weight: float = param(0.0, "cost per metre from its place", low=0)
     displacement_threshold: float = param(1e-3, "least displacement that costs, m", low=0)
     velocity_weight: float = param(1.0, "cost per m/s", low=0)
     velocity_threshold: float = param(1e-4, "least speed that costs, m/s", low=0)
+
+    @property
+    def cover(self) -> float:
+        return math.sqrt(2) * self.size
 
     def shape(self, body: mujoco.MjsBody) -> None:
         geom = self.add_geom(body, BOX, (self.size, self.size, self.size))

@@ -53,6 +53,36 @@ def as_slice(ids: list[int]) -> slice | list[int]:
     return slice(ids[0], ids[-1] + 1, step) if even else ids
 
 
+def _extent(model: mujoco.MjModel, root: int, center: int) -> float:
+    """How far from the origin of body ``center`` any geom may reach, whatever the joints do, m.
+
+    Joints of the root place the robot; one that lifts it has no bound.
+    """
+    reach = {root: 0.0}  # m, of a body's origin from the root's
+    outermost = 0.0
+    for body in range(root, model.nbody):
+        if body != root:
+            parent = int(model.body_parentid[body])
+            if parent not in reach:
+                continue
+            reach[body] = reach[parent] + float(np.linalg.norm(model.body_pos[body]))
+        first = int(model.body_jntadr[body])
+        for joint in range(first, first + int(model.body_jntnum[body])):
+            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+                if body == root and not model.jnt_axis[joint][2]:
+                    continue
+                if body == root or not model.jnt_limited[joint]:
+                    return math.inf
+                reach[body] += float(np.abs(model.jnt_range[joint]).max())
+            elif body != root:  # the origin turns about the anchor
+                reach[body] += 2 * float(np.linalg.norm(model.jnt_pos[joint]))
+        first = int(model.body_geomadr[body])
+        for geom in range(first, first + int(model.body_geomnum[body])):
+            size = float(np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom])
+            outermost = max(outermost, reach[body] + size)
+    return outermost + reach[center]
+
+
 @dataclass
 class MJCFRobot(Robot):
     """A robot described by an MJCF file.
@@ -88,6 +118,8 @@ class MJCFRobot(Robot):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.sensing == ():
+            raise ValueError("robot.sensing = () must name a body, or be null")
         if math.isfinite(self.reach) and self.placements:
             raise ValueError(
                 f"robot.placements = {self.placements!r}: a robot of limited reach stands at a "
@@ -110,6 +142,18 @@ class MJCFRobot(Robot):
             raise ValueError(f"{self.path()}: {' '.join(str(error).split())}") from None
         if robot.body("robot") is None:
             raise ValueError(f"{self.path()} has no body called 'robot': call its outermost so")
+        known = [body.name for body in robot.bodies if body.name and body is not robot.worldbody]
+        named = {
+            "lidar_bodies": self.lidar_bodies if self.sensing is None else (),
+            "robot.sensing": self.sensing or (),
+            "center": (self.center,),
+        }
+        for where, names in named.items():
+            for name in names:
+                if name not in known:
+                    raise ValueError(
+                        f"{where} names no body {name!r} of the robot: {did_you_mean(name, known)}"
+                    )
         joints = robot.body("robot").joints
         self._free = bool(joints) and joints[0].type == mujoco.mjtJoint.mjJNT_FREE
         if self._free:
@@ -141,6 +185,8 @@ class MJCFRobot(Robot):
         pose.qpos[: len(self._start)] = self._start
         mujoco.mj_kinematics(model, pose)
         self.altitude = float(pose.xpos[center, 2])
+        self.aside = math.dist(pose.xpos[center, :2], pose.qpos[:2] if self._free else (0.0, 0.0))
+        self.extent = _extent(model, model.body(self.root).id, center)
         if self._free:
             body = model.body(self.root).id
             address = int(model.jnt_qposadr[model.body_jntadr[body]])
@@ -152,15 +198,6 @@ class MJCFRobot(Robot):
             self._place = batch.bind("mocap_pos")[:, spawn]
             self._turn = batch.bind("mocap_quat")[:, spawn]
             self._attitude = np.array([1.0, 0.0, 0.0, 0.0])
-        bodies = [model.body(i).name for i in range(model.nbody)]
-        known = [name.removeprefix(PREFIX) for name in bodies if name.startswith(PREFIX)]
-        if self.sensing == ():
-            raise ValueError("robot.sensing = () must name a body, or be null")
-        for name in (*(self.sensing or self.lidar_bodies), self.center):
-            if name not in known:
-                raise ValueError(
-                    f"robot.sensing names no body {name!r}: {did_you_mean(name, known)}"
-                )
         ids = [model.body(PREFIX + name).id for name in self.sensing or self.lidar_bodies]
         rotation = batch.bind("xmat")  # [N, nbody, 9]
         self._bodies = as_slice(ids)

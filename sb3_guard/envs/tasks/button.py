@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs import geometry
-from sb3_guard.envs.objects import SPHERE, Objects
+from sb3_guard.envs.objects import MOST, SPHERE, Objects
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Generators, Painter, Simulation, Task
 from sb3_guard.envs.sensors import Channel
@@ -35,10 +35,13 @@ class Button(Objects, Task):
     spaces = ("planar",)
     solid = True
     reachable = True
+    usual_keepout = 0.3
 
-    num: int = param(4, "number of buttons", low=1)
+    num: int = param(4, "number of buttons", low=1, high=MOST)
     size: float = param(0.1, "radius of a button, m", above=0)
-    keepout: float = param(0.3, "radius kept clear around a button, m", low=0)
+    keepout: float | None = param(
+        None, "radius kept clear around a button, m; null: 0.3, or what covers it", low=0
+    )
     delay: int = param(10, "control steps in which no button counts after one was pressed", low=0)
     reward_distance: float = param(1.0, "reward per metre gained")
     bonus: float = param(1.0, "reward for pressing the lit button")

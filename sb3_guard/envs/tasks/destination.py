@@ -45,6 +45,7 @@ class Destination(Task):
                 height=0.0 if self.planar else self.height,
                 reach=self._reach,
                 base=self._base,
+                redrawn=not self.ends,
             ),
         )
 

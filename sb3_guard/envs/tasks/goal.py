@@ -25,6 +25,7 @@ class Goal(Spatial, Destination):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self.check_height(sim, self.size, all_of_it=True)
+        self.check_size(sim, "goal", self.size)
 
     def measure(self) -> Array:
         """Distance from the robot to the goal, [N, 1] m."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint
-from sb3_guard.envs.objects import BOX, SPHERE, Bodies, add_geom
+from sb3_guard.envs.objects import BOX, SPHERE, Bodies, add_geom, check_cover
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Generators, Simulation, World
 from sb3_guard.envs.sensors import Channel
@@ -52,6 +52,11 @@ class Push(Destination):
     )
     reward_approach: float = param(1.0, "reward per metre gained on the object")
     object_lidar: bool = param(False, "whether the object is also seen by a lidar")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.object_keepout is not None:
+            check_cover("push.object_keepout", self.object_keepout, self.object_radius)
 
     def footprints(self) -> tuple[Footprint, ...]:
         return (
@@ -99,6 +104,12 @@ class Push(Destination):
         super().bind(sim)
         self.bodies.bind(sim)
         self.center = self.bodies.positions[:, 0]  # [N, 3] m
+        far = sim.farthest("goal", self.object)
+        if self.size >= far:
+            raise ValueError(
+                f"push.size = {self.size} holds the {self.object} wherever an episode begins: it "
+                f"is at most {far:.2f} m away; make size smaller, or placements larger"
+            )
 
     def reset(self, ids: Array, rngs: Generators) -> None:
         self.bodies.put(ids, self.sim.places(self.object)[ids], rngs)

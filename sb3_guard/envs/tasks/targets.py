@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sb3_guard.envs.objects import Movers
+from sb3_guard.envs.objects import MOST, Movers
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Task
 
@@ -17,8 +17,9 @@ class Targets(Movers, Task):
     interactive = True
     contact = False
     targets = "many"
+    spoils = "a solid target touches the robot at once"
 
-    num: int = param(2, "number of targets", low=1)
+    num: int = param(2, "number of targets", low=1, high=MOST)
     r0: float = param(2.0, "radius around the origin that they do not leave, m", low=0)
     v1: float | None = param(None, "speed away from the robot; null: 10 speed", low=0)
 

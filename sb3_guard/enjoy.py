@@ -9,9 +9,10 @@ from typing import Any
 from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, positive, run
 
 EXAMPLES = """examples:
+  python -m sb3_guard.enjoy --pretrained
   python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards -f logs
   python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards --load-best --n-episodes 20
-  python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards --record agent.mp4
+  python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards --pretrained --record agent.mp4
 """
 
 DEFAULTS: dict[str, Any] = {
@@ -19,6 +20,7 @@ DEFAULTS: dict[str, Any] = {
     "env": "Goal_Point_8Hazards-v0",
     "folder": "logs",
     "exp_id": 0,
+    "pretrained": False,
     "load_best": False,
     "load_checkpoint": None,
     "load_last_checkpoint": False,
@@ -60,6 +62,9 @@ def parser() -> Parser:
     model = which.add_mutually_exclusive_group()
     model.add_argument("--load-best", action="store_true", help="the best model, safe first")
     model.add_argument(
+        "--pretrained", action="store_true", help="an agent that comes with the package"
+    )
+    model.add_argument(
         "--load-checkpoint", type=positive, metavar="STEPS", help="the model kept at so many steps"
     )
     model.add_argument(
@@ -98,7 +103,8 @@ def parser() -> Parser:
         nargs="?",
         const="",
         metavar="FILE.mp4",
-        help="write a video; no display is needed (default: beside the model)",
+        help="write a video; no display is needed (default: beside the model; of a pretrained "
+        "agent in the current folder)",
     )
     output.add_argument("--json", metavar="FILE", help="write the statistics there as JSON")
     output.add_argument("--no-render", action="store_true", help="open no window")
@@ -115,7 +121,13 @@ def _has_display() -> bool:
 
 
 def _enjoy(argv: Sequence[str] | None) -> int:
-    args = {**DEFAULTS, **vars(parser().parse_args(argv))}
+    given = vars(parser().parse_args(argv))
+    args = {**DEFAULTS, **given}
+    if args["pretrained"] and given.keys() & {"folder", "exp_id"}:
+        raise UsageError(
+            "--pretrained plays an agent that comes with the package: leave out --folder and "
+            "--exp-id, or leave out --pretrained to play a run of your own"
+        )
     if not 0 <= args["seed"] < 2**32:
         raise UsageError(f"--seed {args['seed']} is not allowed; it must be from 0 to 2**32 - 1")
     render_mode = "rgb_array" if args["record"] is not None else None

@@ -17,6 +17,8 @@ def test_a_wheel_installed_elsewhere_trains_and_plays(tmp_path):
     site = tmp_path / "site"
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
+        agents = [name for name in archive.namelist() if name.startswith("sb3_guard/pretrained/")]
+    assert sum(name.endswith("-v0.zip") for name in agents) == 4
     env = {**os.environ, "PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"}
 
     def run(*arguments):

@@ -22,8 +22,17 @@ from sb3_guard.zoo.environments import (
     choose_vec_env,
     make_envs,
 )
-from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run, require_writable
+from sb3_guard.zoo.run_folder import (
+    RunFolder,
+    folder_name,
+    latest_run,
+    require_writable,
+    run_path,
+)
 from sb3_guard.zoo.usage import UsageError, import_packages, one_line
+
+#: The trained agents that the package ships: a log folder, written by ``scripts/pretrain.py``.
+PRETRAINED = Path(__file__).parent.parent / "pretrained"
 
 
 def find_run(folder: str, algo: str, env_id: str, number: int = 0) -> RunFolder:
@@ -38,11 +47,32 @@ def find_run(folder: str, algo: str, env_id: str, number: int = 0) -> RunFolder:
     if number == 0:
         number = latest_run(parent, name)
         if number == 0:
+            ships = run_path(str(PRETRAINED), algo, env_id, 1).is_dir()
             raise UsageError(
                 f"there is no run of {algo} on {env_id} in {folder!r}; train one with: "
                 f"python -m sb3_guard.train --algo {algo} --env {env_id} -f {folder}"
+                + (", or play the package's own with --pretrained" if ships else "")
             )
     return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
+
+
+def find_pretrained(algo: str, env_id: str) -> RunFolder:
+    """
+    The run folder of an agent that the package ships.
+
+    :raises UsageError: it ships none of that kind; the message lists what there is
+    """
+    path = run_path(str(PRETRAINED), algo, env_id, 1)
+    if not path.is_dir():
+        shipped = ", ".join(
+            f"{one.parent.name} on {one.name.removesuffix('_1')}"
+            for one in sorted(PRETRAINED.glob("*/*_1"))
+        )
+        raise UsageError(
+            f"no trained agent of {algo} on {env_id} comes with the package; there are: "
+            f"{shipped}; train one with: python -m sb3_guard.train --algo {algo} --env {env_id}"
+        )
+    return RunFolder.open(path)
 
 
 def find_model(run: RunFolder, args: Mapping[str, Any]) -> tuple[Path, Path]:
@@ -112,7 +142,10 @@ def open_agent(args: Mapping[str, Any], render_mode: str | None) -> Agent:
     cls = algorithm(args["algo"])
     import_packages(args["gym_packages"])
     env_id, ours = canonical_id(args["env"])
-    run = find_run(args["folder"], args["algo"], env_id, args["exp_id"])
+    if args["pretrained"]:
+        run = find_pretrained(args["algo"], env_id)
+    else:
+        run = find_run(args["folder"], args["algo"], env_id, args["exp_id"])
     path, normalizer = find_model(run, args)
     setup = build(check(args["algo"], cls, run.hyperparams()))
     if args["num_threads"] > 0:
@@ -158,7 +191,9 @@ def play(args: Mapping[str, Any], render_mode: str | None) -> int:
     agent = open_agent(args, render_mode)
     video = None
     if args["record"] is not None:
-        video = Path(args["record"] or agent.path.with_suffix(".mp4"))
+        beside = agent.path.with_suffix(".mp4")
+        own = f"{args['algo']}-{beside.name}"  # the package's folder is not the user's to write to
+        video = Path(args["record"] or (own if args["pretrained"] else beside))
         _require_file(video, "--record")
     episodes = args["n_episodes"]
     if episodes is None and args["n_timesteps"] is None:

@@ -1,0 +1,39 @@
+"""A constraint of your own, beside those there are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_guard import TRPOLag, evaluate_policy, make_vec_env, register_constraint
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Constraint
+from sb3_guard.envs.sensors import Channel
+
+
+@dataclass
+class Fence(Constraint):
+    """The robot has to stay near the origin: every step outside costs 1."""
+
+    name = "fence"
+    trespassable, movable = True, "no"
+
+    radius: float = param(1.5, "distance from the origin that costs nothing, m", above=0)
+
+    def _room(self):  # [N] m, for all simulations at once; negative outside
+        return self.radius - np.linalg.norm(self.sim.robot.position[:, :2], axis=1)
+
+    def cost(self):
+        return (self._room() < 0).astype(float)
+
+    def observe(self):  # what cannot be seen cannot be learnt
+        return {"fence": self._room()[:, None]}
+
+    def channels(self):
+        return {"fence": Channel(1, unit="m")}
+
+
+register_constraint("Fence", Fence)
+env = make_vec_env("Goal_Point_4Hazards", 10, seed=0, env_kwargs={"fence": {"radius": 1.2}})
+model = TRPOLag("MlpPolicy", env, n_steps=1000, cost_keys=["cost_fence"], cost_limit=25, seed=0)
+model.learn(300_000)
+print("steps outside:", evaluate_policy(model, env, n_eval_episodes=10, seed=1).key_costs[:, 0])

@@ -1,0 +1,34 @@
+"""A robot of your own, from an MJCF file."""
+
+from pathlib import Path
+
+from sb3_guard import CPO, evaluate_policy, make_vec_env, register_robot
+
+Path("puck.xml").write_text("""
+<mujoco model="puck">
+  <worldbody>
+    <body name="robot" pos="0 0 0.1">
+      <joint name="x" type="slide" axis="1 0 0" damping="0.1"/>
+      <joint name="y" type="slide" axis="0 1 0" damping="0.1"/>
+      <geom type="cylinder" size="0.12 0.05" density="20" rgba="0.9 0.5 0.1 1"/>
+      <site name="robot" size="0.01"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push_x" joint="x" gear="0.1" ctrlrange="-1 1"/>
+    <motor name="push_y" joint="y" gear="0.1" ctrlrange="-1 1"/>
+  </actuator>
+  <sensor>
+    <velocimeter name="velocimeter" site="robot"/>
+  </sensor>
+</mujoco>
+""")
+register_robot("Puck", xml="puck.xml")
+
+# Every task and every constraint knows it now, and so do `sb3_guard.make` and the commands.
+env = make_vec_env("Goal_Puck_8Hazards", n_envs=10, seed=0)
+print(f"{env.observation_space.shape[0]} observations, {env.action_space.shape[0]} actions")
+model = CPO("MlpPolicy", env, n_steps=1000, cost_limit=5.0, seed=0)
+model.learn(300_000)
+evaluation = evaluate_policy(model, env, n_eval_episodes=10, seed=1)
+print(f"return {evaluation.returns.mean():.1f}, cost {evaluation.costs.mean():.2f}")

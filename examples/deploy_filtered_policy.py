@@ -1,0 +1,29 @@
+"""Train a policy with a safety layer, and run it where no trainer is."""
+
+import gymnasium
+import numpy as np
+
+from sb3_guard import TRPOSL, make_vec_env
+from sb3_guard.algorithms.common.policies import FilteredPolicy
+
+env = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=0)
+# From a third of the training on, the layer moves actions whose predicted cost is above 0.
+model = TRPOSL("MlpPolicy", env, n_steps=1000, seed=0).learn(300_000)
+model.policy.save("filtered_policy.pt")
+
+# The file holds the network and its layer: no algorithm, critic or environment is needed.
+policy = FilteredPolicy.load("filtered_policy.pt", device="cpu")
+plant = gymnasium.make("Goal_Point_8Hazards-v0")
+for filtered in (True, False):
+    policy.action_filter.active.fill_(filtered)
+    paid = 0.0
+    for seed in range(5):
+        obs, _ = plant.reset(seed=seed)
+        cost, over = 0.0, False
+        while not over:
+            # What the last step cost makes the layer's prediction exact; else it is estimated.
+            action, _ = policy.predict(obs, state=(np.array([[cost]]),), deterministic=True)
+            obs, _, terminated, truncated, info = plant.step(action)
+            cost, over = info["cost"], terminated or truncated
+            paid += cost
+    print(f"cost of an episode {'with' if filtered else 'without'} the layer: {paid / 5:.2f}")

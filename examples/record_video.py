@@ -1,0 +1,26 @@
+"""Film an agent, without a display."""
+
+import gymnasium
+import imageio_ffmpeg
+
+from sb3_guard import CPO
+from sb3_guard.zoo.playback import find_pretrained
+
+# camera: "fixed", "track" behind the robot, or "top"
+env = gymnasium.make(
+    "Goal_Point_8Hazards-v0", render_mode="rgb_array", width=640, height=480, camera="track"
+)
+model = CPO.load(find_pretrained("cpo", "Goal_Point_8Hazards-v0").model)  # or a file of your own
+
+video = imageio_ffmpeg.write_frames("point.mp4", (640, 480), fps=env.metadata["render_fps"])
+video.send(None)
+obs, _ = env.reset(seed=9)
+for _ in range(500):
+    action, _ = model.predict(obs, deterministic=True)
+    obs, reward, terminated, truncated, info = env.step(action)
+    video.send(env.render())
+    if terminated or truncated:
+        obs, _ = env.reset()
+video.close()
+env.close()
+print("point.mp4")

@@ -1,0 +1,20 @@
+"""Two constraints, each with a limit of its own."""
+
+from sb3_guard import CPO, evaluate_policy, make_vec_env
+
+costs = ("cost_hazards", "cost_ghosts")  # every constraint reports its own, and "cost" is the sum
+
+env = make_vec_env(
+    "Goal_Point_8Hazards",
+    n_envs=10,
+    seed=0,
+    env_kwargs={"ghosts": {"num": 4, "speed": 0.002}},  # a constraint more, m per control step
+    monitor_kwargs={"cost_keys": costs},
+)
+model = CPO("MlpPolicy", env, n_steps=1000, cost_keys=costs, cost_limit=[5.0, 2.0], seed=0)
+model.learn(300_000)
+
+evaluation = evaluate_policy(model, env, n_eval_episodes=10, seed=1)
+print("return", evaluation.estimate(evaluation.returns))
+for name, limit, values in zip(costs, model.cost_limit, evaluation.key_costs.T, strict=True):
+    print(f"{name}, limit {limit}:", evaluation.estimate(values))

@@ -1,0 +1,15 @@
+"""Train CPO, save it, load it, see what it gets and what it pays."""
+
+from sb3_guard import CPO, evaluate_policy, make_vec_env
+
+# Ten robots at once, on one batch of simulations. An episode takes 1000 steps, so every update
+# sees ten whole episodes.
+env = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=0)
+model = CPO("MlpPolicy", env, n_steps=1000, cost_limit=5.0, seed=0, verbose=1)
+model.learn(300_000)
+model.save("cpo_point")
+
+model = CPO.load("cpo_point")
+evaluation = evaluate_policy(model, env, n_eval_episodes=10, seed=1)
+print("return", evaluation.estimate(evaluation.returns))
+print("cost  ", evaluation.estimate(evaluation.costs))

@@ -1,0 +1,171 @@
+"""Make the trained agents that the package ships: ``python scripts/pretrain.py``.
+
+Trains what is missing with the library's own command, writes a small copy of each agent to
+``sb3_guard/pretrained`` in the layout of a log folder, and draws their curves. With ``-f`` it takes
+runs that are there, made by exactly this command::
+
+    python -m sb3_guard.train --algo cpo --env Goal_Point_8Hazards -n 1e6 --seed 1 \
+        --eval-freq -1 --num-threads 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import shutil
+import zipfile
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.ticker import EngFormatter
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_guard import train
+from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.figures import AXES, line_style
+from sb3_guard.zoo.playback import PRETRAINED
+from sb3_guard.zoo.results import label, read_curve
+from sb3_guard.zoo.run_folder import RunFolder, run_path
+
+
+class Agent(NamedTuple):
+    """What is trained."""
+
+    algo: str
+    env: str
+    seed: int
+
+    @property
+    def command(self) -> str:
+        """How."""
+        return (
+            f"python -m sb3_guard.train --algo {self.algo} --env {self.env} -n 1e6 "
+            f"--seed {self.seed} --eval-freq -1 --num-threads 1"
+        )
+
+    @property
+    def flags(self) -> dict[str, Any]:
+        """The same as a run's ``args.yml`` has it."""
+        return {"algo": self.algo, "env": f"{self.env}-v0", "n_timesteps": 1_000_000,
+                "seed": self.seed, "eval_freq": -1, "num_threads": 1, "hyperparams": None,
+                "env_kwargs": None, "conf_file": None}  # fmt: skip
+
+
+AGENTS = (
+    Agent("cpo", "Goal_Point_8Hazards", 1),
+    Agent("pcpo", "Goal_Point_8Hazards", 1),
+    Agent("trpo", "Goal_Point_8Hazards", 0),
+    Agent("cpo", "Goal_Point_8Ghosts", 0),
+)
+# What only training needs: loaded without it, an agent begins a new training where it stands.
+TRAINING_ONLY = (
+    "_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer",
+    "ep_success_buffer", "ep_cost_buffer", "running_costs", "running_lengths", "last_costs",
+    "total_costs", "costs", "timing", "start_time", "_ended_costs", "_ended_lengths", "_warned",
+)  # fmt: skip
+
+
+def find(agent: Agent, folders: Sequence[str]) -> RunFolder:
+    """The finished run of an agent in the first folder that has one; else it is trained now."""
+    for folder in folders:
+        for path in sorted(Path(folder, agent.algo).glob(f"{agent.env}-v0_*")):
+            run = RunFolder.open(path)
+            args = run.args()
+            if run.result.exists() and all(args[key] == v for key, v in agent.flags.items()):
+                return run
+    print(agent.command)
+    if train.main([*agent.command.split()[3:], "-f", folders[0]]):
+        raise SystemExit(f"not trained: {agent.command}")
+    return find(agent, folders[:1])
+
+
+def slim(model: BaseAlgorithm, path: Path) -> None:
+    """Save an agent without what only training needs, compressed, the same bytes every time."""
+    for name in model._get_torch_save_params()[0]:
+        if name.endswith("optimizer"):
+            attrgetter(name)(model).state.clear()
+    buffer = io.BytesIO()
+    model.save(buffer, exclude=TRAINING_ONLY)
+    with zipfile.ZipFile(buffer) as full, zipfile.ZipFile(path, "w") as small:
+        for name in full.namelist():
+            if name == "system_info.txt":  # where it was trained is nobody's business
+                continue
+            content = full.read(name)
+            if name == "data":
+                content = json.dumps(_undescribed(json.loads(content))).encode()
+            member = zipfile.ZipInfo(name)  # dated 1980
+            member.external_attr = 0o644 << 16
+            small.writestr(member, content, zipfile.ZIP_DEFLATED, 9)
+
+
+def _undescribed(data: dict[str, Any]) -> dict[str, Any]:
+    """What SB3 saves, without the descriptions of objects, which have addresses in memory."""
+    keep = (":type:", ":serialized:")
+    return {
+        name: {key: value[key] for key in keep}
+        if isinstance(value, dict) and ":serialized:" in value
+        else value
+        for name, value in data.items()
+    }
+
+
+def export(run: RunFolder, agent: Agent) -> RunFolder:
+    """Copy a run to the package, small; the copy plays as the original does."""
+    where = (str(PRETRAINED), agent.algo, f"{agent.env}-v0")
+    shutil.rmtree(run_path(*where, 1), ignore_errors=True)
+    args = {**run.args(), "log_folder": "logs"}
+    copy = RunFolder.create(*where, args, run.hyperparams(), agent.command, number=1)
+    cls = algorithm(agent.algo)
+    model = cls.load(run.model, device="cpu")
+    slim(model, copy.model)
+    observations = np.random.default_rng(0).normal(size=(100, *model.observation_space.shape))
+    want, got = (one.predict(observations, deterministic=True)[0]
+                 for one in (cls.load(run.model), cls.load(copy.model)))  # fmt: skip
+    np.testing.assert_array_equal(want, got)
+    result = json.loads(run.result.read_text())
+    copy.write_result({key: v for key, v in result.items() if key not in ("platform", "seconds")})
+    return copy
+
+
+def draw(runs: Mapping[Agent, RunFolder], path: Path) -> None:
+    """Return and episode cost of the agents while they were trained."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
+    for agent, run in runs.items():
+        curve = read_curve(run.path, 30_000)
+        style = {**line_style(agent.algo), "linestyle": "--" if "Ghosts" in agent.env else "-"}
+        name = f"{label(agent.algo)}, {agent.env}, seed {agent.seed}"
+        for axis, metric in zip(axes, ("J_r", "M_c"), strict=True):
+            axis.plot(curve["step"], curve[metric], label=name, **style)
+            axis.set(xlabel="steps", ylabel=AXES[metric])
+            axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axis.spines[["top", "right"]].set_visible(False)
+            axis.grid(alpha=0.2)
+    axes[1].set_ylim(bottom=0)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2,
+                  frameon=False)  # fmt: skip
+    figure.savefig(path, dpi=100)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "-f", "--folders", nargs="+", default=["logs/pretrained"],
+        help="log folders: a run is taken from the first that has it, or trained into the first",
+    )  # fmt: skip
+    parser.add_argument("-o", "--picture", type=Path, default=Path("docs/images/pretrained.png"))
+    args = parser.parse_args()
+    runs = {agent: find(agent, args.folders) for agent in AGENTS}
+    for agent, run in runs.items():
+        copy = export(run, agent)
+        size = sum(file.stat().st_size for file in copy.path.rglob("*") if file.is_file())
+        print(f"{copy.path.relative_to(PRETRAINED)} {size / 1024:.0f} KiB")
+    draw(runs, args.picture)
+
+
+if __name__ == "__main__":
+    main()

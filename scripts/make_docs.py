@@ -128,11 +128,11 @@ def examples() -> str:
     """The page of the files in ``examples/``: what each says of itself, and the file."""
     parts = [
         "# Examples",
-        "Each is a file in `examples/` that runs as it is; an argument sets the steps to train.",
+        "Each is a file in `examples/` that runs as it is.",
     ]
     for file in sorted((ROOT / "examples").glob("*.py")):
         says = (ast.get_docstring(ast.parse(file.read_text())) or "").splitlines()[0]
-        what = says.rpartition(": ")[0] or says
+        what = (says.rpartition(": ")[0] or says).rstrip(".")
         link = f"[examples/{file.name}](../examples/{file.name})"
         code = f"```{{literalinclude}} ../examples/{file.name}\n:language: python\n```"
         parts += [f"## {file.stem.replace('_', ' ').capitalize()}", f"{what}: {link}.", code]

@@ -107,6 +107,7 @@ def test_time_outs_bootstrap_costs_on_a_copy(terminate: bool) -> None:
         before["bootstraps"] = buffer.cost_bootstraps[:, 0, 0].copy()
         before["costs"] = buffer.costs[:, 0, 0].copy()
         before["advantages"] = buffer.cost_advantages[:, 0, 0].copy()
+        before["returns"] = buffer.cost_returns[:, 0, 0].copy()
         before["values"] = buffer.cost_values[:, 0, 0].copy()
         observations = th.as_tensor(np.stack([o for _, o in terminals]))
         before["terminal"] = model.cost_critic.predict(observations)[:, 0].numpy()
@@ -123,10 +124,12 @@ def test_time_outs_bootstrap_costs_on_a_copy(terminate: bool) -> None:
         expected[steps] = 0.8 * before["terminal"]
     np.testing.assert_allclose(before["bootstraps"], expected, rtol=1e-5)
     # The whole recursion once more, step by step.
-    advantage = 0.0
+    advantage, paid = 0.0, before["last"]
     for t in reversed(range(16)):
         ends = t in steps
         following = 0.0 if ends else (before["last"] if t == 15 else before["values"][t + 1])
+        paid = before["costs"][t] + expected[t] + 0.8 * (0.0 if ends else paid)
+        assert before["returns"][t] == pytest.approx(paid, rel=1e-4, abs=1e-6)
         cost = before["costs"][t] + expected[t]
         error = cost + 0.8 * following - before["values"][t]
         advantage = error + 0.8 * 0.97 * (0.0 if ends else advantage)

@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-import itertools
 import pickle
 import random
 import re
@@ -30,8 +29,10 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_guard.algorithms import ALGORITHMS, CPO, TRPO, TRPOSL, TRPOUSL, TrustRegion
+from sb3_guard.algorithms import ALGORITHMS, CPO, TRPO, TRPOFAC, TRPOSL, TRPOUSL, TrustRegion
+from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.buffers import CostRolloutBuffer
+from sb3_guard.algorithms.common.costs import read_costs
 from sb3_guard.algorithms.common.critics import CostCritic
 
 CLASSES = list(ALGORITHMS.values())
@@ -163,25 +164,38 @@ class _Normed(FlattenExtractor):
 
 
 @pytest.mark.parametrize("cls", CLASSES)
-def test_batch_norm_and_dropout_act_while_fitting_alone(cls: type[TrustRegion]) -> None:
-    """A policy that drops features at random has no KL to itself: none would be accepted."""
-    kwargs = {"features_extractor_class": _Normed, "log_std_init": -1.0}
-    model = small(cls, points(2, hazard=(-1.0, 0.0)), policy_kwargs=kwargs)
-    statistics = []
+@pytest.mark.parametrize("share", [True, False])
+def test_batch_norm_and_dropout_act_while_fitting_alone(
+    cls: type[TrustRegion], share: bool
+) -> None:
+    """And in the critics alone: the actor changes by its step, of the KL that is logged."""
+    kwargs = {
+        "features_extractor_class": _Normed,
+        "share_features_extractor": share,
+        "log_std_init": -1.0,
+    }
+    with pytest.warns(UserWarning, match="batch normalisation that has seen no data") as record:
+        model = small(cls, points(2, hazard=(-1.0, 0.0)), policy_kwargs=kwargs)
+    assert len(record) == 1
     train = model.train
 
     def spy() -> None:
-        before = model.policy.features_extractor.norm.running_mean.clone()
+        before = copy.deepcopy(model.policy)
+        observations = th.as_tensor(model.rollout_buffer.observations.reshape(-1, 4))
         train()
-        statistics.append((before, model.policy.features_extractor.norm.running_mean.clone()))
         assert not any(module.training for module in model.policy.modules())
-        assert model.logger.name_to_value["train/line_search_step"] > 0.0
+        logged = model.logger.name_to_value
+        assert logged["train/line_search_step"] > 0.0
+        pair = [each.get_distribution(observations) for each in (before, model.policy)]
+        assert kl(*pair).mean().item() == pytest.approx(logged["train/kl"], rel=1e-3)
 
     model.train = spy
     model.learn(240)
-    for (before, after), (following, _) in itertools.pairwise(statistics):
-        assert not th.equal(before, after), "fitting the critics moves them"
-        assert th.equal(after, following), "collecting does not"
+    batches = model.policy.vf_features_extractor.norm.num_batches_tracked
+    assert batches == (0 if share else 9)
+    assert model.policy.pi_features_extractor.norm.num_batches_tracked == 0
+    if cls.uses_cost_critic:
+        assert model.cost_critic.features_extractor.norm.num_batches_tracked == 9
     observation = np.ones((3, 4), np.float32)
     actions = [model.predict(observation, deterministic=True)[0] for _ in range(2)]
     np.testing.assert_array_equal(*actions)
@@ -299,11 +313,14 @@ def test_frame_stacks(cls: type[TrustRegion]) -> None:
     assert model.observation_space.shape == (12,) and len(model.ep_cost_buffer) == 4
 
 
-@pytest.mark.parametrize("cls", [CPO, TRPOSL])
-def test_subprocesses_change_nothing(cls: type[TrustRegion]) -> None:
+@pytest.mark.parametrize(
+    ("cls", "how"),
+    [(CPO, {}), (TRPOSL, {"start_method": "fork"}), (TRPOFAC, {"start_method": "fork"})],
+)
+def test_subprocesses_change_nothing(cls: type[TrustRegion], how: dict[str, Any]) -> None:
     runs = []
-    for kind in (DummyVecEnv, SubprocVecEnv):
-        env = kind([lambda: CostPoint(episode_length=30, hazard=(-1.0, 0.0))] * 2)
+    for kind, kwargs in ((DummyVecEnv, {}), (SubprocVecEnv, how)):
+        env = kind([lambda: CostPoint(episode_length=30, hazard=(-1.0, 0.0))] * 2, **kwargs)
         env.seed(0)
         runs.append(small(cls, env).learn(160))
         env.close()
@@ -346,10 +363,12 @@ def test_numbers_of_any_kind_are_costs(cost: Any) -> None:
     assert model.total_cost == 40.0
 
 
-@pytest.mark.parametrize("cost", [np.nan, np.inf, "much", None, [1.0, 2.0]])
+@pytest.mark.parametrize("cost", [np.nan, np.inf, "much", "1.5", b"1", None, [1.0, 2.0]])
 def test_anything_else_is_not(cost: Any) -> None:
     with pytest.raises(ValueError, match=r"info\['cost'\] of environment 0 is .*finite number"):
         small(CPO, info_env(cost=cost)).learn(40)
+    with pytest.raises(ValueError, match=r"info\['b'\] of environment 1 is .*finite number"):
+        read_costs([{"a": 1.0, "b": 2}, {"a": 1.0, "b": cost}], ("a", "b"), False)
 
 
 def test_a_missing_cost_is_an_error_that_says_how_to_go_on() -> None:
@@ -435,9 +454,11 @@ def test_bad_values_are_named(kwargs: dict[str, Any], message: str) -> None:
         small(CPO, points(1), **kwargs)
 
 
-def test_a_bad_cost_reduction_is_named() -> None:
-    with pytest.raises(ValueError, match="cost_reduction=-1"):
-        small(CPO, points(1), cost_reduction=-1)
+@pytest.mark.parametrize("value", [-1, True, np.inf, "much"])
+def test_a_bad_cost_reduction_is_named(value: Any) -> None:
+    with pytest.raises(ValueError, match=f"cost_reduction={value!r}: must be a number in"):
+        small(CPO, points(1), cost_reduction=value)
+    small(CPO, points(1), cost_reduction=np.float32(0.1))
 
 
 def test_an_unknown_argument_is_an_error() -> None:
@@ -502,17 +523,45 @@ def test_parameters_travel(cls: type[TrustRegion]) -> None:
         b.set_parameters({"policy": parameters(a)["policy"]})
 
 
-def test_load_with_another_number_of_envs(tmp_path: Path) -> None:
-    small(CPO, points(2)).learn(100).save(tmp_path / "model")
-    model = CPO.load(tmp_path / "model", env=points(3), device="cpu")
+@pytest.mark.parametrize("cls", CLASSES)
+def test_load_with_another_number_of_envs(cls: type[TrustRegion], tmp_path: Path) -> None:
+    small(cls, points(2), n_critic_updates=1).learn(80).save(tmp_path / "model")
+    model = cls.load(tmp_path / "model", env=points(3), device="cpu")
     model.learn(120, reset_num_timesteps=False)
-    assert model.running_costs.shape == (3, 1)
+    assert model.running_costs.shape == (3, 1) and model.num_timesteps == 200
 
 
-def test_set_env_starts_new_episodes() -> None:
-    model = small(CPO, points(2, episode_length=1000))
-    with pytest.warns(UserWarning, match="no episode has ended"):
-        model.learn(80)
+def test_a_replaced_policy_is_the_one_that_learns() -> None:
+    model = small(CPO, points(2))
+    model.policy = type(model.policy)(
+        model.observation_space, model.action_space, model.lr_schedule
+    )
+    before = model.policy.value_net.weight.clone()
+    model.learn(80)
+    assert not th.equal(before, model.policy.value_net.weight)
+
+
+def test_a_copy_learns_on_its_own() -> None:
+    """With ReLU, whose regression goes through autograd and the network itself."""
+    model = small(CPO, points(2), policy_kwargs={"activation_fn": th.nn.ReLU}).learn(80)
+    model.env = None
+    twin = copy.deepcopy(model)
+    before = parameters(twin)
+    twin.set_env(points(2))
+    twin.learn(80)
+    assert_equal(parameters(model), before)
+    for name in ("policy", "cost_critic"):
+        moved = [
+            not th.equal(before[name][key], parameters(twin)[name][key]) for key in before[name]
+        ]
+        assert all(moved), name
+
+
+@pytest.mark.parametrize("cls", CLASSES)
+def test_set_env_starts_new_episodes(cls: type[TrustRegion]) -> None:
+    model = small(cls, points(2, episode_length=1000), n_critic_updates=1)
+    model._warned = {"no episode has ended yet and the environment states no max_episode_steps"}
+    model.learn(80)
     assert (model.running_lengths == 40).all()
     model.set_env(points(2))
     model.learn(80, reset_num_timesteps=False)

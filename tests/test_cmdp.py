@@ -16,6 +16,8 @@ from sb3_guard.algorithms import (
     TRPO,
     TRPOFAC,
     TRPOIPO,
+    TRPOSL,
+    TRPOUSL,
     TRPOLag,
     TrustRegion,
 )
@@ -206,26 +208,65 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
     TRPO ends at a return of 1.9 and an episode cost of 3.5; the hazard can be walked around. All
     cost half of that or less, but TRPO-USL: its policy learns to push against the correction.
     """
-    settings: dict[str, Any] = {
+    settings: dict[str, dict[str, Any]] = {
         "trpo_lag": {"lambda_lr": 0.05},
         "trpo_fac": {"lambda_lr": 1e-2},
         "trpo_usl": {"cost_gamma": 0.9},
-    }.get(key, {})
-    model = ALGORITHMS[key](
-        "MlpPolicy",
-        make_vec_env(CostPoint, 8, seed=seed),
-        n_steps=100,
-        n_critic_updates=20,
-        learning_rate=3e-3,
-        stats_window_size=160,  # ten updates
-        policy_kwargs={"log_std_init": -0.5, "net_arch": [32, 32]},
-        seed=seed,
-        **settings,
-    ).learn(800 * 60)
-    assert model.ep_info_buffer is not None and model.ep_cost_buffer is not None
-    assert np.mean(model.ep_cost_buffer) < (3.5 if key == "trpo_usl" else 1.75)
+    }
+
+    def train(key: str) -> Any:
+        return ALGORITHMS[key](
+            "MlpPolicy",
+            make_vec_env(CostPoint, 8, seed=seed),
+            n_steps=100,
+            n_critic_updates=20,
+            learning_rate=3e-3,
+            stats_window_size=160,  # ten updates
+            policy_kwargs={"log_std_init": -0.5, "net_arch": [32, 32]},
+            seed=seed,
+            **settings.get(key, {}),
+        ).learn(800 * 60)
+
+    model = train(key)
+    most = 0.9 * np.mean(train("trpo").ep_cost_buffer) if key == "trpo_usl" else 1.75
+    assert np.mean(model.ep_cost_buffer) < most
     assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.2
     assert all(th.isfinite(each).all() for each in model.policy.parameters())
+
+
+@pytest.mark.parametrize(
+    ("cls", "kwargs"),
+    [
+        (TRPOFAC, {"lambda_lr": 0.03, "lambda_init": 1.0}),
+        (TRPOSL, {"warmup": 0.3, "drift": True}),
+        (TRPOUSL, {"warmup": 0.3, "rate": 0.1}),
+    ],
+)
+def test_several_limits_are_kept(cls: type[TrustRegion], kwargs: dict[str, Any]) -> None:
+    """Alone the policy would be on its way to costs of 1.5 and 1.1."""
+    limits = [0.5, 0.4]
+    costs: list[np.ndarray] = []
+    model = cls(
+        "MlpPolicy",
+        make_vec_env(TwoCostBandit, 8, seed=0),
+        n_steps=32,
+        target_kl=0.05,
+        n_critic_updates=20,
+        learning_rate=1e-2,
+        normalize_advantage=False,
+        cost_keys=("cost", "cost_1"),
+        cost_limit=limits,
+        policy_kwargs={"net_arch": [8], "log_std_init": -1.0},
+        seed=0,
+        **kwargs,
+    )
+    train = model.train
+    model.train = lambda: costs.append(model.costs.episode_cost) or train()  # type: ignore
+    model.learn(256 * 15)
+    last = np.mean(costs[-3:], axis=0)
+    assert np.all(last <= 1.02 * np.array(limits)) and np.all(last > 0.0)
+    if cls is TRPOSL:  # the cost is linear, and the layer exact
+        np.testing.assert_allclose(last, limits, rtol=0.02)
 
 
 def test_the_world_agrees_with_its_linear_program() -> None:

@@ -6,8 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint
+from cost_envs import CostPoint, LinearCostBandit
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard.algorithms import CPO, TRPO
 from sb3_guard.algorithms.common.natural_gradient import Case
@@ -71,6 +72,65 @@ def test_cost_reduction_asks_for_less_cost() -> None:
         assert model.accept(Trial(0.01, 0.0, np.array([change]))) is accepted
 
 
+@pytest.mark.parametrize(
+    ("case", "cost_change", "accepted"),
+    [
+        # Violations 0.5 and 0.1: lost, the sum of their squares is to fall.
+        (Case.LOST, [-0.1, 0.1], True),
+        (Case.LOST, [0.1, -0.1], False),
+        (Case.LOST, [-0.1, 0.3], False),
+        (Case.LOST, [0.0, 0.0], True),
+        (Case.LOST, [np.nan, -0.1], False),
+        # What can be kept within the region may not rise.
+        (Case.RECOVERABLE, [-0.1, 0.1], False),
+        (Case.RECOVERABLE, [-0.1, -0.1], True),
+    ],
+)
+def test_line_search_test_of_two_costs(
+    case: Case, cost_change: list[float], accepted: bool
+) -> None:
+    model = make(lambda: CostPoint(cost_keys=KEYS), cost_keys=KEYS)
+    model.costs = CostEstimate(np.ones(2), 1.0, np.array([0.5, 0.1]))
+    model._case = case
+    assert model.accept(Trial(0.01, 0.0, np.array(cost_change))) is accepted
+    if case is Case.LOST:
+        model.cost_reduction = 0.1
+        assert not model.accept(Trial(0.01, 0.0, np.array([-0.05, 0.0])))
+        assert model.accept(Trial(0.01, 0.0, np.array([-0.15, 0.0])))
+
+
+class _Contradiction(LinearCostBandit):
+    """Costs a_0 + 0.5 and 0.5 - a_0: limits of 0.2 contradict each other."""
+
+    def step(self, action: np.ndarray) -> Any:
+        *rest, _ = super().step(action)
+        costs = 0.5 + float(action[0]) * np.array([1.0, -1.0])
+        return (*rest, dict(zip(KEYS, costs, strict=True)))
+
+
+def test_limits_that_contradict_each_other_are_broken_evenly() -> None:
+    model = make(
+        _Contradiction,
+        8,
+        n_steps=64,
+        target_kl=0.05,
+        policy_kwargs={"net_arch": [8], "log_std_init": -1.0},
+        cost_keys=KEYS,
+        cost_limit=0.2,
+    )
+    with th.no_grad():
+        model.policy.action_net.bias[0] = 0.5
+    fractions = []
+    train = model.train
+    model.train = lambda: (
+        train() or fractions.append(model.logger.name_to_value["train/line_search_step"])
+    )
+    model.learn(512 * 10)
+    assert np.mean(np.array(fractions) > 0.0) > 0.8
+    action, _ = model.predict(np.ones(1, np.float32), deterministic=True)
+    assert abs(action[0]) < 0.15
+
+
 @pytest.mark.parametrize("limit", [0.0, 1.0, 3.0, 100.0])
 def test_the_step_solves_the_linearised_problem(limit: float) -> None:
     """Within the region, and within the limit wherever the region reaches it."""
@@ -125,11 +185,15 @@ def test_violation_is_in_units_of_the_cost_surrogate() -> None:
     np.testing.assert_allclose(model.running_costs[:, 0], 0.0, atol=1e-12)
 
 
-def test_before_any_episode_ends_the_stated_length_counts() -> None:
+@pytest.mark.parametrize("subprocess", [False, True])
+def test_before_any_episode_ends_the_stated_length_counts(subprocess: bool) -> None:
+    """Of an environment registered by a function, whose spec can't leave its process, as well."""
     spec = gym.envs.registration.EnvSpec(
         "CostPoint-v0", lambda: CostPoint(10**6, hazard=(-1, 0)), max_episode_steps=500
     )
-    env = make_vec_env(lambda: gym.make(spec), 2, seed=0)
+    kind: Any = SubprocVecEnv if subprocess else None
+    how = {"start_method": "fork"} if subprocess else {}
+    env = make_vec_env(lambda: gym.make(spec), 2, seed=0, vec_env_cls=kind, vec_env_kwargs=how)
     model = CPO("MlpPolicy", env, n_steps=200, cost_limit=0.5, n_critic_updates=1, seed=0)
     rates = []
     train = model.train
@@ -138,15 +202,22 @@ def test_before_any_episode_ends_the_stated_length_counts() -> None:
     assert model.costs is not None and model.costs.horizon == 500 and rates[0] > 0.0
     assert model.costs.violation[0] == pytest.approx(rates[0] - 0.5 / 500, rel=1e-5)
     assert model.costs.episode_cost[0] == pytest.approx(500 * rates[0], rel=1e-5)
+    env.close()
 
 
-def test_without_a_stated_length_the_longest_episode_counts_and_one_warning_says_so() -> None:
-    env = make_vec_env(lambda: CostPoint(episode_length=10**6), 1)
+@pytest.mark.parametrize("subprocess", [False, True])
+def test_without_a_stated_length_the_longest_episode_counts_and_one_warning_says_so(
+    subprocess: bool,
+) -> None:
+    env: Any = make_vec_env(lambda: CostPoint(episode_length=10**6), 1)
+    if subprocess:
+        env = SubprocVecEnv([lambda: CostPoint(episode_length=10**6)], start_method="fork")
     model = CPO("MlpPolicy", env, n_steps=20, n_critic_updates=1, seed=0)
     with pytest.warns(UserWarning, match="no episode has ended yet") as record:
         model.learn(60)
     assert len([w for w in record if "no episode" in str(w.message)]) == 1
     assert model.costs is not None and model.costs.horizon == 60
+    env.close()
 
 
 def test_the_horizon_outlives_a_rollout_in_which_nothing_ends() -> None:

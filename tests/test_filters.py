@@ -336,6 +336,14 @@ def test_targets_use_the_action_executed_next() -> None:
     th.testing.assert_close(found[:, :-1][within], inner[within])
 
 
+def test_what_is_ahead_is_the_cost_of_the_corrected_action() -> None:
+    model = make(TRPOUSL, points(2))
+    observations, executed = th.randn(6, 4), np.full((6, 2), 0.25, np.float32)
+    model.policy.correct = lambda *_: executed
+    expected = model._layer.values(observations, th.as_tensor(executed)).numpy()
+    np.testing.assert_allclose(model._value_ahead(observations), expected, rtol=1e-5)
+
+
 # The algorithms
 
 
@@ -501,6 +509,42 @@ def test_thresholds_default_to_the_limit() -> None:
     keys = ("cost", "cost_1")
     model = make(TRPOSL, points(2, cost_keys=keys), cost_keys=keys, threshold=[0.1, 0.3]).learn(80)
     np.testing.assert_allclose(model.policy.action_filter.threshold.numpy(), [0.1, 0.3])
+
+
+def test_a_given_threshold_holds_from_the_first_step() -> None:
+    model = make(TRPOSL, warmup=0, threshold=0.5)
+    seen = []
+    correct = model.policy.action_filter.correct
+
+    def spy(*args: Any) -> Any:
+        seen.append(model.policy.action_filter.threshold.item())
+        return correct(*args)
+
+    model.policy.action_filter.correct = spy
+    model.learn(160)
+    assert len(seen) == 80 and set(seen) == {0.5}
+
+
+def test_the_cost_model_learns_from_executed_actions() -> None:
+    model = make(TRPOSL, threshold=-1.0)
+    fitted: list[Any] = []
+    original = model.policy.action_filter.regression
+
+    def spy() -> Any:
+        regression = original()
+        fit = regression.fit
+        regression.fit = lambda batch, *rest: fitted.append(batch) or fit(batch, *rest)
+        return regression
+
+    model.policy.action_filter.regression = spy
+    model.learn(160)
+    buffer = model.rollout_buffer
+    executed = model.policy.to_unit(buffer.executed_actions)
+    assert np.abs(executed - np.clip(buffer.actions, -1, 1)).max() > 0.1
+    observations, actions, _ = (each.numpy() for each in fitted[-1])
+    for observation, action in zip(observations, actions, strict=True):
+        (row,) = np.flatnonzero((buffer.observations == observation).all(axis=1))
+        np.testing.assert_allclose(action, executed[row], atol=1e-6)
 
 
 def test_without_a_cost_the_cost_model_rests() -> None:

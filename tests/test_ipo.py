@@ -107,6 +107,25 @@ def test_line_search_test(
     assert model.accept(Trial(kl, improvement, np.array([change]))) is accepted
 
 
+@pytest.mark.parametrize(
+    ("cost", "change", "accepted"),
+    [
+        ([4.0, 8.0], [0.02, 0.02], True),
+        ([4.0, 8.0], [0.02, 0.03], False),
+        # The first limit is broken: that is no reason to break the second.
+        ([6.0, 8.0], [0.1, 0.02], True),
+        ([6.0, 8.0], [-0.1, 0.03], False),
+        ([6.0, 9.0], [0.1, 0.1], True),
+    ],
+)
+def test_each_limit_that_is_kept_stays_so(
+    cost: list[float], change: list[float], accepted: bool
+) -> None:
+    model = make(2, cost_limit=[5.0, 9.0], target_kl=0.02)
+    _estimate(model, cost, 40.0)
+    assert model.accept(Trial(0.01, 0.1, np.array(change))) is accepted
+
+
 def test_from_inside_no_step_reaches_the_limit() -> None:
     """Over a training: whenever the estimate was feasible, the accepted step keeps it so."""
     model = make(cost_limit=12.0, t=100.0, target_kl=0.2)

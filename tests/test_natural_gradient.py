@@ -193,7 +193,7 @@ def test_constrained_step_on_the_boundary(m: int) -> None:
         assert Problem(rng, np.zeros(m)).check(rng) is Case.BINDING
 
 
-@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize("m", [1, 2, 3])
 @pytest.mark.parametrize("c", [-0.5, 0.0])
 def test_without_cost_gradient_a_feasible_policy_takes_the_trpo_step(m: int, c: float) -> None:
     rng = np.random.default_rng(0)
@@ -271,6 +271,43 @@ def test_parallel_gradients(sign: float) -> None:
         assert reached == pytest.approx(-problem.c[0], rel=1e-8)
     else:
         assert 0.5 * x @ problem.F @ x == pytest.approx(problem.delta, rel=1e-8)
+
+
+@pytest.mark.parametrize("noise", [1e-7, 1e-6, 1e-5, 1e-4])
+@pytest.mark.parametrize("m", [2, 3])
+def test_nearly_parallel_gradients_in_float32(m: int, noise: float) -> None:
+    """Reward along a binding cost, but for rounding: within the region, the limits and 0.2 %."""
+    rng = np.random.default_rng(m)
+    for _ in range(100):
+        problem = Problem(rng, np.append(rng.uniform(-1.0, 1.0, 1), np.full(m - 1, -0.7)), size=30)
+        problem.g = problem.B[0] + noise * rng.normal(size=30)
+        exact, (x, case, *_) = problem.solve(), problem.solve(th.float32)
+        assert case is exact.case
+        if case is Case.LOST:
+            continue
+        x = x.double().numpy()
+        reach = np.sqrt(2 * problem.delta * np.diag(problem.B @ problem.inverse @ problem.B.T))
+        assert 0.5 * x @ problem.F @ x <= problem.delta * (1 + 1e-3)
+        assert np.all(problem.c + problem.B @ x <= 1e-3 * reach)
+        assert problem.g @ x >= problem.g @ exact.x.numpy() - 2e-3 * reach[0]
+
+
+@pytest.mark.parametrize("error", [0.0, 0.02])
+def test_opposite_costs_are_weighed_without_leaving_the_region(error: float) -> None:
+    """Of float32 and an inexact F⁻¹, as conjugate gradients that stop early give it."""
+    rng = np.random.default_rng(6)
+    for _ in range(50):
+        problem = Problem(rng, rng.uniform(0.3, 1.0, size=2))
+        problem.B[1] = -problem.B[0] + 1e-6 * rng.normal(size=6)
+        tensors = (problem.g, problem.B, problem.inverse @ problem.g, problem.B @ problem.inverse)
+        g, B, v, W = (th.as_tensor(each, dtype=th.float32) for each in tensors)
+        W[1] *= 1 + error
+        x, case, *_ = constrained_step(g, B, problem.c, v, W, problem.delta)
+        x = x.double().numpy()
+        assert case is Case.LOST
+        assert 0.5 * x @ problem.F @ x <= problem.delta * (1.05 if error else 1.001)
+        excess = np.maximum(0.0, problem.c + problem.B @ x)
+        assert excess @ excess <= (1.05 if error else 1.0) * problem.c @ problem.c
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-9])

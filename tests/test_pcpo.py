@@ -121,6 +121,37 @@ def test_contradictory_limits_are_violated_least(euclidean: bool) -> None:
         np.testing.assert_allclose(problem.B[0] @ x, np.clip(wanted, -reach, reach), rtol=1e-4)
 
 
+@pytest.mark.parametrize("noise", [1e-7, 1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("euclidean", [False, True])
+@pytest.mark.parametrize("m", [2, 3])
+def test_half_spaces_that_meet_far_away_count_as_contradictory(
+    m: int, euclidean: bool, noise: float
+) -> None:
+    """Opposite but for the noise of float32 or of an estimate: no step of a thousand radii."""
+    rng = np.random.default_rng(m)
+    for _ in range(50):
+        problem = Problem(rng, rng.uniform(0.1, 1.0, size=m))
+        problem.B[1] = -problem.B[0] + noise * rng.normal(size=SIZE)
+        x, _ = problem.solve(euclidean, th.float32)
+        x = x.astype(np.float64)
+        assert 0.5 * x @ problem.F @ x <= problem.delta * (1 + 1e-3)
+        excess = np.maximum(0.0, problem.c + problem.B @ x)
+        assert excess @ excess <= problem.c @ problem.c
+
+
+def test_half_spaces_that_only_seem_to_meet_count_as_contradictory() -> None:
+    """Conjugate gradients that stop early leave W inexact, and opposite costs look less so."""
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        problem = Problem(rng, rng.uniform(0.3, 1.0, size=2))
+        problem.B[1] = -problem.B[0]
+        tensors = (problem.g, problem.B, problem.inverse @ problem.g, problem.B @ problem.inverse)
+        g, B, v, W = (th.as_tensor(each) for each in tensors)
+        W[1] *= 1.02
+        x = projected_step(g, B, problem.c, v, W, problem.delta)[0].numpy()
+        assert 0.5 * x @ problem.F @ x <= 1.05 * problem.delta
+
+
 @pytest.mark.parametrize("c", [-0.5, 0.0, 0.5])
 def test_without_cost_gradient(c: float) -> None:
     """The TRPO step where the limit holds, no step where nothing can make it hold."""

@@ -247,6 +247,23 @@ def test_one_full_batch_step_is_adam_on_the_mean_squared_error() -> None:
         th.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
 
 
+def test_critics_are_fitted_to_discounted_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    fitted: list[tuple[nn.Module, np.ndarray]] = []
+
+    def fit(self: Regression, batch: Any, targets: th.Tensor, *_: Any) -> float:
+        fitted.append((self.module, targets.numpy().copy()))
+        return 0.0
+
+    monkeypatch.setattr(Regression, "fit", fit)
+    model = _toy(CPO).learn(200)
+    (policy, values), (critic, costs) = fitted
+    assert policy is model.policy and critic is model.cost_critic
+    buffer = model.rollout_buffer
+    np.testing.assert_array_equal(values, buffer.returns.reshape(-1, 1))
+    np.testing.assert_array_equal(costs, buffer.cost_returns)
+    assert not np.allclose(buffer.returns.ravel(), buffer.advantages.ravel())
+
+
 def test_mlp_needs_bias_and_float32() -> None:
     assert TanhMlp.layers([nn.Linear(2, 2), nn.Tanh(), nn.Linear(2, 1)]) is not None
     assert TanhMlp.layers([nn.Linear(2, 2), nn.Tanh()]) is None
@@ -380,6 +397,69 @@ def test_a_step_that_is_not_finite_is_not_taken(value: float) -> None:
     assert th.equal(_actor_vector(model), before)
 
 
+@pytest.mark.parametrize("size", [-200.0, 1e30, -3e38])
+def test_a_candidate_that_is_no_distribution_is_rejected(size: float) -> None:
+    """exp(log_std) is 0, or the mean is not a number: torch raises at that, training goes on."""
+    model = _toy(TRPO, line_search_max_iter=2)
+    model.step = lambda region: th.full_like(region.gradient, size)  # type: ignore
+    before = _actor_vector(model)
+    model.learn(200)
+    assert th.equal(_actor_vector(model), before)
+    assert model.logger.name_to_value["train/line_search_step"] == 0.0
+
+
+def test_a_search_that_begins_too_far_off_goes_on() -> None:
+    model = _toy(TRPO)
+    step = model.step
+    model.step = lambda region: 1e5 * step(region)  # type: ignore[method-assign]
+    before = _actor_vector(model)
+    model.learn(200)
+    assert not th.equal(_actor_vector(model), before)
+    assert 0.0 < model.logger.name_to_value["train/kl"] <= model.target_kl
+
+
+def test_an_error_during_the_search_leaves_the_old_policy() -> None:
+    model = _toy(TRPO)
+
+    def accept(trial: Any) -> bool:
+        raise RuntimeError("nobody expected this")
+
+    model.accept = accept  # type: ignore[method-assign]
+    before = _actor_vector(model)
+    with pytest.raises(RuntimeError, match="nobody"):
+        model.learn(200)
+    assert th.equal(_actor_vector(model), before)
+
+
+def test_a_trial_says_what_the_candidate_changes() -> None:
+    """Improvement and change of the cost surrogate, from the probabilities before and after."""
+    model = _toy(CPO)
+    changes: list[tuple[Any, float, float]] = []
+    search = model._line_search
+
+    def spy(region: Any, *args: Any) -> Any:
+        batch = region.batch
+
+        def log_prob() -> th.Tensor:
+            with th.no_grad():
+                distribution = model.policy.get_distribution(batch.observations)
+                return distribution.log_prob(batch.actions).double()
+
+        before = log_prob()
+        fraction, trial = search(region, *args)
+        gain = th.exp(log_prob() - before) - 1.0
+        cost = float((gain * batch.cost_advantages[:, 0].double()).mean())
+        changes.append((trial, float((gain * batch.advantages.double()).mean()), cost))
+        return fraction, trial
+
+    model._line_search = spy  # type: ignore[method-assign]
+    model.learn(1000)
+    for trial, improvement, cost in changes:
+        assert trial.improvement == pytest.approx(improvement, rel=1e-3, abs=1e-6)
+        assert trial.cost_change[0] == pytest.approx(cost, rel=1e-3, abs=1e-7)
+    assert max(abs(cost) for _, _, cost in changes) > 1e-4
+
+
 def test_the_step_respects_the_trust_region_and_improves() -> None:
     model = _toy(TRPO, target_kl=0.01)
     kls, gains = [], []
@@ -455,6 +535,16 @@ def test_generators_are_kept_from_before_the_rollout() -> None:
     assert not th.equal(states[0][1], before)
     random.setstate(python)
     np.random.set_state(numpy)  # noqa: NPY002
+
+
+@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
+def test_generators_of_a_gpu_are_kept_from_before_the_rollout() -> None:
+    env = make_vec_env(CostPoint, 1, seed=0)
+    model = TRPO("MlpPolicy", env, n_steps=10, n_critic_updates=1, use_sde=True, device="cuda")
+    before = th.cuda.get_rng_state()
+    model.learn(10)
+    assert th.equal(model._cuda_at_rollout[th.cuda.current_device()], before)
+    assert not th.equal(th.cuda.get_rng_state(), before)
 
 
 @pytest.mark.parametrize("cls", [TRPO, CPO])

@@ -7,6 +7,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
+from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.natural_gradient import Case, constrained_step
 from sb3_guard.algorithms.common.trust_region import Region, Trial, TrustRegion
 
@@ -21,14 +22,16 @@ class CPO(TrustRegion):
                    ½ xᵀFx ≤ δ     F    Fisher matrix of the old policy
 
     solved exactly at each update. From a policy that no step within the trust region can make
-    feasible, the step lowers the violation as much as the region allows; until the limits hold,
-    the line search asks for less cost and not for more reward.
+    feasible, the step lowers the violation as much as the region allows: of several limits,
+    ``Σ max(0, c_i + b_iᵀx)²``. Until the limits hold, the line search asks for less cost, or less
+    of that sum, and not for more reward.
 
     :param policy: policy class or its alias
     :param env: environment or its id
     :param learning_rate: of the critics
     :param cost_reduction: smallest decrease of a violated cost surrogate that the line search
-        accepts, in cost per step; never more than the violation itself
+        accepts, in cost per step; never more than the violation itself. Where several limits can't
+        be reached, of the root of the sum above
 
     Other parameters are those of :class:`TrustRegion`.
     """
@@ -48,8 +51,7 @@ class CPO(TrustRegion):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        if not (isinstance(self.cost_reduction, int | float) and self.cost_reduction >= 0.0):
-            raise ValueError(f"cost_reduction={self.cost_reduction!r}: must be at least 0")
+        check_number("cost_reduction", self.cost_reduction)
 
     def step(self, region: Region) -> th.Tensor:
         g, B, c, delta = region.gradient, region.cost_gradients, region.violation, region.delta
@@ -62,9 +64,15 @@ class CPO(TrustRegion):
 
     def accept(self, trial: Trial) -> bool:
         assert self.costs is not None
-        allowed = np.maximum(-self.costs.violation, -self.cost_reduction)
+        c, change = self.costs.violation, trial.cost_change
+        if self._case is Case.LOST and len(c) > 1:
+            # Limits that contradict each other: less of one violation may be more of another.
+            now, then = (float(np.linalg.norm(each.clip(min=0.0))) for each in (c, c + change))
+            cheaper = then <= max(0.0, now - self.cost_reduction)
+        else:
+            cheaper = bool(np.all(change <= np.maximum(-c, -self.cost_reduction)))
         return (
             trial.kl <= self.target_kl
-            and bool(np.all(trial.cost_change <= allowed))
+            and cheaper
             and (trial.improvement >= 0.0 or not self._case.feasible)
         )

@@ -39,8 +39,8 @@ class TRPOIPO(TrustRegion):
 
     φ continues as a straight line of slope ``-max_multiplier`` once it would be steeper. So the
     cost weighs ``min(1 / (t (d - J_C)), max_multiplier)`` in the gradient, and ``max_multiplier``
-    where the limit is broken, which at ``cost_limit=0`` is always. From a strictly feasible policy
-    the line search accepts none whose estimated cost reaches a limit.
+    where the limit is broken, which at ``cost_limit=0`` is always. While a limit is kept strictly,
+    the line search accepts no policy whose estimated cost reaches it.
 
     :param policy: policy class or its alias
     :param env: environment or its id
@@ -82,8 +82,8 @@ class TRPOIPO(TrustRegion):
     def accept(self, trial: Trial) -> bool:
         assert self.costs is not None
         violation = self.costs.violation
-        stays_inside = np.all(violation + trial.cost_change < 0.0) or not np.all(violation < 0.0)
-        return super().accept(trial) and bool(stays_inside)
+        stays_inside = ~(violation < 0.0) | (violation + trial.cost_change < 0.0)
+        return super().accept(trial) and bool(np.all(stays_inside))
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         assert self.costs is not None

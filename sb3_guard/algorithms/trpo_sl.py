@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
@@ -55,6 +56,8 @@ class TRPOSL(FilteredTrustRegion):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.policy.carry(SafetyLayer, {"n_costs": len(self.cost_keys), "drift": self.drift})
+        # What is derived from the limit is known once an episode has ended.
+        self._set_threshold(np.zeros(len(self.cost_keys)))
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)

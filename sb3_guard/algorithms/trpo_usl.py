@@ -27,11 +27,11 @@ class TRPOUSL(FilteredTrustRegion):
 
     starting from the sampled action, clipped to the box of the action space. Q_i is the discounted
     cost to come of the executed actions, a network with a softplus output fitted to λ-returns with
-    λ = ``cost_gae_lambda``. With λ = 0 the target is ``c + γ Q(s', a')``, a' the action executed
-    next, as in GUARD; fitted once per update, such a critic needs hundreds of updates to forget
-    where it started. ``kappa`` adds the paper's exact penalty: the policy then ascends
-    ``E[ratio · (A - κ h(s, a))]``, whose gradient is that of the expected penalty of the sampled
-    actions.
+    λ = ``cost_gae_lambda``; it can't learn costs below zero. With λ = 0 the target is
+    ``c + γ Q(s', a')``, a' the action executed next, as in GUARD; fitted once per update, such a
+    critic needs hundreds of updates to forget where it started. ``kappa`` adds the paper's exact
+    penalty: the policy then ascends ``E[ratio · (A - κ h(s, a))]``, whose gradient is that of the
+    expected penalty of the sampled actions.
 
     :param policy: policy class or its alias; a class of one's own derives from ``FilteredPolicy``
     :param env: environment or its id; its actions are a Box

@@ -9,43 +9,53 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from sb3_guard.envs import constraints, robots, tasks
 from sb3_guard.envs.part import Constraint, Robot, Task
 from sb3_guard.envs.robots.robot import MJCFRobot
 from sb3_guard.spelling import did_you_mean
 
-ROBOTS: dict[str, type[Robot]] = {
-    "Point": robots.Point,
-    "Car": robots.Car,
-    "Doggo": robots.Doggo,
-    "Swimmer": robots.Swimmer,
-    "Ant": robots.Ant,
-    "Walker": robots.Walker,
-    "Humanoid": robots.Humanoid,
-    "Hopper": robots.Hopper,
-    "Arm3": robots.Arm3,
-    "Arm6": robots.Arm6,
-    "Drone": robots.Drone,
-}
-TASKS: dict[str, type[Task]] = {
-    "Goal": tasks.Goal,
-    "Push": tasks.Push,
-    "Chase": tasks.Chase,
-    "Defense": tasks.Defense,
-    "Button": tasks.Button,
-}
-CONSTRAINTS: dict[str, type[Constraint]] = {
-    "Hazards": constraints.Hazards,
-    "Ghosts": constraints.Ghosts,
-    "Vases": constraints.Vases,
-    "Pillars": constraints.Pillars,
-    "Buttons": constraints.Buttons,
-    "Gremlins": constraints.Gremlins,
-}
+
+def _parts(kind: str, *names: str) -> dict[str, Any]:
+    """Classes by their names: ``Leave`` of the tasks is in ``sb3_guard/envs/tasks/leave.py``."""
+    modules = [import_module(f"sb3_guard.envs.{kind}.{name.lower()}") for name in names]
+    return {name: getattr(module, name) for name, module in zip(names, modules, strict=True)}
+
+
+ROBOTS: dict[str, type[Robot]] = _parts(
+    "robots",
+    "Point",
+    "Car",
+    "Doggo",
+    "Swimmer",
+    "Ant",
+    "Walker",
+    "Humanoid",
+    "Hopper",
+    "Arm3",
+    "Arm6",
+    "Drone",
+)
+TASKS: dict[str, type[Task]] = _parts(
+    "tasks",
+    "Goal",
+    "Push",
+    "Chase",
+    "Defense",
+    "Button",
+)
+CONSTRAINTS: dict[str, type[Constraint]] = _parts(
+    "constraints",
+    "Hazards",
+    "Ghosts",
+    "Vases",
+    "Pillars",
+    "Buttons",
+    "Gremlins",
+)
 
 EPISODE_STEPS = 1000  # control steps
 LADDER = (1, 2, 4, 8, 16)  # numbers of a constraint's objects, by growing difficulty

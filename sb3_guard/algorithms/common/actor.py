@@ -70,6 +70,23 @@ def actor_parameters(policy: ActorCriticPolicy) -> list[th.Tensor]:
     return _reached(distribution.log_prob(distribution.get_actions(deterministic=True)), policy)
 
 
+def actor_modules(policy: ActorCriticPolicy) -> list[nn.Module]:
+    """The modules that compute the action distribution, found by calling them."""
+    policy.set_training_mode(False)
+    called: list[nn.Module] = []
+    hooks = [
+        module.register_forward_hook(lambda module, *_: called.append(module))
+        for module in policy.modules()
+    ]
+    try:
+        with th.no_grad():
+            policy.get_distribution(_zero_observation(policy))
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return called
+
+
 def value_parameters(policy: ActorCriticPolicy) -> list[th.Tensor]:
     """The parameters of the value function that the actor does not share.
 
@@ -130,7 +147,8 @@ class Actor:
         for old, index in zip(self.old, self.slices, strict=True):
             new = self._distribution(index)
             log_prob.append(new.log_prob(self.actions[index]))
-            divergence += float(kl(old, new).sum(dtype=th.float64))
+            # Summed on the CPU: not every device has float64.
+            divergence += float(kl(old, new).cpu().sum(dtype=th.float64))
         ratio = th.exp(th.cat(log_prob) - self.old_log_prob)
         return ratio, divergence / len(ratio)
 

@@ -55,16 +55,28 @@ def read_costs(
         rows = [[info.get(key, 0.0) for key in keys] for info in infos]
         seen = any(key in info for info in infos for key in keys)
     try:
-        costs = np.array(rows, dtype=np.float64).reshape(len(infos), len(keys))
+        raw = np.array(rows)
+        costs = raw.astype(np.float64).reshape(len(infos), len(keys))
     except (TypeError, ValueError):
-        costs = np.full((len(infos), len(keys)), np.nan)
-    if not np.isfinite(costs).all():
-        i, j = np.argwhere(~np.isfinite(costs))[0]
-        raise ValueError(
-            f"info[{keys[j]!r}] of environment {i} is {rows[i][j]!r}: "
-            "a cost must be a finite number"
-        )
+        raise _no_number(rows, keys) from None
+    # NumPy would read a number from a text, which then is somebody's mistake.
+    if raw.dtype.kind in "US" or not np.isfinite(costs).all():
+        raise _no_number(rows, keys)
     return costs, seen
+
+
+def _no_number(rows: Sequence[Sequence[Any]], keys: Sequence[str]) -> ValueError:
+    def is_cost(value: Any) -> bool:
+        try:
+            return not isinstance(value, str | bytes) and bool(np.isfinite(float(value)))
+        except (TypeError, ValueError):
+            return False
+
+    places = ((i, j) for i, row in enumerate(rows) for j in range(len(row)))
+    i, j = next(((i, j) for i, j in places if not is_cost(rows[i][j])), (0, 0))
+    return ValueError(
+        f"info[{keys[j]!r}] of environment {i} is {rows[i][j]!r}: a cost must be a finite number"
+    )
 
 
 def _missing(infos: Sequence[dict[str, Any]], keys: Sequence[str]) -> ValueError:

@@ -13,7 +13,13 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.actor import n_rows, parameterless, rows, value_parameters
+from sb3_guard.algorithms.common.actor import (
+    actor_modules,
+    n_rows,
+    parameterless,
+    rows,
+    value_parameters,
+)
 from sb3_guard.algorithms.common.mlp import TanhMlp, chunks
 
 
@@ -87,8 +93,8 @@ class Regression:
     """Least-squares fit of a network to a batch, full-batch by default.
 
     A batch is observations, or a tuple of observations and whatever else ``values`` takes. Layers
-    that behave in another way during training, such as batch normalisation, do so here alone: the
-    policy that a trust region is about is the one that acted.
+    that behave in another way during training, such as batch normalisation, do so here alone, and
+    those of the actor not even here: the policy that a trust region is about is the one that acted.
 
     :param module: the policy or network that is fitted
     :param values: maps a batch to predictions, shape [B, m]
@@ -97,6 +103,7 @@ class Regression:
     :param inputs: maps a batch to the input of a tanh network, where ``values`` is one
     :param layers: the layers of that network
     :param readout: maps the network's outputs and the batch to predictions; None: they are equal
+    :param still: submodules of ``module`` that behave as in evaluation all the same
     """
 
     def __init__(
@@ -108,6 +115,7 @@ class Regression:
         inputs: Callable[[Any], th.Tensor] | None = None,
         layers: Sequence[nn.Linear] | None = None,
         readout: Callable[[th.Tensor, Any], th.Tensor] | None = None,
+        still: Sequence[nn.Module] = (),
     ) -> None:
         self.module = module
         self.values = values
@@ -116,10 +124,11 @@ class Regression:
         self.inputs = inputs
         self.network = TanhMlp(layers) if layers is not None else None
         self.readout = readout
+        self.still = still
 
     @classmethod
     def of_value(cls, policy: ActorCriticPolicy) -> "Regression":
-        """The policy's own critic; parameters shared with the actor stay still."""
+        """The policy's own critic; what it shares with the actor stays still."""
         parameters = value_parameters(policy)
         standard = type(policy).predict_values is ActorCriticPolicy.predict_values
         extractor = policy.vf_features_extractor
@@ -136,7 +145,8 @@ class Regression:
             return super(ActorCriticPolicy, policy).extract_features(observations, extractor)
 
         values = policy.predict_values
-        return cls(policy, values, parameters, policy.optimizer, features, layers)
+        still = actor_modules(policy)
+        return cls(policy, values, parameters, policy.optimizer, features, layers, None, still)
 
     @classmethod
     def of_network(
@@ -190,6 +200,8 @@ class Regression:
                 inputs = self.inputs(batch)
         self.optimizer.zero_grad(set_to_none=True)
         self.module.train(True)
+        for module in self.still:
+            module.training = False
         loss = 0.0
         for _ in range(n_epochs):
             if batch_size is None or batch_size >= n:

@@ -110,9 +110,11 @@ class Step(NamedTuple):
 # A constraint whose cost moves by less than this within the trust region has no usable gradient
 # (units of the cost per step).
 _NO_REACH = 1e-7
-# Share of the reward gradient that must remain across the constraint to be worth following: below
-# it the remainder is rounding error.
+# Share of the reward gradient, squared, that must remain across the constraint to be worth
+# following: below it the remainder is rounding error.
 _PARALLEL = 1e-8
+# The same of several constraints, whose weights multiply the rounding of v and W, in float32.
+_PARALLEL_TO_SEVERAL = 1e-6
 
 
 def constrained_step(
@@ -137,18 +139,28 @@ def constrained_step(
     :param W: F⁻¹b_i, shape (m, P)
     :param delta: trust-region radius δ > 0
     """
-    rows, images = th.cat([g[None], B]).double(), th.cat([v[None], W]).double()
-    gram = (rows @ images.T).cpu().numpy()  # [1 + m, 1 + m]
+    rows, images = _double(th.cat([g[None], B])), _double(th.cat([v[None], W]))
+    gram = (rows @ images.T).numpy()  # [1 + m, 1 + m]
     a, beta, case, lambda_kl, nu = _solve(
         (gram + gram.T) / 2, np.asarray(c, dtype=np.float64), delta
     )
-    x = a * v + th.as_tensor(beta, dtype=W.dtype, device=W.device) @ W
+    x = a * v + th.as_tensor(beta, dtype=W.dtype).to(W.device) @ W
     return Step(x, case, lambda_kl, nu)
 
 
-# Half-spaces count as contradictory if their nearest point lies 1/√ of this as far as the farthest
-# of them alone.
+def _double(tensor: th.Tensor) -> th.Tensor:
+    """In float64, on the CPU: not every device has that type."""
+    return tensor.cpu().double()
+
+
+# Half-spaces count as contradictory if their nearest point is this many times as far as the
+# farthest of them alone, and as a step of the trust region: where nearly opposite half-spaces
+# meet is then a matter of rounding, and of no use.
+_FAR = 100.0
+# No float64 knows better whether a point 1/√ of this as far as the farthest half-space exists.
 _CONTRADICTION = 1e-10
+# A constraint is kept if it is broken by less than this share of what such a step changes.
+_BROKEN = 1e-2
 
 
 def projected_step(
@@ -167,8 +179,9 @@ def projected_step(
 
         x = y - max(0, (bᵀy + c) / bᵀL⁻¹b) · L⁻¹b
 
-    It may lie outside the trust region. If no point satisfies the constraints, the step minimises
-    ``Σ max(0, c_i + b_iᵀx)²`` over the region, as :func:`constrained_step` does.
+    It may lie outside the trust region. If no point satisfies the constraints, or none within a
+    hundred times the way to the farthest of them, the step minimises ``Σ max(0, c_i + b_iᵀx)²``
+    over the region, as :func:`constrained_step` does.
 
     :param g: reward gradient, shape (P,)
     :param B: cost gradients, shape (m, P)
@@ -180,30 +193,35 @@ def projected_step(
     :return: the step, shape (P,), and how far it was pulled along each ``-L⁻¹b_i``, shape (m,)
     """
     c = np.asarray(c, dtype=np.float64)
-    rows, images = B.double(), W.double()
-    q = float(g.double() @ v.double())
-    y = v * (np.sqrt(2 * delta / q) if q > 0.0 else 0.0)
-    gram = (rows @ images.T).cpu().numpy()  # [m, m]
+    rows, images = _double(B), _double(W)
+    q = float(_double(g) @ _double(v))
+    y = (v * (np.sqrt(2 * delta / q) if q > 0.0 else 0.0)).cpu()
+    gram = (rows @ images.T).numpy()  # [m, m]
     gram = (gram + gram.T) / 2
     moves = np.sqrt(2 * delta * np.maximum(np.diag(gram), 0.0)) > _NO_REACH
-    excess = c + (rows @ y.double()).cpu().numpy()
-    pull = np.zeros(len(c))
+    excess = c + (rows @ y.double()).numpy()
+    x, pull = y, np.zeros(len(c))
     possible = bool(np.all(moves | (c <= 0.0)))
     if possible and np.any(excess[moves] > 0.0):
-        images = rows if euclidean else images
-        S = (rows @ images.T).cpu().numpy()[np.ix_(moves, moves)]
+        along = rows if euclidean else images
+        S = (rows @ along.T).numpy()[np.ix_(moves, moves)]
         normals, lengths = _unit_normals(S)
         offsets = excess[moves] / lengths
         # In units in which the farthest half-space is one away.
         scale = offsets.max()
         u, phi = shortest(normals, offsets / scale)
-        possible = phi > _CONTRADICTION
+        step = max(scale, float(y.norm()) if euclidean else np.sqrt(2 * delta))
+        possible = phi > max(_CONTRADICTION, 1.0 / (1.0 + (_FAR * step / scale) ** 2))
         if possible:
             pull[moves] = u / phi * scale / lengths
+            x = y - (th.as_tensor(pull) @ along).to(W.dtype)
+            # One half-space contradicts nothing. Several may seem to meet where they do not.
+            broken = (c + (rows @ x.double()).numpy())[moves] / lengths
+            possible = len(broken) == 1 or bool(np.all(broken <= _BROKEN * step))
     if not possible:
-        y, images = th.zeros_like(y), W.double()
         pull = _least_violation(gram, c, delta, moves)
-    return y - (th.as_tensor(pull, device=W.device) @ images).to(W.dtype), pull
+        x = -(th.as_tensor(pull) @ images).to(W.dtype)
+    return x.to(W.device), pull
 
 
 _Solution = tuple[float, np.ndarray, float, np.ndarray]
@@ -307,14 +325,30 @@ def _dual(gram: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) -> _
         point, _ = project(np.exp(log_lam))
         return float(point @ point) - 1.0
 
-    lam = np.exp(_root(excess, np.log(1e-7), np.log(1e7)))
-    _, mu = project(lam)
+    def solve() -> tuple[float, np.ndarray]:
+        lam = np.exp(_root(excess, np.log(1e-7), np.log(1e7)))
+        return lam, project(lam)[1]
+
+    lam, mu = solve()
     beta, nu = np.zeros(len(c)), np.zeros(len(c))
-    beta[moves] = -mu * radius / lengths
-    nu[moves] = mu * lam * size / lengths
     if not rewarded:
-        return 0.0, beta, 0.0, np.zeros(len(c))
-    return radius / (lam * size), beta, lam * size / radius, nu
+        beta[moves] = -mu * radius / lengths
+        return 0.0, beta, 0.0, nu
+    a, share, active = radius / (lam * size), np.zeros(len(mu)), mu > 0.0
+    if active.any():
+        rcond = np.sqrt(_PARALLEL_TO_SEVERAL)
+        share[active] = np.linalg.lstsq(normals[active].T, gradient, rcond=rcond)[0]
+        across = gradient - share @ normals
+        if across @ across <= _PARALLEL_TO_SEVERAL:
+            # The reward gradient is a sum of cost gradients: the step is one as well.
+            gradient = share @ normals
+            lam, mu = solve()
+            a, share = 0.0, share / lam
+        else:
+            share[:] = 0.0
+    beta[moves] = (share - mu) * radius / lengths
+    nu[moves] = mu * lam * size / lengths
+    return a, beta, lam * size / radius, nu
 
 
 def _root(decreasing: Callable[[float], float], low: float, high: float) -> float:
@@ -327,7 +361,7 @@ def _root(decreasing: Callable[[float], float], low: float, high: float) -> floa
 
 
 def _least_violation(S: np.ndarray, c: np.ndarray, delta: float, moves: np.ndarray) -> np.ndarray:
-    """Weights p ≥ 0 of ``x = -Σ p_i w_i`` that minimise ``Σ max(0, c_i + b_iᵀx)²`` in the region.
+    """Weights p of ``x = -Σ p_i w_i`` that minimise ``Σ max(0, c_i + b_iᵀx)²`` in the region.
 
     For a fixed multiplier μ of the trust region the dual is a non-negative least-squares problem
     whose solution is p μ; μ by a scalar search, the KL of the step falls as it rises. Constraints
@@ -335,9 +369,9 @@ def _least_violation(S: np.ndarray, c: np.ndarray, delta: float, moves: np.ndarr
     """
     if not moves.any():
         return np.zeros(len(c))
-    normals, lengths = _unit_normals(S[np.ix_(moves, moves)])
+    units, lengths = _unit_normals(S[np.ix_(moves, moves)])
     largest, radius = lengths.max(), np.sqrt(2 * delta)
-    normals = normals * (lengths / largest)[:, None]
+    normals = units * (lengths / largest)[:, None]
     offsets = c[moves] / (largest * radius)
 
     def weights(mu: float) -> np.ndarray:
@@ -351,6 +385,12 @@ def _least_violation(S: np.ndarray, c: np.ndarray, delta: float, moves: np.ndarr
 
     # The compromise between contradictory constraints may lie inside the region: then μ is zero.
     top = 1e9 * max(1.0, float(np.abs(offsets).max()))
+    best = weights(np.exp(_root(excess, np.log(1e-9), np.log(top))))
     p = np.zeros(len(c))
-    p[moves] = weights(np.exp(_root(excess, np.log(1e-9), np.log(top)))) * radius / largest
+    p[moves] = best * radius / largest
+    if len(best) > 1:
+        # Opposite normals have large weights that cancel each other, and would not cancel the
+        # errors of the w_i: of all weights of this point take the smallest.
+        rcond = np.sqrt(_PARALLEL_TO_SEVERAL)
+        p[moves] = np.linalg.lstsq(units.T, best @ normals, rcond=rcond)[0] * radius / lengths
     return p

@@ -39,10 +39,10 @@ from stable_baselines3.common.policies import (
 )
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import explained_variance, obs_as_tensor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
-from sb3_guard.algorithms.common.actor import Actor
+from sb3_guard.algorithms.common.actor import Actor, actor_modules
 from sb3_guard.algorithms.common.buffers import (
     CostDictRolloutBuffer,
     CostRolloutBuffer,
@@ -295,6 +295,7 @@ class TrustRegion(OnPolicyAlgorithm):
         self.costs: CostEstimate | None = None
         self.timing: dict[str, float] = {}
         self._rng_at_rollout: tuple[Any, Any, th.Tensor] | None = None
+        self._cuda_at_rollout: list[th.Tensor] = []  # one per device
         self._begin_rollout_statistics()
 
         if _init_setup_model:
@@ -364,18 +365,24 @@ class TrustRegion(OnPolicyAlgorithm):
             "keep_executed": self._corrects,
         }
         super()._setup_model()
-        self._value_regression = Regression.of_value(self.policy)
         if self.uses_cost_critic:
             self.cost_critic = CostCritic(self.policy, n_costs)
-            self._cost_regression = Regression.of_network(self.cost_critic)
+        if any(
+            getattr(module, "num_batches_tracked", None) == 0
+            for module in actor_modules(self.policy)
+        ):
+            self._warn_once(
+                "the actor has batch normalisation that has seen no data: it will keep the mean 0 "
+                "and variance 1 it starts from, since statistics that move would change the "
+                "policy outside the trust region; VecNormalize normalises observations"
+            )
 
     def _excluded_save_params(self) -> list[str]:
         return [
             *super()._excluded_save_params(),
-            "_value_regression",
-            "_cost_regression",
             "_timeouts",
             "_rng_at_rollout",
+            "_cuda_at_rollout",
         ]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -452,6 +459,7 @@ class TrustRegion(OnPolicyAlgorithm):
         # these to continue as if it had never been written.
         legacy = np.random.get_state()  # noqa: NPY002 (the generator SB3 draws from)
         self._rng_at_rollout = (random.getstate(), legacy, th.get_rng_state())
+        self._cuda_at_rollout = th.cuda.get_rng_state_all() if self.device.type == "cuda" else []
         started = time.perf_counter()
         self._begin_rollout_statistics()
         full = super().collect_rollouts(
@@ -542,13 +550,20 @@ class TrustRegion(OnPolicyAlgorithm):
 
     def _horizon_before_any_episode(self) -> float:
         assert self.env is not None and self.running_lengths is not None
+        limits: list[Any] = []
         try:
-            specs = self.env.get_attr("spec")
+            if isinstance(self.env.unwrapped, SubprocVecEnv):
+                # A number, TimeLimit's: not every spec can be sent from process to process, and to
+                # ask for what isn't there would end them.
+                if self.env.has_attr("_max_episode_steps"):
+                    limits = self.env.get_attr("_max_episode_steps")
+            else:
+                specs = self.env.get_attr("spec")
+                limits = [getattr(spec, "max_episode_steps", None) for spec in specs]
         except (AttributeError, NotImplementedError):
-            specs = []
-        limits = np.array([getattr(spec, "max_episode_steps", None) or np.nan for spec in specs])
-        if len(limits) and np.isfinite(limits).all():
-            return float(limits.mean())
+            pass
+        if limits and all(is_number(limit) and limit > 0 for limit in limits):
+            return float(np.mean(limits))
         longest = float(self.running_lengths.max())
         if self.constrained:
             self._warn_once(
@@ -647,27 +662,36 @@ class TrustRegion(OnPolicyAlgorithm):
         if not bool(th.isfinite(x).all()) or not bool(x.any()):
             return 0.0, stay
         origin = flatten(actor.parameters)
-        fraction = 1.0
-        for _ in range(self.line_search_max_iter):
-            assign(actor.parameters, origin + fraction * x)
-            ratio, kl = actor.evaluate()
-            change = ((ratio - 1.0) @ batch.cost_advantages) / len(ratio)
-            improvement = float(self.surrogate(batch, ratio)) - before
-            trial = Trial(kl, improvement, change.cpu().numpy().astype(np.float64))
-            if self.accept(trial):
-                return fraction, trial
-            fraction *= self.line_search_shrinking_factor
-        assign(actor.parameters, origin)
+        fraction, accepted = 1.0, False
+        try:
+            for _ in range(self.line_search_max_iter):
+                assign(actor.parameters, origin + fraction * x)
+                try:
+                    ratio, kl = actor.evaluate()
+                except ValueError:
+                    # So far off that torch refuses the distribution: a scale of 0, a mean of nan.
+                    fraction *= self.line_search_shrinking_factor
+                    continue
+                change = ((ratio - 1.0) @ batch.cost_advantages) / len(ratio)
+                improvement = float(self.surrogate(batch, ratio)) - before
+                trial = Trial(kl, improvement, change.cpu().numpy().astype(np.float64))
+                accepted = self.accept(trial)
+                if accepted:
+                    return fraction, trial
+                fraction *= self.line_search_shrinking_factor
+        finally:
+            if not accepted:
+                assign(actor.parameters, origin)
         return 0.0, stay
 
     def _update_critics(self, batch: CostRolloutBufferSamples) -> None:
-        loss = self._value_regression.fit(
+        loss = Regression.of_value(self.policy).fit(
             batch.observations, batch.returns[:, None], self.n_critic_updates, self.batch_size
         )
         self._check_finite("value_loss", loss)
         self.logger.record("train/value_loss", loss)
         if self.uses_cost_critic:
-            loss = self._cost_regression.fit(
+            loss = Regression.of_network(self.cost_critic).fit(
                 batch.observations, batch.cost_returns, self.n_critic_updates, self.batch_size
             )
             self._check_finite("cost_value_loss", loss)

@@ -4,7 +4,6 @@ The pages are Markdown that also reads well on GitHub. Equations become MathML w
 built, so that a browser shows them without a script or the network.
 """
 
-import re
 from typing import Any
 
 from docutils import nodes
@@ -65,13 +64,5 @@ def display_math(writer: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
-def keep_shapes(
-    app: Any, what: str, name: str, obj: object, options: object, lines: list[str]
-) -> None:
-    """Shapes such as [N, *shape] are no emphasis."""
-    lines[:] = [re.sub(r"(?<!`)(\[[^]`]*\*\w[^]`]*\])(?!`)", r"``\1``", line) for line in lines]
-
-
 def setup(app: Any) -> None:
     app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))
-    app.connect("autodoc-process-docstring", keep_shapes)

@@ -147,6 +147,11 @@ def test_estimate_by_hand():
     assert same == (2.0, 0.0, 2.0, 2.0)
 
 
+def test_an_evaluation_in_words():
+    words = str(evaluation([1, 3]))
+    assert words.startswith("2 episodes: return 2.000 ± 1.000 (95 % [1.000, 3.000]), cost ")
+
+
 def test_no_interval_from_one_episode_and_nothing_from_none():
     one = evaluation([2.0]).estimate(np.array([2.0]))
     assert one.mean == 2.0 and np.isnan(one.low) and np.isnan(one.high)

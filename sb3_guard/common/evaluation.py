@@ -53,6 +53,10 @@ class Evaluation:
     def __len__(self) -> int:
         return len(self.returns)
 
+    def __str__(self) -> str:
+        returns, costs = self.estimate(self.returns), self.estimate(self.costs)
+        return f"{len(self)} episodes: return {returns}, cost {costs}"
+
     def estimate(self, values: np.ndarray, resamples: int = 2000) -> Estimate:
         """
         Mean, standard deviation and 95 % percentile-bootstrap interval of one of the arrays.

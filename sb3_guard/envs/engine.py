@@ -280,7 +280,7 @@ class Engine:
         self._warned = self._warnings.copy()
 
     def array(self, name: str, shape: tuple[int, ...] = (), dtype: Any = float) -> Array:
-        """The array ``name``, [N, *shape], zero when first asked for; part of the state."""
+        """The array ``name``, ``[N, *shape]``, zero when first asked for; part of the state."""
         if name not in self._arrays:
             self._arrays[name] = np.zeros((self.num_envs, *shape), dtype=dtype)
         return self._arrays[name]

@@ -61,7 +61,7 @@ class Simulation(Protocol):
     steps: Array  # [N] control steps since the episode began
 
     def array(self, name: str, shape: tuple[int, ...] = (), dtype: Any = float) -> Array:
-        """The engine's array ``name``, [N, *shape], zero at first, part of the engine's state."""
+        """The engine's array ``name``, ``[N, *shape]``, zero at first; part of the state."""
 
     def places(self, name: str) -> Array:
         """The live places of footprint ``name``, [N, num, 3] m, redrawn at every reset."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_guard import train
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.usage import Parser, UsageError, one_line, run
+from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, one_line, run
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -144,10 +144,21 @@ def read_grid(path: Path) -> list[str]:
         if value is None or value is False:
             continue
         arguments.append(action.option_strings[-1])
-        if isinstance(value, dict):
+        switch, pairs = action.nargs == 0, isinstance(action, KeyValues)
+        if pairs and isinstance(value, dict):
             arguments += [f"{key}:{one!r}" for key, one in value.items()]
-        elif value is not True:
-            arguments += [str(one) for one in (value if isinstance(value, list) else [value])]
+        elif action.nargs == "+" and not pairs and isinstance(value, list) and value:
+            arguments += [str(one) for one in value]
+        elif isinstance(value, dict | list) or (value is True) != switch:
+            several = "a mapping" if pairs else "one value or a list of them"
+            allowed = several if action.nargs == "+" else "true or false" if switch else "one value"
+            raise UsageError(f"{path}: {name}: {value!r} is not allowed; it must be {allowed}")
+        elif not switch:
+            arguments.append(str(value))
+    try:
+        parser().parse_args(arguments)
+    except UsageError as error:
+        raise UsageError(f"{path}: {one_line(error)}") from None
     return arguments
 
 
@@ -195,7 +206,8 @@ def executor(args: dict[str, Any], folder: Path) -> Iterator["Executor"]:
     from sb3_guard.zoo.worker import looks
 
     # What goes wrong is said here, in a line; its own tracebacks would bury that.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
     address = args["scheduler"]
     try:

@@ -50,29 +50,29 @@ DEFAULTS: dict[str, Any] = {
 }
 
 
-def training_flags(group: argparse._ArgumentGroup) -> None:
-    """Add the flags that say how to train, whatever is trained."""
-    group.add_argument(
-        "-n",
-        "--n-timesteps",
-        type=positive,
-        metavar="N",
-        help="length of training, e.g. 1e6 (default: as in the hyper-parameter file)",
-    )
+def training_flags(group: argparse._ArgumentGroup, **instead: str) -> None:
+    """
+    Add the flags that say how to train, whatever is trained.
+
+    :param instead: help texts that are not those of ``train``, by the flag's name in the result
+    """
+    texts = {
+        "n_timesteps": "length of training, e.g. 1e6 (default: as in the hyper-parameter file)",
+        "hyperparams": "hyper-parameters that differ from the file, e.g. n_steps:500 cost_limit:25",
+        "conf_file": "hyper-parameters: 'paper' for the paper's table to the letter, a YAML file, "
+        "or a Python file or module with a dict 'hyperparams' (default: hyperparams/<algo>.yml)",
+        **instead,
+    }
+    group.add_argument("-n", "--n-timesteps", type=positive, metavar="N", help=texts["n_timesteps"])
     group.add_argument(
         "-params",
         "--hyperparams",
         nargs="+",
         action=KeyValues,
         metavar="KEY:VALUE",
-        help="hyper-parameters that differ from the file, e.g. n_steps:500 cost_limit:25",
+        help=texts["hyperparams"],
     )
-    group.add_argument(
-        "-conf",
-        "--conf-file",
-        metavar="FILE",
-        help="hyper-parameters: a YAML file, or a Python file or module with a dict 'hyperparams'",
-    )
+    group.add_argument("-conf", "--conf-file", metavar="FILE", help=texts["conf_file"])
     group.add_argument(
         "--env-kwargs",
         nargs="+",

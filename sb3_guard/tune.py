@@ -7,7 +7,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, positive, run
+from sb3_guard.train import training_flags
+from sb3_guard.zoo.usage import Parser, UsageError, positive, run
 
 EXAMPLES = """examples:
   python -m sb3_guard.tune --algo trpo_lag --env Goal_Point_8Hazards --n-trials 50 -n 1e6
@@ -68,12 +69,11 @@ def parser() -> Parser:
     what.add_argument(
         "--env", help="environment id; the version may be left out (default: Goal_Point_8Hazards)"
     )
-    what.add_argument(
-        "-n",
-        "--n-timesteps",
-        type=positive,
-        metavar="N",
-        help="length of one training, e.g. 1e6 (default: as in the hyper-parameter file)",
+    training_flags(
+        what,
+        n_timesteps="length of one training, e.g. 1e6 (default: as in the hyper-parameter file)",
+        hyperparams="hyper-parameters that are fixed, and not searched, e.g. cost_limit:5",
+        conf_file="hyper-parameters to begin with, as for train (default: hyperparams/<algo>.yml)",
     )
     what.add_argument(
         "--cost-limit",
@@ -89,41 +89,10 @@ def parser() -> Parser:
         help="search the front of return and cost instead; the limit is only drawn",
     )
     what.add_argument(
-        "-params",
-        "--hyperparams",
-        nargs="+",
-        action=KeyValues,
-        metavar="KEY:VALUE",
-        help="hyper-parameters that are fixed, and not searched, e.g. cost_limit:5",
-    )
-    what.add_argument(
-        "-conf",
-        "--conf-file",
-        metavar="FILE",
-        help="hyper-parameters to begin with (default: those that train uses)",
-    )
-    what.add_argument(
         "--search-space",
         metavar="FILE",
         help="YAML file of ranges and lists to search (default: that of the algorithm)",
     )
-    what.add_argument(
-        "--env-kwargs",
-        nargs="+",
-        action=KeyValues,
-        metavar="KEY:VALUE",
-        help="arguments of the environment, e.g. \"hazards:{'num': 4}\"",
-    )
-    what.add_argument(
-        "--vec-env", choices=["native", "dummy", "subproc"], help="as for train (default: native)"
-    )
-    what.add_argument(
-        "--gym-packages",
-        nargs="+",
-        metavar="MODULE",
-        help="modules to import first, since they register environments",
-    )
-    what.add_argument("--device", help="torch device (default: auto)")
 
     search = result.add_argument_group("search")
     search.add_argument(

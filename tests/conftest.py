@@ -1,10 +1,21 @@
-"""One thread for torch in every test: results and times do not depend on the machine's cores."""
+"""What every test has in common: one thread for torch, and nothing left behind in /tmp."""
+
+from collections.abc import Iterator
 
 import pytest
 
 
 @pytest.fixture(autouse=True, scope="session")
 def _one_torch_thread() -> None:
+    """Results and times do not depend on the machine's cores."""
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _loggers_in_pytests_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Of a model that is given no logger SB3 makes a folder in the system's temporary one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("sb3")))
+        yield

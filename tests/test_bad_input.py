@@ -92,6 +92,8 @@ TRAIN = [
     (["-conf", "absent.yml"], ["there is no hyper-parameter file absent.yml"]),
     # flags
     (["--sede", "3"], ["unknown flag --sede", "--seed"]),
+    (["cpo"], ["'cpo' belongs to no flag", "--help"]),
+    (["-params", "frame_stack:0"], ["frame_stack: 0", "at least 1"]),
     (["-n", "0"], ["-n", "at least 1"]),
     (["-n", "1.5"], ["'1.5' is not a whole number"]),
     (["-n", "many"], ["'many' is not a whole number"]),

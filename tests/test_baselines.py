@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from test_resume import assert_same_run, crash, runs_of
 
-from sb3_guard import enjoy, train
+from sb3_guard import CPO, enjoy, train
 from sb3_guard.zoo.algos import algorithm, baselines
 from sb3_guard.zoo.config import shipped_file
 from sb3_guard.zoo.usage import UsageError
@@ -97,6 +97,33 @@ def test_rl_zoos_command_with_our_algorithm(tmp_path):
     (tmp_path / "guard_trpo").rename(tmp_path / "trpo")
     play = "--algo trpo --env Goal_Point_8Hazards --n-episodes 1 -f"
     assert enjoy.main([*play.split(), str(tmp_path)]) == 0
+
+
+def test_rl_zoos_search_in_our_space(tmp_path, monkeypatch):
+    from sb3_guard.zoo import rl_zoo3
+
+    seen = []
+    learn = CPO.learn
+
+    def noted(self, *args, **kwargs):
+        seen.append((self.n_envs, self.target_kl, self.policy_kwargs))
+        return learn(self, *args, **kwargs)
+
+    monkeypatch.setattr(CPO, "learn", noted)
+    monkeypatch.setattr(sys, "argv", [])
+    command = (
+        "train --algo cpo --env CostPoint-v0 --gym-packages registered_envs -n 60 --device cpu "
+        "--optimize --no-optim-plots --n-trials 2 --n-evaluations 1 --eval-episodes 1 --seed 1 -f"
+    ).split()
+    params = ["-params", "n_envs:2", "n_steps:30", "env_kwargs:dict(episode_length=20)"]
+    assert rl_zoo3.main([*command, str(tmp_path), *params]) == 0
+    (report,) = (tmp_path / "cpo").glob("report_*.csv")
+    trials = pd.read_csv(report)
+    assert trials["state"].tolist() == ["COMPLETE"] * 2
+    assert np.isfinite(trials["value"]).all()
+    for (n_envs, target_kl, policy), drawn in zip(seen, trials["params_target_kl"], strict=True):
+        assert n_envs == 2 and target_kl == pytest.approx(drawn, rel=1e-3)
+        assert policy["ortho_init"] is False and "net_arch" in policy
 
 
 @pytest.mark.parametrize("arguments", [[], ["enjoy"]])

@@ -1,6 +1,7 @@
 """Grids: refused in full or carried out in full, whatever dies meanwhile."""
 
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -193,7 +194,17 @@ GRID_FILES = [
     ("suites: [a", "is not valid YAML"),
     ("just text", "must map flags to values"),
     ("suits: [CostPoint-v0]", "unknown entry 'suits'; did you mean 'suites'?"),
-    ("suites: [Goal_Point_8Hazards]\nscale: 0", "--scale"),
+    ("suites: [Goal_Point_8Hazards]\nscale: 0", "g.yml: argument --scale"),
+    ("suites: []", "suites: [] is not allowed; it must be one value or a"),
+    ("suites: {Goal_Point_8Hazards: 1}", "it must be one value or a list of them"),
+    (
+        "suites: [Goal_Point_8Hazards]\nscale: [1, 2]",
+        "scale: [1, 2] is not allowed; it must be",
+    ),
+    ("suites: [Goal_Point_8Hazards]\ntrack: maybe", "'maybe' is not allowed; it must be true or"),
+    ("suites: [Goal_Point_8Hazards]\nn_timesteps: true", "it must be one value"),
+    ("suites: [Goal_Point_8Hazards]\nhyperparams: [a]", "it must be a mapping"),
+    ("suites: [Goal_Point_8Hazards]\nseeds: [zero]", "g.yml: argument --seeds: invalid int value"),
     ("seeds: [0]", "which grid?"),
 ]
 
@@ -601,6 +612,28 @@ def test_without_dask(tmp_path, monkeypatch, capsys):
     refused(benchmark.main, arguments, capsys, "needs Dask's scheduler", "pip install distributed")
 
 
+def test_the_scheduler_dies(tmp_path, monkeypatch, capsys, here):
+    class Dying(Here):
+        """Dask cancels what is under way when its scheduler is gone."""
+
+        def submit(self, fn, /, *args, **kwargs):
+            future: Future = Future()
+            if args[0].args["algo"] == "trpo":
+                future.cancel()
+                future.set_running_or_notify_cancel()
+                return future
+            return super().submit(fn, *args, **kwargs)
+
+    monkeypatch.setattr(grid, "LocalExecutor", Dying)
+    arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
+    refused(
+        benchmark.main, arguments, capsys,
+        "the workers are gone, or the scheduler is",
+        f"go on with: sb3-guard benchmark -f {tmp_path}",
+    )  # fmt: skip
+    assert not list(tmp_path.glob(".grid-*"))  # so that what still runs somewhere ends
+
+
 def test_no_scheduler_there(tmp_path, monkeypatch, capsys):
     distributed = pytest.importorskip("distributed")
     whole = distributed.Client.__init__
@@ -613,6 +646,8 @@ def test_no_scheduler_there(tmp_path, monkeypatch, capsys):
             benchmark.main, [*arguments, "--scheduler", address], capsys,
             f"no Dask scheduler answers at {address}", "start one with: dask scheduler",
         )  # fmt: skip
+    # Its own tracebacks would bury what is said here.
+    assert not logging.getLogger("distributed.client").isEnabledFor(logging.ERROR)
 
 
 @pytest.mark.slow

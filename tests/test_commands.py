@@ -2,23 +2,33 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
 from cost_envs import CostPoint
+from matplotlib import image
+from PIL import Image
 from rl_zoo3.utils import EnvironmentName, get_model_path
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from worlds import own_parts
 
-from sb3_guard import CPO, cli, enjoy, train
+from sb3_guard import ALGORITHMS, CPO, cli, enjoy, make_vec_env, train
+from sb3_guard.envs import Scenario, register, register_constraint
+from sb3_guard.envs.part import Constraint
+from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.zoo import usage
 from sb3_guard.zoo.config import build, check
 from sb3_guard.zoo.environments import make_envs
+from sb3_guard.zoo.playback import PRETRAINED
 
 TOY = "--gym-packages registered_envs --env CostPoint-v0".split()
 SMALL = (
@@ -282,18 +292,51 @@ def test_record_writes_a_video(logs, tmp_path):
     assert pictures[0].max() > 200 and abs(int(np.median(pictures[0])) - 60) < 10
 
 
-def test_record_our_environment(tmp_path):
+def require_rendering():
     from sb3_guard.envs.rendering import RenderingError, gl_backend
 
     try:
         gl_backend()
     except RenderingError as error:
         pytest.skip(str(error))
+
+
+def test_record_our_environment(tmp_path):
+    require_rendering()
     trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
     video = tmp_path / "film.mp4"
     play = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3", "--record", str(video)]
     assert enjoy.main(play) == 0
     assert video.stat().st_size > 1000
+
+
+def test_an_arm_trains_plays_and_records(tmp_path):
+    import imageio_ffmpeg
+
+    from sb3_guard.envs.rendering import RenderingError, gl_backend
+
+    try:
+        gl_backend()
+    except RenderingError as error:
+        pytest.skip(str(error))
+    command = "-m sb3_guard.train --algo cpo --env Goal_Arm6_8Hazards -n 120 --seed 0 -f".split()
+    small = "--env-kwargs max_episode_steps:10 --eval-freq 60 --eval-episodes 2".split()
+    params = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3"]
+    done = subprocess.run(
+        [sys.executable, *command, str(tmp_path), *small, *params], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    run = tmp_path / "cpo" / "Goal_Arm6_8Hazards-v0_1"
+    assert json.loads((run / "result.json").read_text())["episodes"] == 6
+    video, played = tmp_path / "film.mp4", tmp_path / "played.json"
+    play = ["--algo", "cpo", "--env", "Goal_Arm6_8Hazards", "-f", str(tmp_path), "--load-best"]
+    assert enjoy.main([*play, "-n", "10", "--record", str(video), "--json", str(played)]) == 0
+    assert json.loads(played.read_text())["length"]["values"] == [10]
+    frames = imageio_ffmpeg.read_frames(str(video))
+    next(frames)
+    pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
+    assert len(pictures) == 10
+    assert np.ptp(pictures[0]) > 100 and not np.array_equal(pictures[0], pictures[-1])
 
 
 def test_our_environment_has_a_window(tmp_path, monkeypatch):
@@ -319,6 +362,168 @@ def test_no_backend_no_video(tmp_path, monkeypatch, capsys):
     assert enjoy.main(play) == 2
     assert "error: can't render: RenderingError: no OpenGL backend" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
+
+
+# the agents that the package ships
+
+SHIPPED = sorted(PRETRAINED.glob("*/*_1"))
+
+
+@pytest.mark.parametrize("run", SHIPPED, ids=lambda run: f"{run.parent.name}-{run.name}")
+def test_a_shipped_agent_is_small_good_and_goes_on_learning(run):
+    algo, env_id = run.parent.name, run.name.removesuffix("_1")
+    files = [path for path in run.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 100_000
+    text = "".join(path.read_text() for path in files if path.suffix != ".zip")
+    assert "/tmp" not in text and "/work" not in text and f"--env {env_id[:-3]} " in text
+    env = make_vec_env(env_id, 20, seed=5, max_episode_steps=300)
+    model = ALGORITHMS[algo].load(run / f"{env_id}.zip", env=env, device="cpu", n_steps=10)
+    assert model.ep_info_buffer is None and not model.policy.optimizer.state
+    obs, total = env.reset(), np.zeros(20)
+    for _ in range(300):
+        obs, rewards, *_ = env.step(model.predict(obs, deterministic=True)[0])
+        total += rewards
+    assert total.mean() > 3.0  # random actions: about 0
+    model.learn(200)
+
+
+def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert enjoy.main(["--pretrained", "-n", "20", "--no-render"]) == 0
+    assert "cpo/Goal_Point_8Hazards-v0_1" in capsys.readouterr().out
+    which = ["--algo", "trpo", "--env", "Goal_Point_8Hazards", "--no-render"]
+    short = ["--n-episodes", "1", "--env-kwargs", "max_episode_steps:30"]
+    assert enjoy.main([*which, "--pretrained", *short, "--json", "played.json"]) == 0
+    assert json.loads((tmp_path / "played.json").read_text())["length"]["values"] == [30]
+    assert enjoy.main(which) == 2
+    assert "or play the package's own with --pretrained" in capsys.readouterr().err
+
+
+def test_a_film_of_a_shipped_agent_is_not_written_into_the_package(tmp_path, monkeypatch):
+    require_rendering()
+    monkeypatch.chdir(tmp_path)
+    assert enjoy.main(["--pretrained", "-n", "3", "--record"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["cpo-Goal_Point_8Hazards-v0.mp4"]
+
+
+def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch):
+    require_rendering()
+    script = runpy.run_path(str(PRETRAINED.parent.parent / "scripts" / "render_gallery.py"))
+    animation = script["animation"]
+    monkeypatch.setitem(animation.__globals__, "FRAMES", 2)
+    animation(tmp_path / "film.gif", 0)
+    with Image.open(tmp_path / "film.gif") as film:
+        assert (film.n_frames, film.size) == (2, (808, 278))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--algo", "ppo", "--env", "Goal_Ant_8Hazards"],
+            "no trained agent of ppo on Goal_Ant_8Hazards-v0 comes with the package; there are: "
+            "cpo on Goal_Point_8Ghosts-v0, cpo on Goal_Point_8Hazards-v0, ",
+        ),
+        (["-f", "logs"], "leave out --folder and --exp-id"),
+        (["--exp-id", "1"], "leave out --folder and --exp-id"),
+        (["--load-best"], "not allowed with argument"),
+    ],
+)
+def test_what_is_not_shipped_is_not_played(arguments, message, capsys):
+    assert enjoy.main(["--pretrained", "--no-render", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+# list and show
+
+
+def rows(text: str) -> list[list[str]]:
+    """The cells of the tables in what a command printed."""
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_list_prints_what_there_is(capsys):
+    assert cli.main(["list"]) == 0
+    cells = rows(capsys.readouterr().out)
+    names = [row[0] for row in cells]
+    assert (
+        sum(row.count(f"{row[0]}_8Hazards") + row.count(f"{row[0]}_8Ghosts") for row in cells) == 72
+    )
+    for kind, known in (("robot", ROBOTS), ("task", TASKS), ("constraint", CONSTRAINTS)):
+        first = names.index(kind) + 1
+        assert names[first : first + len(known)] == list(known)
+    assert ["Ant", "8", "planar", "0.2"] in [row[:4] for row in cells]
+    assert ["Goal", "no", "no", "one", "planar, spatial"] in [row[:5] for row in cells]
+    assert ["Ghosts", "yes; no if solid", "active", "planar, spatial"] in [r[:4] for r in cells]
+    assert cli.main(["list", "robots"]) == 0
+    assert [row[0] for row in rows(capsys.readouterr().out)] == ["robot", *ROBOTS]
+
+
+def test_list_shows_what_users_registered(capsys):
+    @dataclass
+    class Quiet(Constraint):
+        def cost(self):
+            return np.zeros(self.sim.num_envs)
+
+    with own_parts():
+        register_constraint("Quiet", Quiet)
+        assert cli.main(["list", "constraints"]) == 0
+    assert ["Quiet", "", "", "planar, spatial"] in [r[:4] for r in rows(capsys.readouterr().out)]
+
+
+def test_a_ladder_of_difficulty(capsys):
+    assert cli.main(["list", "--ladder", "Goal_Point", "Hazards"]) == 0
+    ids = [f"Goal_Point_{n}Hazards-v0" for n in (1, 2, 4, 8, 16)]
+    assert capsys.readouterr().out.split() == ids
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["robot"], "there is no list 'robot'; did you mean 'robots'? allowed: suites, robots,"),
+        (["--ladder"], "not 0 values: for example --ladder Goal_Point Hazards"),
+        (["--ladder", "Goal_Point"], "not 1 values: for example --ladder Goal_Point Hazards"),
+        (["--ladder", "goal_point", "hazards"], "did you mean 'Goal_Point_1Hazards'?"),
+    ],
+)
+def test_list_says_what_it_takes(arguments, message, capsys):
+    assert cli.main(["list", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
+    require_rendering()
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["show", "Goal_Ant_8Ghosts"]) == 0
+    text = capsys.readouterr().out
+    scenario = yaml.safe_load(text.partition("|")[0])
+    assert scenario == {"robot": "Ant", "task": "Goal", "constraints": {"ghosts": {"num": 8}}}
+    cells = rows(text)
+    assert ["accelerometer", "0:3", "[-inf, inf]", "m/s²"] in cells
+    assert ["ghosts_lidar", "3:19", "[0, 1]", "closeness"] in cells
+    assert cells[cells.index(["action", "actuator", "range", "control"]) - 1][1].endswith(":62")
+    assert [row[1] for row in cells[-8:]] == [
+        f"{j}_{i}" for i in (1, 2, 3, 4) for j in ("hip", "ankle")
+    ]
+    assert text.endswith("wrote Goal_Ant_8Ghosts.png\n")
+    frame = image.imread(tmp_path / "Goal_Ant_8Ghosts.png")[..., :3]
+    red, green, blue = np.moveaxis(frame, -1, 0)
+    assert ((red - green > 0.25) & (blue > green)).sum() > 1000  # ghosts
+    assert ((green - red > 0.25) & (green > blue)).sum() > 1000  # the goal
+
+
+def test_show_knows_what_users_registered(tmp_path, monkeypatch, capsys):
+    require_rendering()
+    monkeypatch.setitem(gymnasium.registry, "TwoPits-v0", None)  # to be forgotten afterwards
+    register("TwoPits-v0", Scenario(constraints={"pits": {"type": "hazards", "num": 2}}))
+    assert cli.main(["show", "TwoPits-v0", "-o", str(tmp_path / "pits.png")]) == 0
+    assert "pits_lidar" in capsys.readouterr().out
+    assert cli.main(["show", "CartPole-v1"]) == 2
+    assert "'CartPole-v1' is not an environment of sb3_guard's" in capsys.readouterr().err
+    assert cli.main(["show", "goal_ant_8ghosts"]) == 2
+    assert "did you mean 'Goal_Ant_8Ghosts'?" in capsys.readouterr().err
 
 
 # help and the dispatcher

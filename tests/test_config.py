@@ -2,13 +2,22 @@
 
 import gymnasium as gym
 import pytest
-import yaml
 from torch import nn
 
 from sb3_guard.algorithms import ALGORITHMS, CPO
 from sb3_guard.common.vec_env import make_vec_env
+from sb3_guard.envs import env_ids
 from sb3_guard.zoo.algos import baselines
-from sb3_guard.zoo.config import arguments, build, check, hyperparams_folder, read_hyperparams
+from sb3_guard.zoo.config import (
+    PAPER,
+    _parse_yaml,
+    arguments,
+    build,
+    check,
+    hyperparams_folder,
+    read_file,
+    read_hyperparams,
+)
 from sb3_guard.zoo.usage import UsageError, parse_value
 
 FILE = """
@@ -58,6 +67,7 @@ def test_python_file_and_module(tmp_path, monkeypatch):
         ("n_steps: 100\n", "must map environments"),
         ("Goal_Point_8Hazards-v0: {}\n", "no entry for 'Goal_Point_8Hazard'.*did you mean"),
         ("\x00\x01", "is not valid YAML"),
+        ("default: {1: 2, n_steps: 3}\n", "1 below 'default' is not a name"),
     ],
 )
 def test_files_that_are_not_hyperparameters(tmp_path, content, message):
@@ -68,9 +78,16 @@ def test_files_that_are_not_hyperparameters(tmp_path, content, message):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["absent.yml", "absent.py", "absent_module"])
-def test_absent_file(name):
-    with pytest.raises(UsageError, match=name.removesuffix(".py")):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("absent.yml", "there is no hyper-parameter file absent.yml"),
+        ("absent.py", "can't read hyper-parameters from absent.py: .*"),
+        ("papr", "can't read hyper-parameters from papr: .*; give a .yml file.* or 'paper'"),
+    ],
+)
+def test_absent_file(name, message):
+    with pytest.raises(UsageError, match=message):
         read_hyperparams("cpo", "X-v0", name)
 
 
@@ -172,7 +189,7 @@ def test_objects_are_made():
             normalize=True,
             gamma=0.9,
             env_wrapper="gymnasium.wrappers.FlattenObservation",
-            env_kwargs={"a": 1},
+            env_kwargs="dict(a=1)",
         )
     )
     assert setup.model["learning_rate"](0.5) == pytest.approx(0.005)
@@ -218,36 +235,90 @@ def test_values_on_the_command_line(text, value):
     assert parse_value(text) == value
 
 
-PAPER = {
-    "n_timesteps": 6_000_000,
-    "gamma": 0.99,
-    "gae_lambda": 0.97,
-    "target_kl": 0.02,
-    "line_search_max_iter": 100,
-    "line_search_shrinking_factor": 0.8,
-    "learning_rate": 0.001,
-    "n_critic_updates": 80,
-    "batch_size": None,
+# The paper's table of hyper-parameters, row by row; ... stands for "not used".
+COLUMNS = "trpo trpo_lag trpo_sl trpo_usl trpo_ipo trpo_fac cpo pcpo".split()
+TABLE = {
+    "gamma": [0.99] * 8,
+    "gae_lambda": [0.97] * 8,
+    "line_search_max_iter": [100] * 7 + [...],
+    "line_search_shrinking_factor": [0.8] * 7 + [...],
+    "target_kl": [0.02] * 8,
+    "learning_rate": [0.001] * 8,
+    "n_critic_updates": [80] * 8,
+    "batch_size": [None] * 8,
+    "cost_limit": [..., 0, 0, 0, 0, 0, 0, 0],
+    "lambda_lr": [..., 0.005, ..., ..., ..., 0.0001, ..., ...],
+    "steps": [..., ..., ..., 20, ..., ..., ..., ...],
+    "rate": [..., ..., ..., 0.05, ..., ..., ..., ...],
+    "warmup": [..., ..., pytest.approx(1 / 3), pytest.approx(1 / 3), ..., ..., ..., ...],
+    "t": [..., ..., ..., ..., 0.01, ..., ..., ...],
+    "cost_reduction": [..., ..., ..., ..., ..., ..., 0.0, ...],
 }
+# Where the default is another one.
+DIFFERENT = {"pcpo": {"line_search": (False, True)}}
+
+
+@pytest.mark.parametrize("algo", COLUMNS)
+def test_the_papers_preset_is_its_table(algo):
+    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0", PAPER))
+    for row, cells in TABLE.items():
+        cell = cells[COLUMNS.index(algo)]
+        if cell is ... and row.startswith("line_search"):
+            assert values["line_search"] is False
+        elif cell is ...:
+            assert row not in values
+        else:
+            assert values[row] == cell, row
+    epochs, batch, longest = 200, 30_000, 1_000
+    assert values["n_envs"] * values["n_steps"] == batch and values["n_steps"] == longest
+    for env_id in env_ids():
+        ratio = 5 if env_id.split("_")[1] in ("Ant", "Walker") else 1
+        steps = ratio * epochs * batch
+        assert read_hyperparams(algo, env_id, PAPER) == {**values, "n_timesteps": steps}
 
 
 @pytest.mark.parametrize("algo", sorted(ALGORITHMS))
-def test_shipped_files_are_the_papers_table(algo):
-    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
-    assert PAPER.items() <= values.items()
-    assert values["n_envs"] * values["n_steps"] == 30_000
+def test_the_default_is_the_papers_but_where_it_says_so(algo):
+    env_id = "Goal_Ant_8Hazards-v0"
+    default, paper = (read_hyperparams(algo, env_id, conf) for conf in (None, PAPER))
+    names = {*default, *paper}
+    different = {n: (paper.get(n), default.get(n)) for n in names if paper[n] != default[n]}
+    assert different == DIFFERENT.get(algo, {})
+
+
+@pytest.mark.parametrize("algo", sorted(ALGORITHMS))
+def test_the_models_are_the_papers(algo):
+    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0", PAPER))
     model = ALGORITHMS[algo](env=make_vec_env("Goal_Point_8Hazards", 1), **build(values).model)
     layers = [one for one in model.policy.mlp_extractor.policy_net if isinstance(one, nn.Linear)]
     assert [one.out_features for one in layers] == [64, 64]
     assert isinstance(model.policy.mlp_extractor.policy_net[1], nn.Tanh)
     assert (model.policy.log_std == -0.5).all() and not model.policy.ortho_init
     assert (model.cost_limit, model.cg_damping > 0) == (0.0, True)
-    for env_id in ("Goal_Ant_8Hazards-v0", "Defense_Walker_8Ghosts-v0"):
-        assert read_hyperparams(algo, env_id) == {**values, "n_timesteps": 3e7}
+
+
+def test_the_paper_has_no_other_algorithm():
+    with pytest.raises(
+        UsageError, match=r"-conf paper: 'ppo' is not in the paper; .*allowed: trpo"
+    ):
+        read_hyperparams("ppo", "Goal_Point_8Hazards-v0", PAPER)
+
+
+def test_files_are_parsed_once_and_read_anew(tmp_path):
+    path = tmp_path / "cpo.yml"
+    path.write_text(FILE)
+    first = read_file(path)
+    spared = _parse_yaml.cache_info().hits
+    first["default"]["n_steps"] = 1
+    assert read_file(path)["default"]["n_steps"] == 100
+    assert _parse_yaml.cache_info().hits == spared + 1
+    path.write_text(FILE.replace("100", "101"))
+    assert read_file(path)["default"]["n_steps"] == 101
 
 
 def test_every_algorithm_has_a_file_and_every_file_an_algorithm():
-    files = {path.stem for path in hyperparams_folder().glob("*.yml")}
+    files = {path.stem for path in hyperparams_folder().glob("*.yml")} - {PAPER}
     assert set(ALGORITHMS) <= files <= {*ALGORITHMS, *baselines()}
-    for path in hyperparams_folder().glob("*.yml"):
-        assert "default" in yaml.safe_load(path.read_text())
+    assert read_file(hyperparams_folder() / f"{PAPER}.yml").keys() == ALGORITHMS.keys()
+    for file in files:
+        assert "default" in read_file(hyperparams_folder() / f"{file}.yml")

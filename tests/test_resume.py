@@ -2,20 +2,24 @@
 
 import io
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch as th
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard import train
+from sb3_guard.common.vec_env import VEC_ENVS
 from sb3_guard.zoo.checkpoint import read_checkpoint
 from sb3_guard.zoo.progress import Epochs
 
@@ -179,6 +183,11 @@ def test_finished_run_goes_on_as_a_longer_one(tmp_path, capsys):
     capsys.readouterr()
     assert train.main(["-i", str(run)]) == 0
     assert "is finished: 120 of 120 steps" in capsys.readouterr().out
+    before = outcome(run)
+    for damaged in ('{"n_timest', "[]", json.dumps({**before, "return": "high"})):
+        (run / "result.json").write_text(damaged)
+        assert train.main(["-i", str(run)]) == 0  # writes it again
+        assert outcome(run) == before
     assert train.main(["-i", str(run), "-n", "300"]) == 0
     assert_same_run(tmp_path / "long", tmp_path / "short")
 
@@ -283,3 +292,27 @@ def test_asked_to_stop(number, tmp_path):
     assert train.main(["-i", str(run), "--verbose", "0"]) == 0
     assert train.main([*arguments, "--verbose", "0", "-f", str(tmp_path / "whole")]) == 0
     assert_same_run(tmp_path / "whole", tmp_path / "cut")
+
+
+@pytest.mark.parametrize("stopped", [True, False], ids=["by the signal", "alone"])
+def test_processes_of_environments_die(stopped, tmp_path, monkeypatch, capsys):
+    """By a SIGTERM to the whole process group, as batch systems send it, or for want of memory."""
+    whole = Epochs._on_step
+
+    def step(self):
+        if self.num_timesteps == 100:
+            if stopped:
+                os.kill(os.getpid(), signal.SIGTERM)
+            for one in multiprocessing.active_children():
+                one.kill()
+        return whole(self)
+
+    monkeypatch.setattr(Epochs, "_on_step", step)
+    monkeypatch.setitem(VEC_ENVS, "subproc", partial(SubprocVecEnv, start_method="fork"))
+    arguments = [*TOY, *SHORT, *SMALL, "--eval-freq", "-1", "-n", "120", "--vec-env", "subproc"]
+    assert train.main([*arguments, "-f", str(tmp_path)]) == (143 if stopped else 2)
+    run = runs_of(tmp_path)
+    err = capsys.readouterr().err
+    assert stopped or "error: a process of --vec-env subproc has died, perhaps" in err
+    assert stopped or f"continue with -i {run}" in err
+    assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 60

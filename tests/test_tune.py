@@ -24,8 +24,8 @@ from test_bad_input import empty, refused  # noqa: F401 (a fixture)
 from sb3_guard import cli, train, tune
 from sb3_guard.algorithms import ALGORITHMS
 from sb3_guard.zoo import storages, tuning
-from sb3_guard.zoo.algos import algorithm
-from sb3_guard.zoo.config import build, check, read_hyperparams
+from sb3_guard.zoo.algos import algorithm, baselines
+from sb3_guard.zoo.config import build, check, parameters, read_hyperparams
 from sb3_guard.zoo.samplers import SAMPLERS, SPACES, Choice, Range, Search, read_space, set_dotted
 from sb3_guard.zoo.tuning import FeasibleFirst
 from sb3_guard.zoo.tuning_report import Report, Verdict, front
@@ -48,31 +48,55 @@ def draw(search: Search, seed: int = 0) -> dict:
 
 
 def test_every_algorithm_has_a_space():
-    assert SPACES.keys() == ALGORITHMS.keys()
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+
+    assert SPACES.keys() >= ALGORITHMS.keys()
+    for algo in {*baselines()} - {*SPACES}:
+        assert algo in HYPERPARAMS_SAMPLER, algo
 
 
 @pytest.mark.parametrize("algo", sorted(SPACES))
 def test_spaces_hold_what_algorithms_accept(algo):
-    base = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
+    cls = algorithm(algo)
+    base = check(algo, cls, read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
     for end in (0, -1):
-        values = {**base, "n_steps": 30}
+        values = {**base, "buffer_size" if algo == "crossq" else "n_steps": 30}
         for name, one in SPACES[algo].items():
             ends = one.options if isinstance(one, Choice) else (one.low, one.high)
             values = set_dotted(values, name, ends[end])
-        values = check(algo, ALGORITHMS[algo], values)
-        ALGORITHMS[algo](env=CostPoint(), **build(values).model)
+        values = check(algo, cls, values)
+        cls(env=CostPoint(), **build(values).model)
 
 
 @pytest.mark.parametrize("algo", sorted(SPACES))
 def test_the_first_trial_is_the_shipped_one(algo):
-    base = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
+    base = check(algo, algorithm(algo), read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
     search = Search(algo, base)
     study = optuna.create_study()
     study.enqueue_trial(search.first())
     drawn = search.draw(study.ask())
-    unlisted = search.space.keys() - {"policy_kwargs.net_arch", "policy_kwargs.log_std_init"}
-    assert {k: v for k, v in drawn.items() if k in base} == base
-    assert drawn.keys() - base.keys() == unlisted - base.keys()
+    assert base.items() <= drawn.items()
+    # What the file leaves to the constructor is that one's default.
+    defaults = parameters(algorithm(algo))
+    for name in drawn.keys() - base.keys():
+        assert drawn[name] == pytest.approx(defaults[name].default)
+
+
+@pytest.mark.parametrize("algo", sorted(SPACES))
+def test_a_space_serves_rl_zoo(algo):
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+
+    from sb3_guard.zoo.rl_zoo3 import key_in_rl_zoo, register
+
+    register()
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    extra = {"using_her_replay_buffer": False, "her_kwargs": {}}
+    drawn = HYPERPARAMS_SAMPLER[key_in_rl_zoo(algo)](study.ask(), 2, 4, extra)
+    outer = {name.partition(".")[0] for name in SPACES[algo]}
+    assert drawn.keys() == outer - {"n_envs"}
+    shipped = read_hyperparams(algo, "Goal_Point_8Hazards-v0")["policy_kwargs"]
+    assert shipped.keys() <= drawn["policy_kwargs"].keys()
+    assert HYPERPARAMS_SAMPLER["trpo"].__module__ == "rl_zoo3.hyperparams_opt"
 
 
 def test_what_is_fixed_is_not_searched():
@@ -450,9 +474,9 @@ def test_a_normalised_agent_is_evaluated_as_it_was_trained(tmp_path, folder):
 
 def test_a_seeded_search_is_the_same_again(tmp_path, monkeypatch):
     pretend(monkeypatch, by_kl)
-    tables = []
+    tables, search = [], "--n-trials 6 --n-startup-trials 3 --seed 4".split()
     for name in ("one", "other"):
-        assert run(tmp_path, "--n-trials", "13", "--seed", "4", "--study-name", name) == 0
+        assert run(tmp_path, *search, "--study-name", name) == 0
         path = tmp_path / "trpo_lag" / f"CostPoint-v0_tune_{name}" / "trials.csv"
         tables.append(pd.read_csv(path).drop(columns=["seconds", "worker"]))
     pd.testing.assert_frame_equal(*tables)
@@ -698,7 +722,6 @@ WRONG = [
     (["--cost-limit", "1", "2"], ["selection_limit", "2 entries"]),
     (["--pareto", "--pruner", "median"], ["no pruning with --pareto"]),
     (["--algo", "trpo_lga"], ["unknown algorithm 'trpo_lga'", "did you mean 'trpo_lag'?"]),
-    (["--algo", "crossq", "-params", "n_envs:1"], ["no search space for crossq"]),
     (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),
     (["--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
     (["-params", "lambda_rl:1"], ["'lambda_rl'", "did you mean 'lambda_lr'?"]),
@@ -720,8 +743,12 @@ WRONG = [
 
 @pytest.mark.parametrize(("wrong", "parts"), WRONG, ids=lambda v: " ".join(v)[:40])
 def test_wrong_flags_change_nothing(empty, capsys, wrong, parts):  # noqa: F811
-    fixed = [] if "crossq" in wrong else SMALL
-    refused(tune.main, [*TOY, *fixed, *wrong], capsys, *parts)
+    refused(tune.main, [*TOY, *SMALL, *wrong], capsys, *parts)
+
+
+def test_an_algorithm_without_a_space():
+    with pytest.raises(UsageError, match="no search space for mine; give one with --search-space"):
+        Search("mine", {})
 
 
 @pytest.mark.parametrize(

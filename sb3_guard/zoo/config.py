@@ -5,6 +5,7 @@ environments and YAML anchors. What is read stays plain data, so that the run fo
 ``config.yml`` says exactly what was used; only :func:`build` makes objects of it.
 """
 
+import copy
 import importlib
 import inspect
 import math
@@ -13,6 +14,7 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -52,6 +54,8 @@ NOISE_KEYS: dict[str, Any] = {
 }
 # Arguments of an algorithm that are flags of the command.
 FLAGS = {"env": "--env", "seed": "--seed", "device": "--device", "verbose": "--verbose"}
+# The name of the preset that is the paper's table; `-conf paper` reads it.
+PAPER = "paper"
 NOT_HYPERPARAMETERS = {*FLAGS, "self", "tensorboard_log", "_init_setup_model", "policy_base"}
 
 
@@ -80,19 +84,28 @@ def read_file(path: str | Path) -> dict[str, Any]:
                 content = getattr(importlib.import_module(name), "hyperparams", None)
         except Exception as error:
             raise UsageError(
-                f"can't read hyper-parameters from {name}: {one_line(error)}"
+                f"can't read hyper-parameters from {name}: {one_line(error)}; give a .yml file, "
+                f"a Python file or module, or {PAPER!r}"
             ) from error
     if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
         raise UsageError(
             f"{name} must map environments, or 'default', to hyper-parameters "
             "('default:' and below it lines such as '  n_steps: 1000')"
         )
+    for entry, values in content.items():
+        for key in values:
+            if not isinstance(key, str):
+                raise UsageError(f"{name}: {key!r} below {entry!r} is not a name but a value")
     return content
+
+
+# A grid reads the same few files hundreds of times, and parsing takes milliseconds.
+_parse_yaml = lru_cache(maxsize=64)(yaml.safe_load)
 
 
 def _read_yaml(path: Path) -> Any:
     try:
-        return yaml.safe_load(path.read_text())
+        return copy.deepcopy(_parse_yaml(path.read_text()))
     except FileNotFoundError:
         raise UsageError(f"there is no hyper-parameter file {path}") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -112,6 +125,20 @@ def shipped_file(algo: str) -> Path:
     return theirs if theirs.is_file() else ours
 
 
+def paper_preset(algo: str) -> dict[str, Any]:
+    """
+    What the paper's table has otherwise than the shipped file of an algorithm.
+
+    :raises UsageError: the algorithm is not in the paper
+    """
+    content = read_file(hyperparams_folder() / f"{PAPER}.yml")
+    if algo not in content:
+        raise UsageError(
+            f"-conf {PAPER}: {algo!r} is not in the paper; {did_you_mean(algo, content)}"
+        )
+    return content[algo]
+
+
 def read_hyperparams(
     algo: str, env_id: str, conf_file: str | None = None, overrides: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -120,35 +147,43 @@ def read_hyperparams(
 
     :param algo: key of the algorithm, names the shipped file
     :param env_id: its own entry is taken, with or without a version, else ``default``
-    :param conf_file: file to read instead of the shipped one
+    :param conf_file: file to read instead of the shipped one, or ``paper``: the paper's table
     :param overrides: what the command line says
     :raises UsageError: the file can't be read, or has no entry that fits
     """
-    path = conf_file or shipped_file(algo)
+    preset = paper_preset(algo) if conf_file == PAPER else {}
+    path = shipped_file(algo) if conf_file in (None, PAPER) else conf_file
     content = read_file(path)
     for entry in (env_id, env_id.rsplit("-v", 1)[0], "default"):
         if entry in content:
-            return dict(sorted({**content[entry], **(overrides or {})}.items()))
+            return dict(sorted({**content[entry], **preset, **(overrides or {})}.items()))
     raise UsageError(
         f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
     )
 
 
-def arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
-    """The hyper-parameters an algorithm takes, from its constructor: name to type annotation."""
-    hints: dict[str, Any] = {}
+def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
+    """The hyper-parameters an algorithm takes, from its constructor and those it hands on to."""
+    found: dict[str, inspect.Parameter] = {}
     for cls in algorithm.__mro__:
         constructor = cls.__dict__.get("__init__")
         if constructor is None:
             continue
-        parameters = inspect.signature(constructor, eval_str=True).parameters.values()
-        for one in parameters:
+        own = inspect.signature(constructor, eval_str=True).parameters.values()
+        for one in own:
             if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD):
-                hint = Any if one.annotation is one.empty else one.annotation
-                hints.setdefault(one.name, hint)
-        if all(one.kind is not one.VAR_KEYWORD for one in parameters):
+                found.setdefault(one.name, one)
+        if all(one.kind is not one.VAR_KEYWORD for one in own):
             break
-    return {name: hint for name, hint in hints.items() if name not in NOT_HYPERPARAMETERS}
+    return {name: one for name, one in found.items() if name not in NOT_HYPERPARAMETERS}
+
+
+def arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
+    """The hyper-parameters an algorithm takes: name to type annotation."""
+    return {
+        name: Any if one.annotation is one.empty else one.annotation
+        for name, one in parameters(algorithm).items()
+    }
 
 
 def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -176,6 +211,8 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
                 f"hyper-parameter {name}: {value!r} is not allowed; "
                 f"it must be {_describe(known[name])}"
             ) from None
+    if isinstance(checked.get("env_kwargs"), str):
+        checked["env_kwargs"] = _evaluate("env_kwargs", checked["env_kwargs"])
     checked.setdefault("n_envs", 1)
     aliases = algorithm.policy_aliases
     policy = checked.setdefault("policy", next(iter(aliases)))  # MlpPolicy, or its recurrent twin
@@ -186,7 +223,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
         )
     if "n_timesteps" not in checked:
         raise UsageError(f"n_timesteps of {algo} is not given; use the flag -n, e.g. -n 1e6")
-    for name in ("n_envs", "n_timesteps", "n_steps", "batch_size"):
+    for name in ("n_envs", "n_timesteps", "n_steps", "batch_size", "frame_stack"):
         value = checked.get(name)
         if isinstance(value, int) and value < 1:
             raise UsageError(

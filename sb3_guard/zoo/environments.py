@@ -49,6 +49,8 @@ BAD_ARGUMENTS = (
     gym.error.Error,
     *ERRORS_OF_OURS,
 )
+# What a SubprocVecEnv raises when one of its processes has died.
+PROCESS_DIED = (EOFError, ConnectionError)
 
 
 def canonical_id(env_id: str) -> tuple[str, bool]:
@@ -153,7 +155,7 @@ def make_envs(
                 wrapper_class=None if vec_env == "native" else wrap,
                 monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
             )
-    except (*BAD_ARGUMENTS, EOFError, ConnectionError) as error:
+    except (*BAD_ARGUMENTS, *PROCESS_DIED) as error:
         raise UsageError(f"can't make {env_id}: {one_line(error)}") from error
     try:
         return _wrap(env, setup, evaluation, normalizer)

@@ -9,15 +9,13 @@ import copy
 import shlex
 import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
@@ -44,6 +42,7 @@ from sb3_guard.zoo.config import Setup, build, check, read_hyperparams
 from sb3_guard.zoo.environments import (
     BAD_ARGUMENTS,
     ERRORS_OF_OURS,
+    PROCESS_DIED,
     canonical_id,
     choose_vec_env,
     make_envs,
@@ -53,13 +52,14 @@ from sb3_guard.zoo.progress import Epochs
 from sb3_guard.zoo.run_folder import (
     CHECKPOINT,
     RunFolder,
+    as_read,
     is_disk_error,
     is_run,
     lock,
     require_writable,
     run_path,
 )
-from sb3_guard.zoo.usage import UsageError, import_packages, one_line
+from sb3_guard.zoo.usage import UsageError, import_packages, interrupts, one_line
 
 # Flags that say how to watch or host a run, not what it is: they may change when it is resumed.
 FREE_FLAGS = {"trained_agent", "progress", "verbose", "num_threads", "checkpoint_every", "track"}
@@ -267,6 +267,11 @@ class Experiment:
         """
         try:
             return self._train(folder)
+        except PROCESS_DIED as error:
+            raise UsageError(
+                "a process of --vec-env subproc has died, perhaps for want of memory; "
+                f"continue with -i {folder.path}"
+            ) from error
         except OSError as error:
             if not is_disk_error(error):
                 raise
@@ -279,9 +284,10 @@ class Experiment:
 
     def close(self) -> None:
         """Release the environments."""
-        self.env.close()
-        if self.eval_env is not None:
-            self.eval_env.close()
+        for env in (self.env, self.eval_env):
+            with suppress(*PROCESS_DIED):
+                if env is not None:
+                    env.close()
 
     def _train(self, folder: RunFolder) -> int:
         state, verbose = self.state, self.args["verbose"] > 0
@@ -307,9 +313,15 @@ class Experiment:
             folder.result.unlink(missing_ok=True)
             checkpoints.restore(state)
             restore_run(self.model, state)
+
+        def stop(number: int) -> None:
+            checkpoints.stop = True
+            if verbose:
+                print("\nStopping after this rollout; once more to stop at once.", file=sys.stderr)
+
         began = time.monotonic()
-        with self._tracked(folder), interrupts(checkpoints, verbose) as received:
-            finished = self._learn(callbacks)
+        with self._tracked(folder), interrupts(stop) as received:
+            finished = self._learn(callbacks, received)
         with replacing(folder.model) as file:
             self.model.save(file)
         normalizer = self.model.get_vec_normalize_env()
@@ -357,7 +369,7 @@ class Experiment:
         finally:
             run.finish()
 
-    def _learn(self, callbacks: list[BaseCallback]) -> bool:
+    def _learn(self, callbacks: list[BaseCallback], received: list[int]) -> bool:
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
         interval = self.args["log_interval"]
         kwargs: dict[str, Any] = {}
@@ -368,6 +380,13 @@ class Experiment:
                 left, callback=callbacks, reset_num_timesteps=self.state is None, **kwargs
             )
         except Interrupted:
+            return False
+        except PROCESS_DIED:
+            # SIGTERM to all processes at once, as batch systems send it, ends the environments'
+            # own before the rollout is done; this one may get it last.
+            time.sleep(0.2)
+            if not received:
+                raise
             return False
         except (ValueError, FloatingPointError, *ERRORS_OF_OURS) as error:
             # What an environment or algorithm refuses, e.g. a NaN: its message says it all.
@@ -408,36 +427,6 @@ class Permit(BaseCallback):
         return True
 
 
-@contextmanager
-def interrupts(checkpoints: Checkpoints, verbose: bool) -> Iterator[list[int]]:
-    """
-    Let Ctrl-C and SIGTERM end training after the rollout under way, with a checkpoint.
-
-    A second one ends it at once; the checkpoint before stands.
-
-    :return: the numbers of the signals received
-    """
-    received: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield received
-        return
-
-    def handle(number: int, frame: Any) -> None:
-        received.append(number)
-        if len(received) > 1:
-            raise KeyboardInterrupt
-        checkpoints.stop = True
-        if verbose:
-            print("\nStopping after this rollout; once more to stop at once.", file=sys.stderr)
-
-    before = {one: signal.signal(one, handle) for one in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
-
-
 def prepare(args: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """
     What a new run is: all its flags and hyper-parameters, as its folder will state them.
@@ -456,9 +445,9 @@ def prepare(args: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     if args["n_timesteps"] > 0:
         overrides["n_timesteps"] = args["n_timesteps"]
     values = read_hyperparams(args["algo"], args["env"], args["conf_file"], overrides)
+    values = check(args["algo"], algorithm(args["algo"]), values)
     if args["env_kwargs"]:
         values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **args["env_kwargs"]}
-    values = check(args["algo"], algorithm(args["algo"]), values)
     wrapped = values.get("env_wrapper") is not None
     args["vec_env"] = choose_vec_env(args["vec_env"], ours, wrapped)
     return args, values
@@ -542,9 +531,9 @@ def refuse_another(folder: RunFolder, args: Mapping[str, Any], values: Mapping[s
 
     :raises UsageError: it holds another, or is damaged
     """
-    own, asked = folder.args(), yaml.safe_load(yaml.safe_dump(dict(args)))
+    own, asked = folder.args(), as_read(args)
     pairs = [(name, own.get(name), asked[name]) for name in IDENTITY]
-    own, asked = folder.hyperparams(), yaml.safe_load(yaml.safe_dump(dict(values)))
+    own, asked = folder.hyperparams(), as_read(values)
     pairs += [(name, own.get(name), asked.get(name)) for name in sorted({*own, *asked})]
     differences = [f"{name}: {a} there, {b} here" for name, a, b in pairs if a != b]
     if differences:
@@ -595,7 +584,7 @@ def resume(given: Mapping[str, Any], defaults: Mapping[str, Any]) -> int:
         if wanted > 0:
             values["n_timesteps"] = args["n_timesteps"] = wanted
         values = check(args["algo"], algorithm(args["algo"]), values)
-        if folder.result.exists() and done >= values["n_timesteps"]:
+        if folder.read_result() is not None and done >= values["n_timesteps"]:
             print(
                 f"{folder.path} is finished: {done} of {values['n_timesteps']} steps; "
                 "a larger -n continues it"
@@ -643,7 +632,7 @@ def _refuse_contradictions(
         elif name == "env":
             pairs.append((flag, canonical_id(value)[0], own))
         else:
-            pairs.append((flag, yaml.safe_load(yaml.safe_dump(value)), own))
+            pairs.append((flag, as_read({name: value})[name], own))
     for flag, value, own in pairs:
         if value != own:
             raise UsageError(

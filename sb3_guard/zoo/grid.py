@@ -8,12 +8,10 @@ folders, so it can be killed and started again anywhere, and runs on any
 
 import os
 import shlex
-import signal
 import sys
-import threading
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -22,7 +20,6 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,7 +30,7 @@ from sb3_guard.zoo.config import NOISE_KEYS, RUN_KEYS, arguments
 from sb3_guard.zoo.experiment import Experiment, prepare, refuse_another
 from sb3_guard.zoo.live import Board
 from sb3_guard.zoo.run_folder import RunFolder, in_use, is_run, owner, run_path
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, interrupts, one_line
 from sb3_guard.zoo.worker import Outcome, Task, kill_all, last_line, work
 
 RETRIES = 2  # of a run that fails
@@ -239,7 +236,7 @@ class Execution:
                 f"can't write to log folder {str(self.folder)!r}: {error.strerror}; "
                 "choose another with -f"
             ) from error
-        with self._signals():
+        with interrupts(self._stop):
             try:
                 for run in self.runs:
                     if run.state != "done":
@@ -304,7 +301,8 @@ class Execution:
         except CancelledError:
             if not self._stopping:
                 raise UsageError(
-                    "the workers are gone, or the scheduler is; the runs keep their checkpoints"
+                    "the workers are gone, or the scheduler is; the runs keep their checkpoints: "
+                    "start it again"
                 ) from None
             state, text = "stopped", ""
         except Exception as error:  # a worker died, or can't do the work at all
@@ -343,27 +341,11 @@ class Execution:
     def _stopping(self) -> bool:
         return bool(self.signal or self.no_disk)
 
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        """Ctrl-C and SIGTERM let all runs end with a checkpoint; a second one ends at once."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def handle(number: int, frame: Any) -> None:
-            if self.signal:
-                raise KeyboardInterrupt
-            self.signal = number
-            self.board.say(
-                "Stopping after the rollouts under way; once more to stop at once.", sys.stderr
-            )
-
-        before = {one: signal.signal(one, handle) for one in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for one, handler in before.items():
-                signal.signal(one, handler)
+    def _stop(self, number: int) -> None:
+        self.signal = number
+        self.board.say(
+            "Stopping after the rollouts under way; once more to stop at once.", sys.stderr
+        )
 
 
 def run_grid(runs: Sequence[Run], executor: Executor, args: Mapping[str, Any], go_on: str) -> int:

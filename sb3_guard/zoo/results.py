@@ -24,12 +24,12 @@ from scipy.stats import trim_mean
 
 from sb3_guard.common.files import replacing
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.run_folder import RunFolder
+from sb3_guard.zoo.run_folder import MEASURES, RunFolder
 from sb3_guard.zoo.tables import table
 from sb3_guard.zoo.usage import UsageError, one_line
 
 # Columns of the figures of merit: their key in result.json, and the score made from them
-METRICS = {"J_r": "return", "M_c": "cost", "rho_c": "cost_rate"}
+METRICS = dict(zip(("J_r", "M_c", "rho_c"), MEASURES, strict=True))
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
 LABELS = {
     "trpo": "TRPO",
@@ -134,18 +134,8 @@ def read_run(path: Path) -> dict[str, Any]:
     if not (path / "result.json").exists():
         raise UsageError("unfinished: it has no result.json" + _last_words(path))
     folder = RunFolder(path)
-    try:
-        result = json.loads(folder.result.read_text())
-    except (OSError, ValueError) as error:
-        raise UsageError(f"result.json can't be read: {one_line(error)}") from error
-    if not isinstance(result, dict):
-        raise UsageError("result.json is damaged: it should be a mapping")
-    for key in ("n_timesteps", *METRICS.values()):
-        if key not in result:
-            raise UsageError(f"result.json is damaged: it has no {key}")
+    result = folder.checked_result()
     steps = result["n_timesteps"]
-    if isinstance(steps, bool) or not isinstance(steps, int):
-        raise UsageError(f"result.json is damaged: n_timesteps = {steps!r} should be whole")
     args, config = folder.args(), folder.hyperparams()
     env, algo, seed = args.get("env"), args.get("algo"), args.get("seed")
     if not isinstance(env, str) or not isinstance(algo, str) or not isinstance(seed, int):

@@ -2,10 +2,12 @@
 
 ``python -m sb3_guard.zoo.rl_zoo3 train --algo cpo --env Goal_Point_8Hazards-v0`` takes all flags
 of ``python -m rl_zoo3.train``. In RL-Zoo's table ``trpo`` stays sb3-contrib's and ours is
-``guard_trpo``.
+``guard_trpo``. ``--optimize`` is RL-Zoo's own search, by return alone, in the spaces of
+:mod:`sb3_guard.zoo.samplers`; ``python -m sb3_guard.tune`` searches under a cost limit.
 """
 
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,7 +16,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.zoo.algos import safe_algorithms
-from sb3_guard.zoo.config import shipped_file
+from sb3_guard.zoo.config import read_file, shipped_file
+from sb3_guard.zoo.samplers import SPACES, rl_zoo_sampler
 from sb3_guard.zoo.usage import UsageError, run
 
 
@@ -24,13 +27,20 @@ def key_in_rl_zoo(algo: str) -> str:
 
 
 def register() -> None:
-    """Add our algorithms to RL-Zoo's table; its environments are Gymnasium's, ours among them."""
+    """
+    Add our algorithms and search spaces to RL-Zoo's tables; its environments are Gymnasium's, ours
+    among them.
+    """
     import rl_zoo3
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
     import sb3_guard  # noqa: F401  registers the environments
 
     for algo, cls in safe_algorithms().items():
         rl_zoo3.ALGOS[key_in_rl_zoo(algo)] = cls
+    for algo in SPACES:
+        base = read_file(shipped_file(algo))["default"]
+        HYPERPARAMS_SAMPLER[key_in_rl_zoo(algo)] = rl_zoo_sampler(algo, base)
 
 
 def make_vec_env(
@@ -41,7 +51,10 @@ def make_vec_env(
 
     monitor_kwargs = kwargs.pop("monitor_kwargs", None) or {}
     file = None if monitor_dir is None else f"{monitor_dir}/0.monitor.csv"
-    return CostMonitor(make(env_id, n_envs, **kwargs), file, **monitor_kwargs)
+    with warnings.catch_warnings():
+        # SB3 gives each environment a monitor of its own, which counts no costs.
+        warnings.filterwarnings("ignore", message="The environment is already wrapped with a `Mon")
+        return CostMonitor(make(env_id, n_envs, **kwargs), file, **monitor_kwargs)
 
 
 def train(argv: Sequence[str]) -> int:

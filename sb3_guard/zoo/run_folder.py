@@ -27,6 +27,8 @@ except ImportError:  # Windows has no file locks of this kind: runs there are no
 CHECKPOINT = "checkpoint.zip"
 # What the system says when a disk is full, read-only or broken.
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
+# What a result measures: return, episode cost and cost rate; null where no episode has ended.
+MEASURES = ("return", "cost", "cost_rate")
 BEAT = 10.0  # seconds between the signs of life that a lock gives
 SILENCE = 120.0  # seconds without one after which another host takes a lock over
 
@@ -44,14 +46,25 @@ def is_disk_error(error: BaseException | None) -> bool:
     return False
 
 
-class _Loader(yaml.SafeLoader):
+# In C where libyaml is there: a large grid reads and compares a thousand of these files.
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_SafeDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
+class _Loader(_SafeLoader):
     """Plain data, and the ordered mappings that RL-Zoo writes."""
 
 
 _Loader.add_constructor(
     "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
-    lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0]),  # type: ignore[arg-type]
+    lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0]),
 )
+
+
+def as_read(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain data as a run's files give it back: lists for tuples."""
+    text = yaml.dump(dict(data), Dumper=_SafeDumper)
+    return dict(yaml.load(text, Loader=_SafeLoader))
 
 
 def folder_name(env_id: str) -> str:
@@ -227,13 +240,38 @@ class RunFolder:
         with replacing(self.result) as file:
             file.write(json.dumps(result, indent=2).encode())
 
+    def checked_result(self) -> dict[str, Any]:
+        """
+        The result of a complete run.
+
+        :raises UsageError: there is none, or it is damaged
+        """
+        try:
+            result = json.loads(self.result.read_bytes())
+        except (OSError, ValueError) as error:
+            raise self._damaged(f"can't be read: {one_line(error)}") from error
+        if not isinstance(result, dict):
+            raise self._damaged("is damaged: it should be a mapping")
+        for key in ("n_timesteps", *MEASURES):
+            if key not in result:
+                raise self._damaged(f"is damaged: it has no {key}")
+            value = result[key]
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if key == "n_timesteps" and (not number or not isinstance(value, int)):
+                raise self._damaged(f"is damaged: {key} = {value!r} should be whole")
+            if value is not None and not number:
+                raise self._damaged(f"is damaged: {key} = {value!r} should be a number")
+        return result
+
+    def _damaged(self, how: str) -> UsageError:
+        return UsageError(f"result.json {how}; sb3-guard train -i {self.path} writes it again")
+
     def read_result(self) -> dict[str, Any] | None:
         """The result of a complete run; None if there is none, or it is damaged."""
         try:
-            result = json.loads(self.result.read_bytes())
-        except (OSError, ValueError):
+            return self.checked_result()
+        except UsageError:
             return None
-        return result if isinstance(result, dict) and "n_timesteps" in result else None
 
     @contextmanager
     def owned(self) -> Iterator[None]:
@@ -339,7 +377,7 @@ def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, 
     files = {}
     for name, content in (("config.yml", hyperparams), ("args.yml", args)):
         try:
-            files[name] = yaml.safe_dump(dict(content)).encode()
+            files[name] = yaml.dump(dict(content), Dumper=_SafeDumper).encode()
         except yaml.YAMLError as error:
             raise UsageError(
                 f"{name} can hold plain data only; write classes and calls as text, such as "

@@ -9,7 +9,7 @@ A space maps names of hyper-parameters to a :class:`Range` or a :class:`Choice`.
     policy_kwargs.net_arch: [{pi: [64, 64], vf: [64, 64]}, {pi: [256, 256], vf: [256, 256]}]
 
 Ranges are drawn in the scale in which they matter, as RL-Zoo's samplers do it; those serve for the
-algorithms that have no space here.
+algorithms that have no space here, and :func:`rl_zoo_sampler` makes one of a space for RL-Zoo.
 """
 
 import json
@@ -24,6 +24,8 @@ from optuna.samplers import BaseSampler
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
 from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.config import RUN_KEYS, parameters
 from sb3_guard.zoo.usage import UsageError, one_line
 
 DIGITS = 4  # of a drawn number: enough to tell two apart, and readable in a file
@@ -162,6 +164,16 @@ SPACES: dict[str, dict[str, Range | Choice]] = {
         "steps": Range(5, 40, log=True),
         "rate": Range(0.01, 0.2, log=True),
         "tolerance": Range(0.005, 0.5, log=True),
+    },
+    # RL-Zoo has none for it.
+    "crossq": {
+        "gamma": Range(0.97, 0.9999, log=True, complement=True),
+        "learning_rate": Range(1e-5, 2e-3, log=True),
+        "batch_size": Choice((64, 128, 256, 512)),
+        "policy_delay": Range(1, 4),
+        "policy_kwargs.net_arch": Choice(
+            tuple({"pi": [256, 256], "qf": [n, n]} for n in (256, 512, 1024))
+        ),
     },
 }
 
@@ -320,12 +332,37 @@ class Search:
         return dict(sorted(values.items()))
 
     def first(self) -> dict[str, Any]:
-        """The base's own place in the space, for the first trial; what lies outside is drawn."""
-        known = {
-            one.parameter(name): one.represent(get_dotted(self.base, name))
-            for name, one in self.space.items()
-        }
+        """
+        The base's own place in the space, for the first trial, with the algorithm's defaults where
+        the base says nothing; what lies outside is drawn.
+        """
+        defaults = {name: one.default for name, one in parameters(algorithm(self.algo)).items()}
+        known = {}
+        for name, one in self.space.items():
+            own = get_dotted(self.base, name)
+            known[one.parameter(name)] = one.represent(defaults.get(name) if own is None else own)
         return {name: value for name, value in known.items() if value is not None}
+
+
+def rl_zoo_sampler(algo: str, base: Mapping[str, Any]) -> Callable[..., dict[str, Any]]:
+    """
+    The space of an algorithm as one of RL-Zoo's samplers, which return arguments of the model.
+
+    RL-Zoo replaces ``policy_kwargs`` as a whole, so what is not drawn of it comes from ``base``;
+    how many environments there are is not for its samplers to say.
+
+    :param base: hyper-parameters of the trials where the space says nothing
+    """
+    search = Search(algo, base, fixed={name: base.get(name) for name in RUN_KEYS})
+    names = {name.partition(".")[0] for name in search.space}
+
+    def sample(
+        trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        values = search.draw(trial)
+        return {name: values[name] for name in names}
+
+    return sample
 
 
 def _expression(base: Any, changes: Mapping[str, Any]) -> str:

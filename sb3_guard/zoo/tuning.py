@@ -8,10 +8,8 @@ one is better, then the higher return, then the smaller violation.
 
 import math
 import os
-import signal
 import subprocess
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -36,13 +34,13 @@ from sb3_guard.spelling import did_you_mean
 from sb3_guard.train import DEFAULTS as TRAIN_DEFAULTS
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.config import check, read_hyperparams
-from sb3_guard.zoo.environments import canonical_id
+from sb3_guard.zoo.environments import PROCESS_DIED, canonical_id
 from sb3_guard.zoo.experiment import EVALUATION_SEED_OFFSET, Experiment
 from sb3_guard.zoo.run_folder import folder_name, require_writable
 from sb3_guard.zoo.samplers import SAMPLERS, Choice, Search, read_space, set_dotted
 from sb3_guard.zoo.storages import Storage, StorageLost, open_storage, queue_again
 from sb3_guard.zoo.tuning_report import Report, Verdict, number
-from sb3_guard.zoo.usage import UsageError, import_packages, one_line
+from sb3_guard.zoo.usage import UsageError, import_packages, interrupts, one_line
 
 PRUNERS = ("median", "halving", "none")
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -432,6 +430,10 @@ class Worker:
                 settings.n_timesteps, callback=[evaluations, *experiment.setup.callbacks]
             )
             evaluations.finish()
+        except PROCESS_DIED as error:
+            if self.stopped():  # the signal was for all processes
+                raise Stopped from error
+            raise UsageError("a process of --vec-env subproc has died") from error
         finally:
             experiment.close()
         return evaluations.history, not evaluations.ended
@@ -468,8 +470,6 @@ def prepare(args: Mapping[str, Any]) -> tuple[Settings, Search]:
             raise UsageError(f"unknown {name} {args[name]!r}; {did_you_mean(args[name], choices)}")
     fixed = dict(args["hyperparams"] or {})
     values = read_hyperparams(args["algo"], env_id, args["conf_file"], fixed)
-    if args["env_kwargs"]:
-        values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **args["env_kwargs"]}
     if args["n_timesteps"] > 0:
         values.setdefault("n_timesteps", args["n_timesteps"])
     if args["cost_limit"] is not None:
@@ -477,6 +477,8 @@ def prepare(args: Mapping[str, Any]) -> tuple[Settings, Search]:
         limit = args["cost_limit"]
         values["selection_limit"] = limit[0] if len(limit) == 1 else limit
     base = check(args["algo"], cls, values)
+    if args["env_kwargs"]:
+        base["env_kwargs"] = {**(base.get("env_kwargs") or {}), **args["env_kwargs"]}
     n_timesteps = args["n_timesteps"] if args["n_timesteps"] > 0 else base["n_timesteps"]
     n_evaluations = args["n_evaluations"] or max(n_timesteps // 100_000, 4)
     if n_evaluations > n_timesteps:
@@ -567,30 +569,6 @@ def _open_study(
 
 
 @contextmanager
-def _signals(worker: Worker, verbose: bool) -> Iterator[list[int]]:
-    """Let Ctrl-C and SIGTERM put the trial under way back; a second one ends at once."""
-    received: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield received
-        return
-
-    def handle(signum: int, frame: Any) -> None:
-        received.append(signum)
-        if len(received) > 1:
-            raise KeyboardInterrupt
-        worker.stop = True
-        if verbose:
-            print("\nStopping; once more to stop at once.", file=sys.stderr)
-
-    before = {one: signal.signal(one, handle) for one in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
-
-
-@contextmanager
 def _other_workers(number: int, argv: Sequence[str]) -> Iterator[list[subprocess.Popen[bytes]]]:
     """Start more processes of the same command; they stop when this one does."""
     command = [sys.executable, "-m", "sb3_guard.tune", *argv, "--n-jobs", "1"]
@@ -647,7 +625,13 @@ def _tune(args: Mapping[str, Any], argv: Sequence[str]) -> int:
         worker = Worker(args, settings, search, study, storage, report)
         if verbose and args["worker_of"] is None:
             print(_header(args, settings, study, storage, folder), flush=True)
-        with _signals(worker, verbose) as received:
+
+        def stop(number: int) -> None:
+            worker.stop = True
+            if verbose:
+                print("\nStopping; once more to stop at once.", file=sys.stderr)
+
+        with interrupts(stop) as received:
             with _other_workers(args["n_jobs"] - 1, argv):
                 worker.work()
         trials = storage.call(study.get_trials, deepcopy=False)

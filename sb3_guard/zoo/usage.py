@@ -6,8 +6,11 @@ import difflib
 import importlib
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 
@@ -52,6 +55,9 @@ class Parser(argparse.ArgumentParser):
             near = difflib.get_close_matches(flag, flags, n=1)
             hint = f"did you mean {near[0]}?" if near else "see --help"
             raise UsageError(f"unknown flag {flag}; {hint}")
+        extra = re.match(r"unrecognized arguments: (\S+)", message)
+        if extra:
+            raise UsageError(f"{extra[1]!r} belongs to no flag; see --help")
         raise UsageError(" ".join(message.split()))
 
 
@@ -73,6 +79,33 @@ def run(command: Callable[[], int]) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
+
+
+@contextmanager
+def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
+    """
+    Let Ctrl-C and SIGTERM ask for an end in good order; a second one ends at once.
+
+    :param stop: called with the number of the first signal, between two steps of whatever runs
+    :return: the numbers of the signals received
+    """
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+
+    def handle(number: int, frame: Any) -> None:
+        received.append(number)
+        if len(received) > 1:
+            raise KeyboardInterrupt
+        stop(number)
+
+    before = {one: signal.signal(one, handle) for one in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
 
 
 def steps(text: str) -> int:

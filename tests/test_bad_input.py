@@ -46,6 +46,7 @@ TRAIN = [
     (["--algo", "cpp"], ["unknown algorithm 'cpp'", "did you mean 'cpo'?", "trpo"]),
     # environment
     (["--env", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
+    (["--env", "scene.yml"], ["'scene.yml' is a file", "sb3_guard.register"]),
     (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),
     (["--env", "Goal_Point_8Hazzards-v0"], ["'Hazzards'", "'Hazards'"]),
     (["--env", "CartPole-v99"], ["CartPole-v99"]),

@@ -460,6 +460,17 @@ def test_list_prints_what_there_is(capsys):
     assert [row[0] for row in rows(capsys.readouterr().out)] == ["robot", *ROBOTS]
 
 
+def test_nobody_needs_to_read_to_the_end():
+    done = subprocess.run(
+        f"{sys.executable} -m sb3_guard.cli list robots | true; echo ${{PIPESTATUS[0]}}",
+        shell=True,
+        executable="/bin/bash",
+        capture_output=True,
+        text=True,
+    )
+    assert (done.stdout.strip(), done.stderr) == ("141", "")  # 128 + SIGPIPE, as of other programs
+
+
 def test_list_shows_what_users_registered(capsys):
     @dataclass
     class Quiet(Constraint):

@@ -94,7 +94,10 @@ class Checkpoints(BaseCallback):
         due = time.monotonic() - self._last >= pause
         if self.stop or (due and self.rollouts % self.log_interval == 0):
             # gSDE has drawn its noise by now; the algorithm remembers how things were before.
-            self.write(getattr(self.model, "_rng_at_rollout", None) or random_state())
+            self.write(
+                getattr(self.model, "_rng_at_rollout", None) or random_state(),
+                getattr(self.model, "_cuda_at_rollout", None),
+            )
         if self.stop:
             raise Interrupted
         self._between = False
@@ -111,11 +114,14 @@ class Checkpoints(BaseCallback):
         if self._between:
             self.write(random_state())
 
-    def write(self, generators: tuple[Any, Any, th.Tensor]) -> None:
+    def write(
+        self, generators: tuple[Any, Any, th.Tensor], cuda: list[th.Tensor] | None = None
+    ) -> None:
         """
         Write the checkpoint, replacing the one before in one step.
 
         :param generators: see :func:`random_state`
+        :param cuda: the GPUs' generators, as they are now if there is nothing to go back to
         """
         assert isinstance(self.logger, RunLogger)
         began = time.monotonic()
@@ -126,11 +132,13 @@ class Checkpoints(BaseCallback):
                 "This environment can't save its state (it can't be pickled and has no state()): "
                 "if the run is resumed, its episodes begin anew."
             )
+        if not cuda and th.cuda.is_available():
+            cuda = th.cuda.get_rng_state_all()
         state = {
             "format": FORMAT,
             "num_timesteps": self.model.num_timesteps,
             "generators": generators,
-            "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+            "cuda": cuda or [],
             "environments": environments,
             # Seeded anew for each evaluation, but a wrapper may remember more than its episode.
             "evaluation": [capture(env) for env in self._evaluation_envs()],

@@ -60,6 +60,12 @@ def canonical_id(env_id: str) -> tuple[str, bool]:
     :param env_id: an id, whose version may be left out if the environment is ours
     :raises UsageError: it is unknown
     """
+    if env_id.endswith((".yml", ".yaml")):
+        raise UsageError(
+            f"a run needs an environment with an id, and {env_id!r} is a file: give it one in a "
+            'module of yours, sb3_guard.register("Mine-v0", '
+            f"sb3_guard.Scenario.load({env_id!r})), then --gym-packages my_module --env Mine-v0"
+        )
     try:
         ours = find_scenario(env_id) is not None
         if not ours and is_safety_gymnasium(env_id):

@@ -65,15 +65,20 @@ def run(command: Callable[[], int]) -> int:
     """
     Run a command and turn what the user can put right into one line on stderr.
 
-    :return: the exit status: the command's own, 130 for Ctrl-C, 2 for a :class:`UsageError` or a
-        package that does not import
+    :return: the exit status: the command's own, 130 for Ctrl-C, 141 if nobody reads its output any
+        longer (``| head``), 2 for a :class:`UsageError` or a package that does not import
     """
     # OpenMP's idle threads spin by default: on a machine shared with other work, torch's threads
     # then wait for one another's time slices and training is ten times slower. Read when torch is
     # imported, which the commands do later.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
-        return command()
+        status = command()
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return 141
     except (UsageError, ImportError) as error:  # an absent package, or no backend for MuJoCo
         print(f"error: {one_line(error)}", file=sys.stderr)
         return 2

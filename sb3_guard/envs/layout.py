@@ -175,6 +175,7 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
             xy[:, k + j, 0], fixed[k + j] = place, True
         k += f.num
     queue = deque(np.flatnonzero(~fixed).tolist())
+    weight = np.where(fixed, 1.0 + len(owner), 1.0)  # what a clash with each is worth
     failures: dict[str, int] = {}
     for _ in range(PATIENCE):
         if not queue:
@@ -183,13 +184,11 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         f = owner[k]
         draws = f.draw(rng, DRAWS)
         clash = _square_distance(draws, xy) < apart[k]  # [K, DRAWS]
-        trouble = clash.sum(axis=0)
-        if fixed.any():
-            trouble += len(owner) * clash[fixed].sum(axis=0)
+        trouble = weight @ clash
         if math.isfinite(f.reach):
             trouble += len(owner) ** 2 * f.out_of_reach(draws)
         best = int(trouble.argmin())  # the first clear draw, else the least disturbing one
-        if trouble[best]:
+        if trouble[best] > 0:
             failures[f.name] = failures.get(f.name, 0) + 1
             if trouble[best] >= len(owner):
                 queue.append(k)

@@ -324,8 +324,10 @@ def test_classes_that_cannot_be_parts_are_refused():
 
 
 def test_bad_registrations_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="needs a class or an xml file"):
+    with pytest.raises(ValueError, match=r"one of the two: .*\('X', xml='x.xml'\)"):
         registry.register_robot("X")
+    with pytest.raises(ValueError, match="must be a subclass of Robot; a file is given as xml="):
+        registry.register_robot("X", "x.xml")
     with pytest.raises(ValueError, match="there is no file"):
         registry.register_robot("X", xml=tmp_path / "none.xml")
     for name in ("My_Task", "Käfer", "2Fast", 3):

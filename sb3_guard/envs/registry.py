@@ -100,7 +100,10 @@ def register_robot(
     """
     _check_name(name)
     if (robot is None) == (xml is None):
-        raise ValueError(f"robot {name!r} needs a class or an xml file, not both and not neither")
+        raise ValueError(
+            f"robot {name!r} needs a class or an xml file, one of the two: "
+            f"register_robot({name!r}, xml='{name.lower()}.xml')"
+        )
     if robot is None:
         file = Path(str(xml)).resolve()
         if not file.is_file():
@@ -190,7 +193,8 @@ def _check_class(name: str, part: Any, kind: type, verb: str = "") -> None:
     """
     if not isinstance(part, type) or not issubclass(part, kind):
         given = getattr(part, "__name__", repr(part))
-        raise ValueError(f"{name!r} = {given} must be a subclass of {kind.__name__}")
+        hint = "; a file is given as xml=..." if kind is Robot else ""
+        raise ValueError(f"{name!r} = {given} must be a subclass of {kind.__name__}{hint}")
     parameters = [
         key for key, what in inspect.get_annotations(part).items() if "ClassVar" not in str(what)
     ]

@@ -87,5 +87,6 @@ def _missing(infos: Sequence[dict[str, Any]], keys: Sequence[str]) -> ValueError
     return ValueError(
         f"info of environment {i} has no cost key {key!r}; its keys are {present}{hint}. "
         "Pass the right names as cost_keys=(...), or missing_cost='zero' if the key appears "
-        "only when there is a cost"
+        "only when there is a cost; sb3_guard.common.adapters has wrappers for a cost that is "
+        "elsewhere or has to be computed"
     )

@@ -147,7 +147,15 @@ def test_estimate_by_hand():
     assert same == (2.0, 0.0, 2.0, 2.0)
 
 
+def test_costs_of_one_element_count_like_numbers():
+    env = fixed(2)
+    step = env.envs[0].step
+    env.envs[0].step = lambda action: (*step(action)[:4], {"cost": np.array([10.0])})
+    assert evaluate_policy(Idle(), env, n_eval_episodes=2).key_costs.tolist() == [[20.0], [20.0]]
+
+
 def test_an_evaluation_in_words():
+    assert str(evaluation([2.0])).startswith("1 episodes: return 2.000 ± 0.000, cost ")
     words = str(evaluation([1, 3]))
     assert words.startswith("2 episodes: return 2.000 ± 1.000 (95 % [1.000, 3.000]), cost ")
 

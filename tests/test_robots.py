@@ -378,6 +378,21 @@ def test_the_extent_counts_every_joint(joint: str, extent: float, tmp_path: Path
         assert world("Crank").robot.extent == pytest.approx(extent)
 
 
+@pytest.mark.parametrize(
+    ("actuator", "site", "what"), [("trun", "eye", "trun"), ("turn", "nowhere", "nowhere")]
+)
+def test_misspelt_names_in_a_robot_file_are_not_dropped(actuator, site, what, tmp_path) -> None:
+    (tmp_path / "dial.xml").write_text(f"""
+    <mujoco><worldbody><body name="robot"><joint name="turn"/><geom size="0.1"/>
+      <site name="eye"/></body></worldbody>
+      <actuator><motor joint="{actuator}" ctrlrange="-1 1"/></actuator>
+      <sensor><gyro name="gyro" site="{site}"/></sensor></mujoco>""")
+    with own_parts():
+        register_robot("Dial", xml=tmp_path / "dial.xml")
+        with pytest.raises(ValueError, match=f"dial.xml: .*{what}"):
+            world("Dial")
+
+
 def test_a_robot_module_shows_its_robot(tmp_path: Path) -> None:
     """``python -m sb3_guard.envs.robots.ant`` writes a picture where there is no display."""
     displays = ("DISPLAY", "WAYLAND_DISPLAY")

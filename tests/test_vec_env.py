@@ -4,6 +4,7 @@ import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
+from cost_envs import CostPoint
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard import CostMonitor, Scenario, make_vec_env
@@ -61,6 +62,18 @@ def test_foreign_environments_go_through_gymnasium():
     assert "cost" not in infos[0]
     assert find_scenario("CartPole-v1") is None
     assert find_scenario("Goal_Point_2Hazards") == Scenario.parse("Goal_Point_2Hazards")
+
+
+@pytest.mark.parametrize("make", [CostPoint, lambda **arguments: CostPoint(**arguments)])
+def test_a_class_or_a_function_makes_environments(make):
+    """As Stable-Baselines3's function of this name has it."""
+    env = make_vec_env(make, 2, seed=0, env_kwargs={"episode_length": 50}, max_episode_steps=3)
+    env.reset()
+    for _ in range(3):
+        _, _, dones, infos = env.step(np.zeros((2, *env.action_space.shape)))
+    assert dones.all() and all(info["episode"]["l"] == 3 for info in infos)
+    with pytest.raises(ValueError, match="is not an sb3_guard environment"):
+        make_vec_env(make, vec_env="native")
 
 
 def test_wrappers_and_normalisation_work():

@@ -29,7 +29,8 @@ class Estimate(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        return f"{self.mean:.3f} ± {self.std:.3f} (95 % [{self.low:.3f}, {self.high:.3f}])"
+        interval = f" (95 % [{self.low:.3f}, {self.high:.3f}])" if self.low == self.low else ""
+        return f"{self.mean:.3f} ± {self.std:.3f}{interval}"
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,8 @@ def evaluate_policy(
             )
             observations, rewards, starts, infos = env.step(actions)
             steps += 1
-            last_costs = np.array([[info.get(key, 0.0) for key in keys] for info in infos])
+            rows = [[info.get(key, 0.0) for key in keys] for info in infos]
+            last_costs = np.array(rows, dtype=np.float64).reshape(n, len(keys))
             returns += rewards
             lengths += 1
             costs += last_costs

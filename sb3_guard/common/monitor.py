@@ -19,8 +19,8 @@ def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) ->
     """
     cost = info.get("cost")
     if cost is None:
-        return float(sum(info.get(key, 0.0) for key in cost_keys))
-    return float(cost)
+        return float(sum(float(np.asarray(info.get(key, 0.0)).item()) for key in cost_keys))
+    return float(cost.item() if isinstance(cost, np.ndarray) else cost)
 
 
 class CostMonitor(VecMonitor):

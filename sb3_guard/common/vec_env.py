@@ -188,7 +188,7 @@ class GuardVecEnv(VecEnv):
 
 
 def make_vec_env(
-    env_id: str | Scenario,
+    env_id: str | Scenario | Callable[..., gymnasium.Env],
     n_envs: int = 1,
     seed: int | None = None,
     *,
@@ -204,7 +204,8 @@ def make_vec_env(
     """Make environments for Stable-Baselines3, with episode statistics that include the cost.
 
     :param env_id: an id of ours (the version may be left out), a scenario or its YAML file, any id
-        registered with Gymnasium, or one of Safety-Gymnasium where that package is installed
+        registered with Gymnasium, one of Safety-Gymnasium where that package is installed, or a
+        class or function that makes an environment
     :param n_envs: how many; 30 is a good number for training
     :param seed: the environments get seed, seed + 1, …
     :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"``
@@ -227,8 +228,8 @@ def make_vec_env(
         kwargs["render_mode"] = render_mode
     if max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
-    scenario = find_scenario(env_id)
-    spec = None if scenario is None else _our_envs(env_id).env_spec(env_id)
+    scenario = None if callable(env_id) else find_scenario(env_id)
+    spec = None if scenario is None or callable(env_id) else _our_envs(env_id).env_spec(env_id)
     wrapped = wrapper_class is not None or (spec is not None and spec.additional_wrappers)
     vec_env = vec_env or ("dummy" if scenario is None or wrapped else "native")
     if vec_env not in ("native", *VEC_ENVS):
@@ -253,7 +254,15 @@ def make_vec_env(
     else:
         make: Callable[..., gymnasium.Env] = gymnasium.make
         what: Any = env_id
-        if is_safety_gymnasium(str(env_id)):
+        if callable(env_id):
+            cut = kwargs.pop("max_episode_steps", None)
+
+            def make(_: Any, **arguments: Any) -> gymnasium.Env:
+                env = env_id(**arguments)
+                return env if cut is None else gymnasium.wrappers.TimeLimit(env, cut)
+
+            what = None
+        elif is_safety_gymnasium(str(env_id)):
             make = make_safety_gymnasium
         else:
             # a spec, not an id: other processes may not have registered it

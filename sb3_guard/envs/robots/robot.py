@@ -138,6 +138,7 @@ class MJCFRobot(Robot):
         super().build(world)
         try:
             robot = mujoco.MjSpec.from_file(str(self.path()))
+            robot.compile()  # attach() drops without a word what refers to something missing
         except ValueError as error:
             raise ValueError(f"{self.path()}: {' '.join(str(error).split())}") from None
         if robot.body("robot") is None:

@@ -240,7 +240,11 @@ def executor(args: dict[str, Any], folder: Path) -> Iterator["Executor"]:
 
 
 def _record(folder: Path, given: dict[str, Any]) -> None:
-    """Write down what was asked for, so that the folder is enough to go on."""
+    """
+    Write down what was asked for, so that the folder is enough to go on.
+
+    The record of a grid that is not part of this one is kept under another name.
+    """
     import yaml
 
     from sb3_guard.common.files import replacing
@@ -249,12 +253,51 @@ def _record(folder: Path, given: dict[str, Any]) -> None:
     text = yaml.safe_dump(what, sort_keys=False)
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        kept = _keep_record(folder, yaml.safe_load(text))
         with replacing(folder / RECORD) as file:
             file.write(text.encode())
     except OSError as error:
         raise UsageError(
             f"can't write to log folder {str(folder)!r}: {error.strerror}; choose another with -f"
         ) from error
+
+    if kept is not None and given.get("verbose", 1):
+        print(
+            f"{folder} was another grid's, which is now {kept.name} there; go on with that one "
+            f"with: sb3-guard benchmark -f {folder} --grid {kept}"
+        )
+
+
+def _keep_record(folder: Path, new: dict[str, Any]) -> Path | None:
+    """Rename the record in a grid's folder, unless a new one has all its runs or it was kept."""
+    import yaml
+
+    try:
+        text = (folder / RECORD).read_text()
+        old = yaml.safe_load(text)
+    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError):
+        return None
+    if not isinstance(old, dict) or _contains(new, old):
+        return None
+    number = 1
+    while (kept := folder / f"grid-{number}.yml").exists():
+        if kept.read_bytes() == text.encode():
+            return None
+        number += 1
+    (folder / RECORD).rename(kept)
+    return kept
+
+
+def _contains(new: dict[str, Any], old: dict[str, Any]) -> bool:
+    """Whether one grid has all the runs of another, as far as their flags tell."""
+    lists = ("suites", "algos", "seeds")
+    if any(new.get(name) != old.get(name) for name in {*new, *old} - {*lists}):
+        return False
+    for name in lists:
+        mine, its = (grid.get(name, DEFAULTS[name]) or ["all"] for grid in (new, old))
+        if "all" not in mine and not {*its} <= {*mine}:
+            return False
+    return True
 
 
 def _list(runs: Sequence["Run"]) -> None:

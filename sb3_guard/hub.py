@@ -32,7 +32,8 @@ def parser() -> Parser:
     """The flags, RL-Zoo's where it has them. What is not given is absent from the result."""
     result = Parser(
         prog="sb3-guard hub",
-        description="Upload a trained agent to the Hugging Face hub, or download one.",
+        description="Upload a trained agent to the Hugging Face hub, or download one. "
+        "Downloaded agents are programs: load only from people you trust.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         argument_default=argparse.SUPPRESS,

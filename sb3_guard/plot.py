@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_guard.common.files import replacing
-from sb3_guard.zoo.usage import Parser, UsageError, run
+from sb3_guard.zoo.usage import Parser, UsageError, positive, run
 
 if TYPE_CHECKING:
     from sb3_guard.zoo.figures import Data
@@ -62,9 +62,16 @@ def parser() -> Parser:
     result.add_argument("--env", nargs="+", metavar="ID", help="only these suites")
     result.add_argument(
         "--cost-limit",
+        nargs="+",
         type=float,
         metavar="D",
-        help="only runs of this limit, and unconstrained ones",
+        help="only runs of this limit (several costs: of these limits), and unconstrained ones",
+    )
+    result.add_argument(
+        "--steps",
+        type=positive,
+        metavar="N",
+        help="where an algorithm has runs of several lengths on a suite, those of N steps",
     )
     return result
 
@@ -97,19 +104,20 @@ def _plot(argv: Sequence[str] | None) -> int:
     elif nothing_asked:
         kinds = ["curves"]
 
+    chosen = results.choose(found.runs, args.env, args.cost_limit, args.steps)
     per_run = [file for file in files if file.suffix in (".csv", ".parquet")]
     for file in per_run:
-        results.write_table(file, found.runs)
+        results.write_table(file, chosen)
         print(f"wrote {file}")
     if len(per_run) == len(files) and not kinds and not args.report:
         return 0
-    runs = results.select(found.runs, args.env, args.cost_limit)
-    notes = results.notices(found.runs, runs)
+    runs = results.select(chosen)
+    notes = results.notices(chosen, runs)
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
     for file in files:
         if file not in per_run:
-            results.write_table(file, runs)
+            results.write_table(file, runs, notes)
             print(f"wrote {file}")
     data = Data(runs)
     status = _draw(data, kinds, args, all_of_them="all" in (args.figure or []))

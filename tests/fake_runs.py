@@ -18,6 +18,7 @@ def fake_run(
     cost: float = 5.0,
     epochs: int = 6,
     config: dict[str, Any] | None = None,
+    args: dict[str, Any] | None = None,
     **result: Any,
 ) -> Path:
     """
@@ -33,7 +34,8 @@ def fake_run(
     path = parent / f"{env}_{number}"
     params = path / env
     params.mkdir(parents=True)
-    (params / "args.yml").write_text(yaml.safe_dump({"algo": algo, "env": env, "seed": seed}))
+    flags = {"algo": algo, "env": env, "seed": seed} | (args or {})
+    (params / "args.yml").write_text(yaml.safe_dump(flags))
     settings = {"n_envs": 2, "n_steps": 50, "n_timesteps": 100 * epochs}
     if algo != "trpo":
         settings["cost_limit"] = 0.0

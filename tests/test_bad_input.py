@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import sys
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -151,8 +153,20 @@ def test_constructor_of_an_environment(error, capsys, empty, monkeypatch):
 
 
 def test_track_without_wandb(capsys, empty, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "wandb", None)
+    monkeypatch.setitem(sys.modules, "wandb", None)
     refused(train.main, ["--track"], capsys, "--track needs wandb", "pip install wandb")
+
+
+def test_track_without_a_key(capsys, empty, monkeypatch):
+    def init(**_: object) -> None:
+        raise RuntimeError("no API key\nconfigured")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    refused(
+        train.main, [*TOY, *SMALL, "--track"], capsys,
+        "--track: Weights & Biases can't be used: RuntimeError: no API key configured",
+        "wandb login",
+    )  # fmt: skip
 
 
 def test_corrupt_yaml(capsys, tmp_path):

@@ -158,6 +158,37 @@ def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
     assert capsys.readouterr().out.startswith(f"done    {run}  60 steps")
 
 
+@pytest.mark.parametrize(
+    ("change", "kept"),
+    [
+        ([], False),
+        (["--seeds", "0", "1"], False),  # a grid may grow
+        (["--suites", "CostPoint-v0", "Filmed-v0", "--algos", "trpo"], False),
+        (["--suites", "Filmed-v0"], True),
+        (["--algos", "cpo"], True),
+        (["--checkpoint-every", "0"], True),
+    ],
+)
+def test_an_earlier_grid_of_the_folder_is_not_forgotten(change, kept, tmp_path, here, capsys):
+    arguments = [*GRID[:2], "--algos", "trpo", "--seeds", "0", *SMALL, "-n", "60"]
+    arguments += ["-f", str(tmp_path)]
+    assert benchmark.main(arguments) == 0
+    before = (tmp_path / "grid.yml").read_text()
+    capsys.readouterr()
+    assert benchmark.main([*arguments, *change]) == 0
+    assert (tmp_path / "grid-1.yml").exists() == kept
+    out = capsys.readouterr().out
+    if kept:
+        assert (tmp_path / "grid-1.yml").read_text() == before
+        line = f"sb3-guard benchmark -f {tmp_path} --grid {tmp_path / 'grid-1.yml'}"
+        assert line in out
+        assert benchmark.main([*line.split()[2:], "--dry-run"]) == 0
+        assert "1 runs (1 done" in capsys.readouterr().out
+        for flags in (line.split()[2:], [*arguments, *change], line.split()[2:]):  # to and fro
+            assert benchmark.main(flags) == 0
+        assert len(list(tmp_path.glob("grid-*.yml"))) == 2
+
+
 REFUSED = [
     (["--suites", "Goal_Point_8Hazards", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
     (["--algos", "cpo", "pcpq"], ["unknown algorithm 'pcpq'", "did you mean 'pcpo'?"]),
@@ -282,6 +313,17 @@ def test_another_run_in_the_folder_is_not_touched(tmp_path, here, capsys):
     assert len(here) == 2
 
 
+def test_a_warm_start_is_another_run(tmp_path, here, capsys):
+    one = ["--algo", "cpo", "--env", *GRID[1:], "--verbose", "0"]
+    assert train.main([*one, "--seed", "5", "-f", str(tmp_path / "first")]) == 0
+    model = str(runs_of(tmp_path / "first") / "CostPoint-v0.zip")
+    assert train.main([*one, "--seed", "0", "-i", model, "-f", str(tmp_path / "grid")]) == 0
+    refused(
+        train.main, [*one, "--seeds", "0", "-f", str(tmp_path / "grid")], capsys,
+        "holds another run", f"trained_agent: {model} there, none here",
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("failures", [1, 3])
 def test_failures_are_retried_twice(failures, tmp_path, here, monkeypatch, capsys):
     left = {"n": failures}
@@ -361,6 +403,21 @@ def test_a_result_that_is_not_where_it_should_be(tmp_path, here, monkeypatch, ca
     arguments = [*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path / "grid")]
     assert benchmark.main(arguments) == 1
     assert "the folder must be on a disk that all workers share" in capsys.readouterr().err
+
+
+def test_a_result_that_a_shared_disk_shows_late(tmp_path, here, monkeypatch):
+    """And the whole run folder with it."""
+    whole, asked = grid.is_run, []
+
+    def late(path: Path) -> bool:
+        asked.append(path)
+        return len(asked) > 3 and whole(path)
+
+    monkeypatch.setattr(grid, "PATIENCE", 30.0)
+    monkeypatch.setattr(grid, "is_run", late)
+    monkeypatch.setattr(grid, "RunFolder", lambda path: asked[3] and RunFolder(path))
+    assert benchmark.main([*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)]) == 0
+    assert len(here) == 1 and len(asked) > 3
 
 
 # locks

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -45,6 +46,34 @@ def trained(folder, *arguments: str, algo: str = "cpo", env: str = "CostPoint-v0
         run += LENGTH
     assert train.main([*run, "--verbose", "0"]) == 0
     return max((folder / algo).glob(f"{env}_*"), key=lambda path: path.stat().st_mtime_ns)
+
+
+def test_track_sends_what_tensorboard_gets_and_goes_on(tmp_path, monkeypatch, capsys):
+    """With a stand-in for wandb, which sees the event files that are opened after init only."""
+    calls, logs = [], tmp_path / "logs"
+
+    def init(**kwargs):
+        # Nothing is written yet, of a new run not even its folder.
+        calls.append((kwargs, len(list(tmp_path.rglob("events.*"))), logs.exists()))
+        return SimpleNamespace(id="w1", config=SimpleNamespace(update=update), finish=finish)
+
+    def update(values, allow_val_change):
+        assert values == {"folder": str(logs / "cpo" / "CostPoint-v0_1")}
+
+    def finish():
+        assert (logs / "cpo" / "CostPoint-v0_1" / "result.json").exists()
+        raise OSError("no network")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    run = trained(logs, "--track", "-tb", str(tmp_path / "tb"))
+    assert "did not get everything: OSError: no network" in capsys.readouterr().err
+    assert train.main(["-i", str(run), "-n", "180", "--verbose", "0"]) == 0
+    assert json.loads((run / "result.json").read_text())["n_timesteps"] == 180
+    (first, *before), (second, *after) = calls
+    assert (before, after) == ([0, False], [1, True])
+    assert all(one["sync_tensorboard"] for one in (first, second))
+    assert (first["id"], first["resume"]) == (None, None)
+    assert (second["id"], second["resume"]) == ("w1", "allow")
 
 
 def test_run_folder_is_rl_zoos(tmp_path):
@@ -308,6 +337,26 @@ def test_record_our_environment(tmp_path):
     play = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3", "--record", str(video)]
     assert enjoy.main(play) == 0
     assert video.stat().st_size > 1000
+
+
+def test_enjoy_imports_what_training_imported(tmp_path, monkeypatch):
+    """Before it looks the id up, which only that module may know."""
+    trained(tmp_path)
+    asked = []
+    monkeypatch.setattr("sb3_guard.zoo.playback.import_packages", asked.append)
+    play = ["--algo", "cpo", "--env", "CostPoint-v0", "-f", str(tmp_path), "--no-render"]
+    assert enjoy.main([*play, "--n-episodes", "1"]) == 0
+    assert enjoy.main([*play, "--n-episodes", "1", "--exp-id", "1"]) == 0
+    assert asked == [["registered_envs"]] * 2
+
+
+def test_packages_are_found_in_the_current_folder(tmp_path, monkeypatch):
+    """The script sb3-guard has its own folder on the path, not the current one."""
+    (tmp_path / "parts_of_mine.py").touch()
+    monkeypatch.setattr(sys, "path", [one for one in sys.path if one not in ("", os.getcwd())])
+    monkeypatch.chdir(tmp_path)
+    usage.import_packages(["parts_of_mine"])
+    assert sys.modules.pop("parts_of_mine")
 
 
 def test_an_arm_trains_plays_and_records(tmp_path):

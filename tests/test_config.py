@@ -2,6 +2,7 @@
 
 import gymnasium as gym
 import pytest
+import torch
 from torch import nn
 
 from sb3_guard.algorithms import ALGORITHMS, CPO
@@ -203,9 +204,30 @@ def test_objects_are_made():
 
 
 @pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("dict(net_arch=dict(pi=[64], vf=[-1, 2.5]))", {"net_arch": {"pi": [64], "vf": [-1, 2.5]}}),
+        ("dict(a=(1, None), b={'c': [dict(d=True)]})", {"a": (1, None), "b": {"c": [{"d": True}]}}),
+        ("dict(optimizer_class=th.optim.RMSprop, t=torch.float32)",
+         {"optimizer_class": torch.optim.RMSprop, "t": torch.float32}),
+        ("dict()", {}),
+    ],
+)  # fmt: skip
+def test_expressions_are_data_and_classes_of_torch(text, value):
+    assert build(checked(policy_kwargs=text)).model["policy_kwargs"] == value
+
+
+@pytest.mark.parametrize(
     ("name", "value", "message"),
     [
         ("policy_kwargs", "dict(activation_fn=nn.Rellu)", "can't be evaluated.*Rellu"),
+        ("policy_kwargs", "dict(a=open('x', 'w'))", "can't be evaluated.*open.* is not allowed"),
+        ("policy_kwargs", "dict(a=th.hub.load)", "th.hub.load is no class of torch"),
+        ("policy_kwargs", "dict(a=nn.Module.__subclasses__())", "is not allowed"),
+        ("policy_kwargs", "dict([('a', exit())])", r"dict\(.* is not allowed; .*literals"),
+        ("monitor_kwargs", "dict(a=[__import__('os')])", "__import__.* is not allowed"),
+        ("normalize", "dict(**{'a': 1})", "can't be evaluated"),
+        ("normalize", "{'a': exit()}", r"exit\(\) is not allowed"),
         ("learning_rate", "lin_fast", "not a schedule"),
         ("policy", "no.such.Policy", "there is no class 'no.such.Policy'"),
         ("env_wrapper", "no.such.Wrapper", "wrapper or callback can't be made"),

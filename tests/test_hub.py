@@ -19,6 +19,10 @@ def logs(tmp_path_factory):
     return folder
 
 
+NAME = "cpo-Goal_Point_8Hazards-v0"
+ZOO = "!!python/object/apply:collections.OrderedDict\n- - [algo, ppo]\n  - [env, X-v0]\n"
+
+
 def staged(logs, folder, *flags):
     push = ["push", *WHICH, "-f", str(logs), "-orga", "me", "--to", str(folder), *flags]
     return hub.main(push)
@@ -39,11 +43,48 @@ def test_what_is_uploaded(logs, tmp_path):
     assert "under a limit of 0.0" in page and "--repo-id me/cpo-Filmed-v0" in page
 
 
+def test_no_path_of_this_machine_is_uploaded(logs, tmp_path):
+    params = logs / "cpo" / "Filmed-v0_1" / "Filmed-v0"
+    (params / "command.txt").write_text(f"{logs}/bin/python -m sb3_guard.train -f {logs}")
+    assert staged(logs, tmp_path, "--dry-run", "--no-video") == 0
+    assert str(logs) in (params / "args.yml").read_text()
+    expected = f"python -m sb3_guard.train -f {logs.name}"
+    assert (tmp_path / "command.txt").read_text() == expected
+    for file in ("args.yml", "command.txt", "config.yml", "README.md"):
+        assert str(logs.parent) not in (tmp_path / file).read_text(), file
+    flags = yaml.safe_load((tmp_path / "args.yml").read_text())
+    assert (flags["algo"], flags["log_folder"]) == ("cpo", logs.name)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{algo: cpo, env: X-v0}", "is cpo on X-v0"),
+        (ZOO, "is ppo on X-v0"),
+        ("[", "can't read"),
+        ("a", "is damaged"),
+    ],
+)
+def test_a_download_that_is_another_agent(tmp_path, monkeypatch, capsys, text, message):
+    (tmp_path / "hub").mkdir()
+    for name, content in {"args.yml": text, "config.yml": "", f"{NAME}.zip": ""}.items():
+        (tmp_path / "hub" / name).write_text(content)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "hub"))
+    assert hub.main(["load", "-orga", "me", "-f", str(tmp_path / "logs")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "logs").exists()
+
+
 def test_there_and_back(logs, tmp_path, monkeypatch, capsys):
     assert staged(logs, tmp_path / "hub", "--dry-run", "--no-video") == 0
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "hub"))
     load = ["load", *WHICH[:4], "--repo-id", "me/cpo-Filmed-v0", "-f", str(tmp_path / "logs")]
+    (tmp_path / "logs" / "cpo" / "Filmed-v0_1").mkdir(parents=True)
+    monkeypatch.setattr("sb3_guard.zoo.run_folder.latest_run", lambda *_: 0)  # taken meanwhile
     assert hub.main(load) == 0
+    monkeypatch.undo()
+    out = capsys.readouterr().out
+    assert "load only from people you trust" in out and "Filmed-v0_2" in out
     outputs = []
     for folder in (logs, tmp_path / "logs"):
         capsys.readouterr()

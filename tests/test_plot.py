@@ -295,6 +295,26 @@ def test_table_of_runs_needs_no_choice_of_limit(small, tmp_path, capsys):
     assert plot.main([str(small), *table, "--cost-limit", "5"]) == 0
 
 
+def test_table_of_runs_has_those_asked_for(small, tmp_path, capsys):
+    file = tmp_path / "r.csv"
+    fake_run(small, "cpo", cost_limit=5.0, seed=2)
+    fake_run(small, "cpo", "Push_Point_8Hazards-v0", epochs=3, number=9)
+    fake_run(small, "cpo", "Push_Point_8Hazards-v0", number=8)
+    for flags, rows in (
+        (["--env", "Goal_Point_8Hazards"], 7),
+        (["--cost-limit", "5"], 3),
+        (["--steps", "300"], 8),
+    ):
+        assert plot.main([str(small), "--table", str(file), *flags]) == 0
+        assert len(file.read_text().splitlines()) == 1 + rows, flags
+    file.unlink()
+    capsys.readouterr()
+    for flags in (["--env", "Goal_Pint_8Hazards"], ["--cost-limit", "77"], ["--steps", "1"]):
+        assert plot.main([str(small), "--table", str(file), *flags]) == 2
+        assert "there is no run" in capsys.readouterr().err
+    assert not file.exists()
+
+
 def test_damaged_runs_are_named_and_the_others_shown(small, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("sb3_guard.zoo.report.FIGURES", {})
     broken = small / "cpo" / "Goal_Point_8Hazards-v0_2"

@@ -83,8 +83,21 @@ def test_other_environments_keep_their_ids(tmp_path):
 def test_several_limits_on_several_costs_are_no_number(tmp_path):
     fake_run(tmp_path, cost_limit=[1.0, 2.0])
     fake_run(tmp_path, cost_limit=[3.0], seed=1)
-    limits = read_results([tmp_path]).runs["cost_limit"].tolist()
-    assert limits[0] == 3.0 and math.isnan(limits[1])
+    fake_run(tmp_path, cost_limit=[50.0, 50.0])
+    found = read_results([tmp_path]).runs
+    assert found["cost_limit"][0] == 3.0 and found["cost_limit"][1:].isna().all()
+    assert found["limits"].tolist() == ["3", "1 2", "50 50"]
+    with pytest.raises(UsageError, match=r"several cost limits, 1 2, 3, 50 50, .*--cost-limit 1 2"):
+        select(found)
+    assert select(found, cost_limit=[50, 50])["limits"].tolist() == ["50 50"]
+    with pytest.raises(UsageError, match="no run at cost limit 1; there are runs at 1 2, 3, 50 50"):
+        select(found, cost_limit=1)
+    assert tables(select(found, cost_limit=[1, 2]))["Results"]["limit"].tolist() == ["1 2"]
+
+
+def test_folders_that_overlap_are_read_once(tmp_path):
+    fake_run(tmp_path)
+    assert len(read_results([tmp_path, tmp_path / "cpo", tmp_path / "cpo" / ".."]).runs) == 1
 
 
 @pytest.mark.parametrize("where", ["", "cpo", f"cpo/{HAZARDS}-v0_1"])
@@ -193,14 +206,73 @@ def test_suites_are_chosen_by_id(tmp_path, name):
         select(found, ["Goal_Pint_8Ghosts"])
 
 
-def test_unequal_runs_are_noticed(tmp_path):
-    fake_run(tmp_path)
-    fake_run(tmp_path, seed=1, epochs=3)
-    fake_run(tmp_path, seed=2, config={"gamma": 0.9})
+def test_runs_of_several_lengths_are_not_averaged(tmp_path):
+    fake_run(tmp_path, "trpo", epochs=4)
+    for epochs in (3, 6):
+        fake_run(tmp_path, epochs=epochs)
+    found = read_results([tmp_path]).runs
+    with pytest.raises(UsageError, match=r"cpo on .* in length, 300, 600 steps.* --steps 600"):
+        select(found)
+    with pytest.raises(UsageError, match="no run of 7 steps; there are runs of 300, 400, 600"):
+        select(found, steps=7)
+    chosen = select(found, steps=300)
+    assert chosen["steps"].tolist() == [400, 300]  # where there is no choice, all stay
+    (line,) = notices(found, chosen)
+    assert line == f"{HAZARDS}: runs differ in length: 300, 400 steps"
+
+
+def test_environments_of_other_settings_are_not_compared(tmp_path):
+    fake_run(tmp_path, "trpo", config={"env_kwargs": {"num": 2}})
+    fake_run(tmp_path, config={"env_kwargs": None})
+    with pytest.raises(UsageError, match=r'differ in env_kwargs .*\{"num": 2\} in .*; none in '):
+        select(read_results([tmp_path]).runs)
+
+
+WARM = dict(trained_agent="old.zip")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "line"),
+    [
+        ({}, {"seed": 1, "config": {"a": 0}}, "runs of cpo differ in hyper-parameters"),
+        ({}, {"config": {"a": 0}}, "runs of cpo count twice or more for one seed: 0"),
+        ({}, {"args": WARM}, "some runs went on from a model, others from none"),
+        ({"commit": "a"}, {"seed": 1, "commit": "b"}, "runs differ in commit: a, b"),
+        ({"commit": "a"}, {"seed": 1}, "runs differ in commit: a, unknown"),
+        ({"versions": {"mujoco": "3"}}, {"seed": 1, "versions": {"mujoco": "4"}},
+         "runs differ in mujoco: 3, 4"),
+        ({"versions": {"sb3_guard": "1"}}, {"seed": 1, "versions": {"sb3_guard": "2"}},
+         "runs differ in sb3_guard: 1, 2"),
+        ({"algo": "trpo"}, {"config": {"n_steps": 5}},
+         "algorithms differ in n_steps: 50 (trpo); 5 (cpo)"),
+        ({"algo": "trpo", "config": {"gamma": 0.9}}, {},
+         "algorithms differ in gamma: 0.9 (trpo); default (cpo)"),
+        ({"config": {"warmup": 0.3}}, {"seed": 1, "config": {"warmup": 0.3}, "learned": [300]},
+         "how they were extended"),
+        ({"config": {"learning_rate": "lin_1"}},
+         {"seed": 1, "config": {"learning_rate": "lin_1"}, "learned": [300]},
+         "how they were extended"),
+    ],
+)  # fmt: skip
+def test_unequal_runs_are_noticed(tmp_path, one, other, line):
+    fake_run(tmp_path, **one)
+    fake_run(tmp_path, **other)
     found = read_results([tmp_path]).runs
     lines = notices(found, select(found))
-    assert any("differ in length: 300, 600 steps" in line for line in lines)
-    assert any("runs of cpo differ in hyper-parameters" in line for line in lines)
+    assert any(line in note and note.startswith(HAZARDS) for note in lines), lines
+    write_table(tmp_path / "r.md", select(found), lines)
+    write_table(tmp_path / "r.tex", select(found), lines)
+    assert f"\n- {lines[0]}\n" in (tmp_path / "r.md").read_text()
+    assert f"\n% {lines[0]}\n" in (tmp_path / "r.tex").read_text()
+
+
+def test_equal_runs_need_no_note(tmp_path):
+    fake_run(tmp_path, "trpo")
+    fake_run(tmp_path, "ppo", config={"n_steps": 7})  # a baseline's own
+    fake_run(tmp_path, learned=[300])
+    fake_run(tmp_path, seed=1)
+    found = read_results([tmp_path]).runs
+    assert notices(found, select(found)) == []
 
 
 # Statistics
@@ -257,6 +329,13 @@ def test_negative_returns_are_shifted():
     scores = normalize(table, table).set_index("algo")["reward"]
     # The range is 10: the least return becomes 0.1, TRPO's 10.1.
     assert scores.tolist() == pytest.approx([1.0, 0.1 / 10.1, 5.1 / 10.1])
+
+
+def test_trpo_alone_is_scored_1_and_its_runs_around_it():
+    table = means(trpo=(-4.0, 1.0, 1.0))
+    assert normalize(table, table)["reward"].tolist() == [1.0]
+    runs = pd.concat([table.assign(J_r=-5.0), table.assign(J_r=-3.0)])
+    assert normalize(runs, table)["reward"].tolist() == [0.75, 1.0]
 
 
 def test_only_the_papers_algorithms_count_for_the_shift():

@@ -20,8 +20,10 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard import train
 from sb3_guard.common.vec_env import VEC_ENVS
+from sb3_guard.zoo import experiment
 from sb3_guard.zoo.checkpoint import read_checkpoint
 from sb3_guard.zoo.progress import Epochs
+from sb3_guard.zoo.run_folder import RunFolder
 
 TESTS = Path(__file__).parent
 # Checkpoints at every rollout; models kept and evaluations at steps that are no rollout's end.
@@ -81,9 +83,10 @@ def assert_equal(one, other) -> None:
 
 
 def outcome(run: Path) -> dict[str, object]:
-    """What a run came to, its duration aside."""
+    """What a run came to, its duration and whether it was made longer aside."""
     result = json.loads((run / "result.json").read_text())
     result.pop("seconds")
+    result.pop("learned", None)
     return result
 
 
@@ -190,6 +193,36 @@ def test_finished_run_goes_on_as_a_longer_one(tmp_path, capsys):
         assert outcome(run) == before
     assert train.main(["-i", str(run), "-n", "300"]) == 0
     assert_same_run(tmp_path / "long", tmp_path / "short")
+    # For those whose warm-up or schedule would have been another.
+    assert "learned" not in RunFolder(runs_of(tmp_path / "long")).checked_result()
+    assert RunFolder(run).checked_result()["learned"] == [120]
+    assert train.main(["-i", str(run), "-n", "360"]) == 0
+    assert RunFolder(run).checked_result()["learned"] == [120, 300]
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "result_is_left"),
+    [(experiment, "RunLogger", True), (RunFolder, "write_config", False)],
+)
+def test_a_result_is_always_that_of_its_configuration(
+    owner, name, result_is_left, tmp_path, monkeypatch
+):
+    """Whenever a run that is to go on for longer dies."""
+    assert train.main([*TOY, *SHORT, *SMALL, "-n", "60", "-f", str(tmp_path)]) == 0
+    run = RunFolder(runs_of(tmp_path))
+
+    def die(*_: object, **__: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, die)
+        with pytest.raises(Killed):
+            train.main(["-i", str(run.path), "-n", "120"])
+    assert run.hyperparams()["n_timesteps"] == run.args()["n_timesteps"] == 60
+    assert run.result.exists() == result_is_left
+    assert train.main(["-i", str(run.path), "-n", "120"]) == 0
+    assert run.hyperparams()["n_timesteps"] == run.args()["n_timesteps"] == 120
+    assert run.checked_result()["n_timesteps"] == 120
 
 
 def test_time_goes_on(tmp_path, monkeypatch):

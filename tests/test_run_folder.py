@@ -77,6 +77,14 @@ def test_damaged_config(tmp_path, content):
         run.hyperparams()
 
 
+@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])
+def test_results_are_finite(tmp_path, value):
+    run = create(tmp_path)
+    run.write_result({"n_timesteps": 5, "return": value, "cost": 1.0, "cost_rate": None})
+    with pytest.raises(UsageError, match=r"is damaged: return = .* should be a number"):
+        run.checked_result()
+
+
 def test_log_folder_that_can_not_be(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match=r"can't write to log folder .* choose another with -f"):

@@ -150,6 +150,42 @@ def test_rl_zoos_spaces_become_plain_data(algo):
         assert "action_noise" not in values
 
 
+@pytest.mark.parametrize("algo", ["ddpg", "td3"])
+def test_rl_zoos_noise_is_what_was_drawn(algo):
+    """None, too, although the shipped file has some; what is fixed stays."""
+    base = check(algo, algorithm(algo), read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
+    assert base["noise_type"] == "normal"
+    for kind in ("normal", "ornstein-uhlenbeck", None):
+        study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+        study.enqueue_trial({"noise_type": kind, "noise_std": 0.25}, skip_if_exists=False)
+        values = Search(algo, base).draw(study.ask())
+        assert (values["noise_type"], values.get("noise_std")) == (kind, 0.25 if kind else None)
+        assert (build(check(algo, algorithm(algo), values)).action_noise(2) is None) == (not kind)
+        study.enqueue_trial({"noise_type": kind, "noise_std": 0.25}, skip_if_exists=False)
+        values = Search(algo, base, fixed={"noise_type": "normal"}).draw(study.ask())
+        assert (values["noise_type"], values["noise_std"]) == ("normal", 0.25)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("dict(a=nn.ReLU, b=dict(c=[1]))", "dict(a=nn.ReLU, b=2)"),
+        (" {'a': 1}", "dict(a=1, b=2)"),
+        ("dict()", "dict(b=2)"),
+        ("dict(**x)", None),
+        ("{**x}", None),
+        ("print(1)", None),
+        ("dict(a", None),
+    ],
+)
+def test_an_entry_of_a_mapping_that_is_text_changes(text, expected):
+    if expected is None:
+        with pytest.raises(UsageError, match="can't change entries of"):
+            set_dotted({"x": text}, "x.b", 2)
+    else:
+        assert set_dotted({"x": text}, "x.b", 2) == {"x": expected}
+
+
 def test_a_space_of_ones_own(tmp_path):
     path = tmp_path / "space.yml"
     path.write_text(
@@ -260,7 +296,8 @@ def ended(returns, violations, state=TrialState.COMPLETE):
         ([4.0], [0.0], False),  # above the median, 3
         ([2.0], [0.0], True),
         ([9.0], [0.1], True),  # however much it gets: it costs too much
-        ([9.0, 2.0], [0.0, 0.0], False),  # was better before
+        ([9.0, 2.0], [0.0, 0.0], True),  # however good it was before
+        ([9.0, 4.0], [0.1, 0.0], False),  # keeps the limit by now
     ],
 )
 def test_median_pruning_compares_the_feasible_by_return(returns, violations, pruned):
@@ -272,6 +309,8 @@ def test_median_pruning_compares_the_feasible_by_return(returns, violations, pru
     assert FeasibleFirst("median", 3).prune(study, trial) == pruned
     assert not FeasibleFirst("median", 4).prune(study, trial)
     assert not FeasibleFirst("median", 3, n_warmup_steps=5).prune(study, trial)
+    trial.system_attrs = {"fixed_params": {"gamma": 0.99}}  # the file's, with which to compare
+    assert not FeasibleFirst("median", 3).prune(study, trial)
 
 
 @pytest.mark.parametrize(("violation", "pruned"), [(0.5, False), (2.5, True)])
@@ -597,6 +636,36 @@ def test_trials_that_kill_their_workers_are_given_up(tmp_path):
     storage.close()
 
 
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_trial_is_not_lost_between_failing_and_queueing(tmp_path, monkeypatch, stopped):
+    """Whoever gives it back dies after the first of the two, too; then it is given back once."""
+
+    class Killed(BaseException):
+        pass
+
+    def die(*_: object, **__: object) -> None:
+        raise Killed
+
+    storage = storages.Journal(tmp_path / "study.journal")
+    study = optuna.create_study(storage=storage.storage)
+    study.ask()  # and its worker dies
+    for name in ("add_trial", "tell"):
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(optuna.Study, name, die)
+            if stopped:
+                storages.queue_again(study, study.trials[0])
+                storages.queue_again(study, study.trials[0])  # as after an outage
+                study.tell(0, state=TrialState.FAIL)
+            with storage.claim(study):
+                pass
+        assert study.trials[0].state == TrialState.RUNNING
+    for _ in range(2):
+        with storage.claim(study):
+            pass
+    assert [one.state.name for one in study.trials] == ["FAIL", "WAITING"]
+    storage.close()
+
+
 def test_a_cut_line_of_the_journal_is_mended(tmp_path, folder, monkeypatch):
     """As a full disk leaves it."""
     pretend(monkeypatch, by_kl)
@@ -805,6 +874,23 @@ def test_a_study_whose_creator_died_at_once_is_begun(tmp_path, folder, monkeypat
     optuna.create_study(storage=storage, study_name="trpo_lag_CostPoint-v0", direction="maximize")
     pretend(monkeypatch, by_kl)
     assert run(tmp_path, "--n-trials", "2") == 0
+    assert study_in(folder).trials[0].params["target_kl"] == 0.02  # that of the shipped file
+
+
+def test_a_study_whose_beginner_died_in_between_is_begun(tmp_path, folder, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    def die(self, params):
+        raise Killed
+
+    pretend(monkeypatch, by_kl)
+    with monkeypatch.context() as patch:
+        patch.setattr(optuna.Study, "enqueue_trial", die)
+        with pytest.raises(Killed):
+            run(tmp_path, "--n-trials", "2")
+    assert run(tmp_path, "--n-trials", "2") == 0
+    assert states(folder) == {"COMPLETE": 2}
     assert study_in(folder).trials[0].params["target_kl"] == 0.02  # that of the shipped file
 
 

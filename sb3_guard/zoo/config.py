@@ -5,6 +5,7 @@ environments and YAML anchors. What is read stays plain data, so that the run fo
 ``config.yml`` says exactly what was used; only :func:`build` makes objects of it.
 """
 
+import ast
 import copy
 import importlib
 import inspect
@@ -441,15 +442,54 @@ def _schedule(name: str, value: str) -> Callable[[float], float]:
 
 
 def _evaluate(name: str, text: str) -> Any:
-    """The value of an expression such as ``dict(activation_fn=nn.ReLU)``."""
-    import torch as th
+    """
+    The value of an expression such as ``dict(activation_fn=nn.ReLU)``.
 
+    Settings travel with agents, so no code of theirs runs.
+    """
     try:
-        return eval(text, {"th": th, "torch": th, "nn": th.nn})
+        return _literal(ast.parse(text.strip(), mode="eval").body)
     except Exception as error:
         raise UsageError(
-            f"hyper-parameter {name}: {text!r} can't be evaluated: {one_line(error)}"
+            f"hyper-parameter {name}: {text!r} can't be evaluated: {one_line(error)}; "
+            "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
         ) from error
+
+
+def _literal(node: ast.expr) -> Any:
+    match node:
+        case ast.Call(func=ast.Name(id="dict"), args=[], keywords=pairs):
+            if all(pair.arg for pair in pairs):  # none is **
+                return {pair.arg: _literal(pair.value) for pair in pairs}
+        case ast.Dict(keys=keys, values=values):
+            named = [key for key in keys if key is not None]
+            if len(named) == len(values):
+                return {
+                    ast.literal_eval(key): _literal(value)
+                    for key, value in zip(named, values, strict=True)
+                }
+        case ast.List(elts=items):
+            return [_literal(item) for item in items]
+        case ast.Tuple(elts=items):
+            return tuple(_literal(item) for item in items)
+        case ast.Attribute():
+            return _torch(ast.unparse(node))
+        case ast.Call() | ast.Name():
+            raise ValueError(f"{ast.unparse(node)} is not allowed")
+    return ast.literal_eval(node)
+
+
+def _torch(path: str) -> Any:
+    """A class or a type of numbers of torch: ``nn.ReLU``, ``th.optim.Adam``, ``th.float32``."""
+    import torch as th
+
+    root, *names = path.split(".")
+    value: Any = {"th": th, "torch": th, "nn": th.nn}.get(root)
+    for one in names:
+        value = getattr(value, one)
+    if not isinstance(value, (type, th.dtype)):
+        raise ValueError(f"{path} is no class of torch")
+    return value
 
 
 def _import_class(name: str, path: str) -> type:

@@ -10,8 +10,8 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -65,11 +65,13 @@ from sb3_guard.zoo.usage import UsageError, import_packages, interrupts, one_lin
 FREE_FLAGS = {"trained_agent", "progress", "verbose", "num_threads", "checkpoint_every", "track"}
 # Those that say what a run is, beside its hyper-parameters.
 IDENTITY = (
-    "algo", "env", "seed", "device", "vec_env", "eval_freq", "eval_episodes", "n_eval_envs",
-    "eval_env_kwargs", "save_freq", "log_interval",
+    "algo", "env", "seed", "trained_agent", "device", "vec_env", "eval_freq", "eval_episodes",
+    "n_eval_envs", "eval_env_kwargs", "save_freq", "log_interval",
 )  # fmt: skip
 # The evaluation episodes are not those of training: seeds this far apart don't meet.
 EVALUATION_SEED_OFFSET = 1_000_000
+# Beside a run's configuration: its id at Weights & Biases.
+TRACKED = "wandb.txt"
 
 
 class Experiment:
@@ -99,6 +101,9 @@ class Experiment:
         self._saved = None if folder is None else folder.checkpoint
         #: training ends after the rollout under way when this file is gone
         self.permit: Path | None = None
+        #: its folder is to state flags and hyper-parameters anew once training can go on
+        self.restates = False
+        self._tracker: Any = None  # the run at Weights & Biases
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
         self._check_selection_limit()
         if self._tensorboard_folder is not None:
@@ -283,16 +288,27 @@ class Experiment:
             self.close()
 
     def close(self) -> None:
-        """Release the environments."""
+        """Release the environments, and let Weights & Biases have what it has not yet."""
         for env in (self.env, self.eval_env):
             with suppress(*PROCESS_DIED):
                 if env is not None:
                     env.close()
+        if self._tracker is not None:
+            try:
+                self._tracker.finish()
+            except Exception as error:  # its client raises what it likes; the run is on disk
+                print(
+                    f"--track: Weights & Biases did not get everything: {one_line(error)}; "
+                    "send it with: wandb sync",
+                    file=sys.stderr,
+                )
+            self._tracker = None
 
     def _train(self, folder: RunFolder) -> int:
         state, verbose = self.state, self.args["verbose"] > 0
         if verbose:
             print(f"Run folder: {folder.path} (seed {self.args['seed']})")
+        self.track(folder)
         try:
             find_monitor(self.env).log_to(
                 folder.monitor, offset=None if state is None else monitor_offset(state)
@@ -310,8 +326,11 @@ class Experiment:
         self.model.set_logger(logger)
         checkpoints, epochs, callbacks = self._make_callbacks(folder)
         if state is not None:
-            folder.result.unlink(missing_ok=True)
             checkpoints.restore(state)
+            # In this order, and only now: a result in the folder is always that of its config.
+            folder.result.unlink(missing_ok=True)
+            if self.restates:
+                folder.write_config(self.args, self.hyperparams)
             restore_run(self.model, state)
 
         def stop(number: int) -> None:
@@ -320,7 +339,7 @@ class Experiment:
                 print("\nStopping after this rollout; once more to stop at once.", file=sys.stderr)
 
         began = time.monotonic()
-        with self._tracked(folder), interrupts(stop) as received:
+        with interrupts(stop) as received:
             finished = self._learn(callbacks, received)
         with replacing(folder.model) as file:
             self.model.save(file)
@@ -347,27 +366,46 @@ class Experiment:
         # Of the run's own number, so that a resumed run finds it again.
         return parent / folder.name / f"{self.algo}{folder.path.name[len(folder.name) :]}"
 
-    @contextmanager
-    def _tracked(self, folder: RunFolder) -> Iterator[None]:
-        """Send the run's TensorBoard events to Weights & Biases, if asked to."""
-        if not self.args["track"]:
-            yield
-            return
-        import wandb
+    def track(self, folder: RunFolder | None = None) -> None:
+        """
+        Send the run's TensorBoard events to Weights & Biases, if asked to.
 
-        run = wandb.init(
-            name=f"{self.args['env']}__{self.algo}__{self.args['seed']}__{int(time.time())}",
-            project=self.args["wandb_project_name"],
-            entity=self.args["wandb_entity"],
-            group=self.args["wandb_group"],
-            tags=self.args["wandb_tags"],
-            config={**self.args, "hyperparams": self.hyperparams, "folder": str(folder.path)},
-            sync_tensorboard=True,
-        )
-        try:
-            yield
-        finally:
-            run.finish()
+        Called before the first event file is opened, or they would not be seen; for a new run
+        before its folder is made, so that a refusal leaves nothing behind.
+
+        :param folder: the run's, which remembers the id: a resumed run goes on there, too
+        :raises UsageError: Weights & Biases refuses, e.g. for want of a key or a network
+        """
+        if not self.args["track"]:
+            return
+        path = None if folder is None else folder.params / TRACKED
+        if self._tracker is None:
+            import wandb
+
+            known = None
+            if path is not None and self.state is not None and path.exists():
+                known = path.read_text().strip()
+            name = f"{self.args['env']}__{self.algo}__{self.args['seed']}__{int(time.time())}"
+            try:
+                self._tracker = wandb.init(
+                    id=known,
+                    resume="allow" if known else None,
+                    name=None if known else name,
+                    project=self.args["wandb_project_name"],
+                    entity=self.args["wandb_entity"],
+                    group=self.args["wandb_group"],
+                    tags=self.args["wandb_tags"],
+                    config={**self.args, "hyperparams": self.hyperparams},
+                    sync_tensorboard=True,
+                )
+            except Exception as error:  # its client raises what it likes
+                raise UsageError(
+                    f"--track: Weights & Biases can't be used: {one_line(error)}; log in with: "
+                    "wandb login, set WANDB_MODE=offline, or leave out --track"
+                ) from error
+        if folder is not None and path is not None:
+            path.write_text(self._tracker.id)
+            self._tracker.config.update({"folder": str(folder.path)}, allow_val_change=True)
 
     def _learn(self, callbacks: list[BaseCallback], received: list[int]) -> bool:
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
@@ -464,6 +502,7 @@ def start(args: Mapping[str, Any]) -> int:
     args, values = prepare(args)
     experiment = Experiment(args, values)
     try:
+        experiment.track()
         folder = RunFolder.create(
             args["log_folder"],
             args["algo"],
@@ -535,7 +574,11 @@ def refuse_another(folder: RunFolder, args: Mapping[str, Any], values: Mapping[s
     pairs = [(name, own.get(name), asked[name]) for name in IDENTITY]
     own, asked = folder.hyperparams(), as_read(values)
     pairs += [(name, own.get(name), asked.get(name)) for name in sorted({*own, *asked})]
-    differences = [f"{name}: {a} there, {b} here" for name, a, b in pairs if a != b]
+    differences = [
+        f"{name}: {'none' if a == '' else a} there, {'none' if b == '' else b} here"
+        for name, a, b in pairs
+        if a != b
+    ]
     if differences:
         raise UsageError(
             f"{folder.path} holds another run ({'; '.join(differences[:3])}); "
@@ -591,7 +634,7 @@ def resume(given: Mapping[str, Any], defaults: Mapping[str, Any]) -> int:
             )
             return 0
         experiment = Experiment(args, values, folder)
-        folder.write_config(args, values)
+        experiment.restates = True
         return experiment.train(folder)
 
 

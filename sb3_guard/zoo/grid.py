@@ -331,7 +331,8 @@ class Execution:
 
     def _has_result(self, run: Run) -> bool:
         end = time.monotonic() + PATIENCE
-        while RunFolder(run.path).read_result() is None:
+        # A shared disk may show the folder itself as late as the result in it.
+        while not is_run(run.path) or RunFolder(run.path).read_result() is None:
             if time.monotonic() > end or self._stopping:
                 return False
             time.sleep(POLL)

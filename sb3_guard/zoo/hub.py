@@ -1,6 +1,7 @@
 """Trained agents on the Hugging Face hub, in RL-Zoo's layout, with their costs on the card."""
 
 import json
+import shlex
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -12,8 +13,13 @@ import yaml
 
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
-from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run
+from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_mapping
 from sb3_guard.zoo.usage import UsageError, one_line
+
+# Said before an agent is downloaded.
+TRUST = "agents are programs: load only from people you trust"
+# Flags that name files of this machine
+PATHS = ("log_folder", "tensorboard_log", "conf_file", "trained_agent")
 
 CARD = """
 # {name} on {env}
@@ -95,10 +101,11 @@ def stage(agent: Agent, args: Mapping[str, Any], repo_id: str, folder: Path) -> 
     """
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(agent.path, folder / f"{model_name(args['algo'], agent.env_id)}.zip")
-    for file in ("config.yml", "args.yml", "command.txt"):
-        source = agent.run.params / file
-        if source.is_file():
-            shutil.copyfile(source, folder / file)
+    shutil.copyfile(agent.run.params / "config.yml", folder / "config.yml")
+    flags = agent.run.args()
+    flags |= {name: Path(flags[name]).name for name in PATHS if flags.get(name)}
+    (folder / "args.yml").write_text(yaml.safe_dump(flags))
+    (folder / "command.txt").write_text(command(agent.run))
     if agent.normalizer.suffix == ".pkl" and agent.normalizer.is_file():
         shutil.copyfile(agent.normalizer, folder / "vec_normalize.pkl")
     if agent.run.monitor.is_file():
@@ -162,9 +169,6 @@ def card(agent: Agent, args: Mapping[str, Any], repo_id: str, results: Mapping[s
         rows.append(f"| {key} | {one['mean']:.2f} | {one['std']:.2f} | {interval} |")
     limit = getattr(agent.model, "cost_limit", None)
     constrained = getattr(agent.model, "constrained", False) and limit is not None
-    file = agent.run.params / "command.txt"
-    command = file.read_text().strip() if file.is_file() else ""
-    interpreter, module, rest = command.partition(" -m ")
     page = CARD.format(
         name=name,
         env=agent.env_id,
@@ -174,10 +178,22 @@ def card(agent: Agent, args: Mapping[str, Any], repo_id: str, results: Mapping[s
         actions="sampled" if args["stochastic"] else "most likely",
         rows="\n".join(rows),
         limit=f"; the agent was trained under a limit of {limit}" if constrained else "",
-        command=f"python -m {rest}" if module else interpreter,
+        command=command(agent.run),
         hyperparams=yaml.safe_dump(agent.run.hyperparams()),
     )
     return f"---\n{data.to_yaml()}\n---\n{page}"
+
+
+def command(run: RunFolder) -> str:
+    """The command line of a run, with the names of files, but not where they lie here."""
+    file = run.params / "command.txt"
+    text = file.read_text().strip() if file.is_file() else ""
+    interpreter, module, rest = text.partition(" -m ")
+    try:
+        words = shlex.split(f"python -m {rest}" if module else interpreter)
+    except ValueError:  # a quotation mark that nothing closes
+        return ""
+    return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
 def load(args: Mapping[str, Any]) -> int:
@@ -192,6 +208,7 @@ def load(args: Mapping[str, Any]) -> int:
     repo_id = args["repo_id"] or f"{args['organization']}/{args['repo_name'] or name}"
     from huggingface_hub import snapshot_download
 
+    print(TRUST)
     with _network(f"the download of {repo_id}"):
         downloaded = Path(snapshot_download(repo_id))
     run = install(downloaded, name, args)
@@ -205,7 +222,7 @@ def install(downloaded: Path, name: str, args: Mapping[str, Any]) -> RunFolder:
 
     :param downloaded: folder with the files that :func:`stage` writes
     :param name: name of the model
-    :raises UsageError: the model or its settings are not there
+    :raises UsageError: the model or its settings are not there, or they are another agent's
     """
     model = downloaded / f"{name}.zip"
     for needed in (model, downloaded / "config.yml", downloaded / "args.yml"):
@@ -216,10 +233,16 @@ def install(downloaded: Path, name: str, args: Mapping[str, Any]) -> RunFolder:
                 "--algo and --env"
             )
     env = folder_name(args["env"])
+    trained = read_mapping(downloaded / "args.yml")
+    if (trained.get("algo"), folder_name(str(trained.get("env")))) != (args["algo"], env):
+        raise UsageError(
+            f"the repository's agent is {trained.get('algo')} on {trained.get('env')} by its "
+            f"args.yml, not {args['algo']} on {args['env']}; name its own --algo and --env"
+        )
     parent = Path(args["folder"]) / args["algo"]
     parent.mkdir(parents=True, exist_ok=True)
-    path = parent / f"{env}_{latest_run(parent, env) + 1}"
-    (path / env).mkdir(parents=True)
+    path = claim(parent, env)
+    (path / env).mkdir()
     shutil.copyfile(model, path / f"{env}.zip")
     for file, target in {
         "0.monitor.csv": path / "0.monitor.csv",

@@ -25,6 +25,7 @@ from sb3_guard.zoo.environments import (
 from sb3_guard.zoo.run_folder import (
     RunFolder,
     folder_name,
+    is_run,
     latest_run,
     require_writable,
     run_path,
@@ -131,6 +132,17 @@ class Agent:
     env: VecEnv
 
 
+def _packages_of_training(args: Mapping[str, Any]) -> list[str]:
+    """The modules that registered the environment when the run was trained, if there is one."""
+    parent = Path(args["folder"]) / args["algo"]
+    for env_id in (args["env"], f"{args['env']}-v0"):
+        number = args["exp_id"] or latest_run(parent, folder_name(env_id))
+        path = run_path(args["folder"], args["algo"], env_id, number)
+        if is_run(path):
+            return list(RunFolder.open(path).args()["gym_packages"])
+    return []
+
+
 def open_agent(args: Mapping[str, Any], render_mode: str | None) -> Agent:
     """
     Load an agent and make one environment for it, wrapped as in training.
@@ -140,7 +152,7 @@ def open_agent(args: Mapping[str, Any], render_mode: str | None) -> Agent:
     :raises UsageError: there is no such agent, or it does not fit the environment
     """
     cls = algorithm(args["algo"])
-    import_packages(args["gym_packages"])
+    import_packages(args["gym_packages"] or _packages_of_training(args))
     env_id, ours = canonical_id(args["env"])
     if args["pretrained"]:
         run = find_pretrained(args["algo"], env_id)

@@ -77,6 +77,8 @@ class Epochs(BaseCallback):
         self.last = np.zeros((0, 3))
         # Taken now: what lies on disk may change while the run goes on.
         self._provenance = provenance()
+        #: steps after each part of the run that was to be shorter than it came to be
+        self.learned: list[int] = []
         self._seconds = 0.0  # of the processes before this one
         self._began: float | None = None
 
@@ -137,7 +139,9 @@ class Epochs(BaseCallback):
             which any ended (None if none did), their number ``episodes``, ``cost_rate``,
             cumulative cost ÷ steps of the whole run, ``physics_errors``, the number of episodes
             that ended because the physics diverged, ``cost_limit`` (None: unconstrained),
-            ``seconds`` of training, and :func:`provenance`
+            ``seconds`` of training, and :func:`provenance`. ``learned``, absent from a straight
+            run, is the steps at which it was made longer, since warm-up and schedules were those
+            of shorter runs until then
         """
         monitor = find_monitor(self.training_env)
         means = self.last.mean(axis=0).tolist() if len(self.last) else [None] * 3
@@ -152,6 +156,7 @@ class Epochs(BaseCallback):
             "physics_errors": monitor.physics_errors,
             "cost_limit": limit,
             "seconds": round(self._elapsed(), 3),
+            **({"learned": self.learned} if self.learned else {}),
             **self._provenance,
         }
 
@@ -160,10 +165,20 @@ class Epochs(BaseCallback):
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs to tell the same result."""
-        return {"last": self.last, "episodes": self._episodes, "seconds": self._elapsed()}
+        return {
+            "last": self.last,
+            "episodes": self._episodes,
+            "seconds": self._elapsed(),
+            "total": self.total,
+            "steps": self.model.num_timesteps,
+            "learned": self.learned,
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state`."""
         self.last = state["last"]
         self._episodes = list(state.get("episodes", []))
         self._seconds = state.get("seconds", 0.0)
+        self.learned = list(state.get("learned", []))
+        if state.get("total", self.total) != self.total:
+            self.learned.append(state["steps"])

@@ -165,7 +165,7 @@ def _run_table(runs: pd.DataFrame) -> pd.DataFrame:
             "suite": runs["suite"],
             "algorithm": runs["algo"].map(label),
             "seed": runs["seed"].map(str),
-            "limit": spelled("cost_limit", "{:g}"),
+            "limit": spelled("limits", "{}"),
             "steps": spelled("steps", "{:,}"),
             "return J_r": spelled("J_r", "{:.2f}"),
             "episode cost M_c": spelled("M_c", "{:.2f}"),

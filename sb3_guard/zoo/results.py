@@ -53,15 +53,22 @@ MAIN8 = (
 )  # fmt: skip
 RADAR4 = ("Goal_Point_8Hazards", "Goal_Point_8Ghosts", "Goal_Ant_8Hazards", "Goal_Ant_8Ghosts")
 VERSIONS = ("sb3_guard", "mujoco", "gymnasium", "stable_baselines3", "torch", "numpy", "python")
-TEXTS = ("suite", "robot", "task", "constraint", "algo", "config", "commit", "platform", *VERSIONS)
+TEXTS = (
+    "suite", "robot", "task", "constraint", "algo", "limits", "world", "started_from", "settings",
+    "config", "commit", "platform", *VERSIONS,
+)  # fmt: skip
 COLUMNS = (
     "suite", "robot", "task", "constraint", "algo", "seed", "steps", "J_r", "M_c", "rho_c",
-    "cost_limit", "episodes", "physics_errors", "seconds", "epoch", "config", *VERSIONS, "commit",
-    "platform", "path",
+    "cost_limit", "limits", "episodes", "physics_errors", "seconds", "epoch", "world",
+    "started_from", "settings", "config", *VERSIONS, "commit", "platform", "path",
 )  # fmt: skip
 _SUITE = re.compile(r"([A-Za-z][A-Za-z0-9]*)_([A-Za-z][A-Za-z0-9]*)_(\d+[A-Za-z]\w*)-v0")
 # Runs that agree in these are the same run, made again.
-_SAME = ["suite", "algo", "cost_limit", "seed", "steps", "config"]
+_SAME = ["suite", "world", "algo", "limits", "seed", "steps", "started_from", "config"]
+# What TRPO and those compared with it should share
+SETTINGS = (
+    "n_envs", "n_steps", "gamma", "gae_lambda", "target_kl", "policy_kwargs", "normalize",
+)  # fmt: skip
 RESAMPLES = 2000
 CURVE_POINTS = 200  # at most as many per run, of epochs taken together
 
@@ -85,7 +92,9 @@ def read_results(folders: Sequence[str | Path]) -> Results:
 
     :raises UsageError: a folder does not exist, or holds no trace of a run
     """
-    rows, left_out = [], {}
+    rows: list[dict[str, Any]] = []
+    left_out: dict[str, str] = {}
+    seen: set[Path] = set()
     for folder in dict.fromkeys(map(Path, folders)):
         if not folder.is_dir():
             raise UsageError(f"there is no folder {str(folder)!r}; give one that train wrote to")
@@ -96,6 +105,9 @@ def read_results(folders: Sequence[str | Path]) -> Results:
                 "writes it"
             )
         for path in found:
+            if path.resolve() in seen:  # folders may hold one another
+                continue
+            seen.add(path.resolve())
             try:
                 rows.append(read_run(path))
             except (UsageError, OSError) as error:
@@ -127,8 +139,10 @@ def read_run(path: Path) -> dict[str, Any]:
 
     :return: by column: ``J_r``, ``M_c`` (means over the episodes of the final epoch; NaN if none
         ended), ``rho_c`` (cumulative cost ÷ steps), ``cost_limit`` (NaN: unconstrained, or several
-        costs), ``seconds`` of training, ``epoch`` (steps of a rollout), ``config`` (the same for
-        the same hyper-parameters). What runs of older versions did not write is missing
+        costs), ``limits`` (of all costs, "1 2"; missing: unconstrained), ``seconds`` of training,
+        ``epoch`` (steps of a rollout), ``world`` (``env_kwargs``), ``started_from`` (the model that
+        training went on from), ``settings`` (:data:`SETTINGS`) and ``config`` (the same for the
+        same hyper-parameters). What runs of older versions did not write is missing
     :raises UsageError: the run is not finished, or damaged
     """
     if not (path / "result.json").exists():
@@ -143,8 +157,10 @@ def read_run(path: Path) -> dict[str, Any]:
     known = _SUITE.fullmatch(env)
     task, robot, constraint = known.groups() if known else (None, None, None)
     limit = result.get("cost_limit", config.get("cost_limit"))
-    if isinstance(limit, list):
-        limit = limit[0] if len(limit) == 1 else None
+    limits = limit if isinstance(limit, list) else [] if limit is None else [limit]
+    limits = [_number({"cost_limit": one}, "cost_limit") for one in limits]
+    world = config.get("env_kwargs")
+    settings = {name: config.get(name) for name in SETTINGS}
     versions = result.get("versions")
     versions = versions if isinstance(versions, dict) else {}
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
@@ -158,12 +174,16 @@ def read_run(path: Path) -> dict[str, Any]:
         "seed": seed,
         "steps": steps,
         **{name: _number(result, key) for name, key in METRICS.items()},
-        "cost_limit": _number({"cost_limit": limit}, "cost_limit"),
+        "cost_limit": limits[0] if len(limits) == 1 else math.nan,
+        "limits": _limits(limits) if limits else None,
         "episodes": _number(result, "episodes"),
         "physics_errors": _number(result, "physics_errors"),
         "seconds": _number(result, "seconds"),
         "epoch": math.prod(rollout) if whole else math.nan,
-        "config": _digest(config),
+        "world": json.dumps(world, sort_keys=True, default=str) if world else None,
+        "started_from": args.get("trained_agent") or None,
+        "settings": json.dumps(settings, default=str),
+        "config": _digest(config, result.get("learned")),
         **{name: versions.get(name) for name in VERSIONS},
         "commit": result.get("commit"),
         "platform": result.get("platform"),
@@ -189,24 +209,42 @@ def _number(result: Mapping[str, Any], key: str) -> float:
     return float(value)
 
 
-def _digest(config: Mapping[str, Any]) -> str:
-    """The same for runs that differ in nothing but length and cost limit, columns of their own."""
-    own = {k: v for k, v in config.items() if k not in ("n_timesteps", "cost_limit")}
+def _limits(limits: Iterable[float]) -> str:
+    """Limits as ``--cost-limit`` takes them."""
+    return " ".join(f"{one:.12g}" for one in limits)
+
+
+def _digest(config: Mapping[str, Any], learned: Any = None) -> str:
+    """
+    The same for runs that differ in nothing but what has a column of its own.
+
+    :param learned: step counts of earlier calls of ``learn``: a warm-up or a schedule is stretched
+        over one call, so an extended run is not the run that was as long from the start
+    """
+    columns = ("n_timesteps", "cost_limit", "env_kwargs")
+    own = {k: v for k, v in config.items() if k not in columns}
+    scheduled = any(isinstance(one, str) and one.startswith("lin_") for one in own.values())
+    if learned and (scheduled or "warmup" in own):
+        own["learned"] = learned
     text = json.dumps(own, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
-def select(
-    runs: pd.DataFrame, suites: Sequence[str] | None = None, cost_limit: float | None = None
+def choose(
+    runs: pd.DataFrame,
+    suites: Sequence[str] | None = None,
+    cost_limit: float | Sequence[float] | None = None,
+    steps: int | None = None,
 ) -> pd.DataFrame:
     """
-    The runs that may be averaged: those of some suites and of one cost limit.
-
-    Of runs that are the same, seed included, the last one stands.
+    The runs that are asked for.
 
     :param suites: None: all. The version may be left out
-    :param cost_limit: runs of this limit, and the unconstrained ones; None: the one that there is
-    :raises UsageError: a suite or limit without runs, or several limits and no choice
+    :param cost_limit: runs of this limit, or of these limits on several costs, and the
+        unconstrained ones; None: all
+    :param steps: where an algorithm has runs of several lengths on a suite, those of this one;
+        None: all
+    :raises UsageError: a suite, limit or length without runs
     """
     if suites is not None:
         wanted = [name.removesuffix("-v0") for name in suites]
@@ -214,39 +252,127 @@ def select(
         for name in {*wanted} - {*known} - {f"{one}-v0" for one in known}:
             raise UsageError(f"there is no run of {name!r}; {did_you_mean(name, known)}")
         runs = runs[runs["suite"].str.removesuffix("-v0").isin(wanted)]
-    limits = sorted(runs["cost_limit"].dropna().unique())
-    named = ", ".join(f"{one:g}" for one in limits)
-    if cost_limit is None and len(limits) > 1:
-        raise UsageError(
-            f"there are runs at several cost limits, {named}, which can't be averaged; choose one, "
-            f"such as --cost-limit {limits[0]:g}"
-        )
     if cost_limit is not None:
-        if cost_limit not in limits:
+        limit = _limits([cost_limit] if isinstance(cost_limit, (int, float)) else cost_limit)
+        known = _limits_of(runs)
+        if limit not in known:
             raise UsageError(
-                f"there is no run at cost limit {cost_limit:g}; there are runs at {named or 'none'}"
+                f"there is no run at cost limit {limit}; there are runs at "
+                f"{', '.join(known) or 'none'}"
             )
-        runs = runs[runs["cost_limit"].isna() | (runs["cost_limit"] == cost_limit)]
+        runs = runs[runs["limits"].isna() | (runs["limits"] == limit)]
+    if steps is not None:
+        lengths = sorted(runs["steps"].unique())
+        if steps not in lengths:
+            raise UsageError(
+                f"there is no run of {steps} steps; there are runs of {_joined(lengths)} steps"
+            )
+        several = runs.groupby(["suite", "algo"])["steps"].transform("nunique") > 1
+        runs = runs[~several | (runs["steps"] == steps)]
+    return runs.reset_index(drop=True)
+
+
+def select(
+    runs: pd.DataFrame,
+    suites: Sequence[str] | None = None,
+    cost_limit: float | Sequence[float] | None = None,
+    steps: int | None = None,
+) -> pd.DataFrame:
+    """
+    The runs that may be averaged: those asked for, see :func:`choose`, if they are alike.
+
+    Of runs that are the same, seed included, the last one stands.
+
+    :raises UsageError: as :func:`choose`; or what is left has several cost limits, several lengths
+        of an algorithm on a suite, or several ``env_kwargs`` on a suite
+    """
+    runs = choose(runs, suites, cost_limit, steps)
+    limits = _limits_of(runs)
+    if len(limits) > 1:
+        raise UsageError(
+            f"there are runs at several cost limits, {', '.join(limits)}, which can't be averaged; "
+            f"choose one, such as --cost-limit {limits[0]}"
+        )
+    for suite, group in runs.groupby("suite"):
+        worlds = group.drop_duplicates("world")
+        if len(worlds) > 1:
+            named = "; ".join(
+                f"{'none' if pd.isna(world) else world} in {path}"
+                for world, path in zip(worlds["world"], worlds["path"], strict=True)
+            )
+            raise UsageError(
+                f"runs on {suite} differ in env_kwargs and can't be compared: {named}; give the "
+                "folders of one kind only"
+            )
+    for (where, algo), own in runs.groupby(["suite", "algo"]):
+        lengths = sorted(own["steps"].unique())
+        if len(lengths) > 1:
+            raise UsageError(
+                f"runs of {algo} on {where} differ in length, {_joined(lengths)} steps, and can't "
+                f"be averaged; choose one, such as --steps {lengths[-1]}"
+            )
     return runs.drop_duplicates(_SAME, keep="last").reset_index(drop=True)
 
 
+def _limits_of(runs: pd.DataFrame) -> list[str]:
+    """All limits there are, in the order of their numbers."""
+    known = runs["limits"].dropna().unique()
+    return sorted(known, key=lambda text: [float(one) for one in text.split()])
+
+
+def _joined(lengths: Iterable[int]) -> str:
+    return ", ".join(map(str, lengths))
+
+
 def notices(runs: pd.DataFrame, selected: pd.DataFrame) -> list[str]:
-    """What a reader of the means should know: repeated runs, unequal lengths or settings."""
+    """
+    What a reader of the means should know: repeated runs, and in what those compared differ.
+
+    :param runs: see :func:`choose`
+    :param selected: what :func:`select` made of them
+    """
     again = runs[runs.duplicated(_SAME, keep="last") & runs["suite"].isin({*selected["suite"]})]
     lines = [f"{path} was repeated with the same seed: the later run counts"
              for path in again["path"]]  # fmt: skip
     for suite, group in selected.groupby("suite"):
-        if group["steps"].nunique() > 1:
-            steps = ", ".join(f"{one:,.0f}" for one in sorted(group["steps"].unique()))
-            lines.append(f"{suite}: runs differ in length: {steps} steps")
-        for algo, own in group.groupby("algo"):
-            if own["config"].nunique() > 1:
-                paths = ", ".join(own.drop_duplicates("config")["path"])
-                lines.append(f"{suite}: runs of {algo} differ in hyper-parameters: {paths}")
+        lines += [f"{suite}: {line}" for line in _differences(group)]
         none = group.loc[group["J_r"].isna(), "path"]
         if len(none):
             lines.append(f"{suite}: no episode ended in {', '.join(none)}")
     return lines
+
+
+def _differences(group: pd.DataFrame) -> Iterable[str]:
+    """In what the runs of one suite differ."""
+    if group["steps"].nunique() > 1:
+        yield f"runs differ in length: {_joined(sorted(group['steps'].unique()))} steps"
+    if group["started_from"].nunique(dropna=False) > 1:
+        warm = group.loc[group["started_from"].notna(), "path"]
+        yield f"some runs went on from a model, others from none or another: {', '.join(warm)}"
+    for name in ("sb3_guard", "mujoco", "commit"):
+        values = sorted(group[name].fillna("unknown").unique())
+        if len(values) > 1:
+            yield f"runs differ in {name}: {', '.join(values)}"
+    for algo, own in group.groupby("algo"):
+        if own["config"].nunique() > 1:
+            paths = ", ".join(own.drop_duplicates("config")["path"])
+            yield f"runs of {algo} differ in hyper-parameters or in how they were extended: {paths}"
+        twice = sorted(own.loc[own.duplicated("seed"), "seed"].unique())
+        if twice:
+            yield f"runs of {algo} count twice or more for one seed: {_joined(twice)}"
+    # RL-Zoo's baselines have settings of their own.
+    ours = group[group["algo"].isin(list(LABELS))]
+    settings = [json.loads(text) for text in ours["settings"]]
+    for name in SETTINGS:
+        users: dict[str, list[str]] = {}
+        for algo, own_settings in zip(ours["algo"], settings, strict=True):
+            users.setdefault(json.dumps(own_settings[name], sort_keys=True), []).append(algo)
+        if len(users) > 1 and len({*ours["algo"]}) > 1:
+            named = "; ".join(
+                f"{'default' if value == 'null' else value} ({', '.join(dict.fromkeys(algos))})"
+                for value, algos in users.items()
+            )
+            yield f"algorithms differ in {name}: {named}"
 
 
 # Statistics over seeds
@@ -285,7 +411,7 @@ def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
     Means over seeds, a row per suite and algorithm.
 
     :param runs: see :func:`select`
-    :return: ``suite``, ``algo``, ``cost_limit``, ``seeds``, ``steps``, and for each of
+    :return: ``suite``, ``algo``, ``limits``, ``seeds``, ``steps``, and for each of
         :data:`METRICS` its mean, ``_std`` (of the sample; NaN for one seed), ``_low`` and ``_high``
         (95 % bootstrap interval of the mean)
     """
@@ -294,8 +420,8 @@ def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
         row = {
             "suite": suite,
             "algo": algo,
-            "cost_limit": group["cost_limit"].iloc[0],
-            "seeds": len(group),
+            "limits": group["limits"].iloc[0],
+            "seeds": group["seed"].nunique(),
             "steps": int(group["steps"].max()),
         }
         for name in METRICS:
@@ -303,7 +429,7 @@ def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
             row |= {name: group[name].mean(), f"{name}_std": group[name].std()}
             row |= {f"{name}_low": low, f"{name}_high": high}
         rows.append(row)
-    columns = ["suite", "algo", "cost_limit", "seeds", "steps"]
+    columns = ["suite", "algo", "limits", "seeds", "steps"]
     columns += [name + end for name in METRICS for end in ("", "_std", "_low", "_high")]
     return pd.DataFrame(rows, columns=columns)
 
@@ -314,7 +440,8 @@ def normalize(rows: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
 
     ``reward`` is min(J_r / J_r(TRPO), 1), ``cost`` is M_c / M_c(TRPO), ``cost_rate`` is
     ρ_c / ρ_c(TRPO), not capped. If any mean return of a suite is negative, the least one less 1 %
-    of their range is first subtracted from all returns of the suite.
+    of their range (if all are equal: less their size) is first subtracted from all returns of the
+    suite.
 
     :param rows: a table with ``suite``, ``algo`` and :data:`METRICS`, of means or of runs
     :param means: the means, of :func:`aggregate`, that TRPO's values and the shift come from; only
@@ -324,7 +451,8 @@ def normalize(rows: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
     rows = rows.copy()
     ours = means[means["algo"].isin(list(LABELS))].groupby("suite")["J_r"]
     low, high = ours.min(), ours.max()
-    shift = (0.01 * (high - low) - low).where(low < 0, 0.0)
+    margin = (0.01 * (high - low)).where(high > low, -low)
+    shift = (margin - low).where(low < 0, 0.0)
     trpo = means[means["algo"] == "trpo"].set_index("suite")
     for name, score in SCORES.items():
         offset = rows["suite"].map(shift) if name == "J_r" else 0.0
@@ -523,7 +651,7 @@ def _spelled(scores: pd.DataFrame) -> pd.DataFrame:
         {
             "suite": scores["suite"],
             "algorithm": scores["algo"].map(label),
-            "limit": ["–" if math.isnan(d) else f"{d:g}" for d in scores["cost_limit"]],
+            "limit": ["–" if pd.isna(text) else text for text in scores["limits"]],
             "seeds": scores["seeds"].map(str),
             "steps": [f"{n:,}" for n in scores["steps"]],
             **{heading: column(name) for name, heading in _HEADINGS.items()},
@@ -597,20 +725,23 @@ def check_table(path: Path) -> None:
         )
 
 
-def write_table(path: Path, runs: pd.DataFrame) -> None:
+def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> None:
     """
     Write a table in the format that the file's name says.
 
     :param path: ``.csv`` and ``.parquet`` get a row per run; ``.md`` and ``.tex`` the means over
         seeds and the scores, see :func:`tables`
     :param runs: for means, those that may be averaged, see :func:`select`
+    :param notes: what a reader of the means should know, see :func:`notices`; written below them
     :raises UsageError: see :func:`check_table`; or the file can't be written
     """
     check_table(path)
     if path.suffix == ".md":
         parts = [f"## {title}\n\n{markdown(table)}" for title, table in tables(runs).items()]
+        parts += ["\n".join(f"- {note}" for note in notes)] if notes else []
     elif path.suffix == ".tex":
         parts = [f"% {title}\n{latex(table)}" for title, table in tables(runs).items()]
+        parts += ["\n".join(f"% {note}" for note in notes)] if notes else []
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:

@@ -3,6 +3,7 @@
 import errno
 import glob
 import json
+import math
 import os
 import socket
 import sys
@@ -67,6 +68,21 @@ def as_read(data: Mapping[str, Any]) -> dict[str, Any]:
     return dict(yaml.load(text, Loader=_SafeLoader))
 
 
+def read_mapping(path: Path) -> dict[str, Any]:
+    """
+    The plain data of a run's file, RL-Zoo's included.
+
+    :raises UsageError: it can't be read, or is no mapping
+    """
+    try:
+        content = yaml.load(path.read_text(), Loader=_Loader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UsageError(f"can't read {path}: {one_line(error)}") from error
+    if not isinstance(content, dict):
+        raise UsageError(f"{path} is damaged: it should be a mapping")
+    return content
+
+
 def folder_name(env_id: str) -> str:
     """An environment id as part of a path: no module prefix, no slashes (RL-Zoo's rule)."""
     return env_id.rsplit(":", 1)[-1].replace("/", "-")
@@ -75,6 +91,24 @@ def folder_name(env_id: str) -> str:
 def run_path(log_folder: str, algo: str, env_id: str, number: int) -> Path:
     """The folder of a run: ``<log folder>/<algo>/<env>_<number>``."""
     return Path(log_folder) / algo / f"{folder_name(env_id)}_{number}"
+
+
+def claim(parent: Path, name: str, suffix: str = "") -> Path:
+    """
+    Make a folder with the next free number.
+
+    :param parent: the algorithm's folder, which exists
+    :param name: the environment's, see :func:`folder_name`
+    """
+    number = latest_run(parent, name) + 1
+    while True:
+        path = parent / f"{name}_{number}{suffix}"
+        try:
+            # Making the folder claims the number: another process may be here too.
+            path.mkdir()
+            return path
+        except FileExistsError:
+            number += 1
 
 
 def is_run(path: Path) -> bool:
@@ -154,15 +188,7 @@ class RunFolder:
         try:
             parent.mkdir(parents=True, exist_ok=True)
             if number is None:
-                number = latest_run(parent, name) + 1
-                while True:
-                    path = parent / f"{name}_{number}{suffix}"
-                    try:
-                        # Making the folder claims the number: another process may be here too.
-                        path.mkdir()
-                        break
-                    except FileExistsError:
-                        number += 1
+                path = claim(parent, name, suffix)
             else:
                 path = run_path(log_folder, algo, env_id, number)
             params = path / name
@@ -215,21 +241,11 @@ class RunFolder:
 
     def args(self) -> dict[str, Any]:
         """The flags the run was started with."""
-        return self._read("args.yml")
+        return read_mapping(self.params / "args.yml")
 
     def hyperparams(self) -> dict[str, Any]:
         """The hyper-parameters the run was started with."""
-        return self._read("config.yml")
-
-    def _read(self, name: str) -> dict[str, Any]:
-        path = self.params / name
-        try:
-            content = yaml.load(path.read_text(), Loader=_Loader)
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise UsageError(f"can't read {path}: {one_line(error)}") from error
-        if not isinstance(content, dict):
-            raise UsageError(f"{path} is damaged: it should be a mapping")
-        return content
+        return read_mapping(self.params / "config.yml")
 
     def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
         """Replace what :meth:`create` wrote, e.g. when a finished run is to go on for longer."""
@@ -259,7 +275,7 @@ class RunFolder:
             number = isinstance(value, int | float) and not isinstance(value, bool)
             if key == "n_timesteps" and (not number or not isinstance(value, int)):
                 raise self._damaged(f"is damaged: {key} = {value!r} should be whole")
-            if value is not None and not number:
+            if value is not None and (not number or not math.isfinite(value)):
                 raise self._damaged(f"is damaged: {key} = {value!r} should be a number")
         return result
 

@@ -12,6 +12,7 @@ Ranges are drawn in the scale in which they matter, as RL-Zoo's samplers do it; 
 algorithms that have no space here, and :func:`rl_zoo_sampler` makes one of a space for RL-Zoo.
 """
 
+import ast
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -21,11 +22,10 @@ from typing import Any
 import optuna
 import yaml
 from optuna.samplers import BaseSampler
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.algos import algorithm
-from sb3_guard.zoo.config import RUN_KEYS, parameters
+from sb3_guard.zoo.config import NOISE_KEYS, RUN_KEYS, parameters
 from sb3_guard.zoo.usage import UsageError, one_line
 
 DIGITS = 4  # of a drawn number: enough to tell two apart, and readable in a file
@@ -240,7 +240,7 @@ def set_dotted(values: Mapping[str, Any], name: str, value: Any) -> dict[str, An
     mapping = values.get(outer) or {}
     if isinstance(mapping, str):
         # An expression, such as dict(activation_fn=nn.ReLU), is evaluated when the model is made.
-        return {**values, outer: f"dict({{**{mapping}, {inner!r}: {value!r}}})"}
+        return {**values, outer: _changed(mapping, {inner: repr(value)})}
     return {**values, outer: set_dotted(mapping, inner, value)}
 
 
@@ -317,11 +317,11 @@ class Search:
         assert self._rl_zoo is not None
         extra = {"using_her_replay_buffer": False, "her_kwargs": {}}
         drawn = self._rl_zoo(trial, 1, self.base.get("n_envs", 1), extra)
-        noise = drawn.pop("action_noise", None)
-        if isinstance(noise, NormalActionNoise | OrnsteinUhlenbeckActionNoise):
-            normal = isinstance(noise, NormalActionNoise)
-            drawn["noise_type"] = "normal" if normal else "ornstein-uhlenbeck"
-            drawn["noise_std"] = trial.params["noise_std"]
+        # Made of two parameters, which are data; none may be drawn where the base has some.
+        drawn.pop("action_noise", None)
+        for name in NOISE_KEYS:
+            if name in trial.params:
+                drawn[name] = trial.params[name]
         values = dict(self.base)
         for name, value in drawn.items():
             if name in self._fixed:
@@ -329,6 +329,8 @@ class Search:
             if name == "policy_kwargs":
                 value = _expression(self.base.get(name) or {}, value)
             values[name] = value
+        if values.get("noise_type") is None:
+            values.pop("noise_std", None)
         return dict(sorted(values.items()))
 
     def first(self) -> dict[str, Any]:
@@ -372,7 +374,29 @@ def _expression(base: Any, changes: Mapping[str, Any]) -> str:
         return f"nn.{value.__name__}" if isinstance(value, type) else repr(value)
 
     old = base if isinstance(base, str) else repr(base)
-    return f"dict({{**{old}, {', '.join(f'{k!r}: {text(v)}' for k, v in changes.items())}}})"
+    return _changed(old, {name: text(value) for name, value in changes.items()})
+
+
+def _changed(old: str, changes: Mapping[str, str]) -> str:
+    """The text of a mapping, ``dict(a=1)`` or ``{"a": 1}``, with some of its entries changed."""
+    try:
+        tree = ast.parse(old.strip(), mode="eval").body
+        if isinstance(tree, ast.Dict):
+            names = [key and ast.literal_eval(key) for key in tree.keys]
+            nodes = tree.values
+        elif isinstance(tree, ast.Call) and ast.unparse(tree.func) == "dict" and not tree.args:
+            names = [one.arg for one in tree.keywords]
+            nodes = [one.value for one in tree.keywords]
+        else:
+            names, nodes = [None], []
+        if None in names:
+            raise ValueError("it is no mapping")
+    except (SyntaxError, ValueError) as error:
+        raise UsageError(
+            f"can't change entries of {old!r}: {one_line(error)}; write dict(name=value)"
+        ) from error
+    own: dict[Any, str] = {name: ast.unparse(node) for name, node in zip(names, nodes, strict=True)}
+    return f"dict({', '.join(f'{name}={text}' for name, text in {**own, **changes}.items())})"
 
 
 def _gp(seed: int | None, n_startup_trials: int) -> BaseSampler:

@@ -6,6 +6,7 @@ works on any more is found: by the lock of its worker, which the operating syste
 worker ends, or, across machines, by its heartbeats.
 """
 
+import copy
 import os
 import socket
 import threading
@@ -14,7 +15,7 @@ import uuid
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -35,6 +36,8 @@ Result = TypeVar("Result")
 # Trials that killed so many workers, e.g. for want of memory, are given up.
 MOST_RETRIES = 3
 OWNER = "worker"
+# The number of the interrupted trial that a trial does again.
+REPEATS = "repeats"
 
 
 class StorageLost(UsageError):
@@ -384,22 +387,36 @@ def _retry() -> Callable[[optuna.Study, FrozenTrial], None]:
 
 
 def _give_back(study: optuna.Study, trial: FrozenTrial) -> None:
-    """Fail a trial whose worker is lost, and queue it again."""
-    try:
+    """Queue a trial again whose worker is lost, and fail it."""
+    # In this order: whoever dies in between leaves it as it was, not lost.
+    if not _is_repeated(study, trial):
+        _retry()(study, copy.deepcopy(trial))  # which writes to it
+    with suppress(ValueError, UpdateFinishedTrialError):
         study.tell(trial.number, state=TrialState.FAIL)
-    except (ValueError, UpdateFinishedTrialError):
-        return  # its worker lives, and was just done
-    _retry()(study, trial)
+
+
+def _is_repeated(study: optuna.Study, trial: FrozenTrial) -> bool:
+    """Whether another trial is there to do it again."""
+    return any(
+        trial.number in (*one.system_attrs.get("retry_history", ()), one.system_attrs.get(REPEATS))
+        for one in study.get_trials(deepcopy=False)
+    )
 
 
 def queue_again(study: optuna.Study, trial: FrozenTrial) -> None:
-    """Queue a trial that was interrupted, with all it knows; this does not count as a retry."""
+    """
+    Queue a trial that is interrupted, with all it knows, unless that was done.
+
+    This does not count as a retry. The trial is to be failed after that, see :func:`_give_back`.
+    """
+    if _is_repeated(study, trial):
+        return
     study.add_trial(
         optuna.create_trial(
             state=TrialState.WAITING,
             params=trial.params,
             distributions=trial.distributions,
             user_attrs=trial.user_attrs,
-            system_attrs=trial.system_attrs,
+            system_attrs={**trial.system_attrs, REPEATS: trial.number},
         )
     )

@@ -120,6 +120,9 @@ class FeasibleFirst(BasePruner):
     """
     Prune a trial that compares badly at the same step, where feasible is better than infeasible.
 
+    A trial of given hyper-parameters, such as the first one, the file's, is never pruned: the best
+    is to be compared with it.
+
     A feasible value is compared by its return, an infeasible one by the worst return of all minus
     its violation. Optuna's own pruners compare one number that is stored; the worst return may
     change with every trial.
@@ -139,7 +142,8 @@ class FeasibleFirst(BasePruner):
     def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
         """Whether to end the trial now."""
         step = trial.last_step
-        if step is None:
+        # RL-Zoo's spaces know no place of the file's, and the first trial is like any other.
+        if step is None or trial.system_attrs.get("fixed_params"):
             return False
         trials = [one for one in study.get_trials(deepcopy=False) if one.number != trial.number]
         returns = [v for one in (*trials, trial) for v in one.intermediate_values.values()]
@@ -155,7 +159,7 @@ class FeasibleFirst(BasePruner):
         if len(complete) < max(self.n_startup_trials, 1) or step < self.n_warmup_steps:
             return False
         others = [_scores(one, worst)[step] for one in complete if step in _steps(one)]
-        return bool(others) and max(mine.values()) < float(np.median(others))
+        return bool(others) and mine[step] < float(np.median(others))
 
 
 def _steps(trial: FrozenTrial) -> Mapping[int, float]:
@@ -326,8 +330,8 @@ class Worker:
             print(f"Trial {trial.number} was taken for lost and given to another worker")
             return
         except Stopped:
-            call(tell, trial, state=TrialState.FAIL, skip_if_finished=True)
             call(queue_again, self.study, self._frozen(trial))
+            call(tell, trial, state=TrialState.FAIL, skip_if_finished=True)
             return
         except StorageLost:
             raise
@@ -545,21 +549,23 @@ def _open_study(
     )
 
     def begin() -> bool:
-        """Write down what the study is, if nobody has; whether that was so."""
+        """Write down what the study is, and its first trial, if nobody has; whether that was so."""
         with storage.claim(study):
-            saved = study.user_attrs.get(SETTINGS)
+            saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
             if saved is not None:
                 settings.refuse_others(saved, name)
-                return False
-            if study.trials or [one.name.lower() for one in study.directions] != directions:
+            elif begun or [one.name.lower() for one in study.directions] != directions:
                 raise UsageError(
                     f"{storage.shown} has a study {name!r} that is not one of sb3_guard's; choose "
                     "another --study-name"
                 )
-            # So that the best is never worse than where one came from.
-            study.enqueue_trial(search.first())
-            study.set_user_attr(SETTINGS, asdict(settings))
-            return True
+            else:
+                # First of all: a worker may die after any of these lines, and the next one goes on.
+                study.set_user_attr(SETTINGS, asdict(settings))
+            if not begun:
+                # So that the best is never worse than where one came from.
+                study.enqueue_trial(search.first())
+            return not begun
 
     # Workers that drew the same numbers would try the same things: only the first has the seed.
     seeded = storage.call(begin) and args["seed"] >= 0

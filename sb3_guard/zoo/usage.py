@@ -28,10 +28,12 @@ def one_line(error: BaseException) -> str:
 
 def import_packages(names: Sequence[str]) -> None:
     """
-    Import modules that register environments (``--gym-packages``).
+    Import modules that register environments (``--gym-packages``), the current folder's too.
 
     :raises UsageError: one can't be imported
     """
+    if names and os.getcwd() not in sys.path:  # as with python -m, also for the script sb3-guard
+        sys.path.insert(0, os.getcwd())
     for name in names:
         try:
             importlib.import_module(name)

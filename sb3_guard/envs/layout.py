@@ -127,8 +127,7 @@ class Footprint:
         if len(low) > 1:
             which = rng.choice(len(low), size=n, p=share)
             low, span = low[which], span[which]
-        draws = np.ascontiguousarray(rng.random((n, 2)).T)
-        draws *= span.T
+        draws: Array = np.multiply(rng.random((n, 2)).T, span.T, order="C")
         draws += low.T
         return draws
 
@@ -193,9 +192,9 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
             if trouble[best] >= len(owner):
                 queue.append(k)
                 continue
-            ejected = np.flatnonzero(clash[:, best])
-            xy[:, ejected] = np.inf
-            queue.extend(ejected.tolist())
+            for ejected in clash[:, best].nonzero()[0].tolist():
+                xy[:, ejected] = np.inf
+                queue.append(ejected)
         xy[:, k, 0] = draws[:, best]
     if queue:
         crowded = max(failures, key=lambda name: failures[name])
@@ -224,12 +223,11 @@ def farthest(one: Footprint, other: Footprint) -> float:
 
 def _square_distance(draws: Array, xy: Array) -> Array:
     """Squared distances, [K, n] m², of [2, n] draws to [2, K, 1] places."""
-    dx = draws[0] - xy[0]
-    dy = draws[1] - xy[1]
-    dx *= dx
-    dy *= dy
-    dx += dy
-    return dx
+    offset = draws[:, None] - xy
+    offset *= offset
+    square: Array = offset[0]
+    square += offset[1]
+    return square
 
 
 def check_locations(footprints: Sequence[Footprint]) -> None:

@@ -31,7 +31,7 @@ from sb3_guard.algorithms.common.actor import (
     value_parameters,
 )
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
-from sb3_guard.algorithms.common.mlp import CHUNK, TanhMlp
+from sb3_guard.algorithms.common.mlp import CHUNK, TanhMlp, chunks
 from sb3_guard.algorithms.common.natural_gradient import assign, flatten
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
@@ -91,6 +91,17 @@ def _columns(actor: Actor, policy: ActorCriticPolicy) -> th.Tensor:
         starts[id(parameter)] = position
         position += parameter.numel()
     return th.cat([th.arange(p.numel()) + starts[id(p)] for p in actor.parameters])
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 10, 11, 20, 21, 29, 31])
+def test_no_row_is_left_alone(n: int) -> None:
+    """Batch normalisation does not learn from one."""
+    slices = chunks(n, size=10)
+    sizes = [s.stop - s.start for s in slices]
+    assert min(sizes) > 1 or n == 1
+    assert max(sizes) <= 11
+    covered = [row for s in slices for row in range(s.start, s.stop)]
+    assert covered == list(range(n))
 
 
 @pytest.mark.parametrize("n", [50, CHUNK + 1, 2 * CHUNK])

@@ -120,13 +120,9 @@ def test_episodes_begin_without_a_cost_and_inside_the_layout_rule(env_id):
         groups = [(f, engine._owners[f.name].positions(f.name)) for f in engine.footprints.values()]
         xy = np.concatenate([p[..., :2] for _, p in groups], axis=1)
         keep = np.concatenate([np.full(f.num, f.keepout) for f, _ in groups])
-        robot = np.arange(len(keep)) == 0  # an arm's position is its hand, not its place
         gap = np.linalg.norm(xy[:, :, None] - xy[:, None], axis=-1)
         need = keep[:, None] + keep[None]
-        ignore = np.eye(len(keep), dtype=bool)
-        if engine.robot.workspace == "spatial":
-            ignore |= robot[:, None] | robot[None]
-        assert (gap - need)[:, ~ignore].min() > -1e-6
+        assert (gap - need)[:, ~np.eye(len(keep), dtype=bool)].min() > -1e-6
 
 
 def test_actions_that_are_not_finite_never_reach_the_physics():

@@ -377,7 +377,10 @@ def test_what_an_arm_has_to_reach_is_within_reach_of_its_base(suite, base):
         for _ in range(5):
             assert len(engine.task.advance(np.zeros(1, dtype=int))) == 0
             assert not engine.task.succeeded(engine.task.measure())[0]
-            assert np.linalg.norm(engine.places("goal")[0, 0] - [*base, 0]) <= reach
+            goal = engine.places("goal")[0, 0]
+            assert np.linalg.norm(goal - [*base, 0]) <= reach
+            # of its base, as first goals; of its hand the goal is only not reached yet
+            assert math.dist(goal[:2], base) >= engine.robot.keepout + engine.task.keepout
 
 
 def test_a_robot_of_limited_reach_stands_at_a_fixed_place():

@@ -237,7 +237,8 @@ class MJCFRobot(Robot):
         return self._xpos[:, self._bodies], self._xmat[:, self._bodies]
 
     def positions(self, footprint: str) -> Array:
-        return self.position[:, None]
+        stands = math.isfinite(self.reach)  # where its base is, whatever the hand does
+        return self.sim.places("robot") if stands else self.position[:, None]
 
     def clearance(self, points: Array, planar: bool) -> Array:
         """Distance of points from the robot's origin, [N, K] m."""

@@ -281,11 +281,11 @@ def part(base, name, **verbs):
     return dataclass(type(name.capitalize(), (base,), {"name": name, **verbs}))()
 
 
-def seen(shape, channel="odd_eye"):
+def seen(shape, channel="odd_eye", value=0.0):
     """A constraint that observes an array of this shape and announces one number."""
     return {
         "cost": lambda self: np.zeros(self.sim.num_envs),
-        "observe": lambda self: {"odd_eye": np.zeros(shape)},
+        "observe": lambda self: {"odd_eye": np.full(shape, value)},
         "channels": lambda self: {channel: Channel(1)},
     }
 
@@ -300,6 +300,7 @@ def seen(shape, channel="odd_eye"):
         (seen((2, 3)), r"observe\(\)\['odd_eye'\] of odd has shape \(2, 3\), expected \(2, 1\)"),
         (seen(2), r"observe\(\)\['odd_eye'\] of odd has shape \(2,\), expected \(2, 1\)"),
         (seen((2, 1), "eye"), r"channels\(\) of odd names 'eye', but observe\(\) does not"),
+        (seen((2, 1), value=np.nan), r"observe\(\)\['odd_eye'\] of odd is not finite: \[nan\]"),
         (
             {**seen((2, 1)), "channels": lambda self: {}},
             r"observe\(\) of odd returns 'odd_eye', which has no channel: add 'odd_eye'",
@@ -323,6 +324,7 @@ def test_what_is_wrong_with_a_users_constraint_is_said(verbs, words):
     [
         ("reward", np.zeros((2, 1)), r"reward\(\) of odd has shape \(2, 1\), expected \(2,\)"),
         ("reward", 1.0, r"reward\(\) of odd has shape \(\), expected \(2,\)"),
+        ("reward", np.array([0.0, np.nan]), r"reward\(\) of odd is nan in rows \[1\]: .* a number"),
         ("succeeded", np.zeros((2, 1)), r"succeeded\(\) of odd has shape \(2, 1\)"),
         ("blemished", False, r"blemished\(\) of odd has shape \(\), expected \(2,\)"),
         ("measure", np.zeros(3), r"measure\(\) of odd has shape \(3,\), expected \(2, M\)"),

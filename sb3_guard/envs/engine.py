@@ -443,6 +443,8 @@ class Engine:
             if np.shape(value) != expected:
                 verb = f"observe()[{name!r}]"
                 raise ValueError(_misshapen(part, verb, np.shape(value), expected))
+            if not np.isfinite(value).all():
+                raise ValueError(f"observe()[{name!r}] of {part.name} is not finite: {value[0]}")
         return seen
 
     def _per_row(self, part: Part, verb: str, value: Any, dtype: type = float) -> Array:
@@ -500,6 +502,11 @@ class Engine:
             reward[diverged] = 0.0
             for cost in costs.values():
                 cost[diverged] = 0.0
+        if np.count_nonzero(reward != reward):
+            raise ValueError(
+                f"reward() of {self.task.name} is nan in rows "
+                f"{np.flatnonzero(np.isnan(reward)).tolist()}: it must be a number"
+            )
         total = np.zeros(self.num_envs)
         for name, cost in costs.items():
             if np.count_nonzero(cost >= 0.0) < self.num_envs:

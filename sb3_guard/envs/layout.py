@@ -202,10 +202,12 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         near = ""
         if math.isfinite(f.reach):
             near = f" within the robot's reach, {f.reach} m around its base at {f.base},"
+        what = "1 object" if f.num == 1 else f"{f.num} objects"
+        less = " or ".join(["num"] * (f.num > 1) + ["keepout"] + ["height"] * bool(near))
         raise LayoutError(
-            f"{crowded} cannot be placed: {f.num} objects with keepout {f.keepout} m find no room "
-            f"in {list(f.placements)}{near} beside the other parts; reduce "
-            f"{'num, keepout or height' if near else 'num or keepout, or widen placements'}"
+            f"{crowded} cannot be placed: {what} with keepout {f.keepout} m find no room "
+            f"in {list(f.placements)}{near} beside the other parts; reduce {less}, its "
+            f"own or another's{'' if near else ', or widen placements'}"
         )
     out, k = {}, 0
     for f in footprints:

@@ -223,7 +223,7 @@ def test_what_an_arm_cannot_reach_is_refused_at_construction(params):
 
 def test_crowding_within_reach_speaks_of_it():
     engine = Scenario.parse("Goal_Arm3_2Hazards").override(hazards={"height": [1.99, 2]}).build()
-    words = r"hazards cannot .* within the robot's reach, 2.0 m around .*; reduce num or keepout or height"
+    words = r"hazards cannot .* within the robot's reach, 2.0 m .* reduce num or keepout or height"
     with pytest.raises(LayoutError, match=words):
         engine.reset(np.zeros(1, dtype=int))
 

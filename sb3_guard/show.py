@@ -29,6 +29,9 @@ def observation_table(env: GuardVectorEnv) -> str:
         channel = env.engine.channels[name]
         bounds = f"[{channel.low:g}, {channel.high:g}]"
         rows.append([name, f"{where.start}:{where.stop}", bounds, channel.unit])
+    if env.engine.extras.camera is not None:
+        width, height = env.engine.extras.camera
+        rows.append(["camera", f"image {height} × {width} × 3", "[0, 255]", "red, green, blue"])
     return table(["observation", "slice", "bounds", "unit"], rows)
 
 
@@ -68,22 +71,22 @@ def _show(argv: Sequence[str] | None) -> int:
     if args.camera not in CAMERAS:
         raise UsageError(f"unknown camera {args.camera!r}: {did_you_mean(args.camera, CAMERAS)}")
     file = Path(args.env)
-    kwargs: dict[str, Any] = args.env_kwargs or {}
     try:
         spec = env_spec(args.env)
         if "scenario" not in spec.kwargs:
             raise UsageError(
                 f"{args.env!r} is not an environment of sb3_guard's: see sb3-guard list"
             )
-        env = GuardVectorEnv(
-            1,
-            spec.kwargs["scenario"],
-            render_mode="rgb_array",
-            camera=args.camera,
-            flatten=True,
-            **kwargs,
-        )
-        env.reset(seed=args.seed)
+        kwargs: dict[str, Any] = {
+            **spec.kwargs,
+            "num_envs": 1,
+            "render_mode": "rgb_array",
+            "camera": args.camera,
+            "flatten": False,  # an image fits in no flat observation; the slices are the same
+            **(args.env_kwargs or {}),
+        }
+        env = GuardVectorEnv(**kwargs)
+        env.begin([args.seed])
     except (ValueError, TypeError, RuntimeError) as error:
         raise UsageError(one_line(error)) from None
     data = {key: value for key, value in env.scenario.to_dict().items() if value}

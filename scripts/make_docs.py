@@ -102,12 +102,21 @@ def overview(kind: str, names: Iterable[str]) -> str:
     return "\n\n".join([f"# {kind.title()}s", ABOUT[kind], listed, pictures, toctree]) + "\n"
 
 
+def pictures(kind: str, name: str) -> str:
+    """The pictures of a part: as it is by default, and the others that the gallery has of it."""
+    stem = f"{kind}_{name.lower()}"
+    lines = [f"![{name}](../images/{stem}.png)"]
+    for file in sorted((ROOT / "docs" / "images").glob(f"{stem}_*.png")):
+        lines.append(f"![{name}, {file.stem.rpartition('_')[2]}](../images/{file.name})")
+    return "\n".join(lines)
+
+
 def page(kind: str, name: str, part: type[Part]) -> str:
     """The page of one part."""
     text = inspect.cleandoc(part.__doc__ or "").replace("``", "`")
     parts = [
         f"# {name}",
-        f"![{name}](../images/{kind}_{name.lower()}.png)",
+        pictures(kind, name),
         text,
         taxonomy(part),
         f"Parameters, set with `{part.name or name.lower()}={{...}}`:",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -20,13 +21,21 @@ TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
 PERIOD = 4  # control steps, of 0.02 s, from frame to frame
 FRAMES = 120
 DELAY = 60  # ms that a frame is shown: a third faster than it happens
+# More pictures of a part, as it is elsewhere or can be made: <kind>_<part>_<how>
+VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "constraint_ghosts_spatial": ("Goal_Drone_8Ghosts", {}),
+    "constraint_ghosts_solid": ("Goal_Point_8Ghosts", {"ghosts": {"solid": True}}),
+    "task_chase_solid": ("Chase_Point_8Hazards", {"chase": {"solid": True}}),
+    "task_push_box": ("Push_Point_8Hazards", {"push": {"object": "box"}}),
+}
 # Of 100 seeds the one whose returns and costs over these steps are nearest to the agents' means.
 TYPICAL = 9
 
 
-def picture(name: str, path: Path, camera: str, steps: int, seed: int) -> None:
+def picture(name: str, path: Path, camera: str, steps: int, seed: int, **params: Any) -> None:
     """Write a small picture of an environment after some random steps."""
-    env = GuardVectorEnv(1, name, render_mode="rgb_array", width=360, height=300, camera=camera)
+    window = {"width": 360, "height": 300, "camera": camera}
+    env = GuardVectorEnv(1, name, render_mode="rgb_array", **window, **params)
     env.reset(seed=seed)
     rng = np.random.default_rng(seed)
     for _ in range(steps):
@@ -95,6 +104,8 @@ def main() -> None:
     for constraint in CONSTRAINTS:
         path = args.output / f"constraint_{constraint.lower()}.png"
         picture(f"Goal_Point_8{constraint}", path, "fixed", 1, args.seed)
+    for stem, (env_id, params) in VARIANTS.items():
+        picture(env_id, args.output / f"{stem}.png", "fixed", 1, args.seed, **params)
 
 
 if __name__ == "__main__":

@@ -574,6 +574,21 @@ def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
     assert ((green - red > 0.25) & (green > blue)).sum() > 1000  # the goal
 
 
+def test_show_knows_an_observed_camera_and_lets_its_options_be_changed(tmp_path, capsys):
+    require_rendering()
+    scenario, picture = tmp_path / "seen.yml", tmp_path / "seen.png"
+    scenario.write_text("robot: Car\nobserve: {camera: [32, 24]}\n")
+    show = ["show", str(scenario), "-o", str(picture), "--env-kwargs"]
+    assert cli.main([*show, "num_envs:2", "width:40", "height:30"]) == 0
+    cells = rows(capsys.readouterr().out)
+    assert ["camera", "image 24 × 32 × 3", "[0, 255]", "red, green, blue"] in cells
+    assert image.imread(picture).shape[:2] == (30, 40)
+    assert cli.main([*show, "flatten:True"]) == 2
+    assert capsys.readouterr().err == (
+        "error: observe.camera = (32, 24) needs flatten=False, a Dict observation\n"
+    )
+
+
 def test_show_knows_what_users_registered(tmp_path, monkeypatch, capsys):
     require_rendering()
     monkeypatch.setitem(gymnasium.registry, "TwoPits-v0", None)  # to be forgotten afterwards

@@ -197,7 +197,7 @@ def test_gremlins_of_other_rows_stay_when_a_row_is_reset():
 @pytest.mark.parametrize(
     ("env_id", "parameters"),
     [
-        ("Goal_Point_8Ghosts", {"ghosts": {"speed": 4.0}}),
+        ("Goal_Point_8Ghosts", {"ghosts": {"speed": 2.0}}),
         ("Chase_Point_0Hazards", {"chase": {"speed": 0.2}}),  # its v1 is ten times that
         ("Defense_Point_0Hazards", {"defense": {"v0": 1.5}}),
     ],
@@ -207,6 +207,35 @@ def test_speeds_that_overshoot_are_refused(env_id, parameters):
     world(env_id, 1, **parameters)  # metres per step may be large
     with pytest.raises(ValueError, match=rf"{part}: under speed_law 'proportional'.*at most 1"):
         world(env_id, 1, **{part: {**values, "speed_law": "proportional"}})
+
+
+@pytest.mark.parametrize(
+    ("env_id", "params", "key", "most"),
+    [  # they stop within r1 of the robot and r0 of the origin; where that is 0, by their size
+        ("Goal_Point_1Ghosts", {"r1": 0.0}, "v1", 0.3),
+        ("Goal_Point_1Ghosts", {"r1": 0.0, "size": 0.5}, "speed", 0.5),
+        ("Goal_Point_1Ghosts", {"r1": 0.4}, "v1", 0.8),
+        ("Goal_Point_1Ghosts", {"r0": 0.25}, "v0", 0.5),
+        ("Chase_Point_0Hazards", {}, "v0", 4.0),
+        ("Defense_Point_0Hazards", {}, "v2", 0.3),
+    ],
+)
+def test_speeds_that_jump_across_their_aim_are_refused(env_id, params, key, most):
+    name = "ghosts" if "Ghosts" in env_id else env_id.split("_")[0].lower()
+    world(env_id, **{name: {**params, key: most}})
+    with pytest.raises(ValueError, match=f"{name}: with .* across it for ever: at most {most:g} m"):
+        world(env_id, **{name: {**params, key: most + 0.01}})
+
+
+def test_the_fastest_ghosts_that_are_allowed_stay_with_the_robot():
+    """Still a ghost that stops nowhere is at the robot by no more than its size."""
+    for r1, within in ((0.0, 0.3), (0.4, 0.4)):
+        ghosts = {"r1": r1, "v1": 0.3 if r1 == 0 else 0.8}
+        engine = world("Goal_Point_1Ghosts", ghosts=ghosts)
+        for step in range(30):
+            engine.step(np.zeros((1, 2)))
+            gap = math.dist(engine.places("ghosts")[0, 0, :2], engine.robot.position[0, :2])
+            assert gap <= within or step < 20
 
 
 def test_gremlins_circle_by_the_simulated_clock():

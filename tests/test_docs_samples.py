@@ -1,18 +1,26 @@
-"""What docs/customizing.md shows: its samples run, and its tables are what the code says."""
+"""What docs/customizing.md shows: its samples run, and its tables are what the code says.
+
+The vector wrappers and masses that the pages of environments and robots state, too.
+"""
 
 import dataclasses
 import re
 from pathlib import Path
 
 import gymnasium
+import mujoco
 import pytest
+from gymnasium.wrappers import vector
 from worlds import own_parts
 
+from sb3_guard.envs import tasks
 from sb3_guard.envs.engine import Layout
 from sb3_guard.envs.extras import Extras
+from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.sensors import Lidar
 
-PAGE = (Path(__file__).parent.parent / "docs" / "customizing.md").read_text()
+DOCS = Path(__file__).parent.parent / "docs"
+PAGE = (DOCS / "customizing.md").read_text()
 
 
 def test_samples_run(tmp_path, monkeypatch):
@@ -21,7 +29,7 @@ def test_samples_run(tmp_path, monkeypatch):
     (scenario,) = re.findall(r"```yaml\n(.*?)```", PAGE, flags=re.DOTALL)
     Path("my_scenario.yml").write_text(scenario)
     samples = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
-    assert len(samples) == 9
+    assert len(samples) == 10
     known = dict(gymnasium.registry)
     try:
         with own_parts():
@@ -43,3 +51,29 @@ def test_tables_are_what_the_code_says(name, cls):
     table = PAGE.partition(f"`{name}={{...}}`")[2].partition("| parameter")[2].partition("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)` \| `(.*?)` \|", table, flags=re.MULTILINE)
     assert rows == [(f.name, str(f.default)) for f in dataclasses.fields(cls)]
+
+
+def test_classes_to_build_tasks_on_are_where_the_page_says():
+    names = re.findall(r"`(\w+)`", PAGE.partition("`sb3_guard.envs.tasks`: ")[2].partition(".")[0])
+    assert names == ["Destination", "Goal", "Push", "Targets"]
+    assert set(names) <= set(tasks.__all__)
+
+
+@pytest.mark.parametrize("wrapper", ["NormalizeObservation", "FlattenObservation"])
+def test_the_vector_wrappers_that_refuse_our_reset_work_on_lone_environments(wrapper):
+    assert f"`{wrapper}`" in (DOCS / "environments.md").read_text()
+    wrap = getattr(vector, wrapper)
+    with pytest.raises(ValueError, match="SAME_STEP"):
+        wrap(gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=2))
+    lone = gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=2, vectorization_mode="sync")
+    assert wrap(lone).reset(seed=0)[0].shape == (2, 30)
+
+
+def test_masses_are_what_the_robots_weigh():
+    text = (DOCS / "robots.md").read_text()
+    masses = dict(re.findall(r"^\| \[(\w+)\].*\| ([\d.]+) kg \|", text, flags=re.MULTILINE))
+    assert set(masses) == set(ROBOTS)
+    for name, mass in masses.items():
+        model = mujoco.MjModel.from_xml_path(str(ROBOTS[name].path()))
+        digits = len(mass.partition(".")[2])
+        assert mass == f"{model.body('robot').subtreemass[0]:.{digits}f}", name

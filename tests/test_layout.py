@@ -408,7 +408,7 @@ def test_goals_are_not_reached_when_they_appear(suite):
 
 def test_a_part_can_keep_a_margin_of_its_own():
     base = Scenario.parse("Goal_Point_2Hazards")
-    engine = base.override(goal={"margin": 1.0}, hazards={"height": [0.3, 0.3]}).build(20)
+    engine = base.override(goal={"margin": 1.0}).build(20)
     engine.reset(np.arange(20))
     goal, hazards = engine.places("goal")[:, 0, :2], engine.places("hazards")[..., :2]
     gap = np.linalg.norm(hazards - goal[:, None], axis=-1)

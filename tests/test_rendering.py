@@ -1,11 +1,19 @@
 """Pictures show what is there, and looking changes nothing."""
 
+from dataclasses import dataclass
+
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 
 from sb3_guard import make_vec_env
-from sb3_guard.envs import GuardVectorEnv, env_ids, rendering
+from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_ids, registry, rendering
+from sb3_guard.envs.constraints import Hazards
+from sb3_guard.envs.engine import Engine
+from sb3_guard.envs.extras import EYE, Extras
+from sb3_guard.envs.robots import Point
+from sb3_guard.envs.tasks import Goal
 
 BLUE, GREEN, RED = (0.1, 0.3, 0.95), (0.1, 0.75, 0.2), (1.0, 0.1, 0.1)
 
@@ -58,6 +66,85 @@ def test_the_halo_follows_the_lidar():
         frames.append(env.render()[0].astype(int))
         env.close()
     assert np.abs(frames[0] - frames[1]).max() > 40
+
+
+@pytest.mark.parametrize(
+    ("robot", "sensing", "radius"),
+    [
+        ("Swimmer", None, 0.15),
+        ("Drone", None, 0.15),
+        ("Arm3", ["link_5"], 0.18),
+        ("Arm3", ["link_2"], 0.23),  # begins in the sphere of link_1
+        ("Arm6", ["link_1", "link_3"], 0.23),
+    ],
+)
+def test_no_joint_hides_a_halo(robot, sensing, radius):
+    engine = GuardEnv(f"Goal_{robot}_1Hazards", robot={"sensing": sensing}).engine
+    engine.reset(np.zeros(1, dtype=np.int32))
+    model, data = engine.model, engine.batch.get_data(0)
+    scene = mujoco.MjvScene(model, maxgeom=1000)
+    painter = rendering.ScenePainter(scene, engine, data, 0)
+    origin = engine.robot.frames[0][0]
+    lift = [0, 0, 0.25] if robot == "Swimmer" else [0, 0, 0]
+    spheres = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    for wider in (0.0, 0.06):
+        scene.ngeom = 0
+        painter.halo(np.ones(len(origin) * 60), 10, BLUE)
+        beads = np.array([geom.pos for geom in scene.geoms[: scene.ngeom]])
+        around = beads.reshape(len(origin), 60, 3) - (origin + lift)[:, None]
+        np.testing.assert_allclose(np.linalg.norm(around, axis=2), radius + wider, atol=1e-6)
+        gaps = np.linalg.norm(beads[:, None] - data.geom_xpos[spheres], axis=2)
+        assert (gaps > model.geom_size[spheres, 0] + rendering.BEAD).all()
+
+
+class Halos:
+    """A painter that keeps what the halos show."""
+
+    def __init__(self):
+        self.shown = []
+
+    def halo(self, closeness, azimuth, color):
+        self.shown.append(closeness)
+
+    def zone(self, center, radius, half_height, color):
+        pass
+
+
+@pytest.mark.parametrize("task", ["Goal", "Push", "Chase", "Defense", "Button"])
+def test_halos_show_the_lidars_that_are_observed(task):
+    options = {"Goal": {"lidar": True}, "Push": {"lidar": True, "object_lidar": True}}
+    env = GuardEnv(f"{task}_Point_2Hazards", task=options.get(task, {}), ghosts={"num": 2})
+    env.reset(seed=0)
+    if task == "Button":
+        env.engine.task.wait[:] = 5  # none is lit
+    obs = env.engine.observe()[0]
+    painter = Halos()
+    for part in env.engine.parts:
+        part.draw(painter, 0)
+    layout = env.observation_layout
+    expected = [obs[where] for name, where in layout.items() if name.endswith("_lidar")]
+    np.testing.assert_allclose(
+        sorted(map(tuple, painter.shown)), sorted(map(tuple, expected)), 1e-6
+    )
+
+
+@pytest.mark.parametrize("camera", ["fixed", "top"])
+def test_cameras_show_an_arena_of_any_size_and_place(camera):
+    env = GuardEnv(
+        "Goal_Point_0Hazards",
+        layout={"placements": [[-6.0, -6.0, 6.0, 6.0], [6.0, 0.0, 14.0, 6.0]]},
+        robot={"locations": [[-8.0, 4.0]]},
+        render_mode="rgb_array",
+        camera=camera,
+        width=120,
+        height=120,
+    )
+    env.reset(seed=0)
+    goal, seen = env.engine.places("goal")[0, 0], []
+    for goal[:2] in ((-8, -6), (14, 6), (-8, 6), (14, -6), (100, 100)):
+        seen.append(amount(env.render(), GREEN))
+    env.close()
+    assert min(seen[:4]) > 5 and seen[4] == 0
 
 
 @pytest.mark.parametrize("env_id", env_ids()[:1])
@@ -127,6 +214,79 @@ def test_the_robots_own_camera_can_be_observed():
         gymnasium.make("Goal_Point_8Hazards-v0", observe={"camera": [32, 24]})
     env.close()
     batch.close()
+
+
+def put_the_goal_ahead(env, metres):
+    """Put it straight before the robot, or an arm's hand, and return its middle, [3] m."""
+    engine = env.engine
+    axis = 1 if type(engine.robot).__name__ in ("Car", "Arm3", "Arm6") else 0  # of the body
+    origin, rotation = (frame[0, -1] for frame in engine.robot.frames)
+    middle = origin + metres * rotation[:, axis]
+    engine.places("goal")[0, 0] = middle - [0, 0, 0.25 if engine.task.planar else 0.0]
+    return middle
+
+
+@pytest.mark.parametrize("robot", registry.ROBOTS)
+def test_the_robots_own_camera_looks_ahead(robot):
+    env = GuardEnv(f"Goal_{robot}_0Hazards", flatten=False, observe={"camera": [8, 8]})
+    env.engine.seed(0, np.random.default_rng(0))
+    env.engine.reset(np.zeros(1, dtype=np.int32))
+    model, data = env.engine.model, env.engine.batch.get_data(0)
+    eye = model.camera(EYE).id
+    way = put_the_goal_ahead(env, 1.0) - data.cam_xpos[eye]
+    right, up, back = data.cam_xmat[eye].reshape(3, 3).T @ way
+    assert back < -0.5 and abs(right) < 0.01 and abs(up) < 0.15
+    hit, body = np.zeros(1, dtype=np.int32), model.cam_bodyid[eye]
+    gap = mujoco.mj_ray(model, data, data.cam_xpos[eye], way, None, 1, body, hit)
+    assert gap < 0 or gap > 1, f"{model.geom(hit[0]).name} is in the way"
+
+
+@pytest.mark.parametrize("robot", ["Car", "Arm6"])
+def test_what_is_ahead_is_in_the_middle_of_the_robots_view(robot):
+    options = {"flatten": False, "observe": {"camera": [48, 48]}, "goal": {"size": 0.15}}
+    env = GuardEnv(f"Goal_{robot}_0Hazards", **options)
+    env.reset(seed=0)
+    views = []
+    for metres in (1.0, -1.0):
+        put_the_goal_ahead(env, metres)
+        views.append(env.look()[0].astype(int))
+    env.close()
+    rows, columns = np.nonzero(np.abs(views[0] - views[1]).sum(axis=2) > 30)
+    assert len(rows) > 20
+    assert abs(columns.mean() - 23.5) < 3 and abs(rows.mean() - 23.5) < 5
+
+
+@dataclass
+class Selfie(Point):
+    """A robot that sees itself from behind."""
+
+    eye = (Point.root, (-1.0, 0.0, 0.1), (1.0, 0.0, 0.0))
+
+
+def test_the_robots_own_camera_sees_neither_halo_nor_tint(monkeypatch):
+    robot = Selfie(locations=((0.0, 0.0),), heading=0.0)
+    hazards = Hazards(num=2, locations=((1.0, 0.0),))
+    engine = Engine(robot, Goal(), [hazards], extras=Extras(camera=(48, 48)))
+    engine.reset(np.zeros(1, dtype=np.int32))
+    engine.places("hazards")[0, 1] = 0.0  # under the robot
+    renderer = rendering.Renderer(engine, 48, 48, EYE)
+    paying = renderer.frame(0)
+    assert hazards.cost() > 0
+    assert amount(paying, BLUE) > 20  # zones are seen
+    hazards.weight = 0.0
+    monkeypatch.setattr(engine, "lidar", lambda points, planar: np.zeros((1, 16)))
+    np.testing.assert_array_equal(renderer.frame(0), paying)
+    renderer.close()
+
+
+@dataclass
+class Blind(Point):
+    eye = ("robot/nose", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+
+
+def test_a_robots_eye_is_on_one_of_its_bodies():
+    with pytest.raises(ValueError, match=r"no body 'robot/nose'.*allowed: .*robot/robot"):
+        Engine(Blind(), Goal(), extras=Extras(camera=(8, 8)))
 
 
 @pytest.mark.parametrize("backend", ["glfw", "foo", "osmesa"])

@@ -1,17 +1,29 @@
 """Ids, scenarios, files and keyword arguments, and what they say of bad values."""
 
 from dataclasses import dataclass
+from functools import partial
+from unittest import mock
 
 import gymnasium
 import numpy as np
 import pytest
+from stable_baselines3.common.vec_env import VecEnv
 from worlds import own_parts
 
-from sb3_guard.envs import GuardEnv, Scenario, env_ids, make, registry
+from sb3_guard import make_vec_env
+from sb3_guard.envs import (
+    GuardEnv,
+    GuardVectorEnv,
+    Scenario,
+    env_ids,
+    make,
+    register,
+    registry,
+)
 from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Constraint, Robot, Task
-from sb3_guard.envs.tasks import Goal
+from sb3_guard.envs.tasks import Goal, Push
 from sb3_guard.spelling import did_you_mean
 
 
@@ -94,6 +106,29 @@ def test_bad_ids_say_what_is_wrong(name, message):
         ),
         ({"pillars": {"space": "spatial"}}, "pillars.space = 'spatial' cannot .* always planar"),
         ({"hazards": {"num": 1, "locations": [[0, 1], [1, 0]]}}, "2 locations for 1 objects"),
+        ({"Hazards": {"num": 3}}, "unknown parameter 'Hazards': did you mean 'hazards'"),
+        ({"Hazards": {"type": "hazards"}}, "constraint 'Hazards': write 'hazards', in lower case"),
+        (
+            {"pits": {"num": 3}},
+            "unknown parameter 'pits': .* states its type, such as {'type'",
+        ),
+        ({"pits": {"type": "hazrds"}}, "pits.type = 'hazrds': did you mean 'hazards'"),
+        ({"pits": {"type": "hazards", "size": -1}}, "^pits.size = -1 must be greater than 0"),
+        ({"pits": {"type": "hazards", "sise": 1}}, "^pits has no parameter 'sise'"),
+        ({"pits": {"type": "ghosts", "height": [2, 1]}}, r"^pits.height = \(2, 1\) must be \(low"),
+        (
+            {"pits": {"type": "pillars", "space": "spatial"}},
+            "^pits.space = .* cannot be set",
+        ),
+        (
+            {"hazards": {"height": [1, 2]}},
+            r"hazards.height = \(1, 2\) .* in the air only, .*",
+        ),
+        ({"ghosts": {"height": [1, 2]}}, r"ghosts.height = \(1, 2\) counts in the air only"),
+        (
+            {"goal": {"height": [1, 2]}},
+            r"goal.height = \(1, 2\) .* set goal={'space': ",
+        ),
     ],
 )
 def test_bad_parameters_fail_where_the_world_is_made(params, message):
@@ -153,10 +188,69 @@ def test_scenarios_from_files(tmp_path):
         Scenario.load(path)
     with pytest.raises(ValueError, match="cannot read scenario"):
         Scenario.load(tmp_path / "none.yml")
+    for text in (b"robot: Ant # \xfc", b"\xff\xfe\x00"):
+        path.write_bytes(text)
+        with pytest.raises(ValueError, match=r"scenario '.*mine.yml': it is not text in UTF-8"):
+            Scenario.load(path)
+
+
+MAKERS = (
+    make,
+    make_vec_env,
+    partial(make_vec_env, vec_env="dummy"),
+    GuardEnv,
+    partial(GuardVectorEnv, 1),
+    partial(register, "Mine"),
+)
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+@mock.patch.dict(gymnasium.registry)
+def test_whatever_makes_an_environment_takes_all_that_says_one(maker, tmp_path):
+    path = tmp_path / "mine.yml"
     path.write_text("constraints:\n  hazards: {num: 2}\n")
-    assert make(str(path)).unwrapped.scenario.constraints == {"hazards": {"num": 2}}
-    with pytest.raises(ValueError, match="cannot read scenario"):
-        make(str(tmp_path / "none.yml"))
+    scenario = Scenario.load(path)
+    for what in (path, str(path), scenario, scenario.to_dict(), "Goal_Point_2Hazards"):
+        made = maker(what)
+        if isinstance(made, str):
+            made = gymnasium.make(made)
+        if isinstance(made, VecEnv):
+            assert made.get_attr("scenario") == [scenario]
+        else:
+            assert made.unwrapped.scenario == scenario
+    for what, words in (
+        (tmp_path / "none.yml", "cannot read scenario '.*none.yml': .*No such file"),
+        (str(tmp_path / "none.yml"), "cannot read scenario '.*none.yml': .*No such file"),
+        ({"robt": "Ant"}, "scenario has no key 'robt'"),
+        (3, "scenario = 3 must be an id, a YAML file, a Scenario or its plain data"),
+        (["Goal_Point_2Hazards"], r"scenario = \['Goal_Point_2Hazards'\] must be an id, a YAML"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            maker(what)
+    if getattr(maker, "func", None) is not register:
+        with pytest.raises(ValueError, match="scenario = None must be an id, a YAML file"):
+            maker(None)
+
+
+@mock.patch.dict(gymnasium.registry)
+def test_an_id_that_says_what_it_is_cannot_be_given_to_something_else():
+    before = dict(gymnasium.registry)
+    ant = Scenario(robot="Ant")
+    for name in (
+        "Goal_Point_8Hazards",
+        "Goal_Point_7Hazards-v0",
+        "Goal_Point_7Hazards-v1",
+        "sb3_guard:Goal_Point_7Hazards_noconti",
+    ):
+        with pytest.raises(
+            ValueError, match=f"'{name}' says by itself .* choose a name that is not"
+        ):
+            register(name, ant)
+    assert gymnasium.registry == before
+    same = Scenario.parse("Goal_Point_7Hazards")
+    assert register("Goal_Point_7Hazards", same) == "Goal_Point_7Hazards-v0"
+    assert gymnasium.make("Goal_Point_7Hazards-v0").unwrapped.scenario == same
+    assert register("mine/Goal_Point_7Hazards", ant) == "mine/Goal_Point_7Hazards-v0"
 
 
 @pytest.mark.parametrize(
@@ -169,18 +263,25 @@ def test_scenarios_from_files(tmp_path):
         ({"robot_params": [1]}, r"robot = \[1\] must be a mapping"),
         ({"lidar": "wide"}, "lidar = 'wide' must be a mapping"),
         ({"robt": "Ant"}, "scenario has no key 'robt': did you mean 'robot'"),
+        ({"goal": {"size": 1}}, "no key 'goal': the task's parameters go into task_params"),
+        ({"hazards": {}}, r"no key 'hazards': write constraints: {hazards: {\.\.\.}}"),
+        (
+            {"constraints": {"Hazards": {"num": 3}}},
+            "constraint 'Hazards': write 'hazards'",
+        ),
+        (
+            {"constraints": {"Goal": {"type": "hazards"}}},
+            "constraint 'Goal': this is what the ",
+        ),
+        (
+            {"constraints": {"pits": {"num": 3}}},
+            "unknown constraint 'pits': .*; a constraint under a name of its own states its type",
+        ),
     ],
 )
 def test_malformed_scenarios_say_what_is_wrong(fields, message):
     with pytest.raises(ValueError, match=message):
         Scenario.from_dict(fields)
-
-
-def test_what_is_no_scenario_is_refused():
-    with pytest.raises(ValueError, match="scenario = 3 must be an id, a YAML file, a Scenario or"):
-        GuardEnv(3)
-    with pytest.raises(ValueError, match="scenario has no key 'robt'"):
-        GuardEnv({"robt": "Ant"})
 
 
 def test_what_is_left_blank_has_its_default(tmp_path):
@@ -276,6 +377,56 @@ def test_what_is_registered_again_takes_its_place(tmp_path):
                 again(name)
 
 
+def test_parts_are_called_by_the_names_they_are_registered_under():
+    @dataclass
+    class Relay(Push):
+        """Somebody else's turn."""
+
+        toll: float = param(0.1, "reward taken per step", low=0)
+
+    @dataclass
+    class Crane(registry.ROBOTS["Arm3"]):
+        """Heavy."""
+
+    with own_parts():
+        registry.register_task("Relay", Relay)
+        registry.register_task("Errand", Relay)
+        registry.register_robot("Crane", Crane)
+        for task in ("relay", "errand"):
+            base = Scenario.parse(f"{task.capitalize()}_Crane_0Hazards")
+            for params, words in (
+                ({task: {"toll": -1}}, f"^{task}.toll = -1 must be at least 0"),
+                ({task: {"tol": 1}}, f"^{task} has no parameter 'tol'"),
+                ({task: {"space": "spatial"}}, f"^{task}.space = 'spatial' cannot be set"),
+                ({task: {"object_keepout": 0.01}}, f"^{task}.object_keepout = 0.01 lets"),
+                ({task: {"size": 9}}, f"^{task}.size = 9 holds the ball"),
+                ({"push": {"toll": 1}}, f"set its parameters with {task}={{...}}"),
+                ({"robot": {"heading": "up"}}, "^robot.heading = 'up'"),
+            ):
+                with pytest.raises(ValueError, match=words):
+                    base.override(**params).build()
+            assert base.build().task.name == task
+        with pytest.raises(ValueError, match=r"^relay\.toll = -1"):
+            Relay(toll=-1)
+
+
+def test_names_that_set_something_else_are_refused():
+    class Wet(Hazards):
+        """Puddles."""
+
+    class Home(Goal):
+        """Go home."""
+
+    words = "cannot name a part: its parameters would be set with {}=..., which means something"
+    with own_parts():
+        for name in ("Robot", "Task", "Lidar", "Layout", "Observe", "Camera", "Goal", "pUSH"):
+            with pytest.raises(ValueError, match=f"'{name}' " + words.format(name.lower())):
+                registry.register_constraint(name, Wet)
+        for name in ("Robot", "Task", "Lidar", "Layout", "observe", "Scenario", "Hazards"):
+            with pytest.raises(ValueError, match=f"'{name}' " + words.format(name.lower())):
+                registry.register_task(name, Home)
+
+
 def test_a_constraint_without_a_number_is_one():
     with own_parts():
         registry.register_constraint("Speeding", speeding())
@@ -301,6 +452,10 @@ def test_classes_that_cannot_be_parts_are_refused():
         """No parameters of its own, so that the base's decorator does."""
 
     @dataclass
+    class Named(Hazards):
+        name: str = "wet"
+
+    @dataclass
     class Free(Constraint):
         """Costs nothing, not even a thought."""
 
@@ -315,6 +470,8 @@ def test_classes_that_cannot_be_parts_are_refused():
         with pytest.raises(ValueError, match="class Wide is not a dataclass: its parameters size"):
             registry.register_constraint("Wide", Wide)
         registry.register_constraint("Plain", Plain)
+        with pytest.raises(ValueError, match="class Named: name is no parameter; write it without"):
+            registry.register_constraint("Named", Named)
         with pytest.raises(ValueError, match=r"class Free must define cost\(\)"):
             registry.register_constraint("Free", Free)
         with pytest.raises(ValueError, match=r"class Idle must define reward\(\)"):

@@ -147,6 +147,27 @@ def test_the_object_keeps_clear_of_what_it_could_bump_into(kind, covers):
         Scenario(task="Push", task_params=push)
 
 
+def test_the_object_has_placements_and_a_margin_of_its_own():
+    def footprints(**push):
+        engine = Scenario.parse("Push_Point_2Hazards").override(push=push).build()
+        return engine.footprints["goal"], engine.footprints["ball"]
+
+    left, right = [[-2, -2, 0, 2]], [[0, -2, 2, 2]]
+    for goal, ball in (
+        footprints(placements=left, margin=0.1),  # the goal's, as long as it has none
+        footprints(placements=left, object_placements=left, margin=0.1, object_margin=0.1),
+    ):
+        assert goal.placements == ball.placements == ((-2, -2, 0, 2),)
+        assert goal.margin == ball.margin == 0.1
+    goal, ball = footprints(placements=left, object_placements=right, margin=0.2, object_margin=0.0)
+    assert (goal.placements, ball.placements) == (((-2, -2, 0, 2),), ((0, -2, 2, 2),))
+    assert (goal.margin, ball.margin) == (0.2, 0.0)
+    with pytest.raises(ValueError, match=r"push.object_margin = -1 must be at least 0"):
+        footprints(object_margin=-1)
+    with pytest.raises(ValueError, match=r"ball: keepout 0.2 does not fit the placement"):
+        footprints(object_placements=[[0, 0, 0.3, 1]])
+
+
 def test_a_box_has_posts_that_rest_on_nothing():
     engine = world("Push_Point_0Hazards", push={"object": "box"})
     body = engine.model.body("box/0")
@@ -249,16 +270,34 @@ def test_a_goal_in_space_hangs_where_a_robot_on_the_floor_gets_to(robot, size, h
 
 
 @pytest.mark.parametrize(
-    ("robot", "space", "size"),
-    [("Point", "planar", 2), ("Point", "spatial", 3), ("Drone", "planar", 3)],
+    ("robot", "goal", "size"),
+    [
+        ("Point", {}, 2),
+        ("Point", {"space": "spatial", "height": [0.4, 0.5]}, 3),
+        ("Drone", {"space": "planar"}, 3),
+    ],
 )
-def test_compasses_tell_the_height_of_what_hangs_in_the_air(robot, space, size):
-    engine = world(f"Goal_{robot}_0Hazards", goal={"space": space, "height": [0.4, 0.5]})
+def test_compasses_tell_the_height_of_what_hangs_in_the_air(robot, goal, size):
+    engine = world(f"Goal_{robot}_0Hazards", goal=goal)
     compass = engine.observe()[0, engine.observation_layout["goal_compass"]]
     origin, rotation = engine.robot.frames
     offset = rotation[0, 0].T @ (engine.task.place[0] - origin[0, 0])
     expected = offset[:size] / (np.linalg.norm(offset[:size]) + 0.001)
     np.testing.assert_allclose(compass, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("robot", ["Ant", "Drone"])
+@pytest.mark.parametrize(
+    ("defense", "r1"),
+    [
+        ({"space": "planar"}, 2.0),
+        ({"space": "spatial", "height": [0.3, 1.0]}, 2.5),
+        ({"space": "spatial", "height": [0.3, 1.0], "r1": 1.0}, 1.0),
+    ],
+)
+def test_targets_of_defense_see_farther_in_space_whatever_the_robot(robot, defense, r1):
+    engine = Scenario(robot=robot, task="Defense", task_params=defense).build()
+    assert engine.task.motion.r1 == r1
 
 
 @pytest.mark.parametrize("task", ["Chase", "Defense"])

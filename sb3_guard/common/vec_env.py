@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -34,7 +35,7 @@ VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {
 _OURS = "sb3_guard.envs.gym_env:GuardEnv"
 
 
-def _our_envs(env_id: str | Scenario) -> ModuleType:
+def _our_envs(env_id: Any) -> ModuleType:
     """``sb3_guard.envs``, or an error that says why ``env_id`` can't be looked up in it."""
     try:
         import sb3_guard.envs
@@ -46,16 +47,17 @@ def _our_envs(env_id: str | Scenario) -> ModuleType:
     return sb3_guard.envs
 
 
-def find_scenario(env_id: str | Scenario) -> Scenario | None:
+def find_scenario(env_id: str | Path | Mapping[str, Any] | Scenario) -> Scenario | None:
     """The scenario that an id stands for, or None for an environment that is not ours.
 
     :param env_id: a registered id, one of Safety-Gymnasium, an id of ours with or without ``-v0``,
-        or a scenario
+        a scenario, its plain data or its YAML file
     :raises ValueError: nothing of that name is known, with the nearest match
     :raises gymnasium.error.DependencyNotInstalled: the package that has it is absent or too old
     """
-    if not isinstance(env_id, str):
-        return env_id
+    if not isinstance(env_id, str) or env_id.endswith((".yml", ".yaml")):
+        one: Scenario = _our_envs(env_id).as_scenario(env_id)
+        return one
     for name in (env_id, f"{env_id}-v0"):
         spec = gymnasium.registry.get(name)
         if spec is not None:
@@ -67,9 +69,6 @@ def find_scenario(env_id: str | Scenario) -> Scenario | None:
     if ":" in env_id or is_safety_gymnasium(env_id):
         return None  # of "module:Env-v0" gymnasium imports the module first
     envs = _our_envs(env_id)
-    if env_id.endswith((".yml", ".yaml")):
-        file: Scenario = envs.Scenario.load(env_id)
-        return file
     try:
         return envs.Scenario.parse(env_id)
     except ValueError as error:
@@ -90,7 +89,7 @@ class GuardVecEnv(VecEnv):
     Equal, bit for bit, to a ``DummyVecEnv`` of N lone environments with seeds s, s + 1, …, and many
     times faster.
 
-    :param scenario: an id, a scenario or its plain data
+    :param scenario: an id, a scenario, its plain data or its YAML file
     :param num_envs: number of environments N
     :param spec: what Gymnasium calls it, if it is registered
     :param kwargs: as for :class:`~sb3_guard.envs.vector_env.GuardVectorEnv`
@@ -98,7 +97,7 @@ class GuardVecEnv(VecEnv):
 
     def __init__(
         self,
-        scenario: str | Mapping[str, Any] | Scenario,
+        scenario: str | Path | Mapping[str, Any] | Scenario,
         num_envs: int = 1,
         spec: EnvSpec | None = None,
         **kwargs: Any,
@@ -188,7 +187,7 @@ class GuardVecEnv(VecEnv):
 
 
 def make_vec_env(
-    env_id: str | Scenario | Callable[..., gymnasium.Env],
+    env_id: str | Path | Mapping[str, Any] | Scenario | Callable[..., gymnasium.Env],
     n_envs: int = 1,
     seed: int | None = None,
     *,
@@ -203,9 +202,9 @@ def make_vec_env(
 ) -> VecEnv:
     """Make environments for Stable-Baselines3, with episode statistics that include the cost.
 
-    :param env_id: an id of ours (the version may be left out), a scenario or its YAML file, any id
-        registered with Gymnasium, one of Safety-Gymnasium where that package is installed, or a
-        class or function that makes an environment
+    :param env_id: an id of ours (the version may be left out), a scenario, its plain data or its
+        YAML file, any id registered with Gymnasium, one of Safety-Gymnasium where that package is
+        installed, or a class or function that makes an environment
     :param n_envs: how many; 30 is a good number for training
     :param seed: the environments get seed, seed + 1, …
     :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"``

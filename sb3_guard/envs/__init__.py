@@ -5,6 +5,8 @@ Importing this package registers the named suites with Gymnasium.
 
 import os
 import sys
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
@@ -21,7 +23,7 @@ except (RuntimeError, AttributeError) as error:  # what a backend that is not th
 import gymnasium
 from gymnasium.envs.registration import EnvSpec, parse_env_id
 
-from sb3_guard.envs.gym_env import GuardEnv
+from sb3_guard.envs.gym_env import GuardEnv, as_scenario
 from sb3_guard.envs.registry import (
     EPISODE_STEPS,
     env_ids,
@@ -46,25 +48,22 @@ __all__ = [
 ]
 
 
-def env_spec(name: str | Scenario) -> EnvSpec:
+def env_spec(name: str | Path | Mapping[str, Any] | Scenario) -> EnvSpec:
     """Gymnasium's description of an environment, registered or not.
 
-    :param name: an id of ours, with or without its version, a scenario, or its YAML file
-    :raises ValueError: the id cannot be read
+    :param name: an id of ours, with or without its version, a scenario, its plain data, or its
+        YAML file
+    :raises ValueError: the id cannot be read, or it is none of these
     """
     what: str | dict[str, Any]
-    if isinstance(name, Scenario):
-        env_id, what = "Guard-v0", name.to_dict()
-    else:
-        name = name.removeprefix("sb3_guard:")  # what gymnasium.make would have to import
-        env_id = name if name.rpartition("-v")[2].isdigit() else f"{name}-v0"
+    if isinstance(name, str) and not name.endswith((".yml", ".yaml")):
+        what = name.removeprefix("sb3_guard:")  # what gymnasium.make would have to import
+        env_id = _with_version(what)
         if env_id in gymnasium.registry:
             return gymnasium.registry[env_id]
-        what = name
-        if name.endswith((".yml", ".yaml")):
-            env_id, what = "Guard-v0", Scenario.load(name).to_dict()
-        else:
-            Scenario.parse(name)
+        Scenario.parse(what)
+    else:
+        env_id, what = "Guard-v0", as_scenario(name).to_dict()
     return EnvSpec(
         env_id,
         entry_point="sb3_guard.envs.gym_env:GuardEnv",
@@ -74,23 +73,42 @@ def env_spec(name: str | Scenario) -> EnvSpec:
     )
 
 
-def register(name: str, scenario: Scenario | None = None) -> str:
+def _with_version(name: str) -> str:
+    """An id of ours in full."""
+    return name if name.rpartition("-v")[2].isdigit() else f"{name}-v0"
+
+
+def register(name: str, scenario: str | Path | Mapping[str, Any] | Scenario | None = None) -> str:
     """Make an environment known to :func:`gymnasium.make`.
 
-    :param name: an id such as ``Goal_Point_3Hazards-v0``; with a scenario, any name
-    :param scenario: what it is, if the name does not say it
+    :param name: an id such as ``Goal_Point_3Hazards-v0``; with a scenario, any name that does not
+        say something else
+    :param scenario: what it is, if the name does not say it: a scenario, its plain data, its YAML
+        file or an id
     :return: the id, with its version
-    :raises ValueError: the name cannot be read
+    :raises ValueError: the name cannot be read, or it says something else than the scenario
     """
-    spec = env_spec(name if scenario is None else scenario)
-    if scenario is not None:
-        spec.id = name if name.rpartition("-v")[2].isdigit() else f"{name}-v0"
+    if scenario is None:
+        spec = env_spec(name)
+    else:
+        scenario = as_scenario(scenario)
+        spec = env_spec(scenario)
+        spec.id = _with_version(name.removeprefix("sb3_guard:"))
         spec.namespace, spec.name, spec.version = parse_env_id(spec.id)
+        try:
+            agrees = spec.namespace is not None or Scenario.parse(spec.name) == scenario
+        except ValueError:
+            agrees = True  # the name says nothing
+        if not agrees:
+            raise ValueError(
+                f"{name!r} says by itself which environment it is, and it is not the one given: "
+                "choose a name that is not of the form Task_Robot_NConstraint"
+            )
     gymnasium.registry[spec.id] = spec
     return spec.id
 
 
-def make(name: str | Scenario, **kwargs: Any) -> gymnasium.Env:
+def make(name: str | Path | Mapping[str, Any] | Scenario, **kwargs: Any) -> gymnasium.Env:
     """:func:`gymnasium.make` for any id of ours, registered or not, with or without its version.
 
     :param name: as for :func:`env_spec`

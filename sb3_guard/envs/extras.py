@@ -9,6 +9,7 @@ import numpy as np
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Part, Simulation, World
 from sb3_guard.envs.sensors import Channel
+from sb3_guard.spelling import did_you_mean
 
 EYE = "eye"
 
@@ -70,10 +71,25 @@ class Extras(Part):
             )
 
     def build(self, world: World) -> None:
+        """Give the robot the camera that is observed.
+
+        :raises ValueError: it would sit on a body that is not there
+        """
         super().build(world)
         if self.camera is not None:
-            body = world.spec.body(world.robot.root)
-            body.add_camera(name=EYE, pos=[0, 0, 0.1], xyaxes=[0, -1, 0, 0, 0, 1], fovy=90)
+            # a user's robot that is made without a file need not say where its eye is
+            default = (world.robot.root, (0.0, 0.0, 0.1), (1.0, 0.0, 0.0))
+            name, place, ahead = getattr(world.robot, "eye", default)
+            body = world.spec.body(name)
+            if body is None:
+                known = [b.name for b in world.spec.bodies if b.name]
+                raise ValueError(
+                    f"eye of the robot is on no body {name!r} of the world: "
+                    f"{did_you_mean(name, known)}"
+                )
+            right = np.cross(ahead, [0.0, 0.0, 1.0])
+            axes = [*right, *np.cross(right, ahead)]
+            body.add_camera(name=EYE, pos=place, xyaxes=axes, fovy=90)
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -21,10 +22,15 @@ ROW = np.zeros(1, dtype=np.int32)
 
 
 def as_scenario(
-    scenario: str | Mapping[str, Any] | Scenario, params: Mapping[str, Any]
+    scenario: str | Path | Mapping[str, Any] | Scenario, params: Mapping[str, Any] | None = None
 ) -> Scenario:
-    """A scenario from an id, plain data or a scenario, with parameters of its parts changed."""
-    if isinstance(scenario, str):
+    """The scenario of an id, a YAML file or plain data, with parameters of its parts changed.
+
+    :raises ValueError: it is none of these, or not a good one
+    """
+    if isinstance(scenario, Path):
+        scenario = Scenario.load(scenario)
+    elif isinstance(scenario, str):
         is_file = scenario.endswith((".yml", ".yaml"))
         scenario = Scenario.load(scenario) if is_file else Scenario.parse(scenario)
     elif isinstance(scenario, Mapping):
@@ -80,7 +86,7 @@ class Simulated:
 
     def _simulate(
         self,
-        scenario: str | Mapping[str, Any] | Scenario,
+        scenario: str | Path | Mapping[str, Any] | Scenario,
         params: Mapping[str, Any],
         num_envs: int,
         num_threads: int | None,
@@ -194,7 +200,8 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
     ``info["cost_<type>"]``; ``info["goal_met"]`` is there, and True, only if the goal was reached.
     Episodes are cut by the time limit of :func:`gymnasium.make`.
 
-    :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario` or its plain data
+    :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario`, its plain data or its
+        YAML file
     :param render_mode: ``"rgb_array"``, ``"human"`` or None
     :param flatten: False for a Dict observation with the components by name
     :param width: width of rendered frames, pixels
@@ -208,7 +215,7 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
 
     def __init__(
         self,
-        scenario: str | Mapping[str, Any] | Scenario = "Goal_Point_8Hazards",
+        scenario: str | Path | Mapping[str, Any] | Scenario = "Goal_Point_8Hazards",
         render_mode: str | None = None,
         flatten: bool = True,
         width: int = 480,

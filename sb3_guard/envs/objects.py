@@ -164,6 +164,18 @@ class Spatial(Part):
         if self.height[0] > self.height[1]:
             raise ValueError(f"{self.name}.height = {self.height!r} must be (low, high), in metres")
 
+    def build(self, world: World) -> None:
+        """Settle the part's space.
+
+        :raises ValueError: heights of what lies on the floor
+        """
+        super().build(world)
+        if self.planar and self.height != type(self).height:
+            raise ValueError(
+                f"{self.name}.height = {self.height!r} counts in the air only, but its space is "
+                f"planar: leave it out, or set {self.name}={{'space': 'spatial', 'height': ...}}"
+            )
+
     def check_height(self, sim: Simulation, near: float, all_of_it: bool) -> None:
         """Refuse to hang what a robot on the floor cannot get to.
 
@@ -294,8 +306,9 @@ class Objects(Part):
         if not self.solid:
             for center in self.centers[row]:
                 painter.zone(center, self.size, 0.01 if self.planar else 0.0, self.color)
-        lidar = self.sim.lidar(self.centers, self.planar)[row]
-        painter.halo(lidar, self.sim.lidar_azimuth(self.planar), self.color)
+        lidar = self.observe().get(f"{self.group}_lidar")
+        if lidar is not None:
+            painter.halo(lidar[row], self.sim.lidar_azimuth(self.planar), self.color)
 
     def add_geom(
         self, body: mujoco.MjsBody, kind: mujoco.mjtGeom, size: tuple[float, ...], lift: float = 0.0
@@ -338,8 +351,9 @@ class Movers(Spatial, Objects):
     """Objects that chase the robot or flee from it (Zhao et al. 2024, §4).
 
     Speeds are metres per control step under ``speed_law="unit"`` and, with the paper's equations,
-    ``"proportional"``, fractions of the distance per control step. A subclass states its
-    :meth:`law` of motion. Their z stays within ``height``.
+    ``"proportional"``, fractions of the distance per control step. Speeds that would jump to and
+    fro across what they lead to are refused. A subclass states its :meth:`law` of motion. Their z
+    stays within ``height``.
     """
 
     keepout: float | None = param(
@@ -401,6 +415,21 @@ class Movers(Spatial, Objects):
                 f"{self.name}: under speed_law 'proportional' speeds are shares of the distance "
                 f"and must be at most 1, but the fastest is {fastest:g}: lower speed, or v0, v1, v2"
             )
+        # A step of up to twice the radius at which a mover stops ends within it. Where that is 0 it
+        # goes to and fro over its aim, and by no more than its size still lies on it.
+        aims = (
+            ("the robot", law.near, 0.0),
+            ("the robot", law.far, law.r1),
+            ("the origin", law.settle, 0.0),
+            ("the origin", law.home, law.r0),
+        )
+        for aim, speed, stop in aims if law.unit else ():
+            most = max(2 * stop, self.size)
+            if speed > most:
+                raise ValueError(
+                    f"{self.name}: with {speed:g} m per control step towards {aim} they would jump "
+                    f"across it for ever: at most {most:g} m; lower speed, or v0, v1, v2"
+                )
 
     def before_step(self) -> None:
         centers = self.centers

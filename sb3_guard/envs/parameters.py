@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -116,7 +116,7 @@ class Parameters:
         parameter, the value and what is allowed
     """
 
-    name: ClassVar[str] = ""
+    name: str = ""  # what messages call it, and users the keyword that sets its parameters
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
@@ -142,16 +142,21 @@ class Parameters:
                     raise ValueError(f"{label} = {value!r} must be at most {m['high']}")
 
     @classmethod
-    def from_params(cls, params: Mapping[str, Any]) -> typing.Self:
+    def from_params(cls, params: Mapping[str, Any], name: str | None = None) -> typing.Self:
         """Make one from a mapping of parameter names to values.
 
-        :raises ValueError: an unknown name, with the nearest match
+        :param name: what it is called; None: as its class says
+        :raises ValueError: an unknown name, with the nearest match, or a bad value
         """
-        label = cls.name or cls.__name__
+        label = name or cls.name or cls.__name__
         if not isinstance(params, Mapping):
             raise ValueError(f"{label} = {params!r} must be a mapping of parameters to values")
         known = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
         for key in params:
             if key not in known:
                 raise ValueError(f"{label} has no parameter {key!r}: {did_you_mean(key, known)}")
-        return cls(**params)
+        made = cls.__new__(cls)
+        if name is not None:
+            made.name = name  # before the values are checked: it is in the messages
+        made.__init__(**params)  # type: ignore[misc]
+        return made

@@ -112,15 +112,15 @@ class Part(Parameters):
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
 
     @classmethod
-    def from_params(cls, params: Mapping[str, Any]) -> Self:
+    def from_params(cls, params: Mapping[str, Any], name: str | None = None) -> Self:
         known = {f.name for f in fields(cls)}  # type: ignore[arg-type]
         if isinstance(params, Mapping) and "space" in params and "space" not in known:
             if len(cls.spaces) == 1:
                 raise ValueError(
-                    f"{cls.name}.space = {params['space']!r} cannot be set: its space is always "
-                    f"{cls.spaces[0]}, whatever the robot's workspace; leave it out"
+                    f"{name or cls.name}.space = {params['space']!r} cannot be set: its space is "
+                    f"always {cls.spaces[0]}, whatever the robot's workspace; leave it out"
                 )
-        return super().from_params(params)
+        return super().from_params(params, name)
 
     def footprints(self) -> tuple[Footprint, ...]:
         """What has to be placed when an episode begins."""
@@ -168,6 +168,7 @@ class Part(Parameters):
 class Robot(Part):
     """What a robot answers to the other parts, none of which may ask its name."""
 
+    name = "robot"
     workspace: ClassVar[str]  # "planar" or "spatial": the default space of every other part
     timestep: ClassVar[float]  # s, of one physics step
     root: ClassVar[str]  # name of the outermost body in the compiled world

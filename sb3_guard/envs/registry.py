@@ -9,12 +9,13 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+from collections.abc import Iterable
 from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from sb3_guard.envs.part import Constraint, Robot, Task
+from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.robots.robot import MJCFRobot
 from sb3_guard.spelling import did_you_mean
 
@@ -57,6 +58,16 @@ CONSTRAINTS: dict[str, type[Constraint]] = _parts(
     "Gremlins",
 )
 
+# What else sets parameters, in the fields of a scenario that these name.
+KEYWORDS = {
+    "robot": "robot_params",
+    "task": "task_params",
+    "lidar": "lidar",
+    "layout": "layout",
+    "observe": "observe",
+}
+_OPTIONS = ("name", "scenario", "flatten", "width", "height", "camera")  # of functions that make
+
 EPISODE_STEPS = 1000  # control steps
 LADDER = (1, 2, 4, 8, 16)  # numbers of a constraint's objects, by growing difficulty
 # The named suites: every combination of these, each with eight constraint objects.
@@ -94,7 +105,9 @@ def register_robot(
         :class:`~sb3_guard.envs.robots.robot.MJCFRobot`
     :param attributes: with ``xml``, class attributes: ``timestep`` (s, of one physics step; 0.002),
         ``workspace`` (``"planar"``), ``lidar_bodies`` (``("robot",)``), ``center`` (the body whose
-        origin is the robot's position; ``"robot"``), ``reach`` (m; infinite)
+        origin is the robot's position; ``"robot"``), ``reach`` (m; infinite), ``eye`` (where its
+        camera sits and looks: body, place in m and direction there; ``("robot/robot", (0, 0, 0.1),
+        (1, 0, 0))``)
     :raises ValueError: neither or both of ``robot`` and ``xml`` are given, an attribute is unknown
         or bad, or the name is not usable
     """
@@ -108,7 +121,7 @@ def register_robot(
         file = Path(str(xml)).resolve()
         if not file.is_file():
             raise ValueError(f"robot {name!r}: there is no file {str(xml)!r}")
-        known = ["timestep", "workspace", "lidar_bodies", "center", "reach"]
+        known = ["timestep", "workspace", "lidar_bodies", "center", "reach", "eye"]
         for key in attributes:
             if key not in known:
                 raise ValueError(f"robot {name!r} has no {key!r}: {did_you_mean(key, known)}")
@@ -164,6 +177,7 @@ def register_task(name: str, task: type[Task]) -> None:
     :raises ValueError: the class is no task, or not a whole one, or the name is not usable
     """
     _check_name(name)
+    _check_keyword(name, CONSTRAINTS)
     _check_class(name, task, Task, "reward")
     _add(TASKS, name, task)
 
@@ -174,6 +188,7 @@ def register_constraint(name: str, constraint: type[Constraint]) -> None:
     :raises ValueError: the class is no constraint, or not a whole one, or the name is not usable
     """
     _check_name(name)
+    _check_keyword(name, TASKS)
     _check_class(name, constraint, Constraint, "cost")
     _add(CONSTRAINTS, name, constraint)
 
@@ -183,6 +198,19 @@ def _check_name(name: Any) -> None:
         raise ValueError(
             f"{name!r} cannot be part of an id: use letters and digits, a letter first and no "
             "underscore"
+        )
+
+
+def _check_keyword(name: str, others: Iterable[str]) -> None:
+    """Refuse a name whose lower case sets something else's parameters.
+
+    :param others: the parts of other kinds that have keywords of their own
+    """
+    key = name.lower()
+    if key in (*KEYWORDS, *_OPTIONS, *map(str.lower, others)):
+        raise ValueError(
+            f"{name!r} cannot name a part: its parameters would be set with {key}=..., which means "
+            "something else; use another name"
         )
 
 
@@ -198,6 +226,10 @@ def _check_class(name: str, part: Any, kind: type, verb: str = "") -> None:
     parameters = [
         key for key, what in inspect.get_annotations(part).items() if "ClassVar" not in str(what)
     ]
+    if "name" in parameters:
+        raise ValueError(
+            f"class {part.__name__}: name is no parameter; write it without a type, name = ..."
+        )
     decorated = "__dataclass_params__" in vars(part)
     if not dataclasses.is_dataclass(part) or (parameters and not decorated):
         unread = f": its parameters {', '.join(parameters)} are not read" if parameters else ""
@@ -209,13 +241,13 @@ def _check_class(name: str, part: Any, kind: type, verb: str = "") -> None:
         raise ValueError(f"class {part.__name__} must define {verb}(), as every {kind.__name__}")
 
 
-def _add(table: dict[str, Any], name: str, part: type) -> None:
+def _add(table: dict[str, Any], name: str, part: type[Part]) -> None:
     """Make a part known; one that is defined again, as by a notebook's cell, takes its place."""
     for other, known in table.items():
         if name.lower() == other.lower() and not (name == other and _same(part, known)):
             raise ValueError(f"{other!r} is known already, as another class: use another name")
-    if not part.name:  # type: ignore[attr-defined]
-        part.name = name.lower()  # type: ignore[attr-defined]
+    if "name" not in vars(part) and not issubclass(part, Robot):
+        part.name = name.lower()
     table[name] = part
 
 

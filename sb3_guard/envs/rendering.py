@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from sb3_guard.envs.layout import ARENA
+
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine
     from sb3_guard.envs.part import Robot
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
 Array = np.ndarray
 CAMERAS = ("fixed", "track", "top")
 COST_COLOR = (1.0, 0.1, 0.1)
+HALO, HALO_STEP = 0.15, 0.06  # m, radius of the first halo, and how much wider each other one is
+BEAD = 0.02  # m, radius
+_FRUSTUM = [f"frustum_{side}" for side in ("near", "far", "width", "center", "bottom", "top")]
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 _CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
 
@@ -88,12 +93,25 @@ def gl_backend() -> str:
 
 
 class ScenePainter:
-    """Adds see-through shapes to a scene, for :meth:`sb3_guard.envs.part.Part.draw`."""
+    """Adds see-through shapes to a scene, for :meth:`sb3_guard.envs.part.Part.draw`.
 
-    def __init__(self, scene: mujoco.MjvScene, engine: Engine, row: int) -> None:
-        self._scene = scene
-        self._row = row
-        self._robot = engine.robot
+    :param scene: what they are added to
+    :param engine: whose parts draw
+    :param data: one row's state
+    :param row: which row
+    :param explain: whether to draw halos: they are no things in the world
+    """
+
+    def __init__(
+        self,
+        scene: mujoco.MjvScene,
+        engine: Engine,
+        data: mujoco.MjData,
+        row: int,
+        explain: bool = True,
+    ) -> None:
+        self._scene, self._engine, self._data, self._row = scene, engine, data, row
+        self._explain = explain
         self._halos = 0
 
     def zone(
@@ -105,28 +123,40 @@ class ScenePainter:
             kind, (radius, half_height or radius, half_height or radius), center, (*color, 0.3)
         )
 
+    @functools.cached_property
+    def _first_halo(self) -> tuple[Array, Array, Array]:
+        """Its centers [B, 3] m, the rotations [B, 3, 3] of the lidar bodies, its radii [B] m."""
+        robot, model = self._engine.robot, self._engine.model
+        origin, rotation = robot.frames
+        # above robots on the floor, where it can be seen
+        centers = origin[self._row] + [0.0, 0.0, 0.25 if robot.workspace == "planar" else 0.0]
+        thick = _thickness(model, self._data, _geoms_below(model, robot.root), centers)
+        return centers, rotation[self._row], np.maximum(HALO, thick + 1.5 * BEAD)
+
     def halo(self, closeness: Array, azimuth: int, color: tuple[float, ...]) -> None:
         """Beads around each lidar body, the more solid the closer what they show.
+
+        The first halo has a radius of 15 cm, or more where the robot itself would hide it; each
+        other one is 6 cm wider.
 
         :param closeness: [bodies · azimuth · elevation]
         :param azimuth: bins around
         :param color: red, green, blue
         """
-        origin, rotation = self._robot.frames
-        planar = self._robot.workspace == "planar"
-        radius = 0.15 + 0.06 * self._halos
+        if not self._explain:
+            return
+        centers, rotations, radii = self._first_halo
+        radii = radii + HALO_STEP * self._halos
         self._halos += 1
-        beads = np.asarray(closeness).reshape(origin.shape[1], azimuth, -1)
+        beads = np.asarray(closeness).reshape(len(radii), azimuth, -1)
         for b, a, e in np.ndindex(*beads.shape):
             turn = (a + 0.5) * 2 * math.pi / azimuth
             rise = (e + 0.5) * math.pi / beads.shape[2] - math.pi / 2
             ray = np.array(
                 [math.cos(turn) * math.cos(rise), math.sin(turn) * math.cos(rise), math.sin(rise)]
             )
-            at = origin[self._row, b] + rotation[self._row, b] @ (radius * ray)
-            if planar:  # above the robot, where it can be seen
-                at = at + np.array([0, 0, 0.25])
-            self._add(_SPHERE, (0.02,) * 3, at, (*color, 0.08 + 0.92 * float(beads[b, a, e])))
+            at = centers[b] + rotations[b] @ (radii[b] * ray)
+            self._add(_SPHERE, (BEAD,) * 3, at, (*color, 0.08 + 0.92 * float(beads[b, a, e])))
 
     def glow(self, center: Array) -> None:
         """The tint of a robot that pays a cost."""
@@ -155,7 +185,9 @@ class Renderer:
     :param engine: whose rows to draw
     :param width: pixels
     :param height: pixels
-    :param camera: ``"fixed"``, ``"track"`` (follows the robot) or ``"top"``
+    :param camera: ``"fixed"``, ``"track"`` (follows the robot) or ``"top"``, of which the first and
+        the last show the arena and all placements and locations; or a camera of the model by name,
+        which sees what is in the world: neither halos nor the tint of a cost
     :param mode: ``"rgb_array"`` or ``"human"``
     :raises RenderingError: no OpenGL backend works, or there is no display for ``"human"``
     """
@@ -173,6 +205,9 @@ class Renderer:
         self._human = mode == "human"
         self._camera = mujoco.MjvCamera()
         self._follows = camera == "track"
+        self._explain = camera in CAMERAS
+        self._whole = self._explain and not self._follows  # shows the whole arena
+        self._center, self._scale = _arena(engine)
         if self._follows:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
             self._camera.azimuth, self._camera.elevation = 90.0, -30.0
@@ -193,7 +228,8 @@ class Renderer:
                 engine.model, self._data, show_left_ui=False, show_right_ui=False
             )
             eye = self._viewer.cam  # the whole arena at first; the mouse moves it
-            eye.lookat[:], eye.distance, eye.azimuth, eye.elevation = 0.0, 6.5, 90.0, -42.0
+            eye.lookat[:], eye.distance = self._center, 6.5 * self._scale
+            eye.azimuth, eye.elevation = 90.0, -42.0
             return
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(engine.model, maxgeom=4000)
@@ -203,8 +239,10 @@ class Renderer:
         self._gl = gl.GLContext(width, height)
         self._gl.make_current()
         visual = engine.model.vis.global_
-        visual.offwidth, visual.offheight = max(width, 1920), max(height, 1440)
+        largest = visual.offwidth, visual.offheight
+        visual.offwidth, visual.offheight = width, height  # no larger buffers than these are needed
         self._context = mujoco.MjrContext(engine.model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        visual.offwidth, visual.offheight = largest
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
     def render(self, row: int) -> Array | None:
@@ -227,6 +265,9 @@ class Renderer:
             low, high = places.min(axis=0), places.max(axis=0)
             self._camera.lookat[:] = (low + high) / 2
             self._camera.distance = 1.6 + 1.2 * float(np.linalg.norm(high - low))
+        elif self._whole:
+            camera = self._camera.fixedcamid
+            self._data.cam_xpos[camera] = self._center + self._scale * engine.model.cam_pos[camera]
         self._gl.make_current()
         mujoco.mjv_updateScene(
             engine.model,
@@ -237,16 +278,20 @@ class Renderer:
             mujoco.mjtCatBit.mjCAT_ALL,
             self._scene,
         )
+        if self._whole:  # depth is seen as finely, for its distance, as in the default arena
+            for view in self._scene.camera:
+                for side in _FRUSTUM:
+                    setattr(view, side, self._scale * getattr(view, side))
         self._paint(self._scene, row)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
         return self._pixels[::-1].copy()
 
     def _paint(self, scene: mujoco.MjvScene, row: int) -> None:
-        painter = ScenePainter(scene, self._engine, row)
+        painter = ScenePainter(scene, self._engine, self._data, row, self._explain)
         for part in self._engine.parts:
             part.draw(painter, row)
-        if any(c.cost()[row] > 0 for c in self._engine.constraints):
+        if self._explain and any(c.cost()[row] > 0 for c in self._engine.constraints):
             painter.glow(self._engine.robot.position[row])
 
     def close(self) -> None:
@@ -266,6 +311,35 @@ def _geoms_below(model: mujoco.MjModel, body: str) -> list[int]:
         if int(model.body_parentid[child]) in below:
             below.add(child)
     return [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in below]
+
+
+def _thickness(
+    model: mujoco.MjModel, data: mujoco.MjData, geoms: list[int], points: Array
+) -> Array:
+    """How thick the geoms around each point are, by the thickest; 0 where there is none, [B] m.
+
+    :param points: [B, 3] m
+    """
+    rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    offset = points[:, None] - data.geom_xpos[geoms]  # [B, G, 3]
+    middle, half = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]  # in the geoms' frames
+    inside = np.abs(np.einsum("gij,bgi->bgj", rotation, offset) - middle) <= half
+    thick: Array = np.where(inside.all(axis=2), half.min(axis=1), 0.0).max(axis=1, initial=0.0)
+    return thick
+
+
+def _arena(engine: Engine) -> tuple[Array, float]:
+    """Middle, [3] m, and size, in default arenas, of what holds all placements and locations.
+
+    The default arena belongs to it: movers and arms are at home at the origin.
+    """
+    boxes = list(ARENA)
+    for footprint in engine.footprints.values():
+        boxes += footprint.placements
+        boxes += [(x, y, x, y) for x, y in footprint.locations]
+    low, high = np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]
+    side = ARENA[0][2] - ARENA[0][0]
+    return np.append((low + high) / 2, 0.0), float((high - low).max() / side)
 
 
 def show_robot(robot: Robot) -> None:

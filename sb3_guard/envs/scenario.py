@@ -16,7 +16,7 @@ import numpy as np
 
 from sb3_guard.envs.engine import Engine, Layout
 from sb3_guard.envs.extras import Extras
-from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.envs.registry import CONSTRAINTS, KEYWORDS, ROBOTS, TASKS
 from sb3_guard.envs.sensors import Lidar
 from sb3_guard.spelling import did_you_mean, nearest
 
@@ -25,6 +25,7 @@ _ID = re.compile(
     r"_(?P<num>\d+)(?P<constraint>[A-Za-z][A-Za-z0-9]*)(?P<noconti>_noconti)?(-v0)?"
 )
 Params = Mapping[str, Any]
+_OWN_NAME = "a constraint under a name of its own states its type, such as {'type': 'hazards'}"
 
 
 def _plain(value: Any) -> Any:
@@ -103,7 +104,12 @@ class Scenario:
         known = list(cls.__dataclass_fields__)
         for key in data:
             if key not in known:
-                raise ValueError(f"{label} has no key {key!r}: {did_you_mean(key, known)}")
+                hint = did_you_mean(key, known)
+                if str(key).lower() in map(str.lower, TASKS):
+                    hint = "the task's parameters go into task_params"
+                elif str(key).lower() in map(str.lower, CONSTRAINTS):
+                    hint = f"write constraints: {{{str(key).lower()}: {{...}}}}"
+                raise ValueError(f"{label} has no key {key!r}: {hint}")
         return cls(**data)
 
     @classmethod
@@ -153,12 +159,16 @@ class Scenario:
 
         What is left blank has its default.
 
-        :raises ValueError: the file is missing, is not YAML or holds unknown keys
+        :raises ValueError: the file is missing, is not YAML in UTF-8 or holds unknown keys
         """
         import yaml
 
         try:
-            data = yaml.safe_load(Path(path).read_text())
+            data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        except UnicodeDecodeError:
+            raise ValueError(
+                f"cannot read scenario {str(path)!r}: it is not text in UTF-8; save it as such"
+            ) from None
         except (OSError, yaml.YAMLError) as error:
             detail = " ".join(str(error).split())
             raise ValueError(f"cannot read scenario {str(path)!r}: {detail}") from None
@@ -195,14 +205,7 @@ class Scenario:
         :raises ValueError: an unknown keyword or parameter
         """
         changes: dict[str, Any] = {"constraints": dict(self.constraints)}
-        own = {
-            "robot": "robot_params",
-            self.task.lower(): "task_params",
-            "task": "task_params",
-            "lidar": "lidar",
-            "layout": "layout",
-            "observe": "observe",
-        }
+        own = {**KEYWORDS, self.task.lower(): "task_params"}
         kinds = {name.lower() for name in CONSTRAINTS}
         tasks = {name.lower(): name for name in TASKS}
         for key, value in params.items():
@@ -230,7 +233,9 @@ class Scenario:
                 )
             else:
                 known = [*own, *sorted(kinds)]
-                raise ValueError(f"unknown parameter {key!r}: {did_you_mean(key, known)}")
+                raise ValueError(
+                    f"unknown parameter {key!r}: {did_you_mean(key, known)}; {_OWN_NAME}"
+                )
         return replace(self, **changes)
 
     def parts(self) -> dict[str, Any]:
@@ -239,7 +244,7 @@ class Scenario:
         :raises ValueError: an unknown name, a bad value, or a constraint's name that cannot be used
         """
         by_name = {name.lower(): cls for name, cls in CONSTRAINTS.items()}
-        taken = (self.task.lower(), "robot", "task", "lidar", "layout", "observe")
+        taken = (self.task.lower(), *KEYWORDS)
         constraints = []
         for name, params in self.constraints.items():
             if not name.isidentifier() or not name.isascii():
@@ -247,7 +252,9 @@ class Scenario:
                     f"constraint {name!r}: its cost is called 'cost_<name>', so the name must be "
                     "of letters, digits and underscores, no digit first"
                 )
-            if name in taken:
+            if name.lower() in by_name and name not in by_name:
+                raise ValueError(f"constraint {name!r}: write {name.lower()!r}, in lower case")
+            if name.lower() in taken:
                 raise ValueError(
                     f"constraint {name!r}: this is what the parameters of another part are called "
                     f"({', '.join(taken)}); give it another name"
@@ -258,21 +265,23 @@ class Scenario:
                     "{'num': 8}"
                 )
             params = dict(params)
+            named = "type" not in params
             kind = str(params.pop("type", name)).lower()
             if kind not in by_name:
-                raise ValueError(f"unknown constraint {kind!r}: {did_you_mean(kind, by_name)}")
+                hint = did_you_mean(kind, by_name)
+                if named:
+                    raise ValueError(f"unknown constraint {name!r}: {hint}; {_OWN_NAME}")
+                raise ValueError(f"{name}.type = {kind!r}: {hint}")
             if name in by_name and kind != name:
                 raise ValueError(
                     f"constraint {name!r} cannot be of type {kind!r}, since {name!r} is a type "
                     f"itself: to have {kind} instead, write {name}=None and {kind}={{...}}; to "
                     f"have both, {kind}={{...}}"
                 )
-            constraint = by_name[kind].from_params(params)
-            constraint.name = name  # type: ignore[misc]
-            constraints.append(constraint)
+            constraints.append(by_name[kind].from_params(params, name))
         return {
-            "robot": ROBOTS[self.robot].from_params(self.robot_params),
-            "task": TASKS[self.task].from_params(self.task_params),
+            "robot": ROBOTS[self.robot].from_params(self.robot_params, "robot"),
+            "task": TASKS[self.task].from_params(self.task_params, self.task.lower()),
             "constraints": constraints,
             "lidar": Lidar.from_params(self.lidar),
             "layout": Layout.from_params(self.layout),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -54,7 +55,8 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
     ``infos["cost_<type>"]`` hold the costs of the step for every row.
 
     :param num_envs: number of environments N
-    :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario` or its plain data
+    :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario`, its plain data or its
+        YAML file
     :param max_episode_steps: control steps after which an episode is cut
     :param num_threads: threads that step the physics; by default one per CPU, at most N. The
         results do not depend on it
@@ -72,7 +74,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: str | Mapping[str, Any] | Scenario = "Goal_Point_8Hazards",
+        scenario: str | Path | Mapping[str, Any] | Scenario = "Goal_Point_8Hazards",
         max_episode_steps: int = EPISODE_STEPS,
         num_threads: int | None = None,
         render_mode: str | None = None,

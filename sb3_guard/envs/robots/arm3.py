@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.arm import Arm
+from sb3_guard.envs.robots.robot import PREFIX
 
 
 @dataclass
@@ -18,6 +19,7 @@ class Arm3(Arm):
     links = tuple(f"link_{k}" for k in range(1, 6))
     lidar_bodies = links[::2]
     center = links[-1]
+    eye = (PREFIX + links[-1], (0.0, 0.16, 0.0), (0.0, 1.0, 0.0))
 
 
 if __name__ == "__main__":

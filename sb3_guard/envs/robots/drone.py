@@ -18,6 +18,7 @@ class Drone(MJCFRobot):
     asset = "drone.xml"
     timestep = 0.008
     workspace = "spatial"
+    eye = (MJCFRobot.root, (0.35, 0.0, 0.0), (1.0, 0.0, 0.0))  # before the front propeller
 
 
 if __name__ == "__main__":

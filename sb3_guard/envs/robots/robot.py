@@ -31,6 +31,7 @@ from sb3_guard.envs.part import Array, Generators, Robot, Simulation, World
 from sb3_guard.envs.sensors import Channel
 from sb3_guard.spelling import did_you_mean
 
+Vector = tuple[float, float, float]
 PREFIX = "robot/"
 _SENSOR = mujoco.mjtSensor
 
@@ -110,6 +111,9 @@ class MJCFRobot(Robot):
     )
 
     root: ClassVar[str] = PREFIX + "robot"
+    # the camera that can be observed: on which body of the world it sits, where on it, m, and which
+    # way it looks, both in the body's frame, whose z axis points up in the image
+    eye: ClassVar[tuple[str, Vector, Vector]] = (root, (0.0, 0.0, 0.1), (1.0, 0.0, 0.0))
 
     @classmethod
     def path(cls) -> Path:

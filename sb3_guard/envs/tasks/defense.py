@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_guard.envs import geometry, motion
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Painter, World
+from sb3_guard.envs.part import Array, Painter
 from sb3_guard.envs.tasks.targets import Targets
 
 WHITE = (0.95, 0.95, 0.95)
@@ -33,13 +33,9 @@ class Defense(Targets):
     reward_outside: float = param(0.1, "reward for each target outside the circle")
 
     def law(self) -> motion.Law:
-        r1 = self.r1 if self.r1 is not None else 2.0 if self._flat else 2.5
+        r1 = self.r1 if self.r1 is not None else 2.0 if self.planar else 2.5
         v2 = self.speed if self.v2 is None else self.v2
         return self._law(near=-self.flight, settle=v2, r1=r1)
-
-    def build(self, world: World) -> None:
-        super().build(world)
-        self._flat = world.robot.workspace == "planar"
 
     def measure(self) -> Array:
         """Distances of the targets from the origin in the plane, [N, num] m."""

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs import geometry
-from sb3_guard.envs.layout import Footprint
+from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.objects import BOX, SPHERE, Bodies, add_geom, check_cover
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Generators, Simulation, World
+from sb3_guard.envs.part import Array, Generators, Painter, Simulation, World
 from sb3_guard.envs.sensors import Channel
 from sb3_guard.envs.tasks.destination import Destination
 
@@ -47,6 +47,12 @@ class Push(Destination):
         None, "radius kept clear around the object, m; null: what covers it", low=0
     )
     object_locations: tuple[tuple[float, float], ...] = param((), "fixed place, one (x, y), m")
+    object_placements: tuple[Rectangle, ...] = param(
+        (), "rectangles to draw the object from, m; empty: placements"
+    )
+    object_margin: float | None = param(
+        None, "extra distance of the object to every other one, m; null: margin", low=0
+    )
     null_distance: float = param(
         2.0, "object sizes from which on nearing the object is not rewarded", low=0
     )
@@ -56,7 +62,7 @@ class Push(Destination):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.object_keepout is not None:
-            check_cover("push.object_keepout", self.object_keepout, self.object_radius)
+            check_cover(f"{self.name}.object_keepout", self.object_keepout, self.object_radius)
 
     def footprints(self) -> tuple[Footprint, ...]:
         return (
@@ -65,9 +71,9 @@ class Push(Destination):
                 self.object,
                 1,
                 self.object_radius if self.object_keepout is None else self.object_keepout,
-                self.placements,
+                self.object_placements or self.placements,
                 self.object_locations,
-                self.margin,
+                self.margin if self.object_margin is None else self.object_margin,
                 reach=self._reach,
                 base=self._base,
             ),
@@ -107,8 +113,8 @@ class Push(Destination):
         far = sim.farthest("goal", self.object)
         if self.size >= far:
             raise ValueError(
-                f"push.size = {self.size} holds the {self.object} wherever an episode begins: it "
-                f"is at most {far:.2f} m away; make size smaller, or placements larger"
+                f"{self.name}.size = {self.size} holds the {self.object} wherever an episode "
+                f"begins: it is at most {far:.2f} m away; make size smaller, or placements larger"
             )
 
     def reset(self, ids: Array, rngs: Generators) -> None:
@@ -140,3 +146,9 @@ class Push(Destination):
         if self.object_lidar:
             out["box_lidar"] = self.sim.lidar_channel(self.planar)
         return out
+
+    def draw(self, painter: Painter, row: int) -> None:
+        super().draw(painter, row)
+        if self.object_lidar:
+            closeness = self.sim.lidar(self.center[:, None], self.planar)[row]
+            painter.halo(closeness, self.sim.lidar_azimuth(self.planar), YELLOW)

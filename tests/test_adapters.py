@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import types
+import warnings
 from pathlib import Path
 
 import cloudpickle
@@ -18,7 +19,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import DependencyNotInstalled, NameNotFound
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.env_util import make_vec_env as sb3_make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_guard import CPO, TRPO, CostMonitor, evaluate_policy, make_vec_env
 from sb3_guard.common.adapters import (
@@ -305,6 +307,37 @@ def test_every_kind_of_number_is_a_cost(kind):
         assert len(play(wrapper(one(), budget=9), 8)) == 8
 
 
+def test_environments_may_report_different_kinds_of_numbers():
+    kinds = (float, np.array, lambda cost: np.array([cost]))
+    envs = [
+        lambda kind=kind: Scripted([{"a": kind(i % 2), "b": 2.0} for i in range(8)])
+        for kind in kinds
+    ]
+    keys = ("a", "b")
+    env = CostMonitor(DummyVecEnv(envs), cost_keys=keys)
+    model = CPO("MlpPolicy", env, cost_keys=keys, **SMALL).learn(96)
+    np.testing.assert_array_equal(model.total_costs, [48, 192])
+    np.testing.assert_array_equal(evaluate_policy(model, env, 3).key_costs, [[4, 16]] * 3)
+
+
+@pytest.mark.parametrize("value", [np.array([1.0, 2.0]), np.array(["1.5"])])
+def test_other_arrays_are_no_costs(value):
+    model = CPO("MlpPolicy", Scripted([{"cost": value}] * 8), **SMALL)
+    with pytest.raises(ValueError, match=r"environment 0 is .*: a cost must be a finite number"):
+        model.learn(32)
+
+
+@pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
+def test_a_time_limit_is_seen_around_an_environment_without_a_spec(kind):
+    def one():
+        return gym.wrappers.TimeLimit(CostPoint(10**6), 500)
+
+    env = kind([one, one], **({"start_method": "fork"} if kind is SubprocVecEnv else {}))
+    model = CPO("MlpPolicy", env, **SMALL).learn(64)
+    assert model.costs.horizon == 500
+    env.close()
+
+
 COSTS = [{"cost": cost} for cost in (0.0, 1.0, 0.5, 0.5, 1.0, 0.0)]
 
 
@@ -354,6 +387,25 @@ def test_overspending_ends_the_episode(budget, end):
             if terminated:
                 break
         assert truncated == (end is None)
+
+
+def test_ending_episodes_outside_a_monitor_is_warned_about_and_they_are_counted_all_the_same():
+    def wrapped(make, **kwargs):
+        return make(lambda: Scripted(COSTS), 2, **kwargs)
+
+    with pytest.warns(UserWarning, match="wrap the environment before its monitor"):
+        outside = wrapped(
+            sb3_make_vec_env, wrapper_class=EarlyTermination, wrapper_kwargs={"budget": 1.0}
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        inside = wrapped(make_vec_env, wrapper_class=lambda env: EarlyTermination(env, 1.0))
+    model = TRPO("MlpPolicy", inside, **SMALL)
+    for env in (outside, inside):
+        played = evaluate_policy(model, env, 4, max_steps=100)
+        assert played.lengths.tolist() == [3] * 4
+        assert played.returns.tolist() == [3.0] * 4
+        assert played.costs.tolist() == [1.5] * 4
 
 
 def test_other_costs_than_the_total_can_be_counted():

@@ -454,6 +454,18 @@ def test_bad_values_are_named(kwargs: dict[str, Any], message: str) -> None:
         small(CPO, points(1), **kwargs)
 
 
+def test_a_limit_set_later_is_the_limit() -> None:
+    model = small(CPO, points(2, hazard=(-1.0, 0.0)), n_critic_updates=1)
+    for limit in (2.0, [7]):
+        model.cost_limit = limit
+        model.learn(80)
+        excess = model.costs.episode_cost - np.ravel(limit)
+        np.testing.assert_allclose(model.costs.violation, excess / 30)
+    model.cost_limit = -3
+    with pytest.raises(ValueError, match="cost_limit=-3: must be at least 0, as costs are"):
+        model.learn(80)
+
+
 @pytest.mark.parametrize("value", [-1, True, np.inf, "much"])
 def test_a_bad_cost_reduction_is_named(value: Any) -> None:
     with pytest.raises(ValueError, match=f"cost_reduction={value!r}: must be a number in"):

@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 import torch as th
 from cost_envs import CostPoint
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
+)
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_guard.algorithms import CPO, TRPO
+from sb3_guard.common import callbacks
 from sb3_guard.common.callbacks import CostEvalCallback
-from sb3_guard.common.evaluation import Evaluation
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.monitor import CostMonitor
 
 
@@ -20,6 +25,11 @@ def envs(n: int = 2, **kwargs) -> CostMonitor:
     keys = kwargs.get("cost_keys", ("cost",))
     make = [lambda: CostPoint(episode_length=10, **kwargs)] * n
     return CostMonitor(DummyVecEnv(make), cost_keys=keys)
+
+
+class StopAtOnce(BaseCallback):
+    def _on_step(self):
+        return False
 
 
 def evaluation(mean_return: float, *costs: float) -> Evaluation:
@@ -73,6 +83,48 @@ def test_unconstrained_algorithms_are_judged_by_return():
     )
 
 
+def test_a_cost_of_nan_is_not_safe():
+    assert callback(cost_limit=5.0).score(evaluation(7.0, np.nan))[0] is False
+
+
+@pytest.mark.parametrize("limit", [[1.0, 2.0], [], np.nan, [[1.0]]])
+def test_a_limit_that_does_not_fit_is_refused_before_training(limit):
+    model = CPO("MlpPolicy", envs(), n_steps=20)
+    with pytest.raises(ValueError, match=r"selection_limit=.*each of the 1 cost keys \('cost',\)"):
+        model.learn(20, callback=CostEvalCallback(envs(), selection_limit=limit))
+
+
+@pytest.mark.parametrize("vectorised", [True, False])
+def test_the_training_environment_is_refused(vectorised):
+    env = CostPoint(episode_length=10)
+    model = CPO("MlpPolicy", env, n_steps=20)
+    with pytest.raises(ValueError, match="eval_env is the training environment"):
+        model.learn(20, callback=CostEvalCallback(model.env if vectorised else env))
+
+
+#: (return, cost) of nine evaluations: six models ever less unsafe, then three safe ones
+COURSE = [(60, 90), (50, 80), (40, 70), (30, 60), (20, 50), (10, 40), (8, 4), (9, 4), (7, 2)]
+
+
+@pytest.mark.parametrize(
+    ("stop", "evaluations"),
+    [
+        ({"callback_after_eval": StopTrainingOnNoModelImprovement(3)}, 9),
+        ({"callback_after_eval": StopTrainingOnNoModelImprovement(0)}, 9),
+        ({"callback_on_new_best": StopTrainingOnRewardThreshold(55.0)}, 9),
+        ({"callback_on_new_best": StopTrainingOnRewardThreshold(8.5)}, 8),
+    ],
+)
+def test_sb3s_stopping_callbacks_follow_the_best_model(monkeypatch, stop, evaluations):
+    course = iter(COURSE)
+    monkeypatch.setattr(callbacks, "evaluate_policy", lambda *_, **__: evaluation(*next(course)))
+    model = CPO("MlpPolicy", envs(), n_steps=45, n_critic_updates=1, cost_limit=5.0)
+    watcher = CostEvalCallback(envs(), eval_freq=5, verbose=0, **stop)
+    model.learn(90, callback=watcher)
+    assert len(watcher.evaluations_costs) == evaluations
+    assert watcher.best_score == (True, 9.0) and watcher.best_mean_reward == 9.0
+
+
 def learn(tmp_path, algorithm=CPO, evaluate=True, env=None, steps=120, **kwargs):
     model = algorithm("MlpPolicy", env or envs(), n_steps=20, n_critic_updates=2, seed=3)
     watcher = CostEvalCallback(
@@ -98,7 +150,8 @@ def test_history_has_costs(tmp_path):
     assert not list(tmp_path.glob(".*"))  # nothing half-written
 
 
-def test_logs_the_cost(tmp_path):
+def logged_rows(model) -> list[dict]:
+    """What a model logs from now on, a dictionary per dump."""
     rows = []
 
     class Recorder(Logger):
@@ -106,15 +159,43 @@ def test_logs_the_cost(tmp_path):
             rows.append(dict(self.name_to_value))
             super().dump(step)
 
+    model.set_logger(Recorder(None, []))
+    return rows
+
+
+def test_logs_the_costs(tmp_path):
     keys = ("cost", "heat")
     model = CPO("MlpPolicy", envs(cost_keys=keys), n_steps=20, cost_keys=keys, n_critic_updates=2)
-    model.set_logger(Recorder(None, []))
-    watcher = CostEvalCallback(envs(cost_keys=keys), eval_freq=15, verbose=0)
+    rows = logged_rows(model)
+    watcher = CostEvalCallback(
+        envs(cost_keys=keys, hazard=(-1, 0)), eval_freq=15, log_path=tmp_path, verbose=0
+    )
     model.learn(40, callback=watcher)
     (row,) = [row for row in rows if "eval/mean_reward" in row]
-    assert row["eval/mean_ep_cost"] == row["eval/mean_ep_cost/cost"] == watcher.last_mean_cost
+    assert row["eval/mean_ep_cost"] == row["eval/mean_ep_cost/cost"] == watcher.last_mean_cost > 0
     assert row["eval/mean_ep_cost/heat"] == pytest.approx(2 * row["eval/mean_ep_cost"])
     assert row["time/total_timesteps"] == 30
+    costs = np.load(tmp_path / "evaluations.npz")["key_costs"]
+    assert costs.shape == (1, 5, 2)
+    np.testing.assert_allclose(costs[..., 1], 2 * costs[..., 0])
+
+
+def test_the_one_cost_that_is_limited_is_the_one_shown(tmp_path, capsys):
+    # The environment has a total as well, twice as high.
+    env, other = (envs(cost_keys=("heat", "cost"), hazard=(-1, 0)) for _ in range(2))
+    model = CPO("MlpPolicy", env, n_steps=20, cost_keys=("heat",), seed=0)
+    rows = logged_rows(model)
+    watcher = CostEvalCallback(
+        other, eval_freq=15, callback_after_eval=StopAtOnce(), log_path=tmp_path
+    )
+    model.learn(40, callback=watcher)
+    heat, total = evaluate_policy(
+        model, other, 5, seed=0, cost_keys=("heat", "cost")
+    ).key_costs.mean(axis=0)
+    assert total == pytest.approx(2 * heat) and heat > 0
+    assert rows[0]["eval/mean_ep_cost"] == watcher.last_mean_cost == heat
+    assert np.load(tmp_path / "evaluations.npz")["costs"].mean() == pytest.approx(heat)
+    assert f"heat {heat:.2f} ± " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
@@ -148,10 +229,6 @@ def test_callbacks_on_new_best_and_after_eval(tmp_path):
     class Count(BaseCallback):
         def _on_step(self):
             return True
-
-    class StopAtOnce(Count):
-        def _on_step(self):
-            return False
 
     best, after = Count(), Count()
     learn(tmp_path, callback_on_new_best=best, callback_after_eval=after)

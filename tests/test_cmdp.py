@@ -234,16 +234,20 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
     assert all(th.isfinite(each).all() for each in model.policy.parameters())
 
 
+@pytest.mark.filterwarnings("ignore:TRPOUSL met costs below zero")
 @pytest.mark.parametrize(
-    ("cls", "kwargs"),
+    ("cls", "share", "kwargs"),
     [
-        (TRPOFAC, {"lambda_lr": 0.03, "lambda_init": 1.0}),
-        (TRPOSL, {"warmup": 0.3, "drift": True}),
-        (TRPOUSL, {"warmup": 0.3, "rate": 0.1}),
+        # Its multipliers still circle the saddle point, see above.
+        (TRPOFAC, None, {"lambda_lr": 0.03, "lambda_init": 1.0}),
+        (TRPOSL, 0.95, {"warmup": 0.3, "drift": True}),
+        (TRPOUSL, 0.7, {"warmup": 0.3, "rate": 0.1}),
     ],
 )
-def test_several_limits_are_kept(cls: type[TrustRegion], kwargs: dict[str, Any]) -> None:
-    """Alone the policy would be on its way to costs of 1.5 and 1.1."""
+def test_several_limits_are_kept(
+    cls: type[TrustRegion], share: float | None, kwargs: dict[str, Any]
+) -> None:
+    """With a share of the best return. Alone the policy is on its way to costs of 1.5 and 1.1."""
     limits = [0.5, 0.4]
     costs: list[np.ndarray] = []
     model = cls(
@@ -265,6 +269,9 @@ def test_several_limits_are_kept(cls: type[TrustRegion], kwargs: dict[str, Any])
     model.learn(256 * 15)
     last = np.mean(costs[-3:], axis=0)
     assert np.all(last <= 1.02 * np.array(limits)) and np.all(last > 0.0)
+    if share is not None:
+        returns = [episode["r"] for episode in model.ep_info_buffer]  # the last hundred
+        assert np.mean(returns) >= share * 0.42
     if cls is TRPOSL:  # the cost is linear, and the layer exact
         np.testing.assert_allclose(last, limits, rtol=0.02)
 

@@ -8,7 +8,7 @@ from cost_envs import CostPoint
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_guard.algorithms import CPO
+from sb3_guard.algorithms import CPO, TRPOSL
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.monitor import CostMonitor
 
@@ -152,6 +152,71 @@ def test_costs_of_one_element_count_like_numbers():
     step = env.envs[0].step
     env.envs[0].step = lambda action: (*step(action)[:4], {"cost": np.array([10.0])})
     assert evaluate_policy(Idle(), env, n_eval_episodes=2).key_costs.tolist() == [[20.0], [20.0]]
+
+
+class Costs(gym.Wrapper):
+    """Reports other costs instead of the cost c of a step."""
+
+    def __init__(self, env, report) -> None:
+        super().__init__(env)
+        self.report = report
+
+    def step(self, action):
+        *rest, info = self.env.step(action)
+        return *rest, self.report(info["cost"])
+
+
+@pytest.mark.parametrize(
+    ("report", "message"),
+    [
+        (lambda c: {"cost": c if c < 20 else np.nan}, "is nan: a cost must be a finite number"),
+        (lambda c: {"costs": c}, "no cost key 'cost'.*nearest: 'costs'"),
+    ],
+)
+def test_costs_are_read_as_strictly_as_in_training(report, message):
+    env = Costs(Fixed(3), report)
+    model = CPO("MlpPolicy", Fixed(3), n_steps=20)
+    with pytest.raises(ValueError, match=message):
+        evaluate_policy(model, env, 2)
+
+
+def test_an_absent_cost_is_none_where_the_model_says_so_or_knows_of_no_costs():
+    env = Costs(Fixed(3), lambda c: {"cost": c} if c == 30 else {})
+    lenient = CPO("MlpPolicy", env, n_steps=20, missing_cost="zero")
+    for model in (lenient, Idle()):
+        assert evaluate_policy(model, DummyVecEnv([lambda: env]), 2).costs.tolist() == [30, 30]
+
+
+def test_the_cost_is_that_of_the_one_key_and_of_several_the_total():
+    env = DummyVecEnv([lambda: Costs(Fixed(3), lambda c: {"cost": 9 * c, "a": c, "b": 2 * c})])
+    one, two = (evaluate_policy(Idle(), env, 1, cost_keys=keys) for keys in (("a",), ("a", "b")))
+    assert (one.costs.tolist(), one.key_costs.tolist()) == ([60], [[60]])
+    assert (two.costs.tolist(), two.key_costs.tolist()) == ([540], [[60, 120]])
+
+
+@pytest.mark.parametrize("vectorised", [True, False])
+def test_training_goes_on_with_new_episodes_after_an_evaluation_in_its_environment(vectorised):
+    env = Fixed(30)
+    model = CPO("MlpPolicy", env, n_steps=40, n_critic_updates=1, seed=0).learn(40)
+    assert model.running_lengths.tolist() == [10]
+    evaluate_policy(model, fixed(7), 1)
+    model.learn(20, reset_num_timesteps=False)
+    assert model.running_lengths.tolist() == [20]  # another one's episodes change nothing
+    evaluate_policy(model, model.env if vectorised else env, 1)
+    model.learn(40, reset_num_timesteps=False)
+    assert (model.costs.horizon, model.costs.episode_cost.tolist()) == (30, [4650])
+    model.learn(40, reset_num_timesteps=False)
+    assert model.running_lengths.tolist() == [20]  # once is enough
+
+
+def test_a_policy_of_several_costs_wants_their_names():
+    keys = ("cost", "cost_1")
+    env = DummyVecEnv([lambda: CostPoint(10, cost_keys=keys)])
+    model = TRPOSL("MlpPolicy", env, n_steps=20, cost_keys=keys, warmup=0, seed=0)
+    with pytest.raises(ValueError, match=r"cost_keys=\('cost',\): the policy acts on 2 costs"):
+        evaluate_policy(model.policy, env, 2, seed=1)
+    alone = evaluate_policy(model.policy, env, 2, seed=1, cost_keys=keys)
+    np.testing.assert_array_equal(alone.key_costs, evaluate_policy(model, env, 2, seed=1).key_costs)
 
 
 def test_an_evaluation_in_words():

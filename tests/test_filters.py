@@ -1,5 +1,6 @@
 """The safety layers of TRPO-SL and TRPO-USL: projections, models, and when and where they act."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -392,7 +393,16 @@ def test_last_costs_reach_the_batch(cls: Any) -> None:
 
 @pytest.mark.parametrize("cls", CLASSES)
 @pytest.mark.parametrize(
-    ("warmup", "on_at"), [(1 / 3, 160), (0.5, 240), (0.0, 80), (100, 160), (1, 80), (1.0, None)]
+    ("warmup", "on_at"),
+    [
+        (1 / 3, 160),
+        (0.5, 240),
+        (0.0, 80),
+        (100, 160),
+        (np.int64(100), 160),
+        (1, 80),
+        (1.0, None),
+    ],
 )
 def test_warmup(cls: Any, warmup: float, on_at: int | None) -> None:
     """The first rollout after that share of the first `learn`, or number of steps."""
@@ -525,6 +535,29 @@ def test_a_given_threshold_holds_from_the_first_step() -> None:
     assert len(seen) == 80 and set(seen) == {0.5}
 
 
+@pytest.mark.parametrize("cls", CLASSES)
+def test_a_threshold_given_to_load_holds_at_once(cls: Any, tmp_path: Path) -> None:
+    model = make(cls, n_critic_updates=1, threshold=100.0).learn(80)
+    model.save(tmp_path / "model")
+    kept = cls.load(tmp_path / "model", device="cpu").policy.action_filter.threshold
+    assert th.equal(kept, model.policy.action_filter.threshold)
+    again = cls.load(tmp_path / "model", device="cpu", threshold=-1.0)
+    assert again.policy.action_filter.threshold.item() == -1.0
+    observation = np.zeros((2, 4), np.float32)
+    actions = [each.predict(observation, deterministic=True)[0] for each in (model, again)]
+    assert np.abs(actions[1] - actions[0]).max() > 0.01
+
+
+def test_costs_below_zero_are_named_once_where_they_cant_be_learnt() -> None:
+    with pytest.warns(UserWarning, match="TRPOUSL met costs below zero") as record:
+        make(TRPOUSL, points(2, cost_scale=-1.0), n_critic_updates=1).learn(160)
+    assert len([each for each in record if "below zero" in str(each.message)]) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make(TRPOUSL, n_critic_updates=1).learn(80)
+        make(TRPOSL, points(2, cost_scale=-1.0), n_critic_updates=1).learn(80)
+
+
 def test_the_cost_model_learns_from_executed_actions() -> None:
     model = make(TRPOSL, threshold=-1.0)
     fitted: list[Any] = []
@@ -604,6 +637,8 @@ def test_policies_of_ones_own(cls: Any) -> None:
     ("cls", "kwargs", "message"),
     [
         (TRPOSL, {"warmup": 1.5}, r"warmup=1.5.*\[0, 1\]"),
+        (TRPOSL, {"warmup": np.int64(-1)}, "must be an integer of at least 0"),
+        (TRPOSL, {"warmup": True}, "warmup=True: must be an integer of at least 0"),
         (TRPOSL, {"warmup": -1}, "warmup=-1: must be an integer of at least 0"),
         (TRPOSL, {"threshold": [0.1, 0.2]}, r"threshold=\[0.1, 0.2\].*one for each of the 1"),
         (TRPOSL, {"threshold": "low"}, "threshold='low'"),

@@ -1,5 +1,6 @@
 """TRPO-Lagrangian and TRPO-FAC: multipliers by hand, and what they do to the objective."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -218,6 +219,39 @@ def test_at_a_limit_of_zero(cls: type[TrustRegion], cost_scale: float) -> None:
         assert np.all(rises > 0.0) if cls is TRPOLag else prices[-1] > prices[0] + 0.01
     elif cls is TRPOLag:
         assert not prices.any()
+
+
+@pytest.mark.parametrize("cls", [TRPOLag, TRPOFAC])
+def test_the_rate_given_to_load_is_the_rate(cls: type[TrustRegion], tmp_path: Path) -> None:
+    """As it is with learning_rate; the saved optimizer knows another one."""
+    model = make(cls, n_critic_updates=1, lambda_lr=0.5).learn(400)
+    model.save(tmp_path / "model")
+    again: Any = cls.load(tmp_path / "model", env=model.env, device="cpu", lambda_lr=0.0)
+    before = [each.clone() for each in again.multiplier.parameters()]
+    again.learn(400, reset_num_timesteps=False)
+    assert all(map(th.equal, before, again.multiplier.parameters()))
+    again.lambda_lr = 0.5
+    again.learn(400, reset_num_timesteps=False)
+    assert not any(map(th.equal, before, again.multiplier.parameters()))
+
+
+@pytest.mark.parametrize(("before", "after"), [("sgd", "adam"), ("adam", "sgd")])
+def test_another_optimizer_of_the_multiplier_begins_afresh(
+    before: str, after: str, tmp_path: Path
+) -> None:
+    """And goes on from the multiplier of the file; one of the same kind from its moments."""
+    model = make(TRPOLag, n_critic_updates=1, lambda_optimizer=before).learn(800)
+    model.save(tmp_path / "model")
+    for kind in (before, after):
+        again: Any = TRPOLag.load(
+            tmp_path / "model", env=model.env, device="cpu", lambda_optimizer=kind
+        )
+        assert th.equal(again.multiplier.value, model.multiplier.value)
+        assert again.multiplier.optimizer.state_dict()["state"].keys() == (
+            model.multiplier.optimizer.state_dict()["state"].keys() if kind == before else set()
+        )
+        again.learn(400, reset_num_timesteps=False)
+        assert float(again.multiplier.value[0]) > float(model.multiplier.value[0]) > 0.0
 
 
 @pytest.mark.parametrize(

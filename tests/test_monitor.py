@@ -81,10 +81,22 @@ def test_several_costs(tmp_path):
     assert load_results(str(tmp_path))["c_heat"].tolist() == pytest.approx([0.06])
 
 
+@pytest.mark.parametrize("kind", [float, np.float32, lambda cost: np.array([cost])])
+def test_several_costs_of_every_kind(kind):
+    env = make(2, cost_keys=("cost", "heat"))
+    lone = env.unwrapped.envs[0]
+    step = lone.step
+    lone.step = lambda action: (*step(action)[:4], {k: kind(v) for k, v in lone.shared.items()})
+    env.reset()
+    (episode,) = play(env, 2)
+    assert [episode[key] for key in ("c", "c_cost", "c_heat")] == pytest.approx([0.3, 0.3, 0.03])
+
+
 @pytest.mark.parametrize(
     ("info", "keys", "expected"),
     [
         ({"cost": 2}, ("cost",), 2.0),
+        ({"cost": np.array([2.0])}, ("cost",), 2.0),
         ({"cost": np.float32(0.5)}, ("cost",), 0.5),
         ({"cost": True}, ("cost",), 1.0),
         ({}, ("cost",), 0.0),

@@ -66,12 +66,21 @@ class Problem:
     """A random step problem, and what an optimiser that knows none of our algebra says of it.
 
     :param ratios: violation of each constraint as a share of what the trust region can change
+    :param scales: the units of each cost; none: all the same
     """
 
-    def __init__(self, rng: np.random.Generator, ratios: np.ndarray, size: int = 6) -> None:
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        ratios: np.ndarray,
+        size: int = 6,
+        scales: np.ndarray | None = None,
+    ) -> None:
         self.F = _definite(rng, size)
         self.g = rng.normal(size=size)
         self.B = rng.normal(size=(len(ratios), size))
+        if scales is not None:
+            self.B *= scales[:, None]
         self.delta = 10 ** rng.uniform(-3, -1)
         self.inverse = np.linalg.inv(self.F)
         reach = np.sqrt(2 * self.delta * np.einsum("ij,jk,ik->i", self.B, self.inverse, self.B))
@@ -82,18 +91,23 @@ class Problem:
         g, B, v, W = (th.as_tensor(each, dtype=dtype) for each in tensors)
         return constrained_step(g, B, self.c, v, W, self.delta)
 
+    def scale(self, lost: bool) -> np.ndarray:
+        """What violations are measured in, shape (m,): a sum of squares knows one unit alone."""
+        reach = np.sqrt(2 * self.delta * np.diag(self.B @ self.inverse @ self.B.T))
+        return np.full_like(reach, reach.max()) if lost else reach
+
     def reference(self, rng: np.random.Generator, lost: bool) -> float:
         """The optimal value found by SLSQP in coordinates where the trust region is a unit ball."""
         radius = np.sqrt(2 * self.delta)
         root = np.linalg.inv(np.linalg.cholesky(self.F)).T * radius  # x = root @ y
         g, B = self.g @ root, self.B @ root
-        scale = np.abs(B).max()
+        scale = self.scale(lost)
         constraints = [{"type": "ineq", "fun": lambda y: 1 - y @ y, "jac": lambda y: -2 * y}]
         if lost:
 
             def objective(y: np.ndarray) -> tuple[float, np.ndarray]:
                 excess = np.maximum(0.0, (self.c + B @ y) / scale)
-                return float(excess @ excess), 2 * (B / scale).T @ excess
+                return float(excess @ excess), 2 * (B.T / scale) @ excess
 
         else:
 
@@ -104,7 +118,7 @@ class Problem:
                 {
                     "type": "ineq",
                     "fun": lambda y: -(self.c + B @ y) / scale,
-                    "jac": lambda y: -B / scale,
+                    "jac": lambda y: -(B.T / scale).T,
                 }
             )
         # Near a constraint that only touches the ball, a start can strand: take the best of some.
@@ -133,7 +147,7 @@ class Problem:
         assert 0.5 * x @ self.F @ x <= self.delta * (1 + 1e-8)
         radius = np.sqrt(2 * self.delta)
         root = np.linalg.inv(np.linalg.cholesky(self.F)).T * radius
-        scale = np.abs(self.B @ root).max()
+        scale = self.scale(lost)
         if lost:
             value = float(np.sum(np.maximum(0.0, (self.c + self.B @ x) / scale) ** 2))
             assert value > 0.0
@@ -183,6 +197,68 @@ def test_constrained_step_against_an_optimiser(case: Case, m: int) -> None:
             assert m > 1, f"{ratios} is not {case.name}"
         if seen[case] == wanted:
             break
+
+
+@pytest.mark.parametrize("case", [Case.BINDING, Case.RECOVERABLE])
+@pytest.mark.parametrize("m", [2, 3])
+def test_constraints_of_different_size_against_an_optimiser(case: Case, m: int) -> None:
+    """Costs in units that lie up to twelve orders of magnitude apart."""
+    rng = np.random.default_rng(10 * m + case)
+    seen = 0
+    for ratios in _ratios(case, m, rng):
+        problem = Problem(rng, ratios, scales=10 ** rng.uniform(-4, 8, size=m))
+        if problem.solve().case is case:
+            problem.check(rng)
+            seen += 1
+        if seen == 50:
+            break
+
+
+def _one_after_the_other(ratios: np.ndarray, normals: np.ndarray) -> Iterator[float]:
+    """Least violations within the unit ball by SLSQP, each given those before it.
+
+    :param ratios: violations at the origin, shape (m,)
+    :param normals: how they change, shape (m, n)
+    """
+    y = np.zeros(normals.shape[1])
+    constraints = [{"type": "ineq", "fun": lambda y: 1 - y @ y, "jac": lambda y: -2 * y}]
+    for ratio, normal in zip(ratios, normals, strict=True):
+        answer = minimize(
+            lambda y, ratio=ratio, normal=normal: (ratio + normal @ y, normal),
+            y,
+            jac=True,
+            constraints=constraints,
+            method="SLSQP",
+            options={"ftol": 1e-13, "maxiter": 300},
+        )
+        least, y = max(0.0, float(answer.fun)), 0.999 * answer.x
+        yield least
+        room = least + 1e-8 - ratio
+        constraints.append(
+            {
+                "type": "ineq",
+                "fun": lambda y, room=room, normal=normal: room - normal @ y,
+                "jac": lambda y, normal=normal: -normal,
+            }
+        )
+
+
+@pytest.mark.parametrize(("m", "decades"), [(2, 5), (2, 8), (3, 4)])
+def test_a_lost_constraint_of_small_gradient_is_lowered_as_far_as_the_larger_ones_allow(
+    m: int, decades: int
+) -> None:
+    """Of gradients so different in size, the sum of squares is a hierarchy."""
+    rng = np.random.default_rng(m)
+    for _ in range(25):
+        ratios = np.append(rng.uniform(-0.9, 0.9, size=m - 1), rng.uniform(1.05, 1.5))
+        problem = Problem(rng, ratios, scales=10.0 ** (-decades * np.arange(m) + 7))
+        x, case, *_ = problem.solve()
+        x, reach = x.numpy(), problem.scale(False)
+        assert case is Case.LOST
+        assert 0.5 * x @ problem.F @ x <= problem.delta * (1 + 1e-6)
+        root = np.linalg.inv(np.linalg.cholesky(problem.F)).T * np.sqrt(2 * problem.delta)
+        least = list(_one_after_the_other(ratios, problem.B @ root / reach[:, None]))
+        assert np.all((problem.c + problem.B @ x) / reach <= np.array(least) + 1e-3)
 
 
 @pytest.mark.parametrize("m", [1, 2, 3])

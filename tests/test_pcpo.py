@@ -20,13 +20,18 @@ class Problem:
     """A random projection problem.
 
     :param ratios: violation of each constraint as a share of what the trust region can change
+    :param scales: the units of each cost; none: all the same
     """
 
-    def __init__(self, rng: np.random.Generator, ratios: np.ndarray) -> None:
+    def __init__(
+        self, rng: np.random.Generator, ratios: np.ndarray, scales: np.ndarray | None = None
+    ) -> None:
         root = rng.normal(size=(SIZE, SIZE))
         self.F = root @ root.T + 0.3 * np.eye(SIZE)
         self.g = rng.normal(size=SIZE)
         self.B = rng.normal(size=(len(ratios), SIZE))
+        if scales is not None:
+            self.B *= scales[:, None]
         self.delta = 10 ** rng.uniform(-3, -1)
         self.inverse = np.linalg.inv(self.F)
         reach = np.sqrt(2 * self.delta * np.einsum("ij,jk,ik->i", self.B, self.inverse, self.B))
@@ -47,6 +52,11 @@ class Problem:
         """From the natural step, in radii of the trust region."""
         gap = x - self.natural
         return float(np.sqrt(gap @ gap if euclidean else gap @ self.F @ gap) / self.radius)
+
+    @property
+    def reach(self) -> np.ndarray:
+        """What the trust region can change of each cost, shape (m,)."""
+        return self.radius * np.sqrt(np.diag(self.B @ self.inverse @ self.B.T))
 
     @property
     def radius(self) -> float:
@@ -77,13 +87,14 @@ class Problem:
 @pytest.mark.parametrize("euclidean", [False, True])
 @pytest.mark.parametrize("m", [1, 2, 3])
 def test_projection_against_an_optimiser(m: int, euclidean: bool) -> None:
+    """Of costs in like units, and in units that lie up to twelve orders of magnitude apart."""
     rng = np.random.default_rng(10 * m + euclidean)
     projected = outside = 0
-    for _ in range(300):
-        problem = Problem(rng, rng.uniform(-1.5, 2.5, size=m))
+    for i in range(300):
+        scales = 10 ** rng.uniform(-4, 8, size=m) if i % 2 else None
+        problem = Problem(rng, rng.uniform(-1.5, 2.5, size=m), scales)
         x, pull = problem.solve(euclidean)
-        reach = problem.radius * np.sqrt(np.diag(problem.B @ problem.inverse @ problem.B.T))
-        assert np.all((problem.c + problem.B @ x) / reach <= 1e-7) and np.all(pull >= 0.0)
+        assert np.all((problem.c + problem.B @ x) / problem.reach <= 1e-7) and np.all(pull >= 0.0)
         # The nearest point is unique: a feasible one as near as it is the same one.
         assert problem.distance(x, euclidean) <= problem.reference(euclidean) * (1 + 1e-5) + 1e-6
         projected += pull.any()
@@ -119,6 +130,43 @@ def test_contradictory_limits_are_violated_least(euclidean: bool) -> None:
         wanted = (problem.c[1] - problem.c[0]) / 2
         reach = np.sqrt(2 * problem.delta * s)
         np.testing.assert_allclose(problem.B[0] @ x, np.clip(wanted, -reach, reach), rtol=1e-4)
+
+
+@pytest.mark.parametrize("euclidean", [False, True])
+@pytest.mark.parametrize("m", [2, 3, 4])
+def test_limits_without_a_common_point_against_an_optimiser(m: int, euclidean: bool) -> None:
+    """One half-space lies beyond the sum of the others: least squares within the trust region."""
+    rng = np.random.default_rng(20 * m + euclidean)
+    inside = 0
+    for _ in range(60):
+        problem = Problem(rng, rng.uniform(-0.5, 2.0, size=m), 10 ** rng.uniform(-1, 1, size=m))
+        weights = rng.uniform(0.2, 2.0, size=m - 1)
+        problem.B[-1] = -weights @ problem.B[:-1]
+        gap = rng.uniform(0.02, 0.6) * np.linalg.norm(problem.reach)
+        problem.c[-1] = gap - weights @ problem.c[:-1]
+        x, _ = problem.solve(euclidean)
+        kl = x @ problem.F @ x / (2 * problem.delta)
+        root = np.linalg.inv(np.linalg.cholesky(problem.F)).T * problem.radius
+        B, scale = problem.B @ root, np.abs(problem.c).max()
+
+        def objective(
+            y: np.ndarray, c: np.ndarray = problem.c / scale, B: np.ndarray = B / scale
+        ) -> tuple[float, np.ndarray]:
+            excess = np.maximum(0.0, c + B @ y)
+            return float(excess @ excess), 2 * B.T @ excess
+
+        answer = minimize(
+            objective,
+            np.zeros(SIZE),
+            jac=True,
+            constraints={"type": "ineq", "fun": lambda y: 1 - y @ y, "jac": lambda y: -2 * y},
+            method="SLSQP",
+            options={"ftol": 1e-13, "maxiter": 300},
+        )
+        assert kl <= 1 + 1e-6
+        assert objective(np.linalg.solve(root, x))[0] <= answer.fun * (1 + 1e-5) + 1e-9
+        inside += bool(kl < 0.99)
+    assert 0 < inside < 60, "the compromise lies inside the region, or beyond"
 
 
 @pytest.mark.parametrize("noise", [1e-7, 1e-5, 1e-4, 1e-3])

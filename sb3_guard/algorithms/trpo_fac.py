@@ -5,6 +5,7 @@ from typing import Any, Literal
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
@@ -86,6 +87,8 @@ class TRPOFAC(TrustRegion):
         else:
             violation = th.as_tensor(self.costs.episode_cost - self.cost_limits)
             excess = violation.to(batch.cost_returns).expand_as(batch.cost_returns)
+        # As with the critics' rate: what the attribute says, not what a file has restored.
+        update_learning_rate(self.multiplier.optimizer, self.lambda_lr)
         for _ in range(self.lambda_epochs):
             self.multiplier.ascend(batch.observations, excess)
         price = self.multiplier.predict(batch.observations).cpu().numpy()

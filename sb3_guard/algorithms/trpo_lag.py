@@ -5,6 +5,7 @@ from typing import Any, Literal
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.checks import check_choice, check_number
@@ -91,5 +92,7 @@ class TRPOLag(TrustRegion):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         assert self.costs is not None
+        # As with the critics' rate: what the attribute says, not what a file has restored.
+        update_learning_rate(self.multiplier.optimizer, self.lambda_lr)
         self.multiplier.update(self.costs.episode_cost, self.cost_limits)
         self._record_per_cost("train/multiplier", self.multiplier.value.numpy())

@@ -104,6 +104,12 @@ class TRPOUSL(FilteredTrustRegion):
         assert self.costs is not None
         gamma = self.rollout_buffer.cost_gamma
         limit = discounted_limit(self.cost_limits, self.costs.horizon, gamma)
+        if bool((batch.costs < 0.0).any()):
+            self._warn_once(
+                "TRPOUSL met costs below zero: to its critic no cost to come is less than 0; add a "
+                "constant to the cost of every step, and its sum over an episode to cost_limit, "
+                "or use TRPOSL"
+            )
         actions = self._executed(batch)
         targets = self._targets(batch, actions, gamma)
         loss = self._layer.regression().fit(

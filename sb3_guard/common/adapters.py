@@ -13,6 +13,8 @@ import copy
 import math
 import pkgutil
 import re
+import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, SupportsFloat
@@ -154,6 +156,16 @@ def _check(
         most = "" if high == math.inf else f" and at most {high:g}"
         raise ValueError(f"{name}={value!r}: must be a finite number{least}{most}")
     return float(value)
+
+
+def _has_monitor(env: gym.Env) -> bool:
+    """Whether SB3's ``Monitor`` is among the wrappers; if SB3 isn't imported, it can't be."""
+    module = sys.modules.get("stable_baselines3.common.monitor")
+    while module is not None and isinstance(env, gym.Wrapper):
+        if isinstance(env, module.Monitor):
+            return True
+        env = env.env
+    return False
 
 
 class CostFromStep(gym.Wrapper, RecordConstructorArgs):
@@ -376,6 +388,9 @@ class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
     ``final_reward`` must make up for it. The step that overspends is ``terminated`` and has
     ``info["budget_exceeded"]``; to spend the budget exactly is allowed.
 
+    It goes inside SB3's ``Monitor``, which otherwise never sees the episodes that are ended here:
+    a warning says so.
+
     :param env: an environment that reports its cost; adapters go inside
     :param budget: what an episode may cost, at least 0
     :param final_reward: added to the reward of the step that overspends
@@ -394,6 +409,15 @@ class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
         self.final_reward = _check("final_reward", final_reward)
         self.cost_key = cost_key
         self.episode_cost = 0.0
+        if _has_monitor(env):
+            warnings.warn(
+                "EarlyTermination is around a Monitor, which will not report the episodes that "
+                "overspend: wrap the environment before its monitor, as "
+                "sb3_guard.make_vec_env(..., wrapper_class=...) does; SB3's takes a function that "
+                "makes it wrapped",
+                UserWarning,
+                stacklevel=2,
+            )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

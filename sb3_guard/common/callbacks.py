@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_guard.common.evaluation import Evaluation, evaluate_policy
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy, share_environment
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 
@@ -52,11 +52,17 @@ class CostEvalCallback(EvalCallback):
     run is the same with and without it, and after a resume.
 
     Logs ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/mean_ep_cost`` and, for several
-    costs, ``eval/mean_ep_cost/<key>``. ``evaluations.npz`` has ``timesteps`` [K], ``results``,
-    ``ep_lengths`` and ``costs`` [K, E]. Beside ``best_model.zip`` of an agent that was trained on
-    normalised observations lies ``best_model_vecnormalize.pkl``.
+    costs, of which that is the total, ``eval/mean_ep_cost/<key>``. ``evaluations.npz`` has
+    ``timesteps`` [K], ``results``, ``ep_lengths`` and ``costs`` [K, E], and for several costs
+    ``key_costs`` [K, E, m]. Beside ``best_model.zip`` of an agent that was trained on normalised
+    observations lies ``best_model_vecnormalize.pkl``.
 
-    :param eval_env: environment to evaluate in, wrapped as the training environment is
+    SB3's ``StopTrainingOnNoModelImprovement`` and ``StopTrainingOnRewardThreshold`` may be among
+    its callbacks: the ``best_mean_reward`` that they compare rises with every new best model, and
+    as long as none is safe it is below every return.
+
+    :param eval_env: environment to evaluate in, wrapped as the training environment is, and not
+        that environment itself
     :param selection_limit: episode cost up to which a model counts as safe, one number or one per
         cost key. None: ``max(cost_limit, 1)`` of the algorithm (a limit of 0 would choose nobody,
         or the untrained agent); for an unconstrained algorithm the return alone decides
@@ -102,6 +108,7 @@ class CostEvalCallback(EvalCallback):
         self.selection_limit = selection_limit
         self.seed = seed
         self.evaluations_costs: list[list[float]] = []
+        self.evaluations_key_costs: list[list[list[float]]] = []
         #: (safe, return if safe else minus the violation) of the best model
         self.best_score: tuple[bool, float] = (False, -np.inf)
         self.last_mean_cost = np.inf
@@ -111,22 +118,52 @@ class CostEvalCallback(EvalCallback):
         """The entries of info that are the algorithm's costs."""
         return tuple(getattr(self.model, "cost_keys", ("cost",)))
 
+    def _init_callback(self) -> None:
+        """
+        :raises ValueError: ``selection_limit`` does not fit the cost keys, or the evaluation would
+            be played in the training environment
+        """
+        super()._init_callback()
+        self.limits()
+        if share_environment(self.training_env, self.eval_env):
+            raise ValueError(
+                "eval_env is the training environment, whose episodes every evaluation would "
+                "break off: make another one for it"
+            )
+
     def limits(self) -> np.ndarray:
-        """Episode cost up to which a model counts as safe, one per cost key, shape [m]."""
+        """
+        Episode cost up to which a model counts as safe, one per cost key, shape [m].
+
+        :raises ValueError: ``selection_limit`` does not fit the cost keys
+        """
         limit: Any = self.selection_limit
         if limit is None:
             cost_limit: Any = getattr(self.model, "cost_limit", None)
             constrained = cost_limit is not None and getattr(self.model, "constrained", True)
             limit = np.maximum(cost_limit, 1.0) if constrained else np.inf
-        return np.broadcast_to(np.asarray(limit, dtype=np.float64), (len(self.cost_keys),))
+        limits = np.asarray(limit, dtype=np.float64)
+        m = len(self.cost_keys)
+        if limits.shape not in ((), (m,)) or np.isnan(limits).any():
+            raise ValueError(
+                f"selection_limit={limit!r}: must be one number, or one for each of the {m} cost "
+                f"keys {self.cost_keys}"
+            )
+        return np.broadcast_to(limits, (m,))
 
     def score(self, evaluation: Evaluation) -> tuple[bool, float]:
         """How two models compare: the greater tuple is the better model."""
         excess = np.maximum(evaluation.key_costs.mean(axis=0) - self.limits(), 0.0)  # [m]
         violation = float(excess.sum())
-        if violation > 0.0:
-            return (False, -violation)
-        return (True, float(evaluation.returns.mean()))
+        if violation <= 0.0:
+            return (True, float(evaluation.returns.mean()))
+        return (False, -violation)
+
+    def _remember(self, score: tuple[bool, float]) -> None:
+        """Take a score for the best one, and tell SB3's callbacks in the number they compare."""
+        safe, value = self.best_score = score
+        # Below every return, and higher for a smaller violation.
+        self.best_mean_reward = value if safe else 1e200 * value
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
@@ -148,6 +185,8 @@ class CostEvalCallback(EvalCallback):
         self.evaluations_results.append(evaluation.returns.tolist())
         self.evaluations_length.append(evaluation.lengths.tolist())
         self.evaluations_costs.append(evaluation.costs.tolist())
+        if len(self.cost_keys) > 1:
+            self.evaluations_key_costs.append(evaluation.key_costs.tolist())
         if len(evaluation.successes):
             self.evaluations_successes.append(evaluation.successes.tolist())
         self.write_history()
@@ -157,16 +196,14 @@ class CostEvalCallback(EvalCallback):
         is_best = np.isfinite(score[1]) and score > self.best_score
         if self.verbose >= 1:
             returns = evaluation.estimate(evaluation.returns)
-            costs = evaluation.estimate(evaluation.costs)
-            print(
-                f"Evaluation after {self.num_timesteps} steps: "
-                f"return {returns.mean:.2f} ± {returns.std:.2f}, "
-                f"cost {costs.mean:.2f} ± {costs.std:.2f}{' (best so far)' if is_best else ''}"
-            )
+            words = [f"return {returns.mean:.2f} ± {returns.std:.2f}"]
+            for key, costs in zip(self.cost_keys, evaluation.key_costs.T, strict=True):
+                words.append(f"{key} {costs.mean():.2f} ± {costs.std():.2f}")
+            best = " (best so far)" if is_best else ""
+            print(f"Evaluation after {self.num_timesteps} steps: {', '.join(words)}{best}")
         proceed = True
         if is_best:
-            self.best_score = score
-            self.best_mean_reward = self.last_mean_reward
+            self._remember(score)
             self._save_best()
             if self.callback_on_new_best is not None:
                 proceed = self.callback_on_new_best.on_step()
@@ -208,6 +245,8 @@ class CostEvalCallback(EvalCallback):
             "ep_lengths": self.evaluations_length,
             "costs": self.evaluations_costs,
         }
+        if self.evaluations_key_costs:
+            arrays["key_costs"] = self.evaluations_key_costs
         if self.evaluations_successes:
             arrays["successes"] = self.evaluations_successes
         with replacing(f"{self.log_path}.npz") as file:
@@ -220,9 +259,9 @@ class CostEvalCallback(EvalCallback):
             "results": list(self.evaluations_results),
             "lengths": list(self.evaluations_length),
             "costs": list(self.evaluations_costs),
+            "key_costs": list(self.evaluations_key_costs),
             "successes": list(self.evaluations_successes),
             "best_score": self.best_score,
-            "best_mean_reward": self.best_mean_reward,
             "last_mean_reward": self.last_mean_reward,
             "last_mean_cost": self.last_mean_cost,
         }
@@ -233,9 +272,10 @@ class CostEvalCallback(EvalCallback):
         self.evaluations_results = list(state["results"])
         self.evaluations_length = list(state["lengths"])
         self.evaluations_costs = list(state["costs"])
+        # The checkpoint may be older than this entry.
+        self.evaluations_key_costs = list(state.get("key_costs", []))
         self.evaluations_successes = list(state["successes"])
-        self.best_score = state["best_score"]
-        self.best_mean_reward = state["best_mean_reward"]
+        self._remember(state["best_score"])
         self.last_mean_reward = state["last_mean_reward"]
         self.last_mean_cost = state["last_mean_cost"]
         if self.evaluations_timesteps:

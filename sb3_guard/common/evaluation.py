@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import (
     is_vecenv_wrapped,
 )
 
+from sb3_guard.algorithms.common.costs import read_costs
+from sb3_guard.algorithms.common.trust_region import TrustRegion
 from sb3_guard.common.monitor import total_cost
 
 
@@ -39,7 +41,8 @@ class Evaluation:
     What :func:`evaluate_policy` saw; E episodes in the order in which they ended.
 
     :param returns: undiscounted return of each episode, shape [E]
-    :param costs: undiscounted episode cost, the sum of ``info["cost"]``, shape [E]
+    :param costs: undiscounted cost of each episode, shape [E]: of the one cost key, or, where
+        several are asked for, of all: the sum of ``info["cost"]``, else of the keys
     :param lengths: steps of each episode, shape [E]
     :param key_costs: episode cost of each of the cost keys asked for, shape [E, m]
     :param successes: ``info["is_success"]`` at the end of the episodes that report one
@@ -77,6 +80,15 @@ class Evaluation:
         return Estimate(float(np.mean(values)), float(np.std(values)), low, high)
 
 
+def share_environment(one: VecEnv, other: VecEnv) -> bool:
+    """Whether to reset one of two vectorised environments resets something of the other, too."""
+    parts: list[set[int]] = []
+    for env in (one.unwrapped, other.unwrapped):
+        lone = env.envs if isinstance(env, DummyVecEnv) else []
+        parts.append({id(env), *(id(part.unwrapped) for part in lone)})
+    return not parts[0].isdisjoint(parts[1])
+
+
 @contextmanager
 def _own_random_numbers(seed: int | None) -> Iterator[None]:
     """Let a stochastic policy draw from ``seed``, and leave torch's generators as they were."""
@@ -107,9 +119,15 @@ def evaluate_policy(
     take the first ones that end, whichever row they come from, would favour short episodes.
 
     Returns and lengths are those of a monitor wrapper where there is one, so that reward
-    normalisation outside it does not show. A policy that corrects its actions by what the last
-    step cost says so by a true attribute ``acts_on_cost`` and is given the true last costs, shape
-    [n_envs, m], zeros at the start of an episode, as ``predict(..., state=(costs,))``.
+    normalisation outside it does not show. Costs are read as the model reads them in training,
+    with its ``missing_cost``; if it has none, as a policy or PPO, an absent cost counts as 0.
+
+    A policy that corrects its actions by what the last step cost says so by a true attribute
+    ``acts_on_cost`` and is given the true last costs, shape [n_envs, m], zeros at the start of an
+    episode, as ``predict(..., state=(costs,))``.
+
+    A model's own training environment will do: if ``learn`` is called again, it begins new
+    episodes. In a callback, which runs during ``learn``, evaluate in another environment.
 
     :param model: anything with ``predict``: an algorithm or a policy
     :param env: a single or a vectorised environment; it is reset first
@@ -123,7 +141,8 @@ def evaluate_policy(
         have not ended are left out
     :param on_step: called after each step, e.g. to render
     :param on_episode: called with return, cost and length of each counted episode as it ends
-    :raises ValueError: fewer than one episode is asked for
+    :raises ValueError: fewer than one episode is asked for, a cost is no finite number or missing
+        and may not be, or the policy acts on another number of costs than ``cost_keys`` names
     """
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
@@ -132,7 +151,18 @@ def evaluate_policy(
         env = DummyVecEnv([lambda: lone])
     keys = tuple(getattr(model, "cost_keys", ("cost",)) if cost_keys is None else cost_keys)
     monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
-    acts_on_cost = getattr(getattr(model, "policy", model), "acts_on_cost", False)
+    zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
+    policy = getattr(model, "policy", model)
+    acts_on_cost = getattr(policy, "acts_on_cost", False)
+    if acts_on_cost:
+        thresholds = getattr(getattr(policy, "action_filter", None), "threshold", keys)
+        if len(thresholds) != len(keys):
+            raise ValueError(
+                f"cost_keys={keys}: the policy acts on {len(thresholds)} costs; pass their names "
+                "as cost_keys=(...), or the model instead of its policy"
+            )
+    if isinstance(model, TrustRegion) and model.env is not None:
+        model.begin_anew |= share_environment(model.env, env)
 
     n = env.num_envs
     left = np.array([(n_eval_episodes + i) // n for i in range(n)])
@@ -159,20 +189,22 @@ def evaluate_policy(
             )
             observations, rewards, starts, infos = env.step(actions)
             steps += 1
-            rows = [[info.get(key, 0.0) for key in keys] for info in infos]
-            last_costs = np.array(rows, dtype=np.float64).reshape(n, len(keys))
+            last_costs, _ = read_costs(infos, keys, zero_if_missing)
             returns += rewards
             lengths += 1
             costs += last_costs
-            totals += [total_cost(info, keys) for info in infos]
+            if len(keys) == 1:
+                totals += last_costs[:, 0]
+            else:
+                totals += [total_cost(info, keys) for info in infos]
             if on_step is not None:
                 on_step()
             for i in np.flatnonzero(starts):
                 last_costs[i] = 0.0
                 episode = infos[i].get("episode")
-                if monitored and episode is None:
+                if monitored and episode is None and "budget_exceeded" not in infos[i]:
                     # A wrapper outside the monitor cut the episode (a life lost, in Atari): its
-                    # true end is still to come.
+                    # true end is still to come. Only what EarlyTermination ends is over.
                     continue
                 if left[i]:
                     left[i] -= 1

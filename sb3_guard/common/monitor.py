@@ -11,6 +11,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 
+def _number(value: Any) -> float:
+    """A cost as a float: also of an array of one number."""
+    return float(np.asarray(value).item())
+
+
 def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) -> float:
     """
     The cost of one step: ``info["cost"]``, else the sum of ``cost_keys``; absent keys count as 0.
@@ -19,8 +24,8 @@ def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) ->
     """
     cost = info.get("cost")
     if cost is None:
-        return float(sum(float(np.asarray(info.get(key, 0.0)).item()) for key in cost_keys))
-    return float(cost.item() if isinstance(cost, np.ndarray) else cost)
+        return float(sum(_number(info.get(key, 0.0)) for key in cost_keys))
+    return _number(cost)
 
 
 class CostMonitor(VecMonitor):
@@ -84,7 +89,7 @@ class CostMonitor(VecMonitor):
         self.total_steps += self.num_envs
         if self._columns:
             for sums, key in zip(self._key_costs, self.cost_keys, strict=True):
-                sums += [info.get(key, 0.0) for info in infos]
+                sums += [_number(info.get(key, 0.0)) for info in infos]
         if dones.any():
             # Infos may be the environment's own objects: a copy gets the new entry.
             infos = list(infos)

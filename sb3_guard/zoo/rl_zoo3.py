@@ -54,6 +54,8 @@ def make_vec_env(
     with warnings.catch_warnings():
         # SB3 gives each environment a monitor of its own, which counts no costs.
         warnings.filterwarnings("ignore", message="The environment is already wrapped with a `Mon")
+        # Of what EarlyTermination ends outside of that monitor, ours takes account.
+        warnings.filterwarnings("ignore", message="EarlyTermination is around a Monitor")
         return CostMonitor(make(env_id, n_envs, **kwargs), file, **monitor_kwargs)
 
 

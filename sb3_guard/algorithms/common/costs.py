@@ -55,6 +55,9 @@ def read_costs(
         rows = [[info.get(key, 0.0) for key in keys] for info in infos]
         seen = any(key in info for info in infos for key in keys)
     try:
+        if any(isinstance(value, np.ndarray) for row in rows for value in row):
+            # Arrays of one number are costs, beside plain numbers too.
+            rows = [[np.asarray(value).item() for value in row] for row in rows]
         raw = np.array(rows)
         costs = raw.astype(np.float64).reshape(len(infos), len(keys))
     except (TypeError, ValueError):
@@ -68,7 +71,8 @@ def read_costs(
 def _no_number(rows: Sequence[Sequence[Any]], keys: Sequence[str]) -> ValueError:
     def is_cost(value: Any) -> bool:
         try:
-            return not isinstance(value, str | bytes) and bool(np.isfinite(float(value)))
+            number = float(np.asarray(value).item())
+            return not isinstance(value, str | bytes) and bool(np.isfinite(number))
         except (TypeError, ValueError):
             return False
 

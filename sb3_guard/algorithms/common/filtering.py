@@ -80,7 +80,7 @@ class FilteredTrustRegion(TrustRegion):
                 f"class Filtered{own}(FilteredPolicy, {own}), with FilteredPolicy from "
                 "sb3_guard.algorithms.common.policies"
             )
-        if isinstance(self.warmup, int):
+        if isinstance(self.warmup, int | np.integer):
             check_integer("warmup", self.warmup, 0)
         else:
             check_number("warmup", self.warmup, 0.0, 1.0, "[]")
@@ -90,6 +90,16 @@ class FilteredTrustRegion(TrustRegion):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "policy.action_filter.optimizer"], tensors
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | dict[str, Any],
+        exact_match: bool = True,
+        device: th.device | str = "auto",
+    ) -> None:
+        super().set_parameters(load_path_or_dict, exact_match, device)
+        # A given threshold is a hyper-parameter, which `load` may change.
+        self._set_threshold(self.policy.action_filter.threshold.cpu().numpy())
 
     def _setup_learn(
         self,
@@ -105,7 +115,9 @@ class FilteredTrustRegion(TrustRegion):
         if self.filter_from is None:
             steps = self.warmup
             self.filter_from = (
-                steps if isinstance(steps, int) else math.ceil(steps * total_timesteps)
+                int(steps)
+                if isinstance(steps, int | np.integer)
+                else math.ceil(steps * total_timesteps)
             )
         self._switch_on()
         return prepared

@@ -1,5 +1,7 @@
 """Lagrange multipliers: numbers that follow the violation, and functions of the state."""
 
+from typing import Any
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -10,6 +12,13 @@ from torch.nn import functional as F
 from sb3_guard.algorithms.common.actor import n_rows, rows
 from sb3_guard.algorithms.common.critics import StateNetwork
 from sb3_guard.algorithms.common.mlp import chunks
+
+
+def _only_of_its_kind(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    """The state to load: begun afresh where it is SGD's and the optimizer Adam, or vice versa."""
+    both = optimizer.param_groups, state["param_groups"]
+    adam, was_adam = ("betas" in groups[0] for groups in both)
+    return state if adam == was_adam else optimizer.state_dict()
 
 
 class Multiplier(nn.Module):
@@ -52,6 +61,7 @@ class Multiplier(nn.Module):
         self.register_buffer("last_cost", th.full_like(start, np.inf))  # nothing has risen yet
         kind = th.optim.Adam if adam else th.optim.SGD
         self.optimizer = kind([self.integral], lr=rate)
+        self.optimizer.register_load_state_dict_pre_hook(_only_of_its_kind)
 
     value: th.Tensor
     last_cost: th.Tensor

@@ -360,37 +360,46 @@ def _root(decreasing: Callable[[float], float], low: float, high: float) -> floa
     return float(brentq(decreasing, low, high, xtol=1e-12))
 
 
+# The sum of weights is known to less than a millionth if they cancel each other beyond this.
+_CANCELLED = 1e9
+
+
 def _least_violation(S: np.ndarray, c: np.ndarray, delta: float, moves: np.ndarray) -> np.ndarray:
     """Weights p of ``x = -Σ p_i w_i`` that minimise ``Σ max(0, c_i + b_iᵀx)²`` in the region.
 
     For a fixed multiplier μ of the trust region the dual is a non-negative least-squares problem
-    whose solution is p μ; μ by a scalar search, the KL of the step falls as it rises. Constraints
-    without a usable gradient, those not in ``moves``, are left alone.
+    whose solution is p μ, stated in unit normals since gradients may differ in length by orders of
+    magnitude; μ by a scalar search, the KL of the step falls as it rises. Constraints without a
+    usable gradient, those not in ``moves``, are left alone.
     """
     if not moves.any():
         return np.zeros(len(c))
-    units, lengths = _unit_normals(S[np.ix_(moves, moves)])
+    normals, lengths = _unit_normals(S[np.ix_(moves, moves)])
     largest, radius = lengths.max(), np.sqrt(2 * delta)
-    normals = units * (lengths / largest)[:, None]
     offsets = c[moves] / (largest * radius)
+    slack = np.diag(largest / lengths)
 
     def weights(mu: float) -> np.ndarray:
-        stacked = np.vstack([np.eye(len(offsets)), normals.T / np.sqrt(mu)])
-        residual, _ = nnls(stacked, np.append(offsets, np.zeros(normals.shape[1])))
-        return residual / mu
+        """Of the unit normals, where the trust region is the unit ball."""
+        stacked = np.vstack([slack, normals.T / np.sqrt(mu)])
+        scaled, _ = nnls(stacked, np.append(offsets, np.zeros(normals.shape[1])))
+        return scaled / mu
 
     def excess(log_mu: float) -> float:
-        point = weights(np.exp(log_mu)) @ normals
-        return float(point @ point) - 1.0
+        along = weights(np.exp(log_mu))
+        point = along @ normals
+        beyond = float(point @ point) - 1.0
+        return max(beyond, 1.0) if along.max() > _CANCELLED else beyond
 
     # The compromise between contradictory constraints may lie inside the region: then μ is zero.
+    low = 1e-9 * (lengths.min() / largest) ** 2
     top = 1e9 * max(1.0, float(np.abs(offsets).max()))
-    best = weights(np.exp(_root(excess, np.log(1e-9), np.log(top))))
+    best = weights(np.exp(_root(excess, np.log(low), np.log(top))))
     p = np.zeros(len(c))
-    p[moves] = best * radius / largest
     if len(best) > 1:
         # Opposite normals have large weights that cancel each other, and would not cancel the
         # errors of the w_i: of all weights of this point take the smallest.
         rcond = np.sqrt(_PARALLEL_TO_SEVERAL)
-        p[moves] = np.linalg.lstsq(units.T, best @ normals, rcond=rcond)[0] * radius / lengths
+        best = np.linalg.lstsq(normals.T, best @ normals, rcond=rcond)[0]
+    p[moves] = best * radius / lengths
     return p

@@ -163,7 +163,8 @@ class TrustRegion(OnPolicyAlgorithm):
     :param batch_size: rows per critic step; None for the whole rollout, as in the paper
     :param gamma: discount factor of the reward
     :param gae_lambda: bias-variance trade-off of the reward advantages
-    :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key
+    :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key.
+        The attribute may be set anew at any time, and holds from the next update on
     :param cost_keys: entries of ``info`` that hold the costs of a step
     :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
         absent key means that nothing was charged
@@ -287,6 +288,8 @@ class TrustRegion(OnPolicyAlgorithm):
         self.running_lengths: np.ndarray | None = None  # [n_envs]
         # What the last step cost, 0 before the first one of an episode.
         self.last_costs: np.ndarray | None = None  # [n_envs, m]
+        # Somebody else has reset the environments, so the next `learn` begins new episodes.
+        self.begin_anew = False
         self.total_costs: np.ndarray | None = None  # [m]
         self.ep_cost_buffer: deque[np.ndarray] | None = None
         self.horizon: float | None = None  # T of the last rollout in which an episode ended
@@ -352,7 +355,6 @@ class TrustRegion(OnPolicyAlgorithm):
         # Loading turns tuples into lists.
         self.cost_keys = tuple(self.cost_keys)
         n_costs = len(self.cost_keys)
-        self.cost_limits = np.broadcast_to(np.asarray(self.cost_limit, np.float64), (n_costs,))
         if self.rollout_buffer_class is None:
             dictionary = isinstance(self.observation_space, spaces.Dict)
             self.rollout_buffer_class = CostDictRolloutBuffer if dictionary else CostRolloutBuffer
@@ -380,6 +382,7 @@ class TrustRegion(OnPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [
             *super()._excluded_save_params(),
+            "cost_limits",  # of a file from before it was derived from cost_limit
             "_timeouts",
             "_rng_at_rollout",
             "_cuda_at_rollout",
@@ -392,6 +395,16 @@ class TrustRegion(OnPolicyAlgorithm):
         return state_dicts, tensors
 
     # Collecting
+
+    @property
+    def cost_limits(self) -> np.ndarray:
+        """d: what ``cost_limit`` says now, for each cost key, shape (m,).
+
+        :raises ValueError: ``cost_limit`` was set to something that is no limit
+        """
+        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys), low=0.0)
+        limits = np.asarray(self.cost_limit, np.float64)
+        return np.broadcast_to(limits, (len(self.cost_keys),))
 
     @property
     def _corrects(self) -> bool:
@@ -414,6 +427,8 @@ class TrustRegion(OnPolicyAlgorithm):
         if self.ep_cost_buffer is None or reset_num_timesteps:
             self.ep_cost_buffer = deque(maxlen=self._stats_window_size)
             self.total_costs = np.zeros(n_costs)
+        if self.begin_anew:
+            self._last_obs, self.begin_anew = None, False
         # The environments are reset under the same condition.
         if reset_num_timesteps or self._last_obs is None:
             self.running_costs = np.zeros((self.n_envs, n_costs))
@@ -552,12 +567,12 @@ class TrustRegion(OnPolicyAlgorithm):
         assert self.env is not None and self.running_lengths is not None
         limits: list[Any] = []
         try:
-            if isinstance(self.env.unwrapped, SubprocVecEnv):
-                # A number, TimeLimit's: not every spec can be sent from process to process, and to
-                # ask for what isn't there would end them.
-                if self.env.has_attr("_max_episode_steps"):
-                    limits = self.env.get_attr("_max_episode_steps")
-            else:
+            # TimeLimit's number first: around an environment without a spec there is no other.
+            if self.env.has_attr("_max_episode_steps"):
+                limits = self.env.get_attr("_max_episode_steps")
+            elif not isinstance(self.env.unwrapped, SubprocVecEnv):
+                # Not every spec can be sent from process to process, and to ask for what isn't
+                # there would end them.
                 specs = self.env.get_attr("spec")
                 limits = [getattr(spec, "max_episode_steps", None) for spec in specs]
         except (AttributeError, NotImplementedError):

@@ -116,3 +116,18 @@ def test_no_git_no_commit(monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert commit() is None
     assert set(provenance()) == {"versions", "commit", "platform"}
+
+
+def test_a_package_that_is_not_installed_has_no_version(monkeypatch):
+    """The algorithms train beside an old MuJoCo, or without one."""
+    version = metadata.version
+
+    def without_mujoco(package: str) -> str:
+        if package == "mujoco":
+            raise metadata.PackageNotFoundError(package)
+        return version(package)
+
+    assert "mujoco" in provenance()["versions"]
+    monkeypatch.setattr(metadata, "version", without_mujoco)
+    versions = provenance()["versions"]
+    assert "mujoco" not in versions and "torch" in versions

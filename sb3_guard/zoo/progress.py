@@ -4,6 +4,7 @@ import platform
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -47,10 +48,11 @@ def commit() -> str | None:
 
 
 def provenance() -> dict[str, Any]:
-    """What a result was made with: ``versions`` by package, git ``commit``, ``platform``."""
+    """What a result was made with: ``versions`` of what is there, git ``commit``, ``platform``."""
     versions = {"sb3_guard": sb3_guard.__version__, "python": platform.python_version()}
     for package in PACKAGES:
-        versions[package] = metadata.version(package)
+        with suppress(metadata.PackageNotFoundError):  # the algorithms train without MuJoCo, too
+            versions[package] = metadata.version(package)
     return {"versions": versions, "commit": commit(), "platform": platform.platform()}
 
 

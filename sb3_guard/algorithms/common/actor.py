@@ -32,6 +32,7 @@ from torch import nn
 
 from sb3_guard.algorithms.common.mlp import TanhMlp, chunks
 from sb3_guard.algorithms.common.natural_gradient import flatten, unflatten
+from sb3_guard.algorithms.common.threads import accumulate
 
 
 def rows(batch: Any, index: slice | th.Tensor) -> Any:
@@ -267,25 +268,32 @@ class TanhActor(Actor):
         return th.cat(products, dim=1)
 
     def score(self, weights: th.Tensor) -> th.Tensor:
-        total = [th.zeros_like(parameter) for parameter in self.parameters]
         n = len(self.network.parameters)
-        for activations, index in zip(self.activations, self.slices, strict=True):
+
+        def add(number: int, total: list[th.Tensor]) -> float:
+            activations, index = self.activations[number], self.slices[number]
             distribution, inputs = self._head(activations[-1])
             log_prob = distribution.log_prob(self.actions[index])
             slopes = th.autograd.grad(log_prob @ weights[index], inputs)
             self.network.adjoint(activations, slopes[0], total[:n])
             for each, slope in zip(total[n:], slopes[1:], strict=True):
                 each.add_(slope)
-        return flatten(total)
+            return 0.0
+
+        return flatten(accumulate(add, len(self.slices), self.parameters)[0])
 
     @th.no_grad()
     def fisher(self, vector: th.Tensor) -> th.Tensor:
         pieces = unflatten(vector, self.parameters)
         n = len(self.network.parameters)
-        total = [th.zeros_like(parameter) for parameter in self.parameters]
-        for i, activations in enumerate(self.activations):
+
+        def add(number: int, total: list[th.Tensor]) -> float:
+            activations = self.activations[number]
             change = self.network.tangent(activations, pieces[:n])
-            self.network.adjoint(activations, self._curvature(i, change), total[:n])
+            self.network.adjoint(activations, self._curvature(number, change), total)
+            return 0.0
+
+        total, _ = accumulate(add, len(self.slices), self.network.parameters)
         size = len(self.old_log_prob)
         # A Gaussian's log standard deviations have Fisher matrix 2 I, apart from the mean.
-        return flatten([*(each / size for each in total[:n]), *(2.0 * p for p in pieces[n:])])
+        return flatten([*(each / size for each in total), *(2.0 * p for p in pieces[n:])])

@@ -21,6 +21,7 @@ from sb3_guard.algorithms.common.actor import (
     value_parameters,
 )
 from sb3_guard.algorithms.common.mlp import TanhMlp, chunks
+from sb3_guard.algorithms.common.threads import accumulate
 
 
 class StateNetwork(nn.Module):
@@ -232,25 +233,27 @@ class Regression:
         return total
 
     def _gradients_by_hand(self, batch: Any, targets: th.Tensor, inputs: th.Tensor) -> float:
-        assert self.network is not None
-        gradients = []
-        for parameter in self.network.parameters:
-            if parameter.grad is None:
-                parameter.grad = th.zeros_like(parameter)
-            gradients.append(parameter.grad.zero_())
-        total = 0.0
-        for index in chunks(len(targets)):
-            activations = self.network.forward(inputs[index])
+        network, slices = self.network, chunks(len(targets))
+        assert network is not None
+
+        def add(number: int, gradients: list[th.Tensor]) -> float:
+            index = slices[number]
+            activations = network.forward(inputs[index])
             outputs = activations[-1]
             if self.readout is None:
                 error = outputs - targets[index]
-                total += float(error.flatten() @ error.flatten())
+                total = float(error.flatten() @ error.flatten())
                 slope = error.mul_(2.0 / targets.numel())
             else:
                 outputs.requires_grad_()
                 values = self.readout(outputs, rows(batch, index))
                 loss = F.mse_loss(values, targets[index], reduction="sum")
-                total += loss.item()
+                total = loss.item()
                 (slope,) = th.autograd.grad(loss / targets.numel(), outputs)
-            self.network.adjoint(activations, slope, gradients)
+            network.adjoint(activations, slope, gradients)
+            return total
+
+        gradients, total = accumulate(add, len(slices), network.parameters)
+        for parameter, gradient in zip(network.parameters, gradients, strict=True):
+            parameter.grad = gradient
         return total / targets.numel()

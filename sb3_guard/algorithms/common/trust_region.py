@@ -22,6 +22,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import cached_property
 from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
@@ -42,7 +43,7 @@ from stable_baselines3.common.utils import explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
-from sb3_guard.algorithms.common.actor import Actor, actor_modules
+from sb3_guard.algorithms.common.actor import Actor, actor_modules, parameterless
 from sb3_guard.algorithms.common.buffers import (
     CostDictRolloutBuffer,
     CostRolloutBuffer,
@@ -58,6 +59,7 @@ from sb3_guard.algorithms.common.checks import (
 from sb3_guard.algorithms.common.costs import CostEstimate, read_costs
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
+from sb3_guard.algorithms.common.threads import one_thread
 
 SelfTrustRegion = TypeVar("SelfTrustRegion", bound="TrustRegion")
 
@@ -477,12 +479,15 @@ class TrustRegion(OnPolicyAlgorithm):
         self._cuda_at_rollout = th.cuda.get_rng_state_all() if self.device.type == "cuda" else []
         started = time.perf_counter()
         self._begin_rollout_statistics()
-        full = super().collect_rollouts(
-            _CorrectedEnv(env, self) if self._corrects else env,
-            callback,
-            rollout_buffer,
-            n_rollout_steps,
-        )
+        # a plain network's layers are too small for two threads, an image's are not
+        alone = self.device.type == "cpu" and parameterless(self.policy.features_extractor)
+        with one_thread() if alone else nullcontext():
+            full = super().collect_rollouts(
+                _CorrectedEnv(env, self) if self._corrects else env,
+                callback,
+                rollout_buffer,
+                n_rollout_steps,
+            )
         if full:
             self._finish_costs()
         else:

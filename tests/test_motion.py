@@ -14,6 +14,10 @@ KINDS = {
 }
 
 
+def advance(points, robot, law, planar):
+    motion.Fleet([motion.Moving(points, law, planar)]).advance(robot)
+
+
 def unit(v):
     length = math.sqrt(sum(x * x for x in v))
     return [x / length if length else 0.0 for x in v]
@@ -68,7 +72,7 @@ def test_the_law_equals_the_scalar_loop(kind, planar, unit_law):
             scalar_law(kind, p, r, *rule)
             for p, r in zip(points.tolist(), robot.tolist(), strict=True)
         ]
-        motion.advance(points, robot, law, planar)
+        advance(points, robot, law, planar)
         np.testing.assert_allclose(points, expected, rtol=0, atol=1e-14)
 
 
@@ -76,7 +80,7 @@ def test_a_mover_on_the_spot_stays_and_movers_on_one_spot_do_not_part():
     """The unit vector of a zero offset is zero."""
     points = np.zeros((1, 2, 3))
     law = motion.Law(far=1e-3, near=-1e-3, settle=1e-3, apart=1e-3, gap=0.6, r1=1.0)
-    motion.advance(points, np.zeros((1, 3)), law, planar=False)
+    advance(points, np.zeros((1, 3)), law, planar=False)
     np.testing.assert_array_equal(points, 0.0)
 
 
@@ -88,9 +92,9 @@ def test_rows_do_not_depend_on_each_other(k, planar):
     law = motion.Law(near=-0.01, far=0.01, settle=0.02, home=0.01, apart=0.01, gap=0.9, r0=1, r1=1)
     lone = points.copy()
     for _ in range(20):
-        motion.advance(points, robot, law, planar)
+        advance(points, robot, law, planar)
         for i in range(5):
-            motion.advance(lone[i : i + 1], robot[i : i + 1], law, planar)
+            advance(lone[i : i + 1], robot[i : i + 1], law, planar)
     np.testing.assert_array_equal(points, lone)
 
 

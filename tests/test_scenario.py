@@ -194,6 +194,41 @@ def test_scenarios_from_files(tmp_path):
             Scenario.load(path)
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("task: Goal\nrobot: Ant\ntask: Push\n", "line 3 has the key 'task' again, after line 1: "),
+        ("constraints:\n  hazards:\n    num: 2\n    num: 3\n", "line 4 .* 'num' .* line 3: "),
+        ("task: Goal\nconstraints: {hazards: {num: 2, num: 2}}\n", "line 2 .* 'num' .* line 2: "),
+        ("constraints:\n  ghosts:\n  'ghosts': {num: 2}\n", "line 3 has the key 'ghosts' again"),
+        ("robot_params: {heading: 2020-13-45}\n", "month must be in 1..12"),
+    ],
+)
+def test_files_that_would_be_read_otherwise_than_written_are_refused(text, message, tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"^cannot read scenario '.*mine.yml': {message}"):
+        Scenario.load(path)
+
+
+def test_files_may_share_parameters(tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text(
+        "constraints:\n"
+        "  hazards: &few {num: 2, size: 0.4}\n"
+        "  ghosts: &slow {<<: *few, speed: 0.1}\n"
+        "  pillars: {<<: *few, num: 1}\n"
+        "  others: {<<: *few, <<: *slow, type: ghosts, num: 3}\n"
+    )
+    few = {"num": 2, "size": 0.4}
+    assert Scenario.load(path).constraints == {
+        "hazards": few,
+        "ghosts": {**few, "speed": 0.1},
+        "pillars": {**few, "num": 1},
+        "others": {**few, "speed": 0.1, "type": "ghosts", "num": 3},
+    }
+
+
 MAKERS = (
     make,
     make_vec_env,
@@ -251,6 +286,19 @@ def test_an_id_that_says_what_it_is_cannot_be_given_to_something_else():
     assert register("Goal_Point_7Hazards", same) == "Goal_Point_7Hazards-v0"
     assert gymnasium.make("Goal_Point_7Hazards-v0").unwrapped.scenario == same
     assert register("mine/Goal_Point_7Hazards", ant) == "mine/Goal_Point_7Hazards-v0"
+
+
+@mock.patch.dict(gymnasium.registry)
+def test_ids_of_others_are_theirs():
+    gymnasium.register("somebody/Reef-v0", entry_point=lambda: None)
+    before = dict(gymnasium.registry)
+    for name in ("CartPole", "CartPole-v1", "sb3_guard:CartPole-v1", "somebody/Reef"):
+        with pytest.raises(ValueError, match=r"-v[01]' is registered .* use another name$"):
+            register(name, Scenario())
+    assert gymnasium.registry == before
+    for scenario in (Scenario(), Scenario(robot="Ant")):  # ours take the new meaning, as in a cell
+        assert register("mine/Reef", scenario) == "mine/Reef-v0"
+        assert gymnasium.make("mine/Reef-v0").unwrapped.scenario == scenario
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,8 @@ def test_planar_lidar_equals_the_scalar_loop(bins, gain, reach, alias):
     v = rng.uniform(-3, 3, (7, 2, 5, 2))
     v[0, 0, :4] = [[1, 0], [0, 1], [-1, 0], [0, -1]]  # on the edges between bins
     v[1, 0, :2] = [[0, 0], [-1, -1e-300]]  # on the spot, and an angle that rounds up to 2 pi
-    scan = Lidar(bins=bins, gain=gain, max_distance=reach, alias=alias).scan(by_coordinate(v))
+    lidar = Lidar(bins=bins, gain=gain, max_distance=reach, alias=alias)
+    scan = lidar.scan(by_coordinate(v))[:, :, 0]
     for n, b in np.ndindex(7, 2):
         np.testing.assert_allclose(
             scan[n, b], lidar_2d(v[n, b].tolist(), bins, gain, reach, alias), atol=1e-12
@@ -74,7 +75,8 @@ def test_spatial_lidar_equals_the_scalar_loop(azimuth, elevation, alias):
     rng = np.random.default_rng(1)
     v = rng.uniform(-3, 3, (6, 3, 4, 3))
     v[0, 0, :3] = [[0, 0, 2], [0, 0, -2], [0, 0, 0]]  # the poles, and on the spot
-    scan = Lidar(azimuth=azimuth, elevation=elevation, alias=alias).scan(by_coordinate(v))
+    lidar = Lidar(azimuth=azimuth, elevation=elevation, alias=alias)
+    scan = lidar.scan(by_coordinate(v))[:, :, 0]
     for n, b in np.ndindex(6, 3):
         want = lidar_3d(v[n, b].tolist(), azimuth, elevation, 1.0, alias)
         np.testing.assert_allclose(scan[n, b], want, atol=1e-12)
@@ -82,7 +84,7 @@ def test_spatial_lidar_equals_the_scalar_loop(azimuth, elevation, alias):
 
 def test_lidar_of_nothing_is_empty():
     scan = Lidar().scan(np.zeros((2, 1, 0, 3)))
-    assert scan.shape == (3, 1, 16) and not scan.any()
+    assert scan.shape == (3, 1, 1, 16) and not scan.any()
 
 
 def test_compass_equals_the_formula_and_is_zero_on_the_spot():

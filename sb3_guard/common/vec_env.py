@@ -8,6 +8,7 @@ Ours are imported where they are used: environments of others work where MuJoCo 
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,18 +132,17 @@ class GuardVecEnv(VecEnv):
         # new dictionaries every step: Stable-Baselines3 keeps the ones it is given
         columns = {"cost": out.cost.tolist(), **{k: v.tolist() for k, v in out.costs.items()}}
         columns["TimeLimit.truncated"] = [False] * self.num_envs
-        infos: list[dict[str, Any]] = [
-            dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
-        ]
-        for name, rows in (
+        rows = map(zip, itertools.repeat(tuple(columns)), zip(*columns.values(), strict=True))
+        infos: list[dict[str, Any]] = list(map(dict, rows))
+        for name, happened in (
             ("goal_met", out.goal_met),
             ("goal_unplaced", out.unplaced),
             ("physics_error", out.physics_error),
         ):
-            if rows.any():
-                for row in np.flatnonzero(rows).tolist():
+            if np.count_nonzero(happened):
+                for row in np.flatnonzero(happened).tolist():
                     infos[row][name] = True
-        if t.done.any():
+        if np.count_nonzero(t.done):
             for row in np.flatnonzero(t.done).tolist():
                 last = self.envs.view(out.obs, t.final_images, row)
                 infos[row]["terminal_observation"] = last

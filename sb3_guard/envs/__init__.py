@@ -86,7 +86,8 @@ def register(name: str, scenario: str | Path | Mapping[str, Any] | Scenario | No
     :param scenario: what it is, if the name does not say it: a scenario, its plain data, its YAML
         file or an id
     :return: the id, with its version
-    :raises ValueError: the name cannot be read, or it says something else than the scenario
+    :raises ValueError: the name cannot be read, it says something else than the scenario, or it is
+        the id of somebody else's environment
     """
     if scenario is None:
         spec = env_spec(name)
@@ -104,6 +105,12 @@ def register(name: str, scenario: str | Path | Mapping[str, Any] | Scenario | No
                 f"{name!r} says by itself which environment it is, and it is not the one given: "
                 "choose a name that is not of the form Task_Robot_NConstraint"
             )
+    known = gymnasium.registry.get(spec.id)
+    if known is not None and known.entry_point != spec.entry_point:
+        raise ValueError(
+            f"{spec.id!r} is registered with Gymnasium already, for an environment that is not "
+            "sb3_guard's: use another name"
+        )
     gymnasium.registry[spec.id] = spec
     return spec.id
 

@@ -20,7 +20,6 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from mujoco.batch import Batch, SimulationError
 
-from sb3_guard.envs import geometry, sensors
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import (
     ARENA,
@@ -32,9 +31,10 @@ from sb3_guard.envs.layout import (
     farthest,
     redraw,
 )
+from sb3_guard.envs.motion import fleets
 from sb3_guard.envs.parameters import Parameters, check_count, param
 from sb3_guard.envs.part import FLOOR, Array, Constraint, Part, Robot, Task
-from sb3_guard.envs.sensors import Channel, Lidar
+from sb3_guard.envs.sensors import Channel, Compass, Lidar, Lookout, Scan
 
 FRAME_SKIP = 10
 STAGE = int(mujoco.mjtStage.mjSTAGE_ACC)  # touch, accelerometer and contacts describe the new state
@@ -207,7 +207,7 @@ class Engine:
         self.parts: tuple[Part, ...] = (robot, task, *self.constraints, self.extras)
         self.num_envs = int(num_envs)
         self.num_threads = min(num_threads or _cpus(), self.num_envs)
-        self._lidar = lidar or Lidar()
+        self._lookout = Lookout(lidar or Lidar(), robot.workspace == "planar")
         self._layout = layout or Layout()
 
         names = [part.name for part in self.parts]
@@ -244,15 +244,18 @@ class Engine:
                     margin=max(f.margin, self._layout.margin),
                 )
                 self._owners[f.name] = part
-                self.array(f"places/{f.name}", (f.num, 3))
+                # by coordinate in memory
+                self._arrays[f"places/{f.name}"] = np.zeros((self.num_envs, f.num, 3), order="F")
         check_locations(list(self.footprints.values()))
         # where the generators begin every episode of rows whose layout is not to change
         self._origins: dict[int, Any] = {}
         for part in self.parts:
             part.bind(self)
+        self._fleets = fleets(group for part in self.parts for group in part.moving())
         self._channels: dict[str, Channel] = {}
         for part in self.parts:
-            for name, channel in part.channels().items():
+            self._check_sights(part)
+            for name, channel in self.channels_of(part).items():
                 if not isinstance(channel, Channel):
                     raise ValueError(
                         f"channels() of {part.name} gives {name!r} as {channel!r}: it must be a "
@@ -310,48 +313,21 @@ class Engine:
             self.places(name)[row, 0] = place
         return place is not None
 
-    def lidar(self, points: Array, planar: bool) -> Array:
-        """Lidar of points seen from the robot's lidar bodies.
+    def channels_of(self, part: Part) -> dict[str, Channel]:
+        """Size, bounds and unit of what one part lets the robot observe, by name."""
+        bodies = self.robot.frames[0].shape[1]
+        seen = {n: self._lookout.channel(s, bodies) for n, s in part.sights().items()}
+        return {**seen, **part.channels()}
 
-        :param points: [N, K, 3] m
-        :param planar: whether the points lie in the plane: one ring of bins instead of a sphere
-        :return: [N, bodies · bins]
-        """
-        points = geometry.by_coordinate(points)
-        if planar:  # seen as lying on the floor, whatever their height
-            points[2] = 0.0
-        v = geometry.into_frames(*self.robot.frames, points, 2 if planar else 3)
-        return self._lidar.scan(v).reshape(self.num_envs, -1)
-
-    def lidar_azimuth(self, planar: bool) -> int:
-        """Bins of the lidar around its axis."""
-        return self._lidar.bins if planar else self._lidar.azimuth
-
-    def lidar_channel(self, planar: bool) -> Channel:
-        """What :meth:`lidar` returns."""
-        return self._lidar.channel(self._bodies, planar)
-
-    def compass(self, point: Array, planar: bool = True) -> Array:
-        """Direction of a point in the frames of the robot's lidar bodies.
-
-        :param point: [N, 3] m
-        :param planar: whether the point lies in the plane
-        :return: [N, bodies · 2] if robot and point are planar, else [N, bodies · 3]
-        """
-        point = geometry.by_coordinate(point[:, None])
-        v = geometry.into_frames(*self.robot.frames, point, self._compass_size(planar))
-        return sensors.compass(v[:, :, 0]).T.reshape(self.num_envs, -1)
-
-    def compass_channel(self, planar: bool = True) -> Channel:
-        """What :meth:`compass` returns."""
-        return Channel(self._bodies * self._compass_size(planar), -1.0, 1.0, "direction")
-
-    def _compass_size(self, planar: bool) -> int:
-        return 2 if planar and self.robot.workspace == "planar" else 3
-
-    @property
-    def _bodies(self) -> int:
-        return self.robot.frames[0].shape[1]
+    def halos(self, row: int) -> list[tuple[Array, int, tuple[float, float, float]]]:
+        """Every lidar of a row: closeness [bodies · bins], bins around, and color."""
+        sights = {n: (s, part) for part in self.parts for n, s in part.sights().items()}
+        seen = self._lookout.look({n: s for n, (s, _) in sights.items()}, *self.robot.frames)
+        return [
+            (seen[name][row], self._lookout.azimuth(sight), sight.color or part.color)
+            for name, (sight, part) in sights.items()
+            if isinstance(sight, Scan)
+        ]
 
     @property
     def observation_layout(self) -> dict[str, slice]:
@@ -414,14 +390,36 @@ class Engine:
 
     def observe(self) -> Array:
         """The flat observation of every row, [N, D] float32, a new array."""
+        sights: dict[str, Scan | Compass] = {}
         seen: dict[str, Array] = {}
         for part in self.parts:
-            if self._observed:
-                seen.update(part.observe())
-            else:
-                seen.update(self._checked_observation(part))
+            sights.update(part.sights())
+            seen.update(part.observe() if self._observed else self._checked_observation(part))
         self._observed = True
+        seen.update(self._lookout.look(sights, *self.robot.frames))
         return np.concatenate([seen[name] for name in self._slices], axis=1, dtype=np.float32)
+
+    def _check_sights(self, part: Part) -> None:
+        """Refuse sights that are none.
+
+        :raises ValueError: names the sight and what it must be
+        """
+        for name in part.sights().keys() & part.channels().keys():
+            raise ValueError(
+                f"{part.name} has {name!r} in sights() and in channels(): what is seen has its "
+                "channel already, leave it out there"
+            )
+        for name, sight in part.sights().items():
+            if not isinstance(sight, (Scan, Compass)):
+                raise ValueError(
+                    f"sights() of {part.name} gives {name!r} as {sight!r}: it must be a Scan of "
+                    "points [N, K, 3] or a Compass to a point [N, 3]"
+                )
+            rest = ("K", 3) if isinstance(sight, Scan) else (3,)
+            shape = np.shape(sight[0])
+            if len(shape) != 1 + len(rest) or (shape[0], shape[-1]) != (self.num_envs, 3):
+                expected = (self.num_envs, *rest)
+                raise ValueError(_misshapen(part, f"sights()[{name!r}]", shape, expected))
 
     def _checked_observation(self, part: Part) -> dict[str, Array]:
         """What a part observes.
@@ -476,7 +474,9 @@ class Engine:
                 f"actions of rows {rows} are not finite: {actions[rows[0]].tolist()}; allowed: "
                 "numbers within [-1, 1]"
             )
-        # every part moves from the positions last observed; nothing moves between physics steps
+        # everything moves from the positions last observed; nothing moves between physics steps
+        for fleet in self._fleets:
+            fleet.advance(self.robot.position)
         for part in self.parts:
             part.before_step()
         self.robot.act(np.minimum(np.maximum(actions, -1.0), 1.0))

@@ -32,8 +32,11 @@ def length(v: Array) -> Array:
 
 
 def norm(v: Array) -> Array:
-    """Euclidean length of the last axis, of size 2 or 3."""
-    return length(v.T).T
+    """Euclidean length of the last axis, of size 2 or 3.
+
+    In C order: how sums of it round depends on that.
+    """
+    return np.ascontiguousarray(length(v.T).T)
 
 
 def distance(a: Array, b: Array, planar: bool) -> Array:

@@ -7,8 +7,9 @@ depends on whether the robot is within r1 (Zhao et al. 2024, §4: ghosts, chase 
 
 from __future__ import annotations
 
-import functools
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,58 +51,103 @@ class Law:
     unit: bool = True
 
 
-def advance(points: Array, robot: Array, law: Law, planar: bool) -> None:
-    """Move by one control step, in place.
+class Moving(NamedTuple):
+    """Like movers and what they do.
 
-    :param points: where the movers are, [N, K, 3] m
-    :param robot: where the robot is, [N, 3] m
+    :param points: where they are, [N, K, 3] m, live
     :param law: their law of motion
     :param planar: whether they move and measure in the plane
     """
-    points = points.T[: 2 if planar else 3]
-    here = points.copy()  # by coordinate, [2 or 3, K, N]
-    to_robot = robot.T[: len(here), None] - here
-    size = 2 if law.unit else len(here)
-    to_origin = np.array(law.origin[:size])[:, None, None] - here[:size]
-    robot_distance, origin_distance = length(to_robot), length(to_origin)
-    outside, near = origin_distance > law.r0, robot_distance <= law.r1
-    pull = np.where(near, law.near, law.far)
-    draw = np.where(near, 0.0, law.settle)
-    pull[outside] = 0.0
-    draw[outside] = law.home
-    if law.unit:
-        pull /= np.maximum(robot_distance, TINY)
-        draw /= np.maximum(origin_distance, TINY)
-    move = pull * to_robot
-    move[:size] += draw * to_origin
-    if law.unit and law.apart:
-        _part(move, here, law.gap, law.apart)
-    points += move
+
+    points: Array
+    law: Law
+    planar: bool
 
 
-@functools.lru_cache
-def _pairs(k: int) -> tuple[Array, Array]:
-    """Numbers of the first and of the second of every pair of K movers, in order."""
-    return np.triu_indices(k, 1)
+class Fleet:
+    """All movers of a world that can be moved in one pass, whatever parts they belong to.
 
-
-def _part(move: Array, points: Array, gap: float, speed: float) -> None:
-    """Add ``speed`` away from each other point of the row that is closer than ``gap``.
-
-    :param move: what to add to, by coordinate, [2 or 3, K, N] m
-    :param points: by coordinate, [2 or 3, K, N] m
+    :param groups: of like movers; all in the plane or all in space, all by unit vectors or none
     """
-    k, n = points.shape[1:]
-    first, second = _pairs(k)
-    offset = points.take(first, axis=1) - points.take(second, axis=1)  # [2 or 3, pairs, N]
-    distance = length(offset)
-    close = np.flatnonzero(distance < gap)
-    if not len(close):
-        return
-    pair, row = np.divmod(close, n)
-    push = offset.reshape(len(offset), -1)[:, close]
-    push *= speed / np.maximum(distance.reshape(-1)[close], TINY)
-    # each mover's pushes are summed in the order of the others, whatever the number of rows
-    moved = np.concatenate([second[pair] * n + row, first[pair] * n + row])
-    for x, away in zip(move, push, strict=True):
-        x += np.bincount(moved, np.concatenate([-away, away]), k * n).reshape(k, n)
+
+    def __init__(self, groups: Sequence[Moving]) -> None:
+        planar, self._unit = groups[0].planar, groups[0].law.unit
+        self._size = 2 if planar else 3
+        self._level = self._unit and not planar  # home is sought in the plane
+        self._live = [g.points.T[: self._size] for g in groups]  # by coordinate
+        ends = np.cumsum([g.points.shape[1] for g in groups]).tolist()
+        self._columns = [slice(i, j) for i, j in zip([0, *ends], ends, strict=False)]
+        laws = [g.law for g in groups for _ in range(g.points.shape[1])]
+        self._aims = np.zeros((self._size, 2, ends[-1], len(groups[0].points)))  # robot and origin
+        self._aims[:, 1] = np.array([law.origin[: self._size] for law in laws]).T[..., None]
+        self._radii = np.array([[law.r1 for law in laws], [law.r0 for law in laws]])[..., None]
+        # speeds towards robot and origin, [2, 4 K]: outside r0 twice, within it far and near
+        self._speeds = np.array(
+            [
+                [(0.0, 0.0, law.far, law.near) for law in laws],
+                [(law.home, law.home, law.settle, 0.0) for law in laws],
+            ]
+        ).reshape(2, -1)
+        self._outside = 4 * np.arange(len(laws))[:, None]
+        self._inside = self._outside + 2
+        first, second = np.triu_indices(len(laws), 1)
+        kin = np.repeat(np.arange(len(groups)), [g.points.shape[1] for g in groups])
+        pairs = np.flatnonzero(kin[first] == kin[second])
+        self._first, self._second = first[pairs], second[pairs]
+        self._gap = np.array([laws[i].gap for i in self._first])[:, None]
+        self._apart = np.array([laws[i].apart for i in self._first])
+        self._parts = self._unit and bool(self._apart.any())
+
+    def advance(self, robot: Array) -> None:
+        """Move by one control step, in place.
+
+        :param robot: where the robot is, [N, 3] m
+        """
+        here = np.concatenate(self._live, axis=1)  # [2 or 3, K, N]
+        self._aims[:, 0] = robot.T[: self._size, None]
+        offset = self._aims - here[:, None]  # [2 or 3, 2, K, N]
+        if self._level:
+            offset[2, 1] = 0.0
+        distance = length(offset)  # [2, K, N]
+        near, within = distance <= self._radii
+        case = np.where(within, self._inside, self._outside)
+        case += near
+        speed = self._speeds.take(case, axis=1)  # [2, K, N]
+        if self._unit:
+            speed /= np.maximum(distance, TINY)
+        offset *= speed
+        move = offset[:, 0] + offset[:, 1]
+        if self._parts:
+            self._part(move, here)
+        for live, columns in zip(self._live, self._columns, strict=True):
+            live += move[:, columns]
+
+    def _part(self, move: Array, points: Array) -> None:
+        """Add a push away from each like mover of the row that is closer than the gap.
+
+        :param move: what to add to, by coordinate, [2 or 3, K, N] m
+        :param points: by coordinate, [2 or 3, K, N] m
+        """
+        k, n = points.shape[1:]
+        offset = points.take(self._first, axis=1)  # [2 or 3, pairs, N]
+        offset -= points.take(self._second, axis=1)
+        distance = length(offset)
+        close = (distance < self._gap).ravel().nonzero()[0]
+        if not len(close):
+            return
+        pair, row = np.divmod(close, n)
+        push = offset.reshape(len(offset), -1)[:, close]
+        push *= self._apart[pair] / np.maximum(distance.ravel()[close], TINY)
+        # each mover's pushes are summed in the order of the others, whatever the number of rows
+        moved = np.concatenate([self._second[pair] * n + row, self._first[pair] * n + row])
+        for x, away in zip(move, push, strict=True):
+            x += np.bincount(moved, np.concatenate([-away, away]), k * n).reshape(k, n)
+
+
+def fleets(moving: Iterable[Moving]) -> list[Fleet]:
+    """Few fleets for many groups of movers; those of no movers are left out."""
+    alike: dict[tuple[bool, bool], list[Moving]] = {}
+    for group in moving:
+        if group.points.shape[1]:
+            alike.setdefault((group.planar, group.law.unit), []).append(group)
+    return [Fleet(groups) for groups in alike.values()]

@@ -27,7 +27,7 @@ from sb3_guard.envs.part import (
     Simulation,
     World,
 )
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.sensors import Compass, Scan
 
 BOX = mujoco.mjtGeom.mjGEOM_BOX
 CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -296,19 +296,13 @@ class Objects(Part):
         if self.solid:
             self.bodies.put(ids, self.sim.places(self.group)[ids], rngs)
 
-    def observe(self) -> dict[str, Array]:
-        return {f"{self.group}_lidar": self.sim.lidar(self.centers, self.planar)}
-
-    def channels(self) -> dict[str, Channel]:
-        return {f"{self.group}_lidar": self.sim.lidar_channel(self.planar)}
+    def sights(self) -> dict[str, Scan | Compass]:
+        return {f"{self.group}_lidar": Scan(self.centers, self.planar)}
 
     def draw(self, painter: Painter, row: int) -> None:
         if not self.solid:
             for center in self.centers[row]:
                 painter.zone(center, self.size, 0.01 if self.planar else 0.0, self.color)
-        lidar = self.observe().get(f"{self.group}_lidar")
-        if lidar is not None:
-            painter.halo(lidar[row], self.sim.lidar_azimuth(self.planar), self.color)
 
     def add_geom(
         self, body: mujoco.MjsBody, kind: mujoco.mjtGeom, size: tuple[float, ...], lift: float = 0.0
@@ -431,11 +425,12 @@ class Movers(Spatial, Objects):
                     f"across it for ever: at most {most:g} m; lower speed, or v0, v1, v2"
                 )
 
+    def moving(self) -> tuple[motion.Moving, ...]:
+        return (motion.Moving(self.centers, self.motion, self.planar),)
+
     def before_step(self) -> None:
-        centers = self.centers
-        motion.advance(centers, self.sim.robot.position, self.motion, self.planar)
         if not self.planar:
-            z, (low, high) = centers[..., 2], self.height
+            z, (low, high) = self.centers[..., 2], self.height
             np.minimum(np.maximum(z, low), high, out=z)
         if self.solid:
-            self.bodies.move(centers)
+            self.bodies.move(self.centers)

@@ -7,12 +7,14 @@ engine calls the verbs in this order::
     build(world)        once    add bodies and sensors to the MjSpec
     bind(sim)           once    take live [N, ...] views of what was added
     reset(ids, rngs)            an episode begins in rows ids, at the places just drawn
-    before_step()               set controls, move what moves itself
-    observe()                   name -> [N, d]
+    moving()            once    what moves by a law: the engine moves it before each step
+    before_step()               move what else moves itself
+    sights()                    name -> what lidar and compass see
+    observe()                   name -> [N, d], whatever else is observed
 
 A task adds ``measure``, ``reward``, ``succeeded`` and ``advance``; a constraint adds ``cost``.
-``observe``, ``measure``, ``reward`` and ``cost`` only read. A part keeps no arrays of its own
-between steps: it takes them by name from the engine (:meth:`Simulation.array`), so that an
+``sights``, ``observe``, ``measure``, ``reward`` and ``cost`` only read. A part keeps no arrays of
+its own between steps: it takes them by name from the engine (:meth:`Simulation.array`), so that an
 engine's state can be saved and restored whole.
 """
 
@@ -27,8 +29,9 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs.layout import Footprint
+from sb3_guard.envs.motion import Moving
 from sb3_guard.envs.parameters import Parameters
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.sensors import Channel, Compass, Scan
 
 Array = np.ndarray
 Generators = Sequence[np.random.Generator]
@@ -72,27 +75,9 @@ class Simulation(Protocol):
     def redraw(self, name: str, row: int) -> bool:
         """Draw footprint ``name`` anew in one row, clear of everything's current place."""
 
-    def lidar(self, points: Array, planar: bool) -> Array:
-        """Lidar of [N, K, 3] points seen from the robot's lidar bodies: [N, size]."""
-
-    def compass(self, point: Array, planar: bool = True) -> Array:
-        """Direction of [N, 3] points in the frames of the robot's lidar bodies: [N, size]."""
-
-    def lidar_azimuth(self, planar: bool) -> int:
-        """Bins of the lidar around its axis."""
-
-    def lidar_channel(self, planar: bool) -> Channel:
-        """What :meth:`lidar` returns."""
-
-    def compass_channel(self, planar: bool = True) -> Channel:
-        """What :meth:`compass` returns."""
-
 
 class Painter(Protocol):
-    """Draws what is not a body: zones, goals, halos."""
-
-    def halo(self, closeness: Array, azimuth: int, color: tuple[float, ...]) -> None:
-        """Beads around the lidar bodies for one row's lidar, [bodies · bins]."""
+    """Draws what is not a body, such as zones and goals."""
 
     def zone(
         self, center: Array, radius: float, half_height: float, color: tuple[float, ...]
@@ -150,11 +135,19 @@ class Part(Parameters):
     def reset(self, ids: Array, rngs: Generators) -> None:
         """Begin an episode in rows ``ids``; ``rngs`` holds one generator per row of the batch."""
 
+    def moving(self) -> tuple[Moving, ...]:
+        """What moves by a law towards the robot or away from it; it does so before each step."""
+        return ()
+
     def before_step(self) -> None:
-        """Move what moves itself, from the positions last observed."""
+        """Move what else moves itself, from the positions last observed."""
+
+    def sights(self) -> dict[str, Scan | Compass]:
+        """Named observations from the robot's lidar bodies, always the same ones."""
+        return {}
 
     def observe(self) -> dict[str, Array]:
-        """Named observations, each [N, d]."""
+        """Other named observations, each [N, d]."""
         return {}
 
     def channels(self) -> dict[str, Channel]:

@@ -99,7 +99,6 @@ class ScenePainter:
     :param engine: whose parts draw
     :param data: one row's state
     :param row: which row
-    :param explain: whether to draw halos: they are no things in the world
     """
 
     def __init__(
@@ -108,10 +107,8 @@ class ScenePainter:
         engine: Engine,
         data: mujoco.MjData,
         row: int,
-        explain: bool = True,
     ) -> None:
         self._scene, self._engine, self._data, self._row = scene, engine, data, row
-        self._explain = explain
         self._halos = 0
 
     def zone(
@@ -143,8 +140,6 @@ class ScenePainter:
         :param azimuth: bins around
         :param color: red, green, blue
         """
-        if not self._explain:
-            return
         centers, rotations, radii = self._first_halo
         radii = radii + HALO_STEP * self._halos
         self._halos += 1
@@ -288,10 +283,14 @@ class Renderer:
         return self._pixels[::-1].copy()
 
     def _paint(self, scene: mujoco.MjvScene, row: int) -> None:
-        painter = ScenePainter(scene, self._engine, self._data, row, self._explain)
+        painter = ScenePainter(scene, self._engine, self._data, row)
         for part in self._engine.parts:
             part.draw(painter, row)
-        if self._explain and any(c.cost()[row] > 0 for c in self._engine.constraints):
+        if not self._explain:  # halos and tint are no things in the world
+            return
+        for halo in self._engine.halos(row):
+            painter.halo(*halo)
+        if any(c.cost()[row] > 0 for c in self._engine.constraints):
             painter.glow(self._engine.robot.position[row])
 
     def close(self) -> None:

@@ -37,6 +37,36 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
+def _read_yaml(path: str | Path) -> Any:
+    """The content of a YAML file, whose mappings must not have a key twice.
+
+    PyYAML would take the last of them without a word.
+
+    :raises ValueError: a key is there twice, or the file is not text in UTF-8
+    :raises OSError: the file cannot be read
+    :raises yaml.YAMLError: it is not YAML
+    """
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+            node = super().compose_mapping_node(anchor)
+            lines: dict[str, int] = {}
+            for key, _ in node.value:
+                # Merges, "<<: *other", may be several.
+                if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                    line = key.start_mark.line + 1
+                    if key.value in lines:
+                        raise ValueError(
+                            f"line {line} has the key {key.value!r} again, after line "
+                            f"{lines[key.value]}: keep one of the two"
+                        )
+                    lines[key.value] = line
+            return node
+
+    return yaml.load(Path(path).read_text(encoding="utf-8"), Loader)
+
+
 def _filled(data: Mapping[str, Any]) -> dict[str, Any]:
     """Without the keys that a YAML file leaves blank, at any depth: they keep their defaults."""
     return {
@@ -159,17 +189,18 @@ class Scenario:
 
         What is left blank has its default.
 
-        :raises ValueError: the file is missing, is not YAML in UTF-8 or holds unknown keys
+        :raises ValueError: the file is missing, is not YAML in UTF-8, or holds unknown keys or one
+            key twice
         """
         import yaml
 
         try:
-            data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+            data = _read_yaml(path)
         except UnicodeDecodeError:
             raise ValueError(
                 f"cannot read scenario {str(path)!r}: it is not text in UTF-8; save it as such"
             ) from None
-        except (OSError, yaml.YAMLError) as error:
+        except (OSError, ValueError, yaml.YAMLError) as error:
             detail = " ".join(str(error).split())
             raise ValueError(f"cannot read scenario {str(path)!r}: {detail}") from None
         if not isinstance(data, dict):

@@ -115,7 +115,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         done = outcome.terminated | truncated
         obs = outcome.obs
         images = final_images = self.look()
-        if done.any():
+        if np.count_nonzero(done):
             self.engine.reset(np.flatnonzero(done))
             obs, images = self.engine.observe(), self.look()
         return Transition(obs, outcome, truncated, done, images, final_images)

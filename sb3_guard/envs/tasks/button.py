@@ -11,7 +11,7 @@ from sb3_guard.envs import geometry
 from sb3_guard.envs.objects import MOST, SPHERE, Objects
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Generators, Painter, Simulation, Task
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.sensors import Compass, Scan
 
 GREEN = (0.1, 0.75, 0.2)
 
@@ -99,14 +99,11 @@ class Button(Objects, Task):
         wrong = self.bodies.touched.sum(axis=1) - self.bodies.touched[self._rows, self.right]
         return np.where(self.wait == 0, wrong, 0).astype(float)
 
-    def observe(self) -> dict[str, Array]:
-        lidar = self.sim.lidar(self.centers, self.planar)
-        lidar[~self.lit] = 0.0
-        compass = self.sim.compass(self.goal, self.planar)
-        return {f"{self.group}_lidar": lidar, "goal_compass": compass}
-
-    def channels(self) -> dict[str, Channel]:
-        return {**super().channels(), "goal_compass": self.sim.compass_channel(self.planar)}
+    def sights(self) -> dict[str, Scan | Compass]:
+        return {
+            f"{self.group}_lidar": Scan(self.centers, self.planar, lit=self.lit),
+            "goal_compass": Compass(self.goal, self.planar),
+        }
 
     def draw(self, painter: Painter, row: int) -> None:
         super().draw(painter, row)

@@ -10,7 +10,7 @@ from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Painter, Simulation, Task, World
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.sensors import Channel, Compass, Scan
 
 REDRAWS = 20  # new places drawn before one that is reached already is accepted
 
@@ -69,26 +69,21 @@ class Destination(Task):
                 break
         return True
 
-    def observe(self) -> dict[str, Array]:
-        out = {"goal_compass": self.sim.compass(self.place, self.planar)}
+    def sights(self) -> dict[str, Scan | Compass]:
+        out: dict[str, Scan | Compass] = {"goal_compass": Compass(self.place, self.planar)}
         if self.lidar:
-            out["goal_lidar"] = self.sim.lidar(self.place[:, None], self.planar)
-        if self.distance:
-            gap = geometry.distance(self.sim.robot.position, self.place, self.planar)
-            out["goal_distance"] = np.exp(-gap)[:, None]
+            out["goal_lidar"] = Scan(self.place[:, None], self.planar)
         return out
 
+    def observe(self) -> dict[str, Array]:
+        if not self.distance:
+            return {}
+        gap = geometry.distance(self.sim.robot.position, self.place, self.planar)
+        return {"goal_distance": np.exp(-gap)[:, None]}
+
     def channels(self) -> dict[str, Channel]:
-        out = {"goal_compass": self.sim.compass_channel(self.planar)}
-        if self.lidar:
-            out["goal_lidar"] = self.sim.lidar_channel(self.planar)
-        if self.distance:
-            out["goal_distance"] = Channel(1, 0.0, 1.0, "closeness")
-        return out
+        return {"goal_distance": Channel(1, 0.0, 1.0, "closeness")} if self.distance else {}
 
     def draw(self, painter: Painter, row: int) -> None:
         lift = 0.25 if self.planar else 0.0
         painter.zone(self.place[row] + [0, 0, lift], self.size, lift, self.color)
-        if self.lidar:
-            closeness = self.sim.lidar(self.place[:, None], self.planar)[row]
-            painter.halo(closeness, self.sim.lidar_azimuth(self.planar), self.color)

@@ -12,8 +12,8 @@ from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.objects import BOX, SPHERE, Bodies, add_geom, check_cover
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Generators, Painter, Simulation, World
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.part import Array, Generators, Simulation, World
+from sb3_guard.envs.sensors import Compass, Scan
 from sb3_guard.envs.tasks.destination import Destination
 
 YELLOW = (0.95, 0.8, 0.1)
@@ -135,20 +135,8 @@ class Push(Destination):
     def succeeded(self, now: Array) -> Array:
         return now[:, 1] <= self.size
 
-    def observe(self) -> dict[str, Array]:
-        out = {**super().observe(), "box_compass": self.sim.compass(self.center, self.planar)}
+    def sights(self) -> dict[str, Scan | Compass]:
+        out = {**super().sights(), "box_compass": Compass(self.center, self.planar)}
         if self.object_lidar:
-            out["box_lidar"] = self.sim.lidar(self.center[:, None], self.planar)
+            out["box_lidar"] = Scan(self.center[:, None], self.planar, YELLOW)
         return out
-
-    def channels(self) -> dict[str, Channel]:
-        out = {**super().channels(), "box_compass": self.sim.compass_channel(self.planar)}
-        if self.object_lidar:
-            out["box_lidar"] = self.sim.lidar_channel(self.planar)
-        return out
-
-    def draw(self, painter: Painter, row: int) -> None:
-        super().draw(painter, row)
-        if self.object_lidar:
-            closeness = self.sim.lidar(self.center[:, None], self.planar)[row]
-            painter.halo(closeness, self.sim.lidar_azimuth(self.planar), YELLOW)

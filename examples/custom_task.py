@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_guard import CPO, evaluate_policy, make_vec_env, register_task
 from sb3_guard.envs.part import Task
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.sensors import Channel, Compass
 
 
 @dataclass
@@ -24,17 +24,17 @@ class Circle(Task):
         swept = before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0]  # r² dφ
         return swept / np.maximum(radius, 0.1) / (1 + np.abs(radius - 1))
 
-    def observe(self):
-        origin = np.zeros((self.sim.num_envs, 3))
-        distance = np.linalg.norm(self.sim.robot.position[:, :2], axis=1, keepdims=True)
-        return {"center": np.hstack([self.sim.compass(origin), distance])}
+    def sights(self):  # what the robot sees, by lidar (Scan) or compass
+        return {"center_compass": Compass(np.zeros((self.sim.num_envs, 3)))}
+
+    def observe(self):  # what else it knows
+        return {"center_distance": np.linalg.norm(self.measure(), axis=1, keepdims=True)}
 
     def channels(self):
-        return {"center": Channel(self.sim.compass_channel().size + 1, unit="direction, m")}
+        return {"center_distance": Channel(1, low=0.0, unit="m")}
 
 
 register_task("Circle", Circle)
 env = make_vec_env("Circle_Point_4Hazards", n_envs=10, seed=0)
-model = CPO("MlpPolicy", env, n_steps=1000, cost_limit=5.0, seed=0)
-model.learn(300_000)
+model = CPO("MlpPolicy", env, n_steps=1000, cost_limit=5.0, seed=0).learn(300_000)
 print("metres:", evaluate_policy(model, env, n_eval_episodes=10, seed=1).returns.round(1))

@@ -12,7 +12,7 @@ from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.layout import LayoutError
 from sb3_guard.envs.part import Constraint, Task
 from sb3_guard.envs.robots import Point
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.sensors import Channel, Compass, Lidar, Lookout, Scan
 from sb3_guard.envs.tasks import Goal
 
 
@@ -290,9 +290,26 @@ def seen(shape, channel="odd_eye", value=0.0):
     }
 
 
+def sees(sight, channel=None):
+    """A constraint with a sight."""
+    verbs = {
+        "cost": lambda self: np.zeros(self.sim.num_envs),
+        "sights": lambda self: {"odd_eye": sight},
+    }
+    return verbs if channel is None else {**verbs, "channels": lambda self: {channel: Channel(1)}}
+
+
 @pytest.mark.parametrize(
     ("verbs", "words"),
     [
+        (
+            sees("left"),
+            r"sights\(\) of odd gives 'odd_eye' as 'left': .* a Scan of .* or a Compass",
+        ),
+        (sees(Scan(np.zeros((2, 3)), True)), r"'odd_eye'\] of odd has .* expected \(2, K, 3\)"),
+        (sees(Compass(np.zeros((1, 3)))), r"'odd_eye'\] of odd has shape \(1, 3\), .* \(2, 3\)"),
+        (sees(Compass(np.zeros((2, 3))), "odd_eye"), r"odd has 'odd_eye' in sights\(\) and in ch"),
+        (sees(Compass(np.zeros((2, 3))), "eye"), r"channels\(\) of odd names 'eye', but observe"),
         ({"cost": lambda self: np.zeros((2, 3))}, r"cost\(\) of odd has shape \(2, 3\), .* \(2,\)"),
         ({"cost": lambda self: 0.0}, r"cost\(\) of odd has shape \(\), expected \(2,\): one row"),
         ({"cost": lambda self: np.array([0.0, -0.5])}, r"cost_odd is -0\.5: .* at least 0"),
@@ -421,3 +438,35 @@ def test_lidar_of_any_bodies_is_that_of_each_in_their_order(bodies):
         return obs[:, env.observation_layout["ghosts_lidar"]]
 
     np.testing.assert_array_equal(lidar(bodies), np.hstack([lidar((k,)) for k in bodies]))
+
+
+def test_many_sights_are_seen_as_each_alone():
+    """Lidars and compasses, planar and spatial, lit and dark, in one pass."""
+    rng = np.random.default_rng(0)
+
+    def points(k):
+        return rng.uniform(-2, 2, (5, k, 3))
+
+    lit = np.array([True, False, True, True, False])
+    sights = {
+        "goal": Compass(points(1)[:, 0], planar=False),
+        "vases": Scan(points(3), planar=True),
+        "fish": Scan(points(4), planar=False),
+        "none": Scan(points(0), planar=True),
+        "north": Compass(points(1)[:, 0]),
+        "lamps": Scan(points(2), planar=True, lit=lit),
+        "birds": Scan(points(1), planar=False),
+    }
+    origin = points(2)
+    rotation = np.linalg.qr(rng.normal(size=(5, 2, 3, 3)))[0]
+    for grounded in (True, False):
+        lookout = Lookout(Lidar(), grounded)
+        together = lookout.look(sights, origin, rotation)
+        assert together.keys() == sights.keys()
+        for name, sight in sights.items():
+            alone = Lookout(Lidar(), grounded).look({name: sight}, origin, rotation)[name]
+            assert alone.shape == (5, lookout.channel(sight, 2).size)
+            np.testing.assert_array_equal(together[name], alone)
+        assert not together["lamps"][~lit].any() and together["lamps"][lit].any()
+        assert not together["none"].any()
+    assert lookout.look({}, origin, rotation) == {}

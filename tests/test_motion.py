@@ -98,6 +98,33 @@ def test_rows_do_not_depend_on_each_other(k, planar):
     np.testing.assert_array_equal(points, lone)
 
 
+@pytest.mark.parametrize("planar", [True, False])
+def test_groups_that_move_together_move_as_each_alone(planar):
+    rng = np.random.default_rng(2)
+    laws = [
+        motion.Law(near=-0.03, home=0.01, apart=0.01, gap=0.9, r0=1, r1=1, origin=(0.1, 0.2, 0.3)),
+        motion.Law(far=0.02, home=0.02, r0=0.8, r1=0.5),  # nothing keeps these apart
+        motion.Law(settle=0.02, home=0.01, apart=0.02, gap=0.5, r0=1.5, r1=0.5),
+    ]
+    groups = [motion.Moving(rng.uniform(-1, 1, (4, 3, 3)), law, planar) for law in laws]
+    alone = [motion.Moving(g.points.copy(), g.law, planar) for g in groups]
+    nobody = motion.Moving(np.zeros((4, 0, 3)), laws[0], planar)
+    (fleet,) = motion.fleets([*groups, nobody])
+    for _ in range(30):
+        robot = rng.uniform(-1, 1, (4, 3))
+        fleet.advance(robot)
+        for group, own in zip(groups, alone, strict=True):
+            motion.Fleet([own]).advance(robot)
+            np.testing.assert_array_equal(group.points, own.points)
+
+
+def test_movers_by_other_laws_of_speed_are_fleets_of_their_own():
+    points = np.zeros((1, 1, 3))
+    kinds = [(p, u) for p in (True, False) for u in (True, False)]
+    moving = [motion.Moving(points, motion.Law(unit=u), p) for p, u in kinds for _ in range(2)]
+    assert len(motion.fleets(moving)) == 4
+
+
 # task or constraint -> defaults of v0, v1, v2, apart, gap, r0, r1 in the plane and in space
 DEFAULTS = {
     "ghosts": {"v0": 1e-3, "v1": 1e-3, "v2": 0, "r0": 2.5, "r1": (1.5, 1.5)},

@@ -257,7 +257,7 @@ def test_the_robots_own_camera_sees_neither_halo_nor_tint(monkeypatch):
     assert hazards.cost() > 0
     assert amount(paying, BLUE) > 20  # zones are seen
     hazards.weight = 0.0
-    monkeypatch.setattr(engine, "lidar", lambda points, planar: np.zeros((1, 16)))
+    monkeypatch.setattr(engine, "halos", lambda row: [])
     np.testing.assert_array_equal(renderer.frame(0), paying)
     renderer.close()
 

@@ -36,7 +36,7 @@ def norm(v: Array) -> Array:
 
     In C order: how sums of it round depends on that.
     """
-    return np.ascontiguousarray(length(v.T).T)
+    return length(v.T).T.copy()
 
 
 def distance(a: Array, b: Array, planar: bool) -> Array:

@@ -92,10 +92,9 @@ class Fleet:
         self._inside = self._outside + 2
         first, second = np.triu_indices(len(laws), 1)
         kin = np.repeat(np.arange(len(groups)), [g.points.shape[1] for g in groups])
-        pairs = np.flatnonzero(kin[first] == kin[second])
-        self._first, self._second = first[pairs], second[pairs]
-        self._gap = np.array([laws[i].gap for i in self._first])[:, None]
-        self._apart = np.array([laws[i].apart for i in self._first])
+        self._pairs = np.array([second, first])[:, kin[first] == kin[second]]  # of like movers
+        self._gap = np.array([laws[i].gap for i in self._pairs[1]])[:, None]
+        self._apart = np.array([laws[i].apart for i in self._pairs[1]])
         self._parts = self._unit and bool(self._apart.any())
 
     def advance(self, robot: Array) -> None:
@@ -129,19 +128,22 @@ class Fleet:
         :param points: by coordinate, [2 or 3, K, N] m
         """
         k, n = points.shape[1:]
-        offset = points.take(self._first, axis=1)  # [2 or 3, pairs, N]
-        offset -= points.take(self._second, axis=1)
+        second, first = self._pairs
+        offset = points.take(first, axis=1)  # [2 or 3, pairs, N]
+        offset -= points.take(second, axis=1)
         distance = length(offset)
         close = (distance < self._gap).ravel().nonzero()[0]
         if not len(close):
             return
         pair, row = np.divmod(close, n)
-        push = offset.reshape(len(offset), -1)[:, close]
-        push *= self._apart[pair] / np.maximum(distance.ravel()[close], TINY)
+        push = offset.reshape(len(offset), -1).take(close, axis=1)
+        push *= self._apart.take(pair) / np.maximum(distance.take(close), TINY)
         # each mover's pushes are summed in the order of the others, whatever the number of rows
-        moved = np.concatenate([self._second[pair] * n + row, self._first[pair] * n + row])
-        for x, away in zip(move, push, strict=True):
-            x += np.bincount(moved, np.concatenate([-away, away]), k * n).reshape(k, n)
+        moved = self._pairs.take(pair, axis=1)
+        moved *= n
+        moved += row
+        for x, away in zip(move, np.concatenate([-push, push], axis=1), strict=True):
+            x += np.bincount(moved.ravel(), away, k * n).reshape(k, n)
 
 
 def fleets(moving: Iterable[Moving]) -> list[Fleet]:

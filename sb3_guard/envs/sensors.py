@@ -125,19 +125,22 @@ class Lidar(Parameters):
         d, bodies, k, n = v.shape
         sizes = (k,) if groups is None else tuple(groups)
         columns, rows = (self.bins, 1) if d == 2 else (self.azimuth, self.elevation)
-        distance = length(v)
+        shown = 1 if not self.alias else 3 if rows == 1 else 5
+        values = np.empty((shown, bodies, k, n))  # what each object shows, and its neighbours
+        closeness, distance = values[0], length(v)
         if self.max_distance is None:
-            closeness = np.exp(-self.gain * distance)
+            np.exp(np.multiply(-self.gain, distance, out=distance), out=closeness)
         else:
-            closeness = np.maximum(0.0, self.max_distance - distance) / self.max_distance
+            np.maximum(0.0, self.max_distance - distance, out=closeness)
+            closeness /= self.max_distance
         turn = np.arctan2(v[1], v[0])
         turn *= columns / (2 * math.pi)
         turn %= columns
         column = np.minimum(turn.astype(np.intp), columns - 1)
-        cell, values = column, [closeness]
+        cell = column
         if self.alias:
-            turned = (turn - column) * closeness
-            values += [turned, closeness - turned]
+            np.multiply(np.subtract(turn, column, out=turn), closeness, out=values[1])
+            np.subtract(closeness, values[1], out=values[2])
         if rows > 1:
             tilt = np.arctan2(v[2], length(v[:2]))
             tilt += math.pi / 2
@@ -145,12 +148,12 @@ class Lidar(Parameters):
             row = np.minimum(tilt.astype(np.intp), rows - 1)
             cell = column * rows + row
             if self.alias:
-                raised = (tilt - row) * closeness
-                values += [raised, closeness - raised]
+                np.multiply(np.subtract(tilt, row, out=tilt), closeness, out=values[3])
+                np.subtract(closeness, values[3], out=values[4])
         places = _shown(columns, rows, self.alias).take(cell, axis=1)
         places += _starts(n, bodies, sizes, columns * rows)
         out = np.zeros((n, bodies, len(sizes), columns * rows))
-        np.maximum.at(out.reshape(-1), places.reshape(-1), np.concatenate(values, axis=None))
+        np.maximum.at(out.reshape(-1), places.reshape(-1), values.reshape(-1))
         return out
 
 

@@ -123,8 +123,10 @@ def read_grid(path: Path) -> list[str]:
     """
     import yaml
 
+    from sb3_guard.plain_yaml import load_yaml
+
     try:
-        content = yaml.safe_load(path.read_text())
+        content = load_yaml(path.read_text())
     except FileNotFoundError:
         raise UsageError(f"there is no grid file {path}") from None
     except (OSError, UnicodeDecodeError) as error:

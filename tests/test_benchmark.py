@@ -224,6 +224,7 @@ def test_refused_before_anything_starts(arguments, parts, capsys, tmp_path, monk
 GRID_FILES = [
     ("suites: [a", "is not valid YAML"),
     ("just text", "must map flags to values"),
+    ("seeds: 1\nsuites: [Goal_Point_8Hazards]\nseeds: 2", "line 3 has the key 'seeds' again"),
     ("suits: [CostPoint-v0]", "unknown entry 'suits'; did you mean 'suites'?"),
     ("suites: [Goal_Point_8Hazards]\nscale: 0", "g.yml: argument --scale"),
     ("suites: []", "suites: [] is not allowed; it must be one value or a"),

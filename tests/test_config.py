@@ -68,6 +68,7 @@ def test_python_file_and_module(tmp_path, monkeypatch):
         ("n_steps: 100\n", "must map environments"),
         ("Goal_Point_8Hazards-v0: {}\n", "no entry for 'Goal_Point_8Hazard'.*did you mean"),
         ("\x00\x01", "is not valid YAML"),
+        ("default:\n  n_steps: 1\n  n_steps: 2\n", "line 3 has the key 'n_steps' again, .* line 2"),
         ("default: {1: 2, n_steps: 3}\n", "1 below 'default' is not a name"),
     ],
 )

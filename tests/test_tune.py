@@ -206,6 +206,7 @@ def test_a_space_of_ones_own(tmp_path):
     [
         ("[1, 2", "can't read"),
         ("- a", "must map names"),
+        ("x: [1, 2]\nx: [3, 4]", "line 2 has the key 'x' again, after line 1"),
         ("x: 3", "x .*write a list of options"),
         ("x: [1]", "at least two options"),
         ("x: {low: 1}", "there is no 'high'"),

@@ -37,36 +37,6 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
-def _read_yaml(path: str | Path) -> Any:
-    """The content of a YAML file, whose mappings must not have a key twice.
-
-    PyYAML would take the last of them without a word.
-
-    :raises ValueError: a key is there twice, or the file is not text in UTF-8
-    :raises OSError: the file cannot be read
-    :raises yaml.YAMLError: it is not YAML
-    """
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-            node = super().compose_mapping_node(anchor)
-            lines: dict[str, int] = {}
-            for key, _ in node.value:
-                # Merges, "<<: *other", may be several.
-                if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                    line = key.start_mark.line + 1
-                    if key.value in lines:
-                        raise ValueError(
-                            f"line {line} has the key {key.value!r} again, after line "
-                            f"{lines[key.value]}: keep one of the two"
-                        )
-                    lines[key.value] = line
-            return node
-
-    return yaml.load(Path(path).read_text(encoding="utf-8"), Loader)
-
-
 def _filled(data: Mapping[str, Any]) -> dict[str, Any]:
     """Without the keys that a YAML file leaves blank, at any depth: they keep their defaults."""
     return {
@@ -194,8 +164,10 @@ class Scenario:
         """
         import yaml
 
+        from sb3_guard.plain_yaml import load_yaml
+
         try:
-            data = _read_yaml(path)
+            data = load_yaml(Path(path).read_text(encoding="utf-8"))
         except UnicodeDecodeError:
             raise ValueError(
                 f"cannot read scenario {str(path)!r}: it is not text in UTF-8; save it as such"

@@ -31,6 +31,7 @@ from stable_baselines3.common.noise import (
 )
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import UsageError, one_line
 
@@ -101,7 +102,7 @@ def read_file(path: str | Path) -> dict[str, Any]:
 
 
 # A grid reads the same few files hundreds of times, and parsing takes milliseconds.
-_parse_yaml = lru_cache(maxsize=64)(yaml.safe_load)
+_parse_yaml = lru_cache(maxsize=64)(load_yaml)
 
 
 def _read_yaml(path: Path) -> Any:

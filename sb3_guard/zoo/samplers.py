@@ -23,6 +23,7 @@ import optuna
 import yaml
 from optuna.samplers import BaseSampler
 
+from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.config import NOISE_KEYS, RUN_KEYS, parameters
@@ -186,7 +187,7 @@ def read_space(path: str) -> dict[str, Range | Choice]:
     """
     try:
         with open(path) as file:
-            content = yaml.safe_load(file)
+            content = load_yaml(file.read())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise UsageError(f"--search-space: can't read {path}: {one_line(error)}") from error
     if not isinstance(content, dict) or not content:

@@ -11,8 +11,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard.algorithms import CPO, TRPO
+from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.natural_gradient import Case
-from sb3_guard.algorithms.common.trust_region import CostEstimate, Trial
+from sb3_guard.algorithms.common.trust_region import Trial
 
 KEYS = ("cost", "cost_1")
 

@@ -10,7 +10,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 
 from sb3_guard.algorithms import TRPOIPO
-from sb3_guard.algorithms.common.trust_region import CostEstimate, Trial
+from sb3_guard.algorithms.common.costs import CostEstimate
+from sb3_guard.algorithms.common.trust_region import Trial
 from sb3_guard.algorithms.trpo_ipo import barrier
 
 

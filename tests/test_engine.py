@@ -1,6 +1,6 @@
 """The engine's promises: bit-exact rows, whole states, honest steps."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gymnasium
 import numpy as np
@@ -8,8 +8,10 @@ import pytest
 from suites import IDS
 
 from sb3_guard.envs import GuardVectorEnv, Scenario, env_spec, make
+from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.layout import LayoutError
+from sb3_guard.envs.motion import Law, Moving
 from sb3_guard.envs.part import Constraint, Task
 from sb3_guard.envs.robots import Point
 from sb3_guard.envs.sensors import Channel, Compass, Lidar, Lookout, Scan
@@ -299,6 +301,14 @@ def sees(sight, channel=None):
     return verbs if channel is None else {**verbs, "channels": lambda self: {channel: Channel(1)}}
 
 
+def moves(moving):
+    """A constraint that moves something."""
+    return {
+        "cost": lambda self: np.zeros(self.sim.num_envs),
+        "moving": lambda self: (moving,),
+    }
+
+
 @pytest.mark.parametrize(
     ("verbs", "words"),
     [
@@ -308,6 +318,17 @@ def sees(sight, channel=None):
         ),
         (sees(Scan(np.zeros((2, 3)), True)), r"'odd_eye'\] of odd has .* expected \(2, K, 3\)"),
         (sees(Compass(np.zeros((1, 3)))), r"'odd_eye'\] of odd has shape \(1, 3\), .* \(2, 3\)"),
+        (sees(Scan([[[0.0] * 3]] * 2, True)), r"'odd_eye'\] of odd has .* must have an array"),
+        (
+            sees(Scan(np.zeros((2, 1, 3)), True, lit=True)),
+            r"lit of sights\(\)\['odd_eye'\] of odd h",
+        ),
+        (sees(Compass(np.full((2, 3), np.nan))), r"sights\(\)\['odd_eye'\] of odd .* not finite"),
+        (moves(np.zeros((2, 1, 3))), r"(?s)moving\(\) of odd gives array.*: it must be a tuple of"),
+        (
+            moves(Moving(np.zeros((2, 3)), Law(), True)),
+            r"moving\(\) of odd has shape \(2, 3\), exp",
+        ),
         (sees(Compass(np.zeros((2, 3))), "odd_eye"), r"odd has 'odd_eye' in sights\(\) and in ch"),
         (sees(Compass(np.zeros((2, 3))), "eye"), r"channels\(\) of odd names 'eye', but observe"),
         ({"cost": lambda self: np.zeros((2, 3))}, r"cost\(\) of odd has shape \(2, 3\), .* \(2,\)"),
@@ -470,3 +491,98 @@ def test_many_sights_are_seen_as_each_alone():
         assert not together["lamps"][~lit].any() and together["lamps"][lit].any()
         assert not together["none"].any()
     assert lookout.look({}, origin, rotation) == {}
+
+
+@dataclass
+class Sparks(Hazards):
+    """Hazards that show one more point, or one channel more or less, from the third step on."""
+
+    name = "sparks"
+    more = "points"
+
+    def sights(self):
+        if (self.sim.steps < 2).all():
+            return super().sights()
+        if self.more == "points":
+            points = np.concatenate([self.centers, self.centers[:, :1]], axis=1)
+            return {"sparks_lidar": Scan(points, self.planar)}
+        return {} if self.more == "none" else {**super().sights(), "x": Compass(self.centers[:, 0])}
+
+
+@pytest.mark.parametrize("more", ["points", "none", "x"])
+def test_sights_may_show_more_points_but_no_other_names(more):
+    def running(constraint):
+        engine = Engine(Point(), Goal(), [constraint], num_envs=2)
+        for i in range(2):
+            engine.seed(i, np.random.default_rng(i))
+        engine.reset(np.arange(2))
+        engine.observe()
+        engine.step(np.zeros((2, 2)))
+        return engine
+
+    changing = running(dataclass(type("Sparks", (Sparks,), {"more": more}))(num=2))
+    if more == "points":
+        expected = running(dataclass(type("Sparks", (Hazards,), {"name": "sparks"}))(num=2))
+        for _ in range(2):
+            obs = changing.step(np.ones((2, 2))).obs
+            np.testing.assert_array_equal(obs, expected.step(np.ones((2, 2))).obs)
+        return
+    with pytest.raises(ValueError, match=r"must always name the same ones; '.*' came or went"):
+        changing.step(np.ones((2, 2)))
+
+
+@dataclass
+class Glow(Hazards):
+    """A user's cost, summed over many objects by the base class and by itself."""
+
+    name = "glow"
+
+    def amounts(self):
+        position = self.sim.robot.position
+        x, y = (self.centers[..., i] - position[:, None, i] for i in (0, 1))
+        return np.exp(-np.hypot(x, y))
+
+    def observe(self):
+        east = self.centers[..., 0].sum(axis=1)
+        return {"warmth": self.amounts().mean(axis=1)[:, None], "east": east[:, None]}
+
+    def channels(self):
+        return {"warmth": Channel(1), "east": Channel(1)}
+
+    def cost(self):
+        return super().cost() * (self.sim.steps > 0)  # an episode begins clean
+
+
+def test_a_users_sums_are_those_of_a_lone_environment():
+    engines = [
+        Engine(Point(), Goal(), [Glow(num=9, size=0.01, keepout=0.2)], num_envs=n) for n in (4, 1)
+    ]
+    rng = np.random.default_rng(0)
+    for engine in engines:
+        for i in range(engine.num_envs):
+            engine.seed(i, np.random.default_rng(i))
+        engine.reset(np.arange(engine.num_envs))
+    many, lone = engines
+    for _ in range(50):
+        actions = rng.uniform(-1, 1, (4, 2))
+        row, own = many.step(actions), lone.step(actions[:1])
+        np.testing.assert_array_equal(row.obs[0], own.obs[0])
+        assert row.cost[0] == own.cost[0]
+
+
+def test_a_law_set_anew_holds_from_the_next_step():
+    engine = Scenario.parse("Goal_Point_3Ghosts").build(2)
+    engine.reset(np.arange(2))
+    ghosts = engine.constraints[0]
+
+    def moved():
+        before = engine.places("ghosts").copy()
+        engine.step(np.zeros((2, 2)))
+        return np.linalg.norm(engine.places("ghosts") - before, axis=2).max()
+
+    ghosts.motion = replace(ghosts.motion, r1=0.0)
+    assert moved() == pytest.approx(0.001)
+    ghosts.motion = replace(ghosts.motion, far=0.02, home=0.02)
+    assert moved() == pytest.approx(0.02)
+    ghosts.moving = lambda: ()
+    assert moved() == 0.0

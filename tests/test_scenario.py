@@ -292,9 +292,10 @@ def test_an_id_that_says_what_it_is_cannot_be_given_to_something_else():
 def test_ids_of_others_are_theirs():
     gymnasium.register("somebody/Reef-v0", entry_point=lambda: None)
     before = dict(gymnasium.registry)
-    for name in ("CartPole", "CartPole-v1", "sb3_guard:CartPole-v1", "somebody/Reef"):
-        with pytest.raises(ValueError, match=r"-v[01]' is registered .* use another name$"):
-            register(name, Scenario())
+    for name in ("CartPole-v0", "CartPole-v1", "sb3_guard:CartPole-v1", "somebody/Reef"):
+        for scenario in (Scenario(), None):
+            with pytest.raises(ValueError, match=r"-v[01]' is registered .* use another name$"):
+                register(name, scenario)
     assert gymnasium.registry == before
     for scenario in (Scenario(), Scenario(robot="Ant")):  # ours take the new meaning, as in a cell
         assert register("mine/Reef", scenario) == "mine/Reef-v0"

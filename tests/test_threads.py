@@ -1,22 +1,19 @@
 """Threads that share an update: the same sums, in the same order, and torch left as it was."""
 
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_guard import TRPO
 from sb3_guard.algorithms.common.actor import Actor, TanhActor
 from sb3_guard.algorithms.common.critics import Regression
 from sb3_guard.algorithms.common.mlp import CHUNK
 from sb3_guard.algorithms.common.threads import accumulate, one_thread
-
-
-class Deep(FlattenExtractor):
-    """An extractor of someone's own, which may have layers of any size."""
 
 
 @pytest.fixture(autouse=True)
@@ -62,6 +59,21 @@ def test_an_error_in_any_thread_is_raised_and_threads_restored(broken: int) -> N
     assert th.get_num_threads() == 2
 
 
+def test_training_goes_on_in_a_thread_when_the_main_one_has_ended() -> None:
+    code = """
+import threading, time, torch as th
+from sb3_guard.algorithms.common.threads import accumulate
+th.set_num_threads(2)
+def work():
+    threading.main_thread().join()
+    time.sleep(0.2)
+    print(accumulate(lambda i, sums: float(i), 5, [th.zeros(1)])[1])
+threading.Thread(target=work).start()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "10.0", done.stderr
+
+
 def test_one_thread_gives_back_what_there_was() -> None:
     th.set_num_threads(2)
     with pytest.raises(KeyError), one_thread() as before:
@@ -70,12 +82,13 @@ def test_one_thread_gives_back_what_there_was() -> None:
     assert th.get_num_threads() == 2
 
 
-def quantities(threads: int) -> np.ndarray:
+def quantities(threads: int, env: str) -> np.ndarray:
     """What an update takes from a batch of three slices, on so many threads."""
     th.set_num_threads(threads)
-    model = TRPO("MlpPolicy", "Pendulum-v1", seed=0, n_steps=16)
-    n = 3 * CHUNK - 100
-    observations, targets, actions = th.randn(n, 3), th.randn(n, 1), th.randn(n, 1)
+    model = TRPO("MlpPolicy", env, seed=0, n_steps=16)
+    n, discrete = 3 * CHUNK - 100, env.startswith("CartPole")
+    observations, targets = th.randn(n, 4 if discrete else 3), th.randn(n, 1)
+    actions = th.randint(2, (n,)) if discrete else th.randn(n, 1)
     actor = Actor.of(model.policy, observations, actions)
     assert type(actor) is TanhActor
     score = actor.score(targets.flatten())
@@ -88,8 +101,9 @@ def quantities(threads: int) -> np.ndarray:
     return th.cat([score / n, fisher, th.tensor([loss]), *moved]).numpy()
 
 
-def test_threads_change_no_more_than_rounding() -> None:
-    alone, shared, again = quantities(1), quantities(2), quantities(2)
+@pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1"])
+def test_threads_change_no_more_than_rounding(env: str) -> None:
+    alone, shared, again = (quantities(threads, env) for threads in (1, 2, 2))
     np.testing.assert_array_equal(shared, again)
     np.testing.assert_allclose(shared, alone, rtol=1e-3, atol=1e-5)
     assert not np.array_equal(shared, alone), "the sums had the same order: nothing was shared"
@@ -101,9 +115,7 @@ class ThreadsWhileCollecting(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize(
-    ("policy_kwargs", "threads"), [({}, 1), ({"features_extractor_class": Deep}, 2)]
-)
+@pytest.mark.parametrize(("policy_kwargs", "threads"), [({}, 1), ({"net_arch": [1024, 1024]}, 2)])
 def test_small_layers_act_on_one_thread(policy_kwargs: dict[str, Any], threads: int) -> None:
     th.set_num_threads(2)
     model = TRPO("MlpPolicy", "Pendulum-v1", n_steps=16, policy_kwargs=policy_kwargs)

@@ -48,6 +48,9 @@ __all__ = [
 ]
 
 
+ENTRY_POINT = "sb3_guard.envs.gym_env:GuardEnv"
+
+
 def env_spec(name: str | Path | Mapping[str, Any] | Scenario) -> EnvSpec:
     """Gymnasium's description of an environment, registered or not.
 
@@ -66,7 +69,7 @@ def env_spec(name: str | Path | Mapping[str, Any] | Scenario) -> EnvSpec:
         env_id, what = "Guard-v0", as_scenario(name).to_dict()
     return EnvSpec(
         env_id,
-        entry_point="sb3_guard.envs.gym_env:GuardEnv",
+        entry_point=ENTRY_POINT,
         vector_entry_point="sb3_guard.envs.vector_env:GuardVectorEnv",
         max_episode_steps=EPISODE_STEPS,
         kwargs={"scenario": what},
@@ -106,7 +109,7 @@ def register(name: str, scenario: str | Path | Mapping[str, Any] | Scenario | No
                 "choose a name that is not of the form Task_Robot_NConstraint"
             )
     known = gymnasium.registry.get(spec.id)
-    if known is not None and known.entry_point != spec.entry_point:
+    if known is not None and known.entry_point != ENTRY_POINT:
         raise ValueError(
             f"{spec.id!r} is registered with Gymnasium already, for an environment that is not "
             "sb3_guard's: use another name"

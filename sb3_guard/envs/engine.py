@@ -31,7 +31,7 @@ from sb3_guard.envs.layout import (
     farthest,
     redraw,
 )
-from sb3_guard.envs.motion import fleets
+from sb3_guard.envs.motion import Fleet, Moving, fleets
 from sb3_guard.envs.parameters import Parameters, check_count, param
 from sb3_guard.envs.part import FLOOR, Array, Constraint, Part, Robot, Task
 from sb3_guard.envs.sensors import Channel, Compass, Lidar, Lookout, Scan
@@ -244,14 +244,16 @@ class Engine:
                     margin=max(f.margin, self._layout.margin),
                 )
                 self._owners[f.name] = part
-                # by coordinate in memory
-                self._arrays[f"places/{f.name}"] = np.zeros((self.num_envs, f.num, 3), order="F")
+                self.array(f"places/{f.name}", (f.num, 3))
         check_locations(list(self.footprints.values()))
         # where the generators begin every episode of rows whose layout is not to change
         self._origins: dict[int, Any] = {}
         for part in self.parts:
             part.bind(self)
-        self._fleets = fleets(group for part in self.parts for group in part.moving())
+        self._moving: list[Moving] = []
+        self._fleets: list[Fleet] = []
+        for part in self.parts:
+            self._check_moving(part)
         self._channels: dict[str, Channel] = {}
         for part in self.parts:
             self._check_sights(part)
@@ -324,7 +326,11 @@ class Engine:
         sights = {n: (s, part) for part in self.parts for n, s in part.sights().items()}
         seen = self._lookout.look({n: s for n, (s, _) in sights.items()}, *self.robot.frames)
         return [
-            (seen[name][row], self._lookout.azimuth(sight), sight.color or part.color)
+            (
+                seen[name][row],
+                self._lookout.azimuth(sight),
+                part.color if sight.color is None else sight.color,
+            )
             for name, (sight, part) in sights.items()
             if isinstance(sight, Scan)
         ]
@@ -397,6 +403,12 @@ class Engine:
             seen.update(part.observe() if self._observed else self._checked_observation(part))
         self._observed = True
         seen.update(self._lookout.look(sights, *self.robot.frames))
+        if seen.keys() != self._channels.keys():
+            odd = ", ".join(map(repr, sorted(seen.keys() ^ self._channels.keys())))
+            raise ValueError(
+                f"sights() and observe() must always name the same ones; {odd} came or went: for "
+                "what does not show, give a Scan that is not lit, or zeros"
+            )
         return np.concatenate([seen[name] for name in self._slices], axis=1, dtype=np.float32)
 
     def _check_sights(self, part: Part) -> None:
@@ -415,17 +427,53 @@ class Engine:
                     f"sights() of {part.name} gives {name!r} as {sight!r}: it must be a Scan of "
                     "points [N, K, 3] or a Compass to a point [N, 3]"
                 )
+            verb, points = f"sights()[{name!r}]", sight[0]
+            if not isinstance(points, np.ndarray):
+                raise ValueError(f"{verb} of {part.name} has {points!r}: it must have an array")
             rest = ("K", 3) if isinstance(sight, Scan) else (3,)
-            shape = np.shape(sight[0])
+            shape = points.shape
             if len(shape) != 1 + len(rest) or (shape[0], shape[-1]) != (self.num_envs, 3):
-                expected = (self.num_envs, *rest)
-                raise ValueError(_misshapen(part, f"sights()[{name!r}]", shape, expected))
+                raise ValueError(_misshapen(part, verb, shape, (self.num_envs, *rest)))
+            lit = sight.lit if isinstance(sight, Scan) else None
+            if lit is not None and np.shape(lit) != (self.num_envs,):
+                shape = np.shape(lit)
+                raise ValueError(_misshapen(part, f"lit of {verb}", shape, (self.num_envs,)))
+
+    def _check_moving(self, part: Part) -> None:
+        """Refuse movers that are none.
+
+        :raises ValueError: names the part and what it must give
+        """
+        for group in part.moving():
+            if not isinstance(group, Moving):
+                raise ValueError(
+                    f"moving() of {part.name} gives {group!r}: it must be a tuple of Moving(points "
+                    "[N, K, 3], law, planar)"
+                )
+            shape = np.shape(group.points)
+            if len(shape) != 3 or (shape[0], shape[2]) != (self.num_envs, 3):
+                raise ValueError(_misshapen(part, "moving()", shape, (self.num_envs, "K", 3)))
+
+    def _current_fleets(self) -> list[Fleet]:
+        """All that moves by a law: the same fleets as before unless a part says otherwise."""
+        moving = [group for part in self.parts for group in part.moving()]
+        same = len(moving) == len(self._moving) and all(
+            new.points is old.points and new.law is old.law and new.planar is old.planar
+            for new, old in zip(moving, self._moving, strict=True)
+        )
+        if not same:
+            self._moving, self._fleets = moving, fleets(moving)
+        return self._fleets
 
     def _checked_observation(self, part: Part) -> dict[str, Array]:
         """What a part observes.
 
         :raises ValueError: it is not what its ``channels`` say
         """
+        self._check_sights(part)
+        for name, sight in part.sights().items():
+            if not np.isfinite(sight[0]).all():
+                raise ValueError(f"points of sights()[{name!r}] of {part.name} are not finite")
         seen, channels = part.observe(), part.channels()
         for name in channels.keys() - seen.keys():
             raise ValueError(
@@ -475,7 +523,7 @@ class Engine:
                 "numbers within [-1, 1]"
             )
         # everything moves from the positions last observed; nothing moves between physics steps
-        for fleet in self._fleets:
+        for fleet in self._current_fleets():
             fleet.advance(self.robot.position)
         for part in self.parts:
             part.before_step()

@@ -32,16 +32,17 @@ def length(v: Array) -> Array:
 
 
 def norm(v: Array) -> Array:
-    """Euclidean length of the last axis, of size 2 or 3.
-
-    In C order: how sums of it round depends on that.
-    """
-    return length(v.T).T.copy()
+    """Euclidean length of the last axis, of size 2 or 3."""
+    return length(v.T).T
 
 
 def distance(a: Array, b: Array, planar: bool) -> Array:
     """Distance between points whose last axis is xyz, in the plane or in space."""
-    return norm(a[..., :2] - b[..., :2]) if planar else norm(a - b)
+    if a.ndim != b.ndim:
+        a, b = np.broadcast_arrays(a, b)
+    size = 2 if planar else 3
+    offset = a.T[:size].copy() - b.T[:size].copy()
+    return length(offset).T.copy()  # in C order: how sums of it round depends on that
 
 
 def into_frames(origin: Array, rotation: Array, points: Array, size: int = 3) -> Array:

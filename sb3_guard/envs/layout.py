@@ -23,7 +23,7 @@ Rectangle = tuple[float, float, float, float]
 
 ARENA: tuple[Rectangle, ...] = ((-2.0, -2.0, 2.0, 2.0),)
 DRAWS = 128
-PATIENCE = 4000  # placements before a layout is called impossible
+PATIENCE = 4000  # placements, or 4 of each object, before a layout is called impossible
 
 
 class LayoutError(RuntimeError):
@@ -176,7 +176,7 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
     queue = deque(np.flatnonzero(~fixed).tolist())
     weight = np.where(fixed, 1.0 + len(owner), 1.0)  # what a clash with each is worth
     failures: dict[str, int] = {}
-    for _ in range(PATIENCE):
+    for _ in range(max(PATIENCE, 4 * len(owner))):
         if not queue:
             break
         k = queue.popleft()

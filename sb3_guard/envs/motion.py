@@ -17,6 +17,7 @@ from sb3_guard.envs.geometry import length
 
 Array = np.ndarray
 TINY = 1e-12  # m: the unit vector of a zero offset is zero
+LARGE = 32  # movers of a group that moves on its own
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,8 @@ class Fleet:
         ).reshape(2, -1)
         self._outside = 4 * np.arange(len(laws))[:, None]
         self._inside = self._outside + 2
-        first, second = np.triu_indices(len(laws), 1)
-        kin = np.repeat(np.arange(len(groups)), [g.points.shape[1] for g in groups])
-        self._pairs = np.array([second, first])[:, kin[first] == kin[second]]  # of like movers
+        pairs = [np.array(np.triu_indices(c.stop - c.start, 1)) + c.start for c in self._columns]
+        self._pairs = np.concatenate(pairs, axis=1)[::-1].copy()  # of like movers
         self._gap = np.array([laws[i].gap for i in self._pairs[1]])[:, None]
         self._apart = np.array([laws[i].apart for i in self._pairs[1]])
         self._parts = self._unit and bool(self._apart.any())
@@ -147,9 +147,15 @@ class Fleet:
 
 
 def fleets(moving: Iterable[Moving]) -> list[Fleet]:
-    """Few fleets for many groups of movers; those of no movers are left out."""
+    """Few fleets for many groups of movers; those of no movers are left out.
+
+    Large groups move on their own: together they would leave the processor's cache.
+    """
     alike: dict[tuple[bool, bool], list[Moving]] = {}
+    large = []
     for group in moving:
-        if group.points.shape[1]:
+        if group.points.shape[1] > LARGE:
+            large.append([group])
+        elif group.points.shape[1]:
             alike.setdefault((group.planar, group.law.unit), []).append(group)
-    return [Fleet(groups) for groups in alike.values()]
+    return [Fleet(groups) for groups in [*alike.values(), *large]]

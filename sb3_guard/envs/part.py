@@ -7,10 +7,12 @@ engine calls the verbs in this order::
     build(world)        once    add bodies and sensors to the MjSpec
     bind(sim)           once    take live [N, ...] views of what was added
     reset(ids, rngs)            an episode begins in rows ids, at the places just drawn
-    moving()            once    what moves by a law: the engine moves it before each step
+    moving()                    what moves by a law: the engine moves it
     before_step()               move what else moves itself
     sights()                    name -> what lidar and compass see
     observe()                   name -> [N, d], whatever else is observed
+
+``moving``, ``sights``, ``channels`` and ``measure`` are also called before the first ``reset``.
 
 A task adds ``measure``, ``reward``, ``succeeded`` and ``advance``; a constraint adds ``cost``.
 ``sights``, ``observe``, ``measure``, ``reward`` and ``cost`` only read. A part keeps no arrays of
@@ -136,11 +138,11 @@ class Part(Parameters):
         """Begin an episode in rows ``ids``; ``rngs`` holds one generator per row of the batch."""
 
     def moving(self) -> tuple[Moving, ...]:
-        """What moves by a law towards the robot or away from it; it does so before each step."""
+        """What moves by a law before the next step, from the positions last observed."""
         return ()
 
     def before_step(self) -> None:
-        """Move what else moves itself, from the positions last observed."""
+        """Move what else moves itself, after what :meth:`moving` says; set controls."""
 
     def sights(self) -> dict[str, Scan | Compass]:
         """Named observations from the robot's lidar bodies, always the same ones."""

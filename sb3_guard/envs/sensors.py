@@ -166,7 +166,7 @@ class Lookout:
 
     def __init__(self, lidar: Lidar, grounded: bool) -> None:
         self._lidar, self._grounded = lidar, grounded
-        self._names: list[str] = []
+        self._seen: list[tuple[str, tuple[int, ...], bool]] = []  # name, shape, planar
 
     def _coordinates(self, sight: Scan | Compass) -> int:
         """How many coordinates of a sight's points, in the bodies' frames, count."""
@@ -183,12 +183,11 @@ class Lookout:
         return self._lidar.bins if scan.planar else self._lidar.azimuth
 
     def _plan(self, sights: Mapping[str, Scan | Compass]) -> None:
-        """Settle in which order sights of these names are looked at: alike ones side by side."""
+        """Settle in which order these sights are looked at: alike ones side by side."""
         kinds: dict[tuple[bool, int], list[str]] = {}
         for name, sight in sights.items():
             kind = (isinstance(sight, Compass), self._coordinates(sight))
             kinds.setdefault(kind, []).append(name)
-        self._names = list(sights)
         self._order = [name for kind in sorted(kinds) for name in kinds[kind]]
         self._size = max((size for _, size in kinds), default=2)
         self._flat = 0  # points seen as lying on the floor, whatever their height; they come first
@@ -211,14 +210,16 @@ class Lookout:
     ) -> dict[str, Array]:
         """What is seen, by name: [N, bodies · bins] or [N, bodies · coordinates].
 
-        :param sights: by name; of one name always alike
+        :param sights: by name
         :param origin: positions of the lidar bodies, [N, B, 3] m
         :param rotation: rotations of the lidar bodies, body to world, [N, B, 3, 3]
         """
         if not sights:
             return {}
-        if list(sights) != self._names:
+        seen = [(name, s[0].shape, s.planar) for name, s in sights.items()]
+        if seen != self._seen:
             self._plan(sights)
+            self._seen = seen
         columns = [sights[name][0].T for name in self._order]  # of a compass [3, N]
         points = np.concatenate([c if c.ndim == 3 else c[:, None] for c in columns], axis=1)
         points[2, : self._flat] = 0.0
@@ -230,7 +231,7 @@ class Lookout:
                 out[name] = closeness[:, :, i].reshape(n, -1)
                 lit = sights[name].lit  # type: ignore[union-attr]
                 if lit is not None:
-                    out[name][~lit] = 0.0
+                    out[name][~np.asarray(lit, dtype=bool)] = 0.0
         for size, where, names in self._compasses:
             directions = compass(v[:size, :, where])
             for i, name in enumerate(names):

@@ -24,12 +24,14 @@ from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
-from sb3_guard.algorithms.common.actor import actor_modules, parameterless
+from sb3_guard.algorithms.common.actor import actor_modules
 from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
 from sb3_guard.algorithms.common.checks import check_choice, check_number, check_per_cost, is_number
 from sb3_guard.algorithms.common.costs import CostEstimate, read_costs
 from sb3_guard.algorithms.common.critics import CostCritic
 from sb3_guard.algorithms.common.threads import one_thread
+
+SMALL = 500_000  # weights of a policy that acts on one thread
 
 
 class _CorrectedEnv(VecEnvWrapper):
@@ -259,8 +261,9 @@ class CostOnPolicyAlgorithm(OnPolicyAlgorithm):
         self._cuda_at_rollout = th.cuda.get_rng_state_all() if self.device.type == "cuda" else []
         started = time.perf_counter()
         self._begin_rollout_statistics()
-        # a plain network's layers are too small for two threads, an image's are not
-        alone = self.device.type == "cpu" and parameterless(self.policy.features_extractor)
+        # the layers of a small network take less time than threads that meet
+        weights = sum(parameter.numel() for parameter in self.policy.parameters())
+        alone = self.device.type == "cpu" and weights <= SMALL
         with one_thread() if alone else nullcontext():
             full = super().collect_rollouts(
                 _CorrectedEnv(env, self) if self._corrects else env,

@@ -8,6 +8,7 @@ and they meet once when all are done. Small operations, as in a rollout, stay on
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 
 import torch as th
 
@@ -48,10 +49,15 @@ def accumulate(
         if not others:
             return part(first)
         with ThreadPoolExecutor(len(others)) as pool:
-            futures = [pool.submit(part, numbers) for numbers in others]
+            jobs: list[Callable[[], tuple[list[th.Tensor], float]]] = []
+            for numbers in others:
+                try:
+                    jobs.append(pool.submit(part, numbers).result)
+                except RuntimeError:  # the main thread has ended: no new ones can be started
+                    jobs.append(partial(part, numbers))
             sums, number = part(first)
-            for future in futures:
-                more, another = future.result()
+            for job in jobs:
+                more, another = job()
                 number += another
                 for total, each in zip(sums, more, strict=True):
                     total.add_(each)

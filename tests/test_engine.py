@@ -324,6 +324,13 @@ def moves(moving):
             r"lit of sights\(\)\['odd_eye'\] of odd h",
         ),
         (sees(Compass(np.full((2, 3), np.nan))), r"sights\(\)\['odd_eye'\] of odd .* not finite"),
+        (moves(Moving([[[0.0] * 3]] * 2, Law(), True)), r"moving\(\) of odd gives Moving.*a Law"),
+        (
+            moves(Moving(np.zeros((2, 1, 3)), None, True)),
+            r"(?s)moving\(\) of odd gives Mov.* a Law",
+        ),
+        ({**moves(0), "moving": lambda self: None}, r"moving\(\) of odd gives None: it must be a"),
+        ({**sees(0), "sights": lambda self: None}, r"sights\(\) of odd gives None: .* a mapping"),
         (moves(np.zeros((2, 1, 3))), r"(?s)moving\(\) of odd gives array.*: it must be a tuple of"),
         (
             moves(Moving(np.zeros((2, 3)), Law(), True)),
@@ -506,10 +513,14 @@ class Sparks(Hazards):
         if self.more == "points":
             points = np.concatenate([self.centers, self.centers[:, :1]], axis=1)
             return {"sparks_lidar": Scan(points, self.planar)}
+        if self.more == "flip":
+            return {"sparks_lidar": Scan(self.centers, not self.planar)}
+        if self.more == "nan":
+            return {"sparks_lidar": Scan(np.full_like(self.centers, np.nan), self.planar)}
         return {} if self.more == "none" else {**super().sights(), "x": Compass(self.centers[:, 0])}
 
 
-@pytest.mark.parametrize("more", ["points", "none", "x"])
+@pytest.mark.parametrize("more", ["points", "none", "x", "flip", "nan"])
 def test_sights_may_show_more_points_but_no_other_names(more):
     def running(constraint):
         engine = Engine(Point(), Goal(), [constraint], num_envs=2)
@@ -527,7 +538,11 @@ def test_sights_may_show_more_points_but_no_other_names(more):
             obs = changing.step(np.ones((2, 2))).obs
             np.testing.assert_array_equal(obs, expected.step(np.ones((2, 2))).obs)
         return
-    with pytest.raises(ValueError, match=r"must always name the same ones; '.*' came or went"):
+    words = {
+        "flip": "'sparks_lidar' of the observation has 60 columns; its channel has 16",
+        "nan": r"points of sights\(\)\['sparks_lidar'\] of sparks are not finite",
+    }.get(more, r"must always name the same ones; '.*' came or went")
+    with pytest.raises(ValueError, match=words):
         changing.step(np.ones((2, 2)))
 
 

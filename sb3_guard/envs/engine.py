@@ -31,7 +31,7 @@ from sb3_guard.envs.layout import (
     farthest,
     redraw,
 )
-from sb3_guard.envs.motion import Fleet, Moving, fleets
+from sb3_guard.envs.motion import Fleet, Law, Moving, fleets
 from sb3_guard.envs.parameters import Parameters, check_count, param
 from sb3_guard.envs.part import FLOOR, Array, Constraint, Part, Robot, Task
 from sb3_guard.envs.sensors import Channel, Compass, Lidar, Lookout, Scan
@@ -402,20 +402,38 @@ class Engine:
             sights.update(part.sights())
             seen.update(part.observe() if self._observed else self._checked_observation(part))
         self._observed = True
-        seen.update(self._lookout.look(sights, *self.robot.frames))
+        try:
+            seen.update(self._lookout.look(sights, *self.robot.frames))
+        except Exception:
+            for part in self.parts:  # whose fault is it?
+                self._check_sights(part)
+            raise
         if seen.keys() != self._channels.keys():
             odd = ", ".join(map(repr, sorted(seen.keys() ^ self._channels.keys())))
             raise ValueError(
                 f"sights() and observe() must always name the same ones; {odd} came or went: for "
                 "what does not show, give a Scan that is not lit, or zeros"
             )
-        return np.concatenate([seen[name] for name in self._slices], axis=1, dtype=np.float32)
+        obs = np.concatenate([seen[name] for name in self._slices], axis=1, dtype=np.float32)
+        if obs.shape[1] != self.observation_size:
+            widths = {name: (c.size, np.shape(seen[name])[1]) for name, c in self._channels.items()}
+            name = next(n for n, (size, width) in widths.items() if size != width)
+            raise ValueError(
+                f"{name!r} of the observation has {widths[name][1]} columns; its channel has "
+                f"{widths[name][0]}"
+            )
+        return obs
 
     def _check_sights(self, part: Part) -> None:
         """Refuse sights that are none.
 
         :raises ValueError: names the sight and what it must be
         """
+        if not isinstance(part.sights(), Mapping):
+            raise ValueError(
+                f"sights() of {part.name} gives {part.sights()!r}: it must be a mapping of "
+                "names to Scan or Compass, {} for none"
+            )
         for name in part.sights().keys() & part.channels().keys():
             raise ValueError(
                 f"{part.name} has {name!r} in sights() and in channels(): what is seen has its "
@@ -434,6 +452,8 @@ class Engine:
             shape = points.shape
             if len(shape) != 1 + len(rest) or (shape[0], shape[-1]) != (self.num_envs, 3):
                 raise ValueError(_misshapen(part, verb, shape, (self.num_envs, *rest)))
+            if self._begun and not np.isfinite(points.astype(float)).all():
+                raise ValueError(f"points of {verb} of {part.name} are not finite")
             lit = sight.lit if isinstance(sight, Scan) else None
             if lit is not None and np.shape(lit) != (self.num_envs,):
                 shape = np.shape(lit)
@@ -444,13 +464,18 @@ class Engine:
 
         :raises ValueError: names the part and what it must give
         """
-        for group in part.moving():
-            if not isinstance(group, Moving):
+        moving = part.moving()
+        for group in moving if isinstance(moving, tuple | list) else (moving,):
+            if not (
+                isinstance(group, Moving)
+                and isinstance(group.points, np.ndarray)
+                and isinstance(group.law, Law)
+            ):
                 raise ValueError(
-                    f"moving() of {part.name} gives {group!r}: it must be a tuple of Moving(points "
-                    "[N, K, 3], law, planar)"
+                    f"moving() of {part.name} gives {group!r}: it must be a tuple of "
+                    "Moving(points, law, planar), of an array [N, K, 3] and a Law"
                 )
-            shape = np.shape(group.points)
+            shape = group.points.shape
             if len(shape) != 3 or (shape[0], shape[2]) != (self.num_envs, 3):
                 raise ValueError(_misshapen(part, "moving()", shape, (self.num_envs, "K", 3)))
 
@@ -458,7 +483,7 @@ class Engine:
         """All that moves by a law: the same fleets as before unless a part says otherwise."""
         moving = [group for part in self.parts for group in part.moving()]
         same = len(moving) == len(self._moving) and all(
-            new.points is old.points and new.law is old.law and new.planar is old.planar
+            new.points is old.points and new.law == old.law and new.planar is old.planar
             for new, old in zip(moving, self._moving, strict=True)
         )
         if not same:
@@ -471,9 +496,6 @@ class Engine:
         :raises ValueError: it is not what its ``channels`` say
         """
         self._check_sights(part)
-        for name, sight in part.sights().items():
-            if not np.isfinite(sight[0]).all():
-                raise ValueError(f"points of sights()[{name!r}] of {part.name} are not finite")
         seen, channels = part.observe(), part.channels()
         for name in channels.keys() - seen.keys():
             raise ValueError(

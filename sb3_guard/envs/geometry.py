@@ -38,10 +38,11 @@ def norm(v: Array) -> Array:
 
 def distance(a: Array, b: Array, planar: bool) -> Array:
     """Distance between points whose last axis is xyz, in the plane or in space."""
+    size = 2 if planar else 3
+    a, b = a[..., :size], b[..., :size]
     if a.ndim != b.ndim:
         a, b = np.broadcast_arrays(a, b)
-    size = 2 if planar else 3
-    offset = a.T[:size].copy() - b.T[:size].copy()
+    offset = by_coordinate(a) - by_coordinate(b)
     return length(offset).T.copy()  # in C order: how sums of it round depends on that
 
 

@@ -34,7 +34,7 @@ class Channel:
 class Scan(NamedTuple):
     """Points that a channel of pseudo-lidar shows.
 
-    :param points: [N, K, 3] m, K always the same
+    :param points: [N, K, 3] m
     :param planar: whether they lie in the plane: one ring of bins instead of a sphere, whatever
         their height
     :param color: of its halo in pictures; None: the part's

@@ -23,7 +23,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_guard.algorithms.common.trust_region import TrustRegion
+from sb3_guard.algorithms.common.on_policy import CostOnPolicyAlgorithm
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
@@ -224,7 +224,7 @@ class Experiment:
         args, n_envs = self.args, self.setup.n_envs
         epochs = Epochs(self.setup.n_timesteps, bar=args["progress"])
         others: list[BaseCallback] = [epochs]
-        if not isinstance(self.model, TrustRegion):
+        if not isinstance(self.model, CostOnPolicyAlgorithm):
             others.append(LogCosts())
         if args["save_freq"] > 0:
             others.append(

@@ -58,6 +58,8 @@ class _CorrectedEnv(VecEnvWrapper):
 class CostOnPolicyAlgorithm(OnPolicyAlgorithm):
     """An on-policy algorithm with a cost rollout buffer and a cost critic.
 
+    A subclass calls ``_setup_model`` when its own attributes are set.
+
     :param policy: as for ``OnPolicyAlgorithm``
     :param env: likewise
     :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key
@@ -66,7 +68,8 @@ class CostOnPolicyAlgorithm(OnPolicyAlgorithm):
         absent key means that nothing was charged
     :param cost_gamma: discount factor of the costs; None for ``gamma``
     :param cost_gae_lambda: likewise for ``gae_lambda``
-    :param kwargs: as for ``OnPolicyAlgorithm``
+    :param kwargs: others of ``OnPolicyAlgorithm``, without ``supported_action_spaces`` and
+        ``_init_setup_model``
     """
 
     #: Whether training depends on costs at all.

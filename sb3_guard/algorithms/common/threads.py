@@ -30,7 +30,7 @@ def accumulate(
     """Sum over slices, in an order that depends on the number of threads alone.
 
     :param work: adds slice i's share to the tensors that it is given, and returns a number; called
-        from several threads at once
+        from several threads at once, with no other effect
     :param n_slices: how many slices there are
     :param parameters: what the sums are shaped like
     :return: the sums, and that of the numbers
@@ -53,7 +53,7 @@ def accumulate(
             for numbers in others:
                 try:
                     jobs.append(pool.submit(part, numbers).result)
-                except RuntimeError:  # the main thread has ended: no new ones can be started
+                except RuntimeError:  # no thread can be started, as when the main one has ended
                     jobs.append(partial(part, numbers))
             sums, number = part(first)
             for job in jobs:

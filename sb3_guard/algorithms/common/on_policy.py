@@ -367,7 +367,7 @@ class CostOnPolicyAlgorithm(OnPolicyAlgorithm):
                 specs = self.env.get_attr("spec")
                 limits = [getattr(spec, "max_episode_steps", None) for spec in specs]
         except (AttributeError, NotImplementedError):
-            pass
+            pass  # a vectorised environment need not tell: then no limit is known, as below
         if limits and all(is_number(limit) and limit > 0 for limit in limits):
             return float(np.mean(limits))
         longest = float(self.running_lengths.max())

@@ -8,7 +8,6 @@ Ours are imported where they are used: environments of others work where MuJoCo 
 from __future__ import annotations
 
 import copy
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -130,10 +129,12 @@ class GuardVecEnv(VecEnv):
         t = self.envs.advance(self._actions)
         out = t.outcome
         # new dictionaries every step: Stable-Baselines3 keeps the ones it is given
-        columns = {"cost": out.cost.tolist(), **{k: v.tolist() for k, v in out.costs.items()}}
-        columns["TimeLimit.truncated"] = [False] * self.num_envs
-        rows = map(zip, itertools.repeat(tuple(columns)), zip(*columns.values(), strict=True))
-        infos: list[dict[str, Any]] = list(map(dict, rows))
+        infos: list[dict[str, Any]] = [
+            {"cost": cost, "TimeLimit.truncated": False} for cost in out.cost.tolist()
+        ]
+        for name, costs in out.costs.items():
+            for info, cost in zip(infos, costs.tolist(), strict=True):
+                info[name] = cost
         for name, happened in (
             ("goal_met", out.goal_met),
             ("goal_unplaced", out.unplaced),

@@ -538,7 +538,7 @@ class Engine:
         shape = (self.num_envs, self.robot.action_size)
         if actions.shape != shape:
             raise ValueError(f"actions have shape {actions.shape}, expected {shape}")
-        if not np.isfinite(actions).all():
+        if np.count_nonzero(np.isfinite(actions)) < actions.size:  # all() takes longer
             rows = np.flatnonzero(~np.isfinite(actions).all(axis=1)).tolist()
             raise ValueError(
                 f"actions of rows {rows} are not finite: {actions[rows[0]].tolist()}; allowed: "

@@ -39,10 +39,9 @@ def norm(v: Array) -> Array:
 def distance(a: Array, b: Array, planar: bool) -> Array:
     """Distance between points whose last axis is xyz, in the plane or in space."""
     size = 2 if planar else 3
-    a, b = a[..., :size], b[..., :size]
     if a.ndim != b.ndim:
         a, b = np.broadcast_arrays(a, b)
-    offset = by_coordinate(a) - by_coordinate(b)
+    offset = np.subtract(a.T[:size], b.T[:size], order="C")
     return length(offset).T.copy()  # in C order: how sums of it round depends on that
 
 

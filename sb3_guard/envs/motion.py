@@ -95,6 +95,8 @@ class Fleet:
         self._pairs = np.concatenate(pairs, axis=1)[::-1].copy()  # of like movers
         self._gap = np.array([laws[i].gap for i in self._pairs[1]])[:, None]
         self._apart = np.array([laws[i].apart for i in self._pairs[1]])
+        # from a flat index of [pairs, N] to those of the pair's movers in [K, N]
+        self._shift = (self._pairs - np.arange(len(self._apart))) * len(groups[0].points)
         self._parts = self._unit and bool(self._apart.any())
 
     def advance(self, robot: Array) -> None:
@@ -135,15 +137,15 @@ class Fleet:
         close = (distance < self._gap).ravel().nonzero()[0]
         if not len(close):
             return
-        pair, row = np.divmod(close, n)
+        pair = close // n
         push = offset.reshape(len(offset), -1).take(close, axis=1)
         push *= self._apart.take(pair) / np.maximum(distance.take(close), TINY)
         # each mover's pushes are summed in the order of the others, whatever the number of rows
-        moved = self._pairs.take(pair, axis=1)
-        moved *= n
-        moved += row
+        moved = self._shift.take(pair, axis=1)
+        moved += close
+        moved = moved.ravel()
         for x, away in zip(move, np.concatenate([-push, push], axis=1), strict=True):
-            x += np.bincount(moved.ravel(), away, k * n).reshape(k, n)
+            x += np.bincount(moved, away, k * n).reshape(k, n)
 
 
 def fleets(moving: Iterable[Moving]) -> list[Fleet]:

@@ -268,7 +268,9 @@ class MJCFRobot(Robot):
             out[name] = geometry.rotation_matrix(out[name])
         if self._hinges:
             angles = self._data[:, self._angles]
-            turns = np.stack([np.sin(angles), np.cos(angles)], axis=2)  # [N, hinges, 2]
+            turns = np.empty((*angles.shape, 2))  # [N, hinges, 2]
+            np.sin(angles, out=turns[..., 0])
+            np.cos(angles, out=turns[..., 1])
             out.update((name, turns[:, i]) for i, name in enumerate(self._hinges))
         return out
 

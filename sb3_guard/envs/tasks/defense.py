@@ -39,7 +39,7 @@ class Defense(Targets):
 
     def measure(self) -> Array:
         """Distances of the targets from the origin in the plane, [N, num] m."""
-        return geometry.distance(self.centers, np.asarray(self.origin), planar=True)
+        return geometry.distance(self.centers, np.array([[self.origin]]), planar=True)
 
     def reward(self, before: Array, now: Array) -> Array:
         depth = now / self.radius - 1

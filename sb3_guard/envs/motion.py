@@ -79,9 +79,21 @@ class Fleet:
         ends = np.cumsum([g.points.shape[1] for g in groups]).tolist()
         self._columns = [slice(i, j) for i, j in zip([0, *ends], ends, strict=False)]
         laws = [g.law for g in groups for _ in range(g.points.shape[1])]
-        self._aims = np.zeros((self._size, 2, ends[-1], len(groups[0].points)))  # robot and origin
-        self._aims[:, 1] = np.array([law.origin[: self._size] for law in laws]).T[..., None]
-        self._radii = np.array([[law.r1 for law in laws], [law.r0 for law in laws]])[..., None]
+        k, n = len(laws), len(groups[0].points)
+        # the movers, their origins and the robot
+        self._points = np.zeros((self._size, 2 * k + 1, n))
+        self._points[:, k : 2 * k] = np.array([w.origin[: self._size] for w in laws]).T[..., None]
+        pairs = np.zeros((2, 0), dtype=int)  # of like movers that part, the later one first
+        if self._unit and any(law.apart for law in laws):
+            each = [np.array(np.triu_indices(c.stop - c.start, 1)) + c.start for c in self._columns]
+            pairs = np.concatenate(each, axis=1)[::-1]
+        # offsets lead from each mover to the robot, from each to its origin, and within each pair
+        movers = np.arange(k)
+        self._from = np.concatenate([movers, movers, pairs[0]])
+        self._to = np.concatenate([np.full(k, 2 * k), k + movers, pairs[1]])
+        gaps = np.nextafter([laws[i].gap for i in pairs[1]], -1.0)  # closer than the gap
+        radii = [law.r1 for law in laws], [law.r0 for law in laws], gaps
+        self._radii = np.concatenate(radii)[:, None]
         # speeds towards robot and origin, [2, 4 K]: outside r0 twice, within it far and near
         self._speeds = np.array(
             [
@@ -89,54 +101,50 @@ class Fleet:
                 [(law.home, law.home, law.settle, 0.0) for law in laws],
             ]
         ).reshape(2, -1)
-        self._outside = 4 * np.arange(len(laws))[:, None]
+        self._outside = 4 * movers[:, None]
         self._inside = self._outside + 2
-        pairs = [np.array(np.triu_indices(c.stop - c.start, 1)) + c.start for c in self._columns]
-        self._pairs = np.concatenate(pairs, axis=1)[::-1].copy()  # of like movers
-        self._gap = np.array([laws[i].gap for i in self._pairs[1]])[:, None]
-        self._apart = np.array([laws[i].apart for i in self._pairs[1]])
+        self._apart = np.array([laws[i].apart for i in pairs[1]])
         # from a flat index of [pairs, N] to those of the pair's movers in [K, N]
-        self._shift = (self._pairs - np.arange(len(self._apart))) * len(groups[0].points)
-        self._parts = self._unit and bool(self._apart.any())
+        self._shift = (pairs - np.arange(pairs.shape[1])) * n
 
     def advance(self, robot: Array) -> None:
         """Move by one control step, in place.
 
         :param robot: where the robot is, [N, 3] m
         """
-        here = np.concatenate(self._live, axis=1)  # [2 or 3, K, N]
-        self._aims[:, 0] = robot.T[: self._size, None]
-        offset = self._aims - here[:, None]  # [2 or 3, 2, K, N]
+        for live, columns in zip(self._live, self._columns, strict=True):
+            self._points[:, columns] = live
+        self._points[:, -1] = robot.T[: self._size]
+        offset = self._points.take(self._to, axis=1)  # [2 or 3, 2 K + pairs, N]
+        offset -= self._points.take(self._from, axis=1)
+        k, n = len(self._outside), offset.shape[2]
         if self._level:
-            offset[2, 1] = 0.0
-        distance = length(offset)  # [2, K, N]
-        near, within = distance <= self._radii
-        case = np.where(within, self._inside, self._outside)
-        case += near
+            offset[2, k : 2 * k] = 0.0
+        distance = length(offset)
+        within = distance <= self._radii
+        case = np.where(within[k : 2 * k], self._inside, self._outside)
+        case += within[:k]
         speed = self._speeds.take(case, axis=1)  # [2, K, N]
         if self._unit:
-            speed /= np.maximum(distance, TINY)
-        offset *= speed
-        move = offset[:, 0] + offset[:, 1]
-        if self._parts:
-            self._part(move, here)
+            speed /= np.maximum(distance[: 2 * k], TINY).reshape(2, k, n)
+        aims = offset[:, : 2 * k].reshape(-1, 2, k, n)
+        aims *= speed
+        move = aims[:, 0] + aims[:, 1]
+        close = within[2 * k :].ravel().nonzero()[0]
+        if len(close):
+            self._part(move, offset[:, 2 * k :], distance[2 * k :], close)
         for live, columns in zip(self._live, self._columns, strict=True):
             live += move[:, columns]
 
-    def _part(self, move: Array, points: Array) -> None:
+    def _part(self, move: Array, offset: Array, distance: Array, close: Array) -> None:
         """Add a push away from each like mover of the row that is closer than the gap.
 
         :param move: what to add to, by coordinate, [2 or 3, K, N] m
-        :param points: by coordinate, [2 or 3, K, N] m
+        :param offset: within pairs, by coordinate, [2 or 3, pairs, N] m
+        :param distance: likewise, [pairs, N] m
+        :param close: which are closer than the gap: flat indices of [pairs, N], rising
         """
-        k, n = points.shape[1:]
-        second, first = self._pairs
-        offset = points.take(first, axis=1)  # [2 or 3, pairs, N]
-        offset -= points.take(second, axis=1)
-        distance = length(offset)
-        close = (distance < self._gap).ravel().nonzero()[0]
-        if not len(close):
-            return
+        k, n = move.shape[1:]
         pair = close // n
         push = offset.reshape(len(offset), -1).take(close, axis=1)
         push *= self._apart.take(pair) / np.maximum(distance.take(close), TINY)

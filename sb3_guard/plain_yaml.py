@@ -1,4 +1,4 @@
-"""YAML as people write it: plain data, and no key twice."""
+"""YAML as people write it: plain data, no key twice, and nothing that contains itself."""
 
 from typing import Any
 
@@ -10,6 +10,10 @@ class DoubleKeyError(yaml.YAMLError):
 
 
 class _Loader(yaml.SafeLoader):
+    def __init__(self, stream: Any) -> None:
+        super().__init__(stream)
+        self.deep_construct = True  # PyYAML then refuses an alias within what it stands for
+
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
         lines: dict[str, int] = {}
@@ -29,6 +33,6 @@ class _Loader(yaml.SafeLoader):
 def load_yaml(text: str) -> Any:
     """The plain data of a YAML text.
 
-    :raises yaml.YAMLError: it is no YAML, or a mapping has a key twice
+    :raises yaml.YAMLError: it is no YAML, a mapping has a key twice, or something contains itself
     """
     return yaml.load(text, _Loader)

@@ -139,6 +139,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=1, help="times through a table")
     args = parser.parse_args()
     patterns = ["*"] if args.all else args.suites or []
+    if args.rounds < 1:
+        parser.error(f"--rounds {args.rounds} must be at least 1")
     suites = [i for i in env_ids() if any(fnmatch.fnmatch(i, p) for p in patterns)]
     if patterns and not suites:
         parser.error(f"no id matches {' '.join(patterns)}; ids look like {args.env}")

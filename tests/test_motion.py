@@ -85,6 +85,26 @@ def test_a_mover_on_the_spot_stays_and_movers_on_one_spot_do_not_part():
 
 
 @pytest.mark.parametrize("planar", [True, False])
+def test_at_r0_and_r1_movers_are_within_and_at_the_gap_apart(planar):
+    law = motion.Law(near=1 / 8, far=1 / 4, home=1 / 2, apart=1, gap=1 / 4, r0=1.0, r1=1 / 2)
+    where = {  # x -> where from there
+        0.5: 0.625,  # at r1 of a robot at 1: near
+        0.25: 0.5,  # beyond: far
+        1.0: 1.0,  # at r0: not home
+        1.25: 0.75,  # beyond: home
+    }
+    for x, expected in where.items():
+        points = np.array([[[x, 0.0, 0.0]]])
+        advance(points, np.array([[1.0, 0.0, 0.0]]), law, planar)
+        assert points[0, 0, 0] == expected, x
+    still = motion.Law(apart=1 / 8, gap=1 / 4)
+    for gap, moved in ((1 / 4, 0.0), (1 / 8, 1 / 8)):
+        points = np.array([[[0.0, 0.0, 0.0], [gap, 0.0, 0.0]]])
+        advance(points, np.zeros((1, 3)), still, planar)
+        np.testing.assert_array_equal(points[0, :, 0], [-moved, gap + moved])
+
+
+@pytest.mark.parametrize("planar", [True, False])
 @pytest.mark.parametrize("k", [1, 2, 8])
 def test_rows_do_not_depend_on_each_other(k, planar):
     rng = np.random.default_rng(1)

@@ -4,7 +4,8 @@ Every ratio is measured in one run: short slices of the full step and of a bare 
 model alternate, and the best slice of each counts; of a reset, the best of five repetitions.
 ``python scripts/bench_engine.py`` prints the marks for one suite, ``--all`` a table of every suite,
 ``--suites`` one of those whose ids match. On a machine with neighbours ``--rounds 5`` goes through
-the table five times and takes the best of each figure: noise comes and goes in minutes.
+the table five times and takes the best of each figure, which may be of different rounds: noise comes
+and goes in minutes.
 """
 
 from __future__ import annotations
@@ -142,6 +143,8 @@ def main() -> None:
     if args.rounds < 1:
         parser.error(f"--rounds {args.rounds} must be at least 1")
     suites = [i for i in env_ids() if any(fnmatch.fnmatch(i, p) for p in patterns)]
+    if args.rounds > 1 and not patterns:
+        parser.error("--rounds goes with --all or --suites")
     if patterns and not suites:
         parser.error(f"no id matches {' '.join(patterns)}; ids look like {args.env}")
     print(

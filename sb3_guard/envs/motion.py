@@ -91,7 +91,7 @@ class Fleet:
         movers = np.arange(k)
         self._from = np.concatenate([movers, movers, pairs[0]])
         self._to = np.concatenate([np.full(k, 2 * k), k + movers, pairs[1]])
-        gaps = np.nextafter([laws[i].gap for i in pairs[1]], -1.0)  # closer than the gap
+        gaps = np.nextafter([laws[i].gap for i in pairs[1]], -1.0)  # below the gap, not at it
         radii = [law.r1 for law in laws], [law.r0 for law in laws], gaps
         self._radii = np.concatenate(radii)[:, None]
         # speeds towards robot and origin, [2, 4 K]: outside r0 twice, within it far and near

@@ -4,8 +4,8 @@ Every ratio is measured in one run: short slices of the full step and of a bare 
 model alternate, and the best slice of each counts; of a reset, the best of five repetitions.
 ``python scripts/bench_engine.py`` prints the marks for one suite, ``--all`` a table of every suite,
 ``--suites`` one of those whose ids match. On a machine with neighbours ``--rounds 5`` goes through
-the table five times and takes the best of each figure, which may be of different rounds: noise comes
-and goes in minutes.
+the table five times and takes the best of each figure, which may be of different rounds: noise
+comes and goes in minutes.
 """
 
 from __future__ import annotations

@@ -153,14 +153,18 @@ def main() -> None:
     if suites:
         full, bare = dict.fromkeys(suites, 0.0), dict.fromkeys(suites, 0.0)
         reset = dict.fromkeys(suites, math.inf)
-        for turn in range(args.rounds):
-            for i, env_id in enumerate(suites, 1):
-                print(f"\rround {turn + 1}, {i} of {len(suites)} ", end="", file=sys.stderr)
-                rates = batch_rates(env_id, 30, args.seconds / 6, args.slices)
-                full[env_id] = max(full[env_id], rates["full"])
-                bare[env_id] = max(bare[env_id], rates["bare"])
-                reset[env_id] = min(reset[env_id], 1e3 * reset_seconds(env_id))
-        print(file=sys.stderr)
+        try:
+            for turn in range(args.rounds):
+                for i, env_id in enumerate(suites, 1):
+                    print(f"\rround {turn + 1}, {i} of {len(suites)} ", end="", file=sys.stderr)
+                    rates = batch_rates(env_id, 30, args.seconds / 6, args.slices)
+                    full[env_id] = max(full[env_id], rates["full"])
+                    bare[env_id] = max(bare[env_id], rates["bare"])
+                    reset[env_id] = min(reset[env_id], 1e3 * reset_seconds(env_id))
+            print(file=sys.stderr)
+        except KeyboardInterrupt:
+            print("\ninterrupted; so far:", file=sys.stderr)
+            suites = [i for i in suites if reset[i] < math.inf]
         print("| suite | env-steps/s | of bare physics | reset, ms |\n|---|---|---|---|")
         for i in suites:
             print(f"| {i} | {full[i]:,.0f} | {full[i] / bare[i]:.2f} | {reset[i]:.2f} |")

@@ -483,7 +483,9 @@ class Engine:
         """All that moves by a law: the same fleets as before unless a part says otherwise."""
         moving = [group for part in self.parts for group in part.moving()]
         same = len(moving) == len(self._moving) and all(
-            new.points is old.points and new.law == old.law and new.planar is old.planar
+            new.points is old.points
+            and (new.law is old.law or new.law == old.law)
+            and new.planar is old.planar
             for new, old in zip(moving, self._moving, strict=True)
         )
         if not same:

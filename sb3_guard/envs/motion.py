@@ -83,10 +83,10 @@ class Fleet:
         # the movers, their origins and the robot
         self._points = np.zeros((self._size, 2 * k + 1, n))
         self._points[:, k : 2 * k] = np.array([w.origin[: self._size] for w in laws]).T[..., None]
-        pairs = np.zeros((2, 0), dtype=int)  # of like movers that part, the later one first
-        if self._unit and any(law.apart for law in laws):
-            each = [np.array(np.triu_indices(c.stop - c.start, 1)) + c.start for c in self._columns]
-            pairs = np.concatenate(each, axis=1)[::-1]
+        # pairs of like movers that part, the later one first
+        part = [c for c in self._columns if self._unit and laws[c.start].apart]
+        each = [np.array(np.triu_indices(c.stop - c.start, 1)) + c.start for c in part]
+        pairs = np.concatenate([np.zeros((2, 0), dtype=int), *each], axis=1)[::-1]
         # offsets lead from each mover to the robot, from each to its origin, and within each pair
         movers = np.arange(k)
         self._from = np.concatenate([movers, movers, pairs[0]])
@@ -104,8 +104,9 @@ class Fleet:
         self._outside = 4 * movers[:, None]
         self._inside = self._outside + 2
         self._apart = np.array([laws[i].apart for i in pairs[1]])
-        # from a flat index of [pairs, N] to those of the pair's movers in [K, N]
-        self._shift = (pairs - np.arange(pairs.shape[1])) * n
+        # from a flat index of [pairs, N] to those of the pair's movers in [2 or 3, K, N]
+        ends = pairs[:, None] + k * np.arange(self._size)[:, None]
+        self._shift = n * (ends - np.arange(pairs.shape[1])).reshape(2 * self._size, -1)
 
     def advance(self, robot: Array) -> None:
         """Move by one control step, in place.
@@ -125,14 +126,15 @@ class Fleet:
         case = np.where(within[k : 2 * k], self._inside, self._outside)
         case += within[:k]
         speed = self._speeds.take(case, axis=1)  # [2, K, N]
+        np.maximum(distance, TINY, out=distance)
         if self._unit:
-            speed /= np.maximum(distance[: 2 * k], TINY).reshape(2, k, n)
+            speed /= distance[: 2 * k].reshape(2, k, n)
         aims = offset[:, : 2 * k].reshape(-1, 2, k, n)
         aims *= speed
         move = aims[:, 0] + aims[:, 1]
         close = within[2 * k :].ravel().nonzero()[0]
         if len(close):
-            self._part(move, offset[:, 2 * k :], distance[2 * k :], close)
+            self._part(move, offset, distance, close)
         for live, columns in zip(self._live, self._columns, strict=True):
             live += move[:, columns]
 
@@ -140,20 +142,19 @@ class Fleet:
         """Add a push away from each like mover of the row that is closer than the gap.
 
         :param move: what to add to, by coordinate, [2 or 3, K, N] m
-        :param offset: within pairs, by coordinate, [2 or 3, pairs, N] m
-        :param distance: likewise, [pairs, N] m
+        :param offset: to robots, to origins and within pairs, [2 or 3, 2 K + pairs, N] m
+        :param distance: likewise, [2 K + pairs, N] m, not 0
         :param close: which are closer than the gap: flat indices of [pairs, N], rising
         """
-        k, n = move.shape[1:]
-        pair = close // n
-        push = offset.reshape(len(offset), -1).take(close, axis=1)
-        push *= self._apart.take(pair) / np.maximum(distance.take(close), TINY)
-        # each mover's pushes are summed in the order of the others, whatever the number of rows
+        _, k, n = move.shape
+        pair, where = close // n, close + 2 * k * n
+        push = offset.reshape(len(offset), -1).take(where, axis=1)
+        push *= self._apart.take(pair) / distance.take(where)
         moved = self._shift.take(pair, axis=1)
         moved += close
-        moved = moved.ravel()
-        for x, away in zip(move, np.concatenate([-push, push], axis=1), strict=True):
-            x += np.bincount(moved, away, k * n).reshape(k, n)
+        # each mover's pushes are summed in the order of the others, whatever the number of rows
+        away = np.concatenate([-push, push])
+        move += np.bincount(moved.ravel(), away.ravel(), move.size).reshape(move.shape)
 
 
 def fleets(moving: Iterable[Moving]) -> list[Fleet]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from sb3_guard.envs import geometry, motion
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Painter
+from sb3_guard.envs.part import Array, Painter, Simulation
 from sb3_guard.envs.tasks.targets import Targets
 
 WHITE = (0.95, 0.95, 0.95)
@@ -32,6 +32,10 @@ class Defense(Targets):
     radius: float = param(1.5, "radius of the protected circle, m", above=0)
     reward_outside: float = param(0.1, "reward for each target outside the circle")
 
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self._home = np.array([[self.origin]])  # [1, 1, 3] m
+
     def law(self) -> motion.Law:
         r1 = self.r1 if self.r1 is not None else 2.0 if self.planar else 2.5
         v2 = self.speed if self.v2 is None else self.v2
@@ -39,7 +43,7 @@ class Defense(Targets):
 
     def measure(self) -> Array:
         """Distances of the targets from the origin in the plane, [N, num] m."""
-        return geometry.distance(self.centers, np.array([[self.origin]]), planar=True)
+        return geometry.distance(self.centers, self._home, planar=True)
 
     def reward(self, before: Array, now: Array) -> Array:
         depth = now / self.radius - 1

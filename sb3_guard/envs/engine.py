@@ -1,7 +1,7 @@
 """The engine: a robot, a task and constraints become N running simulations.
 
-One compiled world, one :class:`mujoco.batch.Batch`; every control step is one call that advances
-all rows by ten physics steps on the batch's threads. The engine draws layouts, keeps the clock, the
+One compiled world, one :class:`mujoco.batch.Batch`; every control step advances all rows by ten
+physics steps on the batch's threads. The engine draws layouts, keeps the clock, the
 random generators and the arrays of the parts, and hands out what one control step brought. It
 knows no automatic reset and no time limit: those belong to the gymnasium classes above it.
 """
@@ -18,8 +18,8 @@ from typing import Any
 import mujoco
 import numpy as np
 from gymnasium.error import ResetNeeded
-from mujoco.batch import Batch, SimulationError
 
+from sb3_guard.envs.batch import ControlBatch
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import (
     ARENA,
@@ -220,9 +220,7 @@ class Engine:
         self.model = world.spec.compile()
         _silence_profiler()
         mujoco.set_mju_user_warning(_ignore_warning)
-        self.batch = Batch(
-            self.model, nsim=self.num_envs, nthread=self.num_threads, persistent=True
-        )
+        self.batch = ControlBatch(self.model, self.num_envs, self.num_threads)
 
         self.rngs = [np.random.default_rng() for _ in range(self.num_envs)]
         self._arrays: dict[str, Array] = {}
@@ -552,11 +550,7 @@ class Engine:
         for part in self.parts:
             part.before_step()
         self.robot.act(np.minimum(np.maximum(actions, -1.0), 1.0))
-        diverged = np.zeros(self.num_envs, dtype=bool)
-        try:
-            self.batch.step(nstep=FRAME_SKIP, stage=STAGE)
-        except SimulationError as error:
-            diverged[error.ids] = True
+        diverged = self.batch.advance(FRAME_SKIP, STAGE)
         changed = self._warnings != self._warned
         if np.count_nonzero(changed):  # MuJoCo has reset these rows by itself
             diverged |= changed.any(axis=1)

@@ -1,0 +1,85 @@
+"""The simulations of a world, whose sensors are evaluated once in a control step."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+Array = np.ndarray
+SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+
+
+class ControlBatch(Batch):
+    """A persistent :class:`mujoco.batch.Batch` that advances by control steps.
+
+    ``step`` evaluates the sensors in every physics step, which takes up to a sixth of an arm's
+    time, though nothing reads them before the control step ends. Here they are switched off until
+    then, with the same results bit for bit. The switch is in a copy of the model that the batch
+    runs on. Every physics step evaluates the sensors where that copy cannot be, because someone
+    gives simulations fields or models of their own; where sensors have a history or plugins may
+    read them; and for a lone simulation, where it takes no longer.
+
+    :param model: the model
+    :param nsim: number of simulations N
+    :param nthread: threads that step them
+    """
+
+    def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int) -> None:
+        super().__init__(model, nsim, nthread, persistent=True)
+        self._switched: mujoco.MjModel | None = None
+        if nsim > 1 and not (model.nhistory or model.nplugin):
+            self._switched = copy.copy(model)
+            super().set_models(self._switched)
+            self._models = None  # not the caller's: named views write per-simulation fields
+
+    def advance(self, nstep: int, stage: int) -> Array:
+        """Advance every simulation by ``nstep`` physics steps, then compute stages.
+
+        :param nstep: number of physics steps
+        :param stage: the stages to compute at the new state, a :class:`mujoco.mjtStage`
+        :return: which simulations MuJoCo gave up, [N] bool; they keep their states
+        """
+        failed = np.zeros(self.nsim, dtype=bool)
+        if self._switched is None:
+            try:
+                self.step(nstep=nstep, stage=stage)
+            except SimulationError as error:
+                failed[error.ids] = True
+            return failed
+        option = self._switched.opt
+        flags = option.disableflags
+        option.disableflags = flags | SENSOR
+        try:
+            self.step(nstep=nstep)
+        except SimulationError as error:
+            failed[error.ids] = True
+        finally:
+            option.disableflags = flags
+        try:
+            self.forward(stage=stage)
+        except SimulationError as error:
+            failed[error.ids] = True
+        return failed
+
+    def expand(self, name: str) -> Array:
+        self._release()
+        values: Array = super().expand(name)
+        return values
+
+    def set_const(self, ids: Any = None) -> None:
+        self._release()
+        super().set_const(ids)
+
+    def set_models(self, models: mujoco.MjModel | Sequence[mujoco.MjModel] | None) -> None:
+        self._switched = None
+        super().set_models(models)
+
+    def _release(self) -> None:
+        """Run on the batch's own model again: only its fields can differ between simulations."""
+        if self._switched is not None:
+            self.set_models(None)

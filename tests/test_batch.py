@@ -1,0 +1,136 @@
+"""Sensors once in a control step: the same bits as MuJoCo's own batch, and no trap for users."""
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch, SimulationError
+
+from sb3_guard.envs import Scenario
+from sb3_guard.envs.batch import SENSOR, ControlBatch
+from sb3_guard.envs.engine import FRAME_SKIP, STAGE
+from sb3_guard.envs.vector_env import GuardVectorEnv
+
+N = 3
+FIELDS = ("sensordata", "xpos", "xmat", "qacc", "cvel", "subtree_com")
+
+
+def pair(suite, **params):
+    """The batch of an environment that has begun, and MuJoCo's own in the same state."""
+    batch = GuardVectorEnv(N, suite, **params)
+    batch.reset(seed=0)
+    ours = batch.engine.batch
+    theirs = Batch(ours.model, nsim=N, nthread=1, persistent=True)
+    theirs.state[:] = ours.state
+    return ours, theirs
+
+
+def check_alike(ours, theirs, steps=40):
+    model = ours.model
+    low, high = model.actuator_ctrlrange.T
+    rng = np.random.default_rng(1)
+    fields = [(name, ours.bind(name), theirs.bind(name)) for name in FIELDS]
+    for _ in range(steps):
+        ours.ctrl = theirs.ctrl = rng.uniform(low, high, (N, model.nu))
+        assert not ours.advance(FRAME_SKIP, STAGE).any()
+        theirs.step(nstep=FRAME_SKIP, stage=STAGE)
+        np.testing.assert_array_equal(ours.state, theirs.state)
+        for name, mine, other in fields:
+            np.testing.assert_array_equal(mine, other, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "suite",
+    ["Goal_Point_8Hazards", "Push_Ant_4Vases", "Goal_Arm3_8Pillars", "Goal_Doggo_2Gremlins"],
+)
+def test_sensors_once_in_a_control_step_change_no_bit(suite):
+    ours, theirs = pair(suite)
+    assert ours._switched is not None
+    assert ours.models is None  # users see none but their own
+    check_alike(ours, theirs)
+
+
+def test_physics_steps_evaluate_no_sensors(monkeypatch):
+    ours, _ = pair("Goal_Ant_8Hazards")
+    seen = []
+
+    def step(self, *args, **kwargs):
+        seen.append(bool(self._switched.opt.disableflags & SENSOR))
+        return Batch.step(self, *args, **kwargs)
+
+    monkeypatch.setattr(ControlBatch, "step", step)
+    ours.advance(FRAME_SKIP, STAGE)
+    assert seen == [True]
+    assert not ours._switched.opt.disableflags & SENSOR
+
+
+@pytest.mark.parametrize("randomize", ["field", "named view", "constants", "models"])
+def test_users_may_randomize_the_physics(randomize):
+    ours, theirs = pair("Goal_Ant_8Hazards")
+    ours.advance(FRAME_SKIP, STAGE)
+    theirs.step(nstep=FRAME_SKIP, stage=STAGE)
+    for batch in (ours, theirs):
+        if randomize == "field":
+            batch.expand("opt.gravity")[:, 2] = [-9.81, -5.0, -2.0]
+        elif randomize == "named view":
+            batch.body("robot/robot").mass = [[5.0], [8.0], [12.0]]
+        elif randomize == "constants":
+            batch.set_const()
+        else:
+            models = [batch.get_model(i) for i in range(N)]
+            models[1].opt.gravity[2] = -5.0
+            batch.set_models(models)
+    check_alike(ours, theirs)
+    assert ours._switched is None  # all sensors in every physics step again
+    if randomize != "constants":
+        assert (ours.qpos[0] != ours.qpos[1]).any()
+
+
+def test_sensors_with_a_history_see_every_physics_step():
+    model = mujoco.MjModel.from_xml_string(
+        """
+        <mujoco>
+          <option timestep="0.01"/>
+          <worldbody><body><joint name="hinge"/><geom size="0.1"/></body></worldbody>
+          <actuator><motor joint="hinge"/></actuator>
+          <sensor><jointpos joint="hinge" delay="0.03" nsample="5"/></sensor>
+        </mujoco>
+        """
+    )
+    assert model.nhistory
+    ours, theirs = ControlBatch(model, N, 1), Batch(model, nsim=N, nthread=1, persistent=True)
+    ours.ctrl = theirs.ctrl = [[1.0], [2.0], [3.0]]
+    ours.bind("sensordata")
+    theirs.bind("sensordata")
+    for _ in range(5):
+        ours.advance(FRAME_SKIP, STAGE)
+        theirs.step(nstep=FRAME_SKIP, stage=STAGE)
+        np.testing.assert_array_equal(ours.sensordata, theirs.sensordata)
+    assert (ours.sensordata != 0).all()
+
+
+@pytest.mark.parametrize(("nsim", "verb"), [(1, "step"), (N, "step"), (N, "forward")])
+def test_simulations_that_mujoco_gives_up_are_told(monkeypatch, nsim, verb):
+    engine = Scenario.parse("Goal_Point_8Hazards").build(nsim)
+    engine.reset(np.arange(nsim))
+
+    def fail(self, *args, **kwargs):
+        raise SimulationError(np.array([nsim - 1]), "out of memory")
+
+    monkeypatch.setattr(Batch, verb, fail)
+    failed = engine.batch.advance(FRAME_SKIP, STAGE)
+    assert failed.tolist() == [False] * (nsim - 1) + [True]
+    assert nsim == 1 or not engine.batch._switched.opt.disableflags & SENSOR
+
+
+def test_an_interrupt_leaves_the_sensors_on(monkeypatch):
+    ours, theirs = pair("Goal_Point_8Hazards")
+
+    def interrupt(self, *args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Batch, "step", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            ours.advance(FRAME_SKIP, STAGE)
+    assert not ours._switched.opt.disableflags & SENSOR
+    check_alike(ours, theirs)

@@ -51,15 +51,17 @@ def test_sensors_once_in_a_control_step_change_no_bit(suite):
 
 def test_physics_steps_evaluate_no_sensors(monkeypatch):
     ours, _ = pair("Goal_Ant_8Hazards")
-    seen = []
+    ours.advance(FRAME_SKIP, STAGE)
+    before, seen = ours.sensordata.copy(), []
 
     def step(self, *args, **kwargs):
-        seen.append(bool(self._switched.opt.disableflags & SENSOR))
-        return Batch.step(self, *args, **kwargs)
+        Batch.step(self, *args, **kwargs)
+        seen.append(self.sensordata.copy())
 
     monkeypatch.setattr(ControlBatch, "step", step)
     ours.advance(FRAME_SKIP, STAGE)
-    assert seen == [True]
+    np.testing.assert_array_equal(seen, [before])  # MuJoCo has not written any
+    assert (ours.sensordata != before).any()
     assert not ours._switched.opt.disableflags & SENSOR
 
 
@@ -106,6 +108,41 @@ def test_sensors_with_a_history_see_every_physics_step():
         theirs.step(nstep=FRAME_SKIP, stage=STAGE)
         np.testing.assert_array_equal(ours.sensordata, theirs.sensordata)
     assert (ours.sensordata != 0).all()
+
+
+def test_sensors_of_bodies_that_fall_asleep_are_up_to_date():
+    model = mujoco.MjModel.from_xml_string(
+        """
+        <mujoco>
+          <option timestep="0.004"><flag sleep="enable"/></option>
+          <worldbody>
+            <geom type="plane" size="1 1 1"/>
+            <body name="box" pos="0 0 0.2"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+          </worldbody>
+          <sensor><framepos objtype="body" objname="box"/></sensor>
+        </mujoco>
+        """
+    )
+    ours, theirs = ControlBatch(model, N, 1), Batch(model, nsim=N, nthread=1, persistent=True)
+    for batch in (ours, theirs):
+        batch.bind("sensordata")
+        batch.forward()
+    for _ in range(100):
+        ours.advance(FRAME_SKIP, STAGE)
+        theirs.step(nstep=FRAME_SKIP, stage=STAGE)
+        np.testing.assert_array_equal(ours.sensordata, theirs.sensordata)
+    assert 0.09 < ours.sensordata[0, 2] < 0.11
+
+
+def test_models_that_are_refused_leave_the_batch_as_it_was():
+    ours, theirs = pair("Goal_Point_8Hazards")
+    with pytest.raises(ValueError, match="a model per simulation"):
+        ours.set_models([ours.model])
+    assert ours._switched is not None
+    check_alike(ours, theirs)
+    for batch in (ours, theirs):
+        batch.expand("opt.gravity")
+    check_alike(ours, theirs)
 
 
 @pytest.mark.parametrize(("nsim", "verb"), [(1, "step"), (N, "step"), (N, "forward")])

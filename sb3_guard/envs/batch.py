@@ -12,17 +12,19 @@ from mujoco.batch import Batch, SimulationError
 
 Array = np.ndarray
 SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 
 class ControlBatch(Batch):
     """A persistent :class:`mujoco.batch.Batch` that advances by control steps.
 
     ``step`` evaluates the sensors in every physics step, which takes up to a sixth of an arm's
-    time, though nothing reads them before the control step ends. Here they are switched off until
-    then, with the same results bit for bit. The switch is in a copy of the model that the batch
-    runs on. Every physics step evaluates the sensors where that copy cannot be, because someone
-    gives simulations fields or models of their own; where sensors have a history or plugins may
-    read them; and for a lone simulation, where it takes no longer.
+    time, though they are read when the control step ends. Here they are switched off until then,
+    with the same results bit for bit. The switch is in a copy of the model that the batch runs on.
+    Every physics step evaluates the sensors where that copy cannot be, because someone gives
+    simulations fields or models of their own; where it could make a difference, because sensors
+    have a history, bodies sleep or plugins read sensors; and for a lone simulation, where it gains
+    little. A physics callback in C (``mjcb_control``) reads them as of the last control step.
 
     :param model: the model
     :param nsim: number of simulations N
@@ -32,7 +34,8 @@ class ControlBatch(Batch):
     def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int) -> None:
         super().__init__(model, nsim, nthread, persistent=True)
         self._switched: mujoco.MjModel | None = None
-        if nsim > 1 and not (model.nhistory or model.nplugin):
+        sleep = model.opt.enableflags & SLEEP
+        if nsim > 1 and not (model.nhistory or model.nplugin or sleep):
             self._switched = copy.copy(model)
             super().set_models(self._switched)
             self._models = None  # not the caller's: named views write per-simulation fields
@@ -42,7 +45,7 @@ class ControlBatch(Batch):
 
         :param nstep: number of physics steps
         :param stage: the stages to compute at the new state, a :class:`mujoco.mjtStage`
-        :return: which simulations MuJoCo gave up, [N] bool; they keep their states
+        :return: which simulations MuJoCo gave up, [N] bool; they are to be reset
         """
         failed = np.zeros(self.nsim, dtype=bool)
         if self._switched is None:
@@ -76,8 +79,8 @@ class ControlBatch(Batch):
         super().set_const(ids)
 
     def set_models(self, models: mujoco.MjModel | Sequence[mujoco.MjModel] | None) -> None:
-        self._switched = None
         super().set_models(models)
+        self._switched = None  # not before: the batch reads it as long as the call may fail
 
     def _release(self) -> None:
         """Run on the batch's own model again: only its fields can differ between simulations."""

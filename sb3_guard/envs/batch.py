@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -49,24 +49,16 @@ class ControlBatch(Batch):
         """
         failed = np.zeros(self.nsim, dtype=bool)
         if self._switched is None:
-            try:
-                self.step(nstep=nstep, stage=stage)
-            except SimulationError as error:
-                failed[error.ids] = True
+            _run(self.step, failed, nstep=nstep, stage=stage)
             return failed
         option = self._switched.opt
         flags = option.disableflags
         option.disableflags = flags | SENSOR
         try:
-            self.step(nstep=nstep)
-        except SimulationError as error:
-            failed[error.ids] = True
+            _run(self.step, failed, nstep=nstep)
         finally:
             option.disableflags = flags
-        try:
-            self.forward(stage=stage)
-        except SimulationError as error:
-            failed[error.ids] = True
+        _run(self.forward, failed, stage=stage)
         return failed
 
     def expand(self, name: str) -> Array:
@@ -86,3 +78,11 @@ class ControlBatch(Batch):
         """Run on the batch's own model again: only its fields can differ between simulations."""
         if self._switched is not None:
             self.set_models(None)
+
+
+def _run(call: Callable[..., None], failed: Array, **arguments: int) -> None:
+    """Call the batch; mark the simulations, [N] bool, that MuJoCo gives up."""
+    try:
+        call(**arguments)
+    except SimulationError as error:
+        failed[error.ids] = True

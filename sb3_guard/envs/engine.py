@@ -1,9 +1,9 @@
 """The engine: a robot, a task and constraints become N running simulations.
 
-One compiled world, one :class:`mujoco.batch.Batch`; every control step advances all rows by ten
-physics steps on the batch's threads. The engine draws layouts, keeps the clock, the
-random generators and the arrays of the parts, and hands out what one control step brought. It
-knows no automatic reset and no time limit: those belong to the gymnasium classes above it.
+One compiled world, one :class:`~sb3_guard.envs.batch.ControlBatch`; every control step advances all
+rows by ten physics steps on the batch's threads. The engine draws layouts, keeps the clock, the
+random generators and the arrays of the parts, and hands out what one control step brought. It knows
+no automatic reset and no time limit: those belong to the gymnasium classes above it.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 
 Three wrappers find the cost: :class:`CostFromStep` in a sixth value of ``step``
 (Safety-Gymnasium), :class:`CostFromInfo` under other keys of ``info``, :class:`CostFromFunction`
-in a function of yours. Two use it: :class:`RemainingBudget` shows the agent what is left of a
-budget, :class:`EarlyTermination` ends the episode that overspends it. All are Gymnasium wrappers
-of single environments and need neither torch nor MuJoCo.
+in a function of yours. All are Gymnasium wrappers of single environments and need neither torch nor
+MuJoCo. Wrappers that use the cost are in ``budgets.py``.
 """
 
 from __future__ import annotations
@@ -13,15 +12,12 @@ import copy
 import math
 import pkgutil
 import re
-import sys
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils import RecordConstructorArgs
 
@@ -35,9 +31,10 @@ _SAFETY_GYMNASIUM_ID = re.compile(r"(safety_gymnasium:)?Safety\w+-v\d+")
 def is_safety_gymnasium(env_id: str) -> bool:
     """Whether an id is one of Safety-Gymnasium's, to be made by :func:`make_safety_gymnasium`.
 
-    Who registered an id decides. Of one that nobody registered its form does, and if the package
-    can be imported, it has the last word. ``Safety…Gymnasium-v0``, the package's own conversion to
-    five values, belongs here too: adapting it twice changes nothing.
+    ``safety_gymnasium:`` before an id says so; without it, tasks that sb3_guard has itself are its
+    own. Else who registered an id decides. Of one that nobody registered its form does, and if the
+    package can be imported, it has the last word. ``Safety…Gymnasium-v0``, the package's own
+    conversion to five values, belongs here too: adapting it twice changes nothing.
 
     :raises gymnasium.error.DependencyNotInstalled: the id has the form, and the package is absent
         or does not import
@@ -99,7 +96,7 @@ def _broken(env_id: str, error: Exception) -> DependencyNotInstalled:
     )
 
 
-def _number(value: Any, name: str) -> float:
+def number(value: Any, name: str) -> float:
     """One cost as a float: an int, bool, NumPy scalar or array of one number will do."""
     try:
         number = float(value.item() if isinstance(value, np.ndarray) else value)
@@ -113,9 +110,9 @@ def _number(value: Any, name: str) -> float:
 def _parts(value: Any, name: str) -> dict[str, float] | None:
     """The costs in a dictionary, list, tuple or array by name or number; None for one number."""
     if isinstance(value, Mapping):
-        return {str(key): _number(each, f"{name}[{key!r}]") for key, each in value.items()}
+        return {str(key): number(each, f"{name}[{key!r}]") for key, each in value.items()}
     if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
-        return {str(i): _number(each, f"{name}[{i}]") for i, each in enumerate(value)}
+        return {str(i): number(each, f"{name}[{i}]") for i, each in enumerate(value)}
     return None
 
 
@@ -123,12 +120,12 @@ def _charged(info: Mapping[str, Any], value: Any, name: str) -> dict[str, Any]:
     """``info`` with the cost; several costs also one by one, as ``cost_<name or number>``."""
     parts = _parts(value, name)
     if parts is None:
-        return {**info, "cost": _number(value, name)}
+        return {**info, "cost": number(value, name)}
     named = {f"cost_{part}": cost for part, cost in parts.items()}
     return {**info, **named, "cost": float(sum(parts.values()))}
 
 
-def _entry(info: Mapping[str, Any], key: str, missing_cost: str = "error") -> Any:
+def entry(info: Mapping[str, Any], key: str, missing_cost: str = "error") -> Any:
     if key in info:
         return info[key]
     if missing_cost == "zero":
@@ -140,32 +137,6 @@ def _entry(info: Mapping[str, Any], key: str, missing_cost: str = "error") -> An
         f"info has no cost key {key!r}; its keys are {present}{hint}. Name the right one; "
         "CostFromInfo(..., missing_cost='zero') is for a key that is absent when nothing is charged"
     )
-
-
-def _check(
-    name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, above: bool = False
-) -> float:
-    """
-    :param above: whether ``low`` itself is too low
-    :raises ValueError: ``value`` is not a finite number from ``low`` to ``high``
-    """
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    inside = number and math.isfinite(value) and low <= value <= high
-    if not inside or (above and value == low):
-        least = "" if low == -math.inf else f" above {low:g}" if above else f" of at least {low:g}"
-        most = "" if high == math.inf else f" and at most {high:g}"
-        raise ValueError(f"{name}={value!r}: must be a finite number{least}{most}")
-    return float(value)
-
-
-def _has_monitor(env: gym.Env) -> bool:
-    """Whether SB3's ``Monitor`` is among the wrappers; if SB3 isn't imported, it can't be."""
-    module = sys.modules.get("stable_baselines3.common.monitor")
-    while module is not None and isinstance(env, gym.Wrapper):
-        if isinstance(env, module.Monitor):
-            return True
-        env = env.env
-    return False
 
 
 class CostFromStep(gym.Wrapper, RecordConstructorArgs):
@@ -195,6 +166,31 @@ class CostFromStep(gym.Wrapper, RecordConstructorArgs):
             )
         obs, reward, cost, terminated, truncated, info = values
         return obs, reward, bool(terminated), bool(truncated), _charged(info, cost, "the cost")
+
+
+class CostAsThirdValue(gym.Wrapper, RecordConstructorArgs):
+    """The other way round: ``step`` returns six values, as Safety-Gymnasium's environments do.
+
+    For libraries that train on Safety-Gymnasium, such as OmniSafe and SafePO: ``obs, reward, cost,
+    terminated, truncated, info``, the cost as a float. It must be the outermost wrapper, since
+    Gymnasium's own expect five values.
+
+    :param env: an environment whose ``info`` holds ``"cost"``
+    :raises KeyError: it does not
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+
+    def step(  # type: ignore[override]
+        self, action: Any
+    ) -> tuple[Any, SupportsFloat, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        if "cost" not in info:
+            raise KeyError(f"info has no 'cost': {sorted(info)}; use CostFromInfo first")
+        cost = float(info["cost"])
+        return obs, reward, cost, terminated, truncated, {**info, "cost_sum": cost}
 
 
 class CostFromInfo(gym.Wrapper, RecordConstructorArgs):
@@ -230,7 +226,7 @@ class CostFromInfo(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: a key is missing and may not be, or its value is not a cost
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
-        values = {key: _entry(info, key, self.missing_cost) for key in self.keys}
+        values = {key: entry(info, key, self.missing_cost) for key in self.keys}
         if len(values) == 1:
             [(key, value)] = values.items()
             return obs, reward, terminated, truncated, _charged(info, value, f"info[{key!r}]")
@@ -239,7 +235,7 @@ class CostFromInfo(gym.Wrapper, RecordConstructorArgs):
         for key, value in values.items():
             parts = _parts(value, f"info[{key!r}]")
             if parts is None:
-                total += _number(value, f"info[{key!r}]")
+                total += number(value, f"info[{key!r}]")
                 continue
             total += sum(parts.values())
             costs.update((f"cost_{key}_{part}", cost) for part, cost in parts.items())
@@ -289,150 +285,3 @@ class CostFromFunction(gym.Wrapper, RecordConstructorArgs):
         cost = self.cost(self.last_observation, action, obs, info)
         self.last_observation = copy.deepcopy(obs)
         return obs, reward, terminated, truncated, _charged(info, cost, "what cost(...) returned")
-
-
-class RemainingBudget(gym.Wrapper, RecordConstructorArgs):
-    """Show the agent what is left of its cost budget, so that it can spend it wisely.
-
-    A limit on the episode's cost depends on the past, which a policy of the observation alone does
-    not know. Sauté RL (Sootla et al., ICML 2022) adds the remaining share z of the budget to it:
-    z₀ = 1, z_{t+1} = (z_t - cost_t / budget) / discount, negative when the budget is overspent.
-    A flat observation gets z as its last number, a dictionary an entry ``"budget"`` of shape (1,);
-    any other becomes a dictionary of ``"observation"`` and ``"budget"``.
-
-    With ``unsafe_reward``, the reward of every step that ends with z < 0 is replaced, as in the
-    paper: then any algorithm for rewards alone learns to keep the budget. Evaluate without it to
-    see true returns.
-
-    :param env: an environment that reports its cost; adapters go inside
-    :param budget: what an episode may cost, above 0
-    :param discount: discount factor of the costs, in (0, 1]
-    :param unsafe_reward: reward of the steps after the budget is overspent; None leaves rewards
-    :param cost_key: entry of ``info`` that is counted
-    :raises ValueError: an argument is out of its range, or the observation has an entry
-        ``"budget"`` already
-    """
-
-    def __init__(
-        self,
-        env: gym.Env,
-        budget: float,
-        discount: float = 1.0,
-        unsafe_reward: float | None = None,
-        cost_key: str = "cost",
-    ) -> None:
-        RecordConstructorArgs.__init__(
-            self, budget=budget, discount=discount, unsafe_reward=unsafe_reward, cost_key=cost_key
-        )
-        gym.Wrapper.__init__(self, env)
-        self.budget = _check("budget", budget, 0.0, above=True)
-        self.discount = _check("discount", discount, 0.0, 1.0, above=True)
-        if unsafe_reward is not None:
-            unsafe_reward = _check("unsafe_reward", unsafe_reward)
-        self.unsafe_reward = unsafe_reward
-        self.cost_key = cost_key
-        self.remaining = 1.0
-
-        space = env.observation_space
-        left = spaces.Box(-np.inf, np.inf, (1,), np.float32)
-        if isinstance(space, spaces.Dict):
-            if "budget" in space.spaces:
-                raise ValueError(
-                    "the observation has an entry 'budget' already: is the environment wrapped in "
-                    "RemainingBudget twice?"
-                )
-            self.observation_space = spaces.Dict({**space.spaces, "budget": left})
-        elif isinstance(space, spaces.Box) and len(space.shape) == 1:
-            dtype = space.dtype if space.dtype in (np.float32, np.float64) else np.float32
-            self.observation_space = spaces.Box(
-                np.append(space.low, -np.inf).astype(dtype),
-                np.append(space.high, np.inf).astype(dtype),
-                dtype=dtype,
-            )
-        else:
-            self.observation_space = spaces.Dict({"observation": space, "budget": left})
-
-    def _augmented(self, obs: Any) -> Any:
-        space = self.observation_space
-        if isinstance(space, spaces.Box):
-            return np.append(obs, self.remaining).astype(space.dtype)
-        budget = np.array([self.remaining], dtype=np.float32)
-        if isinstance(self.env.observation_space, spaces.Dict):
-            return {**obs, "budget": budget}
-        return {"observation": obs, "budget": budget}
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        obs, info = self.env.reset(seed=seed, options=options)
-        self.remaining = 1.0
-        return self._augmented(obs), info
-
-    def step(self, action: Any) -> Step:
-        """
-        :raises ValueError: ``info`` lacks the cost, or it is not a number
-        """
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        cost = _number(_entry(info, self.cost_key), f"info[{self.cost_key!r}]")
-        self.remaining = (self.remaining - cost / self.budget) / self.discount
-        if self.unsafe_reward is not None and self.remaining < 0.0:
-            reward = self.unsafe_reward
-        return self._augmented(obs), reward, terminated, truncated, info
-
-
-class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
-    """End an episode that costs more than its budget, so that nothing is earned by overspending.
-
-    The early-terminated MDP of Sun et al. (2021): with it an algorithm for rewards alone respects
-    a limit, if rewards are positive. Where they are not, ending early is tempting, and
-    ``final_reward`` must make up for it. The step that overspends is ``terminated`` and has
-    ``info["budget_exceeded"]``; to spend the budget exactly is allowed.
-
-    It goes inside SB3's ``Monitor``, which otherwise never sees the episodes that are ended here:
-    a warning says so.
-
-    :param env: an environment that reports its cost; adapters go inside
-    :param budget: what an episode may cost, at least 0
-    :param final_reward: added to the reward of the step that overspends
-    :param cost_key: entry of ``info`` that is counted
-    :raises ValueError: an argument is out of its range
-    """
-
-    def __init__(
-        self, env: gym.Env, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
-    ) -> None:
-        RecordConstructorArgs.__init__(
-            self, budget=budget, final_reward=final_reward, cost_key=cost_key
-        )
-        gym.Wrapper.__init__(self, env)
-        self.budget = _check("budget", budget, 0.0)
-        self.final_reward = _check("final_reward", final_reward)
-        self.cost_key = cost_key
-        self.episode_cost = 0.0
-        if _has_monitor(env):
-            warnings.warn(
-                "EarlyTermination is around a Monitor, which will not report the episodes that "
-                "overspend: wrap the environment before its monitor, as "
-                "sb3_guard.make_vec_env(..., wrapper_class=...) does; SB3's takes a function that "
-                "makes it wrapped",
-                UserWarning,
-                stacklevel=2,
-            )
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        self.episode_cost = 0.0
-        return self.env.reset(seed=seed, options=options)
-
-    def step(self, action: Any) -> Step:
-        """
-        :raises ValueError: ``info`` lacks the cost, or it is not a number
-        """
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        self.episode_cost += _number(_entry(info, self.cost_key), f"info[{self.cost_key!r}]")
-        if self.episode_cost > self.budget:
-            terminated = True
-            reward = float(reward) + self.final_reward
-            info = {**info, "budget_exceeded": True}
-        return obs, reward, terminated, truncated, info

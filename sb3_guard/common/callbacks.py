@@ -27,6 +27,8 @@ class LogCosts(BaseCallback):
     """
 
     def _on_step(self) -> bool:
+        if not np.isfinite(find_monitor(self.training_env).total_cost):
+            raise ValueError("the environment reported a cost that is not finite")
         return True
 
     def _on_rollout_end(self) -> None:
@@ -44,18 +46,21 @@ class CostEvalCallback(EvalCallback):
     Evaluate the agent every so often, and keep the best model: safe first, then good.
 
     SB3's callback keeps the model of highest reward, which for a constrained problem is apt to be
-    the least safe one. Here models whose mean episode cost is within ``selection_limit`` come
-    before all others and are ordered by return; the others are ordered by violation, the sum over
-    the costs of what exceeds the limit.
+    the least safe one. Here models whose mean episode cost plus its standard error is within
+    ``selection_limit`` come before all others and are ordered by return; the others are ordered by
+    violation, the sum over the costs of what exceeds the limit. By default two policies must keep
+    it: the stochastic one, which the limit is about, and its mean, which is used afterwards and
+    whose return counts.
 
     Every evaluation plays the same episodes (``seed``) and draws no random number of training's: a
     run is the same with and without it, and after a resume.
 
-    Logs ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/mean_ep_cost`` and, for several
-    costs, of which that is the total, ``eval/mean_ep_cost/<key>``. ``evaluations.npz`` has
-    ``timesteps`` [K], ``results``, ``ep_lengths`` and ``costs`` [K, E], and for several costs
-    ``key_costs`` [K, E, m]. Beside ``best_model.zip`` of an agent that was trained on normalised
-    observations lies ``best_model_vecnormalize.pkl``.
+    Logs ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/mean_ep_cost``; where both policies
+    are evaluated ``eval/stochastic_reward`` and ``eval/stochastic_ep_cost``; and for several costs,
+    of which that is the total, ``eval/mean_ep_cost/<key>``. ``evaluations.npz`` has ``timesteps``
+    [K], ``results``, ``ep_lengths`` and ``costs`` [K, E], and for several costs ``key_costs``
+    [K, E, m]. Beside ``best_model.zip`` of an agent that was trained on normalised observations
+    lies ``best_model_vecnormalize.pkl``.
 
     SB3's ``StopTrainingOnNoModelImprovement`` and ``StopTrainingOnRewardThreshold`` may be among
     its callbacks: the ``best_mean_reward`` that they compare rises with every new best model, and
@@ -64,16 +69,17 @@ class CostEvalCallback(EvalCallback):
     :param eval_env: environment to evaluate in, wrapped as the training environment is, and not
         that environment itself
     :param selection_limit: episode cost up to which a model counts as safe, one number or one per
-        cost key. None: ``max(cost_limit, 1)`` of the algorithm (a limit of 0 would choose nobody,
-        or the untrained agent); for an unconstrained algorithm the return alone decides
+        cost key. None: ``cost_limit`` of the algorithm, and 1 for a limit of 0 (which would choose
+        nobody, or the untrained agent); for an unconstrained algorithm the return alone decides
     :param seed: seed of the evaluation episodes
     :param callback_on_new_best: called when there is a new best model
     :param callback_after_eval: called after each evaluation
-    :param n_eval_episodes: episodes per evaluation
+    :param n_eval_episodes: episodes per evaluation and policy
     :param eval_freq: evaluate every this many calls, i.e. ``eval_freq * n_envs`` steps
     :param log_path: folder of ``evaluations.npz``; None: not written
     :param best_model_save_path: folder of ``best_model.zip``; None: not written
-    :param deterministic: evaluate the most likely actions instead of sampled ones
+    :param deterministic: evaluate the most likely actions alone (True), sampled ones alone (False),
+        or both (None)
     :param verbose: 1 prints a line per evaluation
     """
 
@@ -85,11 +91,11 @@ class CostEvalCallback(EvalCallback):
         seed: int = 0,
         callback_on_new_best: BaseCallback | None = None,
         callback_after_eval: BaseCallback | None = None,
-        n_eval_episodes: int = 5,
+        n_eval_episodes: int = 30,
         eval_freq: int = 10_000,
         log_path: str | os.PathLike[str] | None = None,
         best_model_save_path: str | os.PathLike[str] | None = None,
-        deterministic: bool = True,
+        deterministic: bool | None = None,
         verbose: int = 1,
     ):
         super().__init__(
@@ -102,9 +108,10 @@ class CostEvalCallback(EvalCallback):
             best_model_save_path=None
             if best_model_save_path is None
             else os.fspath(best_model_save_path),
-            deterministic=deterministic,
+            deterministic=deterministic is not False,
             verbose=verbose,
         )
+        self.both = deterministic is None
         self.selection_limit = selection_limit
         self.seed = seed
         self.evaluations_costs: list[list[float]] = []
@@ -141,7 +148,7 @@ class CostEvalCallback(EvalCallback):
         if limit is None:
             cost_limit: Any = getattr(self.model, "cost_limit", None)
             constrained = cost_limit is not None and getattr(self.model, "constrained", True)
-            limit = np.maximum(cost_limit, 1.0) if constrained else np.inf
+            limit = np.where(np.equal(cost_limit, 0.0), 1.0, cost_limit) if constrained else np.inf
         limits = np.asarray(limit, dtype=np.float64)
         m = len(self.cost_keys)
         if limits.shape not in ((), (m,)) or np.isnan(limits).any():
@@ -151,13 +158,30 @@ class CostEvalCallback(EvalCallback):
             )
         return np.broadcast_to(limits, (m,))
 
-    def score(self, evaluation: Evaluation) -> tuple[bool, float]:
-        """How two models compare: the greater tuple is the better model."""
-        excess = np.maximum(evaluation.key_costs.mean(axis=0) - self.limits(), 0.0)  # [m]
-        violation = float(excess.sum())
+    def score(self, *evaluations: Evaluation) -> tuple[bool, float]:
+        """How two models compare: the greater tuple is the better model.
+
+        :param evaluations: of one model; the return of the first counts, the costs of all
+        """
+        violation = 0.0
+        for evaluation in evaluations:
+            costs, n = evaluation.key_costs, len(evaluation)
+            error = costs.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else 0.0
+            excess = np.maximum(costs.mean(axis=0) + error - self.limits(), 0.0)  # [m]
+            violation = float(np.maximum(violation, excess.sum()))  # nan stays nan
         if violation <= 0.0:
-            return (True, float(evaluation.returns.mean()))
+            return (True, float(evaluations[0].returns.mean()))
         return (False, -violation)
+
+    def _evaluate(self, deterministic: bool) -> Evaluation:
+        return evaluate_policy(
+            self.model,
+            self.eval_env,
+            n_eval_episodes=self.n_eval_episodes,
+            deterministic=deterministic,
+            seed=self.seed,
+            cost_keys=self.cost_keys,
+        )
 
     def _remember(self, score: tuple[bool, float]) -> None:
         """Take a score for the best one, and tell SB3's callbacks in the number they compare."""
@@ -170,14 +194,11 @@ class CostEvalCallback(EvalCallback):
             return True
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
-        evaluation = evaluate_policy(
-            self.model,
-            self.eval_env,
-            n_eval_episodes=self.n_eval_episodes,
-            deterministic=self.deterministic,
-            seed=self.seed,
-            cost_keys=self.cost_keys,
-        )
+        evaluation = self._evaluate(self.deterministic)
+        noisy = [self._evaluate(False)] if self.both else []
+        for other in noisy:
+            self.logger.record("eval/stochastic_reward", float(other.returns.mean()))
+            self.logger.record("eval/stochastic_ep_cost", float(other.costs.mean()))
         self.last_mean_reward = float(evaluation.returns.mean())
         self.last_mean_cost = float(evaluation.costs.mean())
 
@@ -192,13 +213,14 @@ class CostEvalCallback(EvalCallback):
         self.write_history()
         self._log(evaluation)
 
-        score = self.score(evaluation)
+        score = self.score(evaluation, *noisy)
         is_best = np.isfinite(score[1]) and score > self.best_score
         if self.verbose >= 1:
             returns = evaluation.estimate(evaluation.returns)
             words = [f"return {returns.mean:.2f} ± {returns.std:.2f}"]
             for key, costs in zip(self.cost_keys, evaluation.key_costs.T, strict=True):
                 words.append(f"{key} {costs.mean():.2f} ± {costs.std():.2f}")
+            words += [f"with noise {other.costs.mean():.2f}" for other in noisy]
             best = " (best so far)" if is_best else ""
             print(f"Evaluation after {self.num_timesteps} steps: {', '.join(words)}{best}")
         proceed = True

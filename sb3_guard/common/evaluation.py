@@ -17,8 +17,8 @@ from stable_baselines3.common.vec_env import (
     is_vecenv_wrapped,
 )
 
+from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import read_costs
-from sb3_guard.algorithms.common.on_policy import CostOnPolicyAlgorithm
 from sb3_guard.common.monitor import total_cost
 
 
@@ -161,7 +161,7 @@ def evaluate_policy(
                 f"cost_keys={keys}: the policy acts on {len(thresholds)} costs; pass their names "
                 "as cost_keys=(...), or the model instead of its policy"
             )
-    if isinstance(model, CostOnPolicyAlgorithm) and model.env is not None:
+    if isinstance(model, Constrained) and model.env is not None:
         model.begin_anew |= share_environment(model.env, env)
 
     n = env.num_envs

@@ -10,10 +10,15 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_guard.common.vec_budgets import end_rows
+
 
 def _number(value: Any) -> float:
     """A cost as a float: also of an array of one number."""
-    return float(np.asarray(value).item())
+    try:
+        return float(np.asarray(value).item())
+    except (TypeError, ValueError):
+        raise ValueError(f"the environment's cost is {value!r}; it must be a number") from None
 
 
 def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) -> float:
@@ -96,6 +101,12 @@ class CostMonitor(VecMonitor):
             for i in np.flatnonzero(dones).tolist():
                 infos[i] = {**infos[i], "episode": self._end_episode(i, infos[i])}
         return obs, rewards, dones, infos
+
+    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
+        """Report the episodes that a wrapper outside ends, and begin new ones."""
+        for i in rows:
+            infos[i] = {**infos[i], "episode": self._end_episode(i, infos[i])}
+        return end_rows(self.venv, rows, infos)
 
     def _end_episode(self, i: int, info: dict[str, Any]) -> dict[str, Any]:
         episode: dict[str, Any] = {

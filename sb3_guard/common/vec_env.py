@@ -58,7 +58,7 @@ def find_scenario(env_id: str | Path | Mapping[str, Any] | Scenario) -> Scenario
     if not isinstance(env_id, str) or env_id.endswith((".yml", ".yaml")):
         one: Scenario = _our_envs(env_id).as_scenario(env_id)
         return one
-    for name in (env_id, f"{env_id}-v0"):
+    for name in (env_id, f"{env_id}-v1", f"{env_id}-v0"):
         spec = gymnasium.registry.get(name)
         if spec is not None:
             if spec.entry_point != _OURS:
@@ -66,8 +66,12 @@ def find_scenario(env_id: str | Path | Mapping[str, Any] | Scenario) -> Scenario
             scenario: type[Scenario] = _our_envs(env_id).Scenario
             what = spec.kwargs["scenario"]
             return scenario.parse(what) if isinstance(what, str) else scenario(**what)
-    if ":" in env_id or is_safety_gymnasium(env_id):
-        return None  # of "module:Env-v0" gymnasium imports the module first
+    try:
+        if ":" in env_id or is_safety_gymnasium(env_id):
+            return None  # of "module:Env-v0" gymnasium imports the module first
+    except DependencyNotInstalled:
+        _our_envs(env_id).Scenario.parse(env_id)  # says what there is without the package
+        raise
     envs = _our_envs(env_id)
     try:
         return envs.Scenario.parse(env_id)
@@ -143,6 +147,9 @@ class GuardVecEnv(VecEnv):
             if np.count_nonzero(happened):
                 for row in np.flatnonzero(happened).tolist():
                     infos[row][name] = True
+        for name, rows in out.ended_by.items():
+            for row in np.flatnonzero(rows).tolist():
+                infos[row]["terminated_by"] = name
         if np.count_nonzero(t.done):
             for row in np.flatnonzero(t.done).tolist():
                 last = self.envs.view(out.obs, t.final_images, row)
@@ -150,11 +157,20 @@ class GuardVecEnv(VecEnv):
                 infos[row]["TimeLimit.truncated"] = bool(t.truncated[row] & ~out.terminated[row])
         return self.envs.view(t.obs, t.images), out.reward.astype(np.float32), t.done, infos
 
+    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
+        """Begin new episodes in some rows; the observations of all rows."""
+        self.envs.engine.reset(np.asarray(rows))
+        return self.envs.view(self.envs.engine.observe(), self.envs.look())
+
     def close(self) -> None:
         self.envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         return [self.envs.frame(row) for row in range(self.num_envs)]
+
+    def film(self, row: int = 0) -> list[np.ndarray]:
+        """The pictures of one row since the last call, ``envs.film_fps`` for each second."""
+        return self.envs.film(row)
 
     def state(self) -> dict[str, Any]:
         """Everything the coming steps depend on, the generators included."""

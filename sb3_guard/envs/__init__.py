@@ -25,13 +25,12 @@ from gymnasium.envs.registration import EnvSpec, parse_env_id
 
 from sb3_guard.envs.gym_env import GuardEnv, as_scenario
 from sb3_guard.envs.registry import (
-    EPISODE_STEPS,
-    env_ids,
     register_constraint,
     register_robot,
     register_task,
 )
 from sb3_guard.envs.scenario import Scenario
+from sb3_guard.envs.suites import env_ids, episode_steps, with_version
 from sb3_guard.envs.vector_env import GuardVectorEnv
 
 __all__ = [
@@ -61,7 +60,7 @@ def env_spec(name: str | Path | Mapping[str, Any] | Scenario) -> EnvSpec:
     what: str | dict[str, Any]
     if isinstance(name, str) and not name.endswith((".yml", ".yaml")):
         what = name.removeprefix("sb3_guard:")  # what gymnasium.make would have to import
-        env_id = _with_version(what)
+        env_id = with_version(what)
         if env_id in gymnasium.registry:
             return gymnasium.registry[env_id]
         Scenario.parse(what)
@@ -71,14 +70,9 @@ def env_spec(name: str | Path | Mapping[str, Any] | Scenario) -> EnvSpec:
         env_id,
         entry_point=ENTRY_POINT,
         vector_entry_point="sb3_guard.envs.vector_env:GuardVectorEnv",
-        max_episode_steps=EPISODE_STEPS,
+        max_episode_steps=episode_steps(env_id),
         kwargs={"scenario": what},
     )
-
-
-def _with_version(name: str) -> str:
-    """An id of ours in full."""
-    return name if name.rpartition("-v")[2].isdigit() else f"{name}-v0"
 
 
 def register(name: str, scenario: str | Path | Mapping[str, Any] | Scenario | None = None) -> str:
@@ -97,7 +91,7 @@ def register(name: str, scenario: str | Path | Mapping[str, Any] | Scenario | No
     else:
         scenario = as_scenario(scenario)
         spec = env_spec(scenario)
-        spec.id = _with_version(name.removeprefix("sb3_guard:"))
+        spec.id = with_version(name.removeprefix("sb3_guard:"))
         spec.namespace, spec.name, spec.version = parse_env_id(spec.id)
         try:
             agrees = spec.namespace is not None or Scenario.parse(spec.name) == scenario
@@ -134,4 +128,5 @@ def make(name: str | Path | Mapping[str, Any] | Scenario, **kwargs: Any) -> gymn
 
 
 for _env_id in env_ids():
-    register(_env_id)
+    if _env_id not in gymnasium.registry:  # another package may have registered its own
+        register(_env_id)

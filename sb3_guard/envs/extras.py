@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sb3_guard.envs.observation import Observations, Values
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Part, Simulation, World
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.part import Part, Simulation, World
 from sb3_guard.spelling import did_you_mean
 
 EYE = "eye"
@@ -36,6 +36,9 @@ class Extras(Part):
     qvel: bool = param(False, "velocities of all joints of the world")
     ctrl: bool = param(False, "controls of all actuators")
     com: bool = param(False, "centre of mass of the robot, m")
+    components: tuple[str, ...] | None = param(
+        None, "names of what is observed, in this order; null: everything, in alphabetical order"
+    )
     camera: tuple[int, int] | None = param(
         None, "width and height, pixels, of an image from the robot; needs flatten=False", low=1
     )
@@ -47,6 +50,12 @@ class Extras(Part):
                 "episode, the same as max_episode_steps, such as 1000; or null"
             )
         super().__post_init__()
+        names = self.components
+        if names is not None and (not names or len(set(names)) < len(names)):
+            raise ValueError(
+                f"observe.components = {names!r} must name at least one component, none twice; "
+                "or be null for everything"
+            )
 
     def check_limit(self, steps: int) -> None:
         """
@@ -94,23 +103,14 @@ class Extras(Part):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         batch, body = sim.batch, sim.model.body(sim.robot.root).id
-        sources: dict[str, tuple[bool, Array, str]] = {
-            "qpos": (self.qpos, batch.bind("qpos"), "m, rad"),
-            "qvel": (self.qvel, batch.bind("qvel"), "m/s, rad/s"),
-            "ctrl": (self.ctrl, batch.bind("ctrl"), "control"),
-        }
+        units = {"qpos": "m, rad", "qvel": "m/s, rad/s", "ctrl": "control"}
+        wanted = [name for name in units if getattr(self, name)]
+        self._state = {name: Values(batch.bind(name), unit=units[name]) for name in wanted}
         if self.com:
-            sources["com"] = (True, batch.bind("subtree_com")[:, body], "m")
-        self._sources = {name: (v, unit) for name, (on, v, unit) in sources.items() if on}
+            self._state["com"] = Values(batch.bind("subtree_com")[:, body], unit="m")
 
-    def observe(self) -> dict[str, Array]:
-        out = {name: value for name, (value, _) in self._sources.items()}
-        if self.remaining is not None:
-            out["remaining"] = np.maximum(1 - self.sim.steps / self.remaining, 0.0)[:, None]
-        return out
-
-    def channels(self) -> dict[str, Channel]:
-        out = {name: Channel(v.shape[1], unit=unit) for name, (v, unit) in self._sources.items()}
-        if self.remaining is not None:
-            out["remaining"] = Channel(1, 0.0, 1.0, "share")
-        return out
+    def observations(self) -> Observations:
+        if self.remaining is None:
+            return self._state
+        left = np.maximum(1 - self.sim.steps / self.remaining, 0.0)[:, None]
+        return {**self._state, "remaining": Values(left, 0.0, 1.0, "share")}

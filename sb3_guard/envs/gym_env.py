@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from sb3_guard.envs.engine import FRAME_SKIP, Engine, Outcome
+from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import EYE
+from sb3_guard.envs.outcome import Outcome
 from sb3_guard.envs.parameters import check_count
 from sb3_guard.envs.rendering import CAMERAS, Renderer
 from sb3_guard.envs.scenario import Scenario
@@ -19,6 +21,7 @@ from sb3_guard.spelling import did_you_mean
 
 Array = np.ndarray
 ROW = np.zeros(1, dtype=np.int32)
+SMOOTH = 25  # pictures a second of a film, at least
 
 
 def as_scenario(
@@ -65,8 +68,10 @@ def observation_space(engine: Engine, flatten: bool) -> spaces.Box | spaces.Dict
 
 
 def action_space(engine: Engine) -> spaces.Box:
-    """Actions of one row, scaled to the actuators' ranges by the robot."""
-    return spaces.Box(-1.0, 1.0, (engine.robot.action_size,), np.float32)
+    """Actions of one row, by default within [−1, 1]: the robot scales them to its actuators."""
+    size = (engine.robot.action_size,)
+    low, high = (np.broadcast_to(bound, size) for bound in engine.robot.action_range)
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
 class Simulated:
@@ -115,8 +120,7 @@ class Simulated:
         self._num_threads = num_threads
         self._window = (width, height, camera)
         self.engine = self.scenario.build(num_envs, num_threads)
-        control_step = FRAME_SKIP * self.engine.model.opt.timestep
-        self.metadata = {**self.metadata, "render_fps": round(1 / control_step)}
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.engine.control_step)}
 
     @property
     def observation_layout(self) -> dict[str, slice]:
@@ -149,9 +153,29 @@ class Simulated:
 
     def frame(self, row: int) -> Array:
         """A picture of one row, [height, width, 3] uint8; never advances physics."""
+        return self._camera_man.frame(row)
+
+    def film(self, row: int = 0) -> list[Array]:
+        """The pictures since the last call, at :attr:`film_fps`: frames between control steps too.
+
+        Robots that are controlled a few times a second, such as Ant, then move smoothly in videos.
+        """
+        return self._camera_man.film(row, self._frames_per_step)
+
+    @property
+    def _frames_per_step(self) -> int:
+        return math.ceil(SMOOTH / self.metadata["render_fps"])
+
+    @property
+    def film_fps(self) -> int:
+        """Pictures of :meth:`film` in a second of the simulation, at least 25."""
+        return self._frames_per_step * int(self.metadata["render_fps"])
+
+    @property
+    def _camera_man(self) -> Renderer:
         if self._renderer is None:
             self._renderer = Renderer(self.engine, *self._window)
-        return self._renderer.frame(row)
+        return self._renderer
 
     def _free_renderers(self) -> None:
         for renderer in (self._renderer, self._eye):
@@ -190,6 +214,9 @@ def step_info(outcome: Outcome, row: int) -> dict[str, Any]:
         info["goal_unplaced"] = True
     if outcome.physics_error[row]:
         info["physics_error"] = True
+    for name, rows in outcome.ended_by.items():
+        if rows[row]:
+            info["terminated_by"] = name
     return info
 
 
@@ -197,7 +224,8 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
     """A safe-RL environment: a robot with a task among constraints.
 
     ``step`` returns the cost of the step as ``info["cost"]``, and per constraint type as
-    ``info["cost_<type>"]``; ``info["goal_met"]`` is there, and True, only if the goal was reached.
+    ``info["cost_<type>"]``; ``info["goal_met"]`` is there, and True, only if the goal was reached;
+    ``info["terminated_by"]`` names the part that ended the episode, if one did.
     Episodes are cut by the time limit of :func:`gymnasium.make`.
 
     :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario`, its plain data or its
@@ -240,9 +268,9 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         return self.view(self.engine.observe(), self.look(), 0), {}
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance by one control step of ten physics steps.
+        """Advance by one control step, of ten physics steps unless the robot says otherwise.
 
-        :param action: [action size], clipped to [−1, 1]
+        :param action: [action size], clipped to the action space
         :raises ValueError: the action has the wrong shape or is not finite, or the episode goes on
             for longer than ``observe={"remaining": ...}`` says
         """

@@ -18,12 +18,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sb3_guard.envs.parameters import Parameters, param
+
 Array = np.ndarray
 Rectangle = tuple[float, float, float, float]
 
-ARENA: tuple[Rectangle, ...] = ((-2.0, -2.0, 2.0, 2.0),)
 DRAWS = 128
 PATIENCE = 4000  # placements, or 4 of each object, before a layout is called impossible
+
+
+@dataclass(frozen=True)
+class Layout(Parameters):
+    """Options of where things are that belong to no part."""
+
+    name = "layout"
+
+    placements: tuple[Rectangle, ...] = param(
+        (),
+        "rectangles (x low, y low, x high, y high) that parts without their own are drawn in, m; "
+        "empty: the arena",
+    )
+    margin: float = param(0.0, "extra distance between any two objects, m", low=0)
+    order: tuple[str, ...] = param(
+        (), "what is placed first, such as [robot, goal]; the others follow: task, constraints"
+    )
+    overlap: bool = param(False, "whether keep-outs may let solid objects begin inside each other")
+    randomize: bool = param(True, "false: every episode of a row begins and goes on alike")
 
 
 class LayoutError(RuntimeError):
@@ -45,6 +65,10 @@ class Footprint:
     :param base: where that is, (x, y) m
     :param mover: whether it moves by itself, so that a new goal may ignore it in need
     :param redrawn: whether the first object is drawn anew within an episode
+    :param last: whether it is also drawn anew once everything else has its place
+    :param cover: radius around its place that a solid object never leaves, m
+    :param label: what messages call its keep-out
+    :param among: places, (x, y) m, of which each centre is one, in place of ``placements``
     """
 
     name: str
@@ -58,9 +82,13 @@ class Footprint:
     mover: bool = False
     base: tuple[float, float] = (0.0, 0.0)
     redrawn: bool = False
+    last: bool = False
+    among: tuple[tuple[float, float], ...] = ()
+    cover: float = 0.0
+    label: str = "keepout"
 
     def __post_init__(self) -> None:
-        drawn = len(self.locations) < self.num or self.redrawn
+        drawn = (len(self.locations) < self.num or self.redrawn) and not self.among
         for r in self.placements:
             if len(r) != 4 or not (r[0] < r[2] and r[1] < r[3]):
                 raise ValueError(
@@ -77,10 +105,10 @@ class Footprint:
                 "give at most one each"
             )
         low = self._lowest
-        for place in self.locations or (self.base,):
+        for place in self.locations or self.among or (self.base,):
             gap = math.hypot(math.dist(place, self.base), low)
             if gap > self.reach:
-                where = f"location {place}" if self.locations else "height"
+                where = f"location {place}" if self.locations or self.among else "height"
                 raise ValueError(
                     f"{self.name}: {where} is out of the robot's reach: {gap:.2f} m from its base "
                     f"at {self.base} even at the lowest height, {low} m; it reaches {self.reach} m"
@@ -114,8 +142,8 @@ class Footprint:
     @property
     def corners(self) -> Array:
         """The outermost places that a centre can have when an episode begins, [n, 2] m."""
-        fixed = np.array(self.locations).reshape(-1, 2)
-        if len(self.locations) == self.num:
+        fixed = np.array(self.locations or self.among).reshape(-1, 2)
+        if len(self.locations) == self.num or self.among:
             return fixed
         low, span, _ = self._room
         drawn = [low + span * share for share in ((0, 0), (0, 1), (1, 0), (1, 1))]
@@ -123,6 +151,8 @@ class Footprint:
 
     def draw(self, rng: np.random.Generator, n: int) -> Array:
         """``n`` uniform centres, [2, n] m."""
+        if self.among:
+            return np.array(self.among).T[:, rng.integers(len(self.among), size=n)]
         low, span, share = self._room
         if len(low) > 1:
             which = rng.choice(len(low), size=n, p=share)
@@ -214,6 +244,12 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         centres = xy[:, k : k + f.num, 0].T
         out[f.name] = np.column_stack([centres, f.elevate(rng, centres)])
         k += f.num
+    for f in footprints:
+        if f.last:
+            drawn = redraw(f, {g: out[g.name] for g in footprints if g is not f}, rng)
+            if drawn is None:
+                raise LayoutError(f"{f.name} finds no room once everything else has its place")
+            out[f.name][0] = drawn
     return out
 
 
@@ -230,6 +266,21 @@ def _square_distance(draws: Array, xy: Array) -> Array:
     square: Array = offset[0]
     square += offset[1]
     return square
+
+
+def check_covers(footprints: Sequence[Footprint]) -> None:
+    """Refuse keep-outs that let solid objects begin inside each other.
+
+    :raises ValueError: names the least that is allowed
+    """
+    for f in footprints:
+        if f.keepout < f.cover - 1e-9:  # rounding
+            least = math.ceil(1000 * f.cover - 1e-6) / 1000
+            raise ValueError(
+                f"{f.label} = {f.keepout!r} lets solid objects begin inside each other: it "
+                f"must be at least {least:g}; leave it out for what covers them, or set "
+                "layout={'overlap': True}"
+            )
 
 
 def check_locations(footprints: Sequence[Footprint]) -> None:

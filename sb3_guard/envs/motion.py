@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sb3_guard.envs.geometry import length
+
+if TYPE_CHECKING:
+    from sb3_guard.envs.part import Part
 
 Array = np.ndarray
 TINY = 1e-12  # m: the unit vector of a zero offset is zero
@@ -65,7 +68,7 @@ class Moving(NamedTuple):
     planar: bool
 
 
-class Fleet:
+class MoverGroup:
     """All movers of a world that can be moved in one pass, whatever parts they belong to.
 
     :param groups: of like movers; all in the plane or all in space, all by unit vectors or none
@@ -157,8 +160,38 @@ class Fleet:
         move += np.bincount(moved.ravel(), away.ravel(), move.size).reshape(move.shape)
 
 
-def fleets(moving: Iterable[Moving]) -> list[Fleet]:
-    """Few fleets for many groups of movers; those of no movers are left out.
+class Motion:
+    """All that moves by a law, in as few groups as can be.
+
+    :param parts: whose movers they are
+    """
+
+    def __init__(self, parts: Sequence[Part]) -> None:
+        self._parts = parts
+        self._moving: list[Moving] = []
+        self._groups: list[MoverGroup] = []
+
+    def advance(self, robot: Array) -> None:
+        """Move by one control step, in place.
+
+        :param robot: where the robot is, [N, 3] m
+        """
+        moving = [group for part in self._parts for group in part.moving()]
+        # the same groups as before unless a part says otherwise
+        same = len(moving) == len(self._moving) and all(
+            new.points is old.points
+            and (new.law is old.law or new.law == old.law)
+            and new.planar is old.planar
+            for new, old in zip(moving, self._moving, strict=True)
+        )
+        if not same:
+            self._moving, self._groups = moving, grouped(moving)
+        for group in self._groups:
+            group.advance(robot)
+
+
+def grouped(moving: Iterable[Moving]) -> list[MoverGroup]:
+    """Movers that move alike together, in few groups; those of no movers are left out.
 
     Large groups move on their own: together they would leave the processor's cache.
     """
@@ -169,4 +202,4 @@ def fleets(moving: Iterable[Moving]) -> list[Fleet]:
             large.append([group])
         elif group.points.shape[1]:
             alike.setdefault((group.planar, group.law.unit), []).append(group)
-    return [Fleet(groups) for groups in [*alike.values(), *large]]
+    return [MoverGroup(groups) for groups in [*alike.values(), *large]]

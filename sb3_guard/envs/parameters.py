@@ -20,6 +20,16 @@ import numpy as np
 from sb3_guard.spelling import did_you_mean
 
 
+class PartError(ValueError):
+    """A part does not keep its contract; the message names the part, the verb and the fix."""
+
+
+def misshapen(what: str, shape: tuple[Any, ...], expected: tuple[Any, ...]) -> str:
+    """An error message about an array of a part."""
+    words = f"({', '.join(map(str, expected))}{',' * (len(expected) == 1)})"
+    return f"{what} has shape {shape}, expected {words}: one row for each simulation of the batch"
+
+
 def check_count(name: str, value: Any) -> None:
     """Refuse a value that is not an integer of at least 1."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:

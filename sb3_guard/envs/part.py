@@ -9,15 +9,15 @@ engine calls the verbs in this order::
     reset(ids, rngs)            an episode begins in rows ids, at the places just drawn
     moving()                    what moves by a law: the engine moves it
     before_step()               move what else moves itself
-    sights()                    name -> what lidar and compass see
-    observe()                   name -> [N, d], whatever else is observed
+    observations()              name -> Scan, Compass or Values: what the robot observes
 
-``moving``, ``sights``, ``channels`` and ``measure`` are also called before the first ``reset``.
+``moving``, ``observations`` and ``measure`` are also called before the first ``reset``.
 
-A task adds ``measure``, ``reward``, ``succeeded`` and ``advance``; a constraint adds ``cost``.
-``sights``, ``observe``, ``measure``, ``reward`` and ``cost`` only read. A part keeps no arrays of
-its own between steps: it takes them by name from the engine (:meth:`Simulation.array`), so that an
-engine's state can be saved and restored whole.
+A task adds ``measure``, ``reward``, ``succeeded`` and ``advance``; a constraint adds ``cost``; any
+part may end an episode with ``terminated``. ``observations``, ``measure``, ``reward``,
+``cost`` and ``terminated`` only read. A part keeps no arrays of its own between steps: it takes
+them by name from the engine (:meth:`Simulation.array`), so that an engine's state can be saved and
+restored whole.
 """
 
 from __future__ import annotations
@@ -25,17 +25,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 import mujoco
 import numpy as np
 
 from sb3_guard.envs.layout import Footprint
 from sb3_guard.envs.motion import Moving
-from sb3_guard.envs.parameters import Parameters
-from sb3_guard.envs.sensors import Channel, Compass, Scan
+from sb3_guard.envs.observation import Observations
+from sb3_guard.envs.parameters import Parameters, param
+from sb3_guard.envs.physics import FRAME_SKIP
+
+if TYPE_CHECKING:
+    from sb3_guard.envs.groups import Group
 
 Array = np.ndarray
+# parameters of parts that exist on the floor and in the air
+SPACE = param(
+    None, "planar or spatial; null: the robot's workspace", choices=(None, "planar", "spatial")
+)
+HEIGHT = param((0.5, 1.5), "range of z in space, m", low=0)
 Generators = Sequence[np.random.Generator]
 
 # Contact bits. A robot's geoms collide with bit ROBOT, the floor with bit FLOOR: a robot that
@@ -49,8 +58,10 @@ class World(Protocol):
     spec: mujoco.MjSpec
     robot: Robot
 
-    def feel(self, name: str, body: str) -> None:
-        """Add a sensor ``name`` of the robot's contacts with ``body``, 0 if there are none."""
+    def feel(self, name: str, body: str, force: bool = False) -> None:
+        """Add a sensor ``name`` of the robot's contacts with ``body``: how many there are, 0 or 1,
+        or their net ``force``, [N, 3] N. :meth:`Simulation.sensor` reads it.
+        """
 
 
 class Simulation(Protocol):
@@ -62,14 +73,19 @@ class Simulation(Protocol):
     robot: Robot
     task: Task
     constraints: tuple[Constraint, ...]
+    footprints: dict[str, Footprint]  # what is placed when an episode begins
     rngs: list[np.random.Generator]  # one per row
     steps: Array  # [N] control steps since the episode began
+    control_step: float  # s, duration of one
 
     def array(self, name: str, shape: tuple[int, ...] = (), dtype: Any = float) -> Array:
         """The engine's array ``name``, ``[N, *shape]``, zero at first; part of the state."""
 
     def places(self, name: str) -> Array:
         """The live places of footprint ``name``, [N, num, 3] m, redrawn at every reset."""
+
+    def sensor(self, name: str) -> Array:
+        """Live values of a sensor, [N, d], such as ``"robot/gyro"`` of the robot's file."""
 
     def farthest(self, one: str, other: str) -> float:
         """Greatest distance in the plane at which two footprints may begin, m."""
@@ -94,9 +110,17 @@ class Part(Parameters):
     space: str | None = None  # "planar" or "spatial"; None: the robot's workspace
     spaces: ClassVar[tuple[str, ...]] = ("planar", "spatial")
     planar: bool
-    height: tuple[float, float]  # m, range of z in space
+    height: tuple[float, float] = (0.5, 1.5)  # m, range of z in space
+    size: float  # m, radius of its objects
+    if TYPE_CHECKING:
+        groups: tuple[Group, ...]
+        group: Group  # where it has one
+    else:
+        groups = ()  # its objects, made by build()
+    every: str = "control"  # before which steps before_step is called: "control" or "physics"
     solid: bool = False  # whether its objects are bodies that the robot bumps into
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
+    family: ClassVar[str] = "guard"  # of suites; a part of GUARD's has a page of its own
 
     @classmethod
     def from_params(cls, params: Mapping[str, Any], name: str | None = None) -> Self:
@@ -109,18 +133,24 @@ class Part(Parameters):
                 )
         return super().from_params(params, name)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.height[0] > self.height[1]:
+            raise ValueError(f"{self.name}.height = {self.height!r} must be (low, high), in metres")
+
     def footprints(self) -> tuple[Footprint, ...]:
-        """What has to be placed when an episode begins."""
-        return ()
+        """What has to be placed when an episode begins: at least its groups."""
+        return tuple(group.footprint for group in self.groups)
 
     def positions(self, footprint: str) -> Array:
         """Where the objects of a footprint are now, [N, num, 3] m."""
-        return self.sim.places(footprint)
+        found = next((g.centers for g in self.groups if g.name == footprint), None)
+        return self.sim.places(footprint) if found is None else found
 
     def build(self, world: World) -> None:
-        """Settle the part's space and add bodies and sensors to ``world.spec``.
+        """Settle the part's space, make its groups, add bodies and sensors to ``world.spec``.
 
-        :raises ValueError: the part does not exist in this space
+        :raises ValueError: it does not exist in this space, or heights of what is on the floor
         """
         space = self.space or world.robot.workspace
         if space not in self.spaces:
@@ -129,13 +159,22 @@ class Part(Parameters):
                 f"set {self.name}={{'space': {self.spaces[0]!r}}}"
             )
         self.planar = space == "planar"
+        if self.planar and self.height != type(self).height:
+            raise ValueError(
+                f"{self.name}.height = {self.height!r} counts in the air only, but its space is "
+                f"planar: leave it out, or set {self.name}={{'space': 'spatial', 'height': ...}}"
+            )
 
     def bind(self, sim: Simulation) -> None:
         """Take live views of the running simulations."""
         self.sim = sim
+        for group in self.groups:
+            group.bind(sim)
 
     def reset(self, ids: Array, rngs: Generators) -> None:
         """Begin an episode in rows ``ids``; ``rngs`` holds one generator per row of the batch."""
+        for group in self.groups:
+            group.reset(ids, rngs)
 
     def moving(self) -> tuple[Moving, ...]:
         """What moves by a law before the next step, from the positions last observed.
@@ -145,22 +184,27 @@ class Part(Parameters):
         return ()
 
     def before_step(self) -> None:
-        """Move what else moves itself, after what :meth:`moving` says; set controls."""
+        """Move what else moves itself, after what :meth:`moving` says; set controls.
 
-    def sights(self) -> dict[str, Scan | Compass]:
-        """Named observations from the robot's lidar bodies, always the same ones."""
-        return {}
+        Called before every control step; before every physics step if :attr:`every` is
+        ``"physics"``, which takes a little longer.
+        """
 
-    def observe(self) -> dict[str, Array]:
-        """Other named observations, each [N, d]."""
-        return {}
+    def observations(self) -> Observations:
+        """What the robot observes of this part, always under the same names."""
+        return {f"{group.name}_lidar": group.scan() for group in self.groups}
 
-    def channels(self) -> dict[str, Channel]:
-        """What :meth:`observe` returns, by name."""
-        return {}
+    def terminated(self) -> Array:
+        """Whether this part ends the episode: a robot that has fallen, a spent budget, [N] bool.
+
+        Called when a control step ends, after ``cost``, and of a part that defines it only.
+        """
+        return np.zeros(self.sim.num_envs, dtype=bool)
 
     def draw(self, painter: Painter, row: int) -> None:
         """Draw one row's share of what is not a body."""
+        for group in self.groups:
+            group.draw(painter, row)
 
 
 class Robot(Part):
@@ -168,13 +212,28 @@ class Robot(Part):
 
     name = "robot"
     workspace: ClassVar[str]  # "planar" or "spatial": the default space of every other part
-    timestep: ClassVar[float]  # s, of one physics step
+    # of one physics step, s, and how MuJoCo integrates it: Euler, RK4, implicit or implicitfast;
+    # None: as its own world says
+    timestep: ClassVar[float | None] = None
+    integrator: ClassVar[str | None] = None
+    frame_skip: ClassVar[int] = FRAME_SKIP  # physics steps in a control step
+    # what MuJoCo computes when a control step ends; with mjSTAGE_NONE positions, velocities and
+    # sensors are those of the last physics step's beginning, as mj_step leaves them
+    stage: ClassVar[mujoco.mjtStage] = mujoco.mjtStage.mjSTAGE_ACC
     root: ClassVar[str]  # name of the outermost body in the compiled world
     reach: ClassVar[float] = math.inf  # m from its base: where goals and hazards make sense
     altitude: float = 0.0  # m, z of its position when an episode begins
-    aside: float = 0.0  # m, distance of that position from its place in the plane
+    offset: float = 0.0  # m, distance of that position from its place in the plane
     extent: float = math.inf  # m, how far from its position its body may reach in any pose
     action_size: int
+    action_range: tuple[Array | float, Array | float] = (-1.0, 1.0)  # lowest and highest actions
+
+    def world(self) -> mujoco.MjSpec | None:
+        """A world of its own, with floor, light and options; None: the arena's.
+
+        The robot is in it: :meth:`build` has nothing to attach.
+        """
+        return None
 
     @property
     def base(self) -> tuple[float, float]:
@@ -184,6 +243,11 @@ class Robot(Part):
     @property
     def position(self) -> Array:
         """Where the robot is, [N, 3] m: its ``robot`` body, or an arm's end effector."""
+        raise NotImplementedError
+
+    @property
+    def velocity(self) -> Array:
+        """How fast the body at :attr:`position` moves, [N, 3] m/s, along the world's axes."""
         raise NotImplementedError
 
     @property
@@ -200,7 +264,7 @@ class Robot(Part):
         raise NotImplementedError
 
     def act(self, actions: Array) -> None:
-        """Apply [N, action_size] actions within [−1, 1] for the next control step."""
+        """Apply [N, action_size] actions within ``action_range`` for the next control step."""
         raise NotImplementedError
 
 
@@ -210,9 +274,10 @@ class Task(Part):
     interactive: bool  # the taxonomy of the paper's task table
     contact: bool
     targets: str  # "one" or "many"
-    bonus: float = 0.0  # reward for success, added after the dense reward is clipped
+    reward_limit: float | None = None  # dense rewards are cut off at ± this; None: they are not
+    bonus: float = 0.0  # reward for success, added to the dense reward after that
     ends: bool = False  # whether success ends the episode instead of drawing a new goal
-    spoils: ClassVar[str] = "its goal is reached at once"  # why an episode is drawn again
+    invalid_reason: ClassVar[str] = "its goal is reached at once"  # why an episode is drawn again
 
     def measure(self) -> Array:
         """The distances that the reward is made of, [N, M] m."""
@@ -226,7 +291,7 @@ class Task(Part):
         """Whether the goal is met, [N] bool."""
         return np.zeros(len(now), dtype=bool)
 
-    def blemished(self) -> Array:
+    def invalid_start(self) -> Array:
         """Whether an episode that begins now is drawn again, [N] bool."""
         return self.succeeded(self.measure())
 
@@ -248,3 +313,7 @@ class Constraint(Part):
     def cost(self) -> Array:
         """The cost of this step, [N], at least 0."""
         raise NotImplementedError
+
+    def costs(self) -> dict[str, Array]:
+        """What is reported as ``cost_<name>``, by name, [N] each; together they are the cost."""
+        return {self.name: self.cost()}

@@ -1,4 +1,4 @@
-"""Which robots, tasks and constraints there are, and the suites that they make.
+"""Which robots, tasks and constraints there are.
 
 Adding one to its table here, or with :func:`register_robot`, :func:`register_task` or
 :func:`register_constraint` from outside, is all it takes to use it in ids, scenarios and commands.
@@ -9,21 +9,32 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import import_module
-from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from sb3_guard.envs.arena import INTEGRATORS
+from sb3_guard.envs.check_part import check_part
+from sb3_guard.envs.engine import Engine
+from sb3_guard.envs.parameters import PartError, check_count
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
+from sb3_guard.envs.robots import gym_mujoco, safety_gymnasium
 from sb3_guard.envs.robots.robot import MJCFRobot
 from sb3_guard.spelling import did_you_mean
+
+P = TypeVar("P", bound=Part)
 
 
 def _parts(kind: str, *names: str) -> dict[str, Any]:
     """Classes by their names: ``Leave`` of the tasks is in ``sb3_guard/envs/tasks/leave.py``."""
     modules = [import_module(f"sb3_guard.envs.{kind}.{name.lower()}") for name in names]
     return {name: getattr(module, name) for name, module in zip(names, modules, strict=True)}
+
+
+def guard(parts: Mapping[str, type[P]]) -> dict[str, type[P]]:
+    """Those of a table that are GUARD's, each with a page of its own in the documentation."""
+    return {name: part for name, part in parts.items() if part.family == "guard"}
 
 
 ROBOTS: dict[str, type[Robot]] = _parts(
@@ -40,6 +51,21 @@ ROBOTS: dict[str, type[Robot]] = _parts(
     "Arm6",
     "Drone",
 )
+ROBOTS |= {
+    robot.__name__: robot
+    for robot in (
+        gym_mujoco.AntV4,
+        gym_mujoco.HalfCheetahV4,
+        gym_mujoco.HopperV4,
+        gym_mujoco.HumanoidV4,
+        gym_mujoco.SwimmerV4,
+        gym_mujoco.Walker2dV4,
+        safety_gymnasium.SafetyPoint,
+        safety_gymnasium.SafetyCar,
+        safety_gymnasium.SafetyAnt,
+        safety_gymnasium.SafetyDoggo,
+    )
+}
 TASKS: dict[str, type[Task]] = _parts(
     "tasks",
     "Goal",
@@ -47,6 +73,9 @@ TASKS: dict[str, type[Task]] = _parts(
     "Chase",
     "Defense",
     "Button",
+    "Forward",
+    "Circle",
+    "Run",
 )
 CONSTRAINTS: dict[str, type[Constraint]] = _parts(
     "constraints",
@@ -56,6 +85,8 @@ CONSTRAINTS: dict[str, type[Constraint]] = _parts(
     "Pillars",
     "Buttons",
     "Gremlins",
+    "Speed",
+    "Boundary",
 )
 
 # What else sets parameters, in the fields of a scenario that these name.
@@ -65,33 +96,12 @@ KEYWORDS = {
     "lidar": "lidar",
     "layout": "layout",
     "observe": "observe",
+    "arena": "arena",
 }
-_OPTIONS = ("name", "scenario", "flatten", "width", "height", "camera")  # of functions that make
-
-EPISODE_STEPS = 1000  # control steps
-LADDER = (1, 2, 4, 8, 16)  # numbers of a constraint's objects, by growing difficulty
-# The named suites: every combination of these, each with eight constraint objects.
-SUITE_ROBOTS = (
-    "Point",
-    "Swimmer",
-    "Ant",
-    "Walker",
-    "Humanoid",
-    "Hopper",
-    "Arm3",
-    "Arm6",
-    "Drone",
-)
-SUITE_TASKS = ("Goal", "Push", "Chase", "Defense")
-SUITE_CONSTRAINTS = ("Hazards", "Ghosts")
-
-
-def env_ids() -> list[str]:
-    """The ids of the named suites."""
-    return [
-        f"{task}_{robot}_8{constraint}-v0"
-        for task, robot, constraint in product(SUITE_TASKS, SUITE_ROBOTS, SUITE_CONSTRAINTS)
-    ]
+OPTIONS = (  # of functions that make environments
+    "name", "scenario", "cost", "flatten", "width", "height", "camera", "render_mode",
+    "max_episode_steps", "num_threads",
+)  # fmt: skip
 
 
 def register_robot(
@@ -103,11 +113,15 @@ def register_robot(
     :param robot: a :class:`~sb3_guard.envs.part.Robot` class
     :param xml: or the robot's MJCF file, by the conventions of
         :class:`~sb3_guard.envs.robots.robot.MJCFRobot`
-    :param attributes: with ``xml``, class attributes: ``timestep`` (s, of one physics step; 0.002),
-        ``workspace`` (``"planar"``), ``lidar_bodies`` (``("robot",)``), ``center`` (the body whose
-        origin is the robot's position; ``"robot"``), ``reach`` (m; infinite), ``eye`` (where its
-        camera sits and looks: body, place in m and direction there; ``("robot/robot", (0, 0, 0.1),
-        (1, 0, 0))``)
+    :param attributes: with ``xml``, class attributes: ``timestep`` (s, of one physics step; the
+        file's), ``frame_skip`` (physics steps in a control step; 10), ``integrator`` (``"Euler"``,
+        ``"RK4"``, ``"implicit"`` or ``"implicitfast"``), ``workspace`` (``"planar"``),
+        ``lidar_bodies`` (``("robot",)``), ``center`` (the body whose origin is the robot's
+        position; ``"robot"``), ``reach`` (m; infinite), ``eye`` (where its camera sits and looks:
+        body, place in m and direction there; ``("robot/robot", (0, 0, 0.1), (1, 0, 0))``),
+        ``scaled`` (whether actions in [−1, 1] are scaled to the control ranges; True), ``floor``
+        (whether it meets the floor; True), ``complete`` (whether the file is a whole world, whose
+        floor and options hold, and ``root`` its outermost body; False)
     :raises ValueError: neither or both of ``robot`` and ``xml`` are given, an attribute is unknown
         or bad, or the name is not usable
     """
@@ -121,16 +135,18 @@ def register_robot(
         file = Path(str(xml)).resolve()
         if not file.is_file():
             raise ValueError(f"robot {name!r}: there is no file {str(xml)!r}")
-        known = ["timestep", "workspace", "lidar_bodies", "center", "reach", "eye"]
+        known = ["timestep", "frame_skip", "integrator", "workspace", "lidar_bodies", "center"]
+        known += ["reach", "eye", "scaled", "floor", "complete", "root"]
         for key in attributes:
             if key not in known:
                 raise ValueError(f"robot {name!r} has no {key!r}: {did_you_mean(key, known)}")
-        body = {"asset": "", "timestep": 0.002, **attributes, "path": classmethod(lambda cls: file)}
+        body = {"asset": "", **attributes, "path": classmethod(lambda cls: file)}
         robot = type(name, (MJCFRobot,), body)
     elif attributes:
         raise ValueError(f"robot {name!r}: {sorted(attributes)} go with xml, not with a class")
     _check_class(name, robot, Robot)
     _check_robot(name, robot)
+    _check_contract(name, robot)
     _add(ROBOTS, name, robot)
 
 
@@ -140,12 +156,16 @@ def _check_robot(name: str, robot: type[Robot]) -> None:
     def positive(value: Any) -> bool:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0
 
-    timestep: Any = getattr(robot, "timestep", None)
-    if not positive(timestep) or math.isinf(timestep):
+    timestep: Any = robot.timestep
+    if timestep is not None and (not positive(timestep) or math.isinf(timestep)):
         raise ValueError(
             f"robot {name!r}: timestep = {timestep!r} must be a positive number of seconds, such "
             "as 0.002"
         )
+    if robot.integrator not in (None, *INTEGRATORS):
+        hint = did_you_mean(str(robot.integrator), INTEGRATORS)
+        raise ValueError(f"robot {name!r}: integrator = {robot.integrator!r}: {hint}")
+    check_count(f"robot {name!r}: frame_skip", robot.frame_skip)
     workspace = getattr(robot, "workspace", None)
     if workspace not in ("planar", "spatial"):
         raise ValueError(f"robot {name!r}: workspace = {workspace!r} must be 'planar' or 'spatial'")
@@ -179,6 +199,7 @@ def register_task(name: str, task: type[Task]) -> None:
     _check_name(name)
     _check_keyword(name, CONSTRAINTS)
     _check_class(name, task, Task, "reward")
+    _check_contract(name, task)
     _add(TASKS, name, task)
 
 
@@ -190,6 +211,7 @@ def register_constraint(name: str, constraint: type[Constraint]) -> None:
     _check_name(name)
     _check_keyword(name, TASKS)
     _check_class(name, constraint, Constraint, "cost")
+    _check_contract(name, constraint)
     _add(CONSTRAINTS, name, constraint)
 
 
@@ -207,7 +229,7 @@ def _check_keyword(name: str, others: Iterable[str]) -> None:
     :param others: the parts of other kinds that have keywords of their own
     """
     key = name.lower()
-    if key in (*KEYWORDS, *_OPTIONS, *map(str.lower, others)):
+    if key in (*KEYWORDS, *OPTIONS, *map(str.lower, others)):
         raise ValueError(
             f"{name!r} cannot name a part: its parameters would be set with {key}=..., which means "
             "something else; use another name"
@@ -239,6 +261,29 @@ def _check_class(name: str, part: Any, kind: type, verb: str = "") -> None:
         )
     if verb and getattr(part, verb) is getattr(kind, verb):
         raise ValueError(f"class {part.__name__} must define {verb}(), as every {kind.__name__}")
+
+
+def _check_contract(name: str, part: type[Part]) -> None:
+    """Run a part with its defaults in a small world, if it can be in one.
+
+    :raises PartError: it does not keep its contract
+    """
+
+    def make(rows: int) -> Engine:
+        one: Any = part.from_params({}, name.lower() if not issubclass(part, Robot) else None)
+        if isinstance(one, Robot):
+            return Engine(one, TASKS["Goal"](), num_envs=rows, num_threads=1)
+        robot = ROBOTS["Point" if "planar" in part.spaces else "Drone"]()
+        if isinstance(one, Task):
+            return Engine(robot, one, num_envs=rows, num_threads=1)
+        return Engine(robot, TASKS["Goal"](), [one], num_envs=rows, num_threads=1)
+
+    try:
+        check_part(make, name)
+    except PartError:
+        raise
+    except Exception:  # it may need other company: where it is used, its own error will say
+        return
 
 
 def _add(table: dict[str, Any], name: str, part: type[Part]) -> None:

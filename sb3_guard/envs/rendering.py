@@ -1,25 +1,24 @@
-"""Pictures of one simulation: its bodies, and what is not a body drawn over them.
+"""Pictures of one simulation, off screen or in MuJoCo's viewer.
 
-Zones, goals, lidar halos and the tint of a cost are not in the physics model. They are added to the
-abstract scene of each frame, so that drawing costs nothing when nobody looks and never changes the
-physics: a frame is made from a copy of one row's state.
+A frame is made from a copy of one row's state, so looking never changes the physics;
+:mod:`sb3_guard.envs.scene` adds to it what is not a body.
 """
 
 from __future__ import annotations
 
+import copy
 import functools
 import importlib
-import math
 import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-from sb3_guard.envs.layout import ARENA
+from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, geoms_below
 
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine
@@ -27,12 +26,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 CAMERAS = ("fixed", "track", "top")
-COST_COLOR = (1.0, 0.1, 0.1)
-HALO, HALO_STEP = 0.15, 0.06  # m, radius of the first halo, and how much wider each other one is
-BEAD = 0.02  # m, radius
-_FRUSTUM = [f"frustum_{side}" for side in ("near", "far", "width", "center", "bottom", "top")]
-_SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
-_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
+ELEVATION = {"fixed": 50.0, "track": 55.0, "top": 90.0}  # degrees
 
 
 class RenderingError(RuntimeError):
@@ -92,88 +86,6 @@ def gl_backend() -> str:
     )
 
 
-class ScenePainter:
-    """Adds see-through shapes to a scene, for :meth:`sb3_guard.envs.part.Part.draw`.
-
-    :param scene: what they are added to
-    :param engine: whose parts draw
-    :param data: one row's state
-    :param row: which row
-    """
-
-    def __init__(
-        self,
-        scene: mujoco.MjvScene,
-        engine: Engine,
-        data: mujoco.MjData,
-        row: int,
-    ) -> None:
-        self._scene, self._engine, self._data, self._row = scene, engine, data, row
-        self._halos = 0
-
-    def zone(
-        self, center: Array, radius: float, half_height: float, color: tuple[float, ...]
-    ) -> None:
-        """A cylinder, or a sphere if ``half_height`` is 0, at ``center``, [3] m."""
-        kind = _CYLINDER if half_height else _SPHERE
-        self._add(
-            kind, (radius, half_height or radius, half_height or radius), center, (*color, 0.3)
-        )
-
-    @functools.cached_property
-    def _first_halo(self) -> tuple[Array, Array, Array]:
-        """Its centers [B, 3] m, the rotations [B, 3, 3] of the lidar bodies, its radii [B] m."""
-        robot, model = self._engine.robot, self._engine.model
-        origin, rotation = robot.frames
-        # above robots on the floor, where it can be seen
-        centers = origin[self._row] + [0.0, 0.0, 0.25 if robot.workspace == "planar" else 0.0]
-        thick = _thickness(model, self._data, _geoms_below(model, robot.root), centers)
-        return centers, rotation[self._row], np.maximum(HALO, thick + 1.5 * BEAD)
-
-    def halo(self, closeness: Array, azimuth: int, color: tuple[float, ...]) -> None:
-        """Beads around each lidar body, the more solid the closer what they show.
-
-        The first halo has a radius of 15 cm, or more where the robot itself would hide it; each
-        other one is 6 cm wider.
-
-        :param closeness: [bodies · azimuth · elevation]
-        :param azimuth: bins around
-        :param color: red, green, blue
-        """
-        centers, rotations, radii = self._first_halo
-        radii = radii + HALO_STEP * self._halos
-        self._halos += 1
-        beads = np.asarray(closeness).reshape(len(radii), azimuth, -1)
-        for b, a, e in np.ndindex(*beads.shape):
-            turn = (a + 0.5) * 2 * math.pi / azimuth
-            rise = (e + 0.5) * math.pi / beads.shape[2] - math.pi / 2
-            ray = np.array(
-                [math.cos(turn) * math.cos(rise), math.sin(turn) * math.cos(rise), math.sin(rise)]
-            )
-            at = centers[b] + rotations[b] @ (radii[b] * ray)
-            self._add(_SPHERE, (BEAD,) * 3, at, (*color, 0.08 + 0.92 * float(beads[b, a, e])))
-
-    def glow(self, center: Array) -> None:
-        """The tint of a robot that pays a cost."""
-        self._add(_SPHERE, (0.25,) * 3, center, (*COST_COLOR, 0.5))
-
-    def _add(
-        self, kind: Any, size: tuple[float, ...], center: Array, rgba: tuple[float, ...]
-    ) -> None:
-        scene = self._scene
-        if scene.ngeom >= scene.maxgeom:
-            return
-        mujoco.mjv_initGeom(
-            scene.geoms[scene.ngeom],
-            kind,
-            np.asarray(size, dtype=float),
-            np.asarray(center, dtype=float),
-            np.eye(3).reshape(-1),
-            np.asarray(rgba, dtype=np.float32),
-        )
-        scene.ngeom += 1
-
-
 class Renderer:
     """Draws rows of an engine, off screen or in MuJoCo's viewer.
 
@@ -182,7 +94,7 @@ class Renderer:
     :param height: pixels
     :param camera: ``"fixed"``, ``"track"`` (follows the robot) or ``"top"``, of which the first and
         the last show the arena and all placements and locations; or a camera of the model by name,
-        which sees what is in the world: neither halos nor the tint of a cost
+        which sees what is in the world: neither lidar rings nor the tint of a cost
     :param mode: ``"rgb_array"`` or ``"human"``
     :raises RenderingError: no OpenGL backend works, or there is no display for ``"human"``
     """
@@ -197,16 +109,17 @@ class Renderer:
     ) -> None:
         self._engine = engine
         self._data = mujoco.MjData(engine.model)
+        self._last: tuple[int, mujoco.MjData] | None = None  # what film showed last
         self._human = mode == "human"
         self._camera = mujoco.MjvCamera()
-        self._follows = camera == "track"
         self._explain = camera in CAMERAS
-        self._whole = self._explain and not self._follows  # shows the whole arena
-        self._center, self._scale = _arena(engine)
-        if self._follows:
+        self._follows = camera == "track"
+        self._aspect = width / height
+        self._middle, self._half = arena(engine)
+        self._geoms = geoms_below(engine.model, engine.robot.root)
+        if self._explain:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-            self._camera.azimuth, self._camera.elevation = 90.0, -30.0
-            self._geoms = _geoms_below(engine.model, engine.robot.root)
+            self._camera.azimuth, self._camera.elevation = 90.0, -ELEVATION[camera]
         else:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self._camera.fixedcamid = engine.model.camera(camera).id
@@ -222,9 +135,7 @@ class Renderer:
             self._viewer = viewer.launch_passive(
                 engine.model, self._data, show_left_ui=False, show_right_ui=False
             )
-            eye = self._viewer.cam  # the whole arena at first; the mouse moves it
-            eye.lookat[:], eye.distance = self._center, 6.5 * self._scale
-            eye.azimuth, eye.elevation = 90.0, -42.0
+            self._look_at(self._viewer.cam, self._data)  # at first; the mouse moves it
             return
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(engine.model, maxgeom=4000)
@@ -247,51 +158,99 @@ class Renderer:
         self._engine.batch.get_data(row, self._data)
         with self._viewer.lock():
             self._viewer.user_scn.ngeom = 0
-            self._paint(self._viewer.user_scn, row)
+            self._paint(self._viewer.user_scn, self._data, row)
         self._viewer.sync()
         return None
 
+    def film(self, row: int, count: int) -> list[Array]:
+        """Pictures from the last call's state to the present one, evenly spaced in time.
+
+        Between the two, joints and mocap bodies are interpolated; zones are where they are now. One
+        picture if an episode has begun since.
+
+        :param count: how many, the last one of now
+        """
+        model = self._engine.model
+        now = mujoco.MjData(model)
+        self._engine.batch.get_data(row, now)
+        frames = []
+        if self._last is not None and self._last[0] == row and self._last[1].time < now.time:
+            before, step = self._last[1], np.zeros(model.nv)
+            root = model.body(self._engine.robot.root).id
+            mujoco.mj_differentiatePos(model, step, 1.0, before.qpos, now.qpos)
+            for moment in np.arange(1, count) / count:
+                between = copy.copy(before)
+                mujoco.mj_integratePos(model, between.qpos, step, moment)
+                between.mocap_pos += moment * (now.mocap_pos - before.mocap_pos)
+                between.mocap_quat[:] = now.mocap_quat
+                mujoco.mj_kinematics(model, between)
+                mujoco.mj_camlight(model, between)
+                frames.append(self._shoot(between, row, between.xpos[root] - now.xpos[root]))
+        self._last = row, now
+        return [*frames, self._shoot(now, row)]
+
     def frame(self, row: int) -> Array:
         """A picture of one row, [height, width, 3] uint8."""
+        self._engine.batch.get_data(row, self._data)
+        return self._shoot(self._data, row)
+
+    def _shoot(self, data: mujoco.MjData, row: int, shift: Array | float = 0.0) -> Array:
         engine = self._engine
-        engine.batch.get_data(row, self._data)
-        if self._follows:
-            places = self._data.geom_xpos[self._geoms]
-            low, high = places.min(axis=0), places.max(axis=0)
-            self._camera.lookat[:] = (low + high) / 2
-            self._camera.distance = 1.6 + 1.2 * float(np.linalg.norm(high - low))
-        elif self._whole:
-            camera = self._camera.fixedcamid
-            self._data.cam_xpos[camera] = self._center + self._scale * engine.model.cam_pos[camera]
+        if self._explain:
+            self._look_at(self._camera, data)
         self._gl.make_current()
         mujoco.mjv_updateScene(
             engine.model,
-            self._data,
+            data,
             self._option,
             None,
             self._camera,
             mujoco.mjtCatBit.mjCAT_ALL,
             self._scene,
         )
-        if self._whole:  # depth is seen as finely, for its distance, as in the default arena
-            for view in self._scene.camera:
-                for side in _FRUSTUM:
-                    setattr(view, side, self._scale * getattr(view, side))
-        self._paint(self._scene, row)
+        self._paint(self._scene, data, row, shift)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
         return self._pixels[::-1].copy()
 
-    def _paint(self, scene: mujoco.MjvScene, row: int) -> None:
-        painter = ScenePainter(scene, self._engine, self._data, row)
-        for part in self._engine.parts:
-            part.draw(painter, row)
-        if not self._explain:  # halos and tint are no things in the world
+    def _look_at(self, camera: mujoco.MjvCamera, data: mujoco.MjData) -> None:
+        """Turn a free camera to the robot, or to the whole arena and the robot near it."""
+        body = data.geom_xpos[self._geoms]
+        low, high = body.min(axis=0), body.max(axis=0)
+        if self._follows:
+            camera.lookat[:] = (low + high) / 2
+            camera.distance = 2.0 + 1.2 * float(np.linalg.norm(high - low))
             return
-        for halo in self._engine.halos(row):
-            painter.halo(*halo)
-        if any(c.cost()[row] > 0 for c in self._engine.constraints):
-            painter.glow(self._engine.robot.position[row])
+        wide = 2.0 * self._half.max()
+        corners = [
+            self._middle + self._half * side for side in ((-1, -1), (-1, 1), (1, -1), (1, 1))
+        ]
+        near = np.clip([low, high], [*(self._middle - wide), 0.0], [*(self._middle + wide), wide])
+        tall = 0.5 if self._engine.robot.workspace == "planar" else 1.5  # m
+        points = [[*corner, z] for corner in corners for z in (0.0, tall)]
+        fovy = float(self._engine.model.vis.global_.fovy)
+        elevation = -float(camera.elevation)
+        at, distance = frame_all(np.array([*points, *near]), elevation, self._aspect, fovy)
+        camera.lookat[:], camera.distance = at, distance
+
+    def _paint(
+        self, scene: mujoco.MjvScene, data: mujoco.MjData, row: int, shift: Array | float = 0.0
+    ) -> None:
+        engine = self._engine
+        painter = ScenePainter(scene, engine, data, row, shift)
+        if self._explain and not self._human:
+            painter.shadows()
+        for part in engine.parts:
+            part.draw(painter, row)
+        if not self._explain:  # the rest is not in the world
+            return
+        for lidar in engine.lidar_readings(row):
+            painter.ring(*lidar)
+        painter.heading()
+        pays = any(c.cost()[row] > 0 for c in engine.constraints)
+        if pays:
+            painter.glow(engine.robot.position[row] + shift)
+        painter.border(self._middle, self._half, COST_COLOR if pays else (0.45, 0.5, 0.56))
 
     def close(self) -> None:
         """Free the window or the OpenGL context."""
@@ -301,44 +260,6 @@ class Renderer:
             self._gl.make_current()
             self._context.free()
             self._gl.free()
-
-
-def _geoms_below(model: mujoco.MjModel, body: str) -> list[int]:
-    """The geoms of a body and of all that hangs on it."""
-    below = {model.body(body).id}
-    for child in range(model.nbody):  # parents come before their children
-        if int(model.body_parentid[child]) in below:
-            below.add(child)
-    return [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in below]
-
-
-def _thickness(
-    model: mujoco.MjModel, data: mujoco.MjData, geoms: list[int], points: Array
-) -> Array:
-    """How thick the geoms around each point are, by the thickest; 0 where there is none, [B] m.
-
-    :param points: [B, 3] m
-    """
-    rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
-    offset = points[:, None] - data.geom_xpos[geoms]  # [B, G, 3]
-    middle, half = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]  # in the geoms' frames
-    inside = np.abs(np.einsum("gij,bgi->bgj", rotation, offset) - middle) <= half
-    thick: Array = np.where(inside.all(axis=2), half.min(axis=1), 0.0).max(axis=1, initial=0.0)
-    return thick
-
-
-def _arena(engine: Engine) -> tuple[Array, float]:
-    """Middle, [3] m, and size, in default arenas, of what holds all placements and locations.
-
-    The default arena belongs to it: movers and arms are at home at the origin.
-    """
-    boxes = list(ARENA)
-    for footprint in engine.footprints.values():
-        boxes += footprint.placements
-        boxes += [(x, y, x, y) for x, y in footprint.locations]
-    low, high = np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]
-    side = ARENA[0][2] - ARENA[0][0]
-    return np.append((low + high) / 2, 0.0), float((high - low).max() / side)
 
 
 def show_robot(robot: Robot) -> None:

@@ -6,7 +6,6 @@ It is plain data: an id string, a dictionary, a YAML file and keyword arguments 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
@@ -14,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from sb3_guard.envs.engine import Engine, Layout
+from sb3_guard.envs import suites
+from sb3_guard.envs.arena import Arena
+from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import Extras
-from sb3_guard.envs.registry import CONSTRAINTS, KEYWORDS, ROBOTS, TASKS
-from sb3_guard.envs.sensors import Lidar
-from sb3_guard.spelling import did_you_mean, nearest
+from sb3_guard.envs.layout import Layout
+from sb3_guard.envs.observation import Lidar
+from sb3_guard.envs.registry import CONSTRAINTS, KEYWORDS, OPTIONS, ROBOTS, TASKS
+from sb3_guard.spelling import did_you_mean
 
-_ID = re.compile(
-    r"(?P<task>[A-Za-z][A-Za-z0-9]*)_(?P<robot>[A-Za-z][A-Za-z0-9]*)"
-    r"_(?P<num>\d+)(?P<constraint>[A-Za-z][A-Za-z0-9]*)(?P<noconti>_noconti)?(-v0)?"
-)
 Params = Mapping[str, Any]
+COSTS = ("sum", "any")
 _OWN_NAME = "a constraint under a name of its own states its type, such as {'type': 'hazards'}"
 
 
@@ -61,6 +60,9 @@ class Scenario:
     :param lidar: parameters of the pseudo-lidar
     :param layout: parameters of the layout
     :param observe: parameters of :class:`~sb3_guard.envs.extras.Extras`
+    :param arena: parameters of the :class:`~sb3_guard.envs.arena.Arena`
+    :param cost: ``"sum"`` of the constraints' costs, or ``"any"``: 1 if any constraint costs
+        something, else 0, and so each of them
     :raises ValueError: an unknown name or a bad value, with what is allowed
     """
 
@@ -72,6 +74,8 @@ class Scenario:
     lidar: Params = field(default_factory=dict)
     layout: Params = field(default_factory=dict)
     observe: Params = field(default_factory=dict)
+    arena: Params = field(default_factory=dict)
+    cost: str = "sum"
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -92,6 +96,8 @@ class Scenario:
                 f"constraints = {self.constraints!r} must be a mapping of names to parameters, "
                 "such as {'hazards': {'num': 8}}"
             )
+        if self.cost not in COSTS:
+            raise ValueError(f"cost = {self.cost!r}: {did_you_mean(self.cost, COSTS)}")
         self.parts()
 
     @classmethod
@@ -116,42 +122,10 @@ class Scenario:
     def parse(cls, name: str) -> Scenario:
         """The scenario of an id such as ``Goal_Point_8Hazards-v0``; the version may be left out.
 
-        :raises ValueError: the id does not follow ``{Task}_{Robot}_{N}{Constraint}[_noconti]``
+        :raises ValueError: it is in no suite, nor does it follow
+            ``{Task}_{Robot}_{N}{Constraint}[_noconti]``
         """
-        match = _ID.fullmatch(name)
-        if match is None:
-            raise ValueError(
-                f"{name!r} is not an id of the form Task_Robot_NConstraint-v0, "
-                "such as 'Goal_Point_8Hazards-v0'"
-            )
-        known = {"robot": list(ROBOTS), "task": list(TASKS), "constraint": list(CONSTRAINTS)}
-        wrong = [kind for kind, names in known.items() if match[kind] not in names]
-        if wrong:
-            kind = wrong[0]
-            hint = did_you_mean(match[kind], known[kind])
-            near = {k: nearest(match[k], names) for k, names in known.items()}
-            if len(wrong) > 1 and all(near.values()):
-                meant = "{task}_{robot}_".format(**near) + match["num"] + str(near["constraint"])
-                meant += match["noconti"] or ""
-                hint = f"did you mean {meant!r}? allowed: {', '.join(known[kind])}"
-            raise ValueError(f"unknown {kind} {match[kind]!r} in {name!r}: {hint}")
-        num = {"num": int(match["num"])}
-        if "num" not in CONSTRAINTS[match["constraint"]].__dataclass_fields__:  # type: ignore
-            if match["num"] != "1":
-                raise ValueError(
-                    f"{name!r}: {match['constraint']} has no parameter num, so that there is one "
-                    f"of it: write 1{match['constraint']}, or give its class a field num"
-                )
-            num = {}
-        task = TASKS[match["task"]]
-        if match["noconti"] and "ends" not in {f.name for f in fields(task)}:  # type: ignore
-            raise ValueError(f"{match['task']} has no goal to end at: drop _noconti from {name!r}")
-        return cls(
-            robot=match["robot"],
-            task=match["task"],
-            constraints={match["constraint"].lower(): num},
-            task_params={"ends": True} if match["noconti"] else {},
-        )
+        return cls(**suites.fields(name))
 
     @classmethod
     def load(cls, path: str | Path) -> Scenario:
@@ -196,22 +170,30 @@ class Scenario:
             "lidar": dict(self.lidar),
             "layout": dict(self.layout),
             "observe": dict(self.observe),
+            "arena": dict(self.arena),
+            "cost": self.cost,
         }
 
-    def override(self, **params: Params | None) -> Scenario:
+    def override(self, cost: str | None = None, **params: Params | None) -> Scenario:
         """This scenario with parameters of its parts changed or constraints added.
 
         ``override(hazards={"size": 0.2}, goal={"size": 0.3}, lidar={"bins": 32})``: a keyword is
-        ``robot``, ``lidar``, ``layout``, ``observe``, the task's name in lower case, or a
-        constraint's; None removes a constraint.
+        ``robot``, ``arena``, ``lidar``, ``layout``, ``observe``, the task's name in lower case, or
+        a constraint's; None removes a constraint.
 
+        :param cost: ``"sum"`` or ``"any"``; None: as it was
         :raises ValueError: an unknown keyword or parameter
         """
-        changes: dict[str, Any] = {"constraints": dict(self.constraints)}
+        changes: dict[str, Any] = {"constraints": dict(self.constraints), "cost": cost or self.cost}
         own = {**KEYWORDS, self.task.lower(): "task_params"}
         kinds = {name.lower() for name in CONSTRAINTS}
         tasks = {name.lower(): name for name in TASKS}
         for key, value in params.items():
+            known = {*own, *kinds, *changes["constraints"], *tasks}
+            new = isinstance(value, Mapping) and "type" in value
+            if key not in known and not new:
+                hint = did_you_mean(key, [*own, *sorted(kinds), *OPTIONS])
+                raise ValueError(f"unknown parameter {key!r}: {hint}; {_OWN_NAME}")
             if value is not None and not isinstance(value, Mapping):
                 such = "{'size': 0.3}"
                 if key == "robot":
@@ -224,20 +206,15 @@ class Scenario:
                 changes[name] = {**changes.get(name, getattr(self, name)), **(value or {})}
             elif value is None and key in changes["constraints"]:
                 del changes["constraints"][key]
-            elif key in kinds or key in changes["constraints"] or (value and "type" in value):
+            elif new or key in kinds or key in changes["constraints"]:
                 old = changes["constraints"].get(key, {})
                 changes["constraints"][key] = {**old, **(value or {})}
-            elif key in tasks:
+            else:
                 wanted = f"{tasks[key]}_{self.robot}_8Hazards-v0"
                 raise ValueError(
                     f"{key} = {value!r}: this scenario's task is {self.task}, not {tasks[key]}: "
                     f"set its parameters with {self.task.lower()}={{...}}, or choose the other "
                     f"task with an id such as {wanted!r}"
-                )
-            else:
-                known = [*own, *sorted(kinds)]
-                raise ValueError(
-                    f"unknown parameter {key!r}: {did_you_mean(key, known)}; {_OWN_NAME}"
                 )
         return replace(self, **changes)
 
@@ -289,6 +266,8 @@ class Scenario:
             "lidar": Lidar.from_params(self.lidar),
             "layout": Layout.from_params(self.layout),
             "extras": Extras.from_params(self.observe),
+            "arena": Arena.from_params(self.arena),
+            "cost": self.cost,
         }
 
     def build(self, num_envs: int = 1, num_threads: int | None = None) -> Engine:

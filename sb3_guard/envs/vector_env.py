@@ -13,16 +13,16 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from sb3_guard.envs.engine import Outcome
 from sb3_guard.envs.gym_env import (
     Simulated,
     action_space,
     observation_space,
     step_info,
 )
+from sb3_guard.envs.outcome import Outcome
 from sb3_guard.envs.parameters import check_count
-from sb3_guard.envs.registry import EPISODE_STEPS
 from sb3_guard.envs.scenario import Scenario
+from sb3_guard.envs.suites import EPISODE_STEPS, episode_steps
 
 Array = np.ndarray
 
@@ -57,7 +57,8 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
     :param num_envs: number of environments N
     :param scenario: an id, a :class:`~sb3_guard.envs.scenario.Scenario`, its plain data or its
         YAML file
-    :param max_episode_steps: control steps after which an episode is cut
+    :param max_episode_steps: control steps after which an episode is cut; None: as its id says,
+        1,000 of a scenario
     :param num_threads: threads that step the physics; by default one per CPU, at most N. The
         results do not depend on it
     :param render_mode: ``"rgb_array"`` (one frame per row) or None
@@ -75,7 +76,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         self,
         num_envs: int = 1,
         scenario: str | Path | Mapping[str, Any] | Scenario = "Goal_Point_8Hazards",
-        max_episode_steps: int = EPISODE_STEPS,
+        max_episode_steps: int | None = None,
         num_threads: int | None = None,
         render_mode: str | None = None,
         flatten: bool = True,
@@ -84,6 +85,9 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         camera: str = "fixed",
         **params: Any,
     ) -> None:
+        if max_episode_steps is None:
+            steps = episode_steps(scenario) if isinstance(scenario, str) else EPISODE_STEPS
+            max_episode_steps = steps
         check_count("max_episode_steps", max_episode_steps)
         self._simulate(
             scenario, params, num_envs, num_threads, render_mode, flatten, width, height, camera
@@ -149,7 +153,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         return self.view(self.begin(seeds, ids), self.look()), {}
 
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Advance every row by one control step of ten physics steps."""
+        """Advance every row by one control step."""
         t = self.advance(actions)
         out = t.outcome
         everyone = np.ones(self.num_envs, dtype=bool)
@@ -164,6 +168,9 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         for name, rows in happened.items():
             if rows.any():
                 infos[name] = infos[f"_{name}"] = rows
+        for name, rows in out.ended_by.items():
+            for row in np.flatnonzero(rows).tolist():
+                infos = self._add_info(infos, {"terminated_by": name}, row)
         if t.done.any():
             final = np.full(self.num_envs, None, dtype=object)
             details: dict[str, Any] = {}

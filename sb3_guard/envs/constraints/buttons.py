@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.objects import SPHERE
+from sb3_guard.envs.groups import SPHERE, add_geom
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array
 
@@ -36,7 +36,7 @@ class Buttons(Obstacles):
     )
 
     def shape(self, body: mujoco.MjsBody) -> None:
-        self.add_geom(body, SPHERE, (self.size,), lift=self.size)
+        add_geom(body, SPHERE, (self.size,), self.color, lift=self.size)
 
     def amounts(self) -> Array:
         own = super().amounts()

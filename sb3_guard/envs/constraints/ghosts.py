@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from sb3_guard.envs import motion
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.objects import Movers
+from sb3_guard.envs.groups import check_reachable, check_size
+from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Simulation
 
@@ -25,7 +26,12 @@ class Ghosts(Movers, Obstacles):
     color = (1.0, 0.1, 0.5)
     trespassable = True
     movable = "active"
+    usual_keepout = 0.5
+    moves = True
 
+    keepout: float | None = param(
+        None, "radius kept clear around an object, m; null: 0.5, or what covers a solid one", low=0
+    )
     v1: float | None = param(None, "speed towards the robot; null: speed", low=0)
     r1: float = param(1.5, "distance to the robot at which they wait, m", low=0)
 
@@ -35,11 +41,10 @@ class Ghosts(Movers, Obstacles):
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        self.check_height(
-            sim, self.size + (sim.robot.extent if self.solid else 0.0), all_of_it=False
-        )
+        near = self.size + (sim.robot.extent if self.solid else 0.0)
+        check_reachable(self, near, everywhere=False)
         if self.num and not self.solid:
-            self.check_size(sim, self.group, self.size)
+            check_size(self, self.name, self.size)
 
     def law(self) -> motion.Law:
         return self._law(far=self.speed if self.v1 is None else self.v1, r1=self.r1)

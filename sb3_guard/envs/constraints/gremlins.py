@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.objects import BOX
+from sb3_guard.envs.groups import BOX, add_geom
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Generators, Simulation
 
@@ -18,8 +18,7 @@ from sb3_guard.envs.part import Array, Generators, Simulation
 class Gremlins(Obstacles):
     """Boxes that circle around their places by the simulated clock (Ray et al. 2019).
 
-    At time t a gremlin is at travel · (sin ωt, cos ωt) from its place, and moves once per control
-    step. Cost: the number touched.
+    At time t a gremlin is at travel · (sin ωt, cos ωt) from its place. Cost: the number touched.
     """
 
     name = "gremlins"
@@ -29,7 +28,7 @@ class Gremlins(Obstacles):
     space = "planar"
     spaces = ("planar",)
     solid = True
-    mover = True
+    moves = True
     usual_keepout = 0.5
 
     size: float = param(0.1, "half of an edge, m", above=0)
@@ -39,14 +38,31 @@ class Gremlins(Obstacles):
         low=0,
     )
     travel: float = param(0.3, "radius of the circles, m", low=0)
+    every: str = param(
+        "control",
+        "whether they move before every control step or before every physics step",
+        choices=("control", "physics"),
+    )
+    welded: bool = param(
+        False, "whether they are light boxes pulled along by welds; false: nothing stops them"
+    )
+    density: float = param(0.001, "of welded ones, kg/m³", above=0)
     rate: float = param(1.0, "angular speed ω, rad per simulated second", low=0)
 
     @property
     def cover(self) -> float:
         return self.travel + math.sqrt(2) * self.size
 
+    @property
+    def begins(self) -> float:
+        return 0.0  # pulled up at once
+
     def shape(self, body: mujoco.MjsBody) -> None:
-        self.add_geom(body, BOX, (self.size, self.size, self.size), lift=self.size)
+        size = (self.size,) * 3
+        if not self.welded:
+            add_geom(body, BOX, size, self.color, lift=self.size)
+            return
+        add_geom(body, BOX, size, self.color, free=True).density = self.density
 
     def positions(self, footprint: str) -> Array:
         """The middles of the circles, [N, num, 3] m, which ``keepout`` is about."""
@@ -66,7 +82,7 @@ class Gremlins(Obstacles):
     def _turn(self, rows: Array | slice) -> None:
         """Go where the clock of these rows says."""
         phase = self.rate * self._time[rows]
-        places = self.sim.places(self.group)[rows].copy()  # [n, num, 3]
+        places = self.group.places[rows].copy()  # [n, num, 3]
         places[..., 0] += (self.travel * np.sin(phase))[:, None]
         places[..., 1] += (self.travel * np.cos(phase))[:, None]
-        self.bodies.move(places, rows)
+        self.group.bodies.move(places, rows)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.objects import Spatial
-from sb3_guard.envs.part import Simulation
+from sb3_guard.envs.groups import check_reachable, check_size
+from sb3_guard.envs.part import HEIGHT, SPACE, Simulation
 
 
 @dataclass
-class Hazards(Spatial, Obstacles):
+class Hazards(Obstacles):
     """Zones to keep out of: discs on the floor, or spheres in the air (Zhao et al. 2024, §4.3).
 
     Cost: Σ max(0, size − distance) over the zones, the distance from the robot's position, or from
@@ -18,13 +18,16 @@ class Hazards(Spatial, Obstacles):
     """
 
     name = "hazards"
-    color = (0.1, 0.3, 0.95)
+    color = (0.0, 0.4, 0.85)
     trespassable = True
     movable = "no"
     reachable = True
 
+    space: str | None = SPACE
+    height: tuple[float, float] = HEIGHT
+
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        self.check_height(sim, self.size, all_of_it=False)
+        check_reachable(self, self.size, everywhere=False)
         if self.num:
-            self.check_size(sim, self.group, self.size)
+            check_size(self, self.name, self.size)

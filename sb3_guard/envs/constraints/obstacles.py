@@ -3,31 +3,82 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
+import mujoco
 import numpy as np
 
-from sb3_guard.envs.objects import Objects
+from sb3_guard.envs.groups import MOST, Group
+from sb3_guard.envs.layout import Rectangle
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Constraint
+from sb3_guard.envs.part import Array, Constraint, World
 
 
 @dataclass
-class Obstacles(Objects, Constraint):
-    """Objects that the robot pays for.
+class Obstacles(Constraint):
+    """Objects, all of one size, that the robot pays for.
 
-    Cost of those it can cross: Σ max(0, size − distance), the distance from the robot's position,
-    an arm's from its nearest link, to the centre. Cost of solid ones: how many it touches when the
-    control step ends, each counted once however many contact points it has.
+    Cost of those it can cross, discs on the floor or spheres in the air: Σ max(0, size − distance),
+    the distance from the robot's position, an arm's from its nearest link, to the centre. Cost of
+    solid ones, which have a :meth:`shape`: how many it touches when the control step ends, each
+    counted once however many contact points it has.
     """
 
+    num: int = param(8, "number of objects", low=0, high=MOST)
+    size: float = param(0.3, "radius of an object, m", above=0)
+    keepout: float | None = param(
+        None, "radius kept clear around an object, m; null: 0.4, or what covers a solid one", low=0
+    )
+    locations: tuple[tuple[float, float], ...] = param((), "fixed places (x, y), m")
+    placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
+    margin: float = param(0.0, "extra distance to every other object, m", low=0)
     weight: float = param(1.0, "cost per metre of depth, or per object touched", low=0)
     indicator: bool = param(False, "cost 1 whenever there is any, instead of the sum")
+
+    usual_keepout: ClassVar[float] = 0.4  # m, of objects that it covers
+    free: ClassVar[bool] = False  # whether solid objects can be pushed
+    welded: bool = False  # whether they can be pushed but are pulled back
+    moves: ClassVar[bool] = False  # whether they leave their places by themselves
+    reachable: ClassVar[bool] = False  # whether they lie within the robot's reach
+
+    @property
+    def cover(self) -> float:
+        """Radius around its place that a solid object never leaves, m."""
+        return self.size
+
+    @property
+    def begins(self) -> float | None:
+        """How deep objects that can be pushed begin in the floor, m; None: as they rest."""
+        return None
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        """Add the geoms of a solid object, whose frame is its place."""
+        raise NotImplementedError(f"{self.name} cannot be solid")
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        self.group = Group(
+            self,
+            world,
+            self.name,
+            self.num,
+            self.keepout,
+            self.usual_keepout,
+            self.cover,
+            self.shape if self.solid else None,
+            self.size if self.free or self.welded else None,
+            self.welded,
+            self.begins,
+            reachable=self.reachable,
+            mover=self.moves,
+        )
+        self.groups = (self.group,)
 
     def amounts(self) -> Array:
         """What each object costs, [N, num]."""
         if self.solid:
-            return self.weight * self.bodies.touched
-        depth = self.size - self.sim.robot.clearance(self.centers, self.planar)
+            return self.weight * self.group.bodies.touched
+        depth = self.size - self.sim.robot.clearance(self.group.centers, self.planar)
         return self.weight * np.maximum(depth, 0.0)
 
     def cost(self) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mujoco
 
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.objects import CYLINDER
+from sb3_guard.envs.groups import CYLINDER, add_geom
 from sb3_guard.envs.parameters import param
 
 
@@ -16,7 +16,7 @@ class Pillars(Obstacles):
     """Columns that do not yield (Ray et al. 2019). Cost: the number touched."""
 
     name = "pillars"
-    color = (0.5, 0.5, 1.0)
+    color = (0.45, 0.45, 0.5)
     trespassable = False
     movable = "no"
     space = "planar"
@@ -31,4 +31,5 @@ class Pillars(Obstacles):
     half_height: float = param(0.5, "half of a pillar's height, m", above=0)
 
     def shape(self, body: mujoco.MjsBody) -> None:
-        self.add_geom(body, CYLINDER, (self.size, self.half_height), lift=self.half_height)
+        size = (self.size, self.half_height)
+        add_geom(body, CYLINDER, size, self.color, lift=self.half_height)

@@ -17,6 +17,7 @@ class Ant(MJCFRobot):
 
     asset = "ant.xml"
     timestep = 0.02
+    integrator = "Euler"
 
 
 if __name__ == "__main__":

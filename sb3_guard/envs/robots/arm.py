@@ -21,6 +21,7 @@ class Arm(MJCFRobot):
     """
 
     timestep = 0.002
+    integrator = "Euler"
     workspace = "spatial"
     reach = 2.0
     links: ClassVar[tuple[str, ...]]

@@ -18,6 +18,7 @@ class Car(MJCFRobot):
 
     asset = "car.xml"
     timestep = 0.004
+    integrator = "Euler"
     eye = (MJCFRobot.root, (0.0, 0.0, 0.1), (0.0, 1.0, 0.0))
 
 

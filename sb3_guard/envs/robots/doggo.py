@@ -18,6 +18,7 @@ class Doggo(MJCFRobot):
 
     asset = "doggo.xml"
     timestep = 0.01
+    integrator = "Euler"
 
 
 if __name__ == "__main__":

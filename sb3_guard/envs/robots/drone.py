@@ -17,6 +17,7 @@ class Drone(MJCFRobot):
 
     asset = "drone.xml"
     timestep = 0.008
+    integrator = "Euler"
     workspace = "spatial"
     eye = (MJCFRobot.root, (0.35, 0.0, 0.0), (1.0, 0.0, 0.0))  # before the front propeller
 

@@ -17,6 +17,7 @@ class Hopper(MJCFRobot):
 
     asset = "hopper.xml"
     timestep = 0.005
+    integrator = "Euler"
 
 
 if __name__ == "__main__":

@@ -16,7 +16,9 @@ class Point(MJCFRobot):
     """
 
     asset = "point.xml"
+    floor = False
     timestep = 0.002
+    integrator = "Euler"
 
 
 if __name__ == "__main__":

@@ -1,16 +1,21 @@
 """A robot from an MJCF file: everything that the other parts ask of it is read from the file.
 
-The file holds the robot alone: no floor, no options, no light. Its conventions:
+The file holds the robot alone, no floor; an ``<option>`` holds unless the class states the same.
+Its conventions:
 
 * the outermost body is called ``robot``; it either begins with a free joint or, for robots that
   move at a fixed height or not at all, with its own slides and hinges; these then hang under a
   mocap body that carries the place and heading of an episode's start;
 * every sensor in the file is observed under its own name; ``jointpos`` as (sin θ, cos θ), ball
   joints as a rotation matrix; sensors whose names begin with ``_`` are not observed;
-* actions in [−1, 1] are scaled linearly to the control range of the actuators, in their order;
+* actions in [−1, 1] are scaled linearly to the control range of the actuators, in their order; of
+  a class with ``scaled = False`` they are the controls themselves;
 * a keyframe named ``start`` holds the pose in which an episode begins;
-* geoms that touch the floor have ``conaffinity="3"``, and ``priority="1"`` if their own friction
-  shall hold on it; with MuJoCo's defaults a geom meets everything but the floor.
+* its contact bits say which of its geoms meet each other; the world sets those for objects and
+  floor. Geoms whose own friction shall hold on the floor have ``priority="1"``.
+
+A class with ``complete = True`` has a file that is a whole world: its floor and its options are
+used, names are as in the file, and the robot begins where the file puts it.
 """
 
 from __future__ import annotations
@@ -26,9 +31,10 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
+from sb3_guard.envs.observation import Observations, Values
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Generators, Robot, Simulation, World
-from sb3_guard.envs.sensors import Channel
+from sb3_guard.envs.robots import mjcf
 from sb3_guard.spelling import did_you_mean
 
 Vector = tuple[float, float, float]
@@ -36,7 +42,7 @@ PREFIX = "robot/"
 _SENSOR = mujoco.mjtSensor
 
 # unit and bounds of the sensors that a robot may carry
-_CHANNELS = {
+_BOUNDS = {
     _SENSOR.mjSENS_ACCELEROMETER: (-math.inf, math.inf, "m/s²"),
     _SENSOR.mjSENS_VELOCIMETER: (-math.inf, math.inf, "m/s"),
     _SENSOR.mjSENS_GYRO: (-math.inf, math.inf, "rad/s"),
@@ -54,36 +60,6 @@ def as_slice(ids: list[int]) -> slice | list[int]:
     return slice(ids[0], ids[-1] + 1, step) if even else ids
 
 
-def _extent(model: mujoco.MjModel, root: int, center: int) -> float:
-    """How far from the origin of body ``center`` any geom may reach, whatever the joints do, m.
-
-    Joints of the root place the robot; one that lifts it has no bound.
-    """
-    reach = {root: 0.0}  # m, of a body's origin from the root's
-    outermost = 0.0
-    for body in range(root, model.nbody):
-        if body != root:
-            parent = int(model.body_parentid[body])
-            if parent not in reach:
-                continue
-            reach[body] = reach[parent] + float(np.linalg.norm(model.body_pos[body]))
-        first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
-            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-                if body == root and not model.jnt_axis[joint][2]:
-                    continue
-                if body == root or not model.jnt_limited[joint]:
-                    return math.inf
-                reach[body] += float(np.abs(model.jnt_range[joint]).max())
-            elif body != root:  # the origin turns about the anchor
-                reach[body] += 2 * float(np.linalg.norm(model.jnt_pos[joint]))
-        first = int(model.body_geomadr[body])
-        for geom in range(first, first + int(model.body_geomnum[body])):
-            size = float(np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom])
-            outermost = max(outermost, reach[body] + size)
-    return outermost + reach[center]
-
-
 @dataclass
 class MJCFRobot(Robot):
     """A robot described by an MJCF file.
@@ -93,10 +69,12 @@ class MJCFRobot(Robot):
     """
 
     asset: ClassVar[str]
-    timestep: ClassVar[float]  # s, one physics step; a control step is ten
     workspace: ClassVar[str] = "planar"
     lidar_bodies: ClassVar[tuple[str, ...]] = ("robot",)
     center: ClassVar[str] = "robot"  # the body whose origin is the robot's position
+    scaled: ClassVar[bool] = True  # whether actions are shares of the actuators' control ranges
+    floor: ClassVar[bool] = True  # False: it slides at a fixed height and never meets the floor
+    complete: ClassVar[bool] = False  # whether the file is a world: floor and options, too
 
     name = "robot"
     keepout: float = param(0.4, "radius kept clear around the robot at the start, m", low=0)
@@ -106,6 +84,9 @@ class MJCFRobot(Robot):
     placements: tuple[Rectangle, ...] = param((), "rectangles to start in, m; empty: the arena")
     margin: float = param(0.0, "extra distance to every other object, m", low=0)
     heading: float | None = param(None, "start heading, rad; null: uniformly random")
+    action_noise: float = param(
+        0.0, "standard deviation of Gaussian noise on every action, in units of actions", low=0
+    )
     sensing: tuple[str, ...] | None = param(
         None, "bodies that carry lidar and compass; null: the robot's own choice"
     )
@@ -124,6 +105,12 @@ class MJCFRobot(Robot):
         super().__post_init__()
         if self.sensing == ():
             raise ValueError("robot.sensing = () must name a body, or be null")
+        placed = self.locations or self.placements or self.heading is not None
+        if self.complete and placed:
+            raise ValueError(
+                f"robot {type(self).__name__} begins where its file puts it: leave out locations, "
+                "placements and heading"
+            )
         if math.isfinite(self.reach) and self.placements:
             raise ValueError(
                 f"robot.placements = {self.placements!r}: a robot of limited reach stands at a "
@@ -135,18 +122,17 @@ class MJCFRobot(Robot):
         return self.locations[0] if self.locations else (0.0, 0.0)
 
     def footprints(self) -> tuple[Footprint, ...]:
-        places = self.locations or ((self.base,) if math.isfinite(self.reach) else ())
+        stands = self.complete or math.isfinite(self.reach)
+        places = self.locations or ((self.base,) if stands else ())
         return (Footprint("robot", 1, self.keepout, self.placements, places, self.margin),)
+
+    def world(self) -> mujoco.MjSpec | None:
+        return mjcf.read(self.path(), self.root, True) if self.complete else None
 
     def build(self, world: World) -> None:
         super().build(world)
-        try:
-            robot = mujoco.MjSpec.from_file(str(self.path()))
-            robot.compile()  # attach() drops without a word what refers to something missing
-        except ValueError as error:
-            raise ValueError(f"{self.path()}: {' '.join(str(error).split())}") from None
-        if robot.body("robot") is None:
-            raise ValueError(f"{self.path()} has no body called 'robot': call its outermost so")
+        robot = world.spec if self.complete else mjcf.read(self.path(), "robot", False)
+        self._own = {sensor.name for sensor in robot.sensors if sensor.name}
         known = [body.name for body in robot.bodies if body.name and body is not robot.worldbody]
         named = {
             "lidar_bodies": self.lidar_bodies if self.sensing is None else (),
@@ -159,8 +145,12 @@ class MJCFRobot(Robot):
                     raise ValueError(
                         f"{where} names no body {name!r} of the robot: {did_you_mean(name, known)}"
                     )
-        joints = robot.body("robot").joints
+        joints = robot.body(self.root if self.complete else "robot").joints
         self._free = bool(joints) and joints[0].type == mujoco.mjtJoint.mjJNT_FREE
+        if self.complete:
+            return
+        mjcf.honour_options(robot.option, world.spec.option)
+        mjcf.set_contact_bits(robot, self.floor, str(self.path()))
         if self._free:
             frame = world.spec.worldbody.add_frame()
         else:
@@ -170,28 +160,53 @@ class MJCFRobot(Robot):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         model, batch = sim.model, sim.batch
+        prefix = "" if self.complete else PREFIX
         self.action_size = model.nu
         low, high = model.actuator_ctrlrange.T
         for i in np.flatnonzero(~(high > low)).tolist():
             raise ValueError(
-                f"actuator {model.actuator(i).name.removeprefix(PREFIX)!r} of the robot has no "
+                f"actuator {model.actuator(i).name.removeprefix(prefix)!r} of the robot has no "
                 'ctrlrange: give it one, such as ctrlrange="-1 1"'
             )
         if not model.nu:
             raise ValueError(f"{self.path()} has no actuators: the robot could not act")
         self._center, self._half = (low + high) / 2, (high - low) / 2
+        if not self.scaled:
+            self.action_range = low, high
+            self._center, self._half = np.zeros(model.nu), np.ones(model.nu)
         self._ctrl = batch.bind("ctrl")
         self._qpos = batch.bind("qpos")
-        start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, PREFIX + "start")
+        start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, prefix + "start")
         self._start = model.key_qpos[start] if start >= 0 else model.qpos0
-        center = model.body(PREFIX + self.center).id
+        center = model.body(prefix + self.center).id
         self._position = batch.bind("xpos")[:, center]
+        root = model.body_rootid[center]  # spatial velocities are at its subtree's centre of mass
+        self._spatial, self._com = batch.bind("cvel")[:, center], batch.bind("subtree_com")[:, root]
         pose = mujoco.MjData(model)
         pose.qpos[: len(self._start)] = self._start
         mujoco.mj_kinematics(model, pose)
         self.altitude = float(pose.xpos[center, 2])
-        self.aside = math.dist(pose.xpos[center, :2], pose.qpos[:2] if self._free else (0.0, 0.0))
-        self.extent = _extent(model, model.body(self.root).id, center)
+        self.offset = math.dist(pose.xpos[center, :2], pose.qpos[:2] if self._free else (0.0, 0.0))
+        self.extent = mjcf.extent(model, model.body(self.root).id, center)
+        if not self.complete:
+            self._bind_place(sim)
+        ids = [model.body(prefix + name).id for name in self.sensing or self.lidar_bodies]
+        rotation = batch.bind("xmat")  # [N, nbody, 9]
+        self._bodies = as_slice(ids)
+        self._xpos, self._xmat = batch.bind("xpos"), rotation.reshape(*rotation.shape[:2], 3, 3)
+        self._sensors = list(self._read_sensors(model))
+        self._data = batch.bind("sensordata")
+        self._balls = [(n, w) for n, kind, w in self._sensors if kind == _SENSOR.mjSENS_BALLQUAT]
+        hinges = [(n, w.start) for n, kind, w in self._sensors if kind == _SENSOR.mjSENS_JOINTPOS]
+        self._hinges, self._angles = [n for n, _ in hinges], as_slice([i for _, i in hinges])
+        self._live = {  # in the order of the file
+            name: Values(self._data[:, where], *_BOUNDS.get(kind, ()))
+            for name, kind, where in self._sensors
+        }
+
+    def _bind_place(self, sim: Simulation) -> None:
+        """Take views of what puts the robot somewhere: its free joint, or the body it hangs on."""
+        model, batch = sim.model, sim.batch
         if self._free:
             body = model.body(self.root).id
             address = int(model.jnt_qposadr[model.body_jntadr[body]])
@@ -203,45 +218,42 @@ class MJCFRobot(Robot):
             self._place = batch.bind("mocap_pos")[:, spawn]
             self._turn = batch.bind("mocap_quat")[:, spawn]
             self._attitude = np.array([1.0, 0.0, 0.0, 0.0])
-        ids = [model.body(PREFIX + name).id for name in self.sensing or self.lidar_bodies]
-        rotation = batch.bind("xmat")  # [N, nbody, 9]
-        self._bodies = as_slice(ids)
-        self._xpos, self._xmat = batch.bind("xpos"), rotation.reshape(*rotation.shape[:2], 3, 3)
-        self._sensors = list(self._read_sensors(model))
-        self._data = batch.bind("sensordata")
-        kinds = {name: kind for name, kind, _ in self._sensors}
-        self._balls = [name for name in kinds if kinds[name] == _SENSOR.mjSENS_BALLQUAT]
-        self._hinges = [name for name in kinds if kinds[name] == _SENSOR.mjSENS_JOINTPOS]
-        self._angles = as_slice([w.start for n, _, w in self._sensors if n in self._hinges])
 
     def _read_sensors(self, model: mujoco.MjModel) -> Any:
         """(name, type, slice of sensordata) of every observed sensor of the robot."""
+        prefix = "" if self.complete else PREFIX
         for i in range(model.nsensor):
-            name = model.sensor(i).name
-            if not name.startswith(PREFIX) or name.startswith(PREFIX + "_"):
+            name = model.sensor(i).name.removeprefix(prefix)
+            if name not in self._own or name.startswith("_"):
                 continue
             joint = int(model.sensor_objid[i])
             kind = int(model.sensor_type[i])
             slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
             if kind == int(_SENSOR.mjSENS_JOINTPOS) and int(model.jnt_type[joint]) == slide:
                 raise ValueError(
-                    f"sensor {name.removeprefix(PREFIX)!r} observes a slide's position as an "
+                    f"sensor {name!r} observes a slide's position as an "
                     "angle: leave it out, or begin its name with '_'"
                 )
             first = int(model.sensor_adr[i])
             where = slice(first, first + int(model.sensor_dim[i]))
-            yield name.removeprefix(PREFIX), _SENSOR(int(model.sensor_type[i])), where
+            yield name, _SENSOR(int(model.sensor_type[i])), where
 
     @property
     def position(self) -> Array:
         return self._position
 
     @property
+    def velocity(self) -> Array:
+        turn, arm = self._spatial[:, :3], self._position - self._com
+        return self._spatial[:, 3:] + np.cross(turn, arm)
+
+    @property
     def frames(self) -> tuple[Array, Array]:
         return self._xpos[:, self._bodies], self._xmat[:, self._bodies]
 
     def positions(self, footprint: str) -> Array:
-        stands = math.isfinite(self.reach)  # where its base is, whatever the hand does
+        # an arm is where its base is, whatever the hand does
+        stands = math.isfinite(self.reach)
         return self.sim.places("robot") if stands else self.position[:, None]
 
     def clearance(self, points: Array, planar: bool) -> Array:
@@ -249,8 +261,10 @@ class MJCFRobot(Robot):
         return geometry.distance(self.position[:, None], points, planar)
 
     def reset(self, ids: Array, rngs: Generators) -> None:
-        places = self.sim.places("robot")
         self._qpos[ids, : len(self._start)] = self._start
+        if self.complete:
+            return
+        places = self.sim.places("robot")
         for i in ids.tolist():
             heading = rngs[i].uniform(0, 2 * math.pi) if self.heading is None else self.heading
             yaw = geometry.yaw_quaternion(np.asarray(heading))
@@ -260,32 +274,23 @@ class MJCFRobot(Robot):
             self._place[ids, 2] = 0.0
 
     def act(self, actions: Array) -> None:
+        if self.action_noise:
+            noise = [rng.standard_normal(self.action_size) for rng in self.sim.rngs]
+            actions = actions + self.action_noise * np.array(noise)
         self._ctrl[:] = self._center + self._half * actions
 
-    def observe(self) -> dict[str, Array]:
-        out = {name: self._data[:, where] for name, _, where in self._sensors}
-        for name in self._balls:
-            out[name] = geometry.rotation_matrix(out[name])
+    def observations(self) -> Observations:
+        out = dict(self._live)
+        for name, where in self._balls:
+            turn = geometry.rotation_matrix(self._data[:, where])
+            out[name] = Values(turn, -1.0, 1.0, "rotation matrix")
         if self._hinges:
             angles = self._data[:, self._angles]
             turns = np.empty((*angles.shape, 2))  # [N, hinges, 2]
             np.sin(angles, out=turns[..., 0])
             np.cos(angles, out=turns[..., 1])
-            out.update((name, turns[:, i]) for i, name in enumerate(self._hinges))
-        return out
-
-    def channels(self) -> dict[str, Channel]:
-        out = {}
-        for name, kind, where in self._sensors:
-            if kind == _SENSOR.mjSENS_JOINTPOS:
-                out[name] = Channel(2, -1.0, 1.0, "sin, cos")
-            elif kind == _SENSOR.mjSENS_BALLQUAT:
-                out[name] = Channel(9, -1.0, 1.0, "rotation matrix")
-            elif kind in _CHANNELS:
-                low, high, unit = _CHANNELS[kind]
-                out[name] = Channel(where.stop - where.start, low, high, unit)
-            else:
-                out[name] = Channel(where.stop - where.start)
+            for i, name in enumerate(self._hinges):
+                out[name] = Values(turns[:, i], -1.0, 1.0, "sin, cos")
         return out
 
     @classmethod

@@ -16,6 +16,7 @@ class Walker(MJCFRobot):
 
     asset = "walker.xml"
     timestep = 0.005
+    integrator = "Euler"
 
 
 if __name__ == "__main__":

@@ -8,16 +8,17 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs import geometry
-from sb3_guard.envs.objects import MOST, SPHERE, Objects
+from sb3_guard.envs.groups import MOST, SPHERE, Group, add_geom
+from sb3_guard.envs.layout import Footprint, Rectangle
+from sb3_guard.envs.observation import Compass, Observations, Scan, Values
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Generators, Painter, Simulation, Task
-from sb3_guard.envs.sensors import Compass, Scan
+from sb3_guard.envs.part import Array, Generators, Painter, Simulation, Task, World
 
 GREEN = (0.1, 0.75, 0.2)
 
 
 @dataclass
-class Button(Objects, Task):
+class Button(Task):
     """Press the right one of several buttons (Ray et al. 2019).
 
     Reward: the distance gained on the lit button, times ``reward_distance``, plus ``bonus`` when it
@@ -34,21 +35,53 @@ class Button(Objects, Task):
     space = "planar"
     spaces = ("planar",)
     solid = True
-    reachable = True
-    usual_keepout = 0.3
 
     num: int = param(4, "number of buttons", low=1, high=MOST)
     size: float = param(0.1, "radius of a button, m", above=0)
     keepout: float | None = param(
         None, "radius kept clear around a button, m; null: 0.3, or what covers it", low=0
     )
+    locations: tuple[tuple[float, float], ...] = param((), "fixed places (x, y), m")
+    placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
+    margin: float = param(0.0, "extra distance to every other object, m", low=0)
+    lidar: bool = param(False, "whether a lidar of its own sees the right button")
+    marker: float | None = param(
+        None, "radius kept clear for a marker that begins elsewhere, m; null: there is none", low=0
+    )
+    again: bool = param(False, "whether the one that was pressed may be the next right one")
+    locked: bool = param(
+        True, "whether after a press the right button does not count either for a while"
+    )
     delay: int = param(10, "control steps in which no button counts after one was pressed", low=0)
     reward_distance: float = param(1.0, "reward per metre gained")
+    reward_limit: float | None = param(
+        10.0, "dense rewards are cut off at ± this; null: they are not", above=0
+    )
     bonus: float = param(1.0, "reward for pressing the lit button")
     ends: bool = param(False, "whether pressing the lit button ends the episode")
 
+    def build(self, world: World) -> None:
+        super().build(world)
+        self.group = Group(
+            self,
+            world,
+            self.name,
+            self.num,
+            self.keepout,
+            usual=0.3,
+            cover=self.size,
+            shape=self.shape,
+            reachable=True,
+        )
+        self.groups = (self.group,)
+
+    def footprints(self) -> tuple[Footprint, ...]:
+        marker = () if self.marker is None else (Footprint("goal", 1, self.marker),)
+        return (*super().footprints(), *marker)
+
     def shape(self, body: mujoco.MjsBody) -> None:
-        self.add_geom(body, SPHERE, (self.size,), lift=self.size)
+        """Add the geom of a button."""
+        add_geom(body, SPHERE, (self.size,), self.color, lift=self.size)
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
@@ -70,7 +103,7 @@ class Button(Objects, Task):
     @property
     def goal(self) -> Array:
         """Where the right button is, [N, 3] m."""
-        return self.sim.places(self.group)[self._rows, self.right]
+        return self.group.places[self._rows, self.right]
 
     @property
     def lit(self) -> Array:
@@ -85,25 +118,32 @@ class Button(Objects, Task):
         return self.reward_distance * (before[:, 0] - now[:, 0])
 
     def succeeded(self, now: Array) -> Array:
-        return self.bodies.touched[self._rows, self.right] & (self.wait == 0)
+        pressed: Array = self.group.bodies.touched[self._rows, self.right]
+        return pressed & (self.wait == 0) if self.locked else pressed
 
     def advance(self, ids: Array) -> Array:
         for i in ids.tolist():
-            if self.num > 1:
+            if self.again:
+                self.right[i] = self.sim.rngs[i].integers(self.num)
+            elif self.num > 1:
                 other = self.sim.rngs[i].integers(self.num - 1)
                 self.right[i] = other + (other >= self.right[i])
             self.wait[i] = self.delay + 1
         return ids[:0]
 
     def mistakes(self) -> Array:
-        wrong = self.bodies.touched.sum(axis=1) - self.bodies.touched[self._rows, self.right]
+        touched = self.group.bodies.touched
+        wrong = touched.sum(axis=1) - touched[self._rows, self.right]
         return np.where(self.wait == 0, wrong, 0).astype(float)
 
-    def sights(self) -> dict[str, Scan | Compass]:
-        return {
-            f"{self.group}_lidar": Scan(self.centers, self.planar, lit=self.lit),
+    def observations(self) -> Observations:
+        out: dict[str, Scan | Compass | Values] = {
+            f"{self.group.name}_lidar": self.group.scan(self.lit),
             "goal_compass": Compass(self.goal, self.planar),
         }
+        if self.lidar:
+            out["goal_lidar"] = Scan(self.goal[:, None], self.planar, GREEN)
+        return out
 
     def draw(self, painter: Painter, row: int) -> None:
         super().draw(painter, row)

@@ -31,7 +31,7 @@ class Chase(Targets):
 
     def measure(self) -> Array:
         """Distance from the robot to the nearest target, [N, 1] m."""
-        distances = self.sim.robot.clearance(self.centers, self.planar)
+        distances = self.sim.robot.clearance(self.group.centers, self.planar)
         return distances.min(axis=1, keepdims=True)
 
     def reward(self, before: Array, now: Array) -> Array:

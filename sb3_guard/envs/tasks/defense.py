@@ -11,7 +11,7 @@ from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Painter, Simulation
 from sb3_guard.envs.tasks.targets import Targets
 
-WHITE = (0.95, 0.95, 0.95)
+SLATE = (0.30, 0.35, 0.45)
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Defense(Targets):
 
     def measure(self) -> Array:
         """Distances of the targets from the origin in the plane, [N, num] m."""
-        return geometry.distance(self.centers, self._home, planar=True)
+        return geometry.distance(self.group.centers, self._home, planar=True)
 
     def reward(self, before: Array, now: Array) -> Array:
         depth = now / self.radius - 1
@@ -51,4 +51,4 @@ class Defense(Targets):
 
     def draw(self, painter: Painter, row: int) -> None:
         super().draw(painter, row)
-        painter.zone(np.array([*self.origin[:2], 0.0]), self.radius, 0.005, WHITE)
+        painter.zone(np.array([*self.origin[:2], 0.0]), self.radius, 0.005, SLATE)

@@ -8,9 +8,9 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
+from sb3_guard.envs.observation import Compass, Observations, Scan, Values
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Painter, Simulation, Task, World
-from sb3_guard.envs.sensors import Channel, Compass, Scan
 
 REDRAWS = 20  # new places drawn before one that is reached already is accepted
 
@@ -22,15 +22,21 @@ class Destination(Task):
     size: float = param(0.5, "radius within which the goal counts as reached, m", above=0)
     keepout: float = param(0.4, "radius kept clear around the goal, m", low=0)
     reward_distance: float = param(1.0, "reward per metre gained")
+    reward_limit: float | None = param(
+        10.0, "dense rewards are cut off at ± this; null: they are not", above=0
+    )
     bonus: float = param(1.0, "reward for reaching the goal")
     ends: bool = param(False, "whether reaching the goal ends the episode")
-    locations: tuple[tuple[float, float], ...] = param((), "fixed first goal, one (x, y), m")
+    locations: tuple[tuple[float, float], ...] = param(
+        (), "fixed first goal, one (x, y), m; several: every goal is one of them, drawn anew"
+    )
     placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
     margin: float = param(0.0, "extra distance to every other object, m", low=0)
+    last: bool = param(False, "whether the goal is placed after everything else")
     lidar: bool = param(False, "whether the goal is also seen by a lidar")
     distance: bool = param(False, "whether the goal's closeness exp(−distance) is observed")
 
-    color = (0.1, 0.75, 0.2)
+    color = (0.0, 0.65, 0.45)
     targets = "one"
 
     def footprints(self) -> tuple[Footprint, ...]:
@@ -40,13 +46,16 @@ class Destination(Task):
                 1,
                 self.keepout,
                 self.placements,
-                self.locations,
+                self.locations if len(self.locations) == 1 else (),
                 self.margin,
                 height=0.0 if self.planar else self.height,
                 reach=self._reach,
                 base=self._base,
                 redrawn=not self.ends,
+                last=self.last,
+                among=self.locations if len(self.locations) > 1 else (),
             ),
+            *super().footprints(),
         )
 
     def build(self, world: World) -> None:
@@ -69,20 +78,14 @@ class Destination(Task):
                 break
         return True
 
-    def sights(self) -> dict[str, Scan | Compass]:
-        out: dict[str, Scan | Compass] = {"goal_compass": Compass(self.place, self.planar)}
+    def observations(self) -> Observations:
+        out: dict[str, Scan | Compass | Values] = {"goal_compass": Compass(self.place, self.planar)}
         if self.lidar:
             out["goal_lidar"] = Scan(self.place[:, None], self.planar)
+        if self.distance:
+            gap = geometry.distance(self.sim.robot.position, self.place, self.planar)
+            out["goal_distance"] = Values(np.exp(-gap)[:, None], 0.0, 1.0, "closeness")
         return out
-
-    def observe(self) -> dict[str, Array]:
-        if not self.distance:
-            return {}
-        gap = geometry.distance(self.sim.robot.position, self.place, self.planar)
-        return {"goal_distance": np.exp(-gap)[:, None]}
-
-    def channels(self) -> dict[str, Channel]:
-        return {"goal_distance": Channel(1, 0.0, 1.0, "closeness")} if self.distance else {}
 
     def draw(self, painter: Painter, row: int) -> None:
         lift = 0.25 if self.planar else 0.0

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from sb3_guard.envs import geometry
-from sb3_guard.envs.objects import Spatial
-from sb3_guard.envs.part import Array, Simulation
+from sb3_guard.envs.groups import check_reachable, check_size
+from sb3_guard.envs.part import HEIGHT, SPACE, Array, Simulation
 from sb3_guard.envs.tasks.destination import Destination
 
 
 @dataclass
-class Goal(Spatial, Destination):
+class Goal(Destination):
     """Reach a place (Zhao et al. 2024, §4.2).
 
     Reward: the distance gained in a control step, times ``reward_distance``, plus ``bonus`` when
@@ -22,10 +22,13 @@ class Goal(Spatial, Destination):
     interactive = False
     contact = False
 
+    space: str | None = SPACE
+    height: tuple[float, float] = HEIGHT
+
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        self.check_height(sim, self.size, all_of_it=True)
-        self.check_size(sim, "goal", self.size)
+        check_reachable(self, self.size, everywhere=True)
+        check_size(self, "goal", self.size)
 
     def measure(self) -> Array:
         """Distance from the robot to the goal, [N, 1] m."""

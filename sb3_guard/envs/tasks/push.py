@@ -9,15 +9,14 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs import geometry
-from sb3_guard.envs.layout import Footprint, Rectangle
-from sb3_guard.envs.objects import BOX, SPHERE, Bodies, add_geom, check_cover
+from sb3_guard.envs.groups import BOX, SPHERE, Group, add_geom
+from sb3_guard.envs.layout import Rectangle
+from sb3_guard.envs.observation import Compass, Observations, Scan
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Generators, Simulation, World
-from sb3_guard.envs.sensors import Compass, Scan
+from sb3_guard.envs.part import Array, Simulation, World
 from sb3_guard.envs.tasks.destination import Destination
 
 YELLOW = (0.95, 0.8, 0.1)
-ROLLING = 0.005  # m, rolling friction: a kick of 0.5 m/s carries the ball 2 m
 
 
 @dataclass
@@ -28,8 +27,8 @@ class Push(Destination):
     from it, and the distance that the object gained on the goal, in the plane; plus ``bonus`` when
     the object's centre is within ``size`` of the goal.
 
-    The ball rolls on when it is let go. The box slides; posts at its corners keep the robot from
-    slipping off its sides.
+    The ball stays near where it is let go, or rolls on with a lower ``object_rolling``. The box
+    slides; posts at its corners keep the robot from slipping off its sides.
     """
 
     name = "push"
@@ -43,6 +42,16 @@ class Push(Destination):
     )
     object_size: float = param(0.2, "radius of the ball, half an edge of the box, m", above=0)
     object_density: float = param(1e-3, "density of the object, kg/m³", above=0)
+    object_rolling: float = param(
+        0.05, "rolling friction of the ball, m; with 0.005 it rolls on for metres", low=0
+    )
+    posts: float = param(0.25, "half width of the box's posts, in sizes", above=0)
+    sink: float | None = param(
+        None, "how deep the object begins in the floor, m; null: as deep as it rests", low=0
+    )
+    goal_height: float | None = param(
+        None, "m, of a goal that distances in space are measured to; null: in the plane", low=0
+    )
     object_keepout: float | None = param(
         None, "radius kept clear around the object, m; null: what covers it", low=0
     )
@@ -59,38 +68,33 @@ class Push(Destination):
     reward_approach: float = param(1.0, "reward per metre gained on the object")
     object_lidar: bool = param(False, "whether the object is also seen by a lidar")
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.object_keepout is not None:
-            check_cover(f"{self.name}.object_keepout", self.object_keepout, self.object_radius)
-
-    def footprints(self) -> tuple[Footprint, ...]:
-        return (
-            *super().footprints(),
-            Footprint(
-                self.object,
-                1,
-                self.object_radius if self.object_keepout is None else self.object_keepout,
-                self.object_placements or self.placements,
-                self.object_locations,
-                self.margin if self.object_margin is None else self.object_margin,
-                reach=self._reach,
-                base=self._base,
-            ),
-        )
-
     @property
     def object_radius(self) -> float:
         """Distance of the object's axis from its outermost point, m: a post's edge of a box."""
-        return self.object_size * (1.0 if self.object == "ball" else 1.25 * math.sqrt(2.0))
-
-    def positions(self, footprint: str) -> Array:
-        return super().positions(footprint) if footprint == "goal" else self.bodies.positions
+        box = (1.0 + self.posts) * math.sqrt(2.0)
+        return self.object_size * (1.0 if self.object == "ball" else box)
 
     def build(self, world: World) -> None:
         super().build(world)
         self._flat = world.robot.workspace == "planar"
-        self.bodies = Bodies(world, self.object, 1, self.shape, self.object_size)
+        self.group = Group(
+            self,
+            world,
+            self.object,
+            1,
+            self.object_keepout,
+            usual=0.0,
+            cover=self.object_radius,
+            shape=self.shape,
+            free=self.object_size,
+            sink=self.sink,
+            reachable=True,
+            label=f"{self.name}.object_keepout",
+            placements=self.object_placements or self.placements,
+            locations=self.object_locations,
+            margin=self.margin if self.object_margin is None else self.object_margin,
+        )
+        self.groups = (self.group,)
 
     def shape(self, body: mujoco.MjsBody) -> None:
         """The geoms of the object."""
@@ -98,18 +102,17 @@ class Push(Destination):
         if self.object == "ball":
             ball = add_geom(body, SPHERE, (r,), YELLOW, free=True)
             ball.density = self.object_density
-            ball.condim, ball.friction = 6, [1.0, 0.005, ROLLING]
+            ball.condim, ball.friction = 6, [1.0, 0.005, self.object_rolling]
             return
         add_geom(body, BOX, (r, r, r), YELLOW, free=True).density = self.object_density
         for x, y in ((r, r), (r, -r), (-r, r), (-r, -r)):
-            post = add_geom(body, BOX, (r / 4, r / 4, r), YELLOW)
+            post = add_geom(body, BOX, (self.posts * r, self.posts * r, r), YELLOW)
             post.pos = [x, y, 0.0]
             post.density = self.object_density
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        self.bodies.bind(sim)
-        self.center = self.bodies.positions[:, 0]  # [N, 3] m
+        self.center = self.group.centers[:, 0]  # [N, 3] m
         far = sim.farthest("goal", self.object)
         if self.size >= far:
             raise ValueError(
@@ -117,14 +120,15 @@ class Push(Destination):
                 f"begins: it is at most {far:.2f} m away; make size smaller, or placements larger"
             )
 
-    def reset(self, ids: Array, rngs: Generators) -> None:
-        self.bodies.put(ids, self.sim.places(self.object)[ids], rngs)
-
     def measure(self) -> Array:
         """Distances robot to object and object to goal, [N, 2] m."""
         distances = np.empty((self.sim.num_envs, 2))
-        distances[:, 0] = geometry.distance(self.sim.robot.position, self.center, self._flat)
-        distances[:, 1] = geometry.distance(self.center, self.place, planar=True)
+        planar, goal = self.goal_height is None, self.place
+        if self.goal_height is not None:
+            goal = self.place + np.array([0.0, 0.0, self.goal_height])
+        flat = self._flat and planar
+        distances[:, 0] = geometry.distance(self.sim.robot.position, self.center, flat)
+        distances[:, 1] = geometry.distance(self.center, goal, planar)
         return distances
 
     def reward(self, before: Array, now: Array) -> Array:
@@ -135,8 +139,8 @@ class Push(Destination):
     def succeeded(self, now: Array) -> Array:
         return now[:, 1] <= self.size
 
-    def sights(self) -> dict[str, Scan | Compass]:
-        out = {**super().sights(), "box_compass": Compass(self.center, self.planar)}
+    def observations(self) -> Observations:
+        out = {**super().observations(), "box_compass": Compass(self.center, self.planar)}
         if self.object_lidar:
             out["box_lidar"] = Scan(self.center[:, None], self.planar, YELLOW)
         return out

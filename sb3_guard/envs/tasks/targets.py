@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sb3_guard.envs.objects import MOST, Movers
+from sb3_guard.envs.groups import MOST, Group
+from sb3_guard.envs.layout import Rectangle
+from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Task
+from sb3_guard.envs.part import Array, Task, World
 
 
 @dataclass
@@ -17,24 +19,38 @@ class Targets(Movers, Task):
     interactive = True
     contact = False
     targets = "many"
-    spoils = "a solid target touches the robot at once"
+    invalid_reason = "a solid target touches the robot at once"
 
     num: int = param(2, "number of targets", low=1, high=MOST)
+    size: float = param(0.3, "radius of an object, m", above=0)
+    keepout: float | None = param(
+        None, "radius kept clear around an object, m; null: 0.5, or what covers a solid one", low=0
+    )
+    locations: tuple[tuple[float, float], ...] = param((), "fixed places (x, y), m")
+    placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
+    margin: float = param(0.0, "extra distance to every other object, m", low=0)
     r0: float = param(2.0, "radius around the origin that they do not leave, m", low=0)
     v1: float | None = param(None, "speed away from the robot; null: 10 speed", low=0)
+    reward_limit: float | None = param(
+        10.0, "dense rewards are cut off at ± this; null: they are not", above=0
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.contact = self.solid
         self.targets = "one" if self.num == 1 else "many"
 
-    @property
-    def group(self) -> str:
-        return "targets"
+    def build(self, world: World) -> None:
+        super().build(world)
+        shape = self.shape if self.solid else None
+        self.group = Group(
+            self, world, "targets", self.num, self.keepout, 0.5, self.size, shape, mover=True
+        )
+        self.groups = (self.group,)
 
-    def blemished(self) -> Array:
+    def invalid_start(self) -> Array:
         """Whether a solid target is touched: it hangs in the link of an arm, [N] bool."""
-        return self.bodies.touched.sum(axis=1) > 0
+        return self.group.bodies.touched.sum(axis=1) > 0
 
     @property
     def flight(self) -> float:

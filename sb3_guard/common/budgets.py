@@ -1,0 +1,272 @@
+"""Wrappers of single environments that make use of a cost which ``info`` reports.
+
+:class:`RemainingBudget` shows the agent what is left of a budget, :class:`EarlyTermination` ends
+the episode that overspends it, :class:`MaxCost` shows the highest cost of the episode so far. They
+need neither torch nor MuJoCo; ``vec_budgets.py`` has the same for all environments of a ``VecEnv``
+at once.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+
+from sb3_guard.common.adapters import Step, entry, number
+
+
+def check(
+    name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, above: bool = False
+) -> float:
+    """
+    :param above: whether ``low`` itself is too low
+    :raises ValueError: ``value`` is not a finite number from ``low`` to ``high``
+    """
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    inside = number and math.isfinite(value) and low <= value <= high
+    if not inside or (above and value == low):
+        least = "" if low == -math.inf else f" above {low:g}" if above else f" of at least {low:g}"
+        most = "" if high == math.inf else f" and at most {high:g}"
+        raise ValueError(f"{name}={value!r}: must be a finite number{least}{most}")
+    return float(value)
+
+
+def cost_of(info: Mapping[str, Any], key: str) -> float:
+    """The cost that ``info`` reports under ``key``.
+
+    :raises ValueError: it is not there, or not a number
+    """
+    return number(entry(info, key), f"info[{key!r}]")
+
+
+def costs_of(infos: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
+    """:func:`cost_of` for every row, shape [N]."""
+    try:
+        costs = np.array([info[key] for info in infos])
+    except (KeyError, ValueError):  # missing, or of several shapes
+        costs = np.array(None)
+    if costs.ndim == 1 and costs.dtype.kind in "fiub" and np.isfinite(costs).all():
+        return costs.astype(np.float64)
+    return np.array([cost_of(info, key) for info in infos])
+
+
+def with_numbers(space: spaces.Space, name: str, size: int) -> spaces.Space:
+    """The space of observations that ``size`` more numbers have joined.
+
+    A flat observation gets them at its end, a dictionary as the entry ``name``; any other becomes a
+    dictionary of ``"observation"`` and ``name``.
+
+    :raises ValueError: there is an entry of that name already
+    """
+    more = spaces.Box(-np.inf, np.inf, (size,), np.float32)
+    if isinstance(space, spaces.Dict):
+        if name in space.spaces:
+            raise ValueError(
+                f"the observation has an entry {name!r} already: is the environment wrapped twice?"
+            )
+        return spaces.Dict({**space.spaces, name: more})
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        dtype = space.dtype if space.dtype in (np.float32, np.float64) else np.float32
+        low = np.append(space.low, more.low).astype(dtype)
+        high = np.append(space.high, more.high).astype(dtype)
+        return spaces.Box(low, high, dtype=dtype)
+    return spaces.Dict({"observation": space, name: more})
+
+
+def join(outer: Any, inner: Any, obs: Any, name: str, numbers: np.ndarray) -> Any:
+    """The observation with the numbers, as :func:`with_numbers` says; also batches of both.
+
+    :param outer: who has the joint ``observation_space``
+    :param inner: who has the space of ``obs``
+    :param numbers: shape [size], or [N, size] for a batch
+    """
+    space = outer.observation_space
+    if isinstance(space, spaces.Box):
+        return np.concatenate([obs, numbers], axis=-1).astype(space.dtype)
+    numbers = numbers.astype(np.float32)
+    if isinstance(inner.observation_space, spaces.Dict):
+        return {**obs, name: numbers}
+    return {"observation": obs, name: numbers}
+
+
+def _has_monitor(env: gym.Env) -> bool:
+    """Whether SB3's ``Monitor`` is among the wrappers; if SB3 isn't imported, it can't be."""
+    module = sys.modules.get("stable_baselines3.common.monitor")
+    while module is not None and isinstance(env, gym.Wrapper):
+        if isinstance(env, module.Monitor):
+            return True
+        env = env.env
+    return False
+
+
+class RemainingBudget(gym.Wrapper, RecordConstructorArgs):
+    """Show the agent what is left of its cost budget, so that it can spend it wisely.
+
+    A limit on the episode's cost depends on the past, which a policy of the observation alone does
+    not know. Sauté RL (Sootla et al., ICML 2022) adds the remaining share z of the budget to it:
+    z₀ = 1, z_{t+1} = (z_t - cost_t / budget) / discount, negative when the budget is overspent.
+    A flat observation gets z as its last number, a dictionary an entry ``"budget"`` of shape (1,);
+    any other becomes a dictionary of ``"observation"`` and ``"budget"``.
+
+    With ``unsafe_reward``, the reward of every step that ends with z < 0 is replaced, as in the
+    paper: then any algorithm for rewards alone learns to keep the budget. Evaluate without it to
+    see true returns.
+
+    :param env: an environment that reports its cost; adapters go inside
+    :param budget: what an episode may cost, above 0
+    :param discount: discount factor of the costs, in (0, 1]
+    :param unsafe_reward: reward of the steps after the budget is overspent; None leaves rewards
+    :param cost_key: entry of ``info`` that is counted
+    :raises ValueError: an argument is out of its range, or the observation has an entry
+        ``"budget"`` already
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        budget: float,
+        discount: float = 1.0,
+        unsafe_reward: float | None = None,
+        cost_key: str = "cost",
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, budget=budget, discount=discount, unsafe_reward=unsafe_reward, cost_key=cost_key
+        )
+        gym.Wrapper.__init__(self, env)
+        self.budget = check("budget", budget, 0.0, above=True)
+        self.discount = check("discount", discount, 0.0, 1.0, above=True)
+        if unsafe_reward is not None:
+            unsafe_reward = check("unsafe_reward", unsafe_reward)
+        self.unsafe_reward = unsafe_reward
+        self.cost_key = cost_key
+        self.remaining = 1.0
+        self.observation_space = with_numbers(env.observation_space, "budget", 1)
+
+    def _augmented(self, obs: Any) -> Any:
+        return join(self, self.env, obs, "budget", np.array([self.remaining]))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.remaining = 1.0
+        return self._augmented(obs), info
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: ``info`` lacks the cost, or it is not a number
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        cost = cost_of(info, self.cost_key)
+        self.remaining = (self.remaining - cost / self.budget) / self.discount
+        if self.unsafe_reward is not None and self.remaining < 0.0:
+            reward = self.unsafe_reward
+        return self._augmented(obs), reward, terminated, truncated, info
+
+
+class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
+    """End an episode that costs more than its budget, so that nothing is earned by overspending.
+
+    The early-terminated MDP of Sun et al. (2021): with it an algorithm for rewards alone respects
+    a limit, if rewards are positive. Where they are not, ending early is tempting, and
+    ``final_reward`` must make up for it. The step that overspends is ``terminated`` and has
+    ``info["budget_exceeded"]``; to spend the budget exactly is allowed.
+
+    It goes inside SB3's ``Monitor``, which otherwise never sees the episodes that are ended here:
+    a warning says so.
+
+    :param env: an environment that reports its cost; adapters go inside
+    :param budget: what an episode may cost, at least 0
+    :param final_reward: added to the reward of the step that overspends
+    :param cost_key: entry of ``info`` that is counted
+    :raises ValueError: an argument is out of its range
+    """
+
+    def __init__(
+        self, env: gym.Env, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, budget=budget, final_reward=final_reward, cost_key=cost_key
+        )
+        gym.Wrapper.__init__(self, env)
+        self.budget = check("budget", budget, 0.0)
+        self.final_reward = check("final_reward", final_reward)
+        self.cost_key = cost_key
+        self.episode_cost = 0.0
+        if _has_monitor(env):
+            warnings.warn(
+                "EarlyTermination is around a Monitor, which will not report the episodes that "
+                "overspend: wrap the environment before its monitor, as "
+                "sb3_guard.make_vec_env(..., wrapper_class=...) does; SB3's takes a function that "
+                "makes it wrapped",
+                UserWarning,
+                stacklevel=2,
+            )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        self.episode_cost = 0.0
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: ``info`` lacks the cost, or it is not a number
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self.episode_cost += cost_of(info, self.cost_key)
+        if self.episode_cost > self.budget:
+            terminated = True
+            reward = float(reward) + self.final_reward
+            info = {**info, "budget_exceeded": True}
+        return obs, reward, terminated, truncated, info
+
+
+class MaxCost(gym.Wrapper, RecordConstructorArgs):
+    """Show the agent the highest cost of a step so far, for limits on the worst step.
+
+    State-wise constrained policy optimisation (Zhao et al., 2023, arXiv 2306.12594) bounds
+    ``E[max_t c_t]``. With M_t, the highest cost before step t (0 at first), the increments
+    ``D_t = max(0, c_t - M_t)`` add up to the highest cost of the episode: an algorithm that limits
+    the sum of ``info["<key>_increase"]`` limits the worst step. M joins the observation as the
+    remaining budget does in :class:`RemainingBudget`, under the name ``"max_cost"``.
+
+    :param env: an environment that reports its costs
+    :param cost_keys: entries of ``info``, each with a maximum of its own
+    """
+
+    def __init__(self, env: gym.Env, cost_keys: Sequence[str] = ("cost",)) -> None:
+        RecordConstructorArgs.__init__(self, cost_keys=cost_keys)
+        gym.Wrapper.__init__(self, env)
+        self.cost_keys = tuple(cost_keys)
+        self.highest = np.zeros(len(self.cost_keys))
+        self.observation_space = with_numbers(
+            env.observation_space, "max_cost", len(self.cost_keys)
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.highest = np.zeros(len(self.cost_keys))
+        return join(self, self.env, obs, "max_cost", self.highest), info
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: ``info`` lacks a cost, or it is not a number
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        costs = np.array([cost_of(info, key) for key in self.cost_keys])
+        increase = np.maximum(costs - self.highest, 0.0)
+        self.highest = np.maximum(self.highest, costs)
+        named = zip(self.cost_keys, increase.tolist(), strict=True)
+        info = {**info, **{f"{key}_increase": value for key, value in named}}
+        obs = join(self, self.env, obs, "max_cost", self.highest)
+        return obs, reward, terminated, truncated, info

@@ -1,0 +1,212 @@
+"""The wrappers of ``budgets.py`` for all environments of a ``VecEnv`` at once.
+
+Row i is, bit for bit, what the wrapper of one environment makes of environment i, on the native
+batch at nearly its speed. They go inside or outside of ``CostMonitor``, and inside ``VecNormalize``
+and frame stacks.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_guard.common.budgets import check, costs_of, join, with_numbers
+
+
+def end_rows(venv: VecEnv, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
+    """End the episodes of some rows and begin new ones there.
+
+    :param rows: their numbers
+    :param infos: of the step that ended them; a monitor adds its statistics there
+    :return: observations, of which those of ``rows`` are new
+    :raises ValueError: a wrapper on the way knows nothing of episodes that others end
+    """
+    if hasattr(type(venv), "end_rows"):
+        return venv.end_rows(rows, infos)  # type: ignore[attr-defined]
+    if isinstance(venv, VecEnvWrapper):
+        raise ValueError(
+            f"VecEarlyTermination can't end single episodes of {type(venv).__name__}: it belongs "
+            "inside of it, next to the environments or CostMonitor"
+        )
+    begun = venv.env_method("reset", indices=rows)
+    observations: Any = [None] * venv.num_envs
+    for row, (obs, _) in zip(rows, begun, strict=True):
+        observations[row] = obs
+    return observations
+
+
+def replace_rows(obs: Any, rows: Sequence[int], new: Any) -> Any:
+    """A batch of observations with those of some rows replaced; the old one is left as it is."""
+    if isinstance(obs, dict):
+        listed = isinstance(new, list)
+        return {
+            key: replace_rows(value, rows, {r: new[r][key] for r in rows} if listed else new[key])
+            for key, value in obs.items()
+        }
+    replaced = obs.copy()
+    for row in rows:
+        replaced[row] = new[row]
+    return replaced
+
+
+class _Observing(VecEnvWrapper):
+    """Numbers of each row join its observation.
+
+    :param name: of the numbers
+    :param size: how many they are
+    """
+
+    def __init__(self, venv: VecEnv, name: str, size: int) -> None:
+        self.name = name
+        self.numbers = np.zeros((venv.num_envs, size))  # [N, size]
+        super().__init__(venv, with_numbers(venv.observation_space, name, size))
+
+    def first(self) -> float:
+        """What the numbers are when an episode begins."""
+        return 0.0
+
+    def reset(self) -> VecEnvObs:
+        self.numbers = np.full_like(self.numbers, self.first())
+        return join(self, self.venv, self.venv.reset(), self.name, self.numbers)
+
+    def joined(self, obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
+        """The observations of a step; rows whose episode ended begin with new numbers."""
+        for row in np.flatnonzero(dones):
+            last = infos[row]["terminal_observation"]
+            last = join(self, self.venv, last, self.name, self.numbers[row])
+            infos[row] = {**infos[row], "terminal_observation": last}
+        self.numbers = np.where(dones[:, None], self.first(), self.numbers)
+        return join(self, self.venv, obs, self.name, self.numbers)
+
+    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
+        """See :func:`end_rows`."""
+        new = end_rows(self.venv, rows, infos)
+        self.numbers[list(rows)] = self.first()
+        if not isinstance(new, list):
+            return join(self, self.venv, new, self.name, self.numbers)
+        pairs = enumerate(new)
+        return [
+            None if obs is None else join(self, self.venv, obs, self.name, self.numbers[row])
+            for row, obs in pairs
+        ]
+
+
+class VecRemainingBudget(_Observing):
+    """:class:`~sb3_guard.common.budgets.RemainingBudget` of every row (Sootla et al., 2022).
+
+    :param venv: environments that report their cost
+    :param budget: what an episode may cost, above 0
+    :param discount: discount factor of the costs, in (0, 1]
+    :param unsafe_reward: reward of the steps after the budget is overspent; None leaves rewards
+    :param cost_key: entry of ``info`` that is counted
+    :raises ValueError: an argument is out of its range
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        budget: float,
+        discount: float = 1.0,
+        unsafe_reward: float | None = None,
+        cost_key: str = "cost",
+    ) -> None:
+        self.budget = check("budget", budget, 0.0, above=True)
+        self.discount = check("discount", discount, 0.0, 1.0, above=True)
+        if unsafe_reward is not None:
+            unsafe_reward = check("unsafe_reward", unsafe_reward)
+        self.unsafe_reward = unsafe_reward
+        self.cost_key = cost_key
+        super().__init__(venv, "budget", 1)
+
+    def first(self) -> float:
+        return 1.0
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        costs = costs_of(infos, self.cost_key)
+        self.numbers = (self.numbers - costs[:, None] / self.budget) / self.discount
+        if self.unsafe_reward is not None:
+            unsafe = np.float32(self.unsafe_reward)
+            rewards = np.where(self.numbers[:, 0] < 0.0, unsafe, rewards)
+        infos = list(infos)
+        return self.joined(obs, dones, infos), rewards, dones, infos
+
+
+class VecMaxCost(_Observing):
+    """:class:`~sb3_guard.common.budgets.MaxCost` of every row (Zhao et al., 2023).
+
+    :param venv: environments that report their costs
+    :param cost_keys: entries of ``info``, each with a maximum of its own
+    """
+
+    def __init__(self, venv: VecEnv, cost_keys: Sequence[str] = ("cost",)) -> None:
+        self.cost_keys = tuple(cost_keys)
+        super().__init__(venv, "max_cost", len(self.cost_keys))
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        costs = np.stack([costs_of(infos, key) for key in self.cost_keys], axis=1)
+        increase = np.maximum(costs - self.numbers, 0.0).tolist()
+        self.numbers = np.maximum(self.numbers, costs)
+        names = [f"{key}_increase" for key in self.cost_keys]
+        infos = [
+            {**info, **dict(zip(names, row, strict=True))}
+            for info, row in zip(infos, increase, strict=True)
+        ]
+        return self.joined(obs, dones, infos), rewards, dones, infos
+
+
+class VecEarlyTermination(VecEnvWrapper):
+    """:class:`~sb3_guard.common.budgets.EarlyTermination` of every row (Sun et al., 2021).
+
+    :param venv: environments that report their cost, perhaps in a ``CostMonitor``, which then
+        reports the episodes that end here, without ``final_reward``
+    :param budget: what an episode may cost, at least 0
+    :param final_reward: added to the reward of the step that overspends
+    :param cost_key: entry of ``info`` that is counted
+    :raises ValueError: an argument is out of its range
+    """
+
+    def __init__(
+        self, venv: VecEnv, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
+    ) -> None:
+        super().__init__(venv)
+        self.budget = check("budget", budget, 0.0)
+        self.final_reward = check("final_reward", final_reward)
+        self.cost_key = cost_key
+        self.episode_costs = np.zeros(venv.num_envs)
+
+    def reset(self) -> VecEnvObs:
+        self.episode_costs = np.zeros(self.num_envs)
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        self.episode_costs += costs_of(infos, self.cost_key)
+        over = self.episode_costs > self.budget
+        if over.any():
+            infos = list(infos)
+            for row in np.flatnonzero(over).tolist():
+                more = {"budget_exceeded": True, "TimeLimit.truncated": False}
+                infos[row] = {**infos[row], **more}
+            rewards = np.where(over, rewards + np.float32(self.final_reward), rewards)
+            rows = np.flatnonzero(over & ~dones).tolist()
+            if rows:
+                for row in rows:
+                    last = (
+                        {key: value[row] for key, value in obs.items()}
+                        if isinstance(obs, dict)
+                        else obs[row]
+                    )
+                    infos[row]["terminal_observation"] = last
+                obs = replace_rows(obs, rows, end_rows(self.venv, rows, infos))
+            dones = dones | over
+        self.episode_costs[dones] = 0.0
+        return obs, rewards, dones, infos
+
+    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
+        """See :func:`end_rows`."""
+        self.episode_costs[list(rows)] = 0.0
+        return end_rows(self.venv, rows, infos)

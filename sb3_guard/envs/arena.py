@@ -1,0 +1,146 @@
+"""Where everything happens: the floor, what lights and shows it, and the physics options."""
+
+from __future__ import annotations
+
+import importlib.resources
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs.layout import Rectangle
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import ROBOT, Part, Robot, Simulation, World
+
+INTEGRATORS = {
+    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+WALL = 0.3  # m, height of walls as they are drawn around robots in the plane
+
+
+@dataclass
+class WorldSpec:
+    """The world under construction: floor, light, cameras and what the parts add.
+
+    :param robot: the robot that it is for
+    :param spec: the world, to which the parts add
+    """
+
+    robot: Robot
+    spec: mujoco.MjSpec
+
+    def feel(self, name: str, body: str, force: bool = False) -> None:
+        """Count contacts between any part of the robot and ``body``; 0 if there are none.
+
+        :param name: name of the sensor
+        :param body: name of a body in the world; the floor's and the walls' is ``"world"``
+        :param force: whether their net force is felt instead, [N, 3] N along the world's axes
+        """
+        found = [mujoco.mjtConDataField.mjCONDATA_FOUND, 0]  # no reduction
+        net = [mujoco.mjtConDataField.mjCONDATA_FORCE, 3]
+        data, reduction = net if force else found
+        self.spec.add_sensor(
+            name=name,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_XBODY,  # in contact sensors: the body's whole subtree
+            objname=self.robot.root,
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            refname=body,
+            intprm=[1 << int(data), int(reduction), 1],  # one slot
+        )
+
+
+@dataclass
+class Arena(Part):
+    """The square in which things are placed; nothing ends at its edge unless it has walls."""
+
+    name = "arena"
+
+    size: float = param(2.0, "half of its edge, m", above=0)
+    walls: str = param(
+        "none",
+        "solid: walls at its edge, which no robot passes; in space with a lid, an edge high",
+        choices=("none", "solid"),
+    )
+    timestep: float | None = param(
+        None, "of a physics step, s; null: the robot's, as for the next two", above=0
+    )
+    frame_skip: int | None = param(None, "physics steps in a control step", low=1)
+    integrator: str | None = param(
+        None, "how MuJoCo integrates a physics step", choices=(None, *INTEGRATORS)
+    )
+    condim: int = param(
+        3, "dimensions of friction of the floor and of objects", choices=(1, 3, 4, 6)
+    )
+
+    @property
+    def placements(self) -> tuple[Rectangle, ...]:
+        """Where what has no placements of its own is drawn, m."""
+        return ((-self.size, -self.size, self.size, self.size),)
+
+    def world(self, robot: Robot) -> WorldSpec:
+        """A world without parts yet: the robot's own, or a floor under the sky."""
+        spec = robot.world()
+        if spec is None:
+            file = importlib.resources.files("sb3_guard.envs") / "arena.xml"
+            spec = mujoco.MjSpec.from_string(file.read_text(encoding="utf-8"))
+        return WorldSpec(robot, spec)
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        spec, robot = world.spec, world.robot
+        timestep, integrator = self.timestep or robot.timestep, self.integrator or robot.integrator
+        if timestep is not None:
+            spec.option.timestep = timestep  # attach() keeps the parent's options
+        if integrator is not None:
+            spec.option.integrator = INTEGRATORS[integrator]
+        spec.default.geom.condim = self.condim
+        if self.walls == "none":
+            return
+        half, height = self.size, WALL / 2 if self.planar else self.size
+        # planes, which nothing tunnels through: they are drawn as large as said but have no end
+        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            _add_wall(spec, (half * x, half * y, height), (y, -x, 0), (0, 0, 1), (half, height))
+        if not self.planar:
+            _add_wall(spec, (0, 0, 2 * height), (1, 0, 0), (0, -1, 0), (half, half))
+
+    def bind(self, sim: Simulation) -> None:
+        """Refuse places beyond solid walls.
+
+        :raises ValueError: names the part and the place
+        """
+        super().bind(sim)
+        if self.walls == "none":
+            return
+        for name, footprint in sim.footprints.items():
+            for place in footprint.corners:
+                if abs(place).max() > self.size:
+                    raise ValueError(
+                        f"{name} may begin at {tuple(place.tolist())}, beyond the walls at "
+                        f"±{self.size} m: set arena={{'size': ...}}, or placements within"
+                    )
+
+
+def _add_wall(
+    spec: mujoco.MjSpec,
+    place: tuple[float, float, float],
+    right: tuple[float, float, float],
+    up: tuple[float, float, float],
+    half: tuple[float, float],
+) -> None:
+    """Add a wall that faces ``right`` × ``up`` and is drawn ``half`` as wide and high, m."""
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.column_stack([right, up, np.cross(right, up)]).ravel())
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=place,
+        quat=quat,
+        size=[*half, 1.0],
+        contype=ROBOT,
+        conaffinity=ROBOT,
+        condim=3,
+        rgba=[0.4, 0.45, 0.5, 0.4],
+    )

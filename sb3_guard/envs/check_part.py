@@ -1,0 +1,128 @@
+"""The contract of a part, checked once instead of in every step.
+
+:func:`check_part` runs a part in a small world of random subsets of rows and staggered resets, as
+Stable-Baselines3's ``check_env`` does with an environment. Registering a part calls it, and so may
+a test of yours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_guard.envs.parameters import PartError, misshapen
+
+if TYPE_CHECKING:
+    from sb3_guard.envs.engine import Engine
+    from sb3_guard.envs.part import Part
+
+Array = np.ndarray
+ROWS, STEPS = 3, 12
+
+
+def per_row(part: Part, verb: str, value: Any, rows: int, dtype: type = float) -> Array:
+    """What a verb of a part gave, [N], a copy: the part may keep and change its own.
+
+    :param rows: N
+    :raises PartError: it has another shape
+    """
+    out: Array = np.array(value, dtype=dtype)
+    if out.shape != (rows,):
+        raise PartError(misshapen(f"{verb} of {part.name}", out.shape, (rows,)))
+    return out
+
+
+def check_moving(part: Part, rows: int) -> None:
+    """Refuse movers that are none.
+
+    :param rows: N
+    :raises PartError: names the part and what it must give
+    """
+    from sb3_guard.envs.motion import Law, Moving
+
+    moving = part.moving()
+    for group in moving if isinstance(moving, tuple | list) else (moving,):
+        if not (
+            isinstance(group, Moving)
+            and isinstance(group.points, np.ndarray)
+            and isinstance(group.law, Law)
+        ):
+            raise PartError(
+                f"moving() of {part.name} gives {group!r}: it must be a tuple of "
+                "Moving(points, law, planar), of an array [N, K, 3] and a Law"
+            )
+        shape = group.points.shape
+        if len(shape) != 3 or (shape[0], shape[2]) != (rows, 3):
+            raise PartError(misshapen(f"moving() of {part.name}", shape, (rows, "K", 3)))
+
+
+def check_part(make: Callable[[int], Engine], name: str) -> None:
+    """Run a world and see whether one of its parts keeps the contract of :mod:`.part`.
+
+    Rows of a batch must be what lone simulations are, bit for bit; what is read twice must be the
+    same; and a restored state must continue as the saved one did.
+
+    :param make: makes an engine with the part and this number of rows
+    :param name: what to call the part in messages
+    :raises PartError: what is not so, and what to do
+    """
+    batch, lone, restored = make(ROWS), make(1), make(ROWS)
+    rng = np.random.default_rng(0)
+    watched = 1  # the row that is also simulated alone
+    for engine, first in ((batch, 0), (lone, watched), (restored, 7)):
+        for row in range(engine.num_envs):
+            engine.seed(row, np.random.default_rng(first + row))
+        engine.reset(np.arange(engine.num_envs))
+    size = batch.robot.action_size
+    low, high = batch.robot.action_range
+    for step in range(STEPS):
+        if step % 3 == 2:
+            ids = np.flatnonzero(rng.random(ROWS) < 0.5)
+            for engine in (batch, restored) if len(ids) else ():
+                engine.reset(ids)
+            if watched in ids:
+                lone.reset(np.zeros(1, dtype=np.int32))
+        if step == STEPS // 2:
+            restored.restore(batch.state())
+        actions = rng.uniform(low, high, (ROWS, size))
+        many, one = batch.step(actions), lone.step(actions[[watched]])
+        for what in ("obs", "reward", "cost", "terminated"):
+            if not np.array_equal(getattr(many, what)[watched], getattr(one, what)[0]):
+                raise PartError(
+                    f"{name}: {what} of a row of a batch differs from that of a lone simulation: "
+                    "use arithmetic elementwise along N, no matrix products, and draw from rngs[i] "
+                    "for row i only"
+                )
+        if step >= STEPS // 2:
+            other = restored.step(actions)
+            if not np.array_equal(other.obs, many.obs) or not np.array_equal(
+                other.reward + other.cost, many.reward + many.cost
+            ):
+                raise PartError(
+                    f"{name}: a restored state continues differently: take what is kept between "
+                    "steps by name, self.sim.array('name'), instead of keeping arrays of your own"
+                )
+        _check_reading(batch, name)
+
+
+def _check_reading(engine: Engine, name: str) -> None:
+    """Refuse verbs that change what they read.
+
+    :raises PartError: names the part
+    """
+    before = engine.state()
+    first = engine.observe()
+    for constraint in engine.constraints:
+        constraint.cost()
+    engine.task.measure()
+    after = engine.state()
+    same = np.array_equal(first, engine.observe()) and all(
+        np.array_equal(after["arrays"][key], value) for key, value in before["arrays"].items()
+    )
+    if not same or not np.array_equal(before["batch"], after["batch"]):
+        raise PartError(
+            f"{name}: observations(), cost() or measure() changes what it reads: change things in "
+            "before_step(), reset() or advance()"
+        )

@@ -1,0 +1,36 @@
+"""Boundary: lines that the robot can cross, but pays for being beyond."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array, Constraint
+
+
+@dataclass
+class Boundary(Constraint):
+    """Cost 1 while the robot's position is beyond \\|x\\| or \\|y\\| (Ji et al. 2023).
+
+    What is None is no boundary.
+    """
+
+    name = "boundary"
+    family = "safety_gymnasium"
+    trespassable = True
+    movable = "no"
+    space = "planar"
+    spaces = ("planar",)
+    color = (0.9, 0.7, 0.1)
+
+    x: float | None = param(1.125, "farthest from the y axis, m; null: anywhere", low=0)
+    y: float | None = param(None, "farthest from the x axis, m; null: anywhere", low=0)
+
+    def cost(self) -> Array:
+        beyond = np.zeros(self.sim.num_envs, dtype=bool)
+        for axis, limit in enumerate((self.x, self.y)):
+            if limit is not None:
+                beyond |= np.abs(self.sim.robot.position[:, axis]) > limit
+        return beyond.astype(float)

@@ -1,0 +1,46 @@
+"""Speed: a limit to how fast the robot may move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import Array, Constraint, Generators, Simulation
+
+
+@dataclass
+class Speed(Constraint):
+    """Cost 1 in each step in which the robot is faster than ``limit`` (Zhang et al. 2020).
+
+    Its speed is the distance that its position moved in the control step, divided by its duration.
+    """
+
+    name = "speed"
+    family = "velocity"
+    trespassable = True
+    movable = "no"
+    color = (0.9, 0.2, 0.1)
+
+    limit: float = param(1.0, "highest speed that is free, m/s")
+    axes: str = param(
+        "xy", "x: forwards along the x axis only; xy: in the plane", choices=("x", "xy")
+    )
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self._before = sim.array(f"{self.name}/before", (2,))
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        self._before[ids] = 0.0
+
+    def before_step(self) -> None:
+        self._before[:] = self.sim.robot.position[:, :2]
+
+    def cost(self) -> Array:
+        velocity = (self.sim.robot.position[:, :2] - self._before) / self.sim.control_step
+        speed = velocity[:, 0]
+        if self.axes == "xy":
+            speed = np.sqrt(velocity[:, 0] ** 2 + velocity[:, 1] ** 2)
+        return ((speed > self.limit) & (self.sim.steps > 0)).astype(float)

@@ -1,0 +1,314 @@
+"""Groups of like objects: placed together, seen by one lidar, felt if solid.
+
+A part *has* groups (:attr:`~sb3_guard.envs.part.Part.groups`). What the robot can pass through is
+plain places, no bodies: it costs the physics nothing. Solid objects are bodies, mocap ones where
+only their part moves them, free ones where the robot may, and free ones welded to a mocap body
+where both do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs import geometry
+from sb3_guard.envs.layout import Footprint
+from sb3_guard.envs.observation import Scan
+from sb3_guard.envs.part import (
+    FLOOR,
+    ROBOT,
+    Array,
+    Generators,
+    Painter,
+    Part,
+    Simulation,
+    World,
+)
+
+Shape = Callable[[mujoco.MjsBody], None]  # adds the geoms of one object to its body
+BOX = mujoco.mjtGeom.mjGEOM_BOX
+CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
+SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
+WELD = [0.02, 1.5]  # solref, s and damping ratio, of welded bodies
+MOST = 1000  # objects in a group: layouts compare every pair
+
+
+class Group:
+    """Like objects of a part: discs on the floor, spheres in the air, or solid bodies.
+
+    :param part: whose they are; its ``size``, ``placements``, ``locations``, ``margin``,
+        ``planar``, ``height`` and ``color`` are theirs
+    :param world: the world under construction
+    :param name: what they are called in layouts, observations and bodies
+    :param num: how many
+    :param keepout: radius kept clear around each, m; None: ``usual``, or ``cover`` if that is more
+    :param usual: keep-out of objects that it covers, m
+    :param cover: radius around its place that a solid object never leaves, m
+    :param shape: adds the geoms of a solid object, whose frame is its place; None: not solid
+    :param free: half height of solid objects that can be pushed, m; None: they stay
+    :param weld: whether those that can be pushed are pulled along by a mocap body
+    :param sink: how deep those that can be pushed begin in the floor, m; None: as they rest
+    :param reachable: whether they must lie within the robot's reach
+    :param footprint: further arguments of the :class:`~sb3_guard.envs.layout.Footprint`
+    """
+
+    def __init__(
+        self,
+        part: Any,
+        world: World,
+        name: str,
+        num: int,
+        keepout: float | None,
+        usual: float = 0.4,
+        cover: float = 0.0,
+        shape: Shape | None = None,
+        free: float | None = None,
+        weld: bool = False,
+        sink: float | None = None,
+        reachable: bool = False,
+        **footprint: Any,
+    ) -> None:
+        self.part: Part = part
+        self.name, self.size, self.solid = name, float(part.size), shape is not None
+        fields = {
+            "placements": part.placements,
+            "locations": part.locations,
+            "margin": part.margin,
+            "height": 0.0 if part.planar else part.height,
+            "reach": world.robot.reach if reachable else math.inf,
+            "base": world.robot.base,
+            "cover": cover if shape else 0.0,
+            "label": f"{part.name}.keepout",
+            **footprint,
+        }
+        clear = max(usual, fields["cover"]) if keepout is None else keepout
+        self.footprint = Footprint(name, num, clear, **fields)
+        number = num if shape else 0
+        self.bodies = Bodies(world, name, number, shape or _no_shape, free, weld, sink)
+
+    def bind(self, sim: Simulation) -> None:
+        """Take live views: ``places``, where they were put, and ``centers``, [N, num, 3] m."""
+        self.bodies.bind(sim)
+        self.places = sim.places(self.name)
+        self.centers = self.bodies.positions if self.solid else self.places
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        """Set solid objects down at their places in rows ``ids``."""
+        if self.solid:
+            self.bodies.put(ids, self.places[ids], rngs)
+
+    def scan(self, visible: Array | None = None) -> Scan:
+        """What lidar sees of them, in all rows or in the ``visible`` ones, [N] bool."""
+        return Scan(self.centers, self.part.planar, visible=visible)
+
+    def draw(self, painter: Painter, row: int) -> None:
+        """Draw one row's objects that are not bodies."""
+        if not self.solid:
+            for center in self.centers[row]:
+                half_height = 0.01 if self.part.planar else 0.0
+                painter.zone(center, self.size, half_height, self.part.color)
+
+
+def _no_shape(body: mujoco.MjsBody) -> None:
+    """No geoms."""
+
+
+class Bodies:
+    """Solid objects as bodies of the world, each with a sensor for the robot's touch.
+
+    :param world: the world under construction
+    :param name: what the bodies are called, followed by their number
+    :param num: how many
+    :param shape: adds the geoms of one body
+    :param free: half height of bodies that can be pushed, m; None: they stay where they are put
+    :param weld: whether each is welded, softly, to a mocap body below it
+    :param sink: how deep free ones begin in the floor, m; None: as they rest
+    :raises ValueError: another part's bodies have this name
+    """
+
+    def __init__(
+        self,
+        world: World,
+        name: str,
+        num: int,
+        shape: Shape,
+        free: float | None = None,
+        weld: bool = False,
+        sink: float | None = None,
+    ) -> None:
+        if num and world.spec.body(f"{name}/0") is not None:
+            raise ValueError(
+                f"two parts have bodies called {name!r}; give the constraint another name"
+            )
+        self.name, self.num, self.free = name, num, free is not None
+        self._height = 0.0
+        if free is not None:
+            timestep = world.spec.option.timestep
+            rest = resting_height(shape, free, timestep) if sink is None else free - sink
+            self._height = rest
+        for i in range(num):
+            body = world.spec.worldbody.add_body(name=f"{name}/{i}", mocap=not self.free)
+            if self.free:
+                body.add_freejoint()
+            shape(body)
+            world.feel(f"{name}/{i}", body=f"{name}/{i}")
+        self._mover = f"{name}/0/mover" if weld and num else ""
+        self._lift = free if weld and free else 0.0
+        for i in range(num if weld else 0):
+            world.spec.worldbody.add_body(name=f"{name}/{i}/mover", mocap=True)
+            world.spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_WELD,
+                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                name1=f"{name}/{i}/mover",
+                name2=f"{name}/{i}",
+                solref=WELD,
+                data=[0, 0, 0, 0, 0, self._lift, 1, 0, 0, 0, 1, 0],  # anchor, offset, turn, torque
+            )
+
+    def bind(self, sim: Simulation) -> None:
+        """Take live views: ``positions`` [N, num, 3] m, and ``velocities``, m/s, of free bodies."""
+        model, batch, k = sim.model, sim.batch, self.num
+        if k == 0:
+            self.positions = self.velocities = np.zeros((sim.num_envs, 0, 3))
+            self._places = self._movers = self.positions
+            self._turns, self._found = np.zeros((sim.num_envs, 0, 4)), np.zeros((sim.num_envs, 0))
+            return
+        body = model.body(f"{self.name}/0")
+        self.positions = batch.bind("xpos")[:, body.id : body.id + k]
+        first = int(model.sensor(f"{self.name}/0").adr[0])
+        self._found = batch.bind("sensordata")[:, first : first + k]
+        if self.free:
+            first = int(body.jntadr[0])
+            q, v = int(model.jnt_qposadr[first]), int(model.jnt_dofadr[first])
+            pose = batch.bind("qpos")[:, q : q + 7 * k].reshape(-1, k, 7)
+            self._places, self._turns = pose[..., :3], pose[..., 3:]
+            self.velocities = batch.bind("qvel")[:, v : v + 6 * k].reshape(-1, k, 6)[..., :3]
+        else:
+            first = int(model.body_mocapid[body.id])
+            self._places = batch.bind("mocap_pos")[:, first : first + k]
+            self._turns = batch.bind("mocap_quat")[:, first : first + k]
+        self._movers = self._places
+        if self._mover:
+            first = int(model.body_mocapid[model.body(self._mover).id])
+            self._movers = batch.bind("mocap_pos")[:, first : first + k]
+            self._mover_turns = batch.bind("mocap_quat")[:, first : first + k]
+
+    @property
+    def touched(self) -> Array:
+        """Which bodies the robot touches, [N, num] bool."""
+        return self._found > 0
+
+    def put(self, ids: Array, places: Array, rngs: Generators) -> None:
+        """Set bodies down in rows ``ids`` at [n, num, 3] m, each with a random heading."""
+        self._places[ids] = places
+        self._places[ids, :, 2] += self._height
+        for i in ids.tolist():
+            heading = rngs[i].uniform(0, 2 * math.pi, self.num)
+            self._turns[i] = geometry.yaw_quaternion(heading)
+        if self._mover:
+            self._mover_turns[ids] = self._turns[ids]
+            self.move(places, ids)
+
+    def move(self, places: Array, rows: Array | slice = slice(None)) -> None:
+        """Move bodies, those that cannot be pushed or what they are welded to, in these rows.
+
+        :param places: [n, num, 3] m
+        """
+        self._movers[rows] = places
+        self._movers[rows, :, 2] += self._lift
+
+
+def resting_height(shape: Shape, half_height: float, timestep: float) -> float:
+    """Height at which a free body lies still on the floor, m.
+
+    Contacts are soft: set down anywhere else it would bounce when an episode begins.
+
+    :param shape: adds the geoms of the body
+    :param half_height: of the body, m
+    :param timestep: s; how soft depends on it
+    """
+    spec = mujoco.MjSpec()
+    spec.option.timestep = timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=FLOOR, conaffinity=FLOOR
+    )
+    body = spec.worldbody.add_body(pos=[0, 0, half_height])
+    body.add_freejoint()
+    shape(body)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, nstep=1000)
+    return float(data.qpos[2])
+
+
+def add_geom(
+    body: mujoco.MjsBody,
+    kind: mujoco.mjtGeom,
+    size: tuple[float, ...],
+    color: tuple[float, float, float],
+    lift: float = 0.0,
+    free: bool = False,
+) -> mujoco.MjsGeom:
+    """Add a geom that robots bump into.
+
+    :param body: whose geom
+    :param kind: its shape
+    :param size: MuJoCo's sizes of this shape, m
+    :param color: red, green, blue
+    :param lift: height over the frame of ``body``, m
+    :param free: whether it lies on the floor, too
+    """
+    bits = ROBOT | FLOOR if free else ROBOT
+    return body.add_geom(
+        type=kind,
+        size=[*size, 0.0, 0.0][:3],
+        pos=[0.0, 0.0, lift],
+        rgba=[*color, 1.0],
+        contype=bits,
+        conaffinity=bits,
+    )
+
+
+def check_reachable(part: Part, near: float, everywhere: bool) -> None:
+    """Refuse to hang what a robot on the floor cannot get to.
+
+    :param part: whose ``height`` it is
+    :param near: how near to the objects the robot's position has to come, m
+    :param everywhere: whether this has to be so at every height of the range, not only at one
+    :raises ValueError: names the heights that are near enough
+    """
+    if part.planar or part.sim.robot.workspace != "planar":
+        return
+    z, (low, high) = part.sim.robot.altitude, part.height
+    gap = max(z - low, high - z) if everywhere else max(z - high, low - z)
+    if gap >= near:
+        raise ValueError(
+            f"{part.name}.height = {part.height!r} is out of reach: the robot's position is "
+            f"{z:.2f} m above the floor, and only heights between {max(z - near, 0.0):.2f} and "
+            f"{z + near:.2f} m count; set {part.name}={{'height': [low, high]}} within these, "
+            "or {'space': 'planar'}"
+        )
+
+
+def check_size(part: Part, footprint: str, size: float) -> None:
+    """Refuse what would hold the robot wherever an episode began.
+
+    :param part: whose ``height`` it is
+    :param footprint: where the objects are placed
+    :param size: their radius, m
+    :raises ValueError: names the size below which it does not
+    """
+    robot, (low, high) = part.sim.robot, part.height
+    z = robot.altitude
+    rise = 0.0 if part.planar else max(abs(z - low), abs(z - high))
+    far = math.hypot(part.sim.farthest(footprint, "robot") + robot.offset, rise)
+    if size >= far:
+        raise ValueError(
+            f"{part.name}.size = {size} holds the robot wherever an episode begins: it is at "
+            f"most {far:.2f} m away; make size smaller, or placements larger"
+        )

@@ -1,0 +1,106 @@
+"""Objects that move by themselves: ghosts, and the targets of Chase and Defense."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs import motion
+from sb3_guard.envs.groups import CYLINDER, SPHERE, add_geom
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.part import HEIGHT, SPACE, Part, Simulation, World
+
+
+@dataclass
+class Movers(Part):
+    """Objects that chase the robot or flee from it (Zhao et al. 2024, §4).
+
+    Speeds are metres per control step under ``speed_law="unit"`` and, with the paper's equations,
+    ``"proportional"``, fractions of the distance per control step. Speeds that would jump to and
+    fro across what they lead to are refused. A subclass states its :meth:`law` of motion. Their z
+    stays within ``height``.
+    """
+
+    space: str | None = SPACE
+    height: tuple[float, float] = HEIGHT
+    solid: bool = param(False, "whether they are bodies that push; false: the robot passes through")
+    speed: float = param(
+        1e-3, "m per control step; what the other speeds default to multiples of", low=0
+    )
+    speed_law: str = param(
+        "unit",
+        "speeds along unit vectors, or proportional: as shares of the distance per control step",
+        choices=("unit", "proportional"),
+    )
+    v0: float | None = param(None, "speed home from beyond r0; null: speed", low=0)
+    r0: float = param(2.5, "radius around the origin that they do not leave, m", low=0)
+    origin: tuple[float, float, float] = param((0.0, 0.0, 0.0), "where home is, (x, y, z) m")
+
+    def build(self, world: World) -> None:
+        super().build(world)
+        if self.solid and not self.planar and self.height[0] < self.size:
+            raise ValueError(
+                f"{self.name}.height = {self.height!r}: solid ones of size {self.size} would stick "
+                f"in the floor; the lowest height must be at least {self.size}"
+            )
+
+    def law(self) -> motion.Law:
+        """How they move."""
+        raise NotImplementedError
+
+    def _law(self, **speeds: float) -> motion.Law:
+        """A law of motion with what all movers have in common."""
+        return motion.Law(
+            home=self.speed if self.v0 is None else self.v0,
+            apart=self.speed,
+            gap=2 * self.size,
+            r0=self.r0,
+            origin=self.origin,
+            unit=self.speed_law == "unit",
+            **speeds,
+        )
+
+    def shape(self, body: mujoco.MjsBody) -> None:
+        if self.planar:
+            size = (self.size, self.size / 2)
+            add_geom(body, CYLINDER, size, self.color, lift=self.size / 2)
+        else:
+            add_geom(body, SPHERE, (self.size,), self.color)
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self.group.centers = self.group.places  # which move, and bodies after them
+        law = self.motion = self.law()
+        fastest = max(abs(law.near), abs(law.far), law.settle, law.home)
+        if not law.unit and fastest > 1.0:
+            raise ValueError(
+                f"{self.name}: under speed_law 'proportional' speeds are shares of the distance "
+                f"and must be at most 1, but the fastest is {fastest:g}: lower speed, or v0, v1, v2"
+            )
+        # A step of up to twice the radius at which a mover stops ends within it. Where that is 0 it
+        # goes to and fro over its aim, and by no more than its size still lies on it.
+        aims = (
+            ("the robot", law.near, 0.0),
+            ("the robot", law.far, law.r1),
+            ("the origin", law.settle, 0.0),
+            ("the origin", law.home, law.r0),
+        )
+        for aim, speed, stop in aims if law.unit else ():
+            most = max(2 * stop, self.size)
+            if speed > most:
+                raise ValueError(
+                    f"{self.name}: with {speed:g} m per control step towards {aim} they would jump "
+                    f"across it for ever: at most {most:g} m; lower speed, or v0, v1, v2"
+                )
+
+    def moving(self) -> tuple[motion.Moving, ...]:
+        return (motion.Moving(self.group.places, self.motion, self.planar),)
+
+    def before_step(self) -> None:
+        if not self.planar:
+            z, (low, high) = self.group.places[..., 2], self.height
+            np.minimum(np.maximum(z, low), high, out=z)
+        if self.solid:
+            self.group.bodies.move(self.group.places)

@@ -1,0 +1,34 @@
+"""What one control step brings, for the gymnasium classes to hand on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sb3_guard.envs.part import Array
+
+
+@dataclass
+class Outcome:
+    """What one control step brought to each row.
+
+    :param obs: observation, [N, D] float32
+    :param reward: [N]
+    :param costs: cost per constraint type, [N] each, under the names of their info keys
+    :param cost: the sum of the costs, [N]
+    :param goal_met: whether the goal was reached in this step, [N] bool
+    :param terminated: a part ended the episode, the goal was its end or the physics diverged,
+        [N] bool
+    :param ended_by: by a part's name, the rows that it was the first to end, [N] bool each
+    :param unplaced: no room was left for the next goal: the episode is to be cut, [N] bool
+    :param physics_error: the physics diverged, [N] bool
+    """
+
+    obs: Array
+    reward: Array
+    costs: dict[str, Array]
+    cost: Array
+    goal_met: Array
+    terminated: Array
+    unplaced: Array
+    physics_error: Array
+    ended_by: dict[str, Array]

@@ -1,0 +1,173 @@
+"""The simulations of a world: the one module that knows :mod:`mujoco.batch`.
+
+It advances them by control steps, evaluates the sensors once in each, and tells which simulations
+diverged.
+"""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+Array = np.ndarray
+FRAME_SKIP = 10
+ACC = int(mujoco.mjtStage.mjSTAGE_ACC)  # touch, accelerometer and contacts describe the new state
+NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
+SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+# CONTACTFULL, CNSTRFULL, BADQPOS, BADQVEL, BADQACC: the result is not to be trusted
+_BAD = slice(int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
+
+
+class Physics(Batch):
+    """A persistent :class:`mujoco.batch.Batch` that advances by control steps.
+
+    ``step`` evaluates the sensors in every physics step, which takes up to a sixth of an arm's
+    time, though they are read when the control step ends. Here they are switched off until then,
+    with the same results bit for bit. The switch is in a copy of the model that the batch runs on.
+    Every physics step evaluates the sensors where that copy cannot be, because someone gives
+    simulations fields or models of their own; where it could make a difference, because sensors
+    have a history, bodies sleep, plugins read sensors or nothing is computed at the new state; and
+    for a lone simulation, where it gains little. A physics callback in C (``mjcb_control``) reads
+    them as of the last control step.
+
+    :param model: the model
+    :param nsim: number of simulations N
+    :param nthread: threads that step them
+    :param frame_skip: physics steps in a control step
+    :param stage: what is computed at the new state when a control step ends, a
+        :class:`mujoco.mjtStage`; ``NONE`` leaves positions, velocities and sensors as of the last
+        physics step's beginning, as :func:`mujoco.mj_step` does
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        nsim: int,
+        nthread: int,
+        frame_skip: int = FRAME_SKIP,
+        stage: int = ACC,
+    ) -> None:
+        _silence_profiler()
+        mujoco.set_mju_user_warning(_ignore_warning)
+        super().__init__(model, nsim, nthread, persistent=True)
+        self.frame_skip, self.stage = frame_skip, stage
+        self._switched: mujoco.MjModel | None = None
+        sleep = model.opt.enableflags & SLEEP
+        if nsim > 1 and stage != NONE and not (model.nhistory or model.nplugin or sleep):
+            self._switched = copy.copy(model)
+            super().set_models(self._switched)
+            self._models = None  # not the caller's: named views write per-simulation fields
+        self._warnings = self.warning[:, _BAD, 1]  # live counts since the batch was made
+        self._warned = self._warnings.copy()
+
+    def advance(self, before: Callable[[], None] | None = None) -> Array:
+        """Advance every simulation by one control step.
+
+        :param before: called before every physics step, to move what moves by itself; None:
+            nothing moves within the control step
+        :return: which simulations diverged or were given up, [N] bool; they are to be reset
+        """
+        failed = np.zeros(self.nsim, dtype=bool)
+        if self._switched is None:
+            self._steps(failed, before, self.stage)
+        else:
+            option = self._switched.opt
+            flags = option.disableflags
+            option.disableflags = flags | SENSOR
+            try:
+                self._steps(failed, before, NONE)
+            finally:
+                option.disableflags = flags
+            _run(self.forward, failed, stage=self.stage)
+        changed = self._warnings != self._warned
+        if np.count_nonzero(changed):  # MuJoCo has reset these simulations by itself
+            failed |= changed.any(axis=1)
+            self._warned[:] = self._warnings
+        return failed
+
+    def _steps(self, failed: Array, before: Callable[[], None] | None, stage: int) -> None:
+        """The physics steps of a control step, then ``stage`` at the new state."""
+        if before is None:
+            _run(self.step, failed, nstep=self.frame_skip, stage=stage)
+            return
+        for left in range(self.frame_skip)[::-1]:
+            before()
+            _run(self.step, failed, nstep=1, stage=NONE if left else stage)
+
+    def clear(self, ids: Array) -> None:
+        """Set simulations ``ids`` to the model's initial state, to be written before :meth:`begin`.
+
+        :param ids: [n]
+        """
+        self.reset(ids, stage=NONE)
+
+    def begin(self, ids: Array) -> None:
+        """Compute everything at the state just written to simulations ``ids``, [n]."""
+        self.forward(ids, stage=ACC)
+        self._warned[ids] = self._warnings[ids]
+
+    def restore(self, state: Array) -> None:
+        """Continue from a copy of ``state``, bit for bit."""
+        self.state[:] = state
+        self.forward(stage=ACC)
+        self.state[:] = state  # without the solver's warm start of the new computation
+        self._warned[:] = self._warnings
+
+    def expand(self, name: str) -> Array:
+        self._release()
+        values: Array = super().expand(name)
+        return values
+
+    def set_const(self, ids: Any = None) -> None:
+        self._release()
+        super().set_const(ids)
+
+    def set_models(self, models: mujoco.MjModel | Sequence[mujoco.MjModel] | None) -> None:
+        super().set_models(models)
+        self._switched = None  # not before: the batch reads it as long as the call may fail
+
+    def _release(self) -> None:
+        """Run on the batch's own model again: only its fields can differ between simulations."""
+        if self._switched is not None:
+            self.set_models(None)
+
+
+def _run(call: Callable[..., None], failed: Array, **arguments: int) -> None:
+    """Call the batch; mark the simulations, [N] bool, that MuJoCo gives up."""
+    try:
+        call(**arguments)
+    except SimulationError as error:
+        failed[error.ids] = True
+
+
+def _ignore_warning(message: str) -> None:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT: the warning counters are read instead."""
+
+
+def profiling_clock() -> ctypes.c_void_p | None:
+    """Where MuJoCo keeps the clock that its Python bindings install; None if it is not found."""
+    for path in Path(mujoco.__file__).parent.glob("*mujoco*"):
+        if path.name.startswith(("libmujoco", "mujoco.dll")):
+            try:
+                return ctypes.c_void_p.in_dll(ctypes.CDLL(str(path)), "mjcb_time")
+            except (OSError, ValueError):
+                continue
+    return None
+
+
+def _silence_profiler() -> None:
+    """Remove the profiling clock, which slows short steps by 5 to 44 %.
+
+    Only the timers of MjData lose their values; the simulation is the same.
+    """
+    clock = profiling_clock()
+    if clock is not None:
+        clock.value = None

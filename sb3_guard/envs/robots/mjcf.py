@@ -1,0 +1,141 @@
+"""A robot's MJCF file on its way into a world: read, looked over, given its contact bits."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs.part import FLOOR, ROBOT
+
+SHIFT = 2  # a robot's own contact bits begin after ROBOT and FLOOR
+NEAR = 1e-6  # m: geoms whose height is fixed meet the floor if they are as near
+_PLANE = mujoco.mjtGeom.mjGEOM_PLANE
+_FREE, _SLIDE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE
+
+
+def read(path: Path, root: str, complete: bool) -> mujoco.MjSpec:
+    """A robot's file.
+
+    :param root: name of the robot's outermost body
+    :param complete: whether the file is a whole world
+    :raises ValueError: it cannot be read, has no such body, or has a floor that it must not have
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compile()  # attach() drops without a word what refers to something missing
+    except ValueError as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+    if spec.body(root) is None:
+        raise ValueError(f"{path} has no body called {root!r}: call its outermost so")
+    floors = [geom.name for geom in spec.worldbody.geoms if geom.type == _PLANE]
+    if floors and not complete:
+        raise ValueError(
+            f"{path} has a floor, geom {floors[0]!r}, and the arena has one: take it out, or keep "
+            f"the file's own world with complete=True, root={root!r}"
+        )
+    return spec
+
+
+def honour_options(option: mujoco.MjOption, world: mujoco.MjOption) -> None:
+    """Set in ``world`` what the ``<option>`` of a file sets to something else than its default."""
+    usual = mujoco.MjSpec().option
+    for name in dir(usual):
+        value = getattr(usual, name)
+        if not name.startswith("_") and not callable(value):
+            own = getattr(option, name)
+            if not np.array_equal(own, value):
+                setattr(world, name, own)
+
+
+def set_contact_bits(spec: mujoco.MjSpec, floor: bool, label: str) -> None:
+    """Let a robot's geoms meet the objects of a world, and its floor where they can come near it.
+
+    The bits of the file keep saying which of its geoms meet each other. A geom without bits meets
+    nothing. The floor is left out by geoms that slide at a fixed height above it: each pair of a
+    planar robot with the floor costs time.
+
+    :param spec: the robot
+    :param floor: whether it meets the floor at all
+    :param label: what to call the robot in messages
+    :raises ValueError: the robot would fall forever
+    """
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    if model.nkey:
+        data.qpos[:] = model.key_qpos[0]
+    mujoco.mj_kinematics(model, data)
+    low = _lowest(model, data)
+    supported = False
+    for i, geom in enumerate(sorted(spec.geoms, key=lambda g: g.id)):
+        if not geom.contype and not geom.conaffinity:
+            continue
+        meets = floor and (_rises(model, data, int(model.geom_bodyid[i])) or low[i] <= NEAR)
+        supported |= meets
+        if max(geom.contype, geom.conaffinity) >= 1 << (31 - SHIFT):
+            raise ValueError(f"{label}: contact bits of geom {geom.name!r} must be below 2^29")
+        geom.contype <<= SHIFT
+        geom.conaffinity = geom.conaffinity << SHIFT | ROBOT | (FLOOR if meets else 0)
+    if not supported and _FREE in model.jnt_type:
+        raise ValueError(
+            f"{label} has a free joint, but no geom that meets the floor: it would fall forever; "
+            'give one contype="1" conaffinity="1", or the robot other joints'
+        )
+
+
+def _lowest(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Height of each geom's lowest point, with its margin, or less, [ngeom] m."""
+    rotation = data.geom_xmat.reshape(-1, 3, 3)
+    middle = np.einsum("gij,gj->gi", rotation, model.geom_aabb[:, :3]) + data.geom_xpos
+    sunk = np.einsum("gj,gj->g", np.abs(rotation[:, 2]), model.geom_aabb[:, 3:])
+    round_ones = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    sunk[round_ones] = model.geom_size[round_ones, 0]
+    lowest: np.ndarray = middle[:, 2] - sunk - model.geom_margin
+    return lowest
+
+
+def _rises(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
+    """Whether a joint may change the height of a body's points."""
+    while body:
+        first = int(model.body_jntadr[body])
+        for joint in range(first, first + int(model.body_jntnum[body])):
+            level = abs(data.xaxis[joint, 2])
+            kind = model.jnt_type[joint]
+            if kind == _SLIDE and level > 1e-9:
+                return True
+            if kind != _SLIDE and (kind != mujoco.mjtJoint.mjJNT_HINGE or level < 1 - 1e-9):
+                return True
+        body = int(model.body_parentid[body])
+    return False
+
+
+def extent(model: mujoco.MjModel, root: int, center: int) -> float:
+    """How far from the origin of body ``center`` any geom may reach, whatever the joints do, m.
+
+    Joints of the root place the robot; one that lifts it has no bound.
+    """
+    reach = {root: 0.0}  # m, of a body's origin from the root's
+    outermost = 0.0
+    for body in range(root, model.nbody):
+        if body != root:
+            parent = int(model.body_parentid[body])
+            if parent not in reach:
+                continue
+            reach[body] = reach[parent] + float(np.linalg.norm(model.body_pos[body]))
+        first = int(model.body_jntadr[body])
+        for joint in range(first, first + int(model.body_jntnum[body])):
+            if model.jnt_type[joint] == _SLIDE:
+                if body == root and not model.jnt_axis[joint][2]:
+                    continue
+                if body == root or not model.jnt_limited[joint]:
+                    return math.inf
+                reach[body] += float(np.abs(model.jnt_range[joint]).max())
+            elif body != root:  # the origin turns about the anchor
+                reach[body] += 2 * float(np.linalg.norm(model.jnt_pos[joint]))
+        first = int(model.body_geomadr[body])
+        for geom in range(first, first + int(model.body_geomnum[body])):
+            size = float(np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom])
+            outermost = max(outermost, reach[body] + size)
+    return outermost + reach[center]

@@ -1,18 +1,17 @@
 """CPO: trust-region steps that keep the linearised cost limits."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_guard.algorithms.common.checks import check_number
+from sb3_guard.algorithms.common.margin import Margin
 from sb3_guard.algorithms.common.natural_gradient import Case, constrained_step
-from sb3_guard.algorithms.common.trust_region import Region, Trial, TrustRegion
+from sb3_guard.algorithms.common.trust_region import Region, Trial
 
 
-class CPO(TrustRegion):
+class CPO(Margin):
     """Constrained policy optimisation (Achiam et al., 2017, arXiv 1705.10528).
 
     ::
@@ -24,30 +23,29 @@ class CPO(TrustRegion):
     solved exactly at each update. From a policy that no step within the trust region can make
     feasible, the step lowers the violation as much as the region allows: of several limits,
     ``Σ max(0, c_i + b_iᵀx)²``. Until the limits hold, the line search asks for less cost, or less
-    of that sum, and not for more reward.
+    of that sum, and not for more reward. The limits are kept with a learnt margin
+    (:class:`~sb3_guard.algorithms.common.margin.Margin`), which the paper does not have.
 
-    :param policy: policy class or its alias
-    :param env: environment or its id
-    :param learning_rate: of the critics
     :param cost_reduction: smallest decrease of a violated cost surrogate that the line search
         accepts, in cost per step; never more than the violation itself. Where several limits can't
         be reached, of the root of the sum above
-
-    Other parameters are those of :class:`TrustRegion`.
     """
+
+    label, family, paper = "CPO", "CPO-based", "Achiam et al. 2017"
+    search_space: ClassVar[dict[str, Any]] = {
+        "margin_lr": [0.0, 0.05, 0.1, 0.2],
+        "cost_reduction": {"low": 0.0, "high": 0.02},
+    }
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        *,
+        *args: Any,
         cost_reduction: float = 0.0,
         **kwargs: Any,
     ) -> None:
         self.cost_reduction = cost_reduction
         self._case = Case.INACTIVE
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -63,8 +61,7 @@ class CPO(TrustRegion):
         return x
 
     def accept(self, trial: Trial) -> bool:
-        assert self.costs is not None
-        c, change = self.costs.violation, trial.cost_change
+        c, change = self.violation(), trial.cost_change
         if self._case is Case.LOST and len(c) > 1:
             # Limits that contradict each other: less of one violation may be more of another.
             now, then = (float(np.linalg.norm(each.clip(min=0.0))) for each in (c, c + change))

@@ -1,18 +1,17 @@
 """PCPO: a TRPO step, then a projection onto the cost limits."""
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_guard.algorithms.common.checks import check_choice
+from sb3_guard.algorithms.common.margin import Margin
 from sb3_guard.algorithms.common.natural_gradient import projected_step
-from sb3_guard.algorithms.common.trust_region import Region, Trial, TrustRegion
+from sb3_guard.algorithms.common.trust_region import Region, Trial
 
 
-class PCPO(TrustRegion):
+class PCPO(Margin):
     """Projection-based constrained policy optimisation (Yang et al., 2020, arXiv 2010.03152).
 
     ::
@@ -22,31 +21,31 @@ class PCPO(TrustRegion):
 
     g and B are the gradients of E[ratio · A] and E[ratio · A_C], c the violations (J_C - d) / T, F
     the Fisher matrix, and L is F or I. The projection knows no trust region: it may ask for more
-    than δ. The line search therefore shortens x until KL ≤ δ, and asks for nothing else.
+    than δ. The line search therefore shortens x until KL ≤ δ, and asks for nothing else. The limits
+    are kept with a learnt margin (:class:`~sb3_guard.algorithms.common.margin.Margin`), which the
+    paper does not have.
 
-    :param policy: policy class or its alias
-    :param env: environment or its id
-    :param learning_rate: of the critics
     :param projection: ``"kl"`` for L = F, ``"l2"`` for L = I
     :param line_search: whether to shorten steps that leave the trust region; False takes them
         whole, as the paper does
-
-    Other parameters are those of :class:`TrustRegion`.
     """
+
+    label, family, paper = "PCPO", "CPO-based", "Yang et al. 2020"
+    search_space: ClassVar[dict[str, Any]] = {
+        "projection": ["kl", "l2"],
+        "margin_lr": [0.0, 0.05, 0.1, 0.2],
+    }
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        *,
+        *args: Any,
         projection: Literal["kl", "l2"] = "kl",
         line_search: bool = True,
         **kwargs: Any,
     ) -> None:
         self.projection = projection
         self.line_search = line_search
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

@@ -1,9 +1,6 @@
 """TRPO: the baseline, which maximises return and ignores cost."""
 
-from typing import Any, ClassVar, Literal
-
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from typing import Any, Literal
 
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
@@ -17,24 +14,18 @@ class TRPO(TrustRegion):
 
     Costs are logged where the environment reports them, and change nothing.
 
-    :param policy: policy class or its alias
     :param env: environment or its id; it need not report a cost
-    :param learning_rate: of the critics
     :param missing_cost: ``"zero"`` runs on any environment, ``"error"`` asks for the cost keys
-
-    Other parameters are those of :class:`TrustRegion`.
     """
 
-    constrained: ClassVar[bool] = False
-    uses_cost_critic: ClassVar[bool] = False
+    label, family, paper = "TRPO", "unconstrained", "Schulman et al. 2015"
+
+    constrained, uses_cost_critic = False, False
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        *,
+        *args: Any,
         missing_cost: Literal["error", "zero"] = "zero",
         **kwargs: Any,
     ) -> None:
-        super().__init__(policy, env, learning_rate, missing_cost=missing_cost, **kwargs)
+        super().__init__(*args, missing_cost=missing_cost, **kwargs)

@@ -1,17 +1,72 @@
 """TRPO-FAC: a Lagrangian whose price of the cost depends on the state."""
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import update_learning_rate
+from torch import nn
+from torch.nn import functional as F
 
+from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
 from sb3_guard.algorithms.common.costs import discounted_limit
-from sb3_guard.algorithms.common.multipliers import StateMultiplier
+from sb3_guard.algorithms.common.critics import StateNetwork
 from sb3_guard.algorithms.common.trust_region import TrustRegion
+
+
+class StateMultiplier(nn.Module):
+    """λ_i(s) ≥ 0 for each constraint: networks of the observation with a softplus output.
+
+    :param policy: the policy whose extractor and architecture each network copies
+    :param n_costs: number m of constraints, and of networks
+    :param rate: learning rate of their Adam
+    :param init: λ that a network without inputs would start at; None leaves the output bias as it
+        was drawn, which starts λ near log 2 ≈ 0.69
+    """
+
+    def __init__(
+        self,
+        policy: ActorCriticPolicy,
+        n_costs: int,
+        rate: float,
+        init: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.networks = nn.ModuleList(StateNetwork(policy, 1) for _ in range(n_costs))
+        if init is not None:
+            for network in self.networks:
+                *_, last = network.parameters()
+                # softplus(x) = init
+                nn.init.constant_(last, init + np.log(-np.expm1(-init)))
+        self.optimizer = th.optim.Adam(self.parameters(), lr=rate)
+
+    def forward(self, observations: PyTorchObs) -> th.Tensor:
+        """Multipliers at observations, shape [B, m]."""
+        return F.softplus(th.cat([network(observations) for network in self.networks], dim=1))
+
+    @th.no_grad()
+    def predict(self, observations: PyTorchObs) -> th.Tensor:
+        """:meth:`forward` without gradients, in slices that bound the memory."""
+        slices = chunks(n_rows(observations))
+        return th.cat([self(rows(observations, index)) for index in slices])
+
+    def ascend(self, observations: PyTorchObs, excess: th.Tensor) -> None:
+        """One step up the mean over the batch of ``Σ_i λ_i(s) · excess_i``.
+
+        :param observations: batch of N observations
+        :param excess: how far each state's cost is above its limit, shape [N, m]
+        """
+        self.optimizer.zero_grad(set_to_none=True)
+        self.networks.train(True)
+        for index in chunks(len(excess)):
+            gain = (self(rows(observations, index)) * excess[index]).sum() / len(excess)
+            (-gain).backward()
+        self.networks.train(False)
+        self.optimizer.step()
 
 
 class TRPOFAC(TrustRegion):
@@ -24,37 +79,40 @@ class TRPOFAC(TrustRegion):
     a limit at every state: the cost-to-go from s, discounted, is to stay below
     ``d_γ = (d/T) (1 - γᵀ)/(1 - γ)``. The policy takes a TRPO step on
     ``E[ratio · (A - Σ λ_i(s) A_Ci)]``; then Adam raises λ(s) where the returns of the batch exceed
-    d_γ and lowers it elsewhere.
+    d_γ and lowers it elsewhere. A and A_C are both standardised, so λ weighs a standard deviation
+    of the one against one of the other, and the unit of the costs does not matter.
 
-    :param policy: policy class or its alias
-    :param env: environment or its id
-    :param learning_rate: of the critics
     :param lambda_lr: learning rate of the multiplier networks
     :param lambda_epochs: steps of the multiplier networks per update, on the whole rollout
     :param lambda_init: multiplier to start near; None for about log 2, where softplus is of 0
     :param mode: ``"statewise"`` as above; ``"expected"`` raises the mean of λ(s) by J_C - d, as
         the GUARD paper writes it: all states then see the same violation
-
-    Other parameters are those of :class:`TrustRegion`.
+    :param units: ``"relative"`` as above; ``"cost"`` leaves A_C in the unit of the costs, as the
+        papers do
     """
+
+    label, family, paper = "TRPO-FAC", "Lagrangian", "Ma et al. 2021"
+    search_space: ClassVar[dict[str, Any]] = {
+        "lambda_lr": {"low": 1e-5, "high": 1e-2, "log": True},
+        "lambda_epochs": {"low": 1, "high": 20, "log": True},
+    }
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        *,
-        lambda_lr: float = 1e-4,
-        lambda_epochs: int = 1,
+        *args: Any,
+        lambda_lr: float = 3e-3,
+        lambda_epochs: int = 10,
         lambda_init: float | None = None,
         mode: Literal["statewise", "expected"] = "statewise",
+        units: Literal["relative", "cost"] = "relative",
         **kwargs: Any,
     ) -> None:
         self.lambda_lr = lambda_lr
         self.lambda_epochs = lambda_epochs
         self.lambda_init = lambda_init
         self.mode = mode
-        super().__init__(policy, env, learning_rate, **kwargs)
+        self.units = units
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -63,6 +121,7 @@ class TRPOFAC(TrustRegion):
         if self.lambda_init is not None:
             check_number("lambda_init", self.lambda_init, ends="()")
         check_choice("mode", self.mode, "statewise", "expected")
+        check_choice("units", self.units, "relative", "cost")
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -76,6 +135,8 @@ class TRPOFAC(TrustRegion):
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
         price = self.multiplier.predict(batch.observations)  # [N, m]
+        if self.units == "relative":
+            price = price / (batch.cost_advantages.std(dim=0) + 1e-12)
         return (ratio * (batch.advantages - (price * batch.cost_advantages).sum(dim=1))).mean()
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:

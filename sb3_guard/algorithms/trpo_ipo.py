@@ -1,16 +1,16 @@
 """TRPO-IPO: a logarithmic barrier keeps the policy away from the cost limits."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_number
+from sb3_guard.algorithms.common.checks import check_choice, check_number
 from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
+
+TINY = 1e-12
 
 
 def barrier(excess: th.Tensor, t: float, slope: float) -> th.Tensor:
@@ -35,48 +35,63 @@ class TRPOIPO(TrustRegion):
 
     ::
 
-        maximise   E[ratio · A] + (1/T) Σ φ(J_Ci + T E[ratio · A_Ci] - d_i),   φ(x) = log(-x) / t
+        maximise   E[ratio · A] + Σ s_i φ((J_Ci + T E[ratio · A_Ci] - d_i) / d_i)
+                   φ(x) = log(-x) / t,   s_i = d_i / (T σ(A_Ci))
 
-    φ continues as a straight line of slope ``-max_multiplier`` once it would be steeper. So the
-    cost weighs ``min(1 / (t (d - J_C)), max_multiplier)`` in the gradient, and ``max_multiplier``
-    where the limit is broken, which at ``cost_limit=0`` is always. While a limit is kept strictly,
-    the line search accepts no policy whose estimated cost reaches it.
+    so that in the gradient the standardised cost advantage weighs ``d / (t (d - J_C))`` beside the
+    standardised reward advantage: 1 / t far inside the limit, more near it, and ``max_multiplier``
+    at most. φ continues as a straight line there, which also leads back where the limit is broken.
+    The unit of the costs does not matter. While a limit is kept strictly, the line search accepts
+    no policy whose estimated cost reaches it.
 
-    :param policy: policy class or its alias
-    :param env: environment or its id
-    :param learning_rate: of the critics
-    :param t: sharpness of the barrier; at the optimum of a problem with m constraints it costs
-        about m/t of an episode's return (standardised advantages: in their units)
+    :param t: sharpness of the barrier: the greater, the closer to the limit it lets the policy go
     :param max_multiplier: the most that cost may weigh against reward
-
-    Other parameters are those of :class:`TrustRegion`.
+    :param units: ``"relative"`` as above; ``"cost"`` for the raw form of the paper, the barrier
+        ``log(d - J_C) / (t T)`` in units of an episode's cost
     """
+
+    label, family, paper = "TRPO-IPO", "Lagrangian", "Liu et al. 2020"
+    search_space: ClassVar[dict[str, Any]] = {
+        "t": {"low": 2.0, "high": 100.0, "log": True},
+        "max_multiplier": {"low": 0.5, "high": 20.0, "log": True},
+    }
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        *,
-        t: float = 0.01,
-        max_multiplier: float = 10.0,
+        *args: Any,
+        t: float = 20.0,
+        max_multiplier: float = 2.0,
+        units: Literal["relative", "cost"] = "relative",
         **kwargs: Any,
     ) -> None:
         self.t = t
         self.max_multiplier = max_multiplier
-        super().__init__(policy, env, learning_rate, **kwargs)
+        self.units = units
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
         check_number("t", self.t, ends="()")
         check_number("max_multiplier", self.max_multiplier, ends="()")
+        check_choice("units", self.units, "relative", "cost")
+
+    def _unit(self) -> np.ndarray:
+        """What excesses are measured in, shape (m,): the limit, or J_C where the limit is 0."""
+        assert self.costs is not None
+        if self.units == "cost":
+            return np.ones(len(self.cost_limits))
+        limits = self.cost_limits
+        return np.where(limits > 0.0, limits, np.maximum(self.costs.episode_cost, TINY))
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
         assert self.costs is not None
         change = (ratio - 1.0) @ batch.cost_advantages / len(ratio)  # [m]
-        horizon = self.costs.horizon
-        excess = horizon * (th.as_tensor(self.costs.violation).to(change) + change)
-        penalty = barrier(excess, self.t, self.max_multiplier).sum() / horizon
+        horizon, unit = self.costs.horizon, th.as_tensor(self._unit()).to(change)
+        excess = horizon * (th.as_tensor(self.costs.violation).to(change) + change) / unit
+        scale = unit / horizon
+        if self.units == "relative":
+            scale = scale / (batch.cost_advantages.std(dim=0) + TINY)
+        penalty = (scale * barrier(excess, self.t, self.max_multiplier)).sum()
         return (ratio * batch.advantages).mean() + penalty
 
     def accept(self, trial: Trial) -> bool:
@@ -87,6 +102,6 @@ class TRPOIPO(TrustRegion):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         assert self.costs is not None
-        margin = -self.costs.violation * self.costs.horizon
+        slack = -self.costs.violation * self.costs.horizon / self._unit()
         steepest = 1.0 / (self.t * self.max_multiplier)
-        self._record_per_cost("train/multiplier", 1.0 / (self.t * np.maximum(margin, steepest)))
+        self._record_per_cost("train/multiplier", 1.0 / (self.t * np.maximum(slack, steepest)))

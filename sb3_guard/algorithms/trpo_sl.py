@@ -1,15 +1,12 @@
 """TRPO-SL: TRPO behind a safety layer that keeps the predicted cost of the next step low."""
 
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_guard.algorithms.common.action_filters import SafetyLayer
-from sb3_guard.algorithms.common.actor import rows
+from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 
@@ -35,23 +32,22 @@ class TRPOSL(FilteredTrustRegion):
         cost key; None: d/T
     :param drift: let the model add b_i(s), for cost that changes whatever the agent does, as when
         a hazard moves
-
-    Other parameters are those of :class:`FilteredTrustRegion`.
     """
+
+    label, family, paper = "TRPO-SL", "hierarchical", "Dalal et al. 2018"
+    search_space: ClassVar[dict[str, Any]] = {
+        "warmup": {"low": 0.0, "high": 0.5},
+        "drift": [False, True],
+    }
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        *,
-        warmup: int | float = 1 / 3,
-        threshold: float | Sequence[float] | None = None,
+        *args: Any,
         drift: bool = False,
         **kwargs: Any,
     ) -> None:
         self.drift = drift
-        super().__init__(policy, env, learning_rate, warmup=warmup, threshold=threshold, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
         super()._setup_model()

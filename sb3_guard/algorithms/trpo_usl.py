@@ -1,12 +1,10 @@
 """TRPO-USL: TRPO behind a layer that descends the predicted cost to come."""
 
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.action_filters import UnrolledSafetyLayer
@@ -46,18 +44,19 @@ class TRPOUSL(FilteredTrustRegion):
     :param steps: K
     :param rate: η, in units of the action space, which runs from -1 to 1
     :param kappa: weight of the exact penalty; 0 for none, as in GUARD
-
-    Other parameters are those of :class:`FilteredTrustRegion`.
     """
+
+    label, family, paper = "TRPO-USL", "hierarchical", "Zhang et al. 2022"
+    search_space: ClassVar[dict[str, Any]] = {
+        "warmup": {"low": 0.0, "high": 0.5},
+        "steps": {"low": 5, "high": 40, "log": True},
+        "rate": {"low": 0.01, "high": 0.2, "log": True},
+        "tolerance": {"low": 0.005, "high": 0.5, "log": True},
+    }
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        *,
-        warmup: int | float = 1 / 3,
-        threshold: float | Sequence[float] | None = None,
+        *args: Any,
         tolerance: float = 0.05,
         steps: int = 20,
         rate: float = 0.05,
@@ -68,7 +67,7 @@ class TRPOUSL(FilteredTrustRegion):
         self.steps = steps
         self.rate = rate
         self.kappa = kappa
-        super().__init__(policy, env, learning_rate, warmup=warmup, threshold=threshold, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -133,7 +132,7 @@ class TRPOUSL(FilteredTrustRegion):
 
         values = by_time(self._layer.values(batch.observations, actions))
         costs = by_time(batch.costs).copy()
-        for step, i, observation in self._timeouts:
+        for step, i, observation in self._timeouts if gamma < 1.0 else ():
             tensor, _ = self.policy.obs_to_tensor(observation)
             costs[step, i] += gamma * self._value_ahead(tensor)[0]
         last = self._value_ahead(obs_as_tensor(self._last_obs, self.device))

@@ -1,14 +1,16 @@
 """Rollout buffers that carry costs beside rewards."""
 
 from collections.abc import Generator
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.type_aliases import TensorDict
+from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
+from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.advantage import discounted_returns, gae
+from sb3_guard.algorithms.common.checks import check_choice
 
 
 class CostRolloutBufferSamples(NamedTuple):
@@ -28,6 +30,7 @@ class CostRolloutBufferSamples(NamedTuple):
 
 
 _FIELDS = CostRolloutBufferSamples._fields[6:]
+_SB3_FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 
 
 class _Costs:
@@ -40,6 +43,10 @@ class _Costs:
     rewards: np.ndarray
     episode_starts: np.ndarray
     generator_ready: bool
+    full: bool
+    observations: Any
+    swap_and_flatten: Any
+    to_torch: Any
 
     def __init__(
         self,
@@ -48,8 +55,11 @@ class _Costs:
         cost_gamma: float = 0.99,
         cost_gae_lambda: float = 1.0,
         keep_executed: bool = False,
+        returns: Literal["lambda", "discounted"] = "lambda",
         **kwargs: Any,
     ) -> None:
+        check_choice("returns", returns, "lambda", "discounted")
+        self.targets = returns
         self.n_costs = n_costs
         self.cost_gamma = cost_gamma
         self.cost_gae_lambda = cost_gae_lambda
@@ -70,15 +80,13 @@ class _Costs:
         super().reset()  # type: ignore[misc]
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
-        """SB3's advantages, and discounted returns in place of its λ-returns.
-
-        The critics regress on returns as in the paper, whatever ``gae_lambda`` is.
-        """
+        """SB3's advantages and returns; or discounted returns, whatever ``gae_lambda`` is."""
         super().compute_returns_and_advantage(last_values, dones)  # type: ignore[misc]
-        last = last_values.cpu().numpy().flatten()
-        self.returns = discounted_returns(
-            self.rewards, self.episode_starts, last, dones, self.gamma
-        )
+        if self.targets == "discounted":
+            last = last_values.cpu().numpy().flatten()
+            self.returns = discounted_returns(
+                self.rewards, self.episode_starts, last, dones, self.gamma
+            )
 
     def compute_cost_returns_and_advantage(
         self, last_cost_values: np.ndarray, dones: np.ndarray
@@ -98,29 +106,48 @@ class _Costs:
             self.cost_gamma,
             self.cost_gae_lambda,
         )
-        self.cost_returns = discounted_returns(
-            costs, self.episode_starts, last_cost_values, dones, self.cost_gamma
-        )
+        if self.targets == "lambda":
+            self.cost_returns = self.cost_advantages + self.cost_values
+        else:
+            self.cost_returns = discounted_returns(
+                costs, self.episode_starts, last_cost_values, dones, self.cost_gamma
+            )
+
+    def observations_by_time(self, device: th.device) -> PyTorchObs:
+        """All observations before :meth:`get`, step by step, shape [T · n_envs, …]."""
+        if isinstance(self.observations, dict):
+            flat: Any = {k: v.reshape(-1, *v.shape[2:]) for k, v in self.observations.items()}
+        else:
+            flat = self.observations.reshape(-1, *self.observations.shape[2:])
+        return obs_as_tensor(flat, device)
+
+    def _flatten(self) -> None:
+        """[T, n, …] -> [n · T, …]: one environment's steps after the other's, as SB3 does."""
+        if self.generator_ready:
+            return
+        assert self.full, "the rollout has not ended yet"
+        for name in (*_SB3_FIELDS, *_FIELDS):
+            setattr(self, name, self.swap_and_flatten(getattr(self, name)))
+        stored = self.observations
+        if isinstance(stored, dict):
+            self.observations = {key: self.swap_and_flatten(v) for key, v in stored.items()}
+        else:
+            self.observations = self.swap_and_flatten(stored)
+        self.generator_ready = True
 
     def get(self, batch_size: int | None = None) -> Generator[CostRolloutBufferSamples, None, None]:
-        if not self.generator_ready:
-            for name in _FIELDS:
-                # [T, n, m] -> [n·T, m], in the order of SB3's swap_and_flatten.
-                array = getattr(self, name).swapaxes(0, 1)
-                setattr(self, name, array.reshape(len(array) * self.buffer_size, array.shape[2]))
+        self._flatten()
         yield from super().get(batch_size)  # type: ignore[misc]
 
+    def whole(self) -> CostRolloutBufferSamples:
+        """The rollout in order, one environment's steps after the other's; nothing is drawn."""
+        self._flatten()
+        return self._get_samples(np.arange(self.buffer_size * self.n_envs))
+
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> CostRolloutBufferSamples:
-        # The whole rollout comes in order, one environment's steps after the other's: a learner
-        # may follow its episodes, and nothing else depends on the order.
-        if len(batch_inds) == self.buffer_size * self.n_envs:
-            batch_inds = np.arange(len(batch_inds))
         samples = super()._get_samples(batch_inds, env)  # type: ignore[misc]
         arrays = (getattr(self, name)[batch_inds] for name in _FIELDS)
-        return CostRolloutBufferSamples(
-            *samples,
-            *(self.to_torch(array) for array in arrays),  # type: ignore[attr-defined]
-        )
+        return CostRolloutBufferSamples(*samples, *(self.to_torch(array) for array in arrays))
 
 
 class CostRolloutBuffer(_Costs, RolloutBuffer):  # type: ignore[misc]
@@ -132,6 +159,8 @@ class CostRolloutBuffer(_Costs, RolloutBuffer):  # type: ignore[misc]
     :param cost_gamma: discount factor of the costs
     :param cost_gae_lambda: bias-variance trade-off of the cost advantages
     :param keep_executed: whether there is room for executed actions beside the sampled ones
+    :param returns: what the critics learn, of rewards and costs alike: ``"lambda"`` for SB3's
+        λ-returns, ``"discounted"`` for discounted sums to come
 
     Other parameters are those of SB3's ``RolloutBuffer``.
     """

@@ -13,15 +13,10 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.actor import (
-    actor_modules,
-    n_rows,
-    parameterless,
-    rows,
-    value_parameters,
-)
-from sb3_guard.algorithms.common.mlp import TanhMlp, chunks
-from sb3_guard.algorithms.common.threads import accumulate
+from sb3_guard.algorithms.common.actor import actor_modules, value_parameters
+from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
+from sb3_guard.algorithms.common.fast.actor import parameterless
+from sb3_guard.algorithms.common.fast.mlp import TanhMlp, squared_error
 
 
 class StateNetwork(nn.Module):
@@ -185,6 +180,7 @@ class Regression:
         targets: th.Tensor,
         n_epochs: int,
         batch_size: int | None = None,
+        rng: np.random.Generator | None = None,
     ) -> float:
         """Take ``n_epochs`` passes over the batch, one optimizer step per minibatch.
 
@@ -192,6 +188,7 @@ class Regression:
         :param targets: shape [N, m]
         :param n_epochs: passes
         :param batch_size: rows per step; None for all of them
+        :param rng: shuffles the rows; None for torch's own generator
         :return: mean squared error during the last pass
         """
         n, inputs = len(targets), None
@@ -211,7 +208,8 @@ class Regression:
                 continue
             loss = 0.0
             # Equal parts, so that no step is taken on a small remainder.
-            for index in th.randperm(n).to(targets.device).tensor_split(-(-n // batch_size)):
+            order = th.randperm(n) if rng is None else th.as_tensor(rng.permutation(n))
+            for index in order.to(targets.device).tensor_split(-(-n // batch_size)):
                 part = None if inputs is None else inputs[index]
                 error = self._gradients(rows(batch, index), targets[index], part)
                 loss += error * len(index) / n
@@ -222,7 +220,10 @@ class Regression:
     def _gradients(self, batch: Any, targets: th.Tensor, inputs: th.Tensor | None) -> float:
         """Set the parameters' gradients of the mean squared error; return the error."""
         if inputs is not None:
-            return self._gradients_by_hand(batch, targets, inputs)
+            assert self.network is not None
+            last = self.readout
+            readout = None if last is None else lambda outputs, i: last(outputs, rows(batch, i))
+            return squared_error(self.network, inputs, targets, readout)
         self.optimizer.zero_grad(set_to_none=True)
         total = 0.0
         for index in chunks(len(targets)):
@@ -231,29 +232,3 @@ class Regression:
             loss.backward(inputs=self.parameters)
             total += loss.item()
         return total
-
-    def _gradients_by_hand(self, batch: Any, targets: th.Tensor, inputs: th.Tensor) -> float:
-        network, slices = self.network, chunks(len(targets))
-        assert network is not None
-
-        def add(number: int, gradients: list[th.Tensor]) -> float:
-            index = slices[number]
-            activations = network.forward(inputs[index])
-            outputs = activations[-1]
-            if self.readout is None:
-                error = outputs - targets[index]
-                total = float(error.flatten() @ error.flatten())
-                slope = error.mul_(2.0 / targets.numel())
-            else:
-                outputs.requires_grad_()
-                values = self.readout(outputs, rows(batch, index))
-                loss = F.mse_loss(values, targets[index], reduction="sum")
-                total = loss.item()
-                (slope,) = th.autograd.grad(loss / targets.numel(), outputs)
-            network.adjoint(activations, slope, gradients)
-            return total
-
-        gradients, total = accumulate(add, len(slices), network.parameters)
-        for parameter, gradient in zip(network.parameters, gradients, strict=True):
-            parameter.grad = gradient
-        return total / targets.numel()

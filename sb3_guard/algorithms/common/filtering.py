@@ -8,8 +8,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
@@ -36,8 +36,6 @@ class FilteredTrustRegion(TrustRegion):
         number of steps
     :param threshold: cost, in the units of the filter's model, that is not corrected; one number or
         one per cost key; None derives it from ``cost_limit``
-
-    Other parameters are those of :class:`TrustRegion`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -51,10 +49,7 @@ class FilteredTrustRegion(TrustRegion):
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
-        *,
+        *args: Any,
         warmup: int | float = 1 / 3,
         threshold: float | Sequence[float] | None = None,
         **kwargs: Any,
@@ -63,7 +58,7 @@ class FilteredTrustRegion(TrustRegion):
         self.threshold = threshold
         # Steps after which the filter is switched on; known once `learn` was called.
         self.filter_from: int | None = None
-        super().__init__(policy, env, learning_rate, **kwargs)
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

@@ -18,31 +18,28 @@ estimated its costs. What an algorithm may replace:
 """
 
 import time
-from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
     ActorCriticPolicy,
     BasePolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_guard.algorithms.common.actor import Actor
+from sb3_guard.algorithms.common.actor import Actor, actor_modules
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.checks import check_integer, check_number, is_number
 from sb3_guard.algorithms.common.critics import Regression
+from sb3_guard.algorithms.common.fast.actor import actor_of
 from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
-from sb3_guard.algorithms.common.on_policy import CostOnPolicyAlgorithm
-
-SelfTrustRegion = TypeVar("SelfTrustRegion", bound="TrustRegion")
+from sb3_guard.algorithms.common.rollouts import CostRollouts
 
 
 class Trial(NamedTuple):
@@ -111,7 +108,7 @@ class Region:
         return direction * float(np.sqrt(2 * self.delta / length))
 
 
-class TrustRegion(CostOnPolicyAlgorithm):
+class TrustRegion(CostRollouts):
     """Trust-region policy optimisation that knows of costs: the spine of every algorithm here.
 
     On its own it is TRPO (Schulman et al., 2015) as the GUARD paper runs it: KL summed over action
@@ -125,13 +122,6 @@ class TrustRegion(CostOnPolicyAlgorithm):
     :param batch_size: rows per critic step; None for the whole rollout, as in the paper
     :param gamma: discount factor of the reward
     :param gae_lambda: bias-variance trade-off of the reward advantages
-    :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key.
-        The attribute may be set anew at any time, and holds from the next update on
-    :param cost_keys: entries of ``info`` that hold the costs of a step
-    :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
-        absent key means that nothing was charged
-    :param cost_gamma: discount factor of the costs; None for ``gamma``
-    :param cost_gae_lambda: likewise for ``gae_lambda``
     :param target_kl: δ, bound on the mean KL(old ‖ new) per update, summed over action dimensions
     :param cg_max_steps: conjugate-gradient iterations per solve
     :param cg_damping: added to the diagonal of the Fisher matrix
@@ -140,25 +130,23 @@ class TrustRegion(CostOnPolicyAlgorithm):
     :param n_critic_updates: passes over the rollout per critic and update
     :param normalize_advantage: whether to standardise the reward advantages; cost advantages are
         centred but never scaled, since they share the limit's units
-    :param use_sde: generalised state-dependent exploration
-    :param sde_sample_freq: steps between draws of its noise matrix; -1 for once per rollout
     :param rollout_buffer_class: a subclass of ``CostRolloutBuffer``; None chooses
-    :param rollout_buffer_kwargs: further arguments of the buffer
-    :param stats_window_size: episodes over which logged episode statistics are averaged
-    :param tensorboard_log: folder for TensorBoard; None for none
-    :param policy_kwargs: arguments of the policy
-    :param verbose: 0 silent, 1 progress, 2 debug
-    :param seed: of every random generator involved
-    :param device: ``"cpu"``, ``"cuda"`` or ``"auto"``
-    :param _init_setup_model: whether to build the networks at once
-    :raises ValueError: if a value is out of range; the message names it and what is allowed
     """
+
+    search_space: ClassVar[dict[str, Any]] = {
+        "target_kl": {"low": 0.002, "high": 0.05, "log": True},
+        "learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},
+        "n_critic_updates": {"low": 10, "high": 100, "log": True},
+    }
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": ActorCriticPolicy,
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
+    returns: ClassVar[Literal["lambda", "discounted"]] = "discounted"
+    # SB3's weights of losses: nothing here mixes those of actor and critic.
+    fixed_arguments: ClassVar[frozenset[str]] = frozenset({"ent_coef", "vf_coef", "max_grad_norm"})
 
     def __init__(
         self,
@@ -169,11 +157,7 @@ class TrustRegion(CostOnPolicyAlgorithm):
         batch_size: int | None = None,
         gamma: float = 0.99,
         gae_lambda: float = 0.97,
-        cost_limit: float | Sequence[float] = 0.0,
-        cost_keys: Sequence[str] = ("cost",),
-        missing_cost: Literal["error", "zero"] = "error",
-        cost_gamma: float | None = None,
-        cost_gae_lambda: float | None = None,
+        *,
         target_kl: float = 0.02,
         # Measured on Goal_Point_8Hazards: undamped, a hundred iterations promise 1.5 times the
         # gain, but the line search cuts the step to a third and it delivers half. With 0.1 the
@@ -186,43 +170,8 @@ class TrustRegion(CostOnPolicyAlgorithm):
         normalize_advantage: bool = True,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
-        rollout_buffer_class: type[RolloutBuffer] | None = None,
-        rollout_buffer_kwargs: dict[str, Any] | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
-        _init_setup_model: bool = True,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            n_steps=n_steps,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            # SB3's loss weights: nothing here mixes the losses of actor and critic.
-            ent_coef=0.0,
-            vf_coef=0.0,
-            max_grad_norm=0.0,
-            use_sde=use_sde,
-            sde_sample_freq=sde_sample_freq,
-            rollout_buffer_class=rollout_buffer_class,
-            rollout_buffer_kwargs=rollout_buffer_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            cost_limit=cost_limit,
-            cost_keys=cost_keys,
-            missing_cost=missing_cost,
-            cost_gamma=cost_gamma,
-            cost_gae_lambda=cost_gae_lambda,
-        )
         self.batch_size = batch_size
         self.target_kl = target_kl
         self.cg_max_steps = cg_max_steps
@@ -231,9 +180,26 @@ class TrustRegion(CostOnPolicyAlgorithm):
         self.line_search_shrinking_factor = line_search_shrinking_factor
         self.n_critic_updates = n_critic_updates
         self.normalize_advantage = normalize_advantage
-
-        if _init_setup_model:
-            self._setup_model()
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            supported_action_spaces=(
+                spaces.Box,
+                spaces.Discrete,
+                spaces.MultiDiscrete,
+                spaces.MultiBinary,
+            ),
+            ent_coef=0.0,
+            vf_coef=0.0,
+            max_grad_norm=0.0,
+            **kwargs,
+        )
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -257,33 +223,24 @@ class TrustRegion(CostOnPolicyAlgorithm):
                 "normalize_advantage=False"
             )
 
-    def learn(
-        self: SelfTrustRegion,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfTrustRegion:
-        return super().learn(
-            total_timesteps,
-            callback,
-            log_interval,
-            tb_log_name or type(self).__name__,
-            reset_num_timesteps,
-            progress_bar,
-        )
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if any(
+            getattr(module, "num_batches_tracked", None) == 0
+            for module in actor_modules(self.policy)
+        ):
+            self._warn_once(
+                "the actor has batch normalisation that has seen no data: it will keep the mean 0 "
+                "and variance 1 it starts from, since statistics that move would change the "
+                "policy outside the trust region; VecNormalize normalises observations"
+            )
 
     # Updating
 
     def train(self) -> None:
         """One update from the rollout: the policy's step, what a leaf learns, the critics."""
-        self.policy.set_training_mode(False)  # but while the critics are fitted
-        optimizers = [self.policy.optimizer]
-        if self.uses_cost_critic:
-            optimizers.append(self.cost_critic.optimizer)
-        self._update_learning_rate(optimizers)
+        self.policy.set_training_mode(False)  # except while the critics are fitted
+        self._update_learning_rate(self.policy.optimizer)
 
         started = time.perf_counter()
         batch = self._batch()
@@ -307,8 +264,7 @@ class TrustRegion(CostOnPolicyAlgorithm):
 
     def _batch(self) -> CostRolloutBufferSamples:
         """The whole rollout, with advantages and critic targets as the updates use them."""
-        buffer = self.rollout_buffer
-        batch: CostRolloutBufferSamples = next(buffer.get(batch_size=None))
+        batch = self.rollout_buffer.whole()
         advantages, cost_advantages = batch.advantages, batch.cost_advantages
         if self.normalize_advantage:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -323,7 +279,7 @@ class TrustRegion(CostOnPolicyAlgorithm):
 
     def _update_actor(self, batch: CostRolloutBufferSamples) -> None:
         assert self.costs is not None
-        actor = Actor.of(self.policy, batch.observations, batch.actions)
+        actor = actor_of(self.policy, batch.observations, batch.actions)
         ratio = th.ones_like(batch.advantages).requires_grad_()
         objective = self.surrogate(batch, ratio)
         (weights,) = th.autograd.grad(objective, ratio)
@@ -332,7 +288,7 @@ class TrustRegion(CostOnPolicyAlgorithm):
             actor,
             batch,
             actor.score(weights),
-            self.costs.violation,
+            self.violation(),
             self.target_kl,
             self.cg_damping,
             self.cg_max_steps,
@@ -342,11 +298,9 @@ class TrustRegion(CostOnPolicyAlgorithm):
         logger.record("train/policy_objective", before + trial.improvement)
         logger.record("train/kl", trial.kl)
         logger.record("train/line_search_step", fraction)
-        if self.constrained:
-            excess = self.costs.violation * self.costs.horizon
-            self._record_per_cost("train/constraint_violation", excess)
-            if self.uses_cost_critic:
-                self._record_per_cost("train/cost_surrogate", trial.cost_change)
+        self._record_violation()
+        if self.constrained and self.uses_cost_critic:
+            self._record_per_cost("train/cost_surrogate", trial.cost_change)
 
     @th.no_grad()
     def _line_search(self, region: Region, x: th.Tensor, before: float) -> tuple[float, Trial]:
@@ -388,21 +342,7 @@ class TrustRegion(CostOnPolicyAlgorithm):
         self._check_finite("value_loss", loss)
         self.logger.record("train/value_loss", loss)
         if self.uses_cost_critic:
-            loss = Regression.of_network(self.cost_critic).fit(
-                batch.observations, batch.cost_returns, self.n_critic_updates, self.batch_size
-            )
-            self._check_finite("cost_value_loss", loss)
-            self.logger.record("train/cost_value_loss", loss)
-
-    def _check_finite(self, name: str, loss: float) -> None:
-        """
-        :raises FloatingPointError: a critic's loss is not finite, and so is what it learnt from
-        """
-        if not np.isfinite(loss):
-            raise FloatingPointError(
-                f"{name} is {loss} after update {self._n_updates + 1}: a reward or observation of "
-                f"the environment is not finite, or learning_rate={self.learning_rate!r} too high"
-            )
+            self.fit_cost_critic(self.n_critic_updates)
 
     # What an algorithm may replace
 
@@ -422,6 +362,11 @@ class TrustRegion(CostOnPolicyAlgorithm):
         :return: the step, shape (P,); zero to stay
         """
         return region.natural_step()
+
+    def violation(self) -> np.ndarray:
+        """What the step has to take away from each cost surrogate, (J_C - d) / T, shape (m,)."""
+        assert self.costs is not None
+        return self.costs.violation
 
     def accept(self, trial: Trial) -> bool:
         """Whether a candidate of the line search becomes the new policy."""

@@ -1,0 +1,309 @@
+"""Any Stable-Baselines3 algorithm, on- or off-policy, with costs and limits.
+
+A cooperative mixin: costs are read from ``info`` while SB3 collects, summed by episode, logged and
+saved. What is done about them is the business of the classes that stand on it.
+"""
+
+import inspect
+import warnings
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from sb3_guard.algorithms.common.arguments import (
+    check_names,
+    documentation,
+    signature,
+    with_defaults,
+)
+from sb3_guard.algorithms.common.checks import check_choice, check_per_cost, is_number
+from sb3_guard.algorithms.common.costs import CostEstimate, read_costs
+
+
+class Constrained(BaseAlgorithm):
+    """Cost keys, limits and episode costs beside an algorithm of Stable-Baselines3.
+
+    Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. Constructors set their own
+    attributes first and then hand the other arguments on: SB3 builds the model at the end of its
+    own. The signature, the docstring and the name under which ``learn`` logs are composed for
+    every subclass.
+
+    :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key.
+        The attribute may be set anew at any time, and holds from the next update on
+    :param cost_keys: entries of ``info`` that hold the costs of a step
+    :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
+        absent key means that nothing was charged
+    :raises TypeError: an argument is not known; the message names the nearest one
+    :raises ValueError: a value is out of range; the message names it and what is allowed
+    """
+
+    #: What tables and figures call it (the class's name if it says nothing), what it is like,
+    #: and where it comes from.
+    label: ClassVar[str] = ""
+    family: ClassVar[str] = ""
+    paper: ClassVar[str] = ""
+    #: Whether training depends on costs at all.
+    constrained: ClassVar[bool] = True
+    #: Arguments of SB3's constructors that the class fills in itself.
+    fixed_arguments: ClassVar[frozenset[str]] = frozenset()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "label" not in vars(cls):
+            cls.label = cls.__name__
+        composed = signature(cls, cls.fixed_arguments)
+        cls.__signature__ = composed  # type: ignore[attr-defined]
+        cls.__doc__ = documentation(cls, composed.parameters)
+        if getattr(cls.learn, "__code__", None) is Constrained.learn.__code__:
+            theirs = inspect.signature(super().learn).parameters
+            interval = theirs["log_interval"].default
+            cls.learn = with_defaults(  # type: ignore[method-assign]
+                Constrained.learn,  # type: ignore[arg-type]
+                log_interval=100 if interval is inspect.Parameter.empty else interval,
+                tb_log_name=cls.__name__,
+            )
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        check_names(cls, kwargs)
+        return super().__new__(cls)
+
+    def __init__(
+        self,
+        *args: Any,
+        cost_limit: float | Sequence[float] = 0.0,
+        cost_keys: Sequence[str] = ("cost",),
+        missing_cost: Literal["error", "zero"] = "error",
+        **kwargs: Any,
+    ) -> None:
+        self.cost_limit = cost_limit
+        self.cost_keys = cost_keys
+        self.missing_cost = missing_cost
+
+        # Running episodes outlive rollouts, and a run may be saved between two.
+        self.running_costs: np.ndarray | None = None  # [n_envs, m]
+        self.running_lengths: np.ndarray | None = None  # [n_envs]
+        # What the last step cost, 0 before the first one of an episode.
+        self.last_costs: np.ndarray | None = None  # [n_envs, m]
+        # Somebody else has reset the environments, so the next `learn` begins new episodes.
+        self.begin_anew = False
+        self.total_costs: np.ndarray | None = None  # [m]
+        self.ep_cost_buffer: deque[np.ndarray] | None = None
+        self.horizon: float | None = None  # T when an episode last ended
+        self.cost_seen = False
+        #: J_C, T and the violations, as last estimated
+        self.costs: CostEstimate | None = None
+        #: Whether the estimate has not been followed yet by what follows it (a multiplier)
+        self.costs_are_new = False
+        self.timing: dict[str, float] = {}
+        self._warned: set[str] = set()
+        self._begin_statistics()
+        super().__init__(*args, **kwargs)
+
+    # Construction
+
+    def _check_hyperparameters(self) -> None:
+        """Refuse values that could only fail later or silently do harm."""
+        check_choice("missing_cost", self.missing_cost, "error", "zero")
+        if (
+            isinstance(self.cost_keys, str)
+            or len(self.cost_keys) < 1
+            or not all(isinstance(key, str) for key in self.cost_keys)
+            or len(set(self.cost_keys)) < len(self.cost_keys)
+        ):
+            raise ValueError(
+                f"cost_keys={self.cost_keys!r}: must be a sequence of one or more different names "
+                "of info entries, such as ('cost',)"
+            )
+        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys), low=0.0)
+
+    def _setup_model(self) -> None:
+        self._check_hyperparameters()
+        self.cost_keys = tuple(self.cost_keys)  # loading turns tuples into lists
+        self._choose_buffer()
+        super()._setup_model()  # type: ignore[safe-super]
+
+    def _choose_buffer(self) -> None:
+        """Say which buffer SB3 is to make, and what it has to know of the costs."""
+
+    def _excluded_save_params(self) -> list[str]:
+        # "cost_limits" is of files from before it was derived from cost_limit
+        return [*super()._excluded_save_params(), "cost_limits", "step_costs"]
+
+    # Costs
+
+    @property
+    def cost_limits(self) -> np.ndarray:
+        """d: what ``cost_limit`` says now, for each cost key, shape (m,).
+
+        :raises ValueError: ``cost_limit`` was set to something that is no limit
+        """
+        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys), low=0.0)
+        limits = np.asarray(self.cost_limit, np.float64)
+        return np.broadcast_to(limits, (len(self.cost_keys),))
+
+    @property
+    def total_cost(self) -> float:
+        """Cost of the whole training so far, summed over the cost keys."""
+        return 0.0 if self.total_costs is None else float(self.total_costs.sum())
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "run",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train, as SB3's ``learn`` does; logs are named after the class.
+
+        :param total_timesteps: steps to take, over all environments
+        :param callback: called at every step
+        :param log_interval: updates, or off-policy episodes, between two logs
+        :param tb_log_name: name of the run in ``tensorboard_log``
+        :param reset_num_timesteps: whether to count from 0 and begin new episodes
+        :param progress_bar: whether to show one
+        :return: the trained model
+        """
+        return super().learn(  # type: ignore[safe-super]
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
+        )
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        n_costs = len(self.cost_keys)
+        if self.ep_cost_buffer is None or reset_num_timesteps:
+            self.ep_cost_buffer = deque(maxlen=self._stats_window_size)
+            self.total_costs = np.zeros(n_costs)
+        if self.begin_anew:
+            self._last_obs, self.begin_anew = None, False
+        # The environments are reset under the same condition.
+        if reset_num_timesteps or self._last_obs is None:
+            self.running_costs = np.zeros((self.n_envs, n_costs))
+            self.running_lengths = np.zeros(self.n_envs, dtype=np.int64)
+            self.last_costs = np.zeros((self.n_envs, n_costs))
+            self._begin_statistics()
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def _begin_statistics(self) -> None:
+        """Forget the episodes that have ended: the next estimate is about others."""
+        self._ended_costs: list[np.ndarray] = []
+        self._ended_lengths: list[int] = []
+        self._cost_seen_lately = False
+
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
+    ) -> None:
+        """Called by SB3 once per step, just before it stores the transition."""
+        super()._update_info_buffer(infos, dones)
+        assert dones is not None and self.ep_cost_buffer is not None
+        assert self.running_costs is not None and self.running_lengths is not None
+        # A vectorised environment without anything to say may leave infos out.
+        infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
+        costs, seen = read_costs(infos, self.cost_keys, self.missing_cost == "zero")
+        self._cost_seen_lately |= seen
+        self.step_costs = costs  # [n_envs, m], for the buffer
+        self.total_costs += costs.sum(axis=0)
+        self.running_costs += costs
+        self.running_lengths += 1
+        self.last_costs = np.where(dones[:, None], 0.0, costs)
+        for i in np.flatnonzero(dones):
+            self._ended_costs.append(self.running_costs[i].copy())
+            self._ended_lengths.append(int(self.running_lengths[i]))
+            self.ep_cost_buffer.append(self._ended_costs[-1])
+            self.running_costs[i] = 0.0
+            self.running_lengths[i] = 0
+
+    def _estimate_costs(self, rate: np.ndarray | None = None) -> bool:
+        """Renew ``costs`` from the episodes that ended since the last time.
+
+        :param rate: mean costs of a step, shape (m,), which tell what an episode would cost where
+            none has ended; None keeps the last estimate then
+        :return: whether there is a new estimate
+        """
+        self.cost_seen |= self._cost_seen_lately
+        if self._ended_costs:
+            self.horizon = horizon = float(np.mean(self._ended_lengths))
+            episode_cost = np.mean(self._ended_costs, axis=0)
+        elif rate is not None:
+            horizon = self.horizon or self._horizon_before_any_episode()
+            episode_cost = rate * horizon
+        else:
+            return False
+        if self.constrained and not self._cost_seen_lately:
+            self._warn_once(
+                f"no info had a cost key of {tuple(self.cost_keys)} during a whole rollout: "
+                "training goes on as if nothing cost anything (missing_cost='zero')"
+            )
+        self.costs = CostEstimate(
+            episode_cost, horizon, (episode_cost - self.cost_limits) / horizon
+        )
+        self.costs_are_new = True
+        self._begin_statistics()
+        return True
+
+    def _horizon_before_any_episode(self) -> float:
+        assert self.env is not None and self.running_lengths is not None
+        limits: list[Any] = []
+        try:
+            # TimeLimit's number first: around an environment without a spec there is no other.
+            if self.env.has_attr("_max_episode_steps"):
+                limits = self.env.get_attr("_max_episode_steps")
+            elif not isinstance(self.env.unwrapped, SubprocVecEnv):
+                # Not every spec can be sent from process to process, and to ask for what isn't
+                # there would end them.
+                specs = self.env.get_attr("spec")
+                limits = [getattr(spec, "max_episode_steps", None) for spec in specs]
+        except (AttributeError, NotImplementedError):
+            pass  # a vectorised environment need not tell: then no limit is known, as below
+        if limits and all(is_number(limit) and limit > 0 for limit in limits):
+            return float(np.mean(limits))
+        longest = float(self.running_lengths.max())
+        if self.constrained:
+            self._warn_once(
+                "no episode has ended yet and the environment states no max_episode_steps: until "
+                f"one ends, the cost limit is spread over the longest so far, {longest:g} steps"
+            )
+        return longest
+
+    def _warn_once(self, message: str) -> None:
+        topic = message.split(":")[0]
+        if topic not in self._warned:
+            self._warned.add(topic)
+            warnings.warn(message, UserWarning, stacklevel=3)
+
+    # Logging
+
+    def _record_per_cost(self, name: str, values: np.ndarray) -> None:
+        """Record one number per constraint; the key is appended where there are several."""
+        for key, value in zip(self.cost_keys, values, strict=True):
+            self.logger.record(f"{name}/{key}" if len(values) > 1 else name, float(value))
+
+    def _record_violation(self) -> None:
+        """Record J_C - d, in units of an episode's cost."""
+        if self.constrained and self.costs is not None:
+            excess = self.costs.violation * self.costs.horizon
+            self._record_per_cost("train/constraint_violation", excess)
+
+    def dump_logs(self, *args: Any) -> None:
+        assert self.ep_cost_buffer is not None and self.total_costs is not None
+        if self.constrained or self.cost_seen:
+            if self.ep_cost_buffer:
+                self._record_per_cost("rollout/ep_cost_mean", np.mean(self.ep_cost_buffer, axis=0))
+            if self.num_timesteps:
+                self._record_per_cost("rollout/cost_rate", self.total_costs / self.num_timesteps)
+        super().dump_logs(*args)

@@ -1,0 +1,217 @@
+"""Epochs of minibatches, as in SB3's PPO, on a loss of one's own.
+
+What differs from PPO is one hook, ``loss``. Critic, entropy bonus, gradient clipping, early
+stopping and logs are PPO's, bit for bit: with the loss it comes with, the class is PPO. Algorithms
+that need no other loss than PPO's stand on ``CostRollouts`` and SB3's own ``PPO`` instead.
+"""
+
+import copy
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import explained_variance
+from torch.nn import functional as F
+
+from sb3_guard.algorithms.common.batches import chunks, rows
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
+from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
+from sb3_guard.algorithms.common.rollouts import CostRollouts
+
+#: ``loss(batch, ratio, distribution)``, see :meth:`FirstOrder.loss`
+Loss = Callable[[CostRolloutBufferSamples, th.Tensor, Distribution], th.Tensor]
+
+
+class FirstOrder(CostRollouts, PPO):
+    """SB3's PPO with a cost critic, whose loss a subclass replaces.
+
+    :param target_kl: where the passes over a rollout stop; None for never
+    :param kl_stop: ``"minibatch"`` stops before the first minibatch whose KL exceeds
+        1.5 ``target_kl``, as SB3 does; ``"epoch"`` after the first pass at whose end the mean over
+        the rollout exceeds ``target_kl``, as OmniSafe does
+    """
+
+    search_space: ClassVar[dict[str, Any]] = {
+        "n_envs": [10, 20, 30],
+        "gamma": [0.95, 0.98, 0.99, 0.995, 0.999],
+        "gae_lambda": [0.9, 0.95, 0.97, 0.99],
+        "learning_rate": {"low": 3e-5, "high": 3e-3, "log": True},
+        "batch_size": [64, 256, 1000],
+        "n_epochs": {"low": 3, "high": 40, "log": True},
+        "policy_kwargs.net_arch": [{"pi": [n, n], "vf": [n, n]} for n in (64, 256)],
+        "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},
+    }
+
+    def __init__(
+        self, *args: Any, kl_stop: Literal["minibatch", "epoch"] = "minibatch", **kwargs: Any
+    ) -> None:
+        self.kl_stop = kl_stop
+        super().__init__(*args, **kwargs)
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        check_choice("kl_stop", self.kl_stop, "minibatch", "epoch")
+        for name in ("n_steps", "batch_size", "n_epochs"):
+            check_integer(name, getattr(self, name))
+        for name in ("gamma", "gae_lambda"):
+            check_number(name, getattr(self, name), 0.0, 1.0, "[]")
+        if self.target_kl is not None:
+            check_number("target_kl", self.target_kl, ends="()")
+
+    # What an algorithm replaces
+
+    def loss(
+        self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution
+    ) -> th.Tensor:
+        """What the policy descends on a minibatch: here PPO's clipped objective.
+
+        :param batch: B rows; reward advantages standardised within them if ``normalize_advantage``,
+            cost advantages as the buffer has them
+        :param ratio: π(a|s) / π_k(a|s), shape [B]
+        :param distribution: π at the batch's observations
+        :return: a scalar
+        """
+        clip = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
+        unclipped = batch.advantages * ratio
+        clipped = batch.advantages * th.clamp(ratio, 1 - clip, 1 + clip)
+        return -th.min(unclipped, clipped).mean()
+
+    # The update
+
+    def train(self) -> None:
+        """Passes over the rollout, then the cost critic."""
+        self.descend(self.loss)
+        values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
+        variance = explained_variance(values.flatten(), returns.flatten())
+        self.logger.record("train/explained_variance", variance)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+        self.fit_cost_critic()
+
+    def centre_costs(self) -> np.ndarray:
+        """Centre the buffer's cost advantages.
+
+        :return: their inverse standard deviations, 0 where they are all alike, shape (m,)
+        """
+        buffer = self.rollout_buffer
+        deviation = buffer.cost_advantages.std(axis=(0, 1), dtype=np.float64)
+        buffer.cost_advantages = buffer.cost_advantages - buffer.cost_advantages.mean(axis=(0, 1))
+        return inverse(deviation)
+
+    def snapshot(self) -> ActorCriticPolicy:
+        """The policy as it is now, to measure distances from while the other one learns."""
+        policy = self.policy
+        kept = {name: getattr(policy, name) for name in ("optimizer", "action_dist")}
+        try:
+            # The one is of no use to a copy, the other may hold parts of a graph.
+            policy.optimizer = policy.action_dist = None  # type: ignore[assignment]
+            old = copy.deepcopy(policy)
+        finally:
+            for name, value in kept.items():
+                setattr(policy, name, value)
+        old.action_dist = copy.copy(kept["action_dist"])
+        old.set_training_mode(False)
+        return old
+
+    def descend(self, loss: Loss, n_epochs: int | None = None, values: bool = True) -> None:
+        """Take passes of minibatches down a loss.
+
+        :param loss: called as :meth:`loss` is
+        :param n_epochs: passes; None for the algorithm's own
+        :param values: whether the reward critic and the entropy bonus learn along
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        history: dict[str, list[float]] = {}
+        for _ in range(self.n_epochs if n_epochs is None else n_epochs):
+            stop = self._descend_once(loss, values, history)
+            self._n_updates += 1
+            if stop:
+                break
+        for name, numbers in history.items():
+            self.logger.record(f"train/{name}", float(np.mean(numbers)))
+
+    def _descend_once(self, loss: Loss, values: bool, history: dict[str, list[float]]) -> bool:
+        """One pass; whether it was the last."""
+        history["approx_kl"] = []  # of the last pass alone, as SB3 logs it
+        for batch in self.rollout_buffer.get(self.batch_size):
+            predicted, log_prob, entropy = self._evaluate(batch)
+            advantages = batch.advantages
+            if self.normalize_advantage and len(advantages) > 1:
+                advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+                batch = batch._replace(advantages=advantages)
+            ratio = th.exp(log_prob - batch.old_log_prob)
+            losses = {"policy_gradient_loss": loss(batch, ratio, self.policy.action_dist)}
+            total = losses["policy_gradient_loss"]
+            if values:
+                losses["entropy_loss"] = -th.mean(-log_prob if entropy is None else entropy)
+                losses["value_loss"] = self._value_loss(batch, predicted.flatten())
+                total = total + self.ent_coef * losses["entropy_loss"]
+                total = total + self.vf_coef * losses["value_loss"]
+            divergence = _approximate_kl(log_prob.detach() - batch.old_log_prob)
+            for name, value in {**losses, "approx_kl": divergence}.items():
+                history.setdefault(name, []).append(value.item())
+            too_far = self.target_kl is not None and float(divergence) > 1.5 * self.target_kl
+            if self.kl_stop == "minibatch" and too_far:
+                return True
+            self.policy.optimizer.zero_grad()
+            total.backward()
+            th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            self.policy.optimizer.step()
+        return (
+            self.kl_stop == "epoch"
+            and self.target_kl is not None
+            and self._mean_kl() > self.target_kl
+        )
+
+    def _evaluate(self, batch: CostRolloutBufferSamples) -> tuple[th.Tensor, ...]:
+        """Values, log-probabilities and entropies; the distribution is ``policy.action_dist``."""
+        actions = batch.actions
+        if isinstance(self.action_space, spaces.Discrete):
+            actions = actions.long().flatten()
+        return self.policy.evaluate_actions(batch.observations, actions)  # type: ignore
+
+    def _value_loss(self, batch: CostRolloutBufferSamples, values: th.Tensor) -> th.Tensor:
+        if self.clip_range_vf is not None:
+            clip = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+            change = th.clamp(values - batch.old_values, -clip, clip)
+            values = batch.old_values + change
+        return F.mse_loss(batch.returns, values)
+
+    @th.no_grad()
+    def _mean_kl(self) -> float:
+        """KL of the whole rollout, estimated as SB3 does a minibatch's."""
+        batch = self.rollout_buffer.whole()
+        total = 0.0
+        for index in chunks(len(batch.actions)):
+            part = CostRolloutBufferSamples(*(rows(field, index) for field in batch))
+            _, log_prob, _ = self._evaluate(part)
+            total += float(_approximate_kl(log_prob - part.old_log_prob)) * len(log_prob)
+        return total / len(batch.actions)
+
+
+class PenalizedPPO(Lagrangian, FirstOrder):
+    """PPO on A - Σ λ_i A_Ci.
+
+    PPO standardises the changed advantages by minibatch, so that a division by 1 + Σ λ would change
+    nothing. At λ = 0 it is SB3's PPO, bit for bit.
+    """
+
+    def train(self) -> None:
+        buffer = self.rollout_buffer
+        # where the reward's advantages are all alike, their unit is 1
+        price = self.price((float(buffer.advantages.std()) or 1.0) * self.centre_costs())
+        buffer.advantages = buffer.advantages - buffer.cost_advantages @ price
+        super().train()
+
+
+def _approximate_kl(log_ratio: th.Tensor) -> th.Tensor:
+    """KL(old ‖ new) from samples of the old one (Schulman, http://joschu.net/blog/kl-approx.html)."""
+    return th.mean((th.exp(log_ratio) - 1) - log_ratio)

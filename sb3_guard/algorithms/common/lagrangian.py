@@ -1,0 +1,235 @@
+"""Lagrange multipliers that follow the violation, for on- and off-policy algorithms."""
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.utils import update_learning_rate
+from torch import nn
+
+from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
+from sb3_guard.algorithms.common.constrained import Constrained
+
+
+def _only_of_its_kind(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    """The state to load: begun afresh where it is SGD's and the optimizer Adam, or vice versa."""
+    both = optimizer.param_groups, state["param_groups"]
+    adam, was_adam = ("betas" in groups[0] for groups in both)
+    return state if adam == was_adam else optimizer.state_dict()
+
+
+SLOW = 0.95  # what the slow average of J_C keeps in an update
+
+
+class Multiplier(nn.Module):
+    """One λ ≥ 0 per constraint, raised while its limit is broken and lowered while it holds.
+
+    With violation Δ = J_C - d, in units of an episode's cost or of the limit, an update is
+
+        I ← clip(I + η Δ, 0, max)
+        λ ← clip(I + K_P Δ̄ + K_D max(0, J̄_C - J̄_C some updates before), 0, max)
+
+    where a bar is an exponential average that begins at its first value. With both gains zero this
+    is projected gradient ascent of the Lagrangian; otherwise the controller of Stooke et al. (2020,
+    arXiv 2007.03964, algorithm 2).
+
+    :param n_costs: number m of constraints
+    :param rate: η
+    :param init: λ before the first update
+    :param maximum: bound on λ and I; None for none
+    :param adam: let Adam scale the ascent of I instead of taking it as it is
+    :param proportional: K_P
+    :param derivative: K_D
+    :param smoothing: what the averages keep of themselves in an update; 0 for none
+    :param delay: updates over which the rise of J_C is taken
+    :param relative: measure costs in units of the limit (of a slow average of J_C where that is 0)
+        and count violations of more than one unit as one, so that neither the unit of cost nor how
+        far away training begins matters
+    """
+
+    def __init__(
+        self,
+        n_costs: int,
+        rate: float,
+        init: float = 0.0,
+        maximum: float | None = None,
+        adam: bool = False,
+        proportional: float = 0.0,
+        derivative: float = 0.0,
+        smoothing: float = 0.0,
+        delay: int = 1,
+        relative: bool = False,
+    ) -> None:
+        super().__init__()
+        self.maximum = maximum
+        self.proportional = proportional
+        self.derivative = derivative
+        self.smoothing = smoothing
+        self.relative = relative
+        start = th.full((n_costs,), float(init), dtype=th.float64)
+        unknown = th.full_like(start, np.inf)
+        self.integral = nn.Parameter(start)
+        self.register_buffer("value", start.clone())
+        self.register_buffer("slow_cost", unknown.clone())
+        self.register_buffer("violation", unknown.clone())
+        # Averages of the last updates, the latest first; before them nothing has risen.
+        self.register_buffer("last_costs", unknown.repeat(delay, 1))
+        kind = th.optim.Adam if adam else th.optim.SGD
+        self.optimizer = kind([self.integral], lr=rate)
+        self.optimizer.register_load_state_dict_pre_hook(_only_of_its_kind)
+
+    value: th.Tensor
+    slow_cost: th.Tensor
+    violation: th.Tensor
+    last_costs: th.Tensor
+
+    @th.no_grad()
+    def update(self, cost: np.ndarray, limit: np.ndarray) -> None:
+        """Follow the violation.
+
+        :param cost: J_C, shape (m,)
+        :param limit: d, shape (m,)
+        """
+        now, bound = th.tensor(cost), th.tensor(limit)
+        self.slow_cost.copy_(_average(self.slow_cost, now, SLOW))
+        violation = now - bound
+        if self.relative:
+            unit = th.where(bound == 0.0, self.slow_cost, bound).abs()
+            unit[unit == 0.0] = 1.0  # neither cost nor limit: nothing is violated
+            now = now / unit
+            violation = (violation / unit).clamp_(-1.0, 1.0)
+        self.integral.grad = -violation
+        self.optimizer.step()
+        self.integral.clamp_(0.0, self.maximum)
+        self.violation.copy_(_average(self.violation, violation, self.smoothing))
+        smooth = _average(self.last_costs[0], now, self.smoothing)
+        rise = (smooth - self.last_costs[-1]).clamp_(min=0.0)
+        self.last_costs.copy_(th.cat([smooth[None], self.last_costs[:-1]]))
+        correction = self.proportional * self.violation + self.derivative * rise
+        self.value.copy_(self.integral + correction)
+        self.value.clamp_(0.0, self.maximum)
+
+
+def _average(before: th.Tensor, now: th.Tensor, keep: float) -> th.Tensor:
+    """The next value of an exponential average whose first is the first it meets."""
+    return th.where(th.isinf(before), now, keep * before + (1.0 - keep) * now)
+
+
+def inverse(deviation: np.ndarray) -> np.ndarray:
+    """1 / deviation, 0 where that is 0."""
+    return np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0.0)
+
+
+class Lagrangian(Constrained):
+    """Prices of the costs that follow the violations, for any algorithm that takes them.
+
+    The prices of an update come from :meth:`price`. They follow J_C once for each new estimate of
+    it, before the policy learns (in :meth:`price`) or after (in :meth:`ascend`, which ``train``
+    calls at its end).
+
+    :param lambda_lr: η, what the multipliers gain per unit of violation and update
+    :param lambda_init: multipliers before the first update
+    :param lambda_max: bound on the multipliers; None for none
+    :param lambda_optimizer: ``"sgd"`` for plain ascent, ``"adam"`` lets Adam choose the steps
+    :param lambda_update: whether the multipliers follow a rollout ``"before"`` the policy learns
+        from it or ``"after"``
+    :param proportional_gain: with ``derivative_gain``, turns the ascent into a PID controller
+        (Stooke et al., 2020, arXiv 2007.03964) whose integral gain is ``lambda_lr``
+    :param derivative_gain: of the rise of J_C
+    :param lambda_smoothing: share that the averages behind those two gains keep in an update
+    :param lambda_delay: updates over which the rise of J_C is taken
+    :param lambda_units: ``"relative"`` measures violations in units of the limit and λ in standard
+        deviations of the advantages, so that a run with all costs and limits multiplied by a number
+        is the same run; ``"cost"`` takes both as they are
+    """
+
+    search_space: ClassVar[dict[str, Any]] = {
+        "lambda_lr": {"low": 5e-4, "high": 0.1, "log": True},
+        "lambda_init": {"low": 0.0, "high": 2.0},
+    }
+
+    def __init__(
+        self,
+        *args: Any,
+        lambda_lr: float = 0.005,
+        lambda_init: float = 0.0,
+        lambda_max: float | None = None,
+        lambda_optimizer: Literal["sgd", "adam"] = "sgd",
+        lambda_update: Literal["before", "after"] = "before",
+        proportional_gain: float = 0.0,
+        derivative_gain: float = 0.0,
+        lambda_smoothing: float = 0.0,
+        lambda_delay: int = 1,
+        lambda_units: Literal["relative", "cost"] = "cost",
+        **kwargs: Any,
+    ) -> None:
+        self.lambda_lr = lambda_lr
+        self.lambda_init = lambda_init
+        self.lambda_max = lambda_max
+        self.lambda_optimizer = lambda_optimizer
+        self.lambda_update = lambda_update
+        self.proportional_gain = proportional_gain
+        self.derivative_gain = derivative_gain
+        self.lambda_smoothing = lambda_smoothing
+        self.lambda_delay = lambda_delay
+        self.lambda_units = lambda_units
+        super().__init__(*args, **kwargs)
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        for name in ("lambda_lr", "lambda_init", "proportional_gain", "derivative_gain"):
+            check_number(name, getattr(self, name))
+        if self.lambda_max is not None:
+            check_number("lambda_max", self.lambda_max, float(self.lambda_init))
+        check_number("lambda_smoothing", self.lambda_smoothing, 0.0, 1.0)
+        check_integer("lambda_delay", self.lambda_delay)
+        check_choice("lambda_units", self.lambda_units, "relative", "cost")
+        check_choice("lambda_optimizer", self.lambda_optimizer, "sgd", "adam")
+        check_choice("lambda_update", self.lambda_update, "before", "after")
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.multiplier = Multiplier(
+            len(self.cost_keys),
+            self.lambda_lr,
+            self.lambda_init,
+            self.lambda_max,
+            self.lambda_optimizer == "adam",
+            self.proportional_gain,
+            self.derivative_gain,
+            self.lambda_smoothing,
+            self.lambda_delay,
+            self.lambda_units == "relative",
+        )
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        return [*state_dicts, "multiplier", "multiplier.optimizer"], tensors
+
+    def price(self, spread: np.ndarray | float = 1.0) -> np.ndarray:
+        """Advantage per unit of cost at this update's λ, float32 as advantages are, shape (m,).
+
+        :param spread: what one standard deviation of a cost's advantages is in the reward's, shape
+            (m,); multiplies λ if it is relative
+        """
+        if self.lambda_update == "before":
+            self.ascend()
+        price = self.multiplier.value.numpy()
+        if self.lambda_units == "relative":
+            price = price * spread
+            self._record_per_cost("train/price", price)
+        return price.astype(np.float32)
+
+    def ascend(self) -> None:
+        """Let the multipliers follow J_C, unless they have followed this estimate already."""
+        if self.costs is None or not self.costs_are_new:
+            return
+        self.costs_are_new = False
+        # As with the critics' rate: what the attribute says, not what a file has restored.
+        update_learning_rate(self.multiplier.optimizer, self.lambda_lr)
+        self.multiplier.update(self.costs.episode_cost, self.cost_limits)
+        self._record_per_cost("train/multiplier", self.multiplier.value.numpy())
+
+    def train(self, *args: Any, **kwargs: Any) -> None:
+        super().train(*args, **kwargs)  # type: ignore[misc]
+        self.ascend()

@@ -1,0 +1,45 @@
+"""A safety margin below the limits, learnt from what updates really bring."""
+
+from typing import Any
+
+import numpy as np
+
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.checks import check_number
+from sb3_guard.algorithms.common.trust_region import TrustRegion
+
+
+class Margin(TrustRegion):
+    """Trust-region steps that aim below the limits by what they have missed them so far.
+
+    ::
+
+        keep   J_Ci ≤ d_i - m_i,        m_i ← clip(m_i + α (J_Ci - d_i), 0, d_i / 2)
+
+    A step and the cost that it promises come from the same rollout, so it promises more than it
+    brings, and J_C settles above d. m learns by how much. At a limit of 0 there is no margin.
+
+    :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the papers
+    """
+
+    def __init__(self, *args: Any, margin_lr: float = 0.1, **kwargs: Any) -> None:
+        self.margin_lr = margin_lr
+        self.margin: np.ndarray | None = None  # m, in units of an episode's cost, shape (m,)
+        super().__init__(*args, **kwargs)
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        check_number("margin_lr", self.margin_lr)
+
+    def violation(self) -> np.ndarray:
+        assert self.costs is not None
+        margin = 0.0 if self.margin is None else self.margin
+        return self.costs.violation + margin / self.costs.horizon
+
+    def fit(self, batch: CostRolloutBufferSamples) -> None:
+        assert self.costs is not None
+        limits = self.cost_limits
+        before = np.zeros(len(limits)) if self.margin is None else self.margin
+        missed = self.costs.episode_cost - limits
+        self.margin = np.clip(before + self.margin_lr * missed, 0.0, limits / 2)
+        self._record_per_cost("train/cost_margin", self.margin)

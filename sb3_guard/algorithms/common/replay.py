@@ -1,0 +1,304 @@
+"""Replay with costs, for any off-policy algorithm of Stable-Baselines3 with continuous actions.
+
+The costs of each step go into the replay buffer. Beside the policy, two networks per cost learn
+Q_C(s, a) = c + γ_C Q_C(s', a'); the episodes that ended since the last update tell J_C.
+"""
+
+import copy
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
+from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_guard.algorithms.common.checks import check_integer, check_number
+from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
+
+
+class CostReplayBufferSamples(NamedTuple):
+    """What SB3's replay buffers return, and the costs of the B transitions, shape [B, m]."""
+
+    observations: Any
+    actions: th.Tensor
+    next_observations: Any
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor | None
+    costs: th.Tensor
+
+
+class _CostColumns(ReplayBuffer):
+    """Cost columns beside a replay buffer.
+
+    :param n_costs: number m of costs
+    """
+
+    def __init__(self, *args: Any, n_costs: int = 1, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.costs = np.zeros((self.buffer_size, self.n_envs, n_costs), np.float32)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
+        # SB3 draws the environments of the rows in there and does not tell: look ahead.
+        generator = np.random.get_state()  # noqa: NPY002 (the generator SB3 draws from)
+        env_inds = np.random.randint(0, high=self.n_envs, size=(len(batch_inds),))  # noqa: NPY002
+        np.random.set_state(generator)  # noqa: NPY002
+        samples = super()._get_samples(batch_inds, env)
+        costs = self.to_torch(self.costs[batch_inds, env_inds])
+        return CostReplayBufferSamples(*samples, costs=costs)
+
+
+class CostReplayBuffer(_CostColumns):
+    """SB3's replay buffer with the costs of each step, shape (buffer_size, n_envs, m)."""
+
+
+class CostDictReplayBuffer(_CostColumns, DictReplayBuffer):
+    """The same for Dict observations."""
+
+
+class CostQ(nn.Module):
+    """Expected discounted cost-to-go Q_C(s, a): per cost, the larger of two networks' values.
+
+    They are built like the policy's critic, learn with its kind of optimizer and share nothing
+    with it.
+
+    :param policy: a policy of SAC's or TD3's kind
+    :param n_costs: number m of costs
+    :param learning_rate: at the beginning
+    """
+
+    def __init__(self, policy: BasePolicy, n_costs: int, learning_rate: float) -> None:
+        super().__init__()
+        kwargs = policy._update_features_extractor(policy.critic_kwargs, None)  # type: ignore
+        kwargs |= {"n_critics": 2 * n_costs, "share_features_extractor": False}
+        self.online = ContinuousCritic(**kwargs).to(policy.device)
+        self.target = copy.deepcopy(self.online)
+        self.train(False)  # but the one that is learning, while it is
+        self.optimizer = policy.optimizer_class(
+            self.online.parameters(),
+            lr=learning_rate,  # type: ignore[call-arg]
+            **policy.optimizer_kwargs,
+        )
+
+    @staticmethod
+    def larger(values: tuple[th.Tensor, ...]) -> th.Tensor:
+        """The larger value of each pair, shape [B, m]."""
+        return th.cat(values, dim=1).unflatten(1, (-1, 2)).amax(dim=2)
+
+    def forward(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """Q_C of actions as the buffer has them, in [-1, 1], shape [B, m]."""
+        return self.larger(self.online(observations, actions))
+
+    def follow(self, tau: float) -> None:
+        """Move the target networks by a share of the way."""
+        polyak_update(self.online.parameters(), self.target.parameters(), tau)
+        ours, theirs = (
+            get_parameters_by_name(one, ["running_"]) for one in (self.online, self.target)
+        )
+        polyak_update(ours, theirs, 1.0)
+
+
+class CostReplay(Constrained, OffPolicyAlgorithm):
+    """Costs and cost critics for an off-policy algorithm with continuous actions.
+
+    A class that stands on it says in :meth:`learn_from` what it does with a batch.
+
+    :param cost_gamma: γ_C, discount factor of the costs, below 1; None for ``gamma``
+    """
+
+    #: What tuning searches, as in a file for ``tune --search-space``; subclasses add theirs.
+    search_space: ClassVar[dict[str, Any]] = {
+        "gamma": [0.95, 0.98, 0.99, 0.995],
+        "learning_rate": {"low": 1e-4, "high": 3e-3, "log": True},
+        "batch_size": [128, 256, 512],
+        "tau": [0.002, 0.005, 0.01, 0.02],
+        "train_freq": [1, 4, 8, 16],
+    }
+
+    replay_buffer: CostReplayBuffer | CostDictReplayBuffer
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str,
+        *args: Any,
+        cost_gamma: float | None = None,
+        **kwargs: Any,
+    ) -> None:
+        space = getattr(env, "action_space", None)
+        if space is not None and not isinstance(space, spaces.Box):
+            raise ValueError(
+                f"{type(self).__name__} needs continuous actions (Box), not {space}: for others "
+                "there are on-policy algorithms such as PPOLag"
+            )
+        self.cost_gamma = cost_gamma
+        super().__init__(policy, env, *args, **kwargs)
+
+    # Construction and saving
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        name = "gamma" if self.cost_gamma is None else "cost_gamma"
+        check_number(name, getattr(self, name), 0.0, 1.0)
+        if self.n_steps != 1:
+            raise ValueError(f"n_steps={self.n_steps!r}: must be 1, costs are replayed by step")
+        buffer_class = self.replay_buffer_class
+        if buffer_class is not None and not issubclass(buffer_class, _CostColumns):
+            raise ValueError(
+                f"replay_buffer_class={buffer_class.__name__}: must be a subclass of "
+                "CostReplayBuffer, or of CostDictReplayBuffer for Dict observations"
+            )
+
+    def _choose_buffer(self) -> None:
+        if self.replay_buffer_class is None:
+            dictionary = isinstance(self.observation_space, spaces.Dict)
+            self.replay_buffer_class = CostDictReplayBuffer if dictionary else CostReplayBuffer
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_costs": len(self.cost_keys)}
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        # Its first weights take nothing from the stream that actions are sampled from.
+        with th.random.fork_rng(devices=[]):
+            self.cost_critic = CostQ(self.policy, len(self.cost_keys), self.lr_schedule(1))
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        return [*state_dicts, "cost_critic", "cost_critic.optimizer"], tensors
+
+    # Collecting
+
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
+    ) -> None:
+        super()._update_info_buffer(infos, dones)
+        self.replay_buffer.costs[self.replay_buffer.pos] = self.step_costs
+
+    # Learning
+
+    def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
+        """One gradient step of everything, :meth:`fit_cost_critic` included.
+
+        :param batch: B transitions
+        :param step: number of the step in this ``train``, from 0
+        :return: what to log, by name
+        """
+        raise NotImplementedError
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """SB3's loop around :meth:`learn_from`, after an estimate of J_C where episodes ended."""
+        if self._estimate_costs():
+            self._record_violation()
+        self.policy.set_training_mode(True)
+        self.cost_critic.online.train(True)
+        owners: tuple[Any, ...] = (self.actor, self.critic, self.cost_critic)  # type: ignore[attr-defined]
+        optimizers: list[th.optim.Optimizer] = [owner.optimizer for owner in owners]
+        temperature: th.optim.Optimizer | None = getattr(self, "ent_coef_optimizer", None)
+        if temperature is not None:
+            optimizers.append(temperature)
+        self._update_learning_rate(optimizers)
+        history: dict[str, list[float]] = {}
+        for step in range(gradient_steps):
+            self._n_updates += 1
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            for name, value in self.learn_from(batch, step).items():  # type: ignore[arg-type]
+                history.setdefault(name, []).append(value)
+        self.cost_critic.online.train(False)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in history.items():
+            self.logger.record(f"train/{name}", float(np.mean(values)))
+
+    def fit_cost_critic(self, batch: CostReplayBufferSamples, next_actions: th.Tensor) -> float:
+        """One step towards c + γ_C (1 - done) Q_C'(s', a'), where a time-out is no end.
+
+        :param batch: B transitions
+        :param next_actions: a', which the reward's critic has been given too
+        :return: the loss
+        """
+        critic, gamma = self.cost_critic, self.gamma if self.cost_gamma is None else self.cost_gamma
+        with th.no_grad():
+            after = critic.larger(critic.target(batch.next_observations, next_actions))
+            target = batch.costs + (1 - batch.dones) * gamma * after  # [B, m]
+        values = th.cat(critic.online(batch.observations, batch.actions), dim=1)
+        loss = F.mse_loss(values.unflatten(1, (-1, 2)), target[:, :, None].expand(-1, -1, 2))
+        critic.optimizer.zero_grad()
+        loss.backward()
+        critic.optimizer.step()
+        return loss.item()
+
+
+class LagrangianReplay(Lagrangian, CostReplay):
+    """Multipliers for an actor that climbs a critic.
+
+    With ``lambda_units="relative"`` the price of a cost is λ times the standard deviation of Q over
+    that of Q_C, both of the transitions in the batch: replayed actions vary after the policy has
+    ceased to.
+
+    :param lambda_starts: steps before which the multipliers stay where they begin
+    """
+
+    search_space: ClassVar[dict[str, Any]] = {
+        "lambda_lr": {"low": 1e-3, "high": 0.2, "log": True},
+        "lambda_init": {"low": 0.0, "high": 2.0},
+        "proportional_gain": {"low": 0.0, "high": 4.0},
+    }
+
+    def __init__(
+        self,
+        *args: Any,
+        lambda_starts: int = 0,
+        lambda_lr: float = 0.02,
+        proportional_gain: float = 1.0,
+        lambda_smoothing: float = 0.9,
+        lambda_units: Literal["relative", "cost"] = "relative",
+        **kwargs: Any,
+    ) -> None:
+        self.lambda_starts = lambda_starts
+        super().__init__(
+            *args,
+            lambda_lr=lambda_lr,
+            proportional_gain=proportional_gain,
+            lambda_smoothing=lambda_smoothing,
+            lambda_units=lambda_units,
+            **kwargs,
+        )
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        check_integer("lambda_starts", self.lambda_starts, 0)
+
+    def ascend(self) -> None:
+        if self.num_timesteps >= self.lambda_starts:
+            super().ascend()
+
+    def penalized(
+        self,
+        loss: th.Tensor,
+        batch: CostReplayBufferSamples,
+        actions: th.Tensor,
+        values: th.Tensor,
+    ) -> th.Tensor:
+        """(loss + Σ price_i Q_Ci(s, a)) / (1 + Σ λ_i); the loss itself while no λ is positive.
+
+        :param loss: what SB3's actor descends, by row, shape [B, 1]
+        :param batch: B transitions
+        :param actions: the policy's, which carry the gradient
+        :param values: Q of the batch's own actions, shape [B, 1]
+        :return: shape [B, 1]
+        """
+        with th.no_grad():
+            costs = self.cost_critic(batch.observations, batch.actions)
+        deviations = costs.std(dim=0, correction=0).double().cpu().numpy()
+        spread = (float(values.detach().std(correction=0)) or 1.0) * inverse(deviations)
+        price = self.price(spread)
+        if not price.any():
+            return loss
+        weights = th.as_tensor(price, device=loss.device)
+        penalty = (self.cost_critic(batch.observations, actions) * weights).sum(1, keepdim=True)
+        return (loss + penalty) / (1.0 + float(self.multiplier.value.sum()))

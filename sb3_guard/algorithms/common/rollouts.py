@@ -1,0 +1,257 @@
+"""Rollouts with costs, for any on-policy algorithm of Stable-Baselines3.
+
+While SB3 collects, the costs of each step go into the rollout buffer. When the rollout is full, the
+cost critic values its states, cost advantages are estimated, and so are J_C, the length of an
+episode and the violations of the limits.
+"""
+
+import random
+import time
+from contextlib import nullcontext
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import obs_as_tensor, update_learning_rate
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
+
+from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
+from sb3_guard.algorithms.common.checks import check_number
+from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.critics import CostCritic, Regression
+from sb3_guard.algorithms.common.fast.threads import one_thread
+
+SMALL = 500_000  # weights of a policy that acts on one thread
+
+
+class _CorrectedEnv(VecEnvWrapper):
+    """Executes corrected actions during one rollout; the algorithm's own env stays unwrapped."""
+
+    def __init__(self, venv: VecEnv, algorithm: "CostRollouts") -> None:
+        super().__init__(venv)
+        self.algorithm = algorithm
+
+    def step_async(self, actions: np.ndarray) -> None:
+        executed = self.algorithm.correct(self.algorithm._last_obs, actions)
+        # SB3 adds the transition, with the sampled action, after the step.
+        buffer = self.algorithm.rollout_buffer
+        buffer.executed_actions[buffer.pos] = executed.reshape(len(executed), -1)
+        self.venv.step_async(executed)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        return self.venv.step_wait()
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+
+class CostRollouts(Constrained, OnPolicyAlgorithm):
+    """Costs, cost advantages and a cost critic for an on-policy algorithm.
+
+    ``class SafePPO(CostRollouts, PPO)`` finds them in ``rollout_buffer`` when ``train`` is called,
+    and ends its ``train`` with :meth:`fit_cost_critic`. The critic is no part of the policy: the
+    policy's optimizer and its gradient clipping never see it.
+
+    :param cost_gamma: discount factor of the costs; None for ``gamma``
+    :param cost_gae_lambda: likewise for ``gae_lambda``
+    """
+
+    #: What tuning searches, as in a file for ``tune --search-space``; subclasses add theirs.
+    search_space: ClassVar[dict[str, Any]] = {
+        "n_envs": [10, 20, 30],
+        "gamma": [0.95, 0.97, 0.98, 0.99, 0.995, 0.999],
+        "gae_lambda": {"low": 0.9, "high": 0.99},
+        "learning_rate": {"low": 3e-5, "high": 3e-3, "log": True},
+        "policy_kwargs.net_arch": [{"pi": [n, n], "vf": [n, n]} for n in (64, 256)],
+        "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},
+    }
+    #: Whether a critic of the costs is built and trained.
+    uses_cost_critic: ClassVar[bool] = True
+    #: What critics learn: SB3's λ-returns, or discounted rewards- and costs-to-go.
+    returns: ClassVar[Literal["lambda", "discounted"]] = "lambda"
+
+    rollout_buffer: CostRolloutBuffer | CostDictRolloutBuffer
+
+    def __init__(
+        self,
+        *args: Any,
+        cost_gamma: float | None = None,
+        cost_gae_lambda: float | None = None,
+        **kwargs: Any,
+    ) -> None:
+        self.cost_gamma = cost_gamma
+        self.cost_gae_lambda = cost_gae_lambda
+        # Shuffles the cost critic's batches: it takes no numbers from anybody else's stream.
+        self.cost_rng: np.random.Generator | None = None
+        # (step, env, observation) of every episode cut by a time limit
+        self._timeouts: list[tuple[int, int, Any]] = []
+        self._rng_at_rollout: tuple[Any, Any, th.Tensor] | None = None
+        self._cuda_at_rollout: list[th.Tensor] = []  # one per device
+        super().__init__(*args, **kwargs)
+
+    # Construction and saving
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        for name in ("cost_gamma", "cost_gae_lambda"):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), 0.0, 1.0, "[]")
+        buffer_class = self.rollout_buffer_class
+        if buffer_class is not None and not issubclass(
+            buffer_class, CostRolloutBuffer | CostDictRolloutBuffer
+        ):
+            raise ValueError(
+                f"rollout_buffer_class={buffer_class.__name__}: must be a subclass of "
+                "CostRolloutBuffer, or of CostDictRolloutBuffer for Dict observations"
+            )
+
+    def _choose_buffer(self) -> None:
+        if self.rollout_buffer_class is None:
+            dictionary = isinstance(self.observation_space, spaces.Dict)
+            self.rollout_buffer_class = CostDictRolloutBuffer if dictionary else CostRolloutBuffer
+        gamma, gae_lambda = self.cost_gamma, self.cost_gae_lambda
+        self.rollout_buffer_kwargs = {
+            "returns": self.returns,
+            **self.rollout_buffer_kwargs,
+            "n_costs": len(self.cost_keys),
+            "cost_gamma": self.gamma if gamma is None else gamma,
+            "cost_gae_lambda": self.gae_lambda if gae_lambda is None else gae_lambda,
+            "keep_executed": self._corrects,
+        }
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.cost_rng is None:
+            self.cost_rng = np.random.default_rng(self.seed)
+        if self.uses_cost_critic:
+            # Its first weights take nothing from the stream that actions are sampled from.
+            with th.random.fork_rng(devices=[]):
+                self.cost_critic = CostCritic(self.policy, len(self.cost_keys))
+
+    def _excluded_save_params(self) -> list[str]:
+        mine = ["_timeouts", "_rng_at_rollout", "_cuda_at_rollout"]
+        return [*super()._excluded_save_params(), *mine]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        if self.uses_cost_critic:
+            state_dicts = [*state_dicts, "cost_critic", "cost_critic.optimizer"]
+        return state_dicts, tensors
+
+    # Collecting
+
+    @property
+    def _corrects(self) -> bool:
+        return type(self).correct is not CostRollouts.correct
+
+    def correct(self, observations: Any, actions: np.ndarray) -> np.ndarray:
+        """The actions to execute in place of the sampled ones, both shaped (n_envs, …)."""
+        return actions
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        # Taken before anything is drawn: a checkpoint written at the start of a rollout restores
+        # these to continue as if it had never been written.
+        legacy = np.random.get_state()  # noqa: NPY002 (the generator SB3 draws from)
+        self._rng_at_rollout = (random.getstate(), legacy, th.get_rng_state())
+        self._cuda_at_rollout = th.cuda.get_rng_state_all() if self.device.type == "cuda" else []
+        started = time.perf_counter()
+        self._begin_statistics()
+        self._timeouts = []
+        # the layers of a small network take less time than threads that meet
+        weights = sum(parameter.numel() for parameter in self.policy.parameters())
+        alone = self.device.type == "cpu" and weights <= SMALL
+        with one_thread() if alone else nullcontext():
+            full = super().collect_rollouts(
+                _CorrectedEnv(env, self) if self._corrects else env,
+                callback,
+                rollout_buffer,
+                n_rollout_steps,
+            )
+        if full:
+            self._estimate_costs(self.rollout_buffer.costs.mean(axis=(0, 1)))
+            if self.uses_cost_critic:
+                self._estimate_advantages()
+        else:
+            # A callback stopped training; SB3 has then counted the step but not read its infos.
+            self._update_info_buffer(callback.locals["infos"], callback.locals["dones"])
+        self.timing["collect"] = time.perf_counter() - started
+        return full
+
+    def _update_info_buffer(
+        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
+    ) -> None:
+        before = self.last_costs
+        super()._update_info_buffer(infos, dones)
+        step = self.rollout_buffer.pos
+        self.rollout_buffer.costs[step] = self.step_costs
+        self.rollout_buffer.previous_costs[step] = before
+        for i, info in enumerate(infos):
+            if info.get("TimeLimit.truncated", False) and (
+                info.get("terminal_observation") is not None
+            ):
+                self._timeouts.append((step, i, info["terminal_observation"]))
+
+    @th.no_grad()
+    def _estimate_advantages(self) -> None:
+        """Value the rollout's states and finish the cost half of the buffer."""
+        buffer = self.rollout_buffer
+        values = self.cost_critic.predict(buffer.observations_by_time(self.device))
+        buffer.cost_values = values.cpu().numpy().reshape(buffer.costs.shape)
+        # Undiscounted, the cost of an episode is a finite sum: what might come after its time is no
+        # part of it, and a critic that is fitted to its own values has no fixed point.
+        for step, i, observation in self._timeouts if buffer.cost_gamma < 1.0 else ():
+            terminal, _ = self.policy.obs_to_tensor(observation)
+            buffer.cost_bootstraps[step, i] = (
+                buffer.cost_gamma * self.cost_critic(terminal)[0].cpu().numpy()
+            )
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        last = self.cost_critic(obs_as_tensor(self._last_obs, self.device)).cpu().numpy()
+        buffer.compute_cost_returns_and_advantage(last, self._last_episode_starts)
+
+    # Learning
+
+    def fit_cost_critic(self, n_epochs: int | None = None, batch_size: int | None = None) -> None:
+        """Fit the cost critic to the rollout's cost returns, with the algorithm's learning rate.
+
+        It draws from no generator but ``cost_rng``.
+
+        :param n_epochs: passes over the rollout; None for the algorithm's own ``n_epochs``
+        :param batch_size: rows per step; None for the algorithm's own ``batch_size``, which may be
+            None for the whole rollout
+        :raises FloatingPointError: its loss is not finite
+        """
+        update_learning_rate(
+            self.cost_critic.optimizer, self.lr_schedule(self._current_progress_remaining)
+        )
+        batch = self.rollout_buffer.whole()
+        loss = Regression.of_network(self.cost_critic).fit(
+            batch.observations,
+            batch.cost_returns,
+            getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,
+            getattr(self, "batch_size", None) if batch_size is None else batch_size,
+            self.cost_rng,
+        )
+        self._check_finite("cost_value_loss", loss)
+        self.logger.record("train/cost_value_loss", loss)
+        self._record_violation()
+
+    def _check_finite(self, name: str, loss: float) -> None:
+        """
+        :raises FloatingPointError: a critic's loss is not finite, and so is what it learnt from
+        """
+        if not np.isfinite(loss):
+            raise FloatingPointError(
+                f"{name} is {loss} after update {self._n_updates + 1}: a reward or observation of "
+                f"the environment is not finite, or learning_rate={self.learning_rate!r} too high"
+            )

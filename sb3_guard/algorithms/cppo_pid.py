@@ -1,0 +1,47 @@
+"""CPPO-PID: PPO whose price of the cost is a PID controller's."""
+
+from typing import Any, ClassVar, Literal
+
+from sb3_guard.algorithms.common.first_order import PenalizedPPO
+
+
+class CPPOPID(PenalizedPPO):
+    """PPO on the Lagrangian, priced by a controller (Stooke et al., 2020, arXiv 2007.03964).
+
+    ::
+
+        max_π min_{λ ≥ 0}   J(π) - Σ λ_i (J_Ci(π) - d_i)
+
+        I ← max(0, I + K_I Δ)          Δ = (J_C - d) / d
+        λ = max(0, I + K_P Δ̄ + K_D ∂)  ∂ = rise of the average J̄_C over some updates, at least 0
+
+    The proportional term answers a violation immediately, the derivative term answers costs that
+    rise, and both damp the oscillation that the integral alone has. ``lambda_lr`` is K_I.
+    """
+
+    label, family, paper = "CPPO-PID", "Lagrangian", "Stooke et al. 2020"
+    search_space: ClassVar[dict[str, Any]] = {
+        "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
+        "proportional_gain": {"low": 0.0, "high": 4.0},
+        "derivative_gain": {"low": 0.0, "high": 4.0},
+    }
+
+    def __init__(
+        self,
+        *args: Any,
+        lambda_lr: float = 0.5,
+        proportional_gain: float = 2.0,
+        derivative_gain: float = 2.0,
+        lambda_smoothing: float = 0.5,
+        lambda_units: Literal["relative", "cost"] = "relative",
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            *args,
+            lambda_lr=lambda_lr,
+            proportional_gain=proportional_gain,
+            derivative_gain=derivative_gain,
+            lambda_smoothing=lambda_smoothing,
+            lambda_units=lambda_units,
+            **kwargs,
+        )

@@ -1,0 +1,88 @@
+"""CUP: an update improves the policy as PPO does, then projects it towards the limits."""
+
+from typing import Any, ClassVar, Literal
+
+import torch as th
+from stable_baselines3.common.distributions import Distribution
+
+from sb3_guard.algorithms.common.actor import kl
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.checks import check_choice
+from sb3_guard.algorithms.common.first_order import FirstOrder
+from sb3_guard.algorithms.common.lagrangian import Lagrangian
+
+
+class CUP(Lagrangian, FirstOrder):
+    """Constrained update projection (Yang et al., 2022, arXiv 2209.07089).
+
+    ::
+
+        π_{k+½} = PPO's step on A alone
+        π_{k+1} = argmin  E[ KL(π_{k+½} ‖ π) + Σ ν_i · (1 - γλ)/(1 - γ) · ratio · A_Ci ]
+
+    Both steps use the rollout of π_k, and ``ratio = π / π_k``. The multipliers ν ascend on the
+    violations. The factor comes from the paper's bound with generalised advantages, and grows
+    without bound as γ → 1.
+
+    :param projection_kl: ``"forward"`` as above; ``"reverse"`` for KL(π ‖ π_{k+½})
+    """
+
+    label, family, paper = "CUP", "First-order", "Yang et al. 2022"
+    search_space: ClassVar[dict[str, Any]] = {
+        "lambda_lr": {"low": 0.005, "high": 0.2, "log": True},
+        "proportional_gain": {"low": 0.0, "high": 1.0},
+    }
+
+    def __init__(
+        self,
+        *args: Any,
+        # A sixth of other methods' gains: at γ = 0.99 and λ = 0.95 the factor above is six.
+        lambda_lr: float = 0.08,
+        proportional_gain: float = 0.33,
+        lambda_units: Literal["relative", "cost"] = "relative",
+        projection_kl: Literal["forward", "reverse"] = "forward",
+        **kwargs: Any,
+    ) -> None:
+        self.projection_kl = projection_kl
+        super().__init__(
+            *args,
+            lambda_lr=lambda_lr,
+            proportional_gain=proportional_gain,
+            lambda_units=lambda_units,
+            **kwargs,
+        )
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        check_choice("projection_kl", self.projection_kl, "forward", "reverse")
+        if self.gamma == 1.0:
+            raise ValueError(
+                "gamma=1.0: CUP weighs costs by (1 - γλ)/(1 - γ), which has no bound there; use a "
+                "discount factor below 1, such as 0.99, or PPOLag, which takes any"
+            )
+
+    @property
+    def factor(self) -> float:
+        """(1 - γλ)/(1 - γ), with the discount and the λ of the advantages."""
+        return (1.0 - self.gamma * self.gae_lambda) / (1.0 - self.gamma)
+
+    def train(self) -> None:
+        self._price = th.as_tensor(self.price(self.centre_costs()), device=self.device)
+        super().train()  # PPO's, on the rewards
+        if bool(self._price.any()):
+            self._improved = self.snapshot()
+            self.descend(self.projection, values=False)
+
+    def projection(
+        self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution
+    ) -> th.Tensor:
+        """What the second step descends on a minibatch: a scalar."""
+        with th.no_grad():
+            improved = self._improved.get_distribution(batch.observations)
+        pair = improved, distribution
+        divergence = kl(*(pair if self.projection_kl == "forward" else pair[::-1]))
+        cost = ratio * (batch.cost_advantages @ self._price)
+        return (divergence + self.factor * cost).mean()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_improved", "_price"]

@@ -1,0 +1,86 @@
+"""FOCOPS: the best policy near the old one, known in closed form, is followed by gradient steps."""
+
+from typing import Any, ClassVar, Literal
+
+import torch as th
+from stable_baselines3.common.distributions import Distribution
+
+from sb3_guard.algorithms.common.actor import kl
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.checks import check_number
+from sb3_guard.algorithms.common.first_order import FirstOrder
+from sb3_guard.algorithms.common.lagrangian import Lagrangian
+
+
+class FOCOPS(Lagrangian, FirstOrder):
+    """First-order constrained optimisation in policy space (Zhang et al., 2020, arXiv 2002.06506).
+
+    ::
+
+        maximise   E[A]  over all policies near the old one π_k
+        subject to J_C + E[A_C] ≤ d,   E[KL(π ‖ π_k)] ≤ δ
+
+    has the solution ``π* ∝ π_k exp((A - Σ ν_i A_Ci) / T)``. The parameters follow it down
+
+    ::
+
+        E[ 1{KL(π_θ ‖ π_k)(s) ≤ η} · ( KL(π_θ ‖ π_k)(s) - ratio · (A - Σ ν_i A_Ci) / T ) ]
+
+    state by state: a state whose policy has moved too far is left alone. The multipliers ν ascend
+    on the violations, and T is a temperature, not a multiplier.
+
+    :param temperature: T, called λ in the paper
+    :param trust_region: η, KL divergence up to which a state is learnt from
+    """
+
+    label, family, paper = "FOCOPS", "First-order", "Zhang et al. 2020"
+    search_space: ClassVar[dict[str, Any]] = {
+        "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
+        "proportional_gain": {"low": 0.0, "high": 4.0},
+        "temperature": {"low": 0.5, "high": 5.0, "log": True},
+    }
+
+    fixed_arguments: ClassVar[frozenset[str]] = frozenset({"clip_range", "clip_range_vf"})
+
+    def __init__(
+        self,
+        *args: Any,
+        temperature: float = 1.5,
+        trust_region: float = 0.02,
+        lambda_lr: float = 0.5,
+        proportional_gain: float = 2.0,
+        lambda_units: Literal["relative", "cost"] = "relative",
+        **kwargs: Any,
+    ) -> None:
+        self.temperature = temperature
+        self.trust_region = trust_region
+        super().__init__(
+            *args,
+            lambda_lr=lambda_lr,
+            proportional_gain=proportional_gain,
+            lambda_units=lambda_units,
+            **kwargs,
+        )
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        check_number("temperature", self.temperature, ends="()")
+        check_number("trust_region", self.trust_region, ends="()")
+
+    def train(self) -> None:
+        self._price = th.as_tensor(self.price(self.centre_costs()), device=self.device)
+        self._old = self.snapshot()
+        super().train()
+
+    def loss(
+        self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution
+    ) -> th.Tensor:
+        with th.no_grad():
+            old = self._old.get_distribution(batch.observations)
+        divergence = kl(distribution, old)
+        near = (divergence.detach() <= self.trust_region).to(divergence)
+        advantages = batch.advantages - batch.cost_advantages @ self._price
+        return (near * (divergence - ratio * advantages / self.temperature)).mean()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_old", "_price"]

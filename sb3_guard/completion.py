@@ -3,27 +3,23 @@
 import argparse
 import importlib
 import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
-from sb3_guard.zoo.usage import Parser, UsageError, run
+from sb3_guard.zoo.flags import Command, command, flag
+from sb3_guard.zoo.usage import UsageError
 
-EXAMPLES = """examples:
+
+@dataclass
+class Flags(Command):
+    """Print a script that completes commands, flags, algorithms and suites."""
+
+    prog: ClassVar[str] = "sb3-guard completion"
+    examples: ClassVar[str] = """examples:
   eval "$(sb3-guard completion bash)"
   sb3-guard completion zsh > ~/.zfunc/_sb3-guard
 """
-SHELLS = ["bash", "zsh", "tcsh"]
-
-
-def parser() -> Parser:
-    """The flags."""
-    result = Parser(
-        prog="sb3-guard completion",
-        description="Print a script that completes commands, flags, algorithms and suites.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    result.add_argument("shell", choices=SHELLS)
-    return result
+    shell: Literal["bash", "zsh", "tcsh"] = flag(positional=True, help="whose script")
 
 
 def whole() -> argparse.ArgumentParser:
@@ -37,7 +33,7 @@ def whole() -> argparse.ArgumentParser:
     result = argparse.ArgumentParser(prog="sb3-guard")
     commands = result.add_subparsers()
     for name, text in COMMANDS.items():
-        own = importlib.import_module(f"sb3_guard.{name}").parser()
+        own = importlib.import_module(f"sb3_guard.{name}").main.flags.parser()
         for action in own._actions:
             if action.dest in known and action.choices is None:
                 action.choices = known[action.dest]
@@ -45,27 +41,24 @@ def whole() -> argparse.ArgumentParser:
     return result
 
 
-def _completion(argv: Sequence[str] | None) -> int:
-    args = parser().parse_args(argv)
+def completion(flags: Flags) -> int:
+    """
+    Print the script.
+
+    :return: exit status
+    :raises UsageError: shtab is not installed
+    """
     try:
         import shtab
     except ImportError:
         raise UsageError(
             "completion needs shtab; install it with: pip install 'sb3-guard[completion]'"
         ) from None
-    print(shtab.complete(whole(), args.shell))
+    print(shtab.complete(whole(), flags.shell))
     return 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run the command.
-
-    :param argv: arguments; None: those of the process
-    :return: exit status: 0, or 2 for wrong usage
-    """
-    return run(lambda: _completion(argv))
-
+main = command(Flags, completion)
 
 if __name__ == "__main__":
     sys.exit(main())

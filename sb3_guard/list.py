@@ -1,20 +1,19 @@
 """What there is: ``sb3-guard list`` prints suites, robots, tasks and constraints."""
 
 import argparse
+import re
 import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
-from sb3_guard.envs import Scenario, env_ids
-from sb3_guard.envs.registry import CONSTRAINTS, LADDER, ROBOTS, TASKS
+from sb3_guard.envs import Scenario
+from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.envs.suites import SUITES, Suite
+from sb3_guard.envs.suites.guard import LADDER
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.tables import table
-from sb3_guard.zoo.usage import Parser, UsageError, import_packages, run
-
-EXAMPLES = """examples:
-  sb3-guard list
-  sb3-guard list robots
-  sb3-guard list --ladder Goal_Point Hazards
-"""
+from sb3_guard.zoo.flags import Command, command, flag
+from sb3_guard.zoo.markdown import table
+from sb3_guard.zoo.usage import UsageError, import_packages
 
 
 def summary(part: type) -> str:
@@ -38,20 +37,30 @@ def yes(part: type, name: str) -> str:
     return value
 
 
+def _of_one(suite: Suite) -> str:
+    """The ids of a suite, a row for each name up to its last part."""
+    stems: dict[str, list[str]] = {}
+    for env_id in suite.scenarios:
+        name = env_id.removesuffix("-v0")
+        stem = name.rpartition("_")[0] or re.sub(r"\d*(-v\d+)?$", "", name)
+        stems.setdefault(stem, []).append(name)
+    width = max(map(len, stems.values()))
+    rows = [[stem, *ids, *[""] * (width - len(ids))] for stem, ids in stems.items()]
+    return f"{suite.about}\n\n{table(['suite', *['id'] * width], rows)}"
+
+
 def suites() -> str:
-    """The named suites, a row per task and robot."""
-    ids = [env_id.removesuffix("-v0") for env_id in env_ids()]
-    stems = dict.fromkeys(env_id.rsplit("_", 1)[0] for env_id in ids)
-    rows = [[stem, *(env_id for env_id in ids if env_id.startswith(stem + "_"))] for stem in stems]
-    return table(["suite", *(["id"] * (len(rows[0]) - 1))], rows)
+    """The named suites of every family."""
+    return "\n\n".join(_of_one(suite) for suite in SUITES.values())
 
 
 def robots() -> str:
     """The robots with their actions, workspaces and time steps."""
     rows = []
     for name, cls in ROBOTS.items():
-        actions = Scenario(robot=name).build().robot.action_size
-        rows.append([name, str(actions), cls.workspace, f"{10 * cls.timestep:g}", summary(cls)])
+        engine = Scenario(robot=name).build()
+        actions, seconds = engine.robot.action_size, engine.control_step
+        rows.append([name, str(actions), cls.workspace, f"{seconds:g}", summary(cls)])
     return table(["robot", "actions", "workspace", "control step, s", "what it is"], rows)
 
 
@@ -84,35 +93,41 @@ def _kind(text: str) -> str:
     return text
 
 
-def parser() -> Parser:
-    """The flags."""
-    result = Parser(
-        prog="sb3-guard list",
-        description="Print suites, robots, tasks and constraints.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+@dataclass
+class Flags(Command):
+    """Print suites, robots, tasks and constraints."""
+
+    prog: ClassVar[str] = "sb3-guard list"
+    examples: ClassVar[str] = """examples:
+  sb3-guard list
+  sb3-guard list robots
+  sb3-guard list --ladder Goal_Point Hazards
+"""
+    kind: str | None = flag(
+        positional=True, nargs="?", kind=_kind, choices=list(KINDS), help="only these"
     )
-    result.add_argument("kind", nargs="?", type=_kind, choices=list(KINDS), help="only these")
-    result.add_argument(
-        "--ladder",
-        nargs="*",
-        metavar="TASK_ROBOT CONSTRAINT",
+    ladder: list[str] | None = flag(
+        nargs="*", metavar="TASK_ROBOT CONSTRAINT",
         help="ids of growing difficulty: more and more of a constraint",
-    )
-    result.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
-    return result
+    )  # fmt: skip
+    gym_packages: list[str] = flag(default=[], metavar="MODULE", help="modules that add parts")
 
 
-def _list(argv: Sequence[str] | None) -> int:
-    args = parser().parse_args(argv)
-    import_packages(args.gym_packages)
-    if args.ladder is not None:
-        if len(args.ladder) != 2:
+def show_lists(flags: Flags) -> int:
+    """
+    Print what there is.
+
+    :return: exit status
+    :raises UsageError: the ladder's names are not a task with a robot, and a constraint
+    """
+    import_packages(flags.gym_packages)
+    if flags.ladder is not None:
+        if len(flags.ladder) != 2:
             raise UsageError(
-                f"--ladder takes a task with a robot, and a constraint, not {len(args.ladder)} "
+                f"--ladder takes a task with a robot, and a constraint, not {len(flags.ladder)} "
                 "values: for example --ladder Goal_Point Hazards"
             )
-        ids = [f"{args.ladder[0]}_{num}{args.ladder[1]}-v0" for num in LADDER]
+        ids = [f"{flags.ladder[0]}_{num}{flags.ladder[1]}-v0" for num in LADDER]
         try:
             for env_id in ids:
                 Scenario.parse(env_id)
@@ -120,19 +135,11 @@ def _list(argv: Sequence[str] | None) -> int:
             raise UsageError(str(error)) from None
         print("\n".join(ids))
         return 0
-    print("\n\n".join(KINDS[kind]() for kind in ([args.kind] if args.kind else KINDS)))
+    print("\n\n".join(KINDS[kind]() for kind in ([flags.kind] if flags.kind else KINDS)))
     return 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run the command.
-
-    :param argv: arguments; None: those of the process
-    :return: exit status: 0, or 2 for wrong usage
-    """
-    return run(lambda: _list(argv))
-
+main = command(Flags, show_lists)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,10 +1,9 @@
 """One environment in full: ``sb3-guard show Goal_Ant_8Ghosts`` prints it and writes a picture."""
 
-import argparse
 import sys
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import yaml
@@ -12,14 +11,9 @@ import yaml
 from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.tables import table
-from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, import_packages, one_line, run
-
-EXAMPLES = """examples:
-  sb3-guard show Goal_Ant_8Ghosts
-  sb3-guard show my_scenario.yml -o mine.png
-  sb3-guard show Goal_Drone_8Hazards --env-kwargs "ghosts:{'num': 4}" --camera track
-"""
+from sb3_guard.zoo.flags import Command, command, flag
+from sb3_guard.zoo.markdown import table
+from sb3_guard.zoo.usage import UsageError, import_packages, one_line
 
 
 def observation_table(env: GuardVectorEnv) -> str:
@@ -42,57 +36,88 @@ def action_table(env: GuardVectorEnv) -> str:
     for i in range(model.nu):
         low, high = model.actuator_ctrlrange[i]
         name = model.actuator(i).name.removeprefix("robot/")
-        rows.append([str(i), name, "[-1, 1]", f"[{low:g}, {high:g}]"])
+        least, most = (np.broadcast_to(b, model.nu)[i] for b in env.engine.robot.action_range)
+        rows.append([str(i), name, f"[{least:g}, {most:g}]", f"[{low:g}, {high:g}]"])
     return table(["action", "actuator", "range", "control"], rows)
 
 
-def parser() -> Parser:
-    """The flags."""
-    result = Parser(
-        prog="sb3-guard show",
-        description="Print an environment's scenario, observations and actions; write a picture.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    result.add_argument("env", help="an id of ours, or a scenario file (.yml)")
-    result.add_argument(
-        "--env-kwargs", nargs="+", action=KeyValues, metavar="KEY:VALUE", help="change parameters"
-    )
-    result.add_argument("-o", "--output", type=Path, help="picture to write (default: <env>.png)")
-    result.add_argument("--camera", default="fixed", help=f"one of {', '.join(CAMERAS)}")
-    result.add_argument("--seed", type=int, default=0, help="of the episode in the picture")
-    result.add_argument("--gym-packages", nargs="+", default=[], help="modules that add parts")
-    return result
+def unsteady(env: GuardVectorEnv) -> str | None:
+    """What is wrong with a robot that is left alone for a second: it falls, or explodes."""
+    engine = env.engine
+    low, high = engine.robot.action_range
+    rest = np.broadcast_to((np.asarray(low) + high) / 2, (env.num_envs, engine.robot.action_size))
+    for step in range(1, round(1 / engine.control_step) + 1):
+        outcome = engine.step(rest)
+        seconds = f"{step * engine.control_step:.2g} s"
+        height, speed = engine.robot.position[0, 2], np.abs(engine.robot.velocity).max()
+        if outcome.physics_error[0] or speed > 50:
+            return (
+                f"the robot, left alone, explodes within {seconds}: make its timestep "
+                f"({engine.model.opt.timestep:g} s) smaller, or stiffness, gears and overlaps"
+            )
+        if height < -0.1:
+            return (
+                f"the robot, left alone, falls through the floor within {seconds}: its geoms need "
+                "contype and conaffinity of 1, and its class floor=True"
+            )
+        if outcome.terminated[0]:
+            break
+    return None
 
 
-def _show(argv: Sequence[str] | None) -> int:
-    args = parser().parse_args(argv)
-    import_packages(args.gym_packages)
-    if args.camera not in CAMERAS:
-        raise UsageError(f"unknown camera {args.camera!r}: {did_you_mean(args.camera, CAMERAS)}")
-    file = Path(args.env)
+@dataclass
+class Flags(Command):
+    """Print an environment's scenario, observations and actions; write a picture."""
+
+    prog: ClassVar[str] = "sb3-guard show"
+    examples: ClassVar[str] = """examples:
+  sb3-guard show Goal_Ant_8Ghosts
+  sb3-guard show my_scenario.yml -o mine.png
+  sb3-guard show Goal_Drone_8Hazards --env-kwargs "ghosts:{'num': 4}" --camera track
+"""
+    env: str = flag(positional=True, help="an id of ours, or a scenario file (.yml)")
+    env_kwargs: dict[str, Any] | None = flag(help="change parameters")
+    output: str | None = flag(
+        "-o", metavar="FILE.png", help="picture to write (default: <env>.png)"
+    )
+    camera: str = flag(default="fixed", help=f"one of {', '.join(CAMERAS)}")
+    seed: int = flag(default=0, help="of the episode in the picture")
+    gym_packages: list[str] = flag(default=[], metavar="MODULE", help="modules that add parts")
+
+
+def show(flags: Flags) -> int:
+    """
+    Print and draw an environment.
+
+    :return: exit status
+    :raises UsageError: there is no such environment, or no picture can be made
+    """
+    import_packages(flags.gym_packages)
+    if flags.camera not in CAMERAS:
+        raise UsageError(f"unknown camera {flags.camera!r}: {did_you_mean(flags.camera, CAMERAS)}")
+    file = Path(flags.env)
     try:
-        spec = env_spec(args.env)
+        spec = env_spec(flags.env)
         if "scenario" not in spec.kwargs:
             raise UsageError(
-                f"{args.env!r} is not an environment of sb3_guard's: see sb3-guard list"
+                f"{flags.env!r} is not an environment of sb3_guard's: see sb3-guard list"
             )
         kwargs: dict[str, Any] = {
             **spec.kwargs,
             "num_envs": 1,
             "render_mode": "rgb_array",
-            "camera": args.camera,
+            "camera": flags.camera,
             "flatten": False,  # an image fits in no flat observation; the slices are the same
-            **(args.env_kwargs or {}),
+            **(flags.env_kwargs or {}),
         }
         env = GuardVectorEnv(**kwargs)
-        env.begin([args.seed])
+        env.begin([flags.seed])
     except (ValueError, TypeError, RuntimeError) as error:
         raise UsageError(one_line(error)) from None
     data = {key: value for key, value in env.scenario.to_dict().items() if value}
     print(yaml.safe_dump(data, sort_keys=False))
     print(observation_table(env), action_table(env), sep="\n\n")
-    path = args.output or Path(f"{file.stem.removesuffix('-v0')}.png")
+    path = Path(flags.output) if flags.output else Path(f"{file.stem.removesuffix('-v0')}.png")
     try:
         frame = env.frame(0)
         from matplotlib import image
@@ -101,18 +126,13 @@ def _show(argv: Sequence[str] | None) -> int:
     except (RenderingError, OSError, ValueError) as error:
         raise UsageError(f"no picture: {one_line(error)}") from None
     print(f"\nwrote {path}")
+    warning = unsteady(env)
+    if warning is not None:
+        print(f"warning: {warning}", file=sys.stderr)
     return 0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run the command.
-
-    :param argv: arguments; None: those of the process
-    :return: exit status: 0, or 2 for wrong usage
-    """
-    return run(lambda: _show(argv))
-
+main = command(Flags, show)
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -9,7 +9,7 @@ import pickle
 import random
 import time
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.logger import RunLogger
+from sb3_guard.zoo.make_envs import seed_rows
 from sb3_guard.zoo.resumable import capture, restore
 from sb3_guard.zoo.usage import UsageError, one_line
 
@@ -30,7 +31,7 @@ NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
 # Checkpoints take at most this share of the time: those with a replay buffer are large.
 LARGEST_SHARE = 0.05
-FORMAT = 1  # increased when the content changes so that older files can't be continued
+FORMAT = 2  # increased when the content changes so that older files can't be continued
 
 
 class Interrupted(Exception):
@@ -60,6 +61,7 @@ class Checkpoints(BaseCallback):
         0: one at every rollout; otherwise large ones are written less often
     :param log_interval: rollouts per logged row; checkpoints fall on logged rollouts, since SB3
         counts rollouts from the start of each ``learn``
+    :param what: what makes the run the run it is, to be found unchanged when it is resumed
     """
 
     def __init__(
@@ -68,12 +70,16 @@ class Checkpoints(BaseCallback):
         others: Sequence[BaseCallback],
         every: float = 10.0,
         log_interval: int = 1,
+        what: Mapping[str, Any] | None = None,
     ):
         super().__init__()
         self.path = path
         self.others = list(others)
         self.every = every
         self.log_interval = max(log_interval, 1)
+        self.what = dict(what or {})
+        #: asked at each boundary whether to stop with a checkpoint, by a grid
+        self.asked: Callable[[], bool] | None = None
         #: set from a signal handler: stop with a checkpoint at the next boundary
         self.stop = False
         self.rollouts = 0  # all of the run's
@@ -92,6 +98,8 @@ class Checkpoints(BaseCallback):
     def _on_rollout_start(self) -> None:
         pause = max(self.every, self._took / LARGEST_SHARE if self.every > 0 else 0.0)
         due = time.monotonic() - self._last >= pause
+        if self.asked is not None:
+            self.stop |= self.asked()
         if self.stop or (due and self.rollouts % self.log_interval == 0):
             # gSDE has drawn its noise by now; the algorithm remembers how things were before.
             self.write(
@@ -136,6 +144,7 @@ class Checkpoints(BaseCallback):
             cuda = th.cuda.get_rng_state_all()
         state = {
             "format": FORMAT,
+            "what": self.what,
             "num_timesteps": self.model.num_timesteps,
             "generators": generators,
             "cuda": cuda or [],
@@ -278,7 +287,7 @@ def restore_run(model: BaseAlgorithm, state: dict[str, Any]) -> None:
         # `learn` begins new episodes when there is no observation to go on from; not the first
         # ones of the run again.
         model._last_obs = None
-        env.seed((model.seed or 0) + state["num_timesteps"])
+        seed_rows(env, model.seed or 0, 0, state["num_timesteps"])
     set_random_state(state["generators"])
     if state["cuda"] and th.cuda.is_available():
         th.cuda.set_rng_state_all(state["cuda"])

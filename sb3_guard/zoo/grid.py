@@ -1,60 +1,42 @@
 """A grid of training runs, suites × algorithms × seeds: checked in full, then carried out.
 
 A run of a grid is a training run like any other, in ``<folder>/<algo>/<env>_<seed + 1>/``, so it is
-played, plotted and resumed like any other. All that a grid knows about its runs it reads from their
-folders, so it can be killed and started again anywhere, and runs on any
-:class:`concurrent.futures.Executor` whose workers see the folder.
+played, plotted and resumed like any other. Dask's workers carry them out, here or on a cluster; all
+that matters is in the run folders: the lock says that a run is under way, ``result.json``, written
+last, that it is done. So a grid can be killed and started again anywhere.
 """
 
-import os
+import logging
+import multiprocessing
 import shlex
 import sys
+import threading
 import time
+import traceback
 import uuid
-from collections.abc import Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    CancelledError,
-    Executor,
-    Future,
-    ThreadPoolExecutor,
-    wait,
-)
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from sb3_guard import __version__
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.algos import algorithm
-from sb3_guard.zoo.config import NOISE_KEYS, RUN_KEYS, arguments
-from sb3_guard.zoo.experiment import Experiment, prepare, refuse_another
-from sb3_guard.zoo.live import Board
-from sb3_guard.zoo.run_folder import RunFolder, in_use, is_run, owner, run_path
+from sb3_guard.zoo.hyperparams import NOISE_KEYS, RUN_KEYS, arguments
+from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run_flags import RunFlags
+from sb3_guard.zoo.run_folder import RunFolder, RunInUse, is_disk_error, is_run, run_path
+from sb3_guard.zoo.start import complete, prepare, refuse_another
 from sb3_guard.zoo.usage import UsageError, interrupts, one_line
-from sb3_guard.zoo.worker import Outcome, Task, kill_all, last_line, work
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+    from sb3_guard.zoo.live import Board
 
 RETRIES = 2  # of a run that fails
 POLL = 0.5  # seconds between looks at what runs
-PATIENCE = 30.0  # seconds a shared disk may take to show a result that a worker has written
-
-
-class LocalExecutor(ThreadPoolExecutor):
-    """
-    Runs on this machine, each in a process with one thread: the threads here only wait for them.
-
-    :param jobs: how many at once; None: as many as there are cores for this process
-    """
-
-    def __init__(self, jobs: int | None = None):
-        super().__init__(jobs or cores())
-
-
-def cores() -> int:
-    """The number of cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS and Windows
-        return os.cpu_count() or 1
 
 
 @dataclass(eq=False)
@@ -71,6 +53,7 @@ class Run:
     #: done · resume · new (planned); waiting · running · in use · done · failed · stopped (later)
     state: str = "new"
     attempts: int = 0
+    #: what went wrong last, in a line
     error: str = ""
     ignored: list[str] = field(default_factory=list)
 
@@ -124,9 +107,9 @@ def expand(
     args = {**args, "progress": False, "num_threads": max(args["num_threads"], 1)}
     for env_id, algo in pairs:
         own = {name: value for name, value in given.items() if name in known[algo]}
-        one, values = prepare(
-            {**args, "env": env_id, "algo": algo, "seed": 0, "hyperparams": own or None}
-        )
+        mine = {"env": env_id, "algo": algo, "seed": 0, "hyperparams": own or None}
+        flags, values = prepare(RunFlags.of({**args, **mine}))
+        one = flags.values()
         values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
         one["n_timesteps"] = values["n_timesteps"]
         prepared[one["env"], algo] = one, values, sorted(given.keys() - own.keys())
@@ -154,7 +137,7 @@ def plan(runs: Sequence[Run]) -> None:
         if not is_run(run.path):
             continue
         folder = RunFolder(run.path)
-        refuse_another(folder, run.args, run.values)
+        refuse_another(folder, RunFlags.of(run.args), run.values)
         if folder.read_result() is not None:
             run.state = "done"
         elif folder.checkpoint.exists():
@@ -163,63 +146,183 @@ def plan(runs: Sequence[Run]) -> None:
 
 def try_out(runs: Sequence[Run]) -> None:
     """
-    Make each suite and each algorithm once and take a step, so that a value that is refused only
-    there ends the grid before it begins.
+    Make each suite and each algorithm once, so that a value that is refused only there ends the
+    grid before it begins.
 
     :raises UsageError: one is refused
     """
     import torch as th
 
-    suites: set[str] = set()
-    algos: set[str] = set()
+    seen: set[str] = set()
+    here = {"device": "cpu", "num_threads": 1, "tensorboard_log": "", "track": False}
     for run in runs:
-        if run.state == "done":
+        if run.state == "done" or {run.args["env"], run.args["algo"]} <= seen:
             continue
-        args = {
-            **run.args,
-            "device": "cpu",
-            "num_threads": 1,
-            "tensorboard_log": "",
-            "track": False,
-        }
-        if args["env"] in suites and args["algo"] in algos:
-            continue
-        suites.add(args["env"])
-        algos.add(args["algo"])
+        seen |= {run.args["env"], run.args["algo"]}
+        args = {**run.args, **here}
         if args["vec_env"] == "subproc":
             args["vec_env"] = "dummy"
         try:
             if run.args["device"] != "auto":
                 th.device(run.args["device"])
-            Experiment(args, run.values).close()
+            Experiment(RunFlags.of(args), run.values).close()
         except (UsageError, RuntimeError) as error:
             raise UsageError(f"{args['algo']} on {args['env']}: {one_line(error)}") from error
 
 
-@dataclass
+# In a worker
+
+_stopped: set[str] = set()  # the grids that have asked their runs to stop
+_one_at_a_time = threading.Lock()  # random generators and thread counts belong to the process
+
+
+def carry_out(run: Run, command: str, grid: str) -> tuple[str, str]:
+    """
+    Complete a run; what goes wrong is also written to ``error.txt`` in its folder.
+
+    :param command: the command line, for the run folder
+    :param grid: the name under which :func:`ask_to_stop` is called
+    :return: the state it is left in, ``done``, ``stopped``, ``failed``, ``in use`` by another
+        process, or ``no disk``: full, read-only or broken; and what went wrong
+    """
+    with _one_at_a_time:
+        try:
+            if grid in _stopped:
+                return "stopped", ""
+            asked = lambda: grid in _stopped  # noqa: E731
+            status = complete(RunFlags.of(run.args), run.values, run.number, command, asked)
+        except RunInUse as error:
+            time.sleep(POLL)
+            return "in use", one_line(error)
+        except Exception as error:
+            if is_disk_error(error):
+                return "no disk", one_line(error)
+            _record(run, traceback.format_exc())
+            return "failed", one_line(error)
+    return "stopped" if status else "done", ""
+
+
+def ask_to_stop(grid: str) -> None:
+    """Let a worker's run end after the rollout under way, if it belongs to a grid."""
+    _stopped.add(grid)
+
+
+def _record(run: Run, text: str) -> None:
+    now = time.strftime("%Y-%m-%d %H:%M:%S")
+    # The grid's summary says it too, so a record that can't be written is no second failure.
+    with suppress(OSError), open(run.path / "error.txt", "a") as file:
+        file.write(f"--- {now}\n{text}\n")
+
+
+# Workers
+
+
+@contextmanager
+def workers(jobs: int | None, scheduler: str | None, folder: Path) -> Iterator["Client"]:
+    """
+    Dask's workers: processes of this machine, or those of a cluster.
+
+    :param jobs: how many on this machine; None: as many as there are cores for this process
+    :param scheduler: address of the cluster's scheduler; None: this machine
+    :param folder: the grid's, which must exist on all of them
+    :raises UsageError: no scheduler answers, or a worker can't do the work
+    """
+    import dask
+    from dask.system import CPU_COUNT
+    from distributed import Client, LocalCluster
+
+    # What goes wrong is said here, in a line; Dask's own words would bury that.
+    for name in ("distributed", "distributed.client", "distributed.nanny"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    if scheduler is None:
+        # Whatever ends a run's process counts as one of its failures.
+        settings = {
+            "distributed.scheduler.allowed-failures": 0,
+            "distributed.scheduler.http.routes": [],
+            "distributed.worker.http.routes": [],
+        }
+        with (
+            dask.config.set(settings),
+            LocalCluster(
+                n_workers=jobs or CPU_COUNT,
+                threads_per_worker=1,
+                memory_limit=None,
+                dashboard_address="127.0.0.1:0",
+                security=True,  # else whoever has an account on this machine may give it work
+                silence_logs=logging.CRITICAL,
+                preload=[LONE],
+                env={"PYTHONWARNINGS": "ignore"},
+            ) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
+            try:
+                yield client
+            except KeyboardInterrupt:  # do not let the runs finish their rollouts
+                for worker in multiprocessing.active_children():
+                    worker.kill()
+                raise
+        return
+    try:
+        client = Client(scheduler, timeout=10, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise UsageError(
+            f"no Dask scheduler answers at {scheduler}: {one_line(error)}; "
+            "start one with: dask scheduler"
+        ) from error
+    with client:
+        _check(client, folder)
+        yield client
+
+
+# Ctrl-C in a terminal reaches a whole group of processes; here, it is for the grid alone.
+LONE = "import os; getattr(os, 'setpgrp', int)()"
+
+
+def _check(client: "Client", folder: Path) -> None:
+    """Refuse a cluster whose workers have another version, or do not see the folder."""
+    try:
+        seen = client.run(_looks, folder)
+    except Exception as error:
+        raise UsageError(
+            f"a Dask worker can't use sb3_guard: {one_line(error)}; install it there"
+        ) from error
+    for worker, (version, visible) in seen.items():
+        if version != __version__:
+            raise UsageError(
+                f"Dask worker {worker} has sb3_guard {version}, this is {__version__}; "
+                "install the same version"
+            )
+        if not visible:
+            raise UsageError(
+                f"Dask worker {worker} does not see the folder {folder}; "
+                "choose one on a disk that all workers share, with -f"
+            )
+
+
+def _looks(path: Path) -> tuple[str, bool]:
+    return __version__, path.exists()
+
+
+# Here
+
+
 class Execution:
     """
     The runs of a grid being carried out.
 
     :param runs: planned
-    :param executor: its workers see the runs' folders
+    :param client: of the workers, which see the runs' folders
     :param board: shows how it goes
-    :param command: the command line, for the run folders
-    :param folder: where the runs' permit lies: they end when it is gone
     """
 
-    runs: Sequence[Run]
-    executor: Executor
-    board: Board
-    command: str
-    folder: Path
-
-    def __post_init__(self) -> None:
-        self.permit = self.folder / f".grid-{uuid.uuid4().hex[:12]}"
+    def __init__(self, runs: Sequence[Run], client: "Client", board: "Board"):
+        self.runs, self.client, self.board = runs, client, board
+        self.name = uuid.uuid4().hex
         self.signal = 0
-        self._asked = False  # the runs to stop
         self.no_disk = ""
-        self._flight: dict[Future[Outcome], tuple[Run, Task]] = {}
+        self._waiting = [run for run in runs if run.state != "done"]
+        self._flight: dict[Future, Run] = {}
+        self._slots = len(client.nthreads())
 
     def carry_out(self) -> int:
         """
@@ -228,115 +331,17 @@ class Execution:
         :return: exit status: 0, 1 if runs failed, or 128 + the signal's number when interrupted
         :raises UsageError: the workers are gone
         """
-        try:
-            self.permit.parent.mkdir(parents=True, exist_ok=True)
-            self.permit.touch()
-        except OSError as error:
-            raise UsageError(
-                f"can't write to log folder {str(self.folder)!r}: {error.strerror}; "
-                "choose another with -f"
-            ) from error
+        for run in self._waiting:
+            run.state = "waiting"
         with interrupts(self._stop):
-            try:
-                for run in self.runs:
-                    if run.state != "done":
-                        self._submit(run)
+            while self._waiting or self._flight:
+                self._submit()
                 self.board.update(self.runs)
-                while self._flight or self._others():
-                    self._look()
-            except BaseException:
-                # A second Ctrl-C, or the workers are gone: what runs here ends at once.
-                self._withdraw()
-                for future in self._flight:
-                    future.cancel()
-                kill_all()
-                raise
-        self._withdraw()
+                time.sleep(POLL)
+                self._collect()
         if self.signal:
             return 128 + self.signal
         return int(any(run.state != "done" for run in self.runs))
-
-    def _withdraw(self) -> None:
-        """Let all runs end after the rollout under way, and those not begun not begin."""
-        self._asked = True
-        try:
-            self.permit.unlink(missing_ok=True)
-        except OSError:  # a disk that became read-only: there is nothing more to save
-            for future in self._flight:
-                future.cancel()
-            kill_all()
-
-    def _others(self) -> list[Run]:
-        return [run for run in self.runs if run.state == "in use"]
-
-    def _submit(self, run: Run) -> None:
-        run.state = "waiting"
-        task = Task(run.args, run.values, run.number, self.command, self.permit, run.attempts + 1)
-        self._flight[self.executor.submit(work, task)] = run, task
-
-    def _look(self) -> None:
-        if self._stopping and not self._asked:
-            self._withdraw()
-        if self._flight:
-            ended, _ = wait(self._flight, timeout=POLL, return_when=FIRST_COMPLETED)
-        else:
-            time.sleep(POLL)
-            ended = set()
-        for future in ended:
-            self._ended(self._flight.pop(future)[0], future)
-        for run, task in self._flight.values():
-            if run.state == "waiting" and owner(run.path).get("grid") == task.name:
-                run.state = "running"
-                self.board.note("started" if run.attempts == 0 else "started again", run)
-        for run in self._others():
-            if self._stopping:
-                run.state = "stopped"
-            elif not in_use(run.path):
-                self._submit(run)
-        self.board.update(self.runs)
-
-    def _ended(self, run: Run, future: "Future[Outcome]") -> None:
-        try:
-            state, text = future.result()
-        except CancelledError:
-            if not self._stopping:
-                raise UsageError(
-                    "the workers are gone, or the scheduler is; the runs keep their checkpoints: "
-                    "start it again"
-                ) from None
-            state, text = "stopped", ""
-        except Exception as error:  # a worker died, or can't do the work at all
-            state, text = "failed", one_line(error)
-        result = run.path / "result.json"
-        if state == "done" and not self._has_result(run):
-            state, text = (
-                "failed",
-                (
-                    f"A worker reports the run as done, but there is no {result}: "
-                    "the folder must be on a disk that all workers share."
-                ),
-            )
-        run.state = state
-        if state == "done":
-            self.board.note("done", run)
-        elif state == "no disk":
-            run.state, self.no_disk = "stopped", self.no_disk or text
-        elif state == "failed":
-            run.attempts += 1
-            run.error = text
-            again = run.attempts <= RETRIES and not self._stopping
-            self.board.note("failed, is tried again" if again else "failed", run)
-            if again:
-                self._submit(run)
-
-    def _has_result(self, run: Run) -> bool:
-        end = time.monotonic() + PATIENCE
-        # A shared disk may show the folder itself as late as the result in it.
-        while not is_run(run.path) or RunFolder(run.path).read_result() is None:
-            if time.monotonic() > end or self._stopping:
-                return False
-            time.sleep(POLL)
-        return True
 
     @property
     def _stopping(self) -> bool:
@@ -344,43 +349,106 @@ class Execution:
 
     def _stop(self, number: int) -> None:
         self.signal = number
-        self.board.say(
-            "Stopping after the rollouts under way; once more to stop at once.", sys.stderr
-        )
+        self.board.say("Stopping after the rollouts under way; once more to stop immediately.")
+
+    def _submit(self) -> None:
+        """Give each idle worker a run, so that what ends a worker is blamed on one run."""
+        if self._stopping:
+            for run in self._waiting:
+                run.state = "stopped"
+            self._waiting.clear()
+            # Every time, since a worker may have died and another taken its run over.
+            self.client.run(ask_to_stop, self.name, on_error="ignore")
+        if self.client.status != "running":
+            raise UsageError("the Dask scheduler is gone; the runs keep their checkpoints")
+        if self.client.cluster is not None:
+            self.client.cluster.scale(self._slots)  # replaces workers that did not come back
+        else:
+            self._slots = len(self.client.nthreads())
+        while self._waiting and len(self._flight) < max(self._slots, 1):
+            run = self._waiting.pop(0)
+            if run.state != "in use":
+                run.state = "running"
+                self.board.note("retrying" if run.attempts else "started", run)
+            command = shlex.join(sys.orig_argv)
+            future = self.client.submit(carry_out, run, command, self.name, pure=False)
+            self._flight[future] = run
+
+    def _collect(self) -> None:
+        for future in [one for one in self._flight if one.done()]:
+            run = self._flight.pop(future)
+            if future.status == "finished":
+                state, text = future.result()
+            elif future.status == "error":
+                # Those of runs are caught where they run: this is Dask's, of a dead worker.
+                error = one_line(future.exception() or RuntimeError())
+                state, text = "failed", f"its process died, perhaps for want of memory: {error}"
+                _record(run, text)
+            else:
+                raise UsageError("the Dask scheduler is gone; the runs keep their checkpoints")
+            self._ended(run, state, text)
+
+    def _ended(self, run: Run, state: str, text: str) -> None:
+        run.state = state
+        if state == "no disk":
+            run.state, self.no_disk = "stopped", text
+        elif state == "in use":
+            self._waiting.append(run)
+        elif state == "failed":
+            run.attempts, run.error = run.attempts + 1, text
+            self.board.note("failed", run)
+            if run.attempts <= RETRIES and not self._stopping:
+                self._waiting.append(run)
+        elif state == "done":
+            self.board.note("done", run)
 
 
-def run_grid(runs: Sequence[Run], executor: Executor, args: Mapping[str, Any], go_on: str) -> int:
+def run_grid(
+    runs: Sequence[Run],
+    folder: Path,
+    again: str,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    verbose: int = 1,
+) -> int:
     """
     Carry out what is not done, and say what has become of it.
 
     :param runs: expanded, planned and tried out
-    :param executor: see :class:`Execution`
-    :param args: all flags
-    :param go_on: how to go on when interrupted, for the message
+    :param folder: where they are
+    :param again: how to continue when interrupted, for the message
+    :param jobs: see :func:`workers`
+    :param scheduler: likewise
+    :param verbose: 0: errors only
     :return: exit status, see :meth:`Execution.carry_out`
-    :raises UsageError: the workers are gone
+    :raises UsageError: the workers are gone, or can't do the work
     """
-    folder = Path(args["log_folder"])
+    from sb3_guard.zoo.live import Board
+
+    status = 0
     states = [run.state for run in runs]
-    with Board(str(folder), args["verbose"]) as board:
+    with Board(str(folder), verbose) as board:
         board.say(
-            f"{len(runs)} runs in {folder}: {states.count('done')} are done, "
-            f"{states.count('resume')} go on from their checkpoints, {states.count('new')} are new"
+            f"{len(runs)} runs in {folder}: {states.count('done')} done, "
+            f"{states.count('resume')} to resume, {states.count('new')} new"
         )
         for algo, names in {run.args["algo"]: run.ignored for run in runs if run.ignored}.items():
             board.say(f"{algo} has no {', '.join(names)}: left out there")
-        execution = Execution(runs, executor, board, shlex.join(sys.orig_argv), folder)
-        try:
-            status = execution.carry_out()
-        except UsageError as error:
-            raise UsageError(f"{one_line(error)}; {go_on}") from error
-    failed = [run for run in runs if run.state == "failed"]
+        execution = None
+        if states.count("done") < len(runs):
+            with workers(jobs, scheduler, folder) as client:
+                execution = Execution(runs, client, board)
+                try:
+                    status = execution.carry_out()
+                except UsageError as error:
+                    raise UsageError(f"{one_line(error)}; {again}") from error
     done = sum(run.state == "done" for run in runs)
     board.say(f"{done} of {len(runs)} runs are done in {folder}")
-    for run in failed:
-        print(f"failed: {run}: {last_line(run.error)}\n  {run.path / 'error.txt'}", file=sys.stderr)
-    if execution.no_disk:
-        print(f"error: {last_line(execution.no_disk)}", file=sys.stderr)
+    for run in runs:
+        if run.state == "failed":
+            print(f"failed: {run}: {run.error}\n  {run.path / 'error.txt'}", file=sys.stderr)
+    if execution is not None and execution.no_disk:
+        print(f"error: {execution.no_disk}", file=sys.stderr)
     if done < len(runs):
-        board.say(go_on[0].upper() + go_on[1:])
+        board.say(again[0].upper() + again[1:])
     return status

@@ -12,12 +12,14 @@ from typing import Any
 import yaml
 
 from sb3_guard.common.evaluation import evaluate_policy
+from sb3_guard.zoo.agent_flags import HubFlags
 from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
 from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_mapping
 from sb3_guard.zoo.usage import UsageError, one_line
 
 # Said before an agent is downloaded.
 TRUST = "agents are programs: load only from people you trust"
+EPISODES = 10  # that the card tells of
 # Flags that name files of this machine
 PATHS = ("log_folder", "tensorboard_log", "conf_file", "trained_agent")
 
@@ -57,55 +59,55 @@ def model_name(algo: str, env_id: str) -> str:
     return f"{algo}-{folder_name(env_id)}"
 
 
-def push(args: Mapping[str, Any]) -> int:
+def push(flags: HubFlags) -> int:
     """
     Evaluate an agent, write its card, film it, and upload all to the hub.
 
-    :param args: all flags of ``hub push``, with their defaults
+    :param flags: of the command
     :return: exit status
     :raises UsageError: there is no such agent, it can't be filmed, or the hub can't be reached
     """
-    agent = open_agent(args, None if args["no_video"] else "rgb_array")
+    agent = open_agent(flags, None if flags.no_video else "rgb_array")
     try:
-        organization = args["organization"]
-        name = args["repo_name"] or model_name(args["algo"], agent.env_id)
+        organization = flags.organization
+        name = flags.repo_name or model_name(flags.algo, agent.env_id)
         repo_id = f"{organization}/{name}"
-        folder = Path(args["folder_on_disk"] or tempfile.mkdtemp(prefix="sb3_guard_hub_"))
-        stage(agent, args, repo_id, folder)
+        folder = Path(flags.to or tempfile.mkdtemp(prefix="sb3_guard_hub_"))
+        stage(agent, flags, repo_id, folder)
     finally:
         agent.env.close()
     print(f"Ready to upload: {folder}")
-    if args["dry_run"]:
+    if flags.dry_run:
         return 0
     from huggingface_hub import HfApi
 
     with _network(f"the upload of {folder} to {repo_id}"):
         api = HfApi()
-        api.create_repo(repo_id, private=args["private"], exist_ok=True)
+        api.create_repo(repo_id, private=flags.private, exist_ok=True)
         url = api.upload_folder(
-            repo_id=repo_id, folder_path=folder, commit_message=args["commit_message"]
+            repo_id=repo_id, folder_path=folder, commit_message=flags.commit_message
         )
     print(f"Uploaded: {url}")
     return 0
 
 
-def stage(agent: Agent, args: Mapping[str, Any], repo_id: str, folder: Path) -> None:
+def stage(agent: Agent, flags: HubFlags, repo_id: str, folder: Path) -> None:
     """
     Write everything that goes to the hub into a folder.
 
     :param agent: the agent and its environment
-    :param args: all flags of ``hub push``
+    :param flags: of the command
     :param repo_id: ``organization/name``
     :param folder: made if it is not there; files of the same names are replaced
     :raises UsageError: the agent can't be filmed
     """
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(agent.path, folder / f"{model_name(args['algo'], agent.env_id)}.zip")
+    shutil.copyfile(agent.path, folder / f"{model_name(flags.algo, agent.env_id)}.zip")
     shutil.copyfile(agent.run.params / "config.yml", folder / "config.yml")
-    flags = agent.run.args()
-    flags |= {name: Path(flags[name]).name for name in PATHS if flags.get(name)}
-    (folder / "args.yml").write_text(yaml.safe_dump(flags))
-    (folder / "command.txt").write_text(command(agent.run))
+    trained = agent.run.args()
+    trained |= {name: Path(trained[name]).name for name in PATHS if trained.get(name)}
+    (folder / "args.yml").write_text(yaml.safe_dump(trained), encoding="utf-8")
+    (folder / "command.txt").write_text(command(agent.run), encoding="utf-8")
     if agent.normalizer.suffix == ".pkl" and agent.normalizer.is_file():
         shutil.copyfile(agent.normalizer, folder / "vec_normalize.pkl")
     if agent.run.monitor.is_file():
@@ -114,27 +116,27 @@ def stage(agent: Agent, args: Mapping[str, Any], repo_id: str, folder: Path) -> 
         evaluate_policy(
             agent.model,
             agent.env,
-            n_eval_episodes=args["n_episodes"],
-            deterministic=not args["stochastic"],
-            seed=args["seed"],
+            n_eval_episodes=flags.n_episodes or EPISODES,
+            deterministic=not flags.stochastic,
+            seed=flags.seed,
         )
     )
-    if not args["no_video"]:
+    if not flags.no_video:
         with camera(agent.env, folder / "replay.mp4", "rgb_array") as shoot:
             evaluate_policy(
                 agent.model,
                 agent.env,
                 n_eval_episodes=1,
-                deterministic=not args["stochastic"],
-                seed=args["seed"],
+                deterministic=not flags.stochastic,
+                seed=flags.seed,
                 on_step=shoot,
             )
-    results["is_deterministic"] = not args["stochastic"]
-    (folder / "results.json").write_text(json.dumps(results, indent=2))
-    (folder / "README.md").write_text(card(agent, args, repo_id, results))
+    results["is_deterministic"] = not flags.stochastic
+    (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
+    (folder / "README.md").write_text(card(agent, flags, repo_id, results), encoding="utf-8")
 
 
-def card(agent: Agent, args: Mapping[str, Any], repo_id: str, results: Mapping[str, Any]) -> str:
+def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]) -> str:
     """The model card: metadata that the hub reads, and a page that people read."""
     from huggingface_hub import EvalResult, ModelCardData
 
@@ -172,10 +174,10 @@ def card(agent: Agent, args: Mapping[str, Any], repo_id: str, results: Mapping[s
     page = CARD.format(
         name=name,
         env=agent.env_id,
-        algo=args["algo"],
+        algo=flags.algo,
         repo_id=repo_id,
         episodes=results["episodes"],
-        actions="sampled" if args["stochastic"] else "most likely",
+        actions="sampled" if flags.stochastic else "most likely",
         rows="\n".join(rows),
         limit=f"; the agent was trained under a limit of {limit}" if constrained else "",
         command=command(agent.run),
@@ -187,36 +189,41 @@ def card(agent: Agent, args: Mapping[str, Any], repo_id: str, results: Mapping[s
 def command(run: RunFolder) -> str:
     """The command line of a run, with the names of files, but not where they lie here."""
     file = run.params / "command.txt"
-    text = file.read_text().strip() if file.is_file() else ""
-    interpreter, module, rest = text.partition(" -m ")
+    text = file.read_text(encoding="utf-8").strip() if file.is_file() else ""
     try:
-        words = shlex.split(f"python -m {rest}" if module else interpreter)
+        words = shlex.split(text)
     except ValueError:  # a quotation mark that nothing closes
         return ""
+    # The interpreter's own path and flags are this machine's: what follows is the command.
+    if "-m" in words:
+        words = ["python", *words[words.index("-m") :]]
+    else:
+        starts = [k for k, word in enumerate(words) if Path(word).stem == "sb3-guard"]
+        words = ["sb3-guard", *words[starts[0] + 1 :]] if starts else words
     return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
-def load(args: Mapping[str, Any]) -> int:
+def load(flags: HubFlags) -> int:
     """
     Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it.
 
-    :param args: all flags of ``hub load``, with their defaults
+    :param flags: of the command
     :return: exit status
     :raises UsageError: the hub can't be reached, or has no such agent
     """
-    name = model_name(args["algo"], args["env"])
-    repo_id = args["repo_id"] or f"{args['organization']}/{args['repo_name'] or name}"
+    name = model_name(flags.algo, flags.env)
+    repo_id = flags.repo_id or f"{flags.organization}/{flags.repo_name or name}"
     from huggingface_hub import snapshot_download
 
     print(TRUST)
     with _network(f"the download of {repo_id}"):
         downloaded = Path(snapshot_download(repo_id))
-    run = install(downloaded, name, args)
+    run = install(downloaded, name, flags)
     print(f"Run folder: {run.path}")
     return 0
 
 
-def install(downloaded: Path, name: str, args: Mapping[str, Any]) -> RunFolder:
+def install(downloaded: Path, name: str, flags: HubFlags) -> RunFolder:
     """
     Make a run folder of what was downloaded.
 
@@ -232,14 +239,14 @@ def install(downloaded: Path, name: str, args: Mapping[str, Any]) -> RunFolder:
                 f"the repository has no {needed.name}, but {found}; name the agent's own "
                 "--algo and --env"
             )
-    env = folder_name(args["env"])
+    env = folder_name(flags.env)
     trained = read_mapping(downloaded / "args.yml")
-    if (trained.get("algo"), folder_name(str(trained.get("env")))) != (args["algo"], env):
+    if (trained.get("algo"), folder_name(str(trained.get("env")))) != (flags.algo, env):
         raise UsageError(
             f"the repository's agent is {trained.get('algo')} on {trained.get('env')} by its "
-            f"args.yml, not {args['algo']} on {args['env']}; name its own --algo and --env"
+            f"args.yml, not {flags.algo} on {flags.env}; name its own --algo and --env"
         )
-    parent = Path(args["folder"]) / args["algo"]
+    parent = Path(flags.folder) / flags.algo
     parent.mkdir(parents=True, exist_ok=True)
     path = claim(parent, env)
     (path / env).mkdir()

@@ -1,77 +1,43 @@
-"""How a grid goes: a live table on a terminal, plain lines elsewhere, read from the run folders."""
+"""How a grid goes: bars on a terminal, plain lines elsewhere; read from the run folders."""
 
 import csv
-import io
-import math
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from sb3_guard.zoo.run_folder import RunFolder, is_run
-from sb3_guard.zoo.worker import last_line
+from sb3_guard.zoo.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from sb3_guard.zoo.grid import Run
 
 REFRESH = 1.0  # seconds between looks into the folders
 LINE_EVERY = 300.0  # seconds between plain lines of progress
-TAIL = 1 << 16  # bytes of a log that are read
-COLOURS = {"running": "cyan", "done": "green", "failed": "red", "in use": "yellow"}
+LOGGED = {
+    "steps": "time/total_timesteps",
+    "return": "rollout/ep_rew_mean",
+    "cost": "rollout/ep_cost_mean",
+}
 
 
-class Progress(NamedTuple):
-    """How far a run is and how it does: return and cost are means of its last episodes."""
-
-    steps: int = 0
-    episode_return: float = math.nan
-    cost: float = math.nan
-
-
-def read_progress(run: Path) -> Progress:
-    """The last that a run has logged; nothing if it has not logged, whoever writes to it now."""
+def read_progress(run: Path) -> dict[str, float]:
+    """The last ``steps``, ``return`` and ``cost`` that a run has logged, whoever writes to it."""
+    last = {"steps": 0.0}
     try:
-        with open(run / "progress.csv", "rb") as file:
-            header = file.readline()
-            start = max(file.seek(0, io.SEEK_END) - TAIL, len(header))
-            file.seek(start)
-            # The first line may lack its beginning, the last one its end.
-            whole = file.read().rpartition(b"\n")[0]
-    except OSError:
-        return Progress()
-    if start > len(header):
-        whole = whole.partition(b"\n")[2]
-    last: dict[str, float] = {}
-    for row in csv.DictReader(io.StringIO((header + whole).decode(errors="replace"))):
-        for key, value in row.items():
-            try:
-                last[key] = float(value)
-            except (TypeError, ValueError):
-                continue
-    return Progress(
-        int(last.get("time/total_timesteps", 0)),
-        last.get("rollout/ep_rew_mean", math.nan),
-        last.get("rollout/ep_cost_mean", math.nan),
-    )
-
-
-def duration(seconds: float) -> str:
-    """A time in words: ``3 h 05 min``."""
-    if not math.isfinite(seconds):
-        return "?"
-    minutes = round(seconds / 60)
-    if minutes < 1:
-        return f"{seconds:.0f} s"
-    if minutes < 60:
-        return f"{minutes} min"
-    hours = minutes // 60
-    return f"{hours} h {minutes % 60:02} min" if hours < 48 else f"{hours / 24:.1f} days"
+        with open(run / "progress.csv", newline="", errors="replace") as file:
+            for row in csv.DictReader(file):
+                for name, column in LOGGED.items():
+                    try:
+                        last[name] = float(row.get(column) or "")
+                    except ValueError:  # not logged in this row, or half written
+                        continue
+    except (OSError, csv.Error):
+        pass
+    return last
 
 
 class Board:
@@ -80,141 +46,91 @@ class Board:
 
     :param title: its folder
     :param verbose: 0: say nothing
-    :param file: where to; None: stdout
+    :param console: where to; None: stdout
     """
 
-    def __init__(self, title: str, verbose: int = 1, file: TextIO | None = None):
-        self.console = Console(file=file, quiet=verbose == 0, highlight=False)
+    def __init__(self, title: str, verbose: int = 1, console: Console | None = None):
+        self.console = console or Console(quiet=verbose == 0, highlight=False)
         self.title = title
-        self.progress: dict[Run, Progress] = {}
-        self._first: dict[Run, tuple[float, int]] = {}
-        self._runs: Sequence[Run] = ()
-        self._looked = self._line = -math.inf
-        self._live: Live | None = None
+        columns = ("[progress.description]{task.description}", "{task.fields[reached]}")
+        self.bars = Progress(
+            TextColumn(columns[0]), BarColumn(24), TextColumn(columns[1]), TimeRemainingColumn(),
+            console=self.console, disable=not self.console.is_terminal, speed_estimate_period=600,
+        )  # fmt: skip
+        self._tasks: dict[Run, TaskID] = {}
+        self._total: TaskID | None = None
+        self._looked = self._line = time.monotonic()
 
     def __enter__(self) -> "Board":
-        if self.console.is_terminal and not self.console.quiet:
-            self._live = Live(console=self.console, auto_refresh=False)
-            self._live.start()
+        self.bars.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._look()
-            self._live.update(self.table(), refresh=True)
-            self._live.stop()
-            self._live = None
+        self.bars.stop()
 
-    def say(self, text: str, file: TextIO | None = None) -> None:
-        """Print a line, above the table if there is one."""
-        if file is None or self._live is not None:
-            self.console.print(text, markup=False, soft_wrap=True)
-        elif not self.console.quiet:
-            print(text, file=file, flush=True)
+    def say(self, text: str) -> None:
+        """Print a line, above the bars if there are any."""
+        self.console.print(text, markup=False, soft_wrap=True)
 
     def note(self, what: str, run: "Run") -> None:
         """Say what has become of a run."""
-        if self._live is not None and what in ("started", "done"):
-            return
         line = f"{time.strftime('%H:%M:%S')}  {what}: {run}"
         if what == "done":
             result = RunFolder(run.path).read_result() or {}
-            for name in ("return", "cost"):
-                if result.get(name) is not None:
-                    line += f", {name} {result[name]:.2f}"
-            line += f" ({self.summary()})"
-        elif what.startswith("failed"):
-            line += f": {last_line(run.error)}"
+            line += "".join(
+                f", {name} {result[name]:.2f}"
+                for name in ("return", "cost")
+                if result.get(name) is not None
+            )
+        elif what == "failed":
+            line += f": {run.error}"
         self.say(line)
 
-    def update(self, runs: Sequence["Run"]) -> None:
-        """Look into the folders and show what is there, but not too often."""
-        self._runs = runs
-        now = time.monotonic()
-        if now - self._looked < REFRESH:
+    def update(self, runs: Sequence["Run"], now: bool = False) -> None:
+        """
+        Look into the folders and show what is there, but not too often.
+
+        :param now: look, however short ago the last time was
+        """
+        clock = time.monotonic()
+        if clock - self._looked < REFRESH and not now:
             return
-        self._looked = now
-        self._look()
-        if self._live is not None:
-            self._live.update(self.table(), refresh=True)
-        elif now - self._line >= LINE_EVERY:
-            if self._line > -math.inf:
-                self.say(f"{time.strftime('%H:%M:%S')}  {self.summary()}")
-            self._line = now
+        self._looked = clock
+        if clock - self._line > LINE_EVERY and self.bars.disable:
+            self._line = clock
+            self.say(f"{time.strftime('%H:%M:%S')}  {summary(runs)}")
+        if self.bars.disable:
+            return
+        reached: float = sum(self._look(run) for run in runs)
+        if self._total is None:
+            self._total = self.bars.add_task(
+                "", total=sum(run.steps for run in runs), completed=int(reached),
+                reached="",
+            )  # fmt: skip
+        title = f"{self.title}: {summary(runs)}"
+        self.bars.update(self._total, completed=int(reached), description=title)
 
-    def _look(self) -> None:
-        for run in self._runs:
-            if run.state == "done":
-                self.progress[run] = self.progress.get(run, Progress())._replace(steps=run.steps)
-            elif run.state in ("running", "in use") or run not in self.progress:
-                self.progress[run] = read_progress(run.path) if is_run(run.path) else Progress()
-            self._first.setdefault(run, (time.monotonic(), self.progress[run].steps))
-            if run.state in ("waiting", "resume", "new"):
-                self._first[run] = (time.monotonic(), self.progress[run].steps)
+    def _look(self, run: "Run") -> float:
+        """How many steps a run has done; a bar for it while it is under way."""
+        if run.state == "done":
+            if run in self._tasks:
+                self.bars.remove_task(self._tasks.pop(run))
+            return run.steps
+        last = read_progress(run.path)
+        if run.state in ("running", "in use"):
+            if run not in self._tasks:
+                self._tasks[run] = self.bars.add_task(str(run), total=run.steps, reached="")
+            words = [f"{last['steps']:,.0f} steps"]
+            words += [f"{name} {last[name]:.2f}" for name in ("return", "cost") if name in last]
+            shown: dict[str, Any] = {"completed": last["steps"], "reached": ", ".join(words)}
+            self.bars.update(self._tasks[run], **shown)
+        elif run in self._tasks:
+            self.bars.remove_task(self._tasks.pop(run))
+        return last["steps"]
 
-    def summary(self) -> str:
-        """The grid on one line: how many runs are where, and the time left."""
-        counts: dict[str, int] = {}
-        for run in self._runs:
-            counts[run.state] = counts.get(run.state, 0) + 1
-        others = [f"{n} {state}" for state, n in counts.items() if state != "done"]
-        words = [f"{counts.get('done', 0)} of {len(self._runs)} done", *others]
-        left = self.left(self._runs)
-        if any(run.state == "running" for run in self._runs) and math.isfinite(left):
-            words.append(f"{duration(left)} left")
-        return ", ".join(words)
 
-    def left(self, runs: Sequence["Run"]) -> float:
-        """Seconds until so many runs are done at the speed of those under way; inf: not known."""
-        steps = sum(
-            max(run.steps - self.progress.get(run, Progress()).steps, 0)
-            for run in runs
-            if run.state not in ("failed", "stopped")
-        )
-        speed = sum(
-            self._speed(run)
-            for run in (runs if len(runs) == 1 else self._runs)
-            if run.state in ("running", "in use")
-        )
-        return steps / speed if speed > 0 else math.inf
-
-    def _speed(self, run: "Run") -> float:
-        since, first = self._first.get(run, (time.monotonic(), 0))
-        elapsed = time.monotonic() - since
-        return (self.progress[run].steps - first) / elapsed if elapsed > 0 else 0.0
-
-    def table(self) -> Table | Text:
-        """The runs under way and those that failed; the rest are counted."""
-        title = f"{self.title}: {self.summary()}"
-        shown = [run for run in self._runs if run.state in ("running", "in use", "failed")]
-        if not shown:
-            return Text(title, style="bold")
-        table = Table(title=title, title_justify="left", title_style="bold")
-        for name in ("environment", "algorithm", "seed", "state", "progress"):
-            table.add_column(name, no_wrap=True)
-        for name in ("steps", "return", "cost", "left"):
-            table.add_column(name, justify="right", no_wrap=True)
-        room = max(self.console.height - 8, 4)
-        for run in shown[:room]:
-            table.add_row(*self._row(run))
-        if len(shown) > room:
-            table.add_row(f"… {len(shown) - room} more")
-        return table
-
-    def _row(self, run: "Run") -> list[Any]:
-        now = self.progress.get(run, Progress())
-
-        def number(value: float) -> str:
-            return "–" if math.isnan(value) else f"{value:.2f}"
-
-        return [
-            run.args["env"],
-            run.args["algo"],
-            str(run.args["seed"]),
-            Text(run.state, style=COLOURS.get(run.state, "")),
-            ProgressBar(total=run.steps, completed=min(now.steps, run.steps), width=20),
-            f"{now.steps:,}",
-            number(now.episode_return),
-            number(now.cost),
-            "–" if run.state == "failed" else duration(self.left([run])),
-        ]
+def summary(runs: Sequence["Run"]) -> str:
+    """The grid on one line: how many runs are where."""
+    counts = Counter(run.state for run in runs)
+    others = [f"{n} {state}" for state, n in counts.items() if state != "done"]
+    return ", ".join([f"{counts['done']} of {len(runs)} done", *others])

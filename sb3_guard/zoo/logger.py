@@ -1,48 +1,73 @@
 """A logger whose files can be continued where a checkpoint was taken."""
 
 import csv
+import io
+import itertools
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.logger import (
-    CSVOutputFormat,
     HumanOutputFormat,
     KVWriter,
     Logger,
     TensorBoardOutputFormat,
+    filter_excluded_keys,
 )
 
+from sb3_guard.common.files import replacing
 
-class ProgressCSV(CSVOutputFormat):
+
+class ProgressCSV(KVWriter):
     """
     SB3's ``progress.csv``, able to go on after a number of rows.
 
+    Rows are appended; where the file must change otherwise, for a new column or after a checkpoint,
+    a new one takes its place in one step, so that neither a kill nor a full disk loses a row.
+
     :param path: the file
     :param rows: rows to keep, later ones are dropped; None begins a new file
+    :raises ValueError: there is no such file, or it has fewer rows, or other content
     """
 
     def __init__(self, path: str | os.PathLike[str], rows: int | None = None):
-        if rows is None or not Path(path).exists():
-            super().__init__(os.fspath(path))
-            self.rows = 0
-            return
-        self.separator = ","
-        self.quotechar = '"'
-        self.rows = rows
-        # Column names grow when a new key is logged, so places in the file are counted in lines.
-        self.file = open(path, "r+")
-        lines = self.file.readlines()[: rows + 1]
-        self.file.seek(0)
-        self.file.truncate()
-        self.file.writelines(lines)
-        self.file.flush()
-        self.keys = next(csv.reader(lines), []) if rows else []
-        if not rows:
-            self.file.seek(0)
-            self.file.truncate()
+        self.path = Path(path)
+        self.rows = rows or 0
+        self.keys: list[str] = []
+        kept = self._read(self.rows) if self.rows else []
+        self._replace(kept)
+
+    def _read(self, rows: int) -> list[dict[str, str]]:
+        """The first rows of the file."""
+        what = f"{self.path} had {rows} rows when the run was saved"
+        try:
+            with open(self.path, encoding="utf-8", newline="") as file:
+                reader = csv.DictReader(file)
+                kept = list(itertools.islice(reader, rows))
+                self.keys = list(reader.fieldnames or [])
+        except (OSError, ValueError, csv.Error) as error:
+            raise ValueError(f"{what}, and can't be read now: {error}") from error
+        whole = all(None not in row and None not in row.values() for row in kept)
+        if len(kept) < rows or not whole:
+            raise ValueError(
+                f"{what} and has {len(kept) if whole else 'damaged ones'} now: put it back, or the "
+                "run can't be continued in this folder"
+            )
+        return kept
+
+    def _replace(self, rows: Sequence[Mapping[str, str]]) -> None:
+        """Write the file anew and open it for what comes."""
+        with replacing(self.path) as binary:
+            file = io.TextIOWrapper(binary, encoding="utf-8", newline="")
+            writer = csv.DictWriter(file, self.keys, restval="", lineterminator="\n")
+            if self.keys:
+                writer.writeheader()
+            writer.writerows(rows)
+            file.flush()
+            file.detach()
+        self.file = open(self.path, "a", encoding="utf-8", newline="")
 
     def write(
         self,
@@ -51,8 +76,22 @@ class ProgressCSV(CSVOutputFormat):
         step: int = 0,
     ) -> None:
         """Append a row."""
-        super().write(key_values, key_excluded, step)
+        values = filter_excluded_keys(key_values, key_excluded, "csv")
+        row = {key: "" if value is None else str(value) for key, value in values.items()}
+        new = sorted(row.keys() - set(self.keys))
+        if new:
+            kept = self._read(self.rows) if self.rows else []
+            self.keys += new
+            self.file.close()
+            self._replace(kept)
+        writer = csv.DictWriter(self.file, self.keys, restval="", lineterminator="\n")
+        writer.writerow(row)
+        self.file.flush()
         self.rows += 1
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
 
 
 class RunLogger(Logger):

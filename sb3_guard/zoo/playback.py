@@ -1,7 +1,8 @@
 """A trained agent found in its run folder, played, and filmed."""
 
+import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +14,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
+from sb3_guard.common.vec_env import GuardVecEnv
+from sb3_guard.zoo.agent_flags import AgentFlags, EnjoyFlags
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import load_model, read_normalizer
-from sb3_guard.zoo.config import build, check
-from sb3_guard.zoo.environments import (
+from sb3_guard.zoo.hyperparams import build, check
+from sb3_guard.zoo.make_envs import (
     ERRORS_OF_OURS,
     canonical_id,
     choose_vec_env,
@@ -30,8 +33,10 @@ from sb3_guard.zoo.run_folder import (
     require_writable,
     run_path,
 )
+from sb3_guard.zoo.trust import require_trust
 from sb3_guard.zoo.usage import UsageError, import_packages, one_line
 
+VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
 #: The trained agents that the package ships: a log folder, written by ``scripts/pretrain.py``.
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
 
@@ -76,7 +81,7 @@ def find_pretrained(algo: str, env_id: str) -> RunFolder:
     return RunFolder.open(path)
 
 
-def find_model(run: RunFolder, args: Mapping[str, Any]) -> tuple[Path, Path]:
+def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     """
     The model that the flags ask for, and where its observation statistics are, if it has any.
 
@@ -85,19 +90,19 @@ def find_model(run: RunFolder, args: Mapping[str, Any]) -> tuple[Path, Path]:
     :raises UsageError: the run has no such model
     """
     kept = sorted(run.path.glob("rl_model_*_steps.zip"), key=_steps)
-    if args["load_best"]:
+    if flags.load_best:
         return _existing(run.path / "best_model.zip"), run.path / "best_model_vecnormalize.pkl"
-    if args["load_checkpoint"] is not None:
-        steps = args["load_checkpoint"]
+    if flags.load_checkpoint is not None:
+        steps = flags.load_checkpoint
         model = run.path / f"rl_model_{steps}_steps.zip"
         if model not in kept:
             known = ", ".join(str(_steps(one)) for one in kept) or "none"
             raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {known}")
         return model, run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
-    if args["load_last_checkpoint"] and kept:
+    if flags.load_last_checkpoint and kept:
         steps = _steps(kept[-1])
         return kept[-1], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
-    if args["load_last_checkpoint"] or not run.model.exists():
+    if flags.load_last_checkpoint or not run.model.exists():
         return _existing(run.checkpoint), run.checkpoint
     return run.model, run.normalizer
 
@@ -132,49 +137,57 @@ class Agent:
     env: VecEnv
 
 
-def _packages_of_training(args: Mapping[str, Any]) -> list[str]:
+def _packages_of_training(flags: AgentFlags) -> list[str]:
     """The modules that registered the environment when the run was trained, if there is one."""
-    parent = Path(args["folder"]) / args["algo"]
-    for env_id in (args["env"], f"{args['env']}-v0"):
-        number = args["exp_id"] or latest_run(parent, folder_name(env_id))
-        path = run_path(args["folder"], args["algo"], env_id, number)
+    parent = Path(flags.folder) / flags.algo
+    for env_id in (flags.env, f"{flags.env}-v0"):
+        number = flags.exp_id or latest_run(parent, folder_name(env_id))
+        path = run_path(flags.folder, flags.algo, env_id, number)
         if is_run(path):
-            return list(RunFolder.open(path).args()["gym_packages"])
+            packages = list(RunFolder.open(path).args()["gym_packages"])
+            require_trust(path, flags.trust, {"gym_packages": packages}, {})
+            return packages
     return []
 
 
-def open_agent(args: Mapping[str, Any], render_mode: str | None) -> Agent:
+def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
     """
     Load an agent and make one environment for it, wrapped as in training.
 
-    :param args: all flags of ``enjoy``, with their defaults
+    :param flags: of the command
     :param render_mode: None, ``"human"``, or ``"rgb_array"``
     :raises UsageError: there is no such agent, or it does not fit the environment
     """
-    cls = algorithm(args["algo"])
-    import_packages(args["gym_packages"] or _packages_of_training(args))
-    env_id, ours = canonical_id(args["env"])
-    if args["pretrained"]:
-        run = find_pretrained(args["algo"], env_id)
+    import_packages(flags.gym_packages or _packages_of_training(flags))
+    cls = algorithm(flags.algo)
+    env_id, ours = canonical_id(flags.env)
+    if flags.pretrained:
+        run = find_pretrained(flags.algo, env_id)
     else:
-        run = find_run(args["folder"], args["algo"], env_id, args["exp_id"])
-    path, normalizer = find_model(run, args)
-    setup = build(check(args["algo"], cls, run.hyperparams()))
-    if args["num_threads"] > 0:
+        run = find_run(flags.folder, flags.algo, env_id, flags.exp_id)
+    path, normalizer = find_model(run, flags)
+    values = {**run.hyperparams(), "callback": None}  # nobody calls one here
+    require_trust(run.path, flags.trust, {}, values)
+    setup = build(check(flags.algo, cls, values))
+    if flags.num_threads > 0:
         import torch as th
 
-        th.set_num_threads(args["num_threads"])
-    model = load_model(cls, path, None, args["device"])
+        th.set_num_threads(flags.num_threads)
+    model = load_model(cls, path, None, flags.device)
     env = make_envs(
         env_id,
         setup,
         n_envs=1,
-        seed=args["seed"],
+        seed=flags.seed,
         # A batch has no window; a single environment has.
         vec_env="dummy"
         if render_mode == "human"
         else choose_vec_env(None, ours, setup.env_wrapper is not None),
-        env_kwargs={**setup.env_kwargs, **(args["env_kwargs"] or {})},
+        env_kwargs={
+            **(VIDEO if ours and render_mode else {}),
+            **setup.env_kwargs,
+            **(flags.env_kwargs or {}),
+        },
         cost_keys=getattr(model, "cost_keys", ("cost",)),
         evaluation=True,
         normalizer=None if setup.normalize is None else read_normalizer(normalizer),
@@ -188,51 +201,55 @@ def open_agent(args: Mapping[str, Any], render_mode: str | None) -> Agent:
     return Agent(run, path, normalizer, env_id, model, env)
 
 
-def play(args: Mapping[str, Any], render_mode: str | None) -> int:
+def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     """
     Play an agent and print what it gets and what it costs.
 
-    :param args: all flags of ``enjoy``, with their defaults
+    :param flags: of the command
     :param render_mode: None, ``"human"``, or ``"rgb_array"`` to record
     :return: exit status
     :raises UsageError: there is no such agent, or no picture can be made
     """
-    for flag in ("record", "json"):
-        if args[flag]:
-            _require_file(Path(args[flag]), f"--{flag}")
-    agent = open_agent(args, render_mode)
+    for name in ("record", "json"):
+        if getattr(flags, name):
+            _require_file(Path(getattr(flags, name)), f"--{name}")
+    agent = open_agent(flags, render_mode)
     video = None
-    if args["record"] is not None:
+    if flags.record is not None:
         beside = agent.path.with_suffix(".mp4")
-        own = f"{args['algo']}-{beside.name}"  # the package's folder is not the user's to write to
-        video = Path(args["record"] or (own if args["pretrained"] else beside))
+        own = f"{flags.algo}-{beside.name}"  # the package's folder is not the user's to write to
+        video = Path(flags.record or (own if flags.pretrained else beside))
         _require_file(video, "--record")
-    episodes = args["n_episodes"]
-    if episodes is None and args["n_timesteps"] is None:
-        episodes = 1 if args["record"] is not None else 5
-    print(f"Playing {agent.path} on {agent.env_id}")
+    episodes = flags.n_episodes
+    if episodes is None and flags.n_timesteps is None:
+        episodes = 1 if flags.record is not None else 5
+    if flags.verbose > 0:
+        print(f"Playing {agent.path} on {agent.env_id}")
     try:
         with camera(agent.env, video, render_mode) as shoot:
             evaluation = evaluate_policy(
                 agent.model,
                 agent.env,
-                n_eval_episodes=episodes or args["n_timesteps"],
-                deterministic=not args["stochastic"],
-                seed=args["seed"],
-                max_steps=args["n_timesteps"],
+                n_eval_episodes=episodes or flags.n_timesteps or 1,
+                deterministic=not flags.stochastic,
+                seed=flags.seed,
+                max_steps=flags.n_timesteps,
                 on_step=shoot,
-                on_episode=_print_episode if args["verbose"] > 0 else None,
+                on_episode=_print_episode if flags.verbose > 0 else None,
             )
     except ERRORS_OF_OURS as error:
         raise UsageError(f"can't play {agent.env_id}: {one_line(error)}") from error
     finally:
         agent.env.close()
-    print(_means(evaluation))
-    if args["json"]:
-        played = {key: args[key] for key in ("algo", "seed", "stochastic")}
+    print(_means(evaluation, agent))
+    rest = (flags.n_timesteps or 0) - int(np.sum(evaluation.lengths))
+    if rest > 0:
+        print(f"The last {rest} steps are of an episode that did not end: they are not counted")
+    if flags.json:
+        played = {name: getattr(flags, name) for name in ("algo", "seed", "stochastic")}
         content = {"model": str(agent.path), "env": agent.env_id, **played, **summary(evaluation)}
-        Path(args["json"]).parent.mkdir(parents=True, exist_ok=True)
-        with replacing(args["json"]) as file:
+        Path(flags.json).parent.mkdir(parents=True, exist_ok=True)
+        with replacing(flags.json) as file:
             file.write(json.dumps(content, indent=2, allow_nan=False).encode())
     if video is not None:
         print(f"Video: {video}")
@@ -274,15 +291,20 @@ def _print_episode(episode_return: float, cost: float, length: int) -> None:
     print(f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length} steps")
 
 
-def _means(evaluation: Evaluation) -> str:
+def _means(evaluation: Evaluation, agent: Agent) -> str:
     count = len(evaluation)
     if count == 0:
         return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"
-    rows = [f"Mean ± std of {count} episode{'s' if count > 1 else ''}, 95 % interval of the mean:"]
+    limit = getattr(agent.model, "cost_limit", None)
+    told = getattr(agent.model, "constrained", False) and limit is not None
+    rows = [f"Mean ± std of {count} episodes, 95 % interval of the mean:"]
+    if count == 1:
+        rows = ["One episode:"]
     for name, values in _columns(evaluation).items():
         mean, std, low, high = evaluation.estimate(values)
-        interval = f"   [{low:.3f}, {high:.3f}]" if count > 1 else ""
-        rows.append(f"  {name:<7}{mean:9.3f} ± {std:.3f}{interval}")
+        interval = f" ± {std:.3f}   [{low:.3f}, {high:.3f}]" if count > 1 else ""
+        end = f"   (limit {limit})" if name == "cost" and told else ""
+        rows.append(f"  {name:<7}{mean:9.3f}{interval}{end}")
     return "\n".join(rows)
 
 
@@ -312,15 +334,24 @@ def camera(env: VecEnv, video: Path | None, render_mode: str | None) -> Iterator
     if first is None:
         raise UsageError("this environment renders no rgb_array frames; it can't be recorded")
     height, width = first.shape[:2]
+    fps = _frames_per_second(env)
+    every = max(1, int(fps / 25))  # 25 pictures a second are enough
     video.parent.mkdir(parents=True, exist_ok=True)
     partial = video.with_name(f".{video.name}.part.mp4")
     try:
         writer = imageio_ffmpeg.write_frames(
-            str(partial), (width, height), fps=_frames_per_second(env), macro_block_size=2
+            str(partial), (width, height), fps=fps / every, macro_block_size=2
         )
         writer.send(None)
+        steps = itertools.count()
+
+        def shoot() -> None:
+            if next(steps) % every == 0:
+                for picture in _film(env):
+                    writer.send(np.ascontiguousarray(picture))
+
         try:
-            yield lambda: writer.send(np.ascontiguousarray(_render(env)))
+            yield shoot
         finally:
             writer.close()
         partial.replace(video)
@@ -340,7 +371,15 @@ def _render(env: VecEnv) -> np.ndarray | None:
         raise UsageError(f"can't render: {one_line(error)}") from error
 
 
+def _film(env: VecEnv) -> list[np.ndarray]:
+    """The pictures of one step: several where a control step of ours is long."""
+    native = env.unwrapped
+    return native.film() if isinstance(native, GuardVecEnv) else [_render(env)]  # type: ignore[list-item]
+
+
 def _frames_per_second(env: VecEnv) -> float:
+    if isinstance(env.unwrapped, GuardVecEnv):
+        return env.unwrapped.envs.film_fps
     try:
         return float(env.get_attr("metadata")[0].get("render_fps", 30))
     except AttributeError:

@@ -2,15 +2,16 @@
 
 from collections.abc import Sequence
 
-from sb3_guard.algorithms import ALGORITHMS
-from sb3_guard.envs.registry import LADDER, SUITE_ROBOTS, env_ids
+from sb3_guard.envs.suites import env_ids
+from sb3_guard.envs.suites.guard import LADDER, SUITE_ROBOTS
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.results import MAIN8, RADAR4
+from sb3_guard.zoo.paper import MAIN8, RADAR4
 from sb3_guard.zoo.usage import UsageError
 
-ALL = tuple(ALGORITHMS)
+# The paper's algorithms.
+ALL = ("trpo", "cpo", "pcpo", "trpo_lag", "trpo_fac", "trpo_ipo", "trpo_sl", "trpo_usl")
 PAPER45 = tuple(
-    env_id for env_id in env_ids() if "_8Hazards" in env_id or env_id.startswith("Goal_")
+    env_id for env_id in env_ids("guard") if "_8Hazards" in env_id or env_id.startswith("Goal_")
 )
 OVERVIEW = tuple(f"{suite}-v0" for suite in MAIN8)
 RADAR = tuple(f"{suite}-v0" for suite in RADAR4)

@@ -137,7 +137,8 @@ class Epochs(BaseCallback):
         """
         J_r, M_c and ρ_c as the paper defines them, and what they were obtained with.
 
-        :return: ``return``, ``cost`` and ``length``, means over the episodes of the last epoch in
+        :return: ``label`` and ``family`` that the algorithm's class states (None: it states none),
+            ``return``, ``cost`` and ``length``, means over the episodes of the last epoch in
             which any ended (None if none did), their number ``episodes``, ``cost_rate``,
             cumulative cost ÷ steps of the whole run, ``physics_errors``, the number of episodes
             that ended because the physics diverged, ``cost_limit`` (None: unconstrained),
@@ -150,7 +151,10 @@ class Epochs(BaseCallback):
         rate = monitor.total_cost / monitor.total_steps if monitor.total_steps else None
         constrained = getattr(self.model, "constrained", False)
         limit = getattr(self.model, "cost_limit", None) if constrained else None
+        algorithm = type(self.model)
         return {
+            "label": getattr(algorithm, "label", None),
+            "family": getattr(algorithm, "family", None),
             **dict(zip(("return", "cost", "length"), means, strict=True)),
             "cost_rate": rate,
             "episodes": len(self.last),

@@ -3,7 +3,7 @@
 ``python -m sb3_guard.zoo.rl_zoo3 train --algo cpo --env Goal_Point_8Hazards-v0`` takes all flags
 of ``python -m rl_zoo3.train``. In RL-Zoo's table ``trpo`` stays sb3-contrib's and ours is
 ``guard_trpo``. ``--optimize`` is RL-Zoo's own search, by return alone, in the spaces of
-:mod:`sb3_guard.zoo.samplers`; ``python -m sb3_guard.tune`` searches under a cost limit.
+:mod:`sb3_guard.zoo.spaces`; ``python -m sb3_guard.tune`` searches under a cost limit.
 """
 
 import sys
@@ -11,14 +11,24 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from stable_baselines3.common.vec_env import VecEnv
+import gymnasium as gym
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.zoo.algos import safe_algorithms
-from sb3_guard.zoo.config import read_file, shipped_file
-from sb3_guard.zoo.samplers import SPACES, rl_zoo_sampler
-from sb3_guard.zoo.usage import UsageError, run
+from sb3_guard.zoo.hyperparams import read_file, shipped_file
+from sb3_guard.zoo.spaces import SPACES, rl_zoo_sampler, space_of
+from sb3_guard.zoo.trust import entries, evaluate, import_class
+from sb3_guard.zoo.usage import KeyValues, UsageError, run
+
+# Hyper-parameters that RL-Zoo evaluates where they are text, and the class it knows by a bare name.
+TEXT = ("normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
+        "monitor_kwargs")  # fmt: skip
+BUFFERS = {"HerReplayBuffer": HerReplayBuffer}
+CLASSES = {"env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback}
 
 
 def key_in_rl_zoo(algo: str) -> str:
@@ -38,9 +48,11 @@ def register() -> None:
 
     for algo, cls in safe_algorithms().items():
         rl_zoo3.ALGOS[key_in_rl_zoo(algo)] = cls
-    for algo in SPACES:
-        base = read_file(shipped_file(algo))["default"]
-        HYPERPARAMS_SAMPLER[key_in_rl_zoo(algo)] = rl_zoo_sampler(algo, base)
+    for algo in {**safe_algorithms(), **SPACES}:
+        path = shipped_file(algo)
+        if space_of(algo):
+            base = read_file(path)["default"] if path.is_file() else {}
+            HYPERPARAMS_SAMPLER[key_in_rl_zoo(algo)] = rl_zoo_sampler(algo, base)
 
 
 def make_vec_env(
@@ -57,6 +69,24 @@ def make_vec_env(
         # Of what EarlyTermination ends outside of that monitor, ours takes account.
         warnings.filterwarnings("ignore", message="EarlyTermination is around a Monitor")
         return CostMonitor(make(env_id, n_envs, **kwargs), file, **monitor_kwargs)
+
+
+def typed(values: dict[str, Any]) -> dict[str, Any]:
+    """
+    Hyper-parameters whose text is read here: RL-Zoo's manager would call ``eval`` on it.
+
+    :raises UsageError: a text is more than literals and classes of torch, or what is named as a
+        wrapper or callback is none
+    """
+    read = dict(values)
+    for name in TEXT:
+        value = values.get(name)
+        if isinstance(value, str):
+            read[name] = BUFFERS.get(value) or evaluate(name, value)
+    for name, base in CLASSES.items():
+        for path, _ in entries(name, values.get(name)):
+            import_class(name, path, base)
+    return read
 
 
 def train(argv: Sequence[str]) -> int:
@@ -78,6 +108,13 @@ def train(argv: Sequence[str]) -> int:
     # RL-Zoo has no hooks for these two, and names them in this module.
     manager: Any = rl_zoo3.exp_manager
     manager.make_vec_env, manager.EvalCallback = make_vec_env, CostEvalCallback
+
+    class TypedManager(rl_zoo3.exp_manager.ExperimentManager):
+        def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+            return super()._preprocess_hyperparams(typed(hyperparams))
+
+    command: Any = rl_zoo3.train
+    command.StoreDict, command.ExperimentManager = KeyValues, TypedManager
     sys.argv = ["rl_zoo3.train", *arguments]
     rl_zoo3.train.train()
     return 0

@@ -8,30 +8,28 @@ import os
 import socket
 import sys
 import tempfile
-import threading
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import SoftFileLease, Timeout
 
 from sb3_guard.common.files import replacing
+from sb3_guard.zoo.flags import IDENTITY
+from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.usage import UsageError, one_line
-
-try:
-    import fcntl
-except ImportError:  # Windows has no file locks of this kind: runs there are not guarded
-    fcntl = None  # type: ignore[assignment]
 
 CHECKPOINT = "checkpoint.zip"
 # What the system says when a disk is full, read-only or broken.
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 # What a result measures: return, episode cost and cost rate; null where no episode has ended.
 MEASURES = ("return", "cost", "cost_rate")
-BEAT = 10.0  # seconds between the signs of life that a lock gives
-SILENCE = 120.0  # seconds without one after which another host takes a lock over
+SILENCE = 120.0  # seconds without a sign of life after which another host takes a lock over
+
+WAIT = 1.2 * SILENCE  # seconds in which such a silence is certainly seen
 
 
 class RunInUse(UsageError):
@@ -62,10 +60,11 @@ _Loader.add_constructor(
 )
 
 
-def as_read(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain data as a run's files give it back: lists for tuples."""
-    text = yaml.dump(dict(data), Dumper=_SafeDumper)
-    return dict(yaml.load(text, Loader=_SafeLoader))
+def plain(value: Any) -> Any:
+    """A value as the files of a run give it back: lists for tuples."""
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    return [plain(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -75,7 +74,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     :raises UsageError: it can't be read, or is no mapping
     """
     try:
-        content = yaml.load(path.read_text(), Loader=_Loader)
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise UsageError(f"can't read {path}: {one_line(error)}") from error
     if not isinstance(content, dict):
@@ -161,43 +160,38 @@ class RunFolder:
     @classmethod
     def create(
         cls,
-        log_folder: str,
-        algo: str,
-        env_id: str,
-        args: Mapping[str, Any],
+        flags: RunFlags,
         hyperparams: Mapping[str, Any],
         command: str,
-        unique: bool = False,
         number: int | None = None,
     ) -> "RunFolder":
         """
         Take a number and write down what the run is.
 
-        :param args: all flags, plain data
+        :param flags: all flags
         :param hyperparams: all hyper-parameters, plain data
         :param command: the command line
-        :param unique: append a unique id to the name (``--uuid``)
         :param number: the number to take, by a caller that has :func:`lock` on the folder, which
             may exist but is no run yet; None: the next free one
         :raises UsageError: the folder can't be written to, or there is more than plain data
         """
-        name = folder_name(env_id)
-        files = _dump(args, hyperparams)
-        parent = Path(log_folder) / algo
-        suffix = f"_{uuid.uuid4()}" if unique else ""
+        name = folder_name(flags.env)
+        files = _dump(flags.values(), hyperparams)
+        parent = Path(flags.log_folder) / flags.algo
+        suffix = f"_{uuid.uuid4()}" if flags.uuid else ""
         try:
             parent.mkdir(parents=True, exist_ok=True)
             if number is None:
                 path = claim(parent, name, suffix)
             else:
-                path = run_path(log_folder, algo, env_id, number)
+                path = run_path(flags.log_folder, flags.algo, flags.env, number)
             params = path / name
             params.mkdir(parents=True, exist_ok=True)
-            (params / "command.txt").write_text(command)
+            (params / "command.txt").write_text(command, encoding="utf-8")
             _write(params, files)
         except OSError as error:
             raise UsageError(
-                f"can't write to log folder {log_folder!r}: {error.strerror}; "
+                f"can't write to log folder {flags.log_folder!r}: {error.strerror}; "
                 "choose another with -f"
             ) from error
         return cls(path)
@@ -242,6 +236,29 @@ class RunFolder:
     def args(self) -> dict[str, Any]:
         """The flags the run was started with."""
         return read_mapping(self.params / "args.yml")
+
+    def flags(self) -> RunFlags:
+        """
+        The flags the run was started with: all of them, since one guessed would be another run.
+
+        :raises UsageError: one is absent, or has a value that it can't have
+        """
+        saved = self.args()
+        absent = sorted(RunFlags.names() - saved.keys())
+        try:
+            if absent:
+                raise UsageError(f"args.yml: there is no {', '.join(absent[:4])}")
+            return RunFlags.read(saved, "args.yml")
+        except UsageError as error:
+            raise UsageError(
+                f"{self.params / 'args.yml'} is damaged ({one_line(error)}); put the file back as "
+                "it was, or start a new run without -i"
+            ) from error
+
+    def what(self) -> dict[str, Any]:
+        """What makes the run the run it is: flags of that role, and hyper-parameters."""
+        args = self.args()
+        return {**{name: args.get(name) for name in RunFlags.names(IDENTITY)}, **self.hyperparams()}
 
     def hyperparams(self) -> dict[str, Any]:
         """The hyper-parameters the run was started with."""
@@ -289,72 +306,59 @@ class RunFolder:
         except UsageError:
             return None
 
-    @contextmanager
-    def owned(self) -> Iterator[None]:
-        """Hold the run's lock, see :func:`lock`."""
-        with lock(self.path):
-            yield
-
 
 @contextmanager
-def lock(folder: Path, grid: str = "") -> Iterator[None]:
+def lock(folder: Path) -> Iterator[None]:
     """
     Hold a run's lock, so that no other process writes to it meanwhile.
 
-    The operating system drops the lock of a process that dies, however it dies; the file then
-    still names it, and the next process takes over. Locks of the system may not reach other hosts,
-    so the file is also touched all the time: another host takes over after a long silence.
+    The lock of a process that died here is taken over immediately. That of another host shows signs
+    of life; it is taken over after a long silence, for which this waits.
 
     :param folder: it exists, and is a run or about to become one
-    :param grid: name of the grid on whose behalf, see :func:`owner`
-    :raises RunInUse: another process has it, or a process on another host may have it
+    :raises RunInUse: another process has it
     :raises UsageError: the folder can't be written to
     """
-    if fcntl is None:
-        yield
-        return
     path = folder / ".lock"
-    me = {"host": socket.gethostname(), "pid": os.getpid(), "grid": grid}
+    holder = owner(folder)
+    elsewhere = holder.get("host", socket.gethostname()) != socket.gethostname()
+    lease = SoftFileLease(path, lease_duration=SILENCE, on_compromise=_lost, is_singleton=False)
+    if elsewhere:
+        print(f"{folder} has a lock of {holder['host']}: waiting for a sign of life of its process")
     try:
-        handle = open(path, "ab", buffering=0)
+        lease.acquire(timeout=WAIT if elsewhere else 0)
+    except Timeout:
+        holder = owner(folder)
+        raise RunInUse(
+            f"{folder} is in use by process {holder.get('pid')} on {holder.get('host')}; "
+            f"if that is gone, remove {path}"
+        ) from None
     except OSError as error:
         raise UsageError(f"can't write to {folder}: {error.strerror}") from error
-    with handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            free = True
-        except OSError:
-            free = False
-        holder = owner(folder)
-        elsewhere = holder.get("host", me["host"]) != me["host"]
-        if not free or (elsewhere and not _silent(path)):
-            raise RunInUse(
-                f"{folder} is in use by process {holder.get('pid')} on {holder.get('host')}; "
-                f"if that is gone, remove {path}, or try again in {SILENCE / 60:.0f} minutes"
-            )
-        try:
-            handle.truncate(0)
-            handle.write(json.dumps(me).encode())
-        except OSError as error:
-            raise UsageError(f"can't write to {folder}: {error.strerror}") from error
-        gone = threading.Event()
-        threading.Thread(target=_beat, args=(path, me, gone), daemon=True).start()
-        try:
-            yield
-        finally:
-            gone.set()
-            handle.truncate(0)
-
-
-def owner(folder: Path) -> dict[str, Any]:
-    """
-    Who has the lock of a run, or had it when it died: ``host``, ``pid``, ``grid``; empty: nobody.
-    """
     try:
-        content = json.loads((folder / ".lock").read_bytes() or "{}")
-    except (OSError, ValueError):
+        yield
+    finally:
+        lease.release()
+
+
+def owner(folder: Path) -> dict[str, str]:
+    """Who has the lock of a run, or had it when it died: ``host``, ``pid``; empty: nobody."""
+    try:
+        lines = (folder / ".lock").read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
         return {}
-    return content if isinstance(content, dict) else {}
+    return {key: value for key, _, value in (line.partition("=") for line in lines) if value}
+
+
+def _lost(compromise: Any) -> None:
+    """End the process, which slept so long that another host took its run over."""
+    print(
+        f"{compromise.lock_file} was taken over while this process gave no sign of life; "
+        "it ends here",
+        file=sys.stderr,
+        flush=True,
+    )
+    os._exit(1)
 
 
 def in_use(folder: Path) -> bool:
@@ -364,28 +368,6 @@ def in_use(folder: Path) -> bool:
             return False
     except RunInUse:
         return True
-
-
-def _silent(path: Path) -> bool:
-    """Whether a lock has given no sign of life for long, by the clock of its own disk."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".clock") as clock:
-        return os.fstat(clock.fileno()).st_mtime - path.stat().st_mtime > SILENCE
-
-
-def _beat(path: Path, me: dict[str, Any], gone: threading.Event) -> None:
-    """Give signs of life; end the process if it slept so long that another host took over."""
-    while not gone.wait(BEAT):
-        holder = owner(path.parent)
-        if holder and holder != me and not gone.is_set():
-            print(
-                f"{path.parent} was taken over by process {holder.get('pid')} on "
-                f"{holder.get('host')} while this one gave no sign of life; it ends here",
-                file=sys.stderr,
-                flush=True,
-            )
-            os._exit(1)
-        with suppress(OSError):
-            os.utime(path)
 
 
 def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, bytes]:

@@ -1,17 +1,245 @@
-"""Tables that read well in a terminal and in a Markdown page."""
+"""Tables that read well in a terminal, in Markdown, in LaTeX and on a web page."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from importlib.util import find_spec
+from io import BufferedRandom
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from sb3_guard.common.files import replacing
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.markdown import escaped, table
+from sb3_guard.zoo.usage import UsageError
+
+# A column's name, or a function of a row; by heading
+Cell = str | Callable[[Any], str]
+Columns = dict[str, Cell]
+FORMATS = (".md", ".tex", ".csv", ".parquet")
+DIGITS = {"rho_c": 5}
+HEADINGS = {"J_r": "return J_r", "M_c": "episode cost M_c", "rho_c": "cost rate ρ_c"}
+SCORE_HEADINGS = {"reward": "reward / TRPO", "cost": "cost / TRPO", "cost_rate": "rate / TRPO"}
+_LATEX = {"±": r"$\pm$", "−": "$-$", "ρ": r"$\rho$", "–": "--", "\N{NO-BREAK SPACE}": "~"}
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def terminal(data: pd.DataFrame) -> str:
+    """A table of text, its columns aligned."""
+    return table(list(data.columns), data.astype(str).to_numpy().tolist())
+
+
+def markdown(data: pd.DataFrame) -> str:
+    """A table of text for a Markdown page."""
+    return terminal(data.astype(str).map(escaped))
+
+
+def latex(data: pd.DataFrame) -> str:
+    """A table of text in LaTeX; it needs ``\\usepackage{booktabs}``."""
+    style = (
+        data.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis=1)
+    )
+    text = style.to_latex(hrules=True, column_format="l" * len(data.columns)).strip()
+    for plain, symbol in _LATEX.items():
+        text = text.replace(plain, symbol)
+    for plain, symbol in ((r"J\_r", "$J_r$"), (r"M\_c", "$M_c$"), (r"$\rho$\_c", r"$\rho_c$")):
+        text = text.replace(f" {plain}", f" {symbol}")
+    return text
+
+
+# Numbers
+
+
+def number(value: Any, digits: int = 2) -> str:
+    """A number with its minus sign, or a dash if there is none."""
+    return "–" if pd.isna(value) else f"{value:,.{digits}f}".replace("-", "−")
+
+
+def spread(value: float, error: float, digits: int = 2) -> str:
+    """A number ± its error, which no line break separates from it."""
+    text = number(value, digits)
+    return text if pd.isna(error) else f"{text}\xa0±\xa0{number(error, digits)}"
+
+
+def spelled(data: pd.DataFrame, columns: Columns) -> pd.DataFrame:
     """
-    A table in Markdown, its columns aligned.
+    A table of text.
 
-    :param header: C titles
-    :param rows: C texts each
+    :param columns: by heading: a column's name, or a function of a row
     """
-    lines = [[cell.replace("|", "\\|") for cell in line] for line in (header, *rows)]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = [f"| {' | '.join(map(str.ljust, line, widths))} |" for line in lines]
-    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
-    return "\n".join([text[0], rule, *text[1:]])
+    rows = data.to_dict("records")
+
+    def cell(row: Any, column: Cell) -> str:
+        if callable(column):
+            return column(row)
+        value = row[column]
+        return value if isinstance(value, str) else number(value, DIGITS.get(column, 2))
+
+    return pd.DataFrame(
+        {heading: [cell(row, column) for row in rows] for heading, column in columns.items()},
+        columns=list(columns),
+    )
+
+
+def whole(name: str) -> Callable[[Any], str]:
+    """A cell with a number of no decimals."""
+    return lambda row: number(row[name], 0)
+
+
+def _mean(name: str) -> Callable[[Any], str]:
+    digits = DIGITS.get(name, 2)
+
+    def cell(row: Any) -> str:
+        text = spread(row[name], row[f"{name}_std"], digits)
+        ends = [number(row[f"{name}_{end}"], digits) for end in ("low", "high")]
+        return text if pd.isna(row[f"{name}_std"]) else f"{text} [{ends[0]}, {ends[1]}]"
+
+    return cell
+
+
+def _limit(row: Any) -> str:
+    return "–" if pd.isna(row["limits"]) else row["limits"]
+
+
+SAFETY_HEADINGS: Columns = {
+    "return, last epochs": lambda row: spread(row["return_last"], row["return_last_se"]),
+    "cost, last epochs": lambda row: spread(row["cost_last"], row["cost_last_se"]),
+    "above limit": lambda row: number(100 * row["above_limit"], 1) + "\xa0%",
+    "95 % of costs": "cost_p95",
+    "worst cost": "cost_max",
+    "cost of training": whole("cost_total"),
+    "feasible IQM return": "feasible_iqm",
+}
+
+
+def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """
+    The tables of a report as text, by title.
+
+    :param runs: see :func:`~sb3_guard.zoo.runs.select`, with the columns of
+        :func:`~sb3_guard.zoo.statistics.with_safety`
+    """
+    from sb3_guard.zoo.statistics import aggregate, by_family, normalize, overall
+
+    means = aggregate(runs)
+    scores = normalize(means, means)
+    who: dict[str, Any] = {"suite": "suite", "algorithm": "label", "limit": _limit}
+    shown: Columns = {heading: score for score, heading in SCORE_HEADINGS.items()}
+    result = {
+        "Results": spelled(
+            scores,
+            {**who, "seeds": whole("seeds"), "steps": whole("steps")}
+            | {heading: _mean(name) for name, heading in HEADINGS.items()}
+            | shown,
+        ),
+        "Safety": spelled(means, {**who, **SAFETY_HEADINGS}),
+    }
+    if scores[["reward", "cost"]].isna().all(axis=None):
+        return result
+    families = by_family(scores)
+    if len(families):
+        columns: Columns = {
+            "suite": "suite",
+            "family": "family",
+            "algorithms": whole("algorithms"),
+            **shown,
+        }
+        result["Families, relative to TRPO"] = spelled(families, columns)
+    if scores["suite"].nunique() > 1:
+        columns = {"algorithm": "label"}
+        for score, heading in SCORE_HEADINGS.items():
+            columns[heading] = partial(_mean_of, score=score)
+            columns[f"{heading}, IQM"] = partial(_iqm_of, score=score)
+        result["All suites, relative to TRPO"] = spelled(overall(runs, means), columns)
+    return result
+
+
+def _mean_of(row: Any, score: str) -> str:
+    return f"{number(row[score])} ({row[f'{score}_n']})"
+
+
+def _iqm_of(row: Any, score: str) -> str:
+    text = number(row[f"{score}_iqm"])
+    ends = [number(row[f"{score}_{end}"]) for end in ("low", "high")]
+    return text if pd.isna(row[f"{score}_low"]) else f"{text} [{ends[0]}, {ends[1]}]"
+
+
+LEARNING: Columns = {
+    "suite": "suite", "algorithm": "label", "seed": whole("seed"), "steps": whole("steps"),
+    "return, first": "J_r_first", "last": "J_r_last", "gain, s.e.": lambda r: number(r["gain"], 1),
+    "cost, first": "M_c_first", "cost, last": "M_c_last", "cost rate": "rho_c",
+}  # fmt: skip
+RUNS: Columns = {
+    "suite": "suite", "algorithm": "label", "seed": whole("seed"), "limit": _limit,
+    "steps": whole("steps"), **{heading: name for name, heading in HEADINGS.items()},
+    "physics errors": whole("physics_errors"), "seconds": whole("seconds"),
+    "commit": lambda row: "–" if pd.isna(row["commit"])
+    else row["commit"][:10] + "-dirty" * row["commit"].endswith("-dirty"),
+    "folder": "path",
+}  # fmt: skip
+
+
+# Files
+
+
+@contextmanager
+def written(path: Path) -> Iterator[BufferedRandom]:
+    """
+    A file that appears complete or not at all, in a folder that is made if need be.
+
+    :raises UsageError: it can't be written
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            yield file
+    except OSError as error:
+        raise UsageError(
+            f"can't write to {str(path)!r}: {error.strerror}; choose another place"
+        ) from error
+
+
+def check_table(path: Path) -> None:
+    """
+    Find out before work is done whether a table can be written in the format its name asks for.
+
+    :raises UsageError: the format is unknown, or Parquet without pyarrow
+    """
+    if path.suffix not in FORMATS:
+        raise UsageError(
+            f"--table {str(path)!r}: unknown format {path.suffix!r}; "
+            f"{did_you_mean(path.suffix, FORMATS)}"
+        )
+    if path.suffix == ".parquet" and find_spec("pyarrow") is None:
+        raise UsageError(
+            f"--table {str(path)!r}: Parquet needs pyarrow; run pip install pyarrow, or write .csv"
+        )
+
+
+def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> None:
+    """
+    Write a table in the format that the file's name says.
+
+    :param path: ``.csv`` and ``.parquet`` get a row per run; ``.md`` and ``.tex`` the means over
+        seeds and the scores, see :func:`tables`
+    :param runs: with the columns of :func:`~sb3_guard.zoo.statistics.with_safety`; for means, those
+        that may be averaged
+    :param notes: what a reader of the means should know; written below them
+    :raises UsageError: see :func:`check_table`; or the file can't be written
+    """
+    check_table(path)
+    parts: list[str] = []
+    if path.suffix == ".md":
+        parts = [f"## {title}\n\n{markdown(one)}" for title, one in tables(runs).items()]
+        parts += ["\n".join(f"- {escaped(note)}" for note in notes)] if notes else []
+    elif path.suffix == ".tex":
+        parts = [f"% {title}\n{latex(one)}" for title, one in tables(runs).items()]
+        parts += ["\n".join(f"% {note}" for note in notes)] if notes else []
+    with written(path) as file:
+        if path.suffix == ".csv":
+            runs.to_csv(file, index=False)
+        elif path.suffix == ".parquet":
+            runs.to_parquet(file, index=False)
+        else:
+            file.write(("\n\n".join(parts) + "\n").encode())

@@ -1,7 +1,6 @@
 """What a command says when it can't do what was asked: one line, exit status 2, no traceback."""
 
 import argparse
-import ast
 import difflib
 import importlib
 import os
@@ -9,13 +8,22 @@ import re
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from sb3_guard.zoo.values import parse_value
+
+LONGEST = 500  # characters of an error that are printed
+
 
 class UsageError(Exception):
     """Something the user can put right; the message names the value, what is allowed, the fix."""
+
+
+class ForeignError(UsageError):
+    """Code of the user's raised its cause, whose traceback is printed below the message."""
 
 
 def one_line(error: BaseException) -> str:
@@ -74,6 +82,9 @@ def run(command: Callable[[], int]) -> int:
     # then wait for one another's time slices and training is ten times slower. Read when torch is
     # imported, which the commands do later.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # "±" on a terminal that is not UTF-8 becomes "?"
+            stream.reconfigure(errors="replace")
     try:
         status = command()
         sys.stdout.flush()
@@ -82,7 +93,10 @@ def run(command: Callable[[], int]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         return 141
     except (UsageError, ImportError) as error:  # an absent package, or no backend for MuJoCo
-        print(f"error: {one_line(error)}", file=sys.stderr)
+        text = one_line(error)
+        print(f"error: {text if len(text) <= LONGEST else text[:LONGEST] + ' …'}", file=sys.stderr)
+        if isinstance(error, ForeignError):
+            traceback.print_exception(error.__cause__)
         return 2
     except KeyboardInterrupt:
         return 130
@@ -134,24 +148,20 @@ def positive(text: str) -> int:
     return value
 
 
-def parse_value(text: str) -> Any:
+def parse_pairs(pairs: Sequence[str], what: str = "key:value") -> dict[str, Any]:
     """
-    The value of ``key:value``: a Python literal or ``dict(a=1)``; anything else is text as it is.
+    The mapping that ``["n_steps:512", "cost_limit:25.0"]`` stands for.
 
-    So ``cost_limit:25``, ``policy:MlpPolicy``, ``hazards:{'num':4}`` and ``learning_rate:lin_1e-3``
-    need no further quotes, and ``policy_kwargs:dict(activation_fn=nn.ReLU)`` stays text until the
-    model is made, as it does in a YAML file.
+    :param what: what it is given to, for the message
+    :raises UsageError: one has no colon
     """
-    try:
-        return ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        pass
-    if text.startswith("dict("):
-        try:
-            return eval(text, {"__builtins__": {}, "dict": dict})
-        except Exception:
-            pass
-    return text
+    values = {}
+    for pair in pairs:
+        key, colon, value = str(pair).partition(":")
+        if not colon or not key:
+            raise UsageError(f"{what}: {pair!r} is not of the form key:value")
+        values[key] = parse_value(value)
+    return values
 
 
 class KeyValues(argparse.Action):
@@ -169,10 +179,6 @@ class KeyValues(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         """Add the pairs to the dictionary; a pair without a colon is an error."""
-        pairs = dict(getattr(namespace, self.dest, None) or {})
-        for pair in values:
-            key, colon, value = pair.partition(":")
-            if not colon or not key:
-                raise UsageError(f"{option_string}: {pair!r} is not of the form key:value")
-            pairs[key] = parse_value(value)
-        setattr(namespace, self.dest, pairs)
+        before = getattr(namespace, self.dest, None) or {}
+        pairs = parse_pairs(values, option_string or self.dest)
+        setattr(namespace, self.dest, {**before, **pairs})

@@ -5,7 +5,6 @@ environments and YAML anchors. What is read stays plain data, so that the run fo
 ``config.yml`` says exactly what was used; only :func:`build` makes objects of it.
 """
 
-import ast
 import copy
 import importlib
 import inspect
@@ -23,16 +22,19 @@ import gymnasium as gym
 import numpy as np
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import (
     ActionNoise,
     NormalActionNoise,
     OrnsteinUhlenbeckActionNoise,
 )
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.trust import entries, evaluate, import_class, wrapper
 from sb3_guard.zoo.usage import UsageError, one_line
 
 # What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
@@ -56,8 +58,9 @@ NOISE_KEYS: dict[str, Any] = {
 }
 # Arguments of an algorithm that are flags of the command.
 FLAGS = {"env": "--env", "seed": "--seed", "device": "--device", "verbose": "--verbose"}
-# The name of the preset that is the paper's table; `-conf paper` reads it.
+# Presets are files of what differs from an algorithm's own file; `-conf NAME` reads them.
 PAPER = "paper"
+PRESETS = {PAPER: "the paper", "omnisafe": "the settings that OmniSafe has published"}
 NOT_HYPERPARAMETERS = {*FLAGS, "self", "tensorboard_log", "_init_setup_model", "policy_base"}
 
 
@@ -107,7 +110,7 @@ _parse_yaml = lru_cache(maxsize=64)(load_yaml)
 
 def _read_yaml(path: Path) -> Any:
     try:
-        return copy.deepcopy(_parse_yaml(path.read_text()))
+        return copy.deepcopy(_parse_yaml(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise UsageError(f"there is no hyper-parameter file {path}") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -127,16 +130,17 @@ def shipped_file(algo: str) -> Path:
     return theirs if theirs.is_file() else ours
 
 
-def paper_preset(algo: str) -> dict[str, Any]:
+def preset(name: str, algo: str) -> dict[str, Any]:
     """
-    What the paper's table has otherwise than the shipped file of an algorithm.
+    What a preset has otherwise than the shipped file of an algorithm.
 
-    :raises UsageError: the algorithm is not in the paper
+    :param name: one of ``PRESETS``
+    :raises UsageError: the algorithm is not in it
     """
-    content = read_file(hyperparams_folder() / f"{PAPER}.yml")
+    content = read_file(hyperparams_folder() / f"{name}.yml")
     if algo not in content:
         raise UsageError(
-            f"-conf {PAPER}: {algo!r} is not in the paper; {did_you_mean(algo, content)}"
+            f"-conf {name}: {algo!r} is not in {PRESETS[name]}; {did_you_mean(algo, content)}"
         )
     return content[algo]
 
@@ -149,16 +153,19 @@ def read_hyperparams(
 
     :param algo: key of the algorithm, names the shipped file
     :param env_id: its own entry is taken, with or without a version, else ``default``
-    :param conf_file: file to read instead of the shipped one, or ``paper``: the paper's table
+    :param conf_file: file to read instead of the shipped one, or a preset: ``paper`` for the
+        paper's table, ``omnisafe`` for OmniSafe's published settings
     :param overrides: what the command line says
     :raises UsageError: the file can't be read, or has no entry that fits
     """
-    preset = paper_preset(algo) if conf_file == PAPER else {}
-    path = shipped_file(algo) if conf_file in (None, PAPER) else conf_file
-    content = read_file(path)
+    changes = preset(conf_file, algo) if conf_file in PRESETS else {}
+    path = shipped_file(algo) if conf_file is None or conf_file in PRESETS else conf_file
+    # An algorithm of a user has no shipped file; its own defaults serve.
+    own = conf_file is None and not Path(path).is_file()
+    content: dict[str, Any] = {"default": {}} if own else read_file(path)
     for entry in (env_id, env_id.rsplit("-v", 1)[0], "default"):
         if entry in content:
-            return dict(sorted({**content[entry], **preset, **(overrides or {})}.items()))
+            return dict(sorted({**content[entry], **changes, **(overrides or {})}.items()))
     raise UsageError(
         f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
     )
@@ -214,7 +221,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
                 f"it must be {_describe(known[name])}"
             ) from None
     if isinstance(checked.get("env_kwargs"), str):
-        checked["env_kwargs"] = _evaluate("env_kwargs", checked["env_kwargs"])
+        checked["env_kwargs"] = evaluate("env_kwargs", checked["env_kwargs"])
     checked.setdefault("n_envs", 1)
     aliases = algorithm.policy_aliases
     policy = checked.setdefault("policy", next(iter(aliases)))  # MlpPolicy, or its recurrent twin
@@ -343,7 +350,7 @@ class Setup:
     :param env_wrapper: wraps each single environment; None: not used
     :param vec_env_wrapper: wraps the vectorised environment; None: not used
     :param monitor_kwargs: arguments of the monitor
-    :param callbacks: callbacks named in the file
+    :param callback: names of callbacks; :meth:`callbacks` makes them
     :param selection_limit: see CostEvalCallback
     :param noise_type: kind of exploration noise; None: none
     :param noise_std: its standard deviation, in the units of the actions
@@ -358,10 +365,23 @@ class Setup:
     env_wrapper: Callable[[gym.Env], gym.Env] | None
     vec_env_wrapper: Callable[[VecEnv], VecEnv] | None
     monitor_kwargs: dict[str, Any]
-    callbacks: list[BaseCallback]
+    callback: Any
     selection_limit: float | list[float] | None
     noise_type: str | None = None
     noise_std: float = 0.0
+
+    def callbacks(self) -> list[BaseCallback]:
+        """
+        The callbacks, made only where somebody trains.
+
+        :raises UsageError: one is not there, not a callback, or refuses its arguments
+        """
+        found = entries("callback", self.callback)
+        classes = [import_class("callback", path, BaseCallback) for path, _ in found]
+        try:
+            return [cls(**kwargs) for cls, (_, kwargs) in zip(classes, found, strict=True)]
+        except Exception as error:  # a user's class may raise anything
+            raise UsageError(f"a callback can't be made: {one_line(error)}") from error
 
     def action_noise(self, actions: int) -> ActionNoise | None:
         """
@@ -379,27 +399,25 @@ class Setup:
 
 def build(values: Mapping[str, Any]) -> Setup:
     """
-    Make objects of checked hyper-parameters: schedules, classes, wrappers, callbacks.
+    Make objects of checked hyper-parameters: schedules, classes, wrappers.
 
     :raises UsageError: text that should name a class or be an expression does not
     """
-    from rl_zoo3.utils import get_callback_list, get_wrapper_class
-
     not_models = {**RUN_KEYS, **NOISE_KEYS}
     model = {name: value for name, value in values.items() if name not in not_models}
     for name, value in model.items():
         if name == "policy":
             if "." in value:
-                model[name] = _import_class(name, value)
+                model[name] = import_class(name, value, BasePolicy)
         elif isinstance(value, str) and value.startswith("lin_"):
             model[name] = _schedule(name, value)
         elif isinstance(value, str) and value.startswith("dict("):
-            model[name] = _evaluate(name, value)
+            model[name] = evaluate(name, value)
         elif isinstance(value, str) and name.endswith("_class"):
-            model[name] = _import_class(name, value)
+            model[name] = import_class(name, value, BaseBuffer)
     normalize = values.get("normalize") or None
     if isinstance(normalize, str):
-        normalize = _evaluate("normalize", normalize)
+        normalize = evaluate("normalize", normalize)
     if normalize is True:
         normalize = {}
     if normalize is not None and "gamma" in values:
@@ -407,13 +425,7 @@ def build(values: Mapping[str, Any]) -> Setup:
         normalize = {"gamma": values["gamma"], **normalize}
     monitor_kwargs = values.get("monitor_kwargs") or {}
     if isinstance(monitor_kwargs, str):
-        monitor_kwargs = _evaluate("monitor_kwargs", monitor_kwargs)
-    try:
-        env_wrapper = get_wrapper_class(dict(values))
-        vec_env_wrapper: Any = get_wrapper_class(dict(values), "vec_env_wrapper")
-        callbacks = get_callback_list(dict(values))
-    except Exception as error:
-        raise UsageError(f"a wrapper or callback can't be made: {one_line(error)}") from error
+        monitor_kwargs = evaluate("monitor_kwargs", monitor_kwargs)
     return Setup(
         model=model,
         n_envs=values["n_envs"],
@@ -421,10 +433,10 @@ def build(values: Mapping[str, Any]) -> Setup:
         normalize=normalize,
         frame_stack=values.get("frame_stack"),
         env_kwargs=dict(values.get("env_kwargs") or {}),
-        env_wrapper=env_wrapper,
-        vec_env_wrapper=vec_env_wrapper,
+        env_wrapper=wrapper("env_wrapper", values.get("env_wrapper"), gym.Wrapper),
+        vec_env_wrapper=wrapper("vec_env_wrapper", values.get("vec_env_wrapper"), VecEnvWrapper),
         monitor_kwargs=monitor_kwargs,
-        callbacks=callbacks,
+        callback=values.get("callback"),
         selection_limit=values.get("selection_limit"),
         noise_type=values.get("noise_type"),
         noise_std=values.get("noise_std", 0.0),
@@ -440,63 +452,3 @@ def _schedule(name: str, value: str) -> Callable[[float], float]:
         raise UsageError(
             f"hyper-parameter {name}: {value!r} is not a schedule; write e.g. lin_0.001"
         ) from None
-
-
-def _evaluate(name: str, text: str) -> Any:
-    """
-    The value of an expression such as ``dict(activation_fn=nn.ReLU)``.
-
-    Settings travel with agents, so no code of theirs runs.
-    """
-    try:
-        return _literal(ast.parse(text.strip(), mode="eval").body)
-    except Exception as error:
-        raise UsageError(
-            f"hyper-parameter {name}: {text!r} can't be evaluated: {one_line(error)}; "
-            "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
-        ) from error
-
-
-def _literal(node: ast.expr) -> Any:
-    match node:
-        case ast.Call(func=ast.Name(id="dict"), args=[], keywords=pairs):
-            if all(pair.arg for pair in pairs):  # none is **
-                return {pair.arg: _literal(pair.value) for pair in pairs}
-        case ast.Dict(keys=keys, values=values):
-            named = [key for key in keys if key is not None]
-            if len(named) == len(values):
-                return {
-                    ast.literal_eval(key): _literal(value)
-                    for key, value in zip(named, values, strict=True)
-                }
-        case ast.List(elts=items):
-            return [_literal(item) for item in items]
-        case ast.Tuple(elts=items):
-            return tuple(_literal(item) for item in items)
-        case ast.Attribute():
-            return _torch(ast.unparse(node))
-        case ast.Call() | ast.Name():
-            raise ValueError(f"{ast.unparse(node)} is not allowed")
-    return ast.literal_eval(node)
-
-
-def _torch(path: str) -> Any:
-    """A class or a type of numbers of torch: ``nn.ReLU``, ``th.optim.Adam``, ``th.float32``."""
-    import torch as th
-
-    root, *names = path.split(".")
-    value: Any = {"th": th, "torch": th, "nn": th.nn}.get(root)
-    for one in names:
-        value = getattr(value, one)
-    if not isinstance(value, (type, th.dtype)):
-        raise ValueError(f"{path} is no class of torch")
-    return value
-
-
-def _import_class(name: str, path: str) -> type:
-    from rl_zoo3.utils import get_class_by_name
-
-    try:
-        return get_class_by_name(path)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise UsageError(f"{name}: there is no class {path!r}: {one_line(error)}") from error

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import (
     is_image_space,
@@ -22,7 +23,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_guard.common.adapters import is_safety_gymnasium
 from sb3_guard.common.vec_env import find_scenario, make_vec_env
-from sb3_guard.zoo.config import Setup
+from sb3_guard.zoo.hyperparams import Setup
 from sb3_guard.zoo.resumable import ResumableEnv
 from sb3_guard.zoo.usage import UsageError, one_line
 
@@ -53,6 +54,29 @@ BAD_ARGUMENTS = (
 PROCESS_DIED = (EOFError, ConnectionError)
 
 
+def row_seeds(seed: int, rows: int, *key: int) -> list[int]:
+    """
+    Seeds for the rows of a run's environments, which no run of another seed shares.
+
+    SB3 seeds row i with ``seed + i``, so that runs of seeds 0 and 1 play almost the same episodes;
+    these are words of a child of NumPy's ``SeedSequence(seed)``.
+
+    :param rows: how many; a longer list begins with a shorter one
+    :param key: of the child: 0 for training, 1 for evaluation, and where training restarts the step
+    """
+    return np.random.SeedSequence(seed, spawn_key=key or (0,)).generate_state(rows).tolist()
+
+
+def seed_rows(env: VecEnv, seed: int, *key: int) -> None:
+    """Seed the next reset, see :func:`row_seeds`; a model seeds it, too, so this comes later."""
+    env.unwrapped._seeds = list(row_seeds(seed, env.num_envs, *key))
+
+
+def evaluation_seed(seed: int) -> int:
+    """The seed that a run of this seed evaluates with; row i plays ``evaluation_seed + i``."""
+    return row_seeds(seed, 1, 1)[0] // 2
+
+
 def canonical_id(env_id: str) -> tuple[str, bool]:
     """
     The full id of an environment, and whether it is one of ours.
@@ -68,9 +92,7 @@ def canonical_id(env_id: str) -> tuple[str, bool]:
         )
     try:
         ours = find_scenario(env_id) is not None
-        if not ours and is_safety_gymnasium(env_id):
-            env_id = env_id.removeprefix("safety_gymnasium:")
-        elif not ours and ":" not in env_id:
+        if not ours and not is_safety_gymnasium(env_id) and ":" not in env_id:
             gym.spec(env_id)
     except (ValueError, gym.error.Error) as error:
         raise UsageError(one_line(error)) from error

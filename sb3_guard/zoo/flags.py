@@ -1,0 +1,281 @@
+"""The flags of a command, each stated once, as a field of a dataclass.
+
+From the field come the parser, the default, the help, the typed attribute, the check of the same
+value in a file, a row of the documentation, and whether it is part of what a run *is*::
+
+    @dataclass
+    class Flags(Command):
+        \"\"\"Train an agent.\"\"\"
+
+        algo: str = flag(default="cpo", help="algorithm", role=IDENTITY)
+        n_timesteps: int = flag("-n", default=-1, kind=positive, metavar="N", help="length")
+
+    main = command(Flags, train)  # train(flags: Flags) -> exit status
+
+The long name is the field's (``--n-timesteps``); annotations choose how a value is read: ``bool``
+is a switch, ``bool | None`` has a ``--no-…``, ``list[int]`` takes several, ``dict`` takes
+``key:value``, ``Literal`` one of its values.
+"""
+
+import argparse
+import dataclasses
+import sys
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Literal, Self
+
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, parse_pairs, run
+
+# Roles of a flag: it says what a run is, how it is started, or how it is hosted and watched,
+# which may change when the run is resumed.
+IDENTITY, START, HOST = "identity", "start", "host"
+
+
+def flag(
+    *names: str,
+    default: Any = None,
+    help: str | None = None,
+    role: str = START,
+    kind: Callable[[Any], Any] | None = None,
+    group: str = "options",
+    exclusive: str | None = None,
+    positional: bool = False,
+    **argparse_options: Any,
+) -> Any:
+    """
+    One flag of a command, as the default of a dataclass field.
+
+    :param names: short names
+    :param default: value where the flag is not given; a list or dictionary is copied
+    :param help: None: not shown
+    :param role: ``IDENTITY``, ``START`` or ``HOST``
+    :param kind: makes the value of its text or number, and raises ``ArgumentTypeError``
+    :param group: heading in ``--help``
+    :param exclusive: at most one flag of the same ``exclusive`` can be given
+    :param positional: the value is given without the flag's name
+    :param argparse_options: for ``add_argument``, e.g. ``metavar``
+    """
+    meta = {
+        "names": names, "help": help, "role": role, "kind": kind, "group": group,
+        "exclusive": exclusive, "positional": positional, "options": argparse_options,
+    }  # fmt: skip
+    if isinstance(default, list | dict):
+        copied = default
+        return dataclasses.field(default_factory=lambda: copied.copy(), metadata=meta)
+    return dataclasses.field(default=default, metadata=meta)
+
+
+@dataclasses.dataclass
+class Command:
+    """Flags and values of a command; subclasses are dataclasses whose docstring describes it."""
+
+    prog: ClassVar[str] = "sb3-guard"
+    examples: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        #: names of the flags that were given, on the command line or in a file
+        self.given: frozenset[str] = frozenset()
+
+    @classmethod
+    def parser(cls) -> Parser:
+        """The flags as a parser; what is not given is absent from its result."""
+        result = Parser(
+            prog=cls.prog,
+            description=" ".join((cls.__doc__ or "").split()),
+            epilog=cls.examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            argument_default=argparse.SUPPRESS,
+        )
+        groups: dict[str, Any] = {}
+        for field, hint in cls._flags():
+            meta = field.metadata
+            group = groups.get(meta["group"])
+            if group is None:
+                group = groups[meta["group"]] = result.add_argument_group(meta["group"])
+            if meta["exclusive"]:
+                name = meta["exclusive"]
+                if name not in groups:
+                    groups[name] = group.add_mutually_exclusive_group()
+                group = groups[name]
+            options = _options(field, hint)
+            if meta["positional"]:
+                group.add_argument(field.name, **{"default": None, **options})
+            else:
+                group.add_argument(*_names(field), dest=field.name, **options)
+        return result
+
+    @classmethod
+    def parse(cls, argv: Sequence[str] | None = None) -> Self:
+        """
+        The values of a command line.
+
+        :param argv: arguments; None: those of the process
+        :raises UsageError: a flag is unknown, with the nearest name, or a value is not allowed
+        """
+        parsed = vars(cls.parser().parse_args(argv))
+        # What is absent is not there at all, except where a value goes without a flag.
+        return cls.of({name: value for name, value in parsed.items() if value is not None})
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Self:
+        """The flags with some values given, typed already."""
+        result = cls(**given)
+        result.given = frozenset(given)
+        return result
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], where: object, but: Sequence[str] = ()) -> Self:
+        """
+        The values of a file, checked as on the command line; data stays data.
+
+        :param data: flags by name, in either spelling
+        :param where: the file, for the message
+        :param but: flags that a file can't give
+        :raises UsageError: a name is unknown, or a value not allowed
+        """
+        known = {field.name: (field, hint) for field, hint in cls._flags() if field.name not in but}
+        given = {}
+        for key, value in data.items():
+            name = str(key).replace("-", "_")
+            if name not in known:
+                raise UsageError(f"{where}: unknown entry {key!r}; {did_you_mean(name, known)}")
+            field, hint = known[name]
+            if value is not None and value != _default(field):
+                try:
+                    value = _typed(hint, field.metadata["kind"], value)
+                except (ValueError, TypeError, argparse.ArgumentTypeError) as error:
+                    raise UsageError(
+                        f"{where}: {key}: {value!r} is not allowed; it must be {_words(hint)}"
+                        + (f" ({error})" if isinstance(error, argparse.ArgumentTypeError) else "")
+                    ) from None
+                given[name] = value
+        return cls.of(given)
+
+    def values(self, *roles: str) -> dict[str, Any]:
+        """The flags by name, of these roles only if any are named."""
+        return {
+            field.name: getattr(self, field.name)
+            for field, _ in self._flags()
+            if not roles or field.metadata["role"] in roles
+        }
+
+    @classmethod
+    def names(cls, *roles: str) -> set[str]:
+        """Names of the flags, of these roles only if any are named."""
+        return {f.name for f, _ in cls._flags() if not roles or f.metadata["role"] in roles}
+
+    @classmethod
+    def documentation(cls) -> str:
+        """The flags as a Markdown table."""
+        rows = ["| flag | what it says | default |", "|---|---|---|"]
+        for field, _ in cls._flags():
+            meta, default = field.metadata, _default(field)
+            if meta["help"] is not None:
+                names = (
+                    [field.name] if meta["positional"] else [f"`{one}`" for one in _names(field)]
+                )
+                shown = "" if default in (None, False, "", []) else f"`{default}`"
+                rows.append(f"| {', '.join(names)} | {meta['help']} | {shown} |")
+        return "\n".join(rows)
+
+    @classmethod
+    def _flags(cls) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
+        hints = typing.get_type_hints(cls)
+        for field in dataclasses.fields(cls):
+            if "role" in field.metadata:
+                yield field, hints[field.name]
+
+
+def command(flags: type[Any], function: Callable[[Any], int]) -> Callable[..., int]:
+    """
+    The ``main`` of a command.
+
+    :param flags: its :class:`Command`
+    :param function: carries it out and returns the exit status
+    """
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        """
+        Run the command.
+
+        :param argv: arguments; None: those of the process
+        :return: exit status: 0, 2 for wrong usage, 130 or 128 + the signal's number if interrupted
+        """
+        return run(lambda: function(flags.parse(sys.argv[1:] if argv is None else argv)))
+
+    main.flags = flags  # type: ignore[attr-defined]  # for what completes or documents them
+    return main
+
+
+def _names(field: "dataclasses.Field[Any]") -> list[str]:
+    return [*field.metadata["names"], "--" + field.name.replace("_", "-")]
+
+
+def _default(field: "dataclasses.Field[Any]") -> Any:
+    made = field.default_factory
+    return field.default if made is dataclasses.MISSING else made()
+
+
+def _bare(hint: Any) -> Any:
+    """An annotation without its ``| None``."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return next(arm for arm in typing.get_args(hint) if arm is not type(None))
+    return hint
+
+
+def _options(field: "dataclasses.Field[Any]", hint: Any) -> dict[str, Any]:
+    """What argparse needs to know of a flag."""
+    meta, bare = field.metadata, _bare(hint)
+    origin, arguments = typing.get_origin(bare), typing.get_args(bare)
+    options: dict[str, Any] = {"help": meta["help"] or argparse.SUPPRESS}
+    if bare is bool:
+        options["action"] = "store_true" if bare is hint else argparse.BooleanOptionalAction
+    elif (origin or bare) is dict:
+        options |= {"nargs": "+", "action": KeyValues, "metavar": "KEY:VALUE"}
+    elif origin is list:
+        options |= {"nargs": "+", "type": meta["kind"] or arguments[0]}
+    elif origin is Literal:
+        options |= {"choices": list(arguments), "type": type(arguments[0])}
+    else:
+        options["type"] = meta["kind"] or bare
+    return options | meta["options"]
+
+
+def _typed(hint: Any, kind: Callable[[Any], Any] | None, value: Any) -> Any:
+    """A value of a file as the flag has it."""
+    bare = _bare(hint)
+    origin, arguments = typing.get_origin(bare), typing.get_args(bare)
+    if (origin or bare) is dict:
+        return dict(value) if isinstance(value, Mapping) else parse_pairs(_several(value))
+    if origin is list:
+        return [_typed(arguments[0], kind, one) for one in _several(value)]
+    allowed = bool if bare is bool else (str, int, float)
+    if origin is Literal:
+        if value not in arguments:
+            raise ValueError
+        return value
+    if isinstance(value, bool) != (bare is bool) or not isinstance(value, allowed):
+        raise TypeError
+    made = (kind or bare)(value)
+    if bare is int and float(value) != made:
+        raise ValueError
+    return made
+
+
+def _several(value: Any) -> list[Any]:
+    if isinstance(value, Mapping) or value == []:
+        raise TypeError
+    return value if isinstance(value, list) else [value]
+
+
+def _words(hint: Any) -> str:
+    bare = _bare(hint)
+    if (typing.get_origin(bare) or bare) is dict:
+        return "a mapping or a list of key:value"
+    if typing.get_origin(bare) is list:
+        return "one value or a list of them"
+    if typing.get_origin(bare) is Literal:
+        return " or ".join(map(str, typing.get_args(bare)))
+    return {bool: "true or false", int: "a whole number", float: "a number"}.get(bare, "text")

@@ -1,0 +1,257 @@
+"""The figures of the GUARD paper's questions, Q1–Q8 (arXiv 2305.13681), and their suites."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from sb3_guard.zoo.figures import (
+    COLORS,
+    DASHES,
+    INK,
+    SCORE_AXES,
+    STYLE,
+    WIDTH,
+    Data,
+    Drawing,
+    Look,
+    add_legend,
+    curves,
+    curves_of,
+    finish,
+    fit_costs,
+    iqm,
+    pareto,
+    profiles,
+)
+from sb3_guard.zoo.runs import REFERENCE
+from sb3_guard.zoo.statistics import SCORES
+
+ALGOS = (
+    "trpo", "cpo", "pcpo", "trpo_lag", "trpo_fac", "trpo_ipo", "trpo_sl", "trpo_usl",
+)  # fmt: skip
+MAIN8 = (
+    "Goal_Point_8Hazards", "Goal_Walker_8Hazards", "Goal_Arm3_8Hazards", "Goal_Drone_8Hazards",
+    "Goal_Point_8Ghosts", "Push_Point_8Hazards", "Chase_Point_8Hazards", "Defense_Point_8Hazards",
+)  # fmt: skip
+RADAR4 = ("Goal_Point_8Hazards", "Goal_Point_8Ghosts", "Goal_Ant_8Hazards", "Goal_Ant_8Ghosts")
+# The robots by degrees of freedom, the number of actions
+ROBOTS = {
+    "Point": 2, "Swimmer": 2, "Arm3": 3, "Drone": 4, "Hopper": 5, "Arm6": 6, "Humanoid": 6,
+    "Ant": 8, "Walker": 10,
+}  # fmt: skip
+OPTIONS = {
+    "Goal\nHazards": "Goal_{}_8Hazards",
+    "Goal\nGhosts": "Goal_{}_8Ghosts",
+    "Push": "Push_{}_8Hazards",
+    "Chase": "Chase_{}_8Hazards",
+    "Defense": "Defense_{}_8Hazards",
+}
+SPOKES = {"reward": "reward", "cost": "cost", "cost_rate": "cost\nrate"}
+POLYGONS = {
+    score: Look(score.replace("_", " "), color, dashes, "o")
+    for score, color, dashes in zip(SCORES.values(), COLORS, DASHES, strict=False)
+}
+
+
+def q1(data: Data) -> Iterator[Drawing]:
+    """Overall results: learning curves of the paper's eight main suites."""
+    yield curves_of(data, MAIN8, "q1", data.missing(MAIN8, ALGOS))
+
+
+def q2(data: Data) -> Iterator[Drawing]:
+    """Difficulty of constraints: TRPO's cost per robot, and every algorithm, Hazards to Ghosts."""
+    pair = ("Hazards", "Ghosts")
+    bars = [f"Goal_{robot}_8{kind}" for robot in ROBOTS for kind in pair]
+    slopes = [f"Goal_Point_8{kind}" for kind in pair]
+    lacks = (data.missing(bars, [REFERENCE]), data.missing(slopes, ALGOS[1:]))
+    missing = "; ".join(filter(None, lacks))
+    have = data.scores.index
+    robots = [r for r in ROBOTS if any((f"Goal_{r}_8{k}", REFERENCE) in have for k in pair)]
+    if not robots:
+        yield Drawing("q2", None, missing)
+        return
+    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
+    left, *others = figure.subplots(1, 3, width_ratios=(1.7, 1, 1))
+    for offset, kind, color, hatch in zip((-0.2, 0.2), pair, COLORS, ("", "//"), strict=False):
+        rows = data.scores.reindex([(f"Goal_{robot}_8{kind}", REFERENCE) for robot in robots])
+        left.bar(
+            np.arange(len(robots)) + offset, rows["M_c"], 0.38, yerr=rows["M_c_std"], color=color,
+            hatch=hatch, edgecolor=INK, ecolor=INK, capsize=2, label=f"8 {kind}",
+        )  # fmt: skip
+        fit_costs(left, [bar.get_height() for bar in left.patches])
+    left.set_xticks(range(len(robots)), robots, rotation=60)
+    left.set(ylabel="episode cost of TRPO", title="Goal, every robot")
+    left.grid(axis="x", visible=False)
+    for axis, score in zip(others, ("reward", "cost"), strict=True):
+        for algo, look in data.looks.items():
+            values = [data.score(suite, algo, score) for suite in slopes]
+            if algo not in data.families and not np.isnan(values).all():
+                axis.plot(pair, values, marker=look.marker, **look.line)
+        axis.set(ylabel=SCORE_AXES[score], title="Goal, Point", xlim=(-0.3, 1.3))
+        mark_trpo(axis)
+    add_legend(figure)
+    yield finish(Drawing("q2", figure, missing))
+
+
+def mark_trpo(axis: Axes) -> None:
+    """TRPO's own score is 1."""
+    axis.axhline(1, color=INK, linewidth=1, label="TRPO")
+    low, high = axis.get_ylim()
+    axis.set_ylim(min(0, low), max(1.06, high))
+
+
+def q3(data: Data) -> Iterator[Drawing]:
+    """Families of algorithms: reward, cost and cost rate on four suites, a polygon per family."""
+    missing = data.missing(RADAR4, ALGOS)
+    have = data.by_family.index.get_level_values("suite")
+    shown = [s for s in RADAR4 if s in have and not np.isnan(data.score(s, REFERENCE, "cost"))]
+    if not shown:
+        yield Drawing("q3", None, missing)
+        return
+    spiders = {
+        suite: {
+            family: [data.score(suite, family, score) for score in SCORES.values()]
+            for family in data.families
+        }
+        for suite in shown
+    }
+    spokes = {suite: [*SPOKES.values()] for suite in shown}
+    yield draw_spiders("q3", spiders, spokes, data.looks, missing)
+
+
+def draw_spiders(
+    name: str,
+    spiders: dict[str, dict[str, list[float]]],
+    spokes: dict[str, list[str]],
+    looks: dict[str, Look],
+    missing: str,
+) -> Drawing:
+    """
+    Spider plots, TRPO's boundary at 1; a missing value leaves a gap.
+
+    :param spiders: values by title and name of a polygon
+    :param spokes: what they are of, by title
+    :param looks: by name of a polygon
+    """
+    columns = min(4, len(spiders))
+    rows = -(-len(spiders) // columns)
+    size = (WIDTH * max(columns, 2) / 4, 2.7 * rows + 0.6)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "polar"})
+    for axis, (title, polygons) in zip(grid.flat, spiders.items(), strict=False):
+        angles = 2 * np.pi * np.arange(len(spokes[title]) + 1) / len(spokes[title])
+        axis.set_theta_offset(np.pi / 2)
+        axis.plot(angles, np.ones(len(angles)), color=INK, linewidth=1.2, label="TRPO")
+        for polygon, values in polygons.items():
+            look, closed = looks[polygon], [*values, values[0]]
+            axis.plot(angles, closed, linewidth=1.5, marker=look.marker, markersize=4, **look.line)
+            if not np.isnan(values).any():
+                axis.fill(angles, closed, color=look.color, alpha=0.1)
+        highest = np.nanmax([1.1, *(value for values in polygons.values() for value in values)])
+        axis.set_ylim(0, 1.05 * highest)
+        axis.set_xticks(angles[:-1], spokes[title])
+        axis.tick_params(axis="x", pad=6, labelsize=7)
+        axis.tick_params(axis="y", labelsize=7)
+        axis.yaxis.set_major_locator(MaxNLocator(4))
+        axis.spines["polar"].set_visible(False)
+        axis.set_title(title, fontweight="bold", fontsize=8)
+    for axis in grid.flat[len(spiders) :]:
+        axis.remove()
+    add_legend(figure)
+    return finish(Drawing(name, figure, missing))
+
+
+def by_robot(data: Data, name: str, lines: Iterable[str], algos: Sequence[str]) -> Drawing:
+    """Scores on Goal with 8 hazards, robots by degrees of freedom."""
+    suites = {robot: f"Goal_{robot}_8Hazards" for robot in ROBOTS}
+    missing = data.missing(suites.values(), (REFERENCE, *algos))
+    lines = [line for line in lines if line in data.looks]
+    shown = [
+        robot
+        for robot, suite in suites.items()
+        if any(not np.isnan(data.score(suite, line, s)) for line in lines for s in SCORES.values())
+    ]
+    if not shown:
+        return Drawing(name, None, missing)
+    figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
+    ticks = [f"{robot}\n{ROBOTS[robot]}" for robot in shown]
+    for axis, score in zip(figure.subplots(1, 2), ("reward", "cost"), strict=True):
+        for line in lines:
+            look, values = data.looks[line], [data.score(suites[r], line, score) for r in shown]
+            axis.plot(ticks, values, marker=look.marker, linewidth=1.4, **look.line)
+        axis.set(xlabel="robot, degrees of freedom", ylabel=SCORE_AXES[score])
+        axis.tick_params(axis="x", labelsize=7)
+        axis.margins(x=0.06)
+        mark_trpo(axis)
+    add_legend(figure)
+    return finish(Drawing(name, figure, missing))
+
+
+def q4(data: Data) -> Iterator[Drawing]:
+    """Task complexity: each family on robots of more and more degrees of freedom."""
+    yield by_robot(data, "q4", data.families, ALGOS[1:])
+
+
+def q5(data: Data) -> Iterator[Drawing]:
+    """Adaptive multiplier: TRPO-Lagrangian against TRPO-FAC."""
+    yield by_robot(data, "q5", ("trpo_lag", "trpo_fac"), ("trpo_lag", "trpo_fac"))
+
+
+def q6(data: Data) -> Iterator[Drawing]:
+    """Feasibility projection: CPO against PCPO."""
+    yield by_robot(data, "q6", ("cpo", "pcpo"), ("cpo", "pcpo"))
+
+
+def q7(data: Data) -> Iterator[Drawing]:
+    """Linearised cost dynamics: TRPO-USL against TRPO-SL."""
+    yield by_robot(data, "q7", ("trpo_usl", "trpo_sl"), ("trpo_usl", "trpo_sl"))
+
+
+def q8(data: Data) -> Iterator[Drawing]:
+    """Every algorithm, every task: five task options, each a mean over the robots there are."""
+    suites = {o: [name.format(robot) for robot in ROBOTS] for o, name in OPTIONS.items()}
+    missing = data.missing([suite for names in suites.values() for suite in names], ALGOS)
+    spiders: dict[str, dict[str, list[float]]] = {}
+    spokes: dict[str, list[str]] = {}
+    for algo in (a for a in data.looks if a != REFERENCE and a not in data.families):
+        # option, robot, score; a mean is over the robots that have all scores
+        values: Any = np.array(
+            [[[data.score(suite, algo, score) for score in SCORES.values()] for suite in row]
+             for row in suites.values()]
+        )  # fmt: skip
+        if not np.isfinite(values).any():
+            continue
+        number = np.isfinite(values).all(axis=2).sum(axis=1)
+        means = np.ma.masked_invalid(values).mean(axis=1).filled(np.nan)
+        title = data.looks[algo].label
+        spiders[title] = dict(zip(SCORES.values(), means.T.tolist(), strict=True))
+        spokes[title] = [
+            option if n == len(ROBOTS) else f"{option}\n({n}/{len(ROBOTS)})"
+            for option, n in zip(suites, number, strict=True)
+        ]
+    yield (
+        draw_spiders("q8", spiders, spokes, POLYGONS, missing)
+        if spiders
+        else Drawing("q8", None, missing)
+    )
+
+
+FIGURES = {
+    **{function.__name__: function for function in (curves, pareto, profiles, iqm)},
+    **{function.__name__: function for function in (q1, q2, q3, q4, q5, q6, q7, q8)},
+}
+
+
+def draw(kind: str, data: Data) -> list[Drawing]:
+    """
+    The figures of one kind, in the house's style.
+
+    :param kind: a key of :data:`FIGURES`
+    """
+    with mpl.rc_context(STYLE):
+        return list(FIGURES[kind](data))

@@ -1,0 +1,458 @@
+"""A training run from flags to result: checked in full first, then made and trained.
+
+RL-Zoo's ``ExperimentManager`` makes the run folder before it has looked at the hyper-parameters,
+and starts counters, seeds and environments anew when it continues; so its pieces are used here
+(schedules, run numbers, file layout, flags) and its class is not.
+"""
+
+import copy
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
+
+from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
+from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import CostMonitor, find_monitor
+from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.checkpoint import (
+    Checkpoints,
+    Interrupted,
+    load_model,
+    monitor_offset,
+    read_checkpoint,
+    read_normalizer,
+    restore_run,
+)
+from sb3_guard.zoo.hyperparams import Setup, build
+from sb3_guard.zoo.logger import RunLogger
+from sb3_guard.zoo.make_envs import (
+    BAD_ARGUMENTS,
+    ERRORS_OF_OURS,
+    PROCESS_DIED,
+    canonical_id,
+    choose_vec_env,
+    evaluation_seed,
+    make_envs,
+    seed_rows,
+)
+from sb3_guard.zoo.progress import Epochs
+from sb3_guard.zoo.run_flags import RunFlags
+from sb3_guard.zoo.run_folder import RunFolder, is_disk_error, require_writable
+from sb3_guard.zoo.tracking import Tracker
+from sb3_guard.zoo.usage import ForeignError, UsageError, interrupts, one_line
+
+
+class Experiment:
+    """
+    One training run, made and checked but not yet on disk.
+
+    :param flags: all flags of the run
+    :param hyperparams: hyper-parameters as data, checked
+    :param folder: the folder of the run to continue; None: a new run
+    :raises UsageError: the environment, the algorithm or a wrapper refuses a value, or TensorBoard
+        events can't be written
+    """
+
+    def __init__(
+        self, flags: RunFlags, hyperparams: Mapping[str, Any], folder: RunFolder | None = None
+    ):
+        self.flags = flags
+        self.hyperparams = dict(hyperparams)
+        self.algorithm = algorithm(flags.algo)
+        self.setup: Setup = build(hyperparams)
+        self.callbacks = self.setup.callbacks()
+        #: the checkpoint to continue from
+        self.state = None if folder is None else read_checkpoint(folder.checkpoint)
+        self._saved = None if folder is None else folder.checkpoint
+        #: training ends after the rollout under way when this says so
+        self.asked_to_stop: Callable[[], bool] | None = None
+        #: its folder is to state flags and hyper-parameters anew once training can go on
+        self.restates = False
+        self.tracker = Tracker(flags, hyperparams) if flags.track else None
+        self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
+        self._check_selection_limit()
+        _check_device(flags.device)
+        if self._tensorboard_folder is not None:
+            require_writable(self._tensorboard_folder, "--tensorboard-log")
+        self.vec_env = choose_vec_env(
+            flags.vec_env, canonical_id(flags.env)[1], self.setup.env_wrapper is not None
+        )
+        if flags.num_threads > 0:
+            th.set_num_threads(flags.num_threads)
+        set_random_seed(flags.seed)
+        self._try_environment(self.setup.env_kwargs)
+        if flags.eval_freq > 0 and flags.eval_env_kwargs is not None:
+            self._try_environment(flags.eval_env_kwargs)
+        self.env = self._make_envs(self.setup.n_envs, flags.seed)
+        try:
+            self.model = self._make_model()
+            seed_rows(self.env, flags.seed)
+            self.model.verbose = max(flags.verbose - 1, 0)
+            self.eval_env = self._make_eval_envs() if flags.eval_freq > 0 else None
+        except BaseException:
+            self.env.close()
+            raise
+
+    def _make_envs(self, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
+        kwargs = {"vec_env": self.vec_env, "env_kwargs": self.setup.env_kwargs, **kwargs}
+        return make_envs(
+            self.flags.env,
+            self.setup,
+            n_envs=n_envs,
+            seed=seed,
+            cost_keys=self.cost_keys,
+            num_threads=self.flags.num_threads if self.flags.num_threads > 0 else None,
+            normalizer=self._warm_start_normalizer(),
+            **kwargs,
+        )
+
+    def _check_selection_limit(self) -> None:
+        limit = self.setup.selection_limit
+        if isinstance(limit, list) and len(limit) != len(self.cost_keys):
+            raise UsageError(
+                f"hyper-parameter selection_limit: {limit} has {len(limit)} entries, but there "
+                f"{'is one cost' if len(self.cost_keys) == 1 else 'are several costs'}, "
+                f"{', '.join(self.cost_keys)}; give one number, or a list of one per cost"
+            )
+
+    def _try_environment(self, env_kwargs: Mapping[str, Any]) -> None:
+        """Make one environment and take a step, so that nothing fails later for want of a cost."""
+        vec_env = "dummy" if self.vec_env == "subproc" else self.vec_env
+        env = self._make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
+        try:
+            env.reset()
+            env.action_space.seed(self.flags.seed)
+            info = env.step(np.array([env.action_space.sample()]))[3][0]
+        except BAD_ARGUMENTS as error:
+            raise UsageError(
+                f"{self.flags.env} fails at its first step: {one_line(error)}"
+            ) from error
+        finally:
+            env.close()
+        if not getattr(self.algorithm, "constrained", False):
+            return
+        if self.setup.model.get("missing_cost", "error") == "zero":
+            return
+        for key in self.cost_keys:
+            if key not in info:
+                raise UsageError(
+                    f"{self.flags.env} reports no cost {key!r} in its info, which has "
+                    f"{', '.join(sorted(info)) or 'nothing'}; name its costs with "
+                    "-params cost_keys:\"['name']\", or count a missing cost as 0 with "
+                    "-params missing_cost:zero"
+                )
+
+    def _make_model(self) -> BaseAlgorithm:
+        flags = self.flags
+        if self._saved is not None:
+            return load_model(self.algorithm, self._saved, self.env, flags.device)
+        arguments = copy.deepcopy(self.setup.model)  # some algorithms add to their policy_kwargs
+        arguments["seed"] = flags.seed
+        try:
+            if flags.trained_agent:
+                # What the networks are is for the saved agent to say.
+                for name in ("policy", "policy_kwargs"):
+                    arguments.pop(name, None)
+                path = Path(flags.trained_agent)
+                return load_model(self.algorithm, path, self.env, flags.device, **arguments)
+            noise = self._action_noise()
+            if noise is not None:
+                arguments["action_noise"] = noise
+            return self.algorithm(env=self.env, device=flags.device, **arguments)
+        except (*BAD_ARGUMENTS, RuntimeError) as error:
+            raise UsageError(f"{flags.algo} can't be made: {one_line(error)}") from error
+
+    def _action_noise(self) -> ActionNoise | None:
+        space = self.env.action_space
+        return self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
+
+    def _warm_start_normalizer(self) -> VecNormalize | None:
+        """Observation statistics that belong to the agent given by ``-i model.zip``."""
+        agent = self.flags.trained_agent
+        if self.state is not None or not agent or self.setup.normalize is None:
+            return None
+        found = sorted(Path(agent).parent.glob("*/vecnormalize.pkl"))
+        return read_normalizer(found[0]) if found else None
+
+    def _make_eval_envs(self) -> VecEnv:
+        number = self.flags.n_eval_envs
+        if number is None:
+            # All episodes at once where that is cheap; a process each would not be.
+            number = self.flags.eval_episodes if self.vec_env == "native" else 1
+        kwargs = self.flags.eval_env_kwargs
+        return self._make_envs(
+            number,
+            evaluation_seed(self.flags.seed),
+            evaluation=True,
+            env_kwargs=self.setup.env_kwargs if kwargs is None else kwargs,
+        )
+
+    def _make_callbacks(self, folder: RunFolder) -> tuple[Checkpoints, Epochs, list[BaseCallback]]:
+        flags, n_envs = self.flags, self.setup.n_envs
+        epochs = Epochs(self.setup.n_timesteps, bar=bool(flags.progress))
+        others: list[BaseCallback] = [epochs]
+        if not isinstance(self.model, Constrained):
+            others.append(LogCosts())
+        if flags.save_freq > 0:
+            others.append(
+                CheckpointCallback(
+                    max(flags.save_freq // n_envs, 1),
+                    str(folder.path),
+                    name_prefix="rl_model",
+                    save_vecnormalize=True,
+                )
+            )
+        if self.eval_env is not None:
+            others.append(
+                CostEvalCallback(
+                    self.eval_env,
+                    selection_limit=self.setup.selection_limit,
+                    seed=evaluation_seed(flags.seed),
+                    n_eval_episodes=flags.eval_episodes,
+                    eval_freq=max(flags.eval_freq // n_envs, 1),
+                    log_path=folder.path,
+                    best_model_save_path=folder.path,
+                    verbose=int(flags.verbose > 0 and self._prints_tables),
+                )
+            )
+        others += self.callbacks
+        checkpoints = Checkpoints(
+            folder.checkpoint,
+            others,
+            every=flags.checkpoint_every,
+            log_interval=flags.log_interval,
+            what=folder.what(),
+        )
+        checkpoints.asked = self.asked_to_stop
+        # The checkpoint comes first: it must see the others as the last rollout left them.
+        return checkpoints, epochs, [checkpoints, *others]
+
+    @property
+    def _prints_tables(self) -> bool:
+        # The progress bar shows the same live; two displays would be one too many.
+        return self.flags.verbose > (1 if self.flags.progress else 0)
+
+    def train(self, folder: RunFolder) -> int:
+        """
+        Train to the end, or to an interrupt, and report.
+
+        :param folder: the run's folder, owned by this process
+        :return: exit status: 0, or 128 + the signal's number when interrupted
+        :raises UsageError: training can't go on, or the disk is full or read-only
+        """
+        try:
+            return self._train(folder)
+        except PROCESS_DIED as error:
+            if not self._lost_a_process():
+                raise  # the pipe of somebody else, such as that of standard output
+            raise UsageError(
+                "a process of --vec-env subproc has died, perhaps for want of memory; "
+                f"continue with -i {folder.path}"
+            ) from error
+        except Exception as error:
+            if from_environment(error):
+                raise ForeignError(
+                    f"{self.flags.env} raised {one_line(error)} at "
+                    f"{self.model.num_timesteps} steps; its traceback:"
+                ) from error
+            if isinstance(error, OSError) and is_disk_error(error):
+                what = "standard output" if _stdout_is_full() else str(folder.path)
+                raise UsageError(
+                    f"can't write to {what}: {error.strerror}; what was written before is "
+                    f"intact: make room, then continue with -i {folder.path}"
+                ) from error
+            raise
+        finally:
+            self.close()
+
+    def _lost_a_process(self) -> bool:
+        """Whether a process of the environments has died; a dying one is waited for."""
+        envs = [env.unwrapped for env in (self.env, self.eval_env) if env is not None]
+        processes = [one for env in envs if isinstance(env, SubprocVecEnv) for one in env.processes]
+        for one in processes:
+            one.join(timeout=0.2)
+        return any(not one.is_alive() for one in processes)
+
+    def close(self) -> None:
+        """Release the environments, and let Weights & Biases have what it has not yet."""
+        for env in (self.env, self.eval_env):
+            with suppress(*PROCESS_DIED):
+                if env is not None:
+                    env.close()
+        if self.tracker is not None:
+            self.tracker.finish()
+
+    def _train(self, folder: RunFolder) -> int:
+        state, verbose = self.state, self.flags.verbose > 0
+        if verbose:
+            print(f"Run folder: {folder.path} (seed {self.flags.seed})")
+        if self.tracker is not None:
+            self.tracker.begin(folder, resumed=state is not None)
+        try:
+            find_monitor(self.env).log_to(
+                folder.monitor, offset=None if state is None else monitor_offset(state)
+            )
+            logger = RunLogger(
+                folder.path,
+                stdout=self._prints_tables,
+                tensorboard=self._tensorboard(folder),
+                state=None if state is None else state["logger"],
+            )
+        except (OSError, ValueError) as error:
+            if is_disk_error(error):
+                raise
+            raise UsageError(one_line(error)) from error
+        self.model.set_logger(logger)
+        checkpoints, epochs, callbacks = self._make_callbacks(folder)
+        if state is not None:
+            checkpoints.restore(state)
+            # In this order, and only now: a result in the folder is always that of its config.
+            folder.result.unlink(missing_ok=True)
+            if self.restates:
+                folder.write_config(self.flags.values(), self.hyperparams)
+                checkpoints.what = folder.what()
+            restore_run(self.model, state)
+
+        def stop(number: int) -> None:
+            checkpoints.stop = True
+            if verbose:
+                print("\nStopping after this rollout; once more to stop at once.", file=sys.stderr)
+
+        began = time.monotonic()
+        with interrupts(stop) as received:
+            finished = self._learn(callbacks, received)
+        with replacing(folder.model) as file:
+            self.model.save(file)
+        normalizer = self.model.get_vec_normalize_env()
+        if normalizer is not None:
+            normalizer.save(str(folder.normalizer))
+        logger.close()
+        result = epochs.result()
+        if finished:
+            folder.write_result({"algo": self.flags.algo, "env": self.flags.env, **result})
+        if verbose:
+            print(summary(folder, self.flags, result, time.monotonic() - began, finished))
+        return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
+
+    @property
+    def _tensorboard_folder(self) -> Path | None:
+        name = self.flags.tensorboard_log or ("runs" if self.flags.track else None)
+        return Path(name) if name else None
+
+    def _tensorboard(self, folder: RunFolder) -> Path | None:
+        parent = self._tensorboard_folder
+        if parent is None:
+            return None
+        # Of the run's own number, so that a resumed run finds it again.
+        return parent / folder.name / f"{self.flags.algo}{folder.path.name[len(folder.name) :]}"
+
+    def _learn(self, callbacks: list[BaseCallback], received: list[int]) -> bool:
+        left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
+        interval = self.flags.log_interval
+        kwargs: dict[str, Any] = {}
+        if interval != -1:
+            kwargs["log_interval"] = interval if interval > 0 else None
+        try:
+            self.model.learn(
+                left, callback=callbacks, reset_num_timesteps=self.state is None, **kwargs
+            )
+        except Interrupted:
+            return False
+        except PROCESS_DIED:
+            # SIGTERM to all processes at once, as batch systems send it, ends the environments'
+            # own before the rollout is done; this one may get it last.
+            time.sleep(0.2)
+            if not received:
+                raise
+            return False
+        except (ValueError, FloatingPointError, *ERRORS_OF_OURS) as error:
+            # What an environment or algorithm refuses, e.g. a NaN: its message says it all.
+            if self.flags.verbose > 1 or (self.vec_env != "native" and from_environment(error)):
+                raise
+            raise UsageError(
+                f"training stopped at {self.model.num_timesteps} steps: {one_line(error)[:600]} "
+                "(--verbose 2 shows where)"
+            ) from error
+        finally:
+            for callback in callbacks:
+                if isinstance(callback, Epochs):
+                    callback.on_training_end()  # leaves the terminal tidy
+        return True
+
+
+def _check_device(name: str) -> None:
+    """
+    Refuse a GPU that is not there; SB3 would train on the CPU instead.
+
+    :raises UsageError: torch has no such device
+    """
+    try:
+        device = th.device("cpu" if name == "auto" else name)
+    except RuntimeError as error:
+        raise UsageError(f"--device {name!r} is not allowed: {one_line(error)}") from None
+    if device.type == "cuda" and (device.index or 0) >= th.cuda.device_count():
+        raise UsageError(
+            f"--device {name!r}: torch sees {th.cuda.device_count()} GPUs here; use auto or cpu"
+        )
+
+
+def from_environment(error: BaseException) -> bool:
+    """Whether an exception was raised below the monitor: by an environment or its wrappers."""
+    within = {CostMonitor.step_wait.__code__, CostMonitor.reset.__code__}
+    own = CostMonitor.step_wait.__code__.co_filename
+    trace, below = error.__traceback__, False
+    while trace is not None:
+        if below and trace.tb_frame.f_code.co_filename != own:
+            return True
+        below = trace.tb_frame.f_code in within
+        trace = trace.tb_next
+    return False
+
+
+def _stdout_is_full() -> bool:
+    try:
+        sys.stdout.flush()  # what could not be written is still waiting
+    except OSError:
+        return True
+    return False
+
+
+def summary(
+    folder: RunFolder, flags: RunFlags, result: Mapping[str, Any], seconds: float, finished: bool
+) -> str:
+    """What a run came to, as the paper measures it, on a few lines."""
+
+    def number(value: float | None, digits: int) -> str:
+        return "– (no episode has ended)" if value is None else f"{value:.{digits}f}"
+
+    limit = "" if result["cost_limit"] is None else f"   (limit {result['cost_limit']})"
+    lines = [
+        f"{'Finished' if finished else 'Interrupted'} at {result['n_timesteps']:,} steps, "
+        f"{seconds:.0f} s",
+        f"  run folder         {folder.path}",
+        f"  return       J_r   {number(result['return'], 3)}",
+        f"  episode cost M_c   {number(result['cost'], 3)}{limit}",
+        f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
+    ]
+    if not finished:
+        lines.append(f"  continue with      -i {folder.path}")
+    elif (own := folder.path.name[len(folder.name) + 1 :]).isdigit():
+        lines.append(
+            f"  see the agent      sb3-guard enjoy --algo {flags.algo} --env {flags.env} "
+            f"-f {folder.path.parent.parent} --exp-id {own}"
+        )
+    return "\n".join(lines)

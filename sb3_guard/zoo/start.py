@@ -1,0 +1,232 @@
+"""Runs that begin, runs of a grid that are brought to their end, and runs that are resumed."""
+
+import dataclasses
+import shlex
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.checkpoint import is_checkpoint, read_checkpoint
+from sb3_guard.zoo.flags import HOST, IDENTITY
+from sb3_guard.zoo.hyperparams import check, read_hyperparams
+from sb3_guard.zoo.make_envs import canonical_id, choose_vec_env
+from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run_flags import RunFlags
+from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder, is_run, lock, plain, run_path
+from sb3_guard.zoo.trust import require_trust
+from sb3_guard.zoo.usage import UsageError, import_packages
+
+
+def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
+    """
+    What a new run is: all its flags and hyper-parameters, as its folder will state them.
+
+    :return: flags and hyper-parameters, checked as far as that goes without making anything
+    :raises UsageError: anything is wrong with them
+    """
+    flags = dataclasses.replace(flags)
+    import_packages(flags.gym_packages)  # which may register algorithms, too
+    cls = algorithm(flags.algo)
+    flags.env, ours = canonical_id(flags.env)
+    if flags.seed < 0:
+        flags.seed = int(np.random.default_rng().integers(2**31))
+    overrides = dict(flags.hyperparams or {})
+    if flags.n_timesteps > 0:
+        overrides["n_timesteps"] = flags.n_timesteps
+    values = check(
+        flags.algo, cls, read_hyperparams(flags.algo, flags.env, flags.conf_file, overrides)
+    )
+    if flags.env_kwargs:
+        values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
+    wrapped = values.get("env_wrapper") is not None
+    chosen: Any = choose_vec_env(flags.vec_env, ours, wrapped)
+    flags.vec_env = chosen
+    return flags, values
+
+
+def start(flags: RunFlags) -> int:
+    """
+    Start a new run.
+
+    :return: exit status
+    :raises UsageError: anything is wrong with the flags; nothing has been written then
+    """
+    flags, values = prepare(flags)
+    experiment = Experiment(flags, values)
+    try:
+        if experiment.tracker is not None:
+            experiment.tracker.begin()
+        folder = RunFolder.create(flags, values, shlex.join(sys.orig_argv))
+    except UsageError:
+        experiment.close()
+        raise
+    with lock(folder.path):
+        return experiment.train(folder)
+
+
+def complete(
+    flags: RunFlags,
+    values: Mapping[str, Any],
+    number: int,
+    command: str,
+    asked_to_stop: Callable[[], bool],
+) -> int:
+    """
+    Bring a run of a given number to its end: start it, or continue it from where it was cut.
+
+    :param flags: as :func:`prepare` returns them
+    :param values: its hyper-parameters, likewise
+    :param number: of its folder
+    :param command: the command line it is part of
+    :param asked_to_stop: when it says so, training ends after the rollout under way
+    :return: exit status, 0 if it is complete, now or already before
+    :raises RunInUse: another process has the run
+    :raises UsageError: it can't be trained, or the folder holds another run
+    """
+    import_packages(flags.gym_packages)
+    path = run_path(flags.log_folder, flags.algo, flags.env, number)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"can't make folder {path}: {error.strerror}") from error
+    with lock(path):
+        if is_run(path):
+            folder = RunFolder(path)
+            refuse_another(folder, flags, values)
+        else:
+            folder = RunFolder.create(flags, values, command, number=number)
+        if folder.read_result() is not None:
+            return 0
+        # Without a checkpoint nothing of it is worth keeping, and it restarts in its place.
+        begun = folder.checkpoint.exists()
+        quiet = dataclasses.replace(flags, progress=False, verbose=0)
+        experiment = Experiment(quiet, values, folder if begun else None)
+        experiment.asked_to_stop = asked_to_stop
+        return experiment.train(folder)
+
+
+def refuse_another(folder: RunFolder, flags: RunFlags, values: Mapping[str, Any]) -> None:
+    """
+    Make sure that a folder holds the run that is asked for.
+
+    :raises UsageError: it holds another, or is damaged
+    """
+    found = differences(folder.what(), what(flags.values(IDENTITY), values))
+    if found:
+        said = [f"{name}: {a} there, {b} here" for name, a, b in found[:3]]
+        raise UsageError(
+            f"{folder.path} holds another run ({'; '.join(said)}); choose another folder with -f"
+        )
+
+
+def what(identity: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """What makes a run the run it is, as its files say it."""
+    return {**plain(identity), **plain(values)}
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """What differs between two runs: name and both values, ``none`` for those that are absent."""
+
+    def shown(value: Any) -> Any:
+        return "none" if value in ("", None) else value
+
+    return [
+        (name, shown(there.get(name)), shown(here.get(name)))
+        for name in sorted({*there, *here})
+        if there.get(name) != here.get(name)
+    ]
+
+
+def continues_run(agent: str) -> bool:
+    """
+    Whether ``-i path`` means a run to continue, rather than a model to begin from.
+
+    :raises UsageError: it is neither
+    """
+    path = Path(agent)
+    if path.is_dir() or path.name == CHECKPOINT or is_checkpoint(path):
+        return True
+    if not path.is_file():
+        raise UsageError(f"-i: there is no run folder or model {agent!r}")
+    return False
+
+
+def resume(given: RunFlags, trusted: bool = False) -> int:
+    """
+    Continue a run in its folder.
+
+    :param given: the flags given now; ``trained_agent`` is the run's folder or checkpoint
+    :param trusted: code that the folder names may run, whoever wrote it
+    :return: exit status
+    :raises UsageError: the run can't be continued, or a flag contradicts what it is
+    """
+    folder = RunFolder.open(given.trained_agent)
+    with lock(folder.path):
+        flags, values = folder.flags(), folder.hyperparams()
+        named = {name: getattr(flags, name) for name in ("env", "gym_packages")}
+        require_trust(folder.path, trusted, named, values)
+        import_packages(flags.gym_packages)
+        _refuse_contradictions(given, flags, values, folder)
+        for name in {*(given.given & RunFlags.names(HOST)), "progress"}:
+            setattr(flags, name, getattr(given, name))
+        state = read_checkpoint(folder.checkpoint)
+        _refuse_edited(folder, state)
+        done, wanted = state["num_timesteps"], given.n_timesteps
+        if 0 < wanted < done:
+            raise UsageError(
+                f"-n {wanted} is less than the {done} steps that {folder.path} has done"
+            )
+        if wanted > 0:
+            values["n_timesteps"] = flags.n_timesteps = wanted
+        values = check(flags.algo, algorithm(flags.algo), values)
+        if folder.read_result() is not None and done >= values["n_timesteps"]:
+            print(
+                f"{folder.path} is finished: {done} of {values['n_timesteps']} steps; "
+                "a larger -n continues it"
+            )
+            return 0
+        experiment = Experiment(flags, values, folder)
+        experiment.restates = True
+        return experiment.train(folder)
+
+
+def _refuse_edited(folder: RunFolder, state: Mapping[str, Any]) -> None:
+    """Raise if the files say something other than what the checkpoint was trained with."""
+    ours, its = ({**one, "n_timesteps": None} for one in (folder.what(), state["what"]))
+    found = differences(its, ours)
+    if found:
+        name, trained, stated = found[0]
+        raise UsageError(
+            f"{name} = {stated} in {folder.params} was {trained} when the run was trained; put it "
+            "back, or start a new run with it, without -i"
+        )
+
+
+def _refuse_contradictions(
+    given: RunFlags, saved: RunFlags, values: Mapping[str, Any], folder: RunFolder
+) -> None:
+    """Raise if a flag asks for something other than what the run is."""
+    pairs = []
+    hosted = {*RunFlags.names(HOST), "trained_agent", "n_timesteps"}
+    for name in given.given & (RunFlags.names() - hosted):
+        value, own = getattr(given, name), getattr(saved, name)
+        flag = "--" + name.replace("_", "-") + " "
+        if name == "hyperparams":
+            asked = check(saved.algo, algorithm(saved.algo), {**values, **value})
+            pairs += [(f"-params {key}:", asked[key], values.get(key)) for key in value]
+        elif name == "log_folder":
+            pairs.append((flag, Path(value).resolve(), folder.path.parent.parent.resolve()))
+        elif name == "env":
+            pairs.append((flag, canonical_id(value)[0], own))
+        else:
+            pairs.append((flag, plain(value), plain(own)))
+    for flag, value, own in pairs:
+        if value != own:
+            raise UsageError(
+                f"{flag}{value} contradicts {flag}{own} of {folder.path}; "
+                "leave it out, or start a new run without -i"
+            )

@@ -1,0 +1,304 @@
+"""A trial of a tuner: an agent trained for each seed with the same hyper-parameters.
+
+Each is evaluated a few times on the way and once at the end; the means over the seeds count. Each
+cost is a constraint of the study, ``J_C - limit <= 0``, so samplers know which trials are feasible.
+"""
+
+import multiprocessing
+import os
+import socket
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.exceptions import TrialPruned, UpdateFinishedTrialError
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import sync_envs_normalization
+
+from sb3_guard.common.evaluation import evaluate_policy
+from sb3_guard.envs.layout import LayoutError
+from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.hyperparams import check
+from sb3_guard.zoo.make_envs import PROCESS_DIED, evaluation_seed
+from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run_flags import RunFlags
+from sb3_guard.zoo.spaces import Search
+from sb3_guard.zoo.studies import STOPPED
+from sb3_guard.zoo.tune_flags import TuneFlags
+from sb3_guard.zoo.tuning_report import short
+from sb3_guard.zoo.usage import UsageError, one_line
+
+# What the hyper-parameters of a trial may lead to; anything else is a mistake in the code.
+FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError, LayoutError)
+FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
+INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
+PROGRESS = 15.0  # seconds between two lines about a trial under way
+GIVEN = "given"  # its hyper-parameters are those of the file
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    What a trial is: the same for all workers of a study, and whenever it is continued.
+
+    :param algo: key of the algorithm
+    :param env: full id of the environment
+    :param hyperparams: where the space says nothing
+    :param space: what is searched, as data
+    :param n_timesteps: length of one training
+    :param seeds: of the trainings of a trial
+    :param n_evaluations: evaluations per training
+    :param eval_episodes: episodes per evaluation
+    :param cost_keys: entries of info that are costs
+    :param cost_limit: highest feasible episode cost, one per cost key; None: no constraint
+    :param pareto: search the trade-off of return and cost instead
+    """
+
+    algo: str
+    env: str
+    hyperparams: dict[str, Any]
+    space: Any
+    n_timesteps: int
+    seeds: list[int]
+    n_evaluations: int
+    eval_episodes: int
+    cost_keys: list[str]
+    cost_limit: list[float] | None
+    pareto: bool
+
+    def outcome(self, mean: Sequence[float]) -> dict[str, float]:
+        """Return, costs by key, and by how much they exceed their limits in all."""
+        costs, violation = list(mean[1:]), 0.0
+        if self.cost_limit is not None:
+            violation = float(np.maximum(np.subtract(costs, self.cost_limit), 0.0).sum())
+        named = dict(zip(self.cost_keys, costs, strict=True))
+        return {"return": mean[0], **named, "violation": violation}
+
+    def refuse_others(self, saved: Mapping[str, Any], study: str) -> None:
+        """
+        Compare with those that a study was begun with.
+
+        :raises UsageError: they are not the same
+        """
+        for name, value in asdict(self).items():
+            old = saved.get(name)
+            if old == value:
+                continue
+            what = name.replace("_", " ")
+            if isinstance(value, dict) and isinstance(old, dict):
+                key = next(k for k in sorted({*old, *value}) if old.get(k) != value.get(k))
+                what, old, value = f"{what} {key}", old.get(key), value.get(key)
+            raise UsageError(
+                f"study {study!r} was begun with {what} {old}, not {value}: "
+                "continue it as it was begun, or begin another with --study-name"
+            )
+
+
+class Stopped(Exception):
+    """A signal asked to stop: the trial under way is done again, later or by another worker."""
+
+
+class Evaluations(BaseCallback):
+    """
+    Evaluate an agent evenly through its training.
+
+    :param experiment: what is trained
+    :param settings: of the study
+    :param after: called with all evaluations so far, each a list of the mean return and the mean
+        episode costs; False ends the training
+    :param on_step: called with the number of steps so far; what it raises ends the training
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        settings: Settings,
+        after: Callable[[list[list[float]]], bool],
+        on_step: Callable[[int], None],
+    ):
+        super().__init__()
+        self.experiment, self.settings = experiment, settings
+        self.after, self.on_step_taken = after, on_step
+        self.history: list[list[float]] = []
+        self.ended = False
+
+    def _on_step(self) -> bool:
+        self.on_step_taken(self.num_timesteps)
+        done = len(self.history) + 1
+        due = done * self.settings.n_timesteps / self.settings.n_evaluations
+        # The last one is for the agent that has learned all it could: see finish.
+        if done < self.settings.n_evaluations and self.num_timesteps >= due:
+            self.ended = not self._evaluate()
+        return not self.ended
+
+    def finish(self) -> None:
+        """Evaluate what training came to, unless it was ended."""
+        while len(self.history) < self.settings.n_evaluations and not self.ended:
+            self.ended = not self._evaluate()
+
+    def _evaluate(self) -> bool:
+        env = self.experiment.eval_env
+        assert env is not None
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, env)
+        result = evaluate_policy(
+            self.model,
+            env,
+            n_eval_episodes=self.settings.eval_episodes,
+            seed=evaluation_seed(self.experiment.flags.seed),
+            cost_keys=self.settings.cost_keys,
+        )
+        row = [float(result.returns.mean()), *result.key_costs.mean(axis=0).tolist()]
+        if not np.isfinite(row).all():
+            raise FloatingPointError(f"an evaluation gave {row}")
+        self.history.append(row)
+        return self.after(self.history)
+
+
+class Objective:
+    """
+    What Optuna optimises: a trial's hyper-parameters to its return, or return and costs.
+
+    :param flags: of the command
+    :param settings: of the study
+    :param search: where hyper-parameters come from
+    """
+
+    def __init__(self, flags: TuneFlags, settings: Settings, search: Search):
+        self.flags, self.settings, self.search = flags, settings, search
+        self.stop = False
+        self.failures = 0  # in a row
+        self._said = 0.0
+
+    def stopped(self) -> bool:
+        """Whether to stop: a signal came, or the process that started this one is gone."""
+        parent = multiprocessing.parent_process()
+        return self.stop or (parent is not None and not parent.is_alive())
+
+    def __call__(self, trial: optuna.Trial) -> float | list[float]:
+        """
+        Train an agent for each seed.
+
+        :return: means over the seeds: return, and with ``pareto`` each episode cost
+        :raises optuna.TrialPruned: it compares badly, or its hyper-parameters fail
+        :raises Stopped: it is to be done again
+        """
+        self._said = time.monotonic()
+        trial.set_user_attr("worker", f"{socket.gethostname()}-{os.getpid()}")
+        try:
+            mean = self._train_seeds(trial)
+        except (TrialPruned, UpdateFinishedTrialError):
+            raise
+        except Stopped:
+            trial.set_user_attr(STOPPED, trial.user_attrs.get(STOPPED, 0) + 1)
+            raise
+        except FAILURES as error:
+            if self.flags.verbose > 1:
+                raise
+            self.failures += 1
+            trial.set_user_attr("error", one_line(error)[:600])
+            self._constrain(trial, None)
+            raise TrialPruned from error
+        self.failures = 0
+        return mean if self.settings.pareto else mean[0]
+
+    def _constrain(self, trial: optuna.Trial, mean: Sequence[float] | None) -> None:
+        """Tell the sampler by how much each cost is below its limit; once in a trial."""
+        if self.settings.cost_limit is None or self.settings.pareto:
+            return
+        costs = [FAILED_VIOLATION] * len(self.settings.cost_keys) if mean is None else mean[1:]
+        for key, cost, limit in zip(
+            self.settings.cost_keys, costs, self.settings.cost_limit, strict=True
+        ):
+            trial.set_constraint(key, cost - limit)
+
+    def _train_seeds(self, trial: optuna.Trial) -> list[float]:
+        values = self.search.draw(trial)
+        trial.set_user_attr("hyperparams", values)
+        settings, finished = self.settings, list[list[list[float]]]()
+        last = settings.n_evaluations * len(settings.seeds)
+        # The best is to be compared with the file's hyper-parameters: they are never pruned.
+        given = trial.user_attrs.get(GIVEN, False)
+        mean: list[float] = []
+
+        def after(history: list[list[float]]) -> bool:
+            """Report the mean of the seeds so far; whether to go on."""
+            mean[:] = np.mean([one[-1] for one in [*finished, history]], axis=0).tolist()
+            outcome = settings.outcome(mean)
+            trial.set_user_attr("result", outcome)
+            if settings.pareto:
+                return True
+            step = settings.n_evaluations * len(finished) + len(history)
+            violation = outcome["violation"]
+            trial.report(INFEASIBLE - violation if violation else mean[0], step)
+            return step == last or given or not trial.should_prune()
+
+        for seed in settings.seeds:
+            # A trial that is done again has kept the seeds that were done.
+            history = trial.user_attrs.get(f"seed {seed}")
+            if history is None:
+                history, on = self._train(trial, values, seed, after)
+                if on:
+                    trial.set_user_attr(f"seed {seed}", history)
+            else:
+                on = all(after(history[: i + 1]) for i in range(len(history)))
+            if not on:
+                break
+            finished.append(history)
+        self._constrain(trial, mean)
+        if len(finished) < len(settings.seeds):
+            raise TrialPruned
+        return mean
+
+    def _train(
+        self,
+        trial: optuna.Trial,
+        values: Mapping[str, Any],
+        seed: int,
+        after: Callable[[list[list[float]]], bool],
+    ) -> tuple[list[list[float]], bool]:
+        """One training: its evaluations, and whether it went to the end."""
+        settings = self.settings
+        checked = check(
+            settings.algo,
+            algorithm(settings.algo),
+            {**values, "n_timesteps": settings.n_timesteps},
+        )
+        experiment = Experiment(run_flags(self.flags, settings, seed), checked)
+
+        def on_step(steps: int) -> None:
+            if self.stopped():
+                raise Stopped
+            if self.flags.verbose and time.monotonic() - self._said >= PROGRESS:
+                self._said = time.monotonic()
+                of = f" of seed {seed}" if len(settings.seeds) > 1 else ""
+                text = f"Trial {trial.number}: {steps:,} of {settings.n_timesteps:,} steps{of}"
+                if evaluations.history:
+                    text += f", return {short(evaluations.history[-1][0])}"
+                    text += f", cost {', '.join(map(short, evaluations.history[-1][1:]))}"
+                print(text, flush=True)
+
+        evaluations = Evaluations(experiment, settings, after, on_step)
+        try:
+            experiment.model.set_logger(Logger(folder=None, output_formats=[]))
+            experiment.model.learn(
+                settings.n_timesteps, callback=[evaluations, *experiment.callbacks]
+            )
+            evaluations.finish()
+        except PROCESS_DIED as error:
+            if self.stopped():  # the signal was for all processes
+                raise Stopped from error
+            raise UsageError("a process of --vec-env subproc has died") from error
+        finally:
+            experiment.close()
+        return evaluations.history, not evaluations.ended
+
+
+def run_flags(flags: TuneFlags, settings: Settings, seed: int) -> RunFlags:
+    """The flags of a trial's training."""
+    own = {"algo": settings.algo, "env": settings.env, "seed": seed}
+    return RunFlags.shared(flags, **own, env_kwargs=None, verbose=0, progress=False)

@@ -1,0 +1,153 @@
+"""The flags of tuning."""
+
+import argparse
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+from sb3_guard.zoo.flags import flag
+from sb3_guard.zoo.run_flags import WHAT, TrainingFlags, seconds, seed_number
+from sb3_guard.zoo.usage import UsageError, positive
+
+SEARCH, WHERE = "search", "storage and workers"
+EXAMPLES = """examples:
+  python -m sb3_guard.tune --algo trpo_lag --env Goal_Point_8Hazards --n-trials 50 -n 1e6
+  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards -params cost_limit:5 --n-jobs 2
+  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards --seeds 0 1 2 --pruner halving
+  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards --pareto --study-name trade-off
+  python -m sb3_guard.tune ... --storage postgresql://me:secret@server/studies
+
+The same command continues a study that was stopped, and joins one that runs: --n-trials counts the
+trials of the study, not of the process.
+"""
+
+
+def limit(value: Any) -> float:
+    """A finite number of at least 0."""
+    try:
+        if 0 <= float(value) < math.inf:
+            return float(value)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{value!r} is not allowed; it must be at least 0")
+
+
+def count(value: Any) -> int:
+    """A whole number of at least 0."""
+    if limit(value).is_integer():
+        return int(limit(value))
+    raise argparse.ArgumentTypeError(f"{value!r} is not a whole number")
+
+
+def fixed_seed(value: Any) -> int:
+    """A seed that is not random."""
+    return seed_number(count(value))
+
+
+@dataclass
+class TuneFlags(TrainingFlags):
+    """Find the hyper-parameters with the highest return under a cost limit."""
+
+    prog: ClassVar[str] = "sb3-guard tune"
+    examples: ClassVar[str] = EXAMPLES
+
+    algo: str = flag(default="cpo", group=WHAT, help="algorithm, e.g. cpo or ppo (default: cpo)")
+    env: str = flag(
+        default="Goal_Point_8Hazards-v0", group=WHAT,
+        help="environment id; the version may be left out (default: Goal_Point_8Hazards)",
+    )  # fmt: skip
+    cost_limit: list[float] | None = flag(
+        kind=limit, metavar="D", group=WHAT,
+        help="highest episode cost of a feasible trial, one for all or one per cost "
+        "(default: selection_limit, else the algorithm's cost_limit, but at least 1)",
+    )  # fmt: skip
+    pareto: bool = flag(
+        default=False, group=WHAT,
+        help="search the trade-off of return and cost instead; the limit is only drawn",
+    )  # fmt: skip
+    search_space: str | None = flag(
+        metavar="FILE", group=WHAT,
+        help="YAML file of ranges and lists to search (default: that of the algorithm)",
+    )  # fmt: skip
+
+    n_trials: int = flag(
+        "--max-total-trials", default=50, kind=positive, metavar="N", group=SEARCH,
+        help="finished trials of the study in all, pruned ones included (default: 50)",
+    )  # fmt: skip
+    seeds: list[int] = flag(
+        default=[0], kind=fixed_seed, metavar="S", group=SEARCH, exclusive="seeds",
+        help="seeds that every trial trains with (default: 0)",
+    )  # fmt: skip
+    n_seeds: int | None = flag(
+        kind=positive, metavar="N", group=SEARCH, exclusive="seeds",
+        help="the first so many seeds: 0 1 2 …",
+    )  # fmt: skip
+    seed: int = flag(
+        default=-1, kind=seed_number, group=SEARCH,
+        help="seed of the sampler (default: -1, a random one)",
+    )  # fmt: skip
+    sampler: Literal["tpe", "gp", "nsgaii", "random"] = flag(
+        default="tpe", group=SEARCH, help="what chooses hyper-parameters (default: tpe)"
+    )
+    pruner: Literal["median", "halving", "none"] = flag(
+        default="median", group=SEARCH, help="what ends bad trials early (default: median)"
+    )
+    n_startup_trials: int = flag(
+        default=10, kind=count, metavar="N", group=SEARCH,
+        help="trials before the sampler learns and the pruner prunes (default: 10)",
+    )  # fmt: skip
+    n_evaluations: int | None = flag(
+        kind=positive, metavar="N", group=SEARCH,
+        help="evaluations per training (default: one per 100,000 steps, but at least 4)",
+    )  # fmt: skip
+    eval_episodes: int = flag(
+        default=5, kind=positive, metavar="N", group=SEARCH, help="episodes each time (default: 5)"
+    )
+
+    log_folder: str = flag(
+        "-f", default="logs", metavar="DIR", group=WHERE, help="where studies go (default: logs)"
+    )
+    study_name: str | None = flag(
+        metavar="NAME", group=WHERE, help="to have several studies (default: <algo>_<env>)"
+    )
+    storage: str | None = flag(
+        metavar="URL", group=WHERE,
+        help="postgresql://… for workers on many machines, or a journal file "
+        "(default: a journal file in the study's folder, for one machine)",
+    )  # fmt: skip
+    heartbeat: int = flag(
+        default=60, kind=positive, metavar="S", group=WHERE,
+        help="seconds between signs of life in PostgreSQL; a worker silent for three times as "
+        "long loses its trial to another (default: 60)",
+    )  # fmt: skip
+    storage_timeout: float = flag(
+        default=300.0, kind=seconds, metavar="S", group=WHERE,
+        help="seconds to wait for a PostgreSQL server that is down (default: 300)",
+    )  # fmt: skip
+    n_jobs: int = flag(
+        default=1, kind=positive, metavar="N", group=WHERE,
+        help="processes that work on it (default: 1)",
+    )  # fmt: skip
+    num_threads: int = flag(
+        default=-1, metavar="N", group=WHERE,
+        help="threads of torch and of the native engine (default: their own choice, or 1 if "
+        "there are several processes)",
+    )  # fmt: skip
+    verbose: Literal[0, 1, 2] = flag(
+        default=1, group=WHERE, help="0 nothing, 1 progress, 2 with tracebacks (default: 1)"
+    )
+
+    def check(self) -> None:
+        """
+        Complete the flags with what follows from others.
+
+        :raises UsageError: two contradict each other
+        """
+        if self.n_seeds is not None:
+            self.seeds = list(range(self.n_seeds))
+        if len(set(self.seeds)) < len(self.seeds):
+            raise UsageError(f"--seeds {' '.join(map(str, self.seeds))}: one is there twice")
+        if self.pareto and self.pruner != "none" and "pruner" in self.given:
+            raise UsageError("--pruner: there is no pruning with --pareto; leave it out")
+        if self.n_jobs > 1 and self.num_threads < 0:
+            self.num_threads = 1

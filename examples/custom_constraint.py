@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_guard import TRPOLag, evaluate_policy, make_vec_env, register_constraint
+from sb3_guard.envs.observation import Values
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Constraint
-from sb3_guard.envs.sensors import Channel
 
 
 @dataclass
@@ -25,11 +25,8 @@ class Fence(Constraint):
     def cost(self):
         return (self._room() < 0).astype(float)
 
-    def observe(self):  # what cannot be seen cannot be learnt
-        return {"fence": self._room()[:, None]}
-
-    def channels(self):
-        return {"fence": Channel(1, unit="m")}
+    def observations(self):  # what cannot be seen cannot be learnt
+        return {"fence": Values(self._room()[:, None], unit="m")}
 
 
 register_constraint("Fence", Fence)

@@ -24,7 +24,7 @@ from mujoco.batch import Batch
 
 from sb3_guard.common.vec_env import GuardVecEnv
 from sb3_guard.envs import env_ids, env_spec
-from sb3_guard.envs.engine import FRAME_SKIP, STAGE, profiling_clock
+from sb3_guard.envs.physics import ACC, FRAME_SKIP, profiling_clock
 from sb3_guard.envs.vector_env import GuardVectorEnv
 
 CLOCK = profiling_clock()
@@ -60,9 +60,11 @@ def batch_rates(env_id: str, n: int, seconds: float, slices: int) -> dict[str, f
     bare = Batch(engine.model, nsim=n, nthread=engine.num_threads, persistent=True)
     bare.state[:] = engine.batch.state
     rng = np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (64, n, engine.robot.action_size)).astype(np.float32)
+    lowest, highest = engine.robot.action_range
+    shape = (64, n, engine.robot.action_size)
+    actions = rng.uniform(lowest, highest, shape).astype(np.float32)
     low, high = engine.model.actuator_ctrlrange.T
-    ctrls = low + (actions + 1) / 2 * (high - low)
+    ctrls = low + (actions - lowest) / np.subtract(highest, lowest) * (high - low)
     ctrl = bare.bind("ctrl")
     turn = iter(range(10**12))
 
@@ -74,7 +76,7 @@ def batch_rates(env_id: str, n: int, seconds: float, slices: int) -> dict[str, f
     def step_bare() -> int:
         for _ in range(4):
             ctrl[:] = ctrls[next(turn) % 64]
-            bare.step(nstep=FRAME_SKIP)
+            bare.step(nstep=engine.batch.frame_skip)
         return 4 * n
 
     # staggered episodes, as in a long training
@@ -101,7 +103,7 @@ def single_rates(env_id: str, seconds: float, slices: int) -> dict[str, float]:
     def step_bare() -> int:
         for _ in range(16):
             data.ctrl[:] = actions[next(turn) % 64]
-            mujoco.mj_step(model, data, nstep=FRAME_SKIP)
+            mujoco.mj_step(model, data, nstep=env.unwrapped.engine.batch.frame_skip)
         return 16
 
     return best({"full": step_full, "bare": step_bare}, seconds, slices)
@@ -147,9 +149,7 @@ def main() -> None:
         parser.error("--rounds goes with --all or --suites")
     if patterns and not suites:
         parser.error(f"no id matches {' '.join(patterns)}; ids look like {args.env}")
-    print(
-        f"mujoco {mujoco.__version__}, stage {STAGE}, {FRAME_SKIP} physics steps per control step"
-    )
+    print(f"mujoco {mujoco.__version__}, stage {ACC}, {FRAME_SKIP} physics steps per control step")
     if suites:
         full, bare = dict.fromkeys(suites, 0.0), dict.fromkeys(suites, 0.0)
         reset = dict.fromkeys(suites, math.inf)

@@ -16,13 +16,12 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from sb3_guard.envs import GuardVectorEnv
-from sb3_guard.envs.engine import FRAME_SKIP
-from sb3_guard.envs.objects import Movers
+from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.part import Part
-from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.list import KINDS, yes
 from sb3_guard.show import action_table, observation_table
-from sb3_guard.zoo.tables import table
+from sb3_guard.zoo.markdown import table
 
 ROOT = Path(__file__).parents[1]
 # Robots that tell the sizes of an observation apart: in the plane, in space, with several lidars.
@@ -69,8 +68,8 @@ def taxonomy(part: type[Part]) -> str:
 def speeds(part: type[Movers]) -> str:
     """What the default speed is by the second, which depends on the robot's time step."""
     robots: dict[float, list[str]] = {}
-    for name, robot in ROBOTS.items():
-        second = part().speed / (FRAME_SKIP * robot.timestep)
+    for name, robot in guard(ROBOTS).items():
+        second = part().speed / (robot.frame_skip * robot.timestep)
         robots.setdefault(second, []).append(name)
     each = "; ".join(f"{', '.join(robots[v])} {v:.3g}" for v in sorted(robots, reverse=True))
     return f"A `speed` of {part().speed:g} m per control step is, in m/s, with {each}."
@@ -150,7 +149,7 @@ def examples() -> str:
 
 def pages() -> dict[str, str]:
     """Every page by its path below docs/."""
-    kinds = {"robot": ROBOTS, "task": TASKS, "constraint": CONSTRAINTS}
+    kinds = {"robot": guard(ROBOTS), "task": guard(TASKS), "constraint": guard(CONSTRAINTS)}
     singles = {
         f"{kind}s/{name.lower()}.md": page(kind, name, part)
         for kind, parts in kinds.items()

@@ -27,10 +27,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard import train
 from sb3_guard.zoo.algos import algorithm
-from sb3_guard.zoo.figures import AXES, line_style
+from sb3_guard.zoo.figures import AXES, COLORS
 from sb3_guard.zoo.playback import PRETRAINED
-from sb3_guard.zoo.results import label, read_curve
+from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, run_path
+from sb3_guard.zoo.runs import described, read_curve
 
 
 class Agent(NamedTuple):
@@ -118,8 +119,10 @@ def export(run: RunFolder, agent: Agent) -> RunFolder:
     """Copy a run to the package, small; the copy plays as the original does."""
     where = (str(PRETRAINED), agent.algo, f"{agent.env}-v0")
     shutil.rmtree(run_path(*where, 1), ignore_errors=True)
-    args = {**run.args(), "log_folder": "logs"}
-    copy = RunFolder.create(*where, args, run.hyperparams(), agent.command, number=1)
+    flags = RunFlags.of({**run.args(), "log_folder": str(PRETRAINED)})
+    copy = RunFolder.create(flags, run.hyperparams(), agent.command, number=1)
+    for file in copy.path.rglob("args.yml"):  # where the package is installed is nobody's business
+        file.write_text(file.read_text().replace(str(PRETRAINED), "logs"))
     cls = algorithm(agent.algo)
     model = cls.load(run.model, device="cpu")
     slim(model, copy.model)
@@ -135,10 +138,11 @@ def export(run: RunFolder, agent: Agent) -> RunFolder:
 def draw(runs: Mapping[Agent, RunFolder], path: Path) -> None:
     """Return and episode cost of the agents while they were trained."""
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
+    colors = dict(zip(sorted({agent.algo for agent in runs}), COLORS, strict=False))
     for agent, run in runs.items():
         curve = read_curve(run.path, 30_000)
-        style = {**line_style(agent.algo), "linestyle": "--" if "Ghosts" in agent.env else "-"}
-        name = f"{label(agent.algo)}, {agent.env}, seed {agent.seed}"
+        style = {"color": colors[agent.algo], "linestyle": "--" if "Ghosts" in agent.env else "-"}
+        name = f"{described(agent.algo)['label']}, {agent.env}, seed {agent.seed}"
         for axis, metric in zip(axes, ("J_r", "M_c"), strict=True):
             axis.plot(curve["step"], curve[metric], label=name, **style)
             axis.set(xlabel="steps", ylabel=AXES[metric])

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sb3_guard import ALGORITHMS, make_vec_env
 from sb3_guard.envs import GuardVectorEnv
-from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.zoo.playback import find_pretrained
 
 TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
@@ -95,13 +95,13 @@ def main() -> None:
         animation(args.output / "trained.gif", args.film_seed)
     if args.only == "trained":
         return
-    for robot in ROBOTS:
+    for robot in guard(ROBOTS):
         path = args.output / f"robot_{robot.lower()}.png"
         picture(f"Goal_{robot}_8Hazards", path, "track", 1, args.seed)
-    for task in TASKS:
+    for task in guard(TASKS):
         path = args.output / f"task_{task.lower()}.png"
         picture(f"{task}_Point_8Hazards", path, "fixed", 1, args.seed)
-    for constraint in CONSTRAINTS:
+    for constraint in guard(CONSTRAINTS):
         path = args.output / f"constraint_{constraint.lower()}.png"
         picture(f"Goal_Point_8{constraint}", path, "fixed", 1, args.seed)
     for stem, (env_id, params) in VARIANTS.items():

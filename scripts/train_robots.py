@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from sb3_guard import TRPO, evaluate_policy, make_vec_env
-from sb3_guard.envs.registry import ROBOTS
-from sb3_guard.zoo.config import build, check, read_hyperparams
+from sb3_guard.envs.registry import ROBOTS, guard
+from sb3_guard.zoo.hyperparams import build, check, read_hyperparams
 
 EPISODES = 20
 SLOW = {"Doggo", "Ant", "Walker", "Humanoid"}  # twice the steps
@@ -38,7 +38,7 @@ def random_returns(env_id: str, seed: int) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robots", nargs="+", default=list(ROBOTS), choices=list(ROBOTS))
+    parser.add_argument("--robots", nargs="+", default=list(guard(ROBOTS)), choices=list(ROBOTS))
     parser.add_argument("-n", "--n-timesteps", type=float, default=5e5, help="steps per robot")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=None, help="torch and physics threads")

@@ -7,6 +7,14 @@ from typing import Any
 import numpy as np
 import yaml
 
+# As classes state them
+LABELS = {
+    "trpo": ("TRPO", "unconstrained"), "cpo": ("CPO", "CPO-based"), "pcpo": ("PCPO", "CPO-based"),
+    "trpo_lag": ("TRPO-Lagrangian", "Lagrangian"), "trpo_fac": ("TRPO-FAC", "Lagrangian"),
+    "trpo_ipo": ("TRPO-IPO", "Lagrangian"), "trpo_sl": ("TRPO-SL", "hierarchical"),
+    "trpo_usl": ("TRPO-USL", "hierarchical"), "ppo": ("PPO", ""), "mine": ("My own", "Lagrangian"),
+}  # fmt: skip
+
 
 def fake_run(
     folder: Path,
@@ -47,8 +55,10 @@ def fake_run(
         mean = returns * epoch / epochs
         rows += [f"{mean + n},10,{epoch},{cost + 0.1 * n}" for n in noise]
     (path / "0.monitor.csv").write_text("\n".join(rows) + "\n")
+    label, family = LABELS.get(algo, (None, None))
     content = {
-        "algo": algo, "env": env, "return": returns, "cost": cost, "length": 10.0,
+        "label": label, "family": family, "algo": algo, "env": env,
+        "return": returns, "cost": cost, "length": 10.0,
         "cost_rate": cost / 10, "episodes": 10, "n_timesteps": 100 * epochs, "physics_errors": 0,
     } | result  # fmt: skip
     content = {key: value for key, value in content.items() if value is not ...}

@@ -1,5 +1,6 @@
 """Commands run as processes of their own that need not import everything again."""
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -18,6 +19,7 @@ def fork(command: Callable[[list[str]], int], arguments: list[str], output: Path
     :return: the child's process id
     """
     output.touch()
+    gc.collect()  # replay buffers of earlier tests, which the child's memory would have to hold too
     pid = os.fork()
     if pid:
         return pid

@@ -48,6 +48,23 @@ class Flickering(CostPoint):
         return *rest, {"cost": float("nan") if self.steps > 20 else 0.0}
 
 
+class Wordy(CostPoint):
+    """Reports its cost in a word."""
+
+    def step(self, action: np.ndarray) -> Any:
+        *rest, _ = super().step(action)
+        return *rest, {"cost": "high" if self.steps > 20 else 0.0}
+
+
+class Broken(CostPoint):
+    """Fails after a while."""
+
+    def step(self, action: np.ndarray) -> Any:
+        if self.steps > 20:
+            raise RuntimeError("out of order")
+        return super().step(action)
+
+
 class StopAt(BaseCallback):
     """A user's callback that ends training."""
 
@@ -65,6 +82,8 @@ for name, cls in {
     "Unpicklable": Unpicklable,
     "NoCost": NoCost,
     "Flickering": Flickering,
+    "Wordy": Wordy,
+    "Broken": Broken,
 }.items():
     if f"{name}-v0" not in gym.registry:
         gym.register(f"{name}-v0", entry_point=f"{cls.__module__}:{name}")

@@ -24,15 +24,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_guard import CPO, TRPO, CostMonitor, evaluate_policy, make_vec_env
 from sb3_guard.common.adapters import (
+    CostAsThirdValue,
     CostFromFunction,
     CostFromInfo,
     CostFromStep,
-    EarlyTermination,
-    RemainingBudget,
     is_safety_gymnasium,
     make_safety_gymnasium,
 )
-from sb3_guard.zoo.environments import canonical_id
+from sb3_guard.common.budgets import EarlyTermination, RemainingBudget
+from sb3_guard.zoo.make_envs import canonical_id
 from sb3_guard.zoo.resumable import ResumableEnv
 from sb3_guard.zoo.usage import UsageError
 
@@ -126,7 +126,7 @@ def make(id, max_episode_steps=None, disable_env_checker=None, **kwargs):
     return SafeTimeLimit(env, max_episode_steps or spec.max_episode_steps)
 
 
-safe_registry = {"SafetyPointGoal1-v0"}
+safe_registry = {"SafetyPointGoal9-v0"}
 
 
 def install(monkeypatch):
@@ -134,14 +134,14 @@ def install(monkeypatch):
     stub = types.ModuleType("safety_gymnasium")
     stub.make = make
     conversion = types.ModuleType("safety_gymnasium.wrappers.gymnasium_conversion")
-    conversion.make_gymnasium_environment = lambda env_id: Converted(make("SafetyPointGoal1-v0"))
+    conversion.make_gymnasium_environment = lambda env_id: Converted(make("SafetyPointGoal9-v0"))
     monkeypatch.setitem(sys.modules, "safety_gymnasium", stub)
     monkeypatch.setitem(sys.modules, "safety_gymnasium.wrappers", types.ModuleType("wrappers"))
     monkeypatch.setitem(sys.modules, conversion.__name__, conversion)
     for name, entry_point, kwargs in (
-        ("SafetyPointGoal1-v0", "safety_gymnasium.builder:Builder", {"task_id": "x", "config": {}}),
+        ("SafetyPointGoal9-v0", "safety_gymnasium.builder:Builder", {"task_id": "x", "config": {}}),
         (
-            "SafetyPointGoal1Gymnasium-v0",
+            "SafetyPointGoal9Gymnasium-v0",
             f"{conversion.__name__}:make_gymnasium_environment",
             {"env_id": "x"},
         ),
@@ -168,6 +168,22 @@ def test_six_values_become_five_and_nothing_is_lost():
     assert 0 < charged < 30
 
 
+def test_five_values_become_six_and_back_without_loss():
+    plain, six = CostPoint(), CostAsThirdValue(CostPoint())
+    back = CostFromStep(CostAsThirdValue(CostPoint()))
+    for env in (plain, six, back):
+        env.reset(seed=0)
+    for action in np.float32([[1.0, 0.0], [0.5, -1.0], [1.0, 1.0]]):
+        obs, reward, terminated, truncated, info = plain.step(action)
+        out = six.step(action)
+        np.testing.assert_array_equal(out[0], obs)
+        assert out[1:5] == (reward, info["cost"], terminated, truncated)
+        assert type(out[2]) is float and out[5]["cost_sum"] == out[2]
+        again = back.step(action)
+        assert again[1:4] == (reward, terminated, truncated)
+        assert again[4] == {**info, "cost_sum": info["cost"]}
+
+
 def test_five_values_are_refused():
     env = CostFromStep(CostPoint())
     env.reset()
@@ -177,12 +193,12 @@ def test_five_values_are_refused():
 
 @pytest.mark.parametrize(
     "env_id",
-    ["SafetyPointGoal1-v0", "safety_gymnasium:SafetyPointGoal1-v0", "SafetyPointGoal1Gymnasium-v0"],
+    ["SafetyPointGoal9-v0", "safety_gymnasium:SafetyPointGoal9-v0", "SafetyPointGoal9Gymnasium-v0"],
 )
 def test_its_ids_are_accepted(package, env_id):
     assert is_safety_gymnasium(env_id)
     full, ours = canonical_id(env_id)
-    assert not ours and full == env_id.removeprefix("safety_gymnasium:")
+    assert not ours and full == env_id  # the prefix tells it from ours of that name
     for name in (env_id, full):
         env = make_vec_env(name, 2, seed=0)
         env.reset()
@@ -192,7 +208,7 @@ def test_its_ids_are_accepted(package, env_id):
 
 
 def test_its_environments_train(package):
-    env = make_vec_env("SafetyPointGoal1-v0", 2, seed=0, max_episode_steps=20)
+    env = make_vec_env("SafetyPointGoal9-v0", 2, seed=0, max_episode_steps=20)
     model = CPO("MlpPolicy", env, cost_limit=0.5, cost_keys=("cost_hazards",), **SMALL).learn(128)
     assert [one["l"] for one in model.ep_info_buffer] == [20] * 6
     evaluation = evaluate_policy(model, env, n_eval_episodes=3, seed=0)
@@ -205,9 +221,13 @@ def test_absent_package_says_where_to_get_it(monkeypatch):
     # not even importlib.util can find it: as if it had never been installed
     for ask in (make_vec_env, make_safety_gymnasium):
         with pytest.raises(DependencyNotInstalled, match="check_safety_gymnasium"):
-            ask("SafetyPointGoal1-v0")
-    with pytest.raises(UsageError, match=r"'SafetyPointGoal1-v0' needs .*safety-gymnasium"):
-        canonical_id("SafetyPointGoal1-v0")
+            ask("safety_gymnasium:SafetyPointGoal9-v0")
+    with pytest.raises(ValueError, match="use 'SafetyPointGoal1-v0'"):
+        make_vec_env("SafetyPointGoal9-v0")  # what there is without the package
+    with pytest.raises(
+        UsageError, match=r"'safety_gymnasium:SafetyPointGoal9-v0' needs .*safety-gymnasium"
+    ):
+        canonical_id("safety_gymnasium:SafetyPointGoal9-v0")
 
 
 def test_broken_package_says_why(monkeypatch, tmp_path):
@@ -215,15 +235,15 @@ def test_broken_package_says_why(monkeypatch, tmp_path):
     (tmp_path / "safety_gymnasium.py").write_text("raise ValueError('mutable\\n default')")
     monkeypatch.delitem(sys.modules, "safety_gymnasium", raising=False)
     with pytest.raises(DependencyNotInstalled, match="ValueError: mutable default") as caught:
-        make_vec_env("SafetyPointGoal1-v0")
+        make_vec_env("safety_gymnasium:SafetyPointGoal9-v0")
     assert "\n" not in str(caught.value)
 
 
 def test_unknown_ids_of_it_have_a_nearest_match(package):
-    with pytest.raises(ValueError, match="did you mean 'SafetyPointGoal1-v0'"):
-        make_vec_env("SafetyPointGoal7-v0")
-    with pytest.raises(NameNotFound, match="did you mean 'SafetyPointGoal1-v0'"):
-        make_safety_gymnasium("SafetyPointGoal7-v0")
+    with pytest.raises(ValueError, match="use 'SafetyPointGoal1-v0'"):
+        make_vec_env("SafetyPointGoal8-v0")
+    with pytest.raises(NameNotFound, match="did you mean 'SafetyPointGoal9-v0'"):
+        make_safety_gymnasium("SafetyPointGoal8-v0")
 
 
 def test_who_registered_an_id_decides(monkeypatch):
@@ -497,7 +517,7 @@ def test_the_spec_says_how_to_wrap_again(monkeypatch):
             lambda env: RemainingBudget(
                 RemainingBudget(Scripted([], SHAPES["dictionary"]), 1.0), 1.0
             ),
-            "wrapped in RemainingBudget twice",
+            "wrapped twice",
         ),
     ],
 )
@@ -521,7 +541,7 @@ def test_adapters_need_neither_torch_nor_mujoco():
 
 
 # MuJoCo 2.3 and 3 have no `mujoco.batch`
-@pytest.mark.parametrize("absent", ["mujoco", "mujoco.batch"])
+@pytest.mark.parametrize("absent", ["mujoco", pytest.param("mujoco.batch", marks=pytest.mark.slow)])
 def test_environments_of_others_are_made_and_trained_on_without_mujoco_4(absent):
     run = without(
         absent,
@@ -536,7 +556,7 @@ def test_environments_of_others_are_made_and_trained_on_without_mujoco_4(absent)
     assert "'Goal_Point_8Hazards-v0': it is not registered" in error and "MuJoCo 4" in error, run
 
 
-@pytest.mark.parametrize("absent", ["mujoco", "mujoco.batch"])
+@pytest.mark.parametrize("absent", [pytest.param("mujoco", marks=pytest.mark.slow), "mujoco.batch"])
 def test_the_commands_train_and_play_on_six_values_without_mujoco_4(absent, tmp_path):
     run = without(
         absent,
@@ -544,7 +564,7 @@ def test_the_commands_train_and_play_on_six_values_without_mujoco_4(absent, tmp_
         "import pytest, test_adapters\n"
         "from sb3_guard import enjoy, train\n"
         "test_adapters.install(pytest.MonkeyPatch())\n"
-        f"where = ['--env', 'SafetyPointGoal1-v0', '-f', {str(tmp_path)!r}]\n"
+        f"where = ['--env', 'SafetyPointGoal9-v0', '-f', {str(tmp_path)!r}]\n"
         "small = ['n_envs:2', 'n_steps:40', 'n_critic_updates:2']\n"
         "assert train.main([*where, '--algo', 'cpo', '-n', '160', '--eval-freq', '80',\n"
         "    '--eval-episodes', '1', '-params', *small]) == 0\n"
@@ -552,7 +572,7 @@ def test_the_commands_train_and_play_on_six_values_without_mujoco_4(absent, tmp_
         "assert train.main(['--env', 'Goal_Point_8Hazards', '-n', '10']) == 2\n",
     )
     assert run.returncode == 0, run.stderr
-    result = json.loads((tmp_path / "cpo" / "SafetyPointGoal1-v0_1" / "result.json").read_text())
+    result = json.loads((tmp_path / "cpo" / "SafetyPointGoal9-v0_1" / "result.json").read_text())
     assert result["n_timesteps"] == 160 and result["cost"] >= 0.0
     assert "sb3_guard's own environments need MuJoCo 4" in run.stderr
 
@@ -560,5 +580,5 @@ def test_the_commands_train_and_play_on_six_values_without_mujoco_4(absent, tmp_
 def test_the_pages_examples_run():
     page = Path(__file__).parent.parent / "docs" / "your_environment.md"
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     exec(compile("\n".join(blocks), str(page), "exec"), {})

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -101,11 +102,11 @@ TRAIN = [
     (["-n", "1.5"], ["'1.5' is not a whole number"]),
     (["-n", "many"], ["'many' is not a whole number"]),
     (["--seed", "one"], ["--seed", "'one'"]),
-    (["--seed", "4294967296"], ["--seed 4294967296", "2**32"]),
+    (["--seed", "4294967296"], ["--seed: '4294967296'", "2**32"]),
     (["--eval-episodes", "0"], ["--eval-episodes", "at least 1"]),
     (["--n-eval-envs", "-2"], ["--n-eval-envs", "at least 1"]),
-    (["--checkpoint-every", "nan"], ["--checkpoint-every nan"]),
-    (["--log-interval", "0"], ["--log-interval 0"]),
+    (["--checkpoint-every", "nan"], ["--checkpoint-every: 'nan'"]),
+    (["--log-interval", "0"], ["--log-interval: '0'"]),
     (["--device", "abacus"], ["abacus"]),
     (["-i", "absent"], ["no run folder or model 'absent'"]),
     ([*TOY, "-tb", "/dev/null"], ["--tensorboard-log", "'/dev/null'", "choose another"]),
@@ -126,7 +127,7 @@ ENJOY = [
     (["-f", "nowhere"], ["'nowhere'"]),
     (["--n-episodes", "0"], ["--n-episodes", "at least 1"]),
     (["--n-episodes", "1", "-n", "5"], ["not allowed with"]),
-    (["--seed", "-1"], ["--seed -1"]),
+    (["--seed", "-1"], ["--seed: '-1'"]),
     (["--load-bets"], ["unknown flag --load-bets", "--load-best"]),
 ]
 
@@ -267,7 +268,7 @@ def test_flags_that_contradict_the_run(arguments, parts, capsys, run):
 
 
 def test_the_runs_own_flags_may_be_repeated(run):
-    arguments = ["-i", str(run), *TOY, "-params", "n_steps:3e1", "cost_limit:0", "-n", "120"]
+    arguments = ["-i", str(run), *TOY, "-params", "n_steps:3e1", "cost_limit:2", "-n", "120"]
     assert train.main([*arguments, "--env-kwargs", "episode_length:20", "--seed", "1"]) == 0
 
 
@@ -286,9 +287,12 @@ def test_agent_of_another_environment(capsys, run, tmp_path):
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        (lambda args: {"a": 1}, ["no proper algo, env, n_timesteps, seed, …;"]),
-        (lambda args: {k: v for k, v in args.items() if k != "eval_freq"}, ["proper eval_freq;"]),
-        (lambda args: {**args, "seed": "one"}, ["proper seed;"]),
+        (lambda args: {"a": 1}, ["there is no algo, checkpoint_every"]),
+        (
+            lambda args: {k: v for k, v in args.items() if k != "eval_freq"},
+            ["there is no eval_freq"],
+        ),
+        (lambda args: {**args, "seed": "one"}, ["seed: 'one' is not allowed"]),
     ],
 )
 def test_damaged_flags(change, parts, capsys, run):
@@ -367,3 +371,64 @@ def test_kept_model_that_is_not_there(capsys, run, tmp_path):
     play = [*TOY, "-f", str(tmp_path), "--no-render"]
     refused(enjoy.main, [*play, "--load-checkpoint", "30"], capsys, "no model at 30 steps")
     refused(enjoy.main, [*play, "--load-best"], capsys, "best_model.zip")
+
+
+@pytest.mark.parametrize(
+    ("env", "parts"),
+    [("Flickering-v0", ["training stopped at", "cost that is not finite"]),
+     ("Wordy-v0", ["the environment's cost is 'high'; it must be a number"])],
+)  # fmt: skip
+def test_costs_of_a_baseline(env, parts, capsys, tmp_path):
+    arguments = f"--algo ppo --env {env} -n 64 -params n_envs:1 n_steps:64 batch_size:32".split()
+    arguments += ["--gym-packages", "registered_envs", "--eval-freq", "-1", "--device", "cpu"]
+    refused(train.main, [*arguments, "-f", str(tmp_path)], capsys, *parts)
+    assert not list(tmp_path.rglob("result.json"))
+
+
+def test_an_exception_of_the_users_keeps_its_traceback(capsys, tmp_path):
+    arguments = "--algo ppo --env Broken-v0 -n 64 -params n_envs:1 n_steps:64 batch_size:32".split()
+    arguments += ["--gym-packages", "registered_envs", "--eval-freq", "-1", "--device", "cpu"]
+    assert train.main([*arguments, "-f", str(tmp_path)]) == 2
+    first, *rest = capsys.readouterr().err.splitlines()
+    assert first.startswith("error: Broken-v0 raised RuntimeError: out of order at ")
+    assert rest[0].startswith("Traceback") and rest[-1] == "RuntimeError: out of order"
+
+
+def test_a_gpu_that_is_not_there(capsys, tmp_path):
+    refused(train.main, ["--device", "cuda:99", "-f", str(tmp_path)], capsys, "--device 'cuda:99'")
+
+
+def test_a_run_whose_files_were_edited(run, capsys):
+    path = run / "CostPoint-v0" / "config.yml"
+    values = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump({**values, "gamma": 0.5}))
+    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "gamma = 0.5", "was")
+    path.write_text(yaml.safe_dump(values))
+
+
+def test_a_terminal_that_is_not_utf_8(tmp_path):
+    """What it can't show becomes "?"; errors end after some 500 characters."""
+    code = "from sb3_guard.zoo.usage import run, UsageError\n"
+    code += "def long(): print('±ρ'); raise UsageError('é' * 900)\nraise SystemExit(run(long))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    assert (done.returncode, done.stdout) == (2, b"??\n")
+    assert len(done.stderr) < 520
+
+
+def test_closed_stdout_is_no_dead_process(tmp_path):
+    """As with ``| head -3``."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = "-m sb3_guard.train --algo ppo --env CostPoint-v0 -n 64 --eval-freq -1 --device cpu"
+    done = subprocess.run(
+        [sys.executable, *command.split(), "-params", "n_steps:32", "batch_size:32", "n_envs:1",
+         "--gym-packages", "registered_envs", "-f", str(tmp_path)],
+        stdout=writer, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.path.dirname(__file__)},
+    )  # fmt: skip
+    os.close(writer)
+    assert done.returncode == 141 and b"subproc" not in done.stderr

@@ -11,7 +11,7 @@ from test_resume import assert_same_run, crash, runs_of
 
 from sb3_guard import CPO, enjoy, train
 from sb3_guard.zoo.algos import algorithm, baselines
-from sb3_guard.zoo.config import shipped_file
+from sb3_guard.zoo.hyperparams import shipped_file
 from sb3_guard.zoo.usage import UsageError
 
 TOY = "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:25".split()
@@ -38,6 +38,7 @@ def arguments(algo: str, folder: Path) -> list[str]:
 @pytest.mark.parametrize("algo", PARAMS)
 def test_trains_with_costs_logged(algo, tmp_path):
     extra = ["--eval-freq", "60", "--log-interval", "1"]
+    extra += ["--env-kwargs", "hazard:(-1.0, 0.0)"]  # where episodes start: each has a cost
     assert train.main([*arguments(algo, tmp_path), *extra]) == 0
     run = tmp_path / algo / "CostPoint-v0_1"
     log = pd.read_csv(run / "progress.csv").dropna(subset=["rollout/ep_cost_mean"])
@@ -64,7 +65,7 @@ def test_discrete_actions_with_rl_zoos_own_file(tmp_path):
 
 
 def test_shipped_files_name_only_what_the_algorithms_take():
-    from sb3_guard.zoo.config import check, hyperparams_folder, read_hyperparams
+    from sb3_guard.zoo.hyperparams import check, hyperparams_folder, read_hyperparams
 
     shipped = {path.stem for path in hyperparams_folder().glob("*.yml")} & set(baselines())
     assert shipped == {"a2c", "crossq", "ddpg", "ppo", "ppo_lstm", "sac", "td3", "tqc"}

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from cost_envs import CostPoint, LinearCostBandit
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard.algorithms import CPO, TRPO
@@ -301,3 +302,17 @@ def test_cost_advantages_are_centred_and_not_scaled() -> None:
     )
     assert batches[0].advantages.mean().item() == pytest.approx(0.0, abs=1e-5)
     assert batches[0].advantages.std().item() == pytest.approx(1.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("limit", [2.0, 0.0])
+def test_the_margin_follows_what_was_missed(limit: float) -> None:
+    env = make_vec_env(lambda: CostPoint(), 2, seed=0)
+    model = CPO("MlpPolicy", env, n_steps=40, cost_limit=limit, margin_lr=0.5, n_critic_updates=1)
+    model.set_logger(Logger(None, []))
+    for cost, margin in ((3.0, 0.5), (2.5, 0.75), (9.0, 1.0), (1.0, 0.5), (0.0, 0.0)):
+        episode = np.array([cost])
+        model.costs = CostEstimate(episode, 10.0, (episode - model.cost_limits) / 10.0)
+        model.fit(None)  # type: ignore[arg-type]
+        expected = margin if limit else 0.0  # at most half the limit
+        assert model.margin == pytest.approx(expected)
+        assert model.violation() * 10.0 == pytest.approx(cost - limit + expected)

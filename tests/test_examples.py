@@ -12,6 +12,7 @@ from nbclient import NotebookClient
 from test_adapters import install
 
 import sb3_guard.envs
+from sb3_guard.algorithms import ALGORITHMS
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.rendering import RenderingError, gl_backend
 
@@ -19,10 +20,12 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 # example: what it prints, in the order of the lines, and the files that it leaves
 SAYS = {
     "compare_algorithms": (["trpo {'r'", "cpo {'r'", "trpo_lag {'r'"], ["compare", "compare.png"]),
+    "custom_algorithm": (["cost of an episode: ["], []),
     "custom_constraint": (["steps outside: ["], []),
     "custom_robot": (["21 observations, 2 actions", "return "], ["puck.xml"]),
     "custom_task": (["metres: ["], []),
     "deploy_filtered_policy": (["with the layer: ", "without the layer: "], ["filtered_policy.pt"]),
+    "ppo_lagrangian": (["return "], []),
     "record_video": (["point.mp4"], ["point.mp4"]),
     "safety_gymnasium_env": (["return ", "cost "], []),
     "several_constraints": (["return", "cost_hazards, limit 5.0", "cost_ghosts, limit 2.0"], []),
@@ -37,6 +40,7 @@ LENGTHS = {
     r"n_trials=20": "n_trials=2",
     r"range\(3000\)": "range(20)",
     r"range\(500\)": "range(3)",
+    r'__name__ == "__main__"': "True",
 }
 
 
@@ -57,10 +61,10 @@ def require_rendering():
 def quick(monkeypatch, tmp_path):
     """Episodes of ten steps, a folder of one's own, and no trace of what is registered."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sb3_guard.envs, "EPISODE_STEPS", 10)
+    monkeypatch.setattr(sb3_guard.envs.suites, "EPISODE_STEPS", 10)
     for name in ("Goal_Point_8Hazards-v0", "Goal_Ant_8Hazards-v0"):
         monkeypatch.setattr(gymnasium.registry[name], "max_episode_steps", 10)
-    tables = (ROBOTS, TASKS, CONSTRAINTS, gymnasium.registry)
+    tables = (ALGORITHMS, ROBOTS, TASKS, CONSTRAINTS, gymnasium.registry)
     before = [dict(table) for table in tables]
     yield tmp_path
     for table, old in zip(tables, before, strict=True):

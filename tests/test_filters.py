@@ -269,7 +269,7 @@ def test_written_out_descent_is_autograds(threshold: float) -> None:
     # Another activation takes the path through autograd.
     other = UnrolledSafetyLayer(policy_of(2, activation_fn=th.nn.ELU), 2)
     other.threshold.fill_(threshold)
-    assert other._slope(features).__name__ != layer._slope(features).__name__
+    assert other._slope(features).__module__ != layer._slope(features).__module__
     assert other._slope(features)(actions).shape == (100, 2)
 
 

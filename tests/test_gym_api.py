@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.env_checker import check_env as sb3_check
-from suites import IDS
+from suites import CASES
 
 import sb3_guard
 from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_ids, env_spec, make, register
@@ -19,7 +19,7 @@ from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_ids, env_spec, make, re
 INFINITE = {"minimum value is -infinity", "maximum value is infinity"}
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", CASES)
 @pytest.mark.parametrize("flatten", [True, False])
 def test_both_checkers_find_nothing_but_infinite_bounds(env_id, flatten):
     env = make(env_id, flatten=flatten)
@@ -31,7 +31,7 @@ def test_both_checkers_find_nothing_but_infinite_bounds(env_id, flatten):
     assert all(any(known in text for known in INFINITE) for text in texts), texts
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", CASES)
 def test_bounds_are_true_and_finite_where_they_can_be(env_id):
     env = gymnasium.make_vec(env_spec(env_id), num_envs=2).unwrapped
     space, layout = env.single_observation_space, env.observation_layout
@@ -51,7 +51,7 @@ def test_bounds_are_true_and_finite_where_they_can_be(env_id):
         assert env.observation_space.contains(obs)
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", CASES)
 def test_pickled_and_copied_environments_continue_bit_for_bit(env_id):
     env = make(env_id).unwrapped
     env.reset(seed=0)
@@ -134,7 +134,7 @@ def test_unregistered_ids_work_in_make_and_after_register():
 
 
 def test_every_suite_is_registered_with_both_entry_points():
-    for env_id in env_ids():
+    for env_id in env_ids("guard"):
         spec = gymnasium.spec(env_id)
         assert spec.entry_point and spec.vector_entry_point
         assert spec == env_spec(env_id)

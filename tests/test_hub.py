@@ -40,7 +40,7 @@ def test_what_is_uploaded(logs, tmp_path):
     values = {one["type"]: float(one["value"].split()[0]) for one in metrics}
     assert values["mean_cost"] == pytest.approx(results["cost"]["mean"], abs=0.006)
     assert values["mean_reward"] == pytest.approx(results["return"]["mean"], abs=0.006)
-    assert "under a limit of 0.0" in page and "--repo-id me/cpo-Filmed-v0" in page
+    assert "under a limit of 2.0" in page and "--repo-id me/cpo-Filmed-v0" in page
 
 
 def test_no_path_of_this_machine_is_uploaded(logs, tmp_path):

@@ -11,7 +11,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_guard.algorithms import TRPO, TRPOFAC, TRPOLag, TrustRegion
 from sb3_guard.algorithms.common.costs import CostEstimate, discounted_limit
-from sb3_guard.algorithms.common.multipliers import Multiplier, StateMultiplier
+from sb3_guard.algorithms.common.lagrangian import Multiplier
+from sb3_guard.algorithms.trpo_fac import StateMultiplier
 
 KEYS = ("cost", "cost_1")
 
@@ -72,9 +73,10 @@ def test_each_cost_has_its_own_multiplier() -> None:
     np.testing.assert_allclose(multiplier.value.numpy(), [1.0, 0.0])
 
 
-def test_the_policy_uses_the_multiplier_of_before_its_step() -> None:
-    """λ of update k is η times the violations of the updates before it, in episode units."""
-    model = make(TRPOLag, cost_limit=2.0, lambda_lr=0.1)
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_the_multiplier_ascends_before_or_after_the_step(moment: str) -> None:
+    """λ of update k is η times the violations of the updates up to it, in episode units."""
+    model = make(TRPOLag, cost_limit=2.0, lambda_lr=0.1, lambda_update=moment)
     prices, violations = [], []
     step, fit = model.step, model.fit
     model.step = lambda region: prices.append(float(model.multiplier.value[0])) or step(region)
@@ -83,7 +85,8 @@ def test_the_policy_uses_the_multiplier_of_before_its_step() -> None:
     expected = [0.0]
     for violation in violations:
         expected.append(max(0.0, expected[-1] + 0.1 * violation))
-    np.testing.assert_allclose(prices, expected[:-1], rtol=1e-6)
+    used = expected[1:] if moment == "before" else expected[:-1]
+    np.testing.assert_allclose(prices, used, rtol=1e-6)
     assert len(prices) == 5 and prices[-1] > 0.0
     assert model.logger.name_to_value["train/multiplier"] == pytest.approx(expected[-1])
 
@@ -99,10 +102,7 @@ def test_the_lagrangian_by_hand() -> None:
 
 def test_without_multiplier_it_is_trpo() -> None:
     """λ stays zero under a limit that holds: the same trajectories, bit for bit."""
-    models = [make(cls, cost_limit=1e6) for cls in (TRPO, TRPOLag)]
-    for model in models:
-        th.manual_seed(0)  # building a cost critic has drawn numbers
-        model.learn(1200)
+    models = [make(cls, cost_limit=1e6).learn(1200) for cls in (TRPO, TRPOLag)]
     a, b = (model.policy.state_dict() for model in models)
     assert float(models[1].multiplier.value[0]) == 0.0
     for name in a:
@@ -208,8 +208,8 @@ def test_at_a_limit_of_zero(cls: type[TrustRegion], cost_scale: float) -> None:
     env = make_vec_env(lambda: CostPoint(cost_scale=cost_scale, hazard=(-1.0, 0.0)), 4, seed=0)
     model: Any = cls("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0)
     logged = []
-    fit = model.fit
-    model.fit = lambda batch: (fit(batch), logged.append(dict(model.logger.name_to_value)))
+    train = model.train
+    model.train = lambda: (train(), logged.append(dict(model.logger.name_to_value)))
     model.learn(2000)
     prices = np.array([each["train/multiplier"] for each in logged])
     assert np.isfinite(prices).all()

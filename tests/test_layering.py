@@ -1,6 +1,7 @@
 """Who may know whom: the layers of the package, read from its imports."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -16,9 +17,10 @@ MODULES = {
 }
 
 
-def imports(path: Path, name: str) -> set[str]:
-    """Modules that a file imports, also inside functions; type-checking blocks do not count."""
-    tree = ast.parse(path.read_text())
+@functools.cache
+def imports(name: str) -> set[str]:
+    """What a module imports, also inside functions; type-checking blocks do not count."""
+    tree = ast.parse(MODULES[name].read_text())
     skip = {
         id(node)
         for block in ast.walk(tree)
@@ -39,11 +41,7 @@ def imports(path: Path, name: str) -> set[str]:
 
 
 def touches(name: str, *packages: str) -> set[str]:
-    return {
-        i
-        for i in imports(MODULES[name], name)
-        if any(i == p or i.startswith(p + ".") for p in packages)
-    }
+    return {i for i in imports(name) if any(i == p or i.startswith(p + ".") for p in packages)}
 
 
 def below(package: str) -> list[str]:
@@ -75,13 +73,22 @@ def test_no_leaf_imports_a_leaf():
         assert not touches(leaf, *(set(leaves) - {leaf})), leaf
 
 
-@pytest.mark.parametrize("name", ["geometry", "layout", "sensors", "motion", "parameters"])
+def test_speed_tricks_are_known_where_they_are_chosen_alone():
+    fast = "sb3_guard.algorithms.common.fast"
+    others = [m for m in MODULES if not m.startswith(fast) and touches(m, fast)]
+    assert {m.rpartition(".")[2] for m in others} == {
+        "action_filters", "critics", "rollouts", "trust_region",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["geometry", "layout", "observation", "motion", "parameters"])
 def test_the_pure_modules_know_only_numpy(name):
     module = f"sb3_guard.envs.{name}"
-    pure = {f"sb3_guard.envs.{n}" for n in ("geometry", "layout", "sensors", "parameters")}
+    names = ("geometry", "layout", "observation", "parameters", "part")
+    pure = {f"sb3_guard.envs.{n}" for n in names}
     pure.add("sb3_guard.spelling")
     assert touches(module, "sb3_guard") <= {
-        i for i in imports(MODULES[module], module) if any(i.startswith(p) for p in pure)
+        i for i in imports(module) if any(i.startswith(p) for p in pure)
     }
     assert not touches(module, "mujoco", "gymnasium")
 
@@ -123,21 +130,17 @@ def test_nothing_imports_the_zoo_but_the_commands():
     [
         ("import sb3_guard.envs", ["torch", "stable_baselines3", "rl_zoo3"]),
         ("import sb3_guard", ["torch", "rl_zoo3", "optuna"]),
-        ("from sb3_guard import CPO", ["rl_zoo3", "optuna"]),
+        (  # where MuJoCo is missing, too
+            "import sys; sys.modules['mujoco'] = None\n"
+            "from sb3_guard import CPO; import sb3_guard.algorithms",
+            ["rl_zoo3", "optuna"],
+        ),
     ],
 )
 def test_imports_stay_light(statement, absent):
     code = f"{statement}\nimport sys\nprint([m for m in {absent!r} if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
-
-
-def test_algorithms_import_where_mujoco_is_missing():
-    code = (
-        "import sys; sys.modules['mujoco'] = None\n"
-        "from sb3_guard import CPO, TRPO; import sb3_guard.algorithms"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_every_public_name_exists():

@@ -7,7 +7,9 @@ import pytest
 from scipy import stats
 
 from sb3_guard.envs import Scenario
-from sb3_guard.envs.layout import ARENA, Footprint, LayoutError, arrange, farthest, redraw
+from sb3_guard.envs.layout import Footprint, LayoutError, arrange, farthest, redraw
+
+ARENA = ((-2.0, -2.0, 2.0, 2.0),)
 
 
 def footprints(task="goal", ghosts=8):
@@ -100,6 +102,7 @@ def difference(task, count):
     return {k: stats.ks_2samp(ours[k], reference[k]).statistic for k in ours}
 
 
+@pytest.mark.slow
 def test_the_distribution_is_close_to_that_of_sequential_sampling():
     """Goal with eight ghosts: distances of 0.03 to 0.08 over 3000 layouts; 400 add noise."""
     measured = difference("goal", 400)

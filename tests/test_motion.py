@@ -15,7 +15,7 @@ KINDS = {
 
 
 def advance(points, robot, law, planar):
-    motion.Fleet([motion.Moving(points, law, planar)]).advance(robot)
+    motion.MoverGroup([motion.Moving(points, law, planar)]).advance(robot)
 
 
 def unit(v):
@@ -129,20 +129,20 @@ def test_groups_that_move_together_move_as_each_alone(planar):
     groups = [motion.Moving(rng.uniform(-1, 1, (4, 3, 3)), law, planar) for law in laws]
     alone = [motion.Moving(g.points.copy(), g.law, planar) for g in groups]
     nobody = motion.Moving(np.zeros((4, 0, 3)), laws[0], planar)
-    (fleet,) = motion.fleets([*groups, nobody])
+    (together,) = motion.grouped([*groups, nobody])
     for _ in range(30):
         robot = rng.uniform(-1, 1, (4, 3))
-        fleet.advance(robot)
+        together.advance(robot)
         for group, own in zip(groups, alone, strict=True):
-            motion.Fleet([own]).advance(robot)
+            motion.MoverGroup([own]).advance(robot)
             np.testing.assert_array_equal(group.points, own.points)
 
 
-def test_movers_by_other_laws_of_speed_are_fleets_of_their_own():
+def test_movers_by_other_laws_of_speed_are_groups_of_their_own():
     points = np.zeros((1, 1, 3))
     kinds = [(p, u) for p in (True, False) for u in (True, False)]
     moving = [motion.Moving(points, motion.Law(unit=u), p) for p, u in kinds for _ in range(2)]
-    assert len(motion.fleets(moving)) == 4
+    assert len(motion.grouped(moving)) == 4
 
 
 # task or constraint -> defaults of v0, v1, v2, apart, gap, r0, r1 in the plane and in space
@@ -220,7 +220,7 @@ def test_movers_of_an_environment_follow_the_law_from_what_was_last_observed(sui
                 new[:, 2] = new[:, 2].clip(0.5, 1.5)
             np.testing.assert_allclose(places[i], new, rtol=0, atol=1e-14)
         if part.solid:
-            np.testing.assert_array_equal(part.bodies.positions, places)
+            np.testing.assert_array_equal(part.group.bodies.positions, places)
 
 
 def test_in_space_z_stays_within_its_range():

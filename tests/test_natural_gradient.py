@@ -18,6 +18,8 @@ from sb3_guard.algorithms.common.natural_gradient import (
     unflatten,
 )
 
+FEW_OR_MANY = [50, pytest.param(500, marks=pytest.mark.slow)]  # random problems
+
 
 def _definite(rng: np.random.Generator, size: int) -> np.ndarray:
     root = rng.normal(size=(size, size))
@@ -183,10 +185,11 @@ def _ratios(case: Case, m: int, rng: np.random.Generator) -> Iterator[np.ndarray
 
 @pytest.mark.parametrize("case", [Case.INACTIVE, Case.BINDING, Case.RECOVERABLE, Case.LOST])
 @pytest.mark.parametrize("m", [1, 2, 3])
-def test_constrained_step_against_an_optimiser(case: Case, m: int) -> None:
-    """Five hundred random problems per case and number of constraints."""
+@pytest.mark.parametrize("wanted", FEW_OR_MANY)
+def test_constrained_step_against_an_optimiser(wanted: int, case: Case, m: int) -> None:
+    """Random problems for each case and number of constraints."""
     rng = np.random.default_rng(100 * m + case)
-    wanted, seen = 500, Counter[Case]()
+    seen = Counter[Case]()
     for ratios in _ratios(case, m, rng):
         problem = Problem(rng, ratios)
         # With several constraints the geometry decides: keep drawing until the case comes up.
@@ -210,7 +213,7 @@ def test_constraints_of_different_size_against_an_optimiser(case: Case, m: int) 
         if problem.solve().case is case:
             problem.check(rng)
             seen += 1
-        if seen == 50:
+        if seen == 25:
             break
 
 
@@ -262,10 +265,11 @@ def test_a_lost_constraint_of_small_gradient_is_lowered_as_far_as_the_larger_one
 
 
 @pytest.mark.parametrize("m", [1, 2, 3])
-def test_constrained_step_on_the_boundary(m: int) -> None:
+@pytest.mark.parametrize("problems", FEW_OR_MANY)
+def test_constrained_step_on_the_boundary(problems: int, m: int) -> None:
     """c = 0 exactly, the usual state at cost_limit = 0: feasible, and the boundary binds."""
     rng = np.random.default_rng(m)
-    for _ in range(500):
+    for _ in range(problems):
         assert Problem(rng, np.zeros(m)).check(rng) is Case.BINDING
 
 
@@ -273,7 +277,7 @@ def test_constrained_step_on_the_boundary(m: int) -> None:
 @pytest.mark.parametrize("c", [-0.5, 0.0])
 def test_without_cost_gradient_a_feasible_policy_takes_the_trpo_step(m: int, c: float) -> None:
     rng = np.random.default_rng(0)
-    for _ in range(500):
+    for _ in range(50):
         problem = Problem(rng, np.zeros(m))
         problem.B[:], problem.c[:] = 0.0, c
         step = problem.solve()
@@ -354,7 +358,7 @@ def test_parallel_gradients(sign: float) -> None:
 def test_nearly_parallel_gradients_in_float32(m: int, noise: float) -> None:
     """Reward along a binding cost, but for rounding: within the region, the limits and 0.2 %."""
     rng = np.random.default_rng(m)
-    for _ in range(100):
+    for _ in range(25):
         problem = Problem(rng, np.append(rng.uniform(-1.0, 1.0, 1), np.full(m - 1, -0.7)), size=30)
         problem.g = problem.B[0] + noise * rng.normal(size=30)
         exact, (x, case, *_) = problem.solve(), problem.solve(th.float32)

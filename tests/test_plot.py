@@ -1,4 +1,4 @@
-"""Figures, the page about a grid, and the command that makes them."""
+"""Figures, the page about runs, and the command that makes them."""
 
 import re
 import shutil
@@ -8,42 +8,37 @@ import xml.etree.ElementTree as ET
 
 import matplotlib.image
 import numpy as np
+import pandas as pd
 import pytest
-from fake_runs import fake_run
+from fake_runs import LABELS, fake_run
 from matplotlib.colors import to_rgb
 
 from sb3_guard import cli, plot
 from sb3_guard.envs import Scenario
-from sb3_guard.envs.registry import SUITE_ROBOTS
+from sb3_guard.envs.suites.guard import SUITE_ROBOTS
 from sb3_guard.zoo import figures
-from sb3_guard.zoo.figures import FIGURES, INK, ROBOTS, Data, draw, inline_svg, pareto_front, save
+from sb3_guard.zoo.figures import INK, Data, fit_costs, inline_svg, pareto_front, save
+from sb3_guard.zoo.paper import ALGOS, FIGURES, OPTIONS, RADAR4, ROBOTS, draw
 from sb3_guard.zoo.report import report
-from sb3_guard.zoo.results import CATEGORIES, LABELS, read_results, select
+from sb3_guard.zoo.runs import read_results, select
+from sb3_guard.zoo.statistics import with_safety
 
-EFFECTS = dict(zip(LABELS, (1.0, 0.5, 0.6, 0.4, 0.7, 0.9, 0.8, 1.5), strict=True))
-RESULTS = [
-    f"{task}_{robot}_8{kind}"
-    for task, kind in (("Goal", "Hazards"), ("Goal", "Ghosts"), ("Push", "Hazards"),
-                       ("Chase", "Hazards"), ("Defense", "Hazards"))
-    for robot in ROBOTS
-]  # fmt: skip
+EFFECTS = dict(zip(ALGOS, (1.0, 0.5, 0.6, 0.4, 0.7, 0.9, 0.8, 1.5), strict=True))
+POINT = "Goal_Point_8Hazards"
 
 
 @pytest.fixture(scope="module")
-def grid(tmp_path_factory):
-    """The paper's 45 suites, eight algorithms; the second seed on two suites only."""
-    folder = tmp_path_factory.mktemp("grid")
-    for suite in RESULTS:
-        for algo, effect in EFFECTS.items():
-            for seed in (0, 1) if suite in RESULTS[:2] else (0,):
-                fake_run(folder, algo, f"{suite}-v0", seed, returns=10 * min(effect, 1) + seed,
-                         cost=4 * effect, epochs=3)  # fmt: skip
-    return folder
-
-
-@pytest.fixture(scope="module")
-def data(grid):
-    return Data(select(read_results([grid]).runs))
+def data(tmp_path_factory):
+    """The paper's 45 suites, eight algorithms; two seeds on the first suite, one elsewhere."""
+    folder = tmp_path_factory.mktemp("runs")
+    for algo, effect in EFFECTS.items():
+        for seed in (0, 1):
+            fake_run(folder, algo, seed=seed, returns=10 * min(effect, 1) + seed, cost=4 * effect,
+                     epochs=3)  # fmt: skip
+    runs = read_results([folder]).runs
+    one = runs[runs["seed"] == 0]
+    suites = [option.format(robot) for option in OPTIONS.values() for robot in ROBOTS]
+    return Data(pd.concat([runs, *(one.assign(suite=suite) for suite in suites if suite != POINT)]))
 
 
 @pytest.fixture
@@ -54,6 +49,10 @@ def small(tmp_path):
             fake_run(tmp_path / "logs", algo, seed=seed, returns=10 * EFFECTS.get(algo, 1.0),
                      cost=4 * EFFECTS.get(algo, 1.0), seconds=60.0, commit="f" * 40)  # fmt: skip
     return tmp_path / "logs"
+
+
+def read(folder) -> Data:
+    return Data(select(with_safety(read_results([folder]).runs)))
 
 
 def texts(figure) -> str:
@@ -69,24 +68,18 @@ def lines(axis) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in FIGURES if kind not in ("curves", "pareto")])
-def test_the_papers_figures_are_whole(kind, data):
+def test_the_papers_figures_are_complete(kind, data):
     (drawing,) = draw(kind, data)
     assert drawing.figure is not None and drawing.missing == ""
     assert "Missing" not in texts(drawing.figure)
-
-
-def test_one_figure_of_curves_and_of_pareto_per_suite(small):
-    found = Data(select(read_results([small]).runs))
-    for kind in ("curves", "pareto"):
-        (drawing,) = draw(kind, found)
-        assert drawing.name == f"{kind}_Goal_Point_8Hazards" and not drawing.missing
 
 
 def test_curves_are_means_of_seeds_with_bands(data):
     (drawing,) = draw("q1", data)
     assert len(drawing.figure.axes) == 24
     axis = drawing.figure.axes[0]
-    assert axis.get_ylabel() == "return" and set(LABELS.values()) <= set(lines(axis))
+    names = {LABELS[algo][0] for algo in ALGOS}
+    assert axis.get_ylabel() == "return" and names <= set(lines(axis))
     # seeds reach 5 and 6 in three equal steps
     assert lines(axis)["CPO"] == pytest.approx([11 / 6, 11 / 3, 5.5])
     assert len(axis.collections) == 8
@@ -97,27 +90,25 @@ def test_curves_are_means_of_seeds_with_bands(data):
 def test_q2_shows_trpos_costs_and_the_slopes(data):
     (drawing,) = draw("q2", data)
     bars, reward, cost = drawing.figure.axes
-    assert len(bars.patches) == 2 * len(ROBOTS)
-    assert [bar.get_height() for bar in bars.patches] == pytest.approx([4.0] * 18)
+    assert [bar.get_height() for bar in bars.patches] == pytest.approx([4.0] * 2 * len(ROBOTS))
     assert lines(cost)["TRPO-USL"] == pytest.approx([1.5, 1.5])
     # Hazards have two seeds: 5.5 of TRPO's 10.5; Ghosts one: 5 of 10
     assert lines(reward)["CPO"] == pytest.approx([5.5 / 10.5, 0.5])
 
 
-def test_q3_has_a_polygon_per_category_and_trpos_at_1(data):
+def test_q3_has_a_polygon_per_family_and_trpos_at_1(data):
     (drawing,) = draw("q3", data)
-    assert [axis.get_title() for axis in drawing.figure.axes] == list(figures.RADAR4)
+    assert [axis.get_title() for axis in drawing.figure.axes] == list(RADAR4)
     polygons = lines(drawing.figure.axes[1])
-    assert set(polygons) == {"TRPO", *CATEGORIES}
+    assert set(polygons) == {"TRPO", "Lagrangian", "CPO-based", "hierarchical"}
     assert (polygons["TRPO"] == 1).all()
-    lagrangian = (0.4 + 0.7 + 0.9) / 3
-    assert polygons["Lagrangian"] == pytest.approx([lagrangian] * 4)
+    assert polygons["Lagrangian"] == pytest.approx([(0.4 + 0.7 + 0.9) / 3] * 4)
 
 
 @pytest.mark.parametrize(
     ("kind", "shown"),
-    [("q4", {*CATEGORIES}), ("q5", {"TRPO-Lagrangian", "TRPO-FAC"}), ("q6", {"CPO", "PCPO"}),
-     ("q7", {"TRPO-USL", "TRPO-SL"})],
+    [("q4", {"Lagrangian", "CPO-based", "hierarchical"}), ("q5", {"TRPO-Lagrangian", "TRPO-FAC"}),
+     ("q6", {"CPO", "PCPO"}), ("q7", {"TRPO-USL", "TRPO-SL"})],
 )  # fmt: skip
 def test_q4_to_q7_go_by_degrees_of_freedom(kind, shown, data):
     (drawing,) = draw(kind, data)
@@ -129,10 +120,9 @@ def test_q4_to_q7_go_by_degrees_of_freedom(kind, shown, data):
 
 def test_q8_has_a_spider_per_algorithm(data):
     (drawing,) = draw("q8", data)
-    assert [axis.get_title() for axis in drawing.figure.axes] == list(LABELS.values())[1:]
-    usl = lines(drawing.figure.axes[-1])
+    (usl,) = (lines(a) for a in drawing.figure.axes if a.get_title() == "TRPO-USL")
+    assert len(drawing.figure.axes) == 7 and set(usl) == {"TRPO", "reward", "cost", "cost rate"}
     assert usl["cost"] == pytest.approx([1.5] * 6) and usl["reward"][2:5] == pytest.approx([1] * 3)
-    assert set(usl) == {"TRPO", "reward", "cost", "cost rate"}
 
 
 def test_robots_are_in_the_order_of_their_actions():
@@ -155,9 +145,9 @@ def test_pareto_front(points, front):
 
 
 def test_pareto_marks_front_and_limit(small):
-    found = Data(select(read_results([small]).runs))
-    (drawing,) = draw("pareto", found)
+    (drawing,) = draw("pareto", read(small))
     (axis,) = drawing.figure.axes
+    assert drawing.name == f"pareto_{POINT}"
     assert lines(axis)["Pareto front"].tolist() == [5.0, 10.0]
     assert "cost limit, 0" in lines(axis)
 
@@ -170,77 +160,105 @@ def test_profiles_rise_and_fall(data):
     assert (cost["CPO"][0], cost["CPO"][-1]) == (0.0, 1.0)
 
 
+@pytest.mark.parametrize(
+    ("values", "end", "text"),
+    [([1.0, 2, 3, 4], None, ""), ([*np.ones(20), 1000.0], 5.25, "↑ up to 1e+03")],
+)
+def test_one_outlier_does_not_squash_a_cost_axis(values, end, text):
+    axis = figures.Figure().subplots()
+    axis.plot(values)
+    fit_costs(axis, [values, np.nan])
+    assert axis.get_ylim()[0] == 0
+    if text:
+        assert axis.get_ylim()[1] == pytest.approx(end) and text in texts(axis.figure)
+    else:
+        assert axis.get_ylim()[1] > max(values) and "↑" not in texts(axis.figure)
+
+
 # What is missing
 
 
 def test_missing_runs_are_named(tmp_path):
     fake_run(tmp_path, "trpo")
     fake_run(tmp_path, "cpo")
-    found = Data(select(read_results([tmp_path]).runs))
+    found = read(tmp_path)
     (drawing,) = draw("q6", found)
-    assert "PCPO on Goal_Point_8Hazards" in drawing.missing
+    assert f"PCPO on {POINT}" in drawing.missing
     assert "TRPO, CPO, PCPO on Goal_Swimmer_8Hazards, " in drawing.missing
-    assert "Missing: PCPO on Goal_Point_8Hazards" in texts(drawing.figure)
+    assert f"Missing: PCPO on {POINT}" in texts(drawing.figure)
     (drawing,) = draw("q7", found)
-    assert drawing.figure is None and "TRPO-USL, TRPO-SL on Goal_Point_8Hazards" in drawing.missing
+    assert drawing.figure is None and f"TRPO-USL, TRPO-SL on {POINT}" in drawing.missing
 
 
-@pytest.mark.parametrize("kind", [k for k in FIGURES if k not in ("curves", "pareto", "q1")])
-def test_without_trpo_there_is_nothing_to_compare_with(tmp_path, kind):
+def test_without_trpo_there_is_nothing_to_compare_with(tmp_path):
     fake_run(tmp_path, "cpo")
-    (drawing,) = draw(kind, Data(select(read_results([tmp_path]).runs)))
-    assert drawing.figure is None
-    assert "TRPO" in drawing.missing.split(" on ")[0].split(", ")
+    found = read(tmp_path)
+    for kind in set(FIGURES) - {"curves", "pareto", "q1"}:
+        (drawing,) = draw(kind, found)
+        assert drawing.figure is None, kind
+        assert "TRPO" in drawing.missing.split(" on ")[0].split(", ") or "all" in drawing.missing
 
 
-def test_a_gap_stays_a_gap(grid, tmp_path):
-    shutil.copytree(grid, tmp_path / "grid")
-    shutil.rmtree(tmp_path / "grid" / "pcpo" / "Goal_Arm3_8Hazards-v0_1")
-    shutil.rmtree(tmp_path / "grid" / "cpo" / "Push_Ant_8Hazards-v0_1")
-    found = Data(select(read_results([tmp_path / "grid"]).runs))
+def test_a_gap_stays_a_gap(data):
+    runs = data.runs
+    lost = ((runs["algo"] == "pcpo") & (runs["suite"] == "Goal_Arm3_8Hazards")) | (
+        (runs["algo"] == "cpo") & (runs["suite"] == "Push_Ant_8Hazards")
+    )
+    found = Data(runs[~lost])
     (q6,) = draw("q6", found)
     assert np.isnan(lines(q6.figure.axes[0])["PCPO"]).tolist() == [n == "Arm3" for n in ROBOTS]
     (q8,) = draw("q8", found)
     assert "Push\n(8/9)" in texts(q8.figure) and "Chase\n(" not in texts(q8.figure)
 
 
-def test_a_run_without_its_episodes_is_left_out_of_the_curves(small, capsys, tmp_path):
-    (small / "cpo" / "Goal_Point_8Hazards-v0_2" / "0.monitor.csv").write_text("#{}\nr,l,t,c\n")
-    assert plot.main([str(small), "-o", str(tmp_path / "out")]) == 0
-    out, err = capsys.readouterr()
-    assert "left out of the curves: can't draw" in err and "v0_2/0.monitor.csv" in err
-    assert "| CPO       | 0     | 2 " in out  # its result counts all the same
-
-
 # How it looks
 
 
-def test_colours_are_okabe_and_itos_and_no_two_algorithms_look_alike():
-    palette = {
-        "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
-    }  # fmt: skip
-    colors = {figures.line_style(algo)["color"] for algo in LABELS}
-    assert {"#000000" if color == INK else color for color in colors} == palette
-    assert np.allclose(to_rgb(INK), 0, atol=0.02)
-    looks = [figures.line_style(algo) for algo in (*LABELS, *figures.BASELINES, "mine")]
-    assert len({(str(s["color"]), str(s["linestyle"])) for s in looks}) == len(looks)
+def contrast(color, page) -> float:
+    """Of a colour on a page, as the WCAG defines it."""
+
+    def luminance(rgb):
+        part = np.array(rgb)
+        part = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+        return part @ [0.2126, 0.7152, 0.0722]
+
+    one, other = sorted((luminance(to_rgb(color)), luminance(to_rgb(page))))
+    return (other + 0.05) / (one + 0.05)
+
+
+def test_colours_are_readable_on_white_and_in_the_dark():
+    for color in (INK, *figures.COLORS):
+        for page in ("#ffffff", "#131416"):
+            assert contrast(color, page) > (4 if color == INK else 2.8), (color, page)
+
+
+def test_no_two_algorithms_look_alike_and_ones_own_has_a_name(tmp_path):
+    for algo in LABELS:
+        fake_run(tmp_path, algo)
+    looks = read(tmp_path).looks
+    own = [looks[algo] for algo in LABELS]
+    for one in (lambda o: (o.color, str(o.dashes)), lambda o: o.marker):
+        assert len({one(look) for look in own}) == len(LABELS)
+    assert looks["mine"].label == "My own" and looks["trpo"].color == INK
+    assert looks["mine"].dashes == looks["trpo_lag"].dashes != looks["cpo"].dashes
 
 
 @pytest.mark.parametrize("kind", FIGURES)
 def test_legends_cover_no_data(kind, small):
-    for drawing in draw(kind, Data(select(read_results([small]).runs))):
+    for drawing in draw(kind, read(small)):
         if drawing.figure is None or not drawing.figure.legends:
             continue
         drawing.figure.draw_without_rendering()
         (legend,) = drawing.figure.legends
         box = legend.get_window_extent()
+        assert box.width <= drawing.figure.bbox.width
         for axis in drawing.figure.axes:
             assert not box.overlaps(axis.get_window_extent()), (kind, axis)
 
 
 @pytest.mark.parametrize("form", figures.FORMATS)
 def test_formats(small, tmp_path, form):
-    found = Data(select(read_results([small]).runs))
+    found = read(small)
     paths = [tmp_path / name / f"figure.{form}" for name in ("a", "b")]
     for path in paths:
         (drawing,) = draw("pareto", found)
@@ -248,7 +266,8 @@ def test_formats(small, tmp_path, form):
     content = paths[0].read_bytes()
     assert content == paths[1].read_bytes()  # the same figure is the same file
     if form == "png":
-        assert matplotlib.image.imread(paths[0]).std() > 0.01
+        image = matplotlib.image.imread(paths[0])
+        assert image.shape[2] == 4 and image[0, 0, 3] == 0  # transparent
     elif form == "svg":
         assert ET.fromstring(content).tag.endswith("svg")
     else:
@@ -260,11 +279,14 @@ def test_formats(small, tmp_path, form):
 
 def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys):
     out = tmp_path / "figures"
+    (small / "cpo" / f"{POINT}-v0_2" / "0.monitor.csv").write_text("#{}\nr,l,t,c\n")
     assert cli.main(["plot", str(small), "-o", str(out)]) == 0
-    assert [path.name for path in out.iterdir()] == ["curves_Goal_Point_8Hazards.png"]
-    printed = capsys.readouterr().out
-    for text in ("| return, first | last", "return J_r", "5.00 ± 0.00", "PPO"):
+    assert [path.name for path in out.iterdir()] == [f"curves_{POINT}.png"]
+    printed, err = capsys.readouterr()
+    for text in ("| return, first | last", "return J_r", "5.00\xa0±\xa00.00", "PPO", "above limit"):
         assert text in printed
+    assert "left out of the curves: can't use" in err and "v0_2/0.monitor.csv" in err
+    assert "| CPO       | 0     | 2 " in printed  # its result counts all the same
 
 
 def test_all_of_it(small, tmp_path, capsys):
@@ -274,56 +296,35 @@ def test_all_of_it(small, tmp_path, capsys):
     out, err = capsys.readouterr()
     assert all(f"wrote {path}" in out for path in paths)
     made = {path.stem for path in (tmp_path / "f").iterdir()}
-    assert made == {"curves_Goal_Point_8Hazards", "pareto_Goal_Point_8Hazards", "profiles", "iqm",
-                    "q1", "q2", "q3", "q4", "q6", "q8"}  # fmt: skip
-    assert "q7 is not drawn; missing: TRPO-USL, TRPO-SL on Goal_Point_8Hazards" in err
+    assert made == {f"curves_{POINT}", f"pareto_{POINT}", "profiles", "iqm", "q1", "q2", "q3", "q4",
+                    "q6", "q8"}  # fmt: skip
+    assert f"q7 is not drawn; missing: TRPO-USL, TRPO-SL on {POINT}" in err
+    # One asked for by name that can't be drawn is a failure.
+    assert plot.main([str(small), "--figure", "q7", "-o", str(tmp_path / "g")]) == 1
+    assert not (tmp_path / "g").exists()
 
 
-def test_a_figure_asked_for_by_name_that_can_not_be_is_a_failure(small, tmp_path, capsys):
-    assert plot.main([str(small), "--figure", "q7", "-o", str(tmp_path / "f")]) == 1
-    assert "q7 is not drawn" in capsys.readouterr().err
-    assert not (tmp_path / "f").exists()
-
-
-def test_table_of_runs_needs_no_choice_of_limit(small, tmp_path, capsys):
-    fake_run(small, "cpo", cost_limit=5.0, seed=2)
-    assert plot.main([str(small), "--table", str(tmp_path / "r.csv")]) == 0
-    assert len((tmp_path / "r.csv").read_text().splitlines()) == 8
-    assert plot.main([str(small), "--table", str(tmp_path / "r.md")]) == 2
-    assert "several cost limits, 0, 5" in capsys.readouterr().err
-    table = ["--table", str(tmp_path / "r.md")]
-    assert plot.main([str(small), *table, "--cost-limit", "5"]) == 0
-
-
-def test_table_of_runs_has_those_asked_for(small, tmp_path, capsys):
+def test_a_table_of_runs_has_those_asked_for(small, tmp_path, capsys):
     file = tmp_path / "r.csv"
     fake_run(small, "cpo", cost_limit=5.0, seed=2)
     fake_run(small, "cpo", "Push_Point_8Hazards-v0", epochs=3, number=9)
     fake_run(small, "cpo", "Push_Point_8Hazards-v0", number=8)
     for flags, rows in (
-        (["--env", "Goal_Point_8Hazards"], 7),
+        ([], 9),  # several limits and lengths
+        (["--env", POINT], 7),
         (["--cost-limit", "5"], 3),
         (["--steps", "300"], 8),
     ):
         assert plot.main([str(small), "--table", str(file), *flags]) == 0
         assert len(file.read_text().splitlines()) == 1 + rows, flags
     file.unlink()
-    capsys.readouterr()
     for flags in (["--env", "Goal_Pint_8Hazards"], ["--cost-limit", "77"], ["--steps", "1"]):
         assert plot.main([str(small), "--table", str(file), *flags]) == 2
         assert "there is no run" in capsys.readouterr().err
     assert not file.exists()
-
-
-def test_damaged_runs_are_named_and_the_others_shown(small, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sb3_guard.zoo.report.FIGURES", {})
-    broken = small / "cpo" / "Goal_Point_8Hazards-v0_2"
-    (broken / "result.json").write_text("{")
-    assert plot.main([str(small), "--report", str(tmp_path / "page.html")]) == 0
-    assert f"left out: {broken}: result.json can't be read" in capsys.readouterr().err
-    page = (tmp_path / "page.html").read_text()
-    assert f"{broken} is left out: result.json can&#x27;t be read" in page
-    assert "runs: 5, algorithms: 3, suites: 1, steps: 3,000" in page
+    means = [str(small), "--table", str(tmp_path / "r.md")]
+    assert plot.main(means) == 2 and "several cost limits, 0, 5" in capsys.readouterr().err
+    assert plot.main([*means, "--cost-limit", "5"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -331,11 +332,10 @@ def test_damaged_runs_are_named_and_the_others_shown(small, tmp_path, capsys, mo
     [
         (["absent"], "there is no folder 'absent'"),
         (["."], "there is no run below '.'"),
-        (["LOGS", "--figure", "q9"], "invalid choice: 'q9'"),
+        (["LOGS", "--figure", "q9"], "no figure 'q9'"),
         (["LOGS", "--format", "gif"], "invalid choice: 'gif'"),
         (["LOGS", "--table", "r.xls"], "unknown format '.xls'"),
         (["LOGS", "--report", "r.pdf"], "--report 'r.pdf' is not an .html file"),
-        (["LOGS", "--env", "Goal_Point_8Gosts"], "did you mean"),
         (["LOGS", "--figures", "q1"], "did you mean --figure?"),
         (["LOGS", "-o", "file/x"], "-o: can't write to folder 'file/x'"),
         (["LOGS", "--table", "file/r.md"], "--table: can't write to folder 'file'"),
@@ -373,20 +373,26 @@ def test_help_shows_examples_and_figures(capsys):
 
 def page_of(folder) -> str:
     found = read_results([folder])
-    return report(Data(select(found.runs)), "A <grid>", found.left_out, ["a & b"])
+    runs = select(with_safety(found.runs))
+    return report(Data(runs), "A <grid>", found.left_out, ["a & b"])
 
 
-def test_page_is_whole_and_by_itself(small):
+def test_page_is_complete_and_by_itself(small):
+    broken = small / "cpo" / f"{POINT}-v0_2"
+    (broken / "result.json").write_text("{")
     page = page_of(small)
     assert "A &lt;grid&gt;" in page and "a &amp; b" in page
+    assert f"{broken} is left out: result.json can&#39;t be read" in page
+    assert "runs: 5, algorithms: 3, suites: 1, steps: 3,000" in page
     # Names of XML namespaces are the only addresses; nothing is loaded.
     addresses = set(re.findall(r"https?://[^\"'\s<)]+", page))
     assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
     assert not re.search(r"<link|<iframe|<script src|@import|url\((?!#)", page)
     assert INK not in page  # dark pages have light ink
-    for name in ("TRPO", "CPO", "PPO", "f" * 10, "PROFILES"):
+    for name in ("TRPO", "CPO", "PPO", "f" * 10, "PROFILES", "feasible IQM return"):
         assert name in page
-    assert page.count("<table>") == 3 and page.count("<svg") > 8
+    assert page.count("<table") == 4 and page.count("<svg") > 8
+    assert f"<td>{small / 'trpo' / POINT}-v0_1</td>" in page  # nothing is abbreviated
 
 
 def test_page_holds_small_videos_and_names_large_ones(small, monkeypatch):
@@ -403,7 +409,7 @@ def test_page_holds_small_videos_and_names_large_ones(small, monkeypatch):
 
 
 def test_inline_figures_are_labelled(small):
-    (drawing,) = draw("pareto", Data(select(read_results([small]).runs)))
+    (drawing,) = draw("pareto", read(small))
     text = inline_svg(drawing.figure, "title")
     assert 'role="img" aria-label="title"' in text and ET.fromstring(text) is not None
 
@@ -435,9 +441,8 @@ def test_tables_sort_in_a_browser(small, tmp_path, monkeypatch):
          f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", file.as_uri()],
         capture_output=True, text=True, timeout=120, check=True,
     ).stdout  # fmt: skip
-    up, down, seeds, algos, low, high, state = re.search("<title>SORTED (.*?)</title>", shown)[
-        1
-    ].split(";")
+    parts = re.search("<title>SORTED (.*?)</title>", shown)[1].split(";")
+    up, down, seeds, algos, low, high, state = parts
     values = [float(one.replace("−", "-")) for one in up.split()]
     assert values == sorted(values) and values[0] == -60 and len(values) == 16
     assert [float(one.replace("−", "-")) for one in down.split()] == values[::-1]

@@ -17,7 +17,7 @@ import sb3_guard
 from sb3_guard import CPO, TRPO, CostMonitor, train
 from sb3_guard.zoo import progress
 from sb3_guard.zoo.progress import Epochs, commit, provenance
-from sb3_guard.zoo.results import read_results
+from sb3_guard.zoo.runs import read_results
 
 RUN = (
     "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:20 --device cpu "
@@ -36,7 +36,7 @@ def test_a_trained_run_says_what_it_was_made_with(tmp_path):
     assert row["torch"] == metadata.version("torch")
     assert row["sb3_guard"] == sb3_guard.__version__ and row["python"] == sys.version.split()[0]
     assert 0 < row["seconds"] < 100 and row["cost_limit"] == 4 and row["steps"] == 120
-    assert row["platform"] and row["epoch"] == 60
+    assert row["platform"] and row["epoch"] == 60 and row["label"] == "CPO"
 
 
 def test_seconds_go_on_in_a_resumed_run(tmp_path):

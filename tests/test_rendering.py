@@ -9,13 +9,14 @@ import pytest
 
 from sb3_guard import make_vec_env
 from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_ids, registry, rendering
+from sb3_guard.envs import scene as scene_module
 from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import EYE, Extras
 from sb3_guard.envs.robots import Point
 from sb3_guard.envs.tasks import Goal
 
-BLUE, GREEN, RED = (0.1, 0.3, 0.95), (0.1, 0.75, 0.2), (1.0, 0.1, 0.1)
+BLUE, GREEN, RED = (0.0, 0.4, 0.85), (0.0, 0.65, 0.45), (0.85, 0.1, 0.1)
 
 
 def amount(frame, colour):
@@ -83,18 +84,18 @@ def test_no_joint_hides_a_halo(robot, sensing, radius):
     engine.reset(np.zeros(1, dtype=np.int32))
     model, data = engine.model, engine.batch.get_data(0)
     scene = mujoco.MjvScene(model, maxgeom=1000)
-    painter = rendering.ScenePainter(scene, engine, data, 0)
+    painter = scene_module.ScenePainter(scene, engine, data, 0)
     origin = engine.robot.frames[0][0]
     lift = [0, 0, 0.25] if robot == "Swimmer" else [0, 0, 0]
     spheres = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
     for wider in (0.0, 0.06):
         scene.ngeom = 0
-        painter.halo(np.ones(len(origin) * 60), 10, BLUE)
+        painter.ring(np.ones(len(origin) * 60), 10, BLUE)
         beads = np.array([geom.pos for geom in scene.geoms[: scene.ngeom]])
         around = beads.reshape(len(origin), 60, 3) - (origin + lift)[:, None]
         np.testing.assert_allclose(np.linalg.norm(around, axis=2), radius + wider, atol=1e-6)
         gaps = np.linalg.norm(beads[:, None] - data.geom_xpos[spheres], axis=2)
-        assert (gaps > model.geom_size[spheres, 0] + rendering.BEAD).all()
+        assert (gaps > model.geom_size[spheres, 0] + scene_module.BEAD).all()
 
 
 @pytest.mark.parametrize("task", ["Goal", "Push", "Chase", "Defense", "Button"])
@@ -105,7 +106,7 @@ def test_halos_show_the_lidars_that_are_observed(task):
     if task == "Button":
         env.engine.task.wait[:] = 5  # none is lit
     obs = env.engine.observe()[0]
-    shown = [tuple(closeness) for closeness, _, _ in env.engine.halos(0)]
+    shown = [tuple(closeness) for closeness, _, _ in env.engine.lidar_readings(0)]
     layout = env.observation_layout
     expected = [obs[where] for name, where in layout.items() if name.endswith("_lidar")]
     np.testing.assert_allclose(sorted(shown), sorted(map(tuple, expected)), 1e-6)
@@ -130,7 +131,7 @@ def test_cameras_show_an_arena_of_any_size_and_place(camera):
     assert min(seen[:4]) > 5 and seen[4] == 0
 
 
-@pytest.mark.parametrize("env_id", env_ids()[:1])
+@pytest.mark.parametrize("env_id", env_ids("guard")[:1])
 def test_looking_changes_nothing(env_id):
     seen, blind = (gymnasium.make(env_id, render_mode=m) for m in ("rgb_array", None))
     a, b = seen.reset(seed=0)[0], blind.reset(seed=0)[0]
@@ -209,7 +210,7 @@ def put_the_goal_ahead(env, metres):
     return middle
 
 
-@pytest.mark.parametrize("robot", registry.ROBOTS)
+@pytest.mark.parametrize("robot", registry.guard(registry.ROBOTS))
 def test_the_robots_own_camera_looks_ahead(robot):
     env = GuardEnv(f"Goal_{robot}_0Hazards", flatten=False, observe={"camera": [8, 8]})
     env.engine.seed(0, np.random.default_rng(0))
@@ -257,7 +258,7 @@ def test_the_robots_own_camera_sees_neither_halo_nor_tint(monkeypatch):
     assert hazards.cost() > 0
     assert amount(paying, BLUE) > 20  # zones are seen
     hazards.weight = 0.0
-    monkeypatch.setattr(engine, "halos", lambda row: [])
+    monkeypatch.setattr(engine, "lidar_readings", lambda row: [])
     np.testing.assert_array_equal(renderer.frame(0), paying)
     renderer.close()
 
@@ -272,7 +273,7 @@ def test_a_robots_eye_is_on_one_of_its_bodies():
         Engine(Blind(), Goal(), extras=Extras(camera=(8, 8)))
 
 
-@pytest.mark.parametrize("backend", ["glfw", "foo", "osmesa"])
+@pytest.mark.parametrize("backend", ["glfw", "foo", pytest.param("osmesa", marks=pytest.mark.slow)])
 def test_a_forced_backend_that_does_not_work_is_one_line(backend, tmp_path):
     import os
     import subprocess
@@ -296,3 +297,53 @@ def test_a_forced_backend_that_does_not_work_is_one_line(backend, tmp_path):
         pytest.skip(f"{backend} works here")
     last = run.stderr.strip().splitlines()[-1]
     assert "MUJOCO_GL" in last and ("RenderingError" in last or "ImportError" in last), last
+
+
+@pytest.mark.parametrize("elevation", [50.0, 90.0])
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 4 / 3])
+def test_a_camera_frames_all_points_and_little_else(elevation, aspect):
+    points = np.random.default_rng(0).uniform((-3, -1, 0), (5, 2, 1), (50, 3))
+    at, distance = scene_module.frame_all(points, elevation, aspect, fovy=45.0)
+    tilt = np.radians(elevation)
+    ahead, up = np.array([[0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    offset = points - (at - distance * ahead)
+    reach = np.tan(np.radians(22.5)) * (offset @ ahead)
+    x, y = offset[:, 0] / (aspect * reach), offset @ up / reach
+    assert max(abs(x).max(), abs(y).max()) <= 1.0  # all in the picture
+    assert max(np.ptp(x), np.ptp(y)) > 1.8  # which they fill
+
+
+def test_bodies_throw_shadows_and_zones_do_not():
+    env = GuardEnv("Goal_Drone_8Hazards")
+    env.reset(seed=0)
+    engine = env.engine
+    data = engine.batch.get_data(0)
+    painted = mujoco.MjvScene(engine.model, maxgeom=1000)
+    look = mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL
+    mujoco.mjv_updateScene(engine.model, data, mujoco.MjvOption(), None, *look, painted)
+    bodies = painted.ngeom
+    scene_module.ScenePainter(painted, engine, data, 0).shadows()
+    shadows = list(painted.geoms[bodies : painted.ngeom])
+    assert len(shadows) == bodies - 1  # the floor throws none
+    height = data.body("robot/robot").xpos[2]
+    for body, shadow in zip(list(painted.geoms[1:bodies]), shadows, strict=True):
+        assert shadow.pos[2] < 0.01 < height
+        assert np.linalg.norm(shadow.pos[:2] - body.pos[:2]) < body.pos[2]
+
+
+def test_a_film_shows_what_happens_between_control_steps():
+    env = GuardEnv(
+        "Goal_Ant_1Hazards", render_mode="rgb_array", width=64, height=48, camera="track"
+    )
+    assert env.film_fps == 25 and env.metadata["render_fps"] == 5
+    env.reset(seed=0)
+    assert len(env.film()) == 1
+    for _ in range(2):
+        env.step(np.ones(8))
+    frames = env.film()
+    assert len(frames) == 5
+    np.testing.assert_array_equal(frames[-1], env.render())
+    assert len({frame.tobytes() for frame in frames}) == 5
+    env.reset(seed=1)
+    assert len(env.film()) == 1  # nothing lies between two episodes
+    env.close()

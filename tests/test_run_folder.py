@@ -1,6 +1,6 @@
 """Run folders: numbered, whole, and owned by one process."""
 
-import json
+import errno
 import os
 import socket
 import subprocess
@@ -13,22 +13,21 @@ from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.logger import ProgressCSV, RunLogger
-from sb3_guard.zoo.run_folder import RunFolder, folder_name, latest_run
+from sb3_guard.zoo.run_flags import RunFlags
+from sb3_guard.zoo.run_folder import RunFolder, RunInUse, folder_name, latest_run, lock, owner
 from sb3_guard.zoo.usage import UsageError
 
 
 def create(tmp_path, env_id="Goal_Point_8Hazards-v0", **kwargs) -> RunFolder:
-    args = {"algo": "cpo", "env": env_id, "env_kwargs": None}
-    return RunFolder.create(
-        str(tmp_path), "cpo", env_id, args, {"n_steps": 5, "normalize": True}, "train me", **kwargs
-    )
+    flags = RunFlags(log_folder=str(tmp_path), algo="cpo", env=env_id, **kwargs)
+    return RunFolder.create(flags, {"n_steps": 5, "normalize": True}, "train me")
 
 
 def test_numbers_go_up_and_belong_to_one_environment(tmp_path):
     names = [create(tmp_path).path.name for _ in range(3)]
     assert names == [f"Goal_Point_8Hazards-v0_{k}" for k in (1, 2, 3)]
     assert create(tmp_path, "Goal-v0").path.name == "Goal-v0_1"
-    assert create(tmp_path, unique=True).path.name.startswith("Goal_Point_8Hazards-v0_4_")
+    assert create(tmp_path, uuid=True).path.name.startswith("Goal_Point_8Hazards-v0_4_")
     assert latest_run(tmp_path / "cpo", "Goal_Point_8Hazards-v0") == 3
 
 
@@ -93,10 +92,10 @@ def test_log_folder_that_can_not_be(tmp_path):
 
 def test_one_owner_at_a_time(tmp_path):
     run = create(tmp_path)
-    with run.owned():
-        with pytest.raises(UsageError, match=f"in use by process {os.getpid()} on"), run.owned():
+    with lock(run.path):
+        with pytest.raises(UsageError, match=f"in use by process {os.getpid()} on"), lock(run.path):
             pass
-    with run.owned():
+    with lock(run.path):
         pass
 
 
@@ -104,25 +103,28 @@ def test_a_dead_owner_is_succeeded(tmp_path):
     run = create(tmp_path)
     script = (
         "import os, pathlib, signal\n"
-        "from sb3_guard.zoo.run_folder import RunFolder\n"
-        f"with RunFolder(pathlib.Path({str(run.path)!r})).owned():\n"
+        "from sb3_guard.zoo.run_folder import lock\n"
+        f"with lock(pathlib.Path({str(run.path)!r})):\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == -9
-    assert json.loads((run.path / ".lock").read_text())["pid"] != os.getpid()
-    with run.owned():
-        assert json.loads((run.path / ".lock").read_text())["pid"] == os.getpid()
+    assert owner(run.path)["pid"] != str(os.getpid())
+    with lock(run.path):
+        assert owner(run.path)["pid"] == str(os.getpid())
+    assert owner(run.path) == {}
 
 
-def test_an_owner_elsewhere_may_be_alive(tmp_path):
+def test_an_owner_elsewhere_may_be_alive(tmp_path, monkeypatch, capsys):
+    """Of another host nothing is known but that its process refreshes the lock, or does not."""
     run = create(tmp_path)
-    (run.path / ".lock").write_text(json.dumps({"host": "elsewhere", "pid": 1}))
-    with pytest.raises(UsageError, match="process 1 on elsewhere; if that is gone, remove"):
-        with run.owned():
+    with lock(run.path):
+        held = (run.path / ".lock").read_text()
+    (run.path / ".lock").write_text(held.replace(f"host={socket.gethostname()}", "host=elsewhere"))
+    monkeypatch.setattr("sb3_guard.zoo.run_folder.WAIT", 0.1)
+    with pytest.raises(RunInUse, match="on elsewhere; if that is gone, remove"):
+        with lock(run.path):
             pass
-    (run.path / ".lock").write_text(json.dumps({"host": socket.gethostname(), "pid": 1}))
-    with run.owned():
-        pass
+    assert "waiting for a sign of life" in capsys.readouterr().out
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path):
@@ -180,3 +182,59 @@ def test_progress_of_no_rows_begins_anew(tmp_path):
     again.close()
     assert rows(tmp_path) == ["b", "2"]
     assert ProgressCSV(tmp_path / "progress.csv", rows=1).keys == ["b"]
+
+
+def test_a_sleeper_whose_run_was_taken_over_ends(tmp_path):
+    script = (
+        "import pathlib, time\n"
+        "from sb3_guard.zoo import run_folder\n"
+        "run_folder.SILENCE = 0.6\n"
+        f"folder = pathlib.Path({str(tmp_path)!r})\n"
+        "with run_folder.lock(folder):\n"
+        '    (folder / ".lock").unlink()\n'
+        "    time.sleep(30)\n"
+        "    print('alive')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "was taken over while this process gave no sign of life" in done.stderr
+
+
+def saved_progress(tmp_path) -> dict:
+    """What a run of three rows knows of its log."""
+    logger = RunLogger(tmp_path)
+    for k in range(3):
+        logger.record("a", k)
+        logger.dump(k)
+    logger.close()
+    return logger.state(iterations=3)
+
+
+@pytest.mark.parametrize("moment", ["resumed", "new column"])
+def test_a_kill_or_a_full_disk_loses_no_row(moment, tmp_path, monkeypatch):
+    state = saved_progress(tmp_path)
+    before = rows(tmp_path)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    if moment == "resumed":
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(OSError):
+            RunLogger(tmp_path, state=state)
+    else:
+        again = RunLogger(tmp_path, state=state)
+        monkeypatch.setattr(os, "fsync", full)
+        again.record("b", 1)
+        with pytest.raises(OSError):
+            again.dump()
+    assert rows(tmp_path) == before
+
+
+@pytest.mark.parametrize("content", [None, "", "a\n0\n1\n", "a,b\n0\n1\n2\n", "a\n0\n\0\n\xff"])
+def test_damaged_progress_is_said(content, tmp_path):
+    state = saved_progress(tmp_path)
+    path = tmp_path / "progress.csv"
+    path.unlink() if content is None else path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(ValueError, match=r"progress\.csv had 3 rows when the run was saved"):
+        RunLogger(tmp_path, state=state)

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from suites import IDS, SIZES
 
-from sb3_guard.envs import GuardVectorEnv, Scenario, env_ids, registry
+import sb3_guard
+from sb3_guard import list as listing
+from sb3_guard import show
+from sb3_guard.envs import GuardVectorEnv, Scenario, env_ids, registry, suites
+from sb3_guard.envs.suites.guard import parse
 
 
 def test_there_are_72_suites_from_one_product():
-    ids = env_ids()
+    ids = env_ids("guard")
     assert len(ids) == len(set(ids)) == 72
     assert "Goal_Arm6_8Hazards-v0" in ids and "Defense_Drone_8Ghosts-v0" in ids
     assert all(env_id in gymnasium.registry for env_id in ids)
@@ -19,11 +23,59 @@ def test_there_are_72_suites_from_one_product():
 
 
 def test_there_are_eleven_robots_and_the_parts_of_the_paper():
-    assert set(registry.ROBOTS) == set(SIZES)
-    assert list(registry.TASKS) == ["Goal", "Push", "Chase", "Defense", "Button"]
-    kinds = {c: registry.CONSTRAINTS[c].spaces for c in registry.CONSTRAINTS}
+    assert set(registry.guard(registry.ROBOTS)) == set(SIZES)
+    assert list(registry.guard(registry.TASKS)) == ["Goal", "Push", "Chase", "Defense", "Button"]
+    kinds = {name: c.spaces for name, c in registry.guard(registry.CONSTRAINTS).items()}
     # hazards and ghosts exist in both spaces: eight constraints in all
     assert sum(map(len, kinds.values())) == 8
+
+
+@pytest.fixture
+def mazes(monkeypatch):
+    """A family of two ids, in which a third name is explained."""
+
+    def explain(name):
+        if not name.startswith("Maze"):
+            return None
+        raise ValueError(f"{name!r} is not here: use 'MazeSmall-v1'")
+
+    table = {
+        f"MazeSmall-v{i}": {"constraints": {"hazards": {"num": 2 + i}}, "layout": {"margin": 0.1}}
+        for i in range(2)
+    }
+    suite = suites.Suite("Mazes", table, {"MazeSmall-v1": 5}, explain)
+    monkeypatch.setitem(suites.SUITES, "mazes", suite)
+    yield suite
+    for env_id in table:
+        gymnasium.registry.pop(env_id, None)
+
+
+def test_a_family_of_its_own_is_known_everywhere(mazes, capsys, tmp_path):
+    assert env_ids("mazes") == ["MazeSmall-v0", "MazeSmall-v1"] == env_ids()[-2:]
+    scenario = Scenario.parse("MazeSmall")  # the latest version
+    assert scenario.constraints == {"hazards": {"num": 3}}
+    for name in ("MazeSmall-v1", sb3_guard.envs.register("MazeSmall-v1")):
+        for env in (sb3_guard.make(name, hazards={"size": 0.2}), gymnasium.make("MazeSmall-v1")):
+            env.reset(seed=0)
+            cut = [env.step(env.action_space.sample())[3] for _ in range(5)]
+            assert cut == [False] * 4 + [True]
+    vec = sb3_guard.make_vec_env("MazeSmall-v1", 2, env_kwargs={"hazards": {"num": 4}})
+    assert vec.get_attr("scenario")[0].constraints["hazards"]["num"] == 4
+    assert GuardVectorEnv(2, "MazeSmall-v1").max_episode_steps == 5
+    assert GuardVectorEnv(2, "MazeSmall-v0").max_episode_steps == 1000
+    assert listing.main(["suites"]) == 0 and "MazeSmall-v1" in capsys.readouterr().out
+    assert show.main(["MazeSmall-v0", "-o", str(tmp_path / "maze.png")]) == 0
+    with pytest.raises(ValueError, match="'MazeLarge' is not here"):
+        Scenario.parse("MazeLarge")
+    with pytest.raises(ValueError, match="unknown suite 'maze': did you mean 'mazes'"):
+        env_ids("maze")
+    with pytest.raises(ValueError, match="did you mean 'MazeSmall-v0'"):
+        Scenario.parse("aMazeSmal")
+
+
+def test_names_of_the_paper_are_told_what_they_are_called():
+    with pytest.raises(ValueError, match=r"8Hazards with hazards=\{'space': 'spatial'\}"):
+        parse("Goal_Drone_8Hazard3Ds")
 
 
 @pytest.mark.parametrize("env_id", IDS)

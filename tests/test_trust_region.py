@@ -24,14 +24,14 @@ from torch import nn
 from sb3_guard.algorithms import CPO, TRPO, TrustRegion
 from sb3_guard.algorithms.common.actor import (
     Actor,
-    TanhActor,
     actor_parameters,
     kl,
-    tanh_actor,
     value_parameters,
 )
+from sb3_guard.algorithms.common.batches import CHUNK, chunks
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
-from sb3_guard.algorithms.common.mlp import CHUNK, TanhMlp, chunks
+from sb3_guard.algorithms.common.fast.actor import TanhActor, actor_of, tanh_actor
+from sb3_guard.algorithms.common.fast.mlp import TanhMlp
 from sb3_guard.algorithms.common.natural_gradient import assign, flatten
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
@@ -123,7 +123,7 @@ def test_both_actors_agree(head: str, n: int) -> None:
 def test_score_is_the_gradient_of_the_mean_ratio(head: str) -> None:
     policy = make_policy(HEADS[head])
     observations, actions = make_batch(policy, 40)
-    actor = Actor.of(policy, observations, actions)
+    actor = actor_of(policy, observations, actions)
     advantages = th.randn(40)
     log_prob = policy.get_distribution(observations).log_prob(actions)
     objective = (th.exp(log_prob - log_prob.detach()) * advantages).mean()
@@ -135,7 +135,7 @@ def test_kl_is_summed_over_action_dimensions() -> None:
     """Three dimensions shifted by one standard deviation each: ½ + ½ + ½, not their mean."""
     policy = make_policy(HEADS["gaussian"])
     observations, actions = make_batch(policy, 8)
-    actor = Actor.of(policy, observations, actions)
+    actor = actor_of(policy, observations, actions)
     with th.no_grad():
         policy.action_net.bias.add_(policy.log_std.exp())
     assert actor.evaluate()[1] == pytest.approx(1.5, rel=1e-5)
@@ -145,7 +145,7 @@ def test_kl_is_summed_over_action_dimensions() -> None:
 def test_kl_is_of_the_old_to_the_new_policy(head: str) -> None:
     policy = make_policy(HEADS[head])
     observations, actions = make_batch(policy, 30)
-    actor = Actor.of(policy, observations, actions)
+    actor = actor_of(policy, observations, actions)
     assert actor.evaluate()[1] == pytest.approx(0.0, abs=1e-6)
     old = copy.deepcopy(policy).get_distribution(observations)
     assign(actor.parameters, flatten(actor.parameters) + 0.1)

@@ -21,15 +21,19 @@ def test_a_wheel_installed_elsewhere_trains_and_plays(tmp_path):
     assert sum(name.endswith("-v0.zip") for name in agents) == 4
     env = {**os.environ, "PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"}
 
-    def run(*arguments):
-        return subprocess.run(
-            [sys.executable, *arguments], cwd=tmp_path, env=env, check=True, capture_output=True,
-            text=True,
-        ).stdout  # fmt: skip
-
-    where = run("-c", "import sb3_guard; print(sb3_guard.__file__)")
-    assert Path(where.strip()).is_relative_to(site)
-    short = "n_envs:2 n_steps:50 n_critic_updates:2".split()
-    which = ["--algo", "cpo", "--env", "Goal_Ant_8Hazards", "-f", "logs"]
-    run("-m", "sb3_guard.train", *which, "-n", "200", "--eval-freq", "-1", "-params", *short)
-    assert "return" in run("-m", "sb3_guard.enjoy", *which, "--n-episodes", "1", "--no-render")
+    which = "--algo cpo --env Goal_Ant_8Hazards -f logs".split()
+    training = "-n 100 --eval-freq -1 -params n_envs:2 n_steps:50 n_critic_updates:2".split()
+    code = f"""
+import sb3_guard
+from sb3_guard import enjoy, train
+print(sb3_guard.__file__)
+assert train.main({[*which, *training]}) == 0
+assert enjoy.main({[*which, "--n-episodes", "1", "--no-render"]}) == 0
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    where, played = done.stdout.split("\nPlaying ")
+    assert Path(where.split("\n")[0]).is_relative_to(site)
+    assert "return" in played

@@ -1,5 +1,7 @@
 """Hyper-parameters: which entry is read, what is refused, what becomes of the values."""
 
+from typing import Any
+
 import gymnasium as gym
 import pytest
 import torch
@@ -9,8 +11,9 @@ from sb3_guard.algorithms import ALGORITHMS, CPO
 from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.envs import env_ids
 from sb3_guard.zoo.algos import baselines
-from sb3_guard.zoo.config import (
+from sb3_guard.zoo.hyperparams import (
     PAPER,
+    PRESETS,
     _parse_yaml,
     arguments,
     build,
@@ -19,7 +22,8 @@ from sb3_guard.zoo.config import (
     read_file,
     read_hyperparams,
 )
-from sb3_guard.zoo.usage import UsageError, parse_value
+from sb3_guard.zoo.usage import UsageError
+from sb3_guard.zoo.values import parse_value
 
 FILE = """
 default: &default
@@ -200,7 +204,7 @@ def test_objects_are_made():
     assert setup.normalize == {"gamma": 0.9}
     assert isinstance(setup.env_wrapper(gym.make("CartPole-v1")), gym.wrappers.FlattenObservation)
     assert setup.env_kwargs == {"a": 1}
-    assert (setup.n_envs, setup.n_timesteps, setup.callbacks) == (1, 100, [])
+    assert (setup.n_envs, setup.n_timesteps, setup.callbacks()) == (1, 100, [])
     assert "env_kwargs" not in setup.model and "n_envs" not in setup.model
 
 
@@ -231,7 +235,7 @@ def test_expressions_are_data_and_classes_of_torch(text, value):
         ("normalize", "{'a': exit()}", r"exit\(\) is not allowed"),
         ("learning_rate", "lin_fast", "not a schedule"),
         ("policy", "no.such.Policy", "there is no class 'no.such.Policy'"),
-        ("env_wrapper", "no.such.Wrapper", "wrapper or callback can't be made"),
+        ("env_wrapper", "no.such.Wrapper", "there is no class 'no.such.Wrapper'"),
     ],
 )
 def test_text_that_names_nothing(name, value, message):
@@ -277,8 +281,26 @@ TABLE = {
     "t": [..., ..., ..., ..., 0.01, ..., ..., ...],
     "cost_reduction": [..., ..., ..., ..., ..., ..., 0.0, ...],
 }
-# Where the default is another one.
-DIFFERENT = {"pcpo": {"line_search": (False, True)}}
+# Where the default is another one: (the paper's, ours).
+LIMIT = {"cost_limit": (0.0, 2.0)}
+DIFFERENT = {
+    "trpo": {},
+    "cpo": {**LIMIT, "margin_lr": (0.0, None)},
+    "pcpo": {**LIMIT, "margin_lr": (0.0, None), "line_search": (False, True)},
+    "trpo_lag": {**LIMIT, "lambda_update": ("after", None)},
+    "trpo_fac": {
+        **LIMIT,
+        "lambda_lr": (0.0001, None),
+        "lambda_epochs": (1, None),
+        "units": ("cost", None),
+    },
+    "trpo_ipo": {
+        **LIMIT,
+        "t": (0.01, None),
+        "max_multiplier": (0.5, None),
+        "units": ("cost", None),
+    },
+}
 
 
 @pytest.mark.parametrize("algo", COLUMNS)
@@ -294,22 +316,22 @@ def test_the_papers_preset_is_its_table(algo):
             assert values[row] == cell, row
     epochs, batch, longest = 200, 30_000, 1_000
     assert values["n_envs"] * values["n_steps"] == batch and values["n_steps"] == longest
-    for env_id in env_ids():
+    for env_id in env_ids("guard"):
         ratio = 5 if env_id.split("_")[1] in ("Ant", "Walker") else 1
         steps = ratio * epochs * batch
         assert read_hyperparams(algo, env_id, PAPER) == {**values, "n_timesteps": steps}
 
 
-@pytest.mark.parametrize("algo", sorted(ALGORITHMS))
+@pytest.mark.parametrize("algo", COLUMNS)
 def test_the_default_is_the_papers_but_where_it_says_so(algo):
     env_id = "Goal_Ant_8Hazards-v0"
     default, paper = (read_hyperparams(algo, env_id, conf) for conf in (None, PAPER))
     names = {*default, *paper}
-    different = {n: (paper.get(n), default.get(n)) for n in names if paper[n] != default[n]}
-    assert different == DIFFERENT.get(algo, {})
+    both = {n: (paper.get(n), default.get(n)) for n in names}
+    assert {n: pair for n, pair in both.items() if pair[0] != pair[1]} == DIFFERENT.get(algo, LIMIT)
 
 
-@pytest.mark.parametrize("algo", sorted(ALGORITHMS))
+@pytest.mark.parametrize("algo", COLUMNS)
 def test_the_models_are_the_papers(algo):
     values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0", PAPER))
     model = ALGORITHMS[algo](env=make_vec_env("Goal_Point_8Hazards", 1), **build(values).model)
@@ -327,6 +349,54 @@ def test_the_paper_has_no_other_algorithm():
         read_hyperparams("ppo", "Goal_Point_8Hazards-v0", PAPER)
 
 
+# The settings behind OmniSafe's published results (docs/omnisafe.md), for those that both have.
+LAGRANGIAN = {"lambda_init": 0.001, "lambda_lr": 0.035, "lambda_optimizer": "adam"}
+PPO_LIKE = {
+    "learning_rate": 3e-4, "n_epochs": 40, "batch_size": 64, "target_kl": 0.02, "kl_stop": "epoch",
+    "max_grad_norm": 40.0,
+}  # fmt: skip
+OMNISAFE: dict[str, dict[str, Any]] = {
+    "ppo_lag": {**PPO_LIKE, **LAGRANGIAN, "clip_range": 0.2},
+    "cppo_pid": {
+        **PPO_LIKE, "proportional_gain": 0.1, "lambda_lr": 0.01, "derivative_gain": 0.01,
+        "lambda_delay": 10, "lambda_smoothing": 0.95,
+    },
+    "focops": {
+        **PPO_LIKE, **LAGRANGIAN, "temperature": 1.5, "trust_region": 0.02, "lambda_max": 2.0,
+    },
+    "cup": {**PPO_LIKE, **LAGRANGIAN, "target_kl": 0.01, "lambda_max": 2.0},
+    "p3o": {**PPO_LIKE, "penalty": 20.0},
+    "cpo": {"target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
+    "pcpo": {"target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
+    "trpo_lag": {**LAGRANGIAN, "target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
+    "rcpo": {**LAGRANGIAN, "target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
+    "crpo": {"target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("algo", list(OMNISAFE))
+def test_the_omnisafe_preset_is_the_published_table(algo):
+    env_id = "Goal_Point_8Hazards-v0"
+    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, env_id, "omnisafe"))
+    assert (values["gamma"], values["gae_lambda"], values["cost_limit"]) == (0.99, 0.95, 25.0)
+    assert values["n_envs"] * values["n_steps"] == 20_000 and values["n_timesteps"] == 10_000_000
+    assert values["normalize"]["norm_obs"]
+    model = ALGORITHMS[algo](env=make_vec_env("Goal_Point_8Hazards", 1), **build(values).model)
+    for name, value in OMNISAFE[algo].items():
+        if name == "learning_rate":
+            assert [model.lr_schedule(left) for left in (1.0, 0.5, 0.0)] == [value, value / 2, 0.0]
+        elif name == "clip_range":
+            assert model.clip_range(1.0) == value
+        else:
+            assert getattr(model, name) == value, name
+    if "lambda_lr" in OMNISAFE[algo]:
+        assert model.lambda_units == "cost" and model.lambda_update == "before"
+    page = (hyperparams_folder().parent / "docs" / "omnisafe.md").read_text()
+    row = next(line for line in page.splitlines() if line.startswith(f"| `{algo}` |"))
+    for name, value in OMNISAFE[algo].items():
+        assert f"`{name}` {value}" in row, name
+
+
 def test_files_are_parsed_once_and_read_anew(tmp_path):
     path = tmp_path / "cpo.yml"
     path.write_text(FILE)
@@ -340,8 +410,8 @@ def test_files_are_parsed_once_and_read_anew(tmp_path):
 
 
 def test_every_algorithm_has_a_file_and_every_file_an_algorithm():
-    files = {path.stem for path in hyperparams_folder().glob("*.yml")} - {PAPER}
+    files = {path.stem for path in hyperparams_folder().glob("*.yml")} - {*PRESETS}
     assert set(ALGORITHMS) <= files <= {*ALGORITHMS, *baselines()}
-    assert read_file(hyperparams_folder() / f"{PAPER}.yml").keys() == ALGORITHMS.keys()
+    assert read_file(hyperparams_folder() / f"{PAPER}.yml").keys() == {*COLUMNS}
     for file in files:
         assert "default" in read_file(hyperparams_folder() / f"{file}.yml")

@@ -6,8 +6,7 @@ import pytest
 from mujoco.batch import Batch, SimulationError
 
 from sb3_guard.envs import Scenario
-from sb3_guard.envs.batch import SENSOR, ControlBatch
-from sb3_guard.envs.engine import FRAME_SKIP, STAGE
+from sb3_guard.envs.physics import ACC, FRAME_SKIP, SENSOR, Physics
 from sb3_guard.envs.vector_env import GuardVectorEnv
 
 N = 3
@@ -31,8 +30,8 @@ def check_alike(ours, theirs, steps=40):
     fields = [(name, ours.bind(name), theirs.bind(name)) for name in FIELDS]
     for _ in range(steps):
         ours.ctrl = theirs.ctrl = rng.uniform(low, high, (N, model.nu))
-        assert not ours.advance(FRAME_SKIP, STAGE).any()
-        theirs.step(nstep=FRAME_SKIP, stage=STAGE)
+        assert not ours.advance().any()
+        theirs.step(nstep=FRAME_SKIP, stage=ACC)
         np.testing.assert_array_equal(ours.state, theirs.state)
         for name, mine, other in fields:
             np.testing.assert_array_equal(mine, other, err_msg=name)
@@ -51,15 +50,15 @@ def test_sensors_once_in_a_control_step_change_no_bit(suite):
 
 def test_physics_steps_evaluate_no_sensors(monkeypatch):
     ours, _ = pair("Goal_Ant_8Hazards")
-    ours.advance(FRAME_SKIP, STAGE)
+    ours.advance()
     before, seen = ours.sensordata.copy(), []
 
     def step(self, *args, **kwargs):
         Batch.step(self, *args, **kwargs)
         seen.append(self.sensordata.copy())
 
-    monkeypatch.setattr(ControlBatch, "step", step)
-    ours.advance(FRAME_SKIP, STAGE)
+    monkeypatch.setattr(Physics, "step", step)
+    ours.advance()
     np.testing.assert_array_equal(seen, [before])  # MuJoCo has not written any
     assert (ours.sensordata != before).any()
     assert not ours._switched.opt.disableflags & SENSOR
@@ -68,8 +67,8 @@ def test_physics_steps_evaluate_no_sensors(monkeypatch):
 @pytest.mark.parametrize("randomize", ["field", "named view", "constants", "models"])
 def test_users_may_randomize_the_physics(randomize):
     ours, theirs = pair("Goal_Ant_8Hazards")
-    ours.advance(FRAME_SKIP, STAGE)
-    theirs.step(nstep=FRAME_SKIP, stage=STAGE)
+    ours.advance()
+    theirs.step(nstep=FRAME_SKIP, stage=ACC)
     for batch in (ours, theirs):
         if randomize == "field":
             batch.expand("opt.gravity")[:, 2] = [-9.81, -5.0, -2.0]
@@ -99,13 +98,13 @@ def test_sensors_with_a_history_see_every_physics_step():
         """
     )
     assert model.nhistory
-    ours, theirs = ControlBatch(model, N, 1), Batch(model, nsim=N, nthread=1, persistent=True)
+    ours, theirs = Physics(model, N, 1), Batch(model, nsim=N, nthread=1, persistent=True)
     ours.ctrl = theirs.ctrl = [[1.0], [2.0], [3.0]]
     ours.bind("sensordata")
     theirs.bind("sensordata")
     for _ in range(5):
-        ours.advance(FRAME_SKIP, STAGE)
-        theirs.step(nstep=FRAME_SKIP, stage=STAGE)
+        ours.advance()
+        theirs.step(nstep=FRAME_SKIP, stage=ACC)
         np.testing.assert_array_equal(ours.sensordata, theirs.sensordata)
     assert (ours.sensordata != 0).all()
 
@@ -123,13 +122,13 @@ def test_sensors_of_bodies_that_fall_asleep_are_up_to_date():
         </mujoco>
         """
     )
-    ours, theirs = ControlBatch(model, N, 1), Batch(model, nsim=N, nthread=1, persistent=True)
+    ours, theirs = Physics(model, N, 1), Batch(model, nsim=N, nthread=1, persistent=True)
     for batch in (ours, theirs):
         batch.bind("sensordata")
         batch.forward()
     for _ in range(100):
-        ours.advance(FRAME_SKIP, STAGE)
-        theirs.step(nstep=FRAME_SKIP, stage=STAGE)
+        ours.advance()
+        theirs.step(nstep=FRAME_SKIP, stage=ACC)
         np.testing.assert_array_equal(ours.sensordata, theirs.sensordata)
     assert 0.09 < ours.sensordata[0, 2] < 0.11
 
@@ -154,7 +153,7 @@ def test_simulations_that_mujoco_gives_up_are_told(monkeypatch, nsim, verb):
         raise SimulationError(np.array([nsim - 1]), "out of memory")
 
     monkeypatch.setattr(Batch, verb, fail)
-    failed = engine.batch.advance(FRAME_SKIP, STAGE)
+    failed = engine.batch.advance()
     assert failed.tolist() == [False] * (nsim - 1) + [True]
     assert nsim == 1 or not engine.batch._switched.opt.disableflags & SENSOR
 
@@ -168,6 +167,6 @@ def test_an_interrupt_leaves_the_sensors_on(monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Batch, "step", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            ours.advance(FRAME_SKIP, STAGE)
+            ours.advance()
     assert not ours._switched.opt.disableflags & SENSOR
     check_alike(ours, theirs)

@@ -1,0 +1,36 @@
+"""An algorithm of your own, which the commands then train, tune and plot.
+
+python -m sb3_guard.train --gym-packages custom_algorithm --algo trpo_price \
+    -conf custom_algorithm.py --env Goal_Point_8Hazards -n 1e6
+"""
+
+import torch as th
+
+from sb3_guard import make_vec_env, register_algorithm
+from sb3_guard.algorithms import TrustRegion
+
+
+class TRPOPrice(TrustRegion):
+    """Cost at a fixed price p: maximise E[ratio · (A - p Σ A_Ci)] within the trust region.
+
+    :param price: p, what a unit of cost is worth in standard deviations of the advantage
+    """
+
+    label, family = "TRPO at a price", "Lagrangian"
+
+    def __init__(self, *args, price=1.0, **kwargs):
+        self.price = price
+        super().__init__(*args, **kwargs)
+
+    def surrogate(self, batch, ratio):
+        costs = batch.cost_advantages.sum(dim=1)
+        return th.mean(ratio * (batch.advantages - self.price * costs))
+
+
+register_algorithm("trpo_price", TRPOPrice)
+hyperparams = {"default": {"n_envs": 10, "n_steps": 1000, "cost_limit": 5.0, "price": 10.0}}
+
+if __name__ == "__main__":
+    env = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=0)
+    model = TRPOPrice("MlpPolicy", env, n_steps=1000, price=10.0, seed=0).learn(100_000)
+    print("cost of an episode:", model.costs.episode_cost)

@@ -1,0 +1,174 @@
+"""Kill a tuner's workers, and its database, again and again: is every trial done exactly once?
+
+``python scripts/kill_tuner.py --trials 40`` starts three workers on one study in a journal file and
+kills one of them with SIGKILL every second or so; each is replaced by a new one.
+``--storage postgresql`` has the study in a PostgreSQL server of its own, which is stopped, or
+crashed, and started again in between. The trainings are stand-ins of a quarter of a second
+(``tests/instant_training.py``). At the end the study must have as many finished trials as were
+asked for, none of them twice and none missing.
+"""
+
+import argparse
+import multiprocessing
+import random
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+
+import optuna
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
+from postgres import Server, running
+from processes import fresh, wait_for
+
+from sb3_guard import tune
+
+STUDY = "kills"
+DONE = (TrialState.COMPLETE, TrialState.PRUNED)
+FLAGS = (
+    "--algo trpo_lag --gym-packages instant_training --env Still-v0 -params n_envs:1 n_steps:10 "
+    f"-n 40 --eval-episodes 1 --device cpu --num-threads 1 --study-name {STUDY} --heartbeat 1"
+).split()
+
+
+def work(arguments: list[str]) -> int:
+    """Run the command, in a process of its own."""
+    return tune.main(arguments)
+
+
+def load(storage: str) -> optuna.Study:
+    """The study, read as anybody can."""
+    if "://" in storage:
+        return optuna.load_study(
+            study_name=STUDY, storage=storage.replace("postgresql:", "postgresql+psycopg:")
+        )
+    return optuna.load_study(study_name=STUDY, storage=JournalStorage(JournalFileBackend(storage)))
+
+
+def _one_ended(workers: Mapping[Path, BaseProcess]) -> bool:
+    return not all(one.is_alive() for one in workers.values())
+
+
+def _at_work(workers: Mapping[Path, BaseProcess]) -> list[Path]:
+    """Outputs of the workers that have printed their header."""
+    return [one for one in workers if one.read_text().count("\n") >= 5]
+
+
+def campaign(
+    storage: str,
+    folder: Path,
+    n_trials: int,
+    n_workers: int,
+    kills: int,
+    server: Server | None = None,
+    say: Callable[[str], object] = lambda text: None,
+) -> optuna.Study:
+    """
+    Run a study whose workers are killed.
+
+    :param storage: for ``tune --storage``
+    :param folder: where reports and the workers' output go
+    :param n_trials: trials of the study
+    :param n_workers: how many work at a time
+    :param kills: after so many, the workers are left alone
+    :param server: of the database; it is stopped, or crashed, after every fourth kill
+    :param say: told what happens
+    :return: the study at its end
+    :raises AssertionError: a worker that was left alone failed or did not end
+    """
+    number = 0
+    workers: dict[Path, BaseProcess] = {}
+
+    def start() -> None:
+        nonlocal number
+        number += 1
+        output = folder / f"worker-{number}.txt"
+        arguments = [*FLAGS, "-f", str(folder), "--storage", storage, "--n-trials", str(n_trials)]
+        workers[output] = fresh(work, arguments, output)
+
+    for _ in range(n_workers):
+        start()
+    for kill in range(kills):
+        wait_for(lambda: bool(_at_work(workers)) or _one_ended(workers), 120.0)
+        time.sleep(random.uniform(0.0, 0.4))
+        if _one_ended(workers):
+            break  # the study is at its end
+        output = random.choice(_at_work(workers))
+        workers.pop(output).kill()
+        start()
+        if server is not None and kill % 4 == 3:
+            mode = random.choice(["fast", "immediate"])
+            server.stop(mode)
+            time.sleep(random.uniform(0.0, 3.0))
+            server.start()
+            say(f"the database was stopped ({mode}) and started again")
+        say(f"{kill + 1} workers killed")
+    for output, one in workers.items():
+        one.join(300.0)
+        assert one.exitcode == 0, f"{output}: {one.exitcode}\n{output.read_text()}"
+        assert "Traceback" not in output.read_text(), output.read_text()
+    return load(storage)
+
+
+def faults(study: optuna.Study, n_trials: int) -> list[str]:
+    """
+    What is wrong with a study at its end.
+
+    A trial and the repetition of it have the same hyper-parameters, and no others have.
+    """
+    trials = study.get_trials(deepcopy=False)
+    done = [one for one in trials if one.state in DONE]
+    found = []
+    if len(done) != n_trials:
+        found.append(f"{len(done)} trials are finished, not {n_trials}")
+    found += [
+        f"trial {one.number} is {one.state.name.lower()} for ever"
+        for one in trials
+        if one.state in (TrialState.RUNNING, TrialState.WAITING)
+    ]
+    for i, one in enumerate(done):
+        if any(one.params == other.params for other in done[:i]):
+            found.append(f"trial {one.number} was done before")
+    failed = [one for one in trials if one.state == TrialState.FAIL]
+    for one in failed:
+        same = [t for t in trials if one.params.items() <= t.params.items()]
+        # Whatever takes down four workers is given up.
+        if not any(t.state in DONE for t in same) and len(same) < 4:
+            found.append(f"trial {one.number} was lost")
+    return found
+
+
+def main() -> int:
+    """Run a campaign and say what it came to."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--storage", choices=["journal", "postgresql"], default="journal")
+    parser.add_argument("--trials", type=int, default=40)
+    parser.add_argument("--workers", type=int, default=3)
+    parser.add_argument("--kills", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0, help="of the moments of the kills")
+    args = parser.parse_args()
+    random.seed(args.seed)
+    numbers = (args.trials, args.workers, args.kills)
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder = Path(name)
+        server, storage = None, str(folder / "study.journal")
+        if args.storage == "postgresql":
+            server = stack.enter_context(running())
+            storage = server.url
+        study = campaign(storage, folder, *numbers, server=server, say=print)
+        found = faults(study, args.trials)
+        again = sum(one.state == TrialState.FAIL for one in study.get_trials(deepcopy=False))
+    print(f"{args.trials} trials; workers were killed in {again}: {found or 'none is lost'}")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    multiprocessing.set_forkserver_preload(["sb3_guard.zoo.tuning"])
+    sys.exit(main())

@@ -1,0 +1,118 @@
+"""Traces of Safety-Gymnasium 1.0.0, and our simulations in the states that they hold.
+
+``scripts/record_safety_gymnasium.py`` says what is recorded.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs import Scenario
+
+FOLDER = Path(__file__).parent / "data" / "safety_gymnasium"
+GEOM = mujoco.mjtGeom
+# Pairs whose contacts MuJoCo 4 computes otherwise than 2.3.3: forces between them, and what
+# accelerometers and touch sensors tell of these, differ.
+ROUND = (GEOM.mjGEOM_PLANE, GEOM.mjGEOM_SPHERE, GEOM.mjGEOM_CAPSULE)
+
+
+def load(name: str) -> dict[str, Any]:
+    """The arrays of a file."""
+    out = {}
+    with np.load(FOLDER / f"{name}.npz") as archive:
+        for key in archive.files:
+            name, _, kind = key.partition(":")
+            values = archive[key]
+            if kind:  # in planes of bytes
+                values = np.ascontiguousarray(np.moveaxis(values, 0, -1)).view(kind)[..., 0]
+            out[name] = values
+    return out
+
+
+class Trace:
+    """A trace, and an engine with a row for each of its states."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.arrays = load(name)
+        self.states = len(self.arrays["time"])
+        self.before = self.arrays["state"]  # where each step began
+        self.after = self.before + 1
+        self.engine = Scenario.parse(f"Safety{name}-v0").build(self.states, num_threads=1)
+        self.engine.steps[:] = 1
+        self.engine._begun = True
+
+    def __getitem__(self, key: str) -> Any:
+        return self.arrays[key]
+
+    @cached_property
+    def actions(self) -> Any:
+        return self["action_percent"] / 100
+
+    def set(self, rows: Any, task: Any) -> None:
+        """Put row i into state ``rows[i]``, with the goal and the timer of state ``task[i]``."""
+        engine, batch, n = self.engine, self.engine.batch, len(rows)
+        world = self["world"][rows]
+        batch.bind("qpos")[:n], batch.bind("qvel")[:n] = self["qpos"][rows], self["qvel"][rows]
+        batch.bind("qacc_warmstart")[:n] = 0.0
+        batch.bind("time")[:n] = self["time"][rows]
+        ctrl = np.zeros((self.states, engine.robot.action_size))
+        ctrl[self.after] = np.clip(self.actions, *engine.robot.action_range)
+        batch.bind("ctrl")[:n] = ctrl[rows]
+        engine.places("robot")[:n, 0, :2] = self["world_robot"][world, :2]
+        if not engine.robot._free:
+            engine.robot._place[:n, :2] = self["world_robot"][world, :2]
+            half = self["world_robot"][world, 2] / 2
+            engine.robot._turn[:n] = 0.0
+            engine.robot._turn[:n, 0], engine.robot._turn[:n, 3] = np.cos(half), np.sin(half)
+        if "goal" in engine.footprints:
+            engine.places("goal")[:n, 0, :2] = self["goal"][task]
+        for kind, group in (("hazards", "hazards"), ("pillars", "pillars"), ("buttons", "button")):
+            if f"world_{kind}" in self.arrays:
+                places = self[f"world_{kind}"][world]
+                engine.places(group)[:n, :, :2] = places[..., :2]
+                if kind != "hazards":
+                    first = int(engine.model.body(f"{group}/0").mocapid[0])
+                    batch.bind("mocap_pos")[:n, first : first + places.shape[1], :2] = places[
+                        ..., :2
+                    ]
+        if "world_buttons" in self.arrays:
+            engine.array("button/right", dtype=np.int64)[:n] = self["goal_button"][task]
+            timer = self["timer"][task]
+            engine.array("button/wait", dtype=np.int64)[:n] = np.where(timer > 0, timer + 1, 0)
+        if "world_gremlins" in self.arrays:
+            self._set_gremlins(n, world, self["mocap"][rows])
+        batch.forward(np.arange(n), stage=mujoco.mjtStage.mjSTAGE_ACC)
+
+    def _set_gremlins(self, n: int, world: Any, mocap: Any) -> None:
+        """Put what pulls the gremlins where it was; recorded are offsets common to all."""
+        model, batch = self.engine.model, self.engine.batch
+        places = self["world_gremlins"][world]
+        self.engine.places("gremlins")[:n, :, :2] = places[..., :2]
+        first = int(model.body("gremlins/0/mover").mocapid[0])
+        movers = slice(first, first + places.shape[1])
+        batch.bind("mocap_pos")[:n, movers] = mocap[:, None]
+        batch.bind("mocap_pos")[:n, movers, :2] += places[..., :2]
+        batch.bind("mocap_quat")[:n, movers] = self["world_gremlin_quat"][world]
+
+    @cached_property
+    def rough(self) -> Any:
+        """What :meth:`find_rough` finds in the rows as they were first set."""
+        return self.find_rough()
+
+    def find_rough(self) -> Any:
+        """Rows in which bodies touch whose contacts the two versions compute differently."""
+        model = self.engine.model
+        kinds = model.geom_type
+        out = np.zeros(self.states, dtype=bool)
+        for row in range(self.states):
+            data = self.engine.batch.get_data(row)
+            for contact in data.contact[: data.ncon]:
+                pair = sorted(int(kinds[g]) for g in contact.geom)
+                out[row] |= pair[0] != GEOM.mjGEOM_PLANE and pair[1] not in ROUND
+        return out

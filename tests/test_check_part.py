@@ -1,0 +1,87 @@
+"""What a user's part promises is checked once, when it is registered."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from worlds import own_parts
+
+from sb3_guard.envs import register_constraint, register_task, registry
+from sb3_guard.envs.observation import Values
+from sb3_guard.envs.parameters import PartError
+from sb3_guard.envs.part import Constraint, Task
+
+
+def kind(base, **verbs):
+    """A class of parts as a user may write it."""
+    return dataclass(type("Odd", (base,), {"__annotations__": {}, **verbs}))
+
+
+def matrix(self):
+    weights = np.random.default_rng(0).normal(size=(9, 3))
+    seen = self.sim.robot.frames[1].reshape(-1, 9) @ weights
+    return np.abs(seen).sum(axis=1) * (self.sim.steps > 0)
+
+
+def own_clock(self):
+    self.clock = getattr(self, "clock", 0) + (self.sim.steps > 0).any()
+    return np.full(self.sim.num_envs, float(self.clock))
+
+
+def one_stream(self, ids, rngs):
+    self.sim.array("odd/luck")[ids] = rngs[0].random(len(ids))
+
+
+def luck(self):
+    return {"luck": Values(self.sim.array("odd/luck")[:, None].copy())}
+
+
+def moves_what_it_reads(self):
+    self.sim.places("goal")[..., 0] += 0.001
+    return np.zeros(self.sim.num_envs)
+
+
+def nothing(self):
+    return np.zeros(self.sim.num_envs)
+
+
+@pytest.mark.parametrize(
+    ("verbs", "words"),
+    [
+        ({"cost": lambda self: 0.0}, r"cost\(\) of odd has shape \(\), expected \(3,\)"),
+        ({"cost": lambda self: nothing(self) - 1}, "cost_odd is -1.0: a cost must be at least 0"),
+        ({"cost": nothing, "reset": one_stream, "observations": luck}, "draw from rngs"),
+        ({"cost": own_clock}, "Odd: "),
+        ({"cost": moves_what_it_reads}, "Odd: "),
+        ({"cost": nothing, "moving": lambda self: None}, "moving.* of odd gives None"),
+        ({"cost": nothing, "terminated": lambda self: False}, r"terminated\(\) of odd has shape"),
+    ],
+)
+def test_a_constraint_that_breaks_its_contract_is_not_registered(verbs, words):
+    with own_parts():
+        with pytest.raises(PartError, match=words):
+            register_constraint("Odd", kind(Constraint, **verbs))
+        assert "Odd" not in registry.CONSTRAINTS
+
+
+def test_a_task_is_checked_too():
+    wrong = kind(Task, reward=lambda self, before, now: np.zeros((len(now), 1)))
+    with own_parts(), pytest.raises(PartError, match=r"reward\(\) of odd has shape \(3, 1\)"):
+        register_task("Odd", wrong)
+
+
+def test_a_part_that_needs_other_company_is_registered_all_the_same():
+    def cost(self):
+        return self.sim.robot.fuel  # Point has none
+
+    with own_parts():
+        register_constraint("Odd", kind(Constraint, cost=cost))
+        assert "Odd" in registry.CONSTRAINTS
+
+
+def test_our_own_parts_keep_the_contract():
+    for name, constraint in registry.CONSTRAINTS.items():
+        registry._check_contract(name, constraint)
+    for name, task in registry.TASKS.items():
+        registry._check_contract(name, task)
+    registry._check_contract("Ant", registry.ROBOTS["Ant"])

@@ -1,0 +1,305 @@
+"""PPO-Lagrangian and its kin: losses and multipliers by hand, and where others go wrong."""
+
+import random
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint, TabularCMDP
+from known_optima import problems, solve
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from torch.distributions import Normal
+
+from sb3_guard.algorithms import ALGORITHMS, CPPOPID, CRPO, CUP, FOCOPS, P3O, RCPO, PPOLag
+from sb3_guard.algorithms.common.costs import CostEstimate
+from sb3_guard.algorithms.common.lagrangian import Lagrangian, Multiplier
+
+KEYS = ("ppo_lag", "cppo_pid", "focops", "cup", "p3o", "crpo", "rcpo")
+LAGRANGIAN = [ALGORITHMS[key] for key in KEYS if issubclass(ALGORITHMS[key], Lagrangian)]
+
+
+def make(cls: Any, n_costs: int = 1, **kwargs: Any) -> Any:
+    keys = ("cost", "cost_1")[:n_costs]
+    env = make_vec_env(lambda: CostPoint(30, cost_keys=keys, hazard=(-1.0, 0.0)), 4, seed=0)
+    batch = {} if cls in (CRPO, RCPO) else {"batch_size": 64}
+    settings = {"n_steps": 32, "seed": 0, "device": "cpu", "cost_keys": keys, **batch, **kwargs}
+    model = cls("MlpPolicy", env, **settings)
+    model.set_logger(configure(format_strings=[]))
+    return model
+
+
+def state(model: Any) -> list[Any]:
+    """Weights, optimizer and generators as plain values."""
+    moments = [v for e in model.policy.optimizer.state_dict()["state"].values() for v in e.values()]
+    tensors = [*model.policy.state_dict().values(), *moments, th.get_rng_state()]
+    return [*(t.tolist() for t in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
+
+
+# While the limit is out of reach
+
+
+@pytest.mark.parametrize("cls", [PPOLag, CPPOPID])
+@pytest.mark.parametrize("kwargs", [{}, {"target_kl": 0.003, "clip_range_vf": 0.2}], ids=str)
+def test_out_of_reach_of_the_limit_it_is_sb3s_ppo(cls: Any, kwargs: dict[str, Any]) -> None:
+    theirs = make_vec_env(lambda: CostPoint(30, hazard=(-1.0, 0.0)), 4, seed=0)
+    settings = {"n_steps": 32, "batch_size": 64, "seed": 0, "device": "cpu", **kwargs}
+    a = state(PPO("MlpPolicy", theirs, **settings).learn(384))
+    model = make(cls, cost_limit=1e6, **kwargs).learn(384)
+    assert a == state(model)
+    assert model.total_cost > 0.0 and float(model.multiplier.value) == 0.0
+
+
+# Multipliers
+
+
+def follow(multiplier: Multiplier, costs: list[float], limit: float) -> list[float]:
+    values = []
+    for cost in costs:
+        multiplier.update(np.array([cost]), np.array([limit]))
+        values.append(float(multiplier.value[0]))
+    return values
+
+
+def test_relative_violations_by_hand() -> None:
+    """η = 0.5, K_P = 2, d = 4: violations 0.25, 1 (of 2.5), -1 (of -1), 0."""
+    multiplier = Multiplier(1, 0.5, proportional=2.0, relative=True)
+    values = follow(multiplier, [5.0, 14.0, 0.0, 4.0], 4.0)
+    np.testing.assert_allclose(values, [0.125 + 0.5, 0.625 + 2.0, 0.0, 0.125])
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_relative_multipliers_do_not_know_the_unit(scale: float) -> None:
+    costs = [5.0, 14.0, 3.0, 4.5]
+    kwargs: dict[str, Any] = {
+        "rate": 0.5, "proportional": 2.0, "derivative": 1.0, "smoothing": 0.5, "relative": True
+    }  # fmt: skip
+    for limit in (4.0, 0.0):
+        a = follow(Multiplier(1, **kwargs), costs, limit)
+        b = follow(Multiplier(1, **kwargs), [scale * cost for cost in costs], scale * limit)
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+        assert a[1] > 0.0
+
+
+def test_without_cost_and_limit_nothing_is_violated() -> None:
+    assert follow(Multiplier(1, 0.5, proportional=1.0, relative=True), [0.0, 0.0], 0.0) == [0, 0]
+
+
+def test_smoothing_and_delay_by_hand() -> None:
+    """Averages of J_C: 4, 6, 7; of the violation 0, 2, 3. The rise over two updates is 3."""
+    kwargs: dict[str, Any] = {"proportional": 0.5, "derivative": 2.0, "smoothing": 0.5, "delay": 2}
+    values = follow(Multiplier(1, 0.0, **kwargs), [4.0, 8.0, 8.0], 4.0)
+    np.testing.assert_allclose(values, [0.0, 1.0, 1.5 + 6.0])
+
+
+@pytest.mark.parametrize("cls", LAGRANGIAN)
+def test_a_broken_limit_raises_the_multiplier_and_a_kept_one_lowers_it(cls: Any) -> None:
+    """And J_C is that of this rollout, not of a window of episodes."""
+    model = make(cls, cost_limit=10.0)
+    seen = []
+    for cost in (20.0, 20.0, 1.0):
+        model.costs = CostEstimate(np.array([cost]), 30.0, np.array([(cost - 10.0) / 30.0]))
+        model.costs_are_new = True
+        model.price(np.ones(1))
+        seen.append(float(model.multiplier.integral.detach()))
+    assert 0.0 < seen[0] < seen[1] > seen[2]
+
+
+@pytest.mark.parametrize("cls", LAGRANGIAN)
+def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
+    """Costs and limit × 1024, a power of two: actions stay what they are for some updates."""
+    runs = []
+    for scale in (1.0, 1024.0):
+        env = make_vec_env(
+            lambda scale=scale: CostPoint(30, cost_scale=scale, hazard=(-1.0, 0.0)), 4, seed=0
+        )
+        # The critic's error is in units of cost: what it has learnt is no part of this.
+        settings = {"n_steps": 32, "seed": 0, "device": "cpu", "cost_limit": 2.0 * scale}
+        model = cls("MlpPolicy", env, **settings)
+        for parameter in model.cost_critic.parameters():
+            parameter.requires_grad_(False).zero_()
+        model.fit_cost_critic = lambda *_: None
+        if cls is RCPO:
+            model._update_critics = lambda *_: None
+        model.learn(256)
+        runs.append(model)
+    multipliers = [float(model.multiplier.value) for model in runs]
+    assert multipliers[0] > 0.0 and multipliers[1] == pytest.approx(multipliers[0], rel=1e-4)
+    for a, b in zip(*(model.policy.parameters() for model in runs), strict=True):
+        th.testing.assert_close(a, b, rtol=1e-2, atol=1e-3)
+
+
+# Losses by hand
+
+
+class Given:
+    """A policy whose distributions are given, in place of one that was kept."""
+
+    def __init__(self, mean: th.Tensor) -> None:
+        self.mean = mean
+
+    def get_distribution(self, observations: Any) -> Any:
+        return gaussian(self.mean)
+
+
+def gaussian(mean: th.Tensor) -> Any:
+    """SB3's distribution of actions with these means [B, 1] and the standard deviation 1."""
+    from stable_baselines3.common.distributions import DiagGaussianDistribution
+
+    made = DiagGaussianDistribution(1)
+    made.distribution = Normal(mean, th.ones_like(mean))
+    return made
+
+
+def batch(advantages: list[float], cost_advantages: list[list[float]]) -> Any:
+    class Batch:
+        observations = None
+
+    made: Any = Batch()
+    made.advantages = th.tensor(advantages)
+    made.cost_advantages = th.tensor(cost_advantages)
+    return made
+
+
+def test_focops_loss_by_hand() -> None:
+    """KL of unit Gaussians is half the squared distance: 0.005, 0.18, 0; η = 0.02 leaves two.
+
+    A - ν A_C = 1 - 0.5·2 = 0, (masked), 2 + 0.5 = 2.5. Rows: 0.005 - 0; 0; 0 - 1.5·2.5/2. Over 3
+    rows, by states and not by the batch's mean KL, 0.0617, which would leave nothing.
+    """
+    model = make(FOCOPS, temperature=2.0, trust_region=0.02)
+    model._old, model._price = Given(th.zeros(3, 1)), th.tensor([0.5])
+    new = gaussian(th.tensor([[0.1], [0.6], [0.0]]))
+    ratio = th.tensor([1.1, 0.9, 1.5])
+    loss = model.loss(batch([1.0, 5.0, 2.0], [[2.0], [1.0], [-1.0]]), ratio, new)
+    assert float(loss) == pytest.approx((0.005 - 1.5 * 2.5 / 2.0) / 3)
+
+
+@pytest.mark.parametrize("kind", ["forward", "reverse"])
+def test_cup_projection_by_hand(kind: str) -> None:
+    """(1 - 0.9·0.5)/(1 - 0.9) = 5.5; ν A_C = 1, -2; ratio · that = 1.2, -1; KL = 0.02, 0.08."""
+    model = make(CUP, gamma=0.9, gae_lambda=0.5, projection_kl=kind)
+    assert model.factor == pytest.approx(5.5)
+    model._improved, model._price = Given(th.zeros(2, 1)), th.tensor([0.5, 0.25])
+    rows = batch([9.0, 9.0], [[1.0, 2.0], [-2.0, -4.0]])
+    new = gaussian(th.tensor([[0.2], [0.4]]))
+    loss = model.projection(rows, th.tensor([1.2, 0.5]), new)
+    assert float(loss) == pytest.approx((0.02 + 0.08) / 2 + 5.5 * (1.2 - 1.0) / 2, rel=1e-5)
+
+
+def test_cup_compares_with_the_policy_that_collected() -> None:
+    """The second step's ratios are π / π_k: after the first they are not 1."""
+    model = make(CUP, cost_limit=0.01)
+    ratios, projection = [], model.projection
+
+    def spy(rows: Any, ratio: th.Tensor, distribution: Any) -> th.Tensor:
+        ratios.append(ratio.detach().clone())
+        return projection(rows, ratio, distribution)
+
+    model.projection = spy
+    model.learn(128)
+    assert float((ratios[0] - 1.0).abs().max()) > 0.01
+
+
+def test_p3o_by_hand() -> None:
+    """A_C centred is 1, -1; ratios 1.5, 0.5 are clipped to 1.2, 0.8: max 1.5, -0.5; mean 0.5."""
+    model = make(P3O, penalty_units="cost", penalty=3.0, normalize_advantage=False)
+    model._unit, model._violation = th.ones(1), th.tensor([0.25])
+    rows, ratio = batch([2.0, 1.0], [[7.0], [5.0]]), th.tensor([1.5, 0.5])
+    assert float(model.penalties(rows, ratio)) == pytest.approx(0.75)
+    # PPO's part: min(3, 2.4), min(0.5, 0.8): mean 1.45
+    assert float(model.loss(rows, ratio, None)) == pytest.approx(3.0 * 0.75 - 1.45)
+
+
+def test_p3os_penalty_is_exactly_zero_at_the_old_policy_inside_the_limit() -> None:
+    """Whatever the minibatch: without centring in it the mean of 64 advantages is noise."""
+    model = make(P3O, n_costs=2)
+    model._unit, model._violation = th.ones(2), th.tensor([-1e-3, 0.02])
+    for seed in range(20):
+        noise = th.randn(64, 2, generator=th.Generator().manual_seed(seed)).tolist()
+        penalties = model.penalties(batch([0.0] * 64, noise), th.ones(64))
+        assert float(penalties[0]) == 0.0 and float(penalties[1]) == pytest.approx(0.02, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("costs", "worst"), [([1.0, 2.0], None), ([3.0, 2.0], 0), ([3.0, 7.0], 1), ([2.1, 0.0], None)]
+)
+def test_crpo_lowers_the_cost_that_is_most_above_its_limit(costs: Any, worst: Any) -> None:
+    """Limits 2 and 3 with a tolerance of a tenth; the surrogate is A or minus that cost's A_C."""
+    model = make(CRPO, n_costs=2, cost_limit=[2.0, 3.0], tolerance=0.1)
+    model.costs = CostEstimate(np.array(costs), 30.0, np.zeros(2))
+    assert model.violated == worst
+    rows, ratio = batch([1.0, 2.0], [[3.0, 5.0], [4.0, 6.0]]), th.tensor([1.0, 0.5])
+    expected = 1.0 if worst is None else [-2.5, -4.0][worst]
+    assert float(model.surrogate(rows, ratio)) == pytest.approx(expected)
+
+
+def test_rcpo_takes_the_whole_step() -> None:
+    model = make(RCPO, cost_limit=0.5).learn(256)
+    assert model.logger.name_to_value["train/line_search_step"] == 1.0
+
+
+def test_epochs_stop_by_the_mean_over_the_rollout() -> None:
+    """A pass of two minibatches is taken whole, though the second is beyond the bound already."""
+    steps = {}
+    for stop in ("minibatch", "epoch"):
+        model = make(PPOLag, kl_stop=stop, target_kl=1e-7, n_epochs=10, cost_limit=1e6).learn(128)
+        assert model._n_updates == 1
+        first = next(iter(model.policy.optimizer.state.values()))
+        steps[stop] = int(first["step"])
+    assert steps == {"minibatch": 1, "epoch": 2}
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("cls", "kwargs", "message"),
+    [
+        (CUP, {"gamma": 1.0}, r"gamma=1.0: CUP weighs costs by .*use a discount factor below 1"),
+        (CUP, {"projection_kl": "both"}, "projection_kl='both': must be 'forward' or 'reverse'"),
+        (PPOLag, {"lambda_init": 2.0, "lambda_max": 1.0}, r"lambda_max=1.0.*\[2, inf\)"),
+        (PPOLag, {"cost_limit": [1.0, 2.0]}, r"cost_limit=.*one for each of the 1 cost keys"),
+        (PPOLag, {"lambda_units": "euro"}, "lambda_units='euro': must be 'relative' or 'cost'"),
+        (PPOLag, {"kl_stop": "never"}, "kl_stop='never'"),
+        (CPPOPID, {"lambda_smoothing": 1.0}, r"lambda_smoothing=1.0: must be a number in \[0, 1\)"),
+        (CPPOPID, {"lambda_delay": 0}, "lambda_delay=0: must be an integer of at least 1"),
+        (FOCOPS, {"temperature": 0.0}, "temperature=0.0"),
+        (FOCOPS, {"trust_region": -1.0}, "trust_region=-1.0"),
+        (P3O, {"penalty": 0.0}, "penalty=0.0"),
+        (P3O, {"penalty_units": "x"}, "penalty_units='x'"),
+        (CRPO, {"tolerance": -0.1}, "tolerance=-0.1"),
+        (P3O, {"n_epochs": 0}, "n_epochs=0: must be an integer of at least 1"),
+    ],
+)
+def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(cls, **kwargs)
+
+
+def test_focops_takes_no_clip_range() -> None:
+    with pytest.raises(TypeError, match="FOCOPS takes no argument 'clip_range'"):
+        make(FOCOPS, clip_range=0.2)
+
+
+# Known optima
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_known_optimum(key: str) -> None:
+    """The five-step table under three quarters of its optimum's cost, multipliers as they come.
+
+    The networks learn faster than by default, which takes seconds in place of minutes.
+    """
+    problem = problems()["table"]
+    if key in ("focops", "cup"):  # still on their way after 60 updates
+        problem = replace(problem, updates=100)
+    assert isinstance(problem.world().cmdp, TabularCMDP)
+    fast: dict[str, Any] = {"learning_rate": 3e-3, "batch_size": problem.n_envs * problem.n_steps}
+    if key in ("crpo", "rcpo"):
+        fast = {"learning_rate": 3e-3, "n_critic_updates": 20}
+    outcome = solve(ALGORITHMS[key], problem, 0, **fast)
+    assert outcome.good, outcome

@@ -1,0 +1,249 @@
+"""SAC- and TD3-Lagrangian: SB3's own while the limit holds, and what costs add to them."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint
+from gymnasium import spaces
+from known_optima import Outcomes, problems
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_guard import SACLag, TD3Lag, evaluate_policy
+from sb3_guard.algorithms.common.replay import CostReplayBuffer, CostReplayBufferSamples
+
+
+def settings() -> dict[str, Any]:
+    """Small and quick; SB3 writes into ``policy_kwargs``, so they are made anew."""
+    return {
+        "learning_starts": 60,
+        "seed": 0,
+        "device": "cpu",
+        "batch_size": 16,
+        "buffer_size": 2_000,
+        "policy_kwargs": {"net_arch": [16]},
+    }
+
+
+both = pytest.mark.parametrize("cls", [SACLag, TD3Lag])
+
+
+def points(n_envs: int = 2, **kwargs: Any) -> Any:
+    return make_vec_env(lambda: CostPoint(30, hazard=(-1.0, 0.0), **kwargs), n_envs, seed=0)
+
+
+def noise(n: int = 2) -> NormalActionNoise:
+    return NormalActionNoise(np.zeros(n), np.full(n, 0.1))
+
+
+def state_of(model: Any) -> list[Any]:
+    """Weights, optimizers' moments and generators as plain values."""
+    tensors = [*model.policy.state_dict().values(), th.get_rng_state()]
+    for owner in (model.actor, model.critic):
+        for entry in owner.optimizer.state_dict()["state"].values():
+            tensors += entry.values()
+    if getattr(model, "log_ent_coef", None) is not None:
+        tensors.append(model.log_ent_coef)
+    _, keys, position, *_ = np.random.get_state()  # noqa: NPY002
+    return [*(tensor.tolist() for tensor in tensors), keys.tolist(), position]
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "more"),
+    [
+        (SACLag, SAC, {"gradient_steps": 2, "target_update_interval": 2}),
+        (SACLag, SAC, {"ent_coef": 0.1, "use_sde": True}),
+        (TD3Lag, TD3, {"gradient_steps": 3}),
+    ],
+)
+def test_while_the_limit_holds_it_is_sb3s_bit_for_bit(ours: Any, theirs: Any, more: Any) -> None:
+
+    def kwargs() -> dict[str, Any]:
+        return settings() | more | ({"action_noise": noise()} if ours is TD3Lag else {})
+
+    expected = theirs("MlpPolicy", VecNormalize(points()), **kwargs()).learn(200)
+    logged = dict(expected.logger.name_to_value)
+    state = state_of(expected)
+    model = ours("MlpPolicy", VecNormalize(points()), cost_limit=1e6, **kwargs()).learn(200)
+    assert state_of(model) == state
+    assert model.total_cost > 0.0 and float(model.multiplier.value) == 0.0
+    for name in ("actor_loss", "critic_loss", "n_updates", "learning_rate"):
+        assert model.logger.name_to_value[f"train/{name}"] == pytest.approx(
+            logged[f"train/{name}"], rel=1e-6
+        ), name
+    assert model.logger.name_to_value["train/cost_critic_loss"] > 0.0
+    # A limit that is broken makes another run of it.
+    assert state_of(ours("MlpPolicy", VecNormalize(points()), **kwargs()).learn(200)) != state
+
+
+class Clock(gymnasium.Env[Any, Any]):
+    """Observes the time t = 1, 2, … within the episode; its step costs t and, as another, 10 t."""
+
+    observation_space = spaces.Box(0.0, 100.0, (1,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, length: int, cut: bool) -> None:
+        self.length, self.cut, self.t = length, cut, 0
+
+    def reset(self, **kwargs: Any) -> Any:
+        super().reset(**kwargs)
+        self.t = 1
+        return np.array([1.0], np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        info = {"cost": float(self.t), "ten": 10.0 * self.t}
+        self.t += 1
+        over = self.t > self.length
+        observation = np.array([self.t], np.float32)
+        return observation, 0.0, over and not self.cut, over and self.cut, info
+
+
+@both
+@pytest.mark.parametrize("cut", [False, True])
+def test_what_is_replayed_and_learnt_from(cls: Any, cut: bool) -> None:
+    """Each row has the cost of its own step, the last one's too, and what came after it."""
+    env = make_vec_env(lambda: Clock(4, cut), 3)
+    model = cls("MlpPolicy", env, cost_keys=("cost", "ten"), cost_limit=[10.0, 1.0], **settings())
+    model.learn(90)
+    batch = model.replay_buffer.sample(256)
+    times = batch.observations[:, 0]
+    th.testing.assert_close(batch.costs, th.stack([times, 10.0 * times], dim=1))
+    assert {*times.tolist()} == {1.0, 2.0, 3.0, 4.0}
+    # Not the observation after the reset, and no end where a time limit cut the episode.
+    th.testing.assert_close(batch.next_observations[:, 0], times + 1.0)
+    ends = (times == 4.0) & (not cut)
+    assert th.equal(batch.dones[:, 0].bool(), ends)
+    # J_C of whole episodes: 1 + 2 + 3 + 4.
+    np.testing.assert_allclose(model.costs.episode_cost, [10.0, 100.0])
+    np.testing.assert_allclose(model.multiplier.value[0], 0.0)
+    assert float(model.multiplier.value[1]) > 0.0
+
+    # The loss by hand, with the larger of two target values per cost.
+    critic = model.cost_critic
+    actions = th.zeros_like(batch.actions)
+    with th.no_grad():
+        after = th.cat(critic.target(batch.next_observations, actions), dim=1)
+        largest = th.stack([after[:, :2].max(1)[0], after[:, 2:].max(1)[0]], dim=1)
+        target = batch.costs + 0.99 * (1.0 - ends.float()[:, None]) * largest
+        values = th.cat(critic.online(batch.observations, batch.actions), dim=1)
+        expected = float(((values - target.repeat_interleave(2, dim=1)) ** 2).mean())
+    assert model.fit_cost_critic(batch, actions) == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_actors_loss_by_hand() -> None:
+    model = SACLag("MlpPolicy", points(), lambda_init=2.0, **settings()).learn(120)
+    model.costs_are_new = False
+    model.multiplier.value[:] = 0.5
+    batch = model.replay_buffer.sample(8)
+    loss, values = th.randn(8, 1), th.arange(8.0).reshape(8, 1)
+    actions = th.rand(8, 2)
+    with th.no_grad():
+        spread = values.std(correction=0) / model.cost_critic(*batch[:2]).std(0, correction=0)
+        costs = model.cost_critic(batch.observations, actions)
+        expected = (loss + 0.5 * spread * costs) / 1.5
+    th.testing.assert_close(model.penalized(loss, batch, actions, values), expected)
+
+
+@both
+def test_multipliers_follow_ended_episodes_once_and_not_before_their_time(cls: Any) -> None:
+    """Episodes of 30 steps: λ moves at their ends alone, by η and K_P, once ``lambda_starts``."""
+    more = {"cost_limit": 0.01, "lambda_lr": 0.1, "proportional_gain": 0.0, "train_freq": 10}
+    model = cls("MlpPolicy", points(1), lambda_starts=100, gradient_steps=3, **more, **settings())
+    seen: dict[int, float] = {}
+
+    def look(names: dict[str, Any], _: Any) -> bool:
+        seen[names["self"].num_timesteps] = float(model.multiplier.value)
+        return True
+
+    model.learn(180, callback=look)
+    assert seen[100] == 0.0  # the episodes until then broke the limit as well
+    assert [seen[n] for n in (101, 121, 125, 151)] == pytest.approx([0.1, 0.2, 0.2, 0.3])
+
+
+@both
+def test_saved_and_loaded(cls: Any, tmp_path: Path) -> None:
+    kwargs = settings() | {"cost_limit": 0.1, "buffer_size": 500}
+    model = cls("MlpPolicy", points(), **kwargs).learn(150)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    again = cls.load(tmp_path / "model", env=points())
+    again.load_replay_buffer(tmp_path / "buffer")
+    assert again.buffer_size == 500 and again.replay_buffer.costs.any()
+    assert float(again.multiplier.value) == float(model.multiplier.value) > 0.0
+    for name, value in model.cost_critic.state_dict().items():
+        assert th.equal(value, again.cost_critic.state_dict()[name]), name
+    moments, loaded = (one.cost_critic.optimizer.state_dict() for one in (model, again))
+    assert loaded["state"].keys() == moments["state"].keys() != set()
+    observation = model.get_env().reset()
+    np.testing.assert_array_equal(
+        *(m.predict(observation, deterministic=True)[0] for m in (model, again))
+    )
+    again.learn(40, reset_num_timesteps=False)
+    assert again.num_timesteps == 190
+    result = evaluate_policy(again, points(1), n_eval_episodes=2)
+    assert result is not None
+
+
+def test_dict_observations() -> None:
+    class Both(gymnasium.ObservationWrapper[Any, Any, Any]):
+        def __init__(self) -> None:
+            super().__init__(CostPoint(30, hazard=(-1.0, 0.0)))
+            self.observation_space = spaces.Dict({"all": self.env.observation_space})
+
+        def observation(self, observation: Any) -> Any:
+            return {"all": observation}
+
+    model = SACLag("MultiInputPolicy", make_vec_env(Both, 2), **settings()).learn(100)
+    batch = model.replay_buffer.sample(5)
+    assert batch.observations["all"].shape[0] == 5 and batch.costs.shape == (5, 1)
+
+
+def test_sampling_draws_what_sb3s_buffer_draws() -> None:
+    space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    buffer = CostReplayBuffer(20, space, space, "cpu", n_envs=4, n_costs=1)
+    for step in range(5):
+        rows = np.arange(4.0)[:, None] + 10 * step
+        buffer.costs[step] = rows
+        buffer.add(rows, rows, rows, rows[:, 0], np.zeros(4), [{}] * 4)
+    batch = buffer.sample(50)
+    assert isinstance(batch, CostReplayBufferSamples) and len({*batch.costs[:, 0].tolist()}) > 10
+    th.testing.assert_close(batch.costs, batch.rewards)
+    assert CostReplayBufferSamples._fields[:6] == ReplayBufferSamples._fields
+
+
+@both
+@pytest.mark.parametrize(
+    ("more", "error"),
+    [
+        ({"n_steps": 3}, "n_steps=3: must be 1"),
+        ({"cost_gamma": 1.0}, r"cost_gamma=1.0: must be a number in \[0, 1\)"),
+        ({"lambda_starts": -1}, "lambda_starts=-1"),
+        ({"cost_limit": [1.0, 2.0]}, "cost_limit=.*one for each of the 1 cost keys"),
+        ({"lambda_init": 2.0, "lambda_max": 1.0}, "lambda_max=1.0"),
+        ({"env": gymnasium.make("CartPole-v1")}, r"needs continuous actions \(Box\), not Discrete"),
+    ],
+)
+def test_bad_input(cls: Any, more: Any, error: str) -> None:
+    with pytest.raises(ValueError, match=error):
+        cls("MlpPolicy", **{"env": points(1), **more})
+
+
+@both
+def test_it_finds_a_known_optimum(cls: Any) -> None:
+    """Defaults but for a small network and a high rate, which spare time."""
+    problem, steps = problems()["bandit"], 8_000
+    env, outcomes = problem.make_env(), Outcomes(steps)
+    fast: dict[str, Any] = {"learning_rate": 3e-3, "batch_size": 64, "seed": 0, "device": "cpu"}
+    # SAC's temperature would need longer to come down from 1.
+    fast |= {"action_noise": noise()} if cls is TD3Lag else {"ent_coef": 0.01}
+    policy = {"net_arch": [32, 32]}
+    cls("MlpPolicy", env, cost_limit=0.5, policy_kwargs=policy, **fast).learn(steps, outcomes)
+    assert np.mean(outcomes.returns) / problem.best >= 0.9
+    assert 0.85 <= np.mean(outcomes.costs) / 0.5 <= 1.05

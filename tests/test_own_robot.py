@@ -1,0 +1,161 @@
+"""A user's MJCF file needs to know nothing of our worlds."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import pytest
+from worlds import own_parts, world
+
+from sb3_guard.envs import GuardVectorEnv, Scenario, register_constraint, register_robot
+from sb3_guard.envs.part import Constraint
+from sb3_guard.envs.registry import ROBOTS
+from sb3_guard.show import unsteady
+
+CART = """
+<mujoco>
+  {options}
+  <worldbody>
+    {floor}
+    <body name="robot" pos="0 0 0.1">
+      <freejoint/>
+      <geom name="chassis" type="box" size="0.15 0.1 0.03" density="300"/>
+      <site name="middle"/>
+      <body name="left" pos="0.05 0.12 -0.04">
+        <joint name="left" axis="0 1 0" damping="0.001"/>
+        <geom name="left" type="cylinder" size="0.06 0.015" zaxis="0 1 0"/>
+      </body>
+      <body name="right" pos="0.05 -0.12 -0.04">
+        <joint name="right" axis="0 1 0" damping="0.001"/>
+        <geom name="right" type="cylinder" size="0.06 0.015" zaxis="0 1 0"/>
+      </body>
+      <geom name="skid" type="sphere" size="0.03" pos="-0.1 0 -0.07" friction="0.01" priority="1"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="left" gear="0.5" ctrlrange="-1 1"/>
+    <motor joint="right" gear="0.5" ctrlrange="-1 1"/>
+  </actuator>
+  <sensor><velocimeter name="velocimeter" site="middle"/></sensor>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def cart(tmp_path):
+    def write(change=lambda text: text, options="", ground="", **attributes):
+        path = tmp_path / "cart.xml"
+        path.write_text(change(CART.format(options=options, floor=ground)))
+        register_robot("Cart", xml=path, **attributes)
+        return Scenario(robot="Cart")
+
+    with own_parts():
+        yield write
+
+
+def test_plain_geoms_on_a_free_joint_stand_and_drive(cart):
+    fixed = {"heading": 0.0, "locations": [[0.0, 0.0]]}
+    engine = cart().override(robot=fixed, pillars={"num": 2}).build()
+    engine.reset(np.zeros(1, dtype=int))
+    start = engine.robot.position[0].copy()
+    for _ in range(60):
+        engine.step(np.zeros((1, 2)))
+    assert abs(engine.robot.position[0] - start).max() < 0.03
+    for _ in range(60):
+        engine.step(np.full((1, 2), 0.3))
+    assert engine.robot.position[0, 0] > 0.2 and abs(engine.robot.position[0, 2] - start[2]) < 0.03
+
+
+def test_what_meets_what_within_the_robot_is_the_files_business(cart):
+    pairs = []
+    for bits in ("", 'contype="0"'):  # the skid meets the others, or only what is not the robot
+        change = lambda text: text.replace('name="skid"', f'name="skid" {bits}')  # noqa: B023, E731
+        model = cart(change).build().model
+        skid, left, floor = (model.geom(n) for n in ("robot/skid", "robot/left", "floor"))
+        pairs.append([bool(skid.contype & g.conaffinity | g.contype & skid.conaffinity)
+                      for g in (left, floor)])  # fmt: skip
+    assert pairs == [[True, True], [True, True]]
+    change = lambda text: text.replace("<geom ", '<geom conaffinity="0" ')  # noqa: E731
+    model = cart(change).build().model
+    left, right, floor = (model.geom(n) for n in ("robot/left", "robot/right", "floor"))
+    assert not (left.contype & right.conaffinity or right.contype & left.conaffinity)
+    assert floor.contype & left.conaffinity
+
+
+def test_robots_at_a_fixed_height_leave_the_floor_out_if_they_cannot_touch_it():
+    for robot, touching in (("Point", 0), ("Swimmer", 3), ("Walker", 6)):
+        model = world(f"Goal_{robot}_0Hazards").model
+        floor = model.geom("floor")
+        assert np.count_nonzero(model.geom_conaffinity[1:] & floor.contype) == touching
+
+
+def test_a_robot_that_would_fall_forever_is_refused(cart):
+    change = lambda text: text.replace("<geom ", '<geom contype="0" conaffinity="0" ')  # noqa: E731
+    with pytest.raises(ValueError, match=r"cart\.xml has a free joint, but no geom that meets"):
+        cart(change).build()
+
+
+def test_a_floor_in_the_file_is_answered_or_kept(cart):
+    ground = '<geom name="ground" type="plane" size="5 5 1"/>'
+    with pytest.raises(ValueError, match=r"has a floor, geom 'ground', .* complete=True"):
+        cart(ground=ground).build()
+    with own_parts():
+        del ROBOTS["Cart"]
+        cart(ground=ground, complete=True, root="robot")
+        engine = Scenario(robot="Cart").build()
+    engine.reset(np.zeros(1, dtype=int))
+    for _ in range(60):
+        engine.step(np.zeros((1, 2)))
+    assert engine.robot.position[0, 2] == pytest.approx(0.1, abs=0.03)
+    assert [engine.model.geom(i).name for i in range(1)] == ["ground"]
+
+
+def test_options_of_the_file_hold_unless_the_class_states_them(cart):
+    options = '<option timestep="0.004" gravity="0 0 -1.62" integrator="RK4" density="1.2"/>'
+    option = cart(options=options).build().model.opt
+    assert (option.timestep, option.gravity[2], option.density) == (0.004, -1.62, 1.2)
+    assert option.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    assert option.jacobian == mujoco.mjtJacobian.mjJAC_DENSE  # the file says nothing of it
+    stated = cart(options=options, timestep=0.001, integrator="Euler").build().model.opt
+    assert (stated.timestep, stated.integrator) == (0.001, mujoco.mjtIntegrator.mjINT_EULER)
+
+
+@pytest.mark.parametrize(
+    ("joint", "attributes", "words"),
+    [
+        ('type="slide" axis="0 0 1"', {"floor": False}, "falls through the floor within 0."),
+        ('type="hinge" axis="1 0 0" stiffness="1e7" ref="1"', {"timestep": 0.05}, "explodes"),
+        ('type="slide" axis="0 0 1"', {}, None),
+    ],
+)
+def test_show_warns_of_robots_that_fall_or_explode(cart, joint, attributes, words):
+    change = lambda text: text.replace("<freejoint/>", f"<joint {joint}/>")  # noqa: E731
+    env = GuardVectorEnv(1, cart(change, **attributes))
+    env.begin([0])
+    found = unsteady(env)
+    assert found is None if words is None else words in found
+
+
+def test_a_users_free_body_lies_on_the_floor():
+    @dataclass
+    class Crate(Constraint):
+        """A box to look at."""
+
+        name = "crate"
+
+        def build(self, world):
+            super().build(world)
+            body = world.spec.worldbody.add_body(name="crate", pos=[1.5, 1.5, 0.3])
+            body.add_freejoint()
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1])
+
+        def cost(self):
+            return np.zeros(self.sim.num_envs)
+
+    with own_parts():
+        register_constraint("Crate", Crate)
+        engine = Scenario.parse("Goal_Point_1Crate").build()
+    engine.reset(np.zeros(1, dtype=int))
+    for _ in range(60):
+        engine.step(np.zeros((1, 2)))
+    assert engine.batch.get_data(0).body("crate").xpos[2] == pytest.approx(0.1, abs=0.01)

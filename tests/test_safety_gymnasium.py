@@ -1,0 +1,178 @@
+"""Safety-Gymnasium's tasks, compared with what its release 1.0.0 did from the same states."""
+
+import functools
+
+import gymnasium
+import numpy as np
+import pytest
+from safety_traces import Trace, load
+
+from sb3_guard.envs import Scenario, env_ids
+from sb3_guard.envs.suites.safety_gymnasium import LEVELS, NAMES
+
+NAVIGATION = [f"{robot}{level}" for robot in NAMES for level in LEVELS]
+EXACT = 1e-6  # relative; observations in the files have 21 bits
+# Forces. The solver stops at a tolerance, in each version somewhere else; and where bodies meet
+# whose contacts MuJoCo 4 finds otherwise than 2.3.3 does, they have nothing in common.
+FORCES = ("accelerometer", "touch")
+SOLVED = 2e-3
+
+trace = functools.cache(Trace)
+
+
+@pytest.mark.parametrize("name", NAVIGATION)
+def test_observations_of_every_state(name):
+    t = trace(name)
+    rows = np.arange(t.states)
+    t.set(rows, rows)
+    ours, theirs = t.engine.observe(np.float64), t["obs"]
+    assert ours.shape == theirs.shape
+    error = np.abs(ours - theirs) / np.maximum(np.abs(theirs), 0.01)
+    for component, where in t.engine.observation_layout.items():
+        worst = error[:, where].max(axis=1)
+        if component.startswith(FORCES):
+            assert (worst[~t.rough] < SOLVED).all(), component
+            assert (worst[~t.rough] < EXACT).mean() > 0.9, component
+        else:
+            assert worst.max() < EXACT, component
+
+
+@pytest.mark.parametrize("name", NAVIGATION)
+def test_rewards_costs_goals_and_deaths_of_every_step(name):
+    t = trace(name)
+    engine, n = t.engine, len(t.before)
+    assert n >= 200
+    t.set(t.before, t.before)
+    before = engine.task.measure().copy()
+    t.set(t.after, t.before)
+    now = engine.task.measure()
+    met = engine.task.succeeded(now)[:n]
+    reward = engine.task.reward(before, now)[:n] + engine.task.bonus * met
+    np.testing.assert_allclose(reward, t["reward"], rtol=EXACT, atol=1e-9)
+    np.testing.assert_array_equal(met, t["goal_met"])
+    np.testing.assert_array_equal(engine.robot.terminated()[:n], t["terminated"])
+    total = np.zeros(n)
+    for constraint in engine.constraints:
+        for key, cost in constraint.costs().items():
+            total += cost[:n]
+            if f"cost_{key}" in t.arrays:
+                np.testing.assert_array_equal(cost[:n] > 0, t[f"cost_{key}"], key)
+            else:
+                assert not cost.any(), key
+    np.testing.assert_array_equal(total > 0, t["cost_sum"])
+
+
+@pytest.mark.parametrize("name", NAVIGATION)
+def test_every_event_that_the_task_knows_is_in_the_trace(name):
+    """Goals, walls, deaths, and contacts with everything that can be touched."""
+    arrays = load(name)
+    events = {"goal_met"} if not name[:-1].endswith(("Circle", "Run")) else set()
+    events |= {"terminated"} if name.startswith("Ant") else set()
+    for key in arrays:
+        if key.startswith(("cost_", "touched_")) and not (key == "cost_sum" and name[-1] == "0"):
+            events.add(key)
+    scenario = Scenario.parse(f"Safety{name}-v0")
+    for thing in set(scenario.constraints) & {"vases", "pillars", "gremlins"}:
+        assert f"touched_{thing}" in events
+    if "Push" in name:
+        assert "touched_push_box" in events
+    assert {event: bool(arrays[event].any()) for event in events} == dict.fromkeys(events, True)
+
+
+@pytest.mark.parametrize(
+    ("robot", "usual", "most"),  # m or rad; the files resolve 5e-7
+    [("Point", 1e-6, 1e-6), ("Car", 1e-6, 1e-5), ("Ant", 1e-3, 0.1), ("Doggo", 1e-6, 1e-5)],
+)
+def test_one_control_step_of_another_mujoco(robot, usual, most):
+    t = trace(f"{robot}Goal0")
+    n = len(t.before)
+    t.set(t.before, t.before)
+    actions = np.zeros((t.states, t.engine.robot.action_size))
+    actions[:n] = t.actions
+    t.engine.step(actions)
+    off = np.abs(t.engine.batch.bind("qpos")[:n] - t["qpos"][t.after]).max(axis=1)
+    assert np.quantile(off, 0.9) < usual and off.max() < most
+
+
+def test_ids_and_time_limits():
+    assert set(env_ids("safety_gymnasium")) == {f"Safety{name}-v0" for name in NAVIGATION}
+    for name in NAVIGATION:
+        steps = 500 if "Circle" in name or "Run" in name else 1000
+        assert gymnasium.spec(f"Safety{name}-v0").max_episode_steps == steps
+    env = gymnasium.make("SafetyPointGoal0-v0")
+    assert env.observation_space.shape == (28,) and env.action_space.shape == (2,)
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [
+        ("SafetyRacecarGoal1-v0", "SafetyCarGoal1-v0"),
+        ("SafetyPointGoal1Vision-v0", "SafetyPointGoal1-v0"),
+        ("SafetyAntFadingEasy1-v0", "SafetyAntGoal1-v0"),
+        ("SafetyAntMultiGoal1-v0", "SafetyAntGoal1-v0"),
+    ],
+)
+def test_ids_that_are_not_here_say_what_is(name, near):
+    with pytest.raises(ValueError, match=f"{near}.*safety_gymnasium:{name}"):
+        Scenario.parse(name)
+
+
+def gap(ours, theirs):
+    """The Kolmogorov–Smirnov distance of two samples."""
+    points = np.sort(np.concatenate([ours, theirs]))
+    shares = [np.searchsorted(np.sort(s), points, side="right") / len(s) for s in (ours, theirs)]
+    return np.abs(shares[0] - shares[1]).max()
+
+
+GROUPS = {
+    "agent": "robot",
+    "goal": "goal",
+    "hazard": "hazards",
+    "vase": "vases",
+    "pillar": "pillars",
+    "push_box": "box",
+    "button": "button",
+    "gremlin": "gremlins",
+}
+
+
+@pytest.mark.parametrize("name", ["PointGoal1", "PointButton2", "CarPush1", "PointCircle1"])
+def test_layouts_are_distributed_alike(name):
+    """Coordinates of everything, and distances to the robot, of 400 new episodes of each."""
+    recorded = load("distributions")
+    places = recorded[f"layout_{name}"]  # [400, things, 2] m
+    things = [str(thing).rstrip("0123456789") for thing in recorded[f"things_{name}"]]
+    engine = Scenario.parse(f"Safety{name}-v0").build(400, num_threads=1)
+    for row in range(400):
+        engine.seed(row, np.random.default_rng(row))
+    engine.reset(np.arange(400))
+    robot = engine.places("robot")[:, :, :2]
+    for thing, group in GROUPS.items():
+        which = [i for i, one in enumerate(things) if one == thing]
+        if not which or (thing == "goal" and "Button" in name):
+            continue  # that marker jumps to a button
+        theirs, ours = places[:, which], engine.places(group)[:, :, :2]
+        away = places[:, [things.index("agent")]]
+        for a, b in (
+            (ours[..., 0], theirs[..., 0]),
+            (np.abs(ours[..., 1]), np.abs(theirs[..., 1])),
+            (np.linalg.norm(ours - robot, axis=2), np.linalg.norm(theirs - away, axis=2)),
+        ):
+            assert gap(a.ravel(), b.ravel()) < 0.13, group  # chance passes this once in 400
+
+
+@pytest.mark.parametrize("name", ["PointGoal1"])
+def test_random_episodes_earn_and_cost_alike(name):
+    """Returns, costs and lengths of 200 episodes of 100 random steps."""
+    theirs = load("distributions")[f"episodes_{name}"]
+    engine = Scenario.parse(f"Safety{name}-v0").build(200, num_threads=1)
+    for row in range(200):
+        engine.seed(row, np.random.default_rng(row))
+    engine.reset(np.arange(200))
+    rng, ours, alive = np.random.default_rng(0), np.zeros((200, 3)), np.ones(200, dtype=bool)
+    for _ in range(100):
+        out = engine.step(rng.uniform(-1, 1, (200, engine.robot.action_size)))
+        ours += np.stack([out.reward, out.cost, np.ones(200)], axis=1) * alive[:, None]
+        alive &= ~out.terminated
+    for column in range(3):
+        assert gap(ours[:, column], theirs[:, column]) < 0.17, column

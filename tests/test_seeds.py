@@ -1,0 +1,41 @@
+"""Runs of different seeds share no episode, and evaluation none with training."""
+
+import numpy as np
+import pytest
+from registered_envs import CostPoint  # noqa: F401  registers the environments
+
+from sb3_guard.zoo.make_envs import evaluation_seed, row_seeds
+from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run_flags import RunFlags
+from sb3_guard.zoo.start import prepare
+
+
+def test_no_seed_is_drawn_twice():
+    training = [one for seed in range(30) for one in row_seeds(seed, 30)]
+    evaluation = [evaluation_seed(seed) + i for seed in range(30) for i in range(30)]
+    assert len({*training, *evaluation}) == len(training) + len(evaluation)
+    assert all(0 <= one < 2**32 for one in training + evaluation)
+    assert row_seeds(3, 30)[:5] == row_seeds(3, 5)  # more rows don't change the first
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "native"])
+@pytest.mark.parametrize("algo", ["cpo", "sac"])
+def test_first_observations_of_seeds_0_and_1_differ(algo, vec_env):
+    """With SB3's seed + i, row 1 of seed 0 was row 0 of seed 1."""
+    env = {"dummy": "CostPoint-v0", "native": "Goal_Point_8Hazards"}[vec_env]
+    firsts = []
+    for seed in (0, 1):
+        params = {"n_envs": 4, "n_timesteps": 8}
+        flags, values = prepare(
+            RunFlags(algo=algo, env=env, seed=seed, device="cpu", hyperparams=params, eval_freq=1,
+                     n_eval_envs=4)
+        )  # fmt: skip
+        experiment = Experiment(flags, values)
+        experiment.eval_env.seed(evaluation_seed(seed))
+        firsts += [experiment.env.reset(), experiment.eval_env.reset()]
+        again = Experiment(flags, values)
+        np.testing.assert_array_equal(again.env.reset(), firsts[-2])
+        again.close()
+        experiment.close()
+    rows = np.concatenate(firsts)
+    assert len(np.unique(rows, axis=0)) == len(rows) == 16

@@ -82,7 +82,7 @@ def test_what_cannot_be_measured_is_refused():
 
 def test_rl_zoos_command_with_our_algorithm(tmp_path):
     command = (
-        "-m sb3_guard.zoo.rl_zoo3 train --algo guard_trpo --env Goal_Point_8Hazards-v0 -n 400 "
+        "-m sb3_guard.zoo.rl_zoo3 train --algo guard_trpo --env SafetyPointGoal1-v0 -n 400 "
         "--eval-freq 200 --eval-episodes 1 -f"
     ).split()
     params = ["-params", "n_envs:2", "n_steps:100", "n_critic_updates:2"]
@@ -91,12 +91,14 @@ def test_rl_zoos_command_with_our_algorithm(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "cost_rate" in done.stdout and "Evaluation after 200 steps" in done.stdout
-    run = tmp_path / "guard_trpo" / "Goal_Point_8Hazards-v0_1"
+    run = tmp_path / "guard_trpo" / "SafetyPointGoal1-v0_1"
     assert (run / "best_model.zip").is_file()
+    # From the entry 'Safety*', a pattern that RL-Zoo itself does not know.
+    assert (run / "SafetyPointGoal1-v0" / "vecnormalize.pkl").is_file()
     assert "c" in pd.read_csv(run / "0.monitor.csv", skiprows=1)
     # Our player reads what RL-Zoo wrote, ordered mappings and all.
     (tmp_path / "guard_trpo").rename(tmp_path / "trpo")
-    play = "--algo trpo --env Goal_Point_8Hazards --n-episodes 1 -f"
+    play = "--algo trpo --env SafetyPointGoal1 --n-episodes 1 -f"
     assert enjoy.main([*play.split(), str(tmp_path)]) == 0
 
 

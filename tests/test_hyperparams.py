@@ -34,6 +34,8 @@ Goal_Point_8Hazards-v0:
   n_steps: 200
 Bare_Name:
   n_steps: 300
+"*_Ant_*":
+  n_steps: 400
 """
 
 
@@ -46,10 +48,22 @@ def conf(tmp_path):
 
 @pytest.mark.parametrize(
     ("env_id", "n_steps"),
-    [("Goal_Point_8Hazards-v0", 200), ("Bare_Name-v0", 300), ("Anything-v3", 100)],
+    [
+        ("Goal_Point_8Hazards-v0", 200),
+        ("Bare_Name-v0", 300),
+        ("Goal_Ant_8Hazards-v0", 400),
+        ("Anything-v3", 100),
+    ],
 )
 def test_entry_of_the_environment_else_default(conf, env_id, n_steps):
     assert read_hyperparams("cpo", env_id, conf)["n_steps"] == n_steps
+
+
+@pytest.mark.parametrize("algo", sorted({*ALGORITHMS} - {"trpo"}))
+def test_safety_gymnasiums_tasks_have_its_limit(algo):
+    values = read_hyperparams(algo, "SafetyPointGoal1-v0")
+    assert values["cost_limit"] == 25.0
+    check(algo, ALGORITHMS[algo], values)
 
 
 def test_command_line_wins(conf):

@@ -1,8 +1,9 @@
 """Hyper-parameters as data: found, merged, checked, and turned into what constructors take.
 
 They are RL-Zoo's files: ``hyperparams/<algo>.yml`` with a ``default`` entry, entries for single
-environments and YAML anchors. What is read stays plain data, so that the run folder's
-``config.yml`` says exactly what was used; only :func:`build` makes objects of it.
+environments or patterns of them (``Safety*``), and YAML anchors. What is read stays plain data, so
+that the run folder's ``config.yml`` says exactly what was used; only :func:`build` makes objects of
+it.
 """
 
 import copy
@@ -14,6 +15,7 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -152,7 +154,8 @@ def read_hyperparams(
     The hyper-parameters of an algorithm on an environment, sorted by name, not yet checked.
 
     :param algo: key of the algorithm, names the shipped file
-    :param env_id: its own entry is taken, with or without a version, else ``default``
+    :param env_id: its own entry is taken, with or without a version, else the first pattern that
+        fits, else ``default``
     :param conf_file: file to read instead of the shipped one, or a preset: ``paper`` for the
         paper's table, ``omnisafe`` for OmniSafe's published settings
     :param overrides: what the command line says
@@ -163,12 +166,21 @@ def read_hyperparams(
     # An algorithm of a user has no shipped file; its own defaults serve.
     own = conf_file is None and not Path(path).is_file()
     content: dict[str, Any] = {"default": {}} if own else read_file(path)
-    for entry in (env_id, env_id.rsplit("-v", 1)[0], "default"):
-        if entry in content:
-            return dict(sorted({**content[entry], **changes, **(overrides or {})}.items()))
-    raise UsageError(
-        f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
-    )
+    values = entry(content, env_id)
+    if values is None:
+        raise UsageError(
+            f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
+        )
+    return dict(sorted({**values, **changes, **(overrides or {})}.items()))
+
+
+def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] | None:
+    """The entry of a file that an environment takes; None: there is none."""
+    patterns = (name for name in content if "*" in name and fnmatchcase(env_id, name))
+    for name in (env_id, env_id.rsplit("-v", 1)[0], *patterns, "default"):
+        if name in content:
+            return content[name]
+    return None
 
 
 def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:

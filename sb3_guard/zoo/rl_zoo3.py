@@ -9,9 +9,12 @@ of ``python -m rl_zoo3.train``. In RL-Zoo's table ``trpo`` stays sb3-contrib's a
 import sys
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import gymnasium as gym
+import yaml
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -19,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.zoo.algos import safe_algorithms
-from sb3_guard.zoo.hyperparams import read_file, shipped_file
+from sb3_guard.zoo.hyperparams import entry, read_file, shipped_file
 from sb3_guard.zoo.spaces import SPACES, rl_zoo_sampler, space_of
 from sb3_guard.zoo.trust import entries, evaluate, import_class
 from sb3_guard.zoo.usage import KeyValues, UsageError, run
@@ -110,6 +113,20 @@ def train(argv: Sequence[str]) -> int:
     manager.make_vec_env, manager.EvalCallback = make_vec_env, CostEvalCallback
 
     class TypedManager(rl_zoo3.exp_manager.ExperimentManager):
+        def read_hyperparameters(self) -> Any:
+            if not self.config.endswith((".yml", ".yaml")):
+                return super().read_hyperparameters()
+            # RL-Zoo looks for the id alone, or 'default'; our files have patterns too.
+            given, env_id = self.config, self.env_name.gym_id
+            with TemporaryDirectory() as folder:
+                self.config = f"{folder}/{Path(given).name}"
+                Path(self.config).write_text(
+                    yaml.safe_dump({env_id: entry(read_file(given), env_id)})
+                )
+                found = super().read_hyperparameters()
+            self.config = given
+            return found
+
         def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
             return super()._preprocess_hyperparams(typed(hyperparams))
 

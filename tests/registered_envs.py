@@ -59,9 +59,11 @@ class Wordy(CostPoint):
 class Broken(CostPoint):
     """Fails after a while."""
 
+    error = RuntimeError("out of order")
+
     def step(self, action: np.ndarray) -> Any:
         if self.steps > 20:
-            raise RuntimeError("out of order")
+            raise self.error
         return super().step(action)
 
 

@@ -4,16 +4,19 @@ import os
 import shutil
 import subprocess
 import sys
+from errno import ENOSPC
 from types import SimpleNamespace
 
 import pytest
 import yaml
 from cost_envs import CostPoint
-from registered_envs import Filmed
+from registered_envs import Broken, Filmed
 
 from sb3_guard import CPO, enjoy, train
 from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.zoo import playback
+from sb3_guard.zoo.run_folder import read_mapping
+from sb3_guard.zoo.usage import UsageError
 
 TOY = ["--gym-packages", "registered_envs", "--env", "CostPoint-v0"]
 SMALL = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3", "-n", "60", "--verbose", "0",
@@ -93,6 +96,9 @@ TRAIN = [
       "selection_limit:[1]"], ["selection_limit: [1.0]", "several costs, cost, heat"]),
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
+    (["--algo", "ppo", "-params", "n_steps:1e12"], ["ppo can't be made", "allocate", "10000000"]),
+    (["--gym-packages", "../x"], ["'../x' is no module's name"]),
+    (["--gym-packages", ""], ["'' is no module's name"]),
     (["-conf", "absent.yml"], ["there is no hyper-parameter file absent.yml"]),
     # flags
     (["--sede", "3"], ["unknown flag --sede", "--seed"]),
@@ -175,6 +181,15 @@ def test_corrupt_yaml(capsys, tmp_path):
     arguments = ["-conf", str(tmp_path / "bad.yml"), "-f", str(tmp_path / "logs")]
     refused(train.main, arguments, capsys, "bad.yml is not valid YAML", "line")
     assert not (tmp_path / "logs").exists()
+
+
+def test_a_yaml_bomb(capsys, tmp_path):
+    lines = ["default: {a0: &a0 [x]}"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
+    (tmp_path / "bomb.yml").write_text("\n".join(lines))
+    refused(train.main, ["-conf", str(tmp_path / "bomb.yml")], capsys, "e+10 values")
+    with pytest.raises(UsageError, match="values"):
+        read_mapping(tmp_path / "bomb.yml")
 
 
 def test_a_csv_that_was_changed(capsys, run):
@@ -309,6 +324,7 @@ def test_damaged_flags(change, parts, capsys, run):
         ("/proc/foo.mp4", ["--record", "'/proc'", "choose another"]),
         ("/dev/null/foo.mp4", ["--record", "'/dev/null'", "choose another"]),
         (".", ["'.' is a folder"]),
+        ("x" * 300 + ".mp4", ["File name too long", "xxx"]),
     ],
 )
 def test_unwritable_video(record, parts, capsys, run, tmp_path, monkeypatch):
@@ -385,13 +401,16 @@ def test_costs_of_a_baseline(env, parts, capsys, tmp_path):
     assert not list(tmp_path.rglob("result.json"))
 
 
-def test_an_exception_of_the_users_keeps_its_traceback(capsys, tmp_path):
+@pytest.mark.parametrize("error", [RuntimeError("out of order"), OSError(ENOSPC, "no space")])
+def test_an_exception_of_the_users_keeps_its_traceback(error, capsys, tmp_path, monkeypatch):
+    """A full disk of the environment's is not the run's."""
+    monkeypatch.setattr(Broken, "error", error)
     arguments = "--algo ppo --env Broken-v0 -n 64 -params n_envs:1 n_steps:64 batch_size:32".split()
     arguments += ["--gym-packages", "registered_envs", "--eval-freq", "-1", "--device", "cpu"]
     assert train.main([*arguments, "-f", str(tmp_path)]) == 2
     first, *rest = capsys.readouterr().err.splitlines()
-    assert first.startswith("error: Broken-v0 raised RuntimeError: out of order at ")
-    assert rest[0].startswith("Traceback") and rest[-1] == "RuntimeError: out of order"
+    assert first.startswith(f"error: Broken-v0 raised {type(error).__name__}: {error} at ")
+    assert rest[0].startswith("Traceback") and rest[-1] == f"{type(error).__name__}: {error}"
 
 
 def test_a_gpu_that_is_not_there(capsys, tmp_path):
@@ -419,10 +438,14 @@ def test_a_terminal_that_is_not_utf_8(tmp_path):
     assert len(done.stderr) < 520
 
 
-def test_closed_stdout_is_no_dead_process(tmp_path):
-    """As with ``| head -3``."""
-    reader, writer = os.pipe()
-    os.close(reader)
+@pytest.mark.parametrize("output", ["closed", "full"])
+def test_output_that_nobody_takes(output, tmp_path):
+    """As with ``| head -3``, which is no process that died; a full disk there is not the run's."""
+    if output == "full":
+        writer = os.open("/dev/full", os.O_WRONLY)
+    else:
+        reader, writer = os.pipe()
+        os.close(reader)
     command = "-m sb3_guard.train --algo ppo --env CostPoint-v0 -n 64 --eval-freq -1 --device cpu"
     done = subprocess.run(
         [sys.executable, *command.split(), "-params", "n_steps:32", "batch_size:32", "n_envs:1",
@@ -431,4 +454,7 @@ def test_closed_stdout_is_no_dead_process(tmp_path):
         env={**os.environ, "PYTHONPATH": os.path.dirname(__file__)},
     )  # fmt: skip
     os.close(writer)
-    assert done.returncode == 141 and b"subproc" not in done.stderr
+    if output == "full":
+        assert b"error: can't write to standard output" in done.stderr
+    else:
+        assert done.returncode == 141 and b"subproc" not in done.stderr

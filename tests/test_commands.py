@@ -237,6 +237,24 @@ def test_enjoy_prints_return_and_cost(logs, which, capsys):
     assert float(mean.split()[1]) == pytest.approx(np.mean(returns), abs=1e-3)
 
 
+def test_enjoy_says_what_was_cut_and_what_noise_does(logs, capsys):
+    run = logs / "cpo" / "Filmed-v0_1"
+    result = run.joinpath("result.json").read_text()
+    run.joinpath("result.json").write_text(json.dumps(json.loads(result) | {"return": 1e3}))
+    try:
+        assert enjoy.main([*PLAY, "-f", str(logs), "-n", "50"]) == 0
+        out = capsys.readouterr().out
+        assert "10 steps so far" in out and "--stochastic" in out
+        assert enjoy.main([*PLAY, "-f", str(logs), "-n", "50", "--verbose", "0"]) == 0
+        first, *means = capsys.readouterr().out.splitlines()
+    finally:
+        run.joinpath("result.json").write_text(result)
+    assert first.startswith("Mean") and [one.split()[0] for one in means] == [
+        "return", "cost", "length"
+    ]  # fmt: skip
+    assert "limit 2: " in means[1]
+
+
 def test_enjoy_writes_its_statistics(logs, tmp_path):
     file = tmp_path / "made" / "played.json"
     assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "3", "--json", str(file)]) == 0

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_guard.algorithms import CPO, TRPOSL
-from sb3_guard.common.evaluation import Evaluation, evaluate_policy
+from sb3_guard.common.evaluation import Evaluation, estimate, evaluate_policy
 from sb3_guard.common.monitor import CostMonitor
 
 
@@ -78,6 +78,7 @@ def test_single_environment():
 def test_stops_after_max_steps():
     result = evaluate_policy(Idle(), fixed(2, 5), n_eval_episodes=100, max_steps=4)
     assert result.lengths.tolist() == [2, 2]
+    assert result.unfinished[:, [0, 2]].tolist() == [[4.0, 4.0]]  # return and steps of the other
 
 
 def test_callbacks():
@@ -220,9 +221,18 @@ def test_a_policy_of_several_costs_wants_their_names():
 
 
 def test_an_evaluation_in_words():
-    assert str(evaluation([2.0])).startswith("1 episodes: return 2.000 ± 0.000, cost ")
+    assert str(evaluation([2.0])).startswith("1 episodes: return 2.000, cost ")
     words = str(evaluation([1, 3]))
     assert words.startswith("2 episodes: return 2.000 ± 1.000 (95 % [1.000, 3.000]), cost ")
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"),
+    [(3.0, "limit 3: kept"), (0.9, "limit 0.9: exceeded"), (2.0, "limit 2: undecided")],
+)
+def test_a_cost_against_its_limit(limit, words):
+    assert estimate(np.array([1.0, 3.0])).against(limit) == words
+    assert estimate(np.array([1.0])).against(2.0) == "limit 2"  # one episode decides nothing
 
 
 def test_no_interval_from_one_episode_and_nothing_from_none():

@@ -1,13 +1,15 @@
 """Agents for the hub: what is uploaded, what becomes of a download, and no network."""
 
 import json
+import shlex
 
 import pytest
 import yaml
 from test_commands import PLAY, trained
 
-from sb3_guard import enjoy, hub
+from sb3_guard import enjoy, hub, train
 from sb3_guard.zoo import hub as zoo_hub
+from sb3_guard.zoo.agent_flags import EnjoyFlags, HubFlags
 
 WHICH = ["--env", "Filmed-v0", "--gym-packages", "registered_envs", "--n-episodes", "2"]
 
@@ -41,6 +43,29 @@ def test_what_is_uploaded(logs, tmp_path):
     assert values["mean_cost"] == pytest.approx(results["cost"]["mean"], abs=0.006)
     assert values["mean_reward"] == pytest.approx(results["return"]["mean"], abs=0.006)
     assert "under a limit of 2.0" in page and "--repo-id me/cpo-Filmed-v0" in page
+
+
+def test_the_commands_of_the_card_are_commands(logs, tmp_path):
+    """Whether training was started by the script, a path to it, or the module."""
+    params = logs / "cpo" / "Filmed-v0_1" / "Filmed-v0"
+    for program in (
+        "sb3-guard train",
+        "/opt/bin/sb3-guard train",
+        "/opt/python -m sb3_guard.train",
+    ):
+        (params / "command.txt").write_text(f"{program} --algo cpo --env Filmed-v0 -n 60")
+        assert staged(logs, tmp_path, "--dry-run", "--no-video") == 0
+        page = (tmp_path / "README.md").read_text()
+        lines = [one for one in page.splitlines() if one.startswith(("sb3-guard ", "python "))]
+        load, play, again = (shlex.split(one) for one in lines)
+        assert load[:3] == ["sb3-guard", "hub", "load"] and HubFlags.parse(load[2:])
+        assert play[:2] == ["sb3-guard", "enjoy"] and EnjoyFlags.parse(play[2:])
+        assert again[:2] == ["sb3-guard", "train"] or again[:3] == [
+            "python",
+            "-m",
+            "sb3_guard.train",
+        ]
+        train.Flags.parse(again[again.index("--algo") :])
 
 
 def test_no_path_of_this_machine_is_uploaded(logs, tmp_path):
@@ -88,8 +113,9 @@ def test_there_and_back(logs, tmp_path, monkeypatch, capsys):
     outputs = []
     for folder in (logs, tmp_path / "logs"):
         capsys.readouterr()
-        assert enjoy.main([*PLAY, "-f", str(folder), "--n-episodes", "2"]) == 0
-        outputs.append(capsys.readouterr().out.splitlines()[1:])
+        play = [*PLAY, "-f", str(folder), "--n-episodes", "2", "--verbose", "0"]
+        assert enjoy.main(play) == 0
+        outputs.append(capsys.readouterr().out)
     assert outputs[0] == outputs[1]
 
 

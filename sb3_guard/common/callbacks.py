@@ -218,8 +218,10 @@ class CostEvalCallback(EvalCallback):
         if self.verbose >= 1:
             returns = evaluation.estimate(evaluation.returns)
             words = [f"return {returns.mean:.2f} ± {returns.std:.2f}"]
-            for key, costs in zip(self.cost_keys, evaluation.key_costs.T, strict=True):
-                words.append(f"{key} {costs.mean():.2f} ± {costs.std():.2f}")
+            rows = zip(self.cost_keys, evaluation.key_costs.T, self.limits(), strict=True)
+            for key, costs, limit in rows:
+                beside = f" (limit {limit:g})" if np.isfinite(limit) else ""
+                words.append(f"{key} {costs.mean():.2f} ± {costs.std():.2f}{beside}")
             words += [f"with noise {other.costs.mean():.2f}" for other in noisy]
             best = " (best so far)" if is_best else ""
             print(f"Evaluation after {self.num_timesteps} steps: {', '.join(words)}{best}")

@@ -31,8 +31,35 @@ class Estimate(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        interval = f" (95 % [{self.low:.3f}, {self.high:.3f}])" if self.low == self.low else ""
-        return f"{self.mean:.3f} ± {self.std:.3f}{interval}"
+        if np.isnan(self.low):  # one episode has no spread
+            return f"{self.mean:.3f}"
+        return f"{self.mean:.3f} ± {self.std:.3f} (95 % [{self.low:.3f}, {self.high:.3f}])"
+
+    def against(self, limit: float) -> str:
+        """Whether a cost keeps a limit, as far as the interval tells: ``limit 2: exceeded``."""
+        if np.isnan(self.low):
+            return f"limit {limit:g}"
+        kept = "kept" if self.high <= limit else "exceeded" if self.low > limit else "undecided"
+        return f"limit {limit:g}: {kept}"
+
+
+def estimate(values: np.ndarray, resamples: int = 2000) -> Estimate:
+    """
+    Mean, standard deviation and 95 % percentile-bootstrap interval of one value an episode.
+
+    The resampling has its own fixed seed: the same episodes give the same interval.
+
+    :param values: one value an episode, shape [E], e.g. ``evaluation.costs``
+    :param resamples: number of bootstrap samples
+    :return: NaNs where there are too few episodes (none; for the interval, one)
+    """
+    if len(values) == 0:
+        return Estimate(*[float("nan")] * 4)
+    low = high = float("nan")
+    if len(values) > 1:
+        rows = np.random.default_rng(0).integers(len(values), size=(resamples, len(values)))
+        low, high = np.quantile(values[rows].mean(axis=1), [0.025, 0.975]).tolist()
+    return Estimate(float(np.mean(values)), float(np.std(values)), low, high)
 
 
 @dataclass(frozen=True)
@@ -46,6 +73,8 @@ class Evaluation:
     :param lengths: steps of each episode, shape [E]
     :param key_costs: episode cost of each of the cost keys asked for, shape [E, m]
     :param successes: ``info["is_success"]`` at the end of the episodes that report one
+    :param unfinished: return, cost and steps of the episodes that ``max_steps`` cut short,
+        shape [K, 3]; they are in none of the others
     """
 
     returns: np.ndarray
@@ -53,6 +82,7 @@ class Evaluation:
     lengths: np.ndarray
     key_costs: np.ndarray
     successes: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    unfinished: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __len__(self) -> int:
         return len(self.returns)
@@ -61,23 +91,7 @@ class Evaluation:
         returns, costs = self.estimate(self.returns), self.estimate(self.costs)
         return f"{len(self)} episodes: return {returns}, cost {costs}"
 
-    def estimate(self, values: np.ndarray, resamples: int = 2000) -> Estimate:
-        """
-        Mean, standard deviation and 95 % percentile-bootstrap interval of one of the arrays.
-
-        The resampling has its own fixed seed: the same episodes give the same interval.
-
-        :param values: one value an episode, shape [E], e.g. ``evaluation.costs``
-        :param resamples: number of bootstrap samples
-        :return: NaNs where there are too few episodes (none; for the interval, one)
-        """
-        if len(values) == 0:
-            return Estimate(*[float("nan")] * 4)
-        low = high = float("nan")
-        if len(values) > 1:
-            rows = np.random.default_rng(0).integers(len(values), size=(resamples, len(values)))
-            low, high = np.quantile(values[rows].mean(axis=1), [0.025, 0.975]).tolist()
-        return Estimate(float(np.mean(values)), float(np.std(values)), low, high)
+    estimate = staticmethod(estimate)
 
 
 def share_environment(one: VecEnv, other: VecEnv) -> bool:
@@ -225,4 +239,5 @@ def evaluate_policy(
         lengths=np.array([episode[2] for episode in ended], dtype=np.int64),
         key_costs=np.array([episode[3] for episode in ended]).reshape(len(ended), len(keys)),
         successes=np.array(successes, dtype=bool),
+        unfinished=np.stack([returns, totals, lengths], axis=1)[(left > 0) & (lengths > 0)],
     )

@@ -168,7 +168,8 @@ def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]
     for key in ("return", "cost", "length"):
         one = results[key]
         interval = "–" if one["low"] is None else f"{one['low']:.2f} to {one['high']:.2f}"
-        rows.append(f"| {key} | {one['mean']:.2f} | {one['std']:.2f} | {interval} |")
+        spread = "–" if one["low"] is None else f"{one['std']:.2f}"
+        rows.append(f"| {key} | {one['mean']:.2f} | {spread} | {interval} |")
     limit = getattr(agent.model, "cost_limit", None)
     constrained = getattr(agent.model, "constrained", False) and limit is not None
     page = CARD.format(

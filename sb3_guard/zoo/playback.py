@@ -12,6 +12,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.common.vec_env import GuardVecEnv
@@ -235,23 +236,28 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
                 seed=flags.seed,
                 max_steps=flags.n_timesteps,
                 on_step=shoot,
-                on_episode=_print_episode if flags.verbose > 0 else None,
+                on_episode=(lambda *one: print(_episode(*one))) if flags.verbose > 0 else None,
             )
     except ERRORS_OF_OURS as error:
         raise UsageError(f"can't play {agent.env_id}: {one_line(error)}") from error
     finally:
         agent.env.close()
     print(_means(evaluation, agent))
-    rest = (flags.n_timesteps or 0) - int(np.sum(evaluation.lengths))
-    if rest > 0:
-        print(f"The last {rest} steps are of an episode that did not end: they are not counted")
+    if flags.verbose > 0:
+        for one in evaluation.unfinished:
+            print(_episode(*one), "so far: this episode did not end and is not counted")
+        trained = (agent.run.read_result() or {}).get("return")
+        if not flags.stochastic and trained is not None:
+            best = evaluation.estimate(evaluation.returns).high
+            if best < trained - 0.5 * abs(trained):
+                print(f"With noise, in training, its return was {trained:.2f}: see --stochastic")
     if flags.json:
         played = {name: getattr(flags, name) for name in ("algo", "seed", "stochastic")}
         content = {"model": str(agent.path), "env": agent.env_id, **played, **summary(evaluation)}
         Path(flags.json).parent.mkdir(parents=True, exist_ok=True)
         with replacing(flags.json) as file:
             file.write(json.dumps(content, indent=2, allow_nan=False).encode())
-    if video is not None:
+    if video is not None and flags.verbose > 0:
         print(f"Video: {video}")
     return 0
 
@@ -287,23 +293,29 @@ def _columns(evaluation: Evaluation) -> dict[str, np.ndarray]:
     }
 
 
-def _print_episode(episode_return: float, cost: float, length: int) -> None:
-    print(f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length} steps")
+def _episode(episode_return: float, cost: float, length: float) -> str:
+    return f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length:.0f} steps"
 
 
 def _means(evaluation: Evaluation, agent: Agent) -> str:
     count = len(evaluation)
     if count == 0:
         return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"
-    limit = getattr(agent.model, "cost_limit", None)
-    told = getattr(agent.model, "constrained", False) and limit is not None
+    columns, limits = _columns(evaluation), {}
+    if isinstance(agent.model, Constrained) and agent.model.constrained:
+        keys = agent.model.cost_keys
+        if len(keys) > 1:  # each has its limit, their sum has none
+            columns |= dict(zip(keys, evaluation.key_costs.T, strict=True))
+        names = keys if len(keys) > 1 else ("cost",)
+        limits = dict(zip(names, agent.model.cost_limits, strict=True))
     rows = [f"Mean ± std of {count} episodes, 95 % interval of the mean:"]
     if count == 1:
         rows = ["One episode:"]
-    for name, values in _columns(evaluation).items():
-        mean, std, low, high = evaluation.estimate(values)
+    for name, values in columns.items():
+        estimate = evaluation.estimate(values)
+        mean, std, low, high = estimate
         interval = f" ± {std:.3f}   [{low:.3f}, {high:.3f}]" if count > 1 else ""
-        end = f"   (limit {limit})" if name == "cost" and told else ""
+        end = f"   {estimate.against(limits[name])}" if name in limits else ""
         rows.append(f"  {name:<7}{mean:9.3f}{interval}{end}")
     return "\n".join(rows)
 

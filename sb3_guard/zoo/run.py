@@ -6,6 +6,7 @@ and starts counters, seeds and environments anew when it continues; so its piece
 """
 
 import copy
+import shlex
 import signal
 import sys
 import time
@@ -25,6 +26,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
+from sb3_guard.common.evaluation import estimate
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import CostMonitor, find_monitor
 from sb3_guard.zoo.algos import algorithm
@@ -173,7 +175,7 @@ class Experiment:
             if noise is not None:
                 arguments["action_noise"] = noise
             return self.algorithm(env=self.env, device=flags.device, **arguments)
-        except (*BAD_ARGUMENTS, RuntimeError) as error:
+        except (*BAD_ARGUMENTS, RuntimeError, MemoryError) as error:
             raise UsageError(f"{flags.algo} can't be made: {one_line(error)}") from error
 
     def _action_noise(self) -> ActionNoise | None:
@@ -345,6 +347,7 @@ class Experiment:
         if finished:
             folder.write_result({"algo": self.flags.algo, "env": self.flags.env, **result})
         if verbose:
+            result["interval"] = estimate(epochs.last[:, 1])
             print(summary(folder, self.flags, result, time.monotonic() - began, finished))
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
@@ -425,7 +428,7 @@ def from_environment(error: BaseException) -> bool:
 
 def _stdout_is_full() -> bool:
     try:
-        sys.stdout.flush()  # what could not be written is still waiting
+        print(flush=True)
     except OSError:
         return True
     return False
@@ -439,13 +442,16 @@ def summary(
     def number(value: float | None, digits: int) -> str:
         return "– (no episode has ended)" if value is None else f"{value:.{digits}f}"
 
-    limit = "" if result["cost_limit"] is None else f"   (limit {result['cost_limit']})"
+    costs, limit = result["interval"], result["cost_limit"]
+    interval = "" if np.isnan(costs.low) else f"   [{costs.low:.3f}, {costs.high:.3f}]"
+    if isinstance(limit, int | float):  # several limits are of parts of the cost
+        interval += f"   {costs.against(limit)}"
     lines = [
         f"{'Finished' if finished else 'Interrupted'} at {result['n_timesteps']:,} steps, "
         f"{seconds:.0f} s",
         f"  run folder         {folder.path}",
         f"  return       J_r   {number(result['return'], 3)}",
-        f"  episode cost M_c   {number(result['cost'], 3)}{limit}",
+        f"  episode cost M_c   {number(result['cost'], 3)}{interval}",
         f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
     ]
     if not finished:
@@ -453,6 +459,6 @@ def summary(
     elif (own := folder.path.name[len(folder.name) + 1 :]).isdigit():
         lines.append(
             f"  see the agent      sb3-guard enjoy --algo {flags.algo} --env {flags.env} "
-            f"-f {folder.path.parent.parent} --exp-id {own}"
+            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {own}"
         )
     return "\n".join(lines)

@@ -18,6 +18,7 @@ import yaml
 from filelock import SoftFileLease, Timeout
 
 from sb3_guard.common.files import replacing
+from sb3_guard.plain_yaml import Bounded
 from sb3_guard.zoo.flags import IDENTITY
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.usage import UsageError, one_line
@@ -50,7 +51,7 @@ _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _SafeDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
-class _Loader(_SafeLoader):
+class _Loader(Bounded, _SafeLoader):
     """Plain data, and the ordered mappings that RL-Zoo writes."""
 
 

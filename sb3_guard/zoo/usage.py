@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import errno
 import importlib
 import os
 import re
@@ -45,7 +46,14 @@ def import_packages(names: Sequence[str]) -> None:
     for name in names:
         try:
             importlib.import_module(name)
-        except ImportError as error:
+        except (ImportError, TypeError, ValueError) as error:
+            if not re.fullmatch(r"\w+(\.\w+)*", name):
+                raise UsageError(
+                    f"--gym-packages: {name!r} is no module's name; it must be like my_envs or "
+                    "package.my_envs, importable from the current folder"
+                ) from None
+            if not isinstance(error, ImportError):
+                raise  # from within the module
             raise UsageError(f"--gym-packages: can't import {name!r}: {one_line(error)}") from error
 
 
@@ -92,7 +100,10 @@ def run(command: Callable[[], int]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         return 141
-    except (UsageError, ImportError) as error:  # an absent package, or no backend for MuJoCo
+    except (UsageError, ImportError, OSError) as error:
+        # an absent package, or no backend for MuJoCo; a name too long, no room where output goes
+        if isinstance(error, OSError) and error.errno not in (errno.ENAMETOOLONG, errno.ENOSPC):
+            raise
         text = one_line(error)
         print(f"error: {text if len(text) <= LONGEST else text[:LONGEST] + ' …'}", file=sys.stderr)
         if isinstance(error, ForeignError):

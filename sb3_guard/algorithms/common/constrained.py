@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
@@ -195,9 +195,16 @@ class Constrained(BaseAlgorithm):
             self.running_lengths = np.zeros(self.n_envs, dtype=np.int64)
             self.last_costs = np.zeros((self.n_envs, n_costs))
             self._begin_statistics()
-        return super()._setup_learn(
+        steps, callbacks = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
+        among = callbacks.callbacks if isinstance(callbacks, CallbackList) else [callbacks]
+        if self.constrained and any(type(one) is EvalCallback for one in among):
+            self._warn_once(
+                "EvalCallback keeps the model of the highest reward, whatever it costs: "
+                "sb3_guard.CostEvalCallback keeps the best safe one"
+            )
+        return steps, callbacks
 
     def _begin_statistics(self) -> None:
         """Forget the episodes that have ended: the next estimate is about others."""

@@ -1,5 +1,8 @@
 """The native vector environment of Stable-Baselines3, against one environment after the other."""
 
+import os
+import weakref
+
 import cloudpickle
 import gymnasium
 import numpy as np
@@ -194,6 +197,32 @@ def test_native_environments_can_be_copied():
     twin = copy.deepcopy(env)
     for _ in range(3):
         np.testing.assert_array_equal(env.step(np.ones((2, 2)))[0], twin.step(np.ones((2, 2)))[0])
+
+
+def test_a_closed_environment_is_over_and_leaves_nothing():
+    env = GuardVecEnv("Goal_Point_8Hazards", 2, num_threads=2)
+    env.reset()
+    env.close()
+    for name, arguments in (("reset", []), ("step", [np.zeros((2, 2))])):
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="was closed"):
+            getattr(env, name)(*arguments)
+    simulations = weakref.ref(env.envs.engine.batch)
+    del env
+    assert simulations() is None  # without waiting for the garbage collector
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_fork_has_no_threads_to_step_what_it_inherits(threads):
+    env = GuardVecEnv("Goal_Point_8Hazards", 2, num_threads=threads)
+    env.reset()
+    if (child := os.fork()) == 0:
+        try:
+            env.step(np.zeros((2, 2)))
+            os._exit(1)
+        except RuntimeError as error:
+            os._exit(2 if "forked" in str(error) else 3)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == threads
 
 
 def test_a_step_before_the_first_reset_is_refused():

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from gymnasium.error import ResetNeeded
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import DTypeLike
 
 from sb3_guard.envs.arena import Arena
@@ -84,6 +84,7 @@ class Engine:
         self.num_threads = min(num_threads or _cpus(), self.num_envs)
         self._build()
 
+        self._process: int | None = os.getpid()  # whose threads step it; None: closed
         self.rngs = [np.random.default_rng() for _ in range(self.num_envs)]
         self._arrays: dict[str, Array] = {}
         self.steps = self.array("steps", dtype=np.int64)
@@ -229,6 +230,7 @@ class Engine:
 
         :raises LayoutError: a part finds no room, or no start is without a cost
         """
+        self._check_open()
         ids = np.asarray(ids, dtype=np.int32)
         self.steps[ids] = 0
         if not self._layout.randomize:
@@ -290,6 +292,7 @@ class Engine:
         :raises ValueError: actions of the wrong shape or not finite
         :raises gymnasium.error.ResetNeeded: no episode has begun
         """
+        self._check_open()
         if not self._begun:
             raise ResetNeeded("call reset() before step()")
         actions = self._check_actions(actions)
@@ -336,6 +339,25 @@ class Engine:
         return Outcome(
             self.observe(), reward, costs, total, met, terminated, unplaced, diverged, ended_by
         )
+
+    def close(self) -> None:
+        """Part with the parts, so that the memory is free as soon as nobody uses the engine."""
+        self._process = None
+        for part in self.parts:
+            vars(part).pop("sim", None)
+
+    def _check_open(self) -> None:
+        """
+        :raises gymnasium.error.ClosedEnvironmentError: it was closed
+        :raises RuntimeError: it came here by ``os.fork``, without the threads that step it
+        """
+        if self._process is None:
+            raise ClosedEnvironmentError("the environment was closed: make another one")
+        if self.num_threads > 1 and self._process != os.getpid():
+            raise RuntimeError(
+                "the environment was made before this process was forked, and the threads that "
+                "step it are not here: make it in this process, or with num_threads=1"
+            )
 
     def _before_physics(self) -> None:
         for part in self._quick:

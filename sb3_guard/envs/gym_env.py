@@ -177,11 +177,13 @@ class Simulated:
             self._renderer = Renderer(self.engine, *self._window)
         return self._renderer
 
-    def _free_renderers(self) -> None:
+    def _free(self) -> None:
         for renderer in (self._renderer, self._eye):
             if renderer is not None:
                 renderer.close()
         self._renderer = self._eye = None
+        if hasattr(self, "engine"):  # not after a refusal in the constructor
+            self.engine.close()
 
     def state(self) -> dict[str, Any]:
         """Everything the coming steps depend on; :meth:`restore` continues from it bit for bit."""
@@ -301,8 +303,8 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         return self._renderer.render(0)
 
     def close(self) -> None:
-        """Free the renderers."""
-        self._free_renderers()
+        """Free the renderers and end the simulation: a step after it is an error."""
+        self._free()
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a :meth:`state` of the same scenario."""

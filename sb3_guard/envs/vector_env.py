@@ -188,5 +188,5 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         return tuple(self.frame(row) for row in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Free the renderers."""
-        self._free_renderers()
+        """Free the renderers and end the simulations: a step after it is an error."""
+        self._free()

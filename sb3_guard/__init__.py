@@ -28,6 +28,7 @@ _EXPORTS = {
     "P3O": "sb3_guard.algorithms",
     "CRPO": "sb3_guard.algorithms",
     "RCPO": "sb3_guard.algorithms",
+    "SCPO": "sb3_guard.algorithms",
     "SACLag": "sb3_guard.algorithms",
     "TD3Lag": "sb3_guard.algorithms",
     "ALGORITHMS": "sb3_guard.algorithms",

@@ -20,6 +20,7 @@ from sb3_guard.algorithms.pcpo import PCPO
 from sb3_guard.algorithms.ppo_lag import PPOLag
 from sb3_guard.algorithms.rcpo import RCPO
 from sb3_guard.algorithms.sac_lag import SACLag
+from sb3_guard.algorithms.scpo import SCPO
 from sb3_guard.algorithms.td3_lag import TD3Lag
 from sb3_guard.algorithms.trpo import TRPO
 from sb3_guard.algorithms.trpo_fac import TRPOFAC
@@ -44,6 +45,7 @@ KEYS = (
     "p3o",
     "crpo",
     "rcpo",
+    "scpo",
     "sac_lag",
     "td3_lag",
 )
@@ -101,6 +103,7 @@ __all__ = [
     "P3O",
     "PCPO",
     "RCPO",
+    "SCPO",
     "TRPO",
     "TRPOFAC",
     "TRPOIPO",

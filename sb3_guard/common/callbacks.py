@@ -57,10 +57,11 @@ class CostEvalCallback(EvalCallback):
 
     Logs ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/mean_ep_cost``; where both policies
     are evaluated ``eval/stochastic_reward`` and ``eval/stochastic_ep_cost``; and for several costs,
-    of which that is the total, ``eval/mean_ep_cost/<key>``. ``evaluations.npz`` has ``timesteps``
-    [K], ``results``, ``ep_lengths`` and ``costs`` [K, E], and for several costs ``key_costs``
-    [K, E, m]. Beside ``best_model.zip`` of an agent that was trained on normalised observations
-    lies ``best_model_vecnormalize.pkl``.
+    of which that is the total, ``eval/mean_ep_cost/<key>``; and ``eval/mean_max_cost`` of an
+    algorithm that limits the worst step, whose highest costs are what must keep its limit.
+    ``evaluations.npz`` has ``timesteps`` [K], ``results``, ``ep_lengths`` and ``costs`` [K, E], and
+    for several costs ``key_costs`` [K, E, m]. Beside ``best_model.zip`` of an agent that was
+    trained on normalised observations lies ``best_model_vecnormalize.pkl``.
 
     SB3's ``StopTrainingOnNoModelImprovement`` and ``StopTrainingOnRewardThreshold`` may be among
     its callbacks: the ``best_mean_reward`` that they compare rises with every new best model, and
@@ -68,7 +69,7 @@ class CostEvalCallback(EvalCallback):
 
     :param eval_env: environment to evaluate in, wrapped as the training environment is, and not
         that environment itself
-    :param selection_limit: episode cost up to which a model counts as safe, one number or one per
+    :param selection_limit: cost up to which a model counts as safe, one number or one per
         cost key. None: ``cost_limit`` of the algorithm, and 1 for a limit of 0 (which would choose
         nobody, or the untrained agent); for an unconstrained algorithm the return alone decides
     :param seed: seed of the evaluation episodes
@@ -165,7 +166,7 @@ class CostEvalCallback(EvalCallback):
         """
         violation = 0.0
         for evaluation in evaluations:
-            costs, n = evaluation.key_costs, len(evaluation)
+            costs, n = evaluation.limited, len(evaluation)
             error = costs.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else 0.0
             excess = np.maximum(costs.mean(axis=0) + error - self.limits(), 0.0)  # [m]
             violation = float(np.maximum(violation, excess.sum()))  # nan stays nan
@@ -218,10 +219,11 @@ class CostEvalCallback(EvalCallback):
         if self.verbose >= 1:
             returns = evaluation.estimate(evaluation.returns)
             words = [f"return {returns.mean:.2f} ± {returns.std:.2f}"]
-            rows = zip(self.cost_keys, evaluation.key_costs.T, self.limits(), strict=True)
+            name = "worst step of {}" if evaluation.limit_on == "max" else "{}"
+            rows = zip(self.cost_keys, evaluation.limited.T, self.limits(), strict=True)
             for key, costs, limit in rows:
                 beside = f" (limit {limit:g})" if np.isfinite(limit) else ""
-                words.append(f"{key} {costs.mean():.2f} ± {costs.std():.2f}{beside}")
+                words.append(f"{name.format(key)} {costs.mean():.2f} ± {costs.std():.2f}{beside}")
             words += [f"with noise {other.costs.mean():.2f}" for other in noisy]
             best = " (best so far)" if is_best else ""
             print(f"Evaluation after {self.num_timesteps} steps: {', '.join(words)}{best}")
@@ -242,6 +244,8 @@ class CostEvalCallback(EvalCallback):
         if len(self.cost_keys) > 1:
             for key, cost in zip(self.cost_keys, evaluation.key_costs.mean(axis=0), strict=True):
                 self.logger.record(f"eval/mean_ep_cost/{key}", float(cost))
+        if evaluation.limit_on == "max":
+            self.logger.record("eval/mean_max_cost", float(evaluation.worst.mean()))
         if len(evaluation.successes):
             self.logger.record("eval/success_rate", float(evaluation.successes.mean()))
         # Written at once, so that the row bears the step of the evaluation.

@@ -75,6 +75,8 @@ class Evaluation:
     :param successes: ``info["is_success"]`` at the end of the episodes that report one
     :param unfinished: return, cost and steps of the episodes that ``max_steps`` cut short,
         shape [K, 3]; they are in none of the others
+    :param max_costs: highest cost of a step, by key, shape [E, m]; 0 where none is above it
+    :param limit_on: what of the costs the model's limits bound, their ``"sum"`` or ``"max"``
     """
 
     returns: np.ndarray
@@ -83,13 +85,28 @@ class Evaluation:
     key_costs: np.ndarray
     successes: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     unfinished: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    max_costs: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)))
+    limit_on: str = "sum"
 
     def __len__(self) -> int:
         return len(self.returns)
 
     def __str__(self) -> str:
         returns, costs = self.estimate(self.returns), self.estimate(self.costs)
-        return f"{len(self)} episodes: return {returns}, cost {costs}"
+        text = f"{len(self)} episodes: return {returns}, cost {costs}"
+        if self.limit_on == "max":
+            text += f", worst step {self.estimate(self.worst)}"
+        return text
+
+    @property
+    def limited(self) -> np.ndarray:
+        """What the model's limits bound, of each episode and cost key, shape [E, m]."""
+        return self.max_costs if self.limit_on == "max" else self.key_costs
+
+    @property
+    def worst(self) -> np.ndarray:
+        """Highest cost of a step of any key, shape [E]."""
+        return self.max_costs.max(axis=1)
 
     estimate = staticmethod(estimate)
 
@@ -182,8 +199,9 @@ def evaluate_policy(
     left = np.array([(n_eval_episodes + i) // n for i in range(n)])
     returns, lengths = np.zeros(n), np.zeros(n, dtype=np.int64)
     costs = np.zeros((n, len(keys)))  # [n, m], episodes under way
+    highest = np.zeros((n, len(keys)))
     totals = np.zeros(n)
-    ended: list[tuple[float, float, int, np.ndarray]] = []
+    ended: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
     successes: list[bool] = []
 
     with _own_random_numbers(seed):
@@ -207,6 +225,7 @@ def evaluate_policy(
             returns += rewards
             lengths += 1
             costs += last_costs
+            highest = np.maximum(highest, last_costs)
             if len(keys) == 1:
                 totals += last_costs[:, 0]
             else:
@@ -225,13 +244,14 @@ def evaluate_policy(
                     outcome = (float(returns[i]), int(lengths[i]))
                     if episode is not None:
                         outcome = (float(episode["r"]), int(episode["l"]))
-                    ended.append((outcome[0], float(totals[i]), outcome[1], costs[i].copy()))
+                    sums = costs[i].copy(), highest[i].copy()
+                    ended.append((outcome[0], float(totals[i]), outcome[1], *sums))
                     if "is_success" in infos[i]:
                         successes.append(bool(infos[i]["is_success"]))
                     if on_episode is not None:
                         on_episode(outcome[0], float(totals[i]), outcome[1])
                 returns[i] = totals[i] = lengths[i] = 0
-                costs[i] = 0.0
+                costs[i] = highest[i] = 0.0
 
     return Evaluation(
         returns=np.array([episode[0] for episode in ended]),
@@ -240,4 +260,6 @@ def evaluate_policy(
         key_costs=np.array([episode[3] for episode in ended]).reshape(len(ended), len(keys)),
         successes=np.array(successes, dtype=bool),
         unfinished=np.stack([returns, totals, lengths], axis=1)[(left > 0) & (lengths > 0)],
+        max_costs=np.array([episode[4] for episode in ended]).reshape(len(ended), len(keys)),
+        limit_on=getattr(model, "limit_on", "sum"),
     )

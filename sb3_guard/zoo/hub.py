@@ -165,13 +165,15 @@ def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]
         ],
     )
     rows = []
-    for key in ("return", "cost", "length"):
-        one = results[key]
+    for key, one in results.items():
+        if not isinstance(one, dict):
+            continue
         interval = "–" if one["low"] is None else f"{one['low']:.2f} to {one['high']:.2f}"
         spread = "–" if one["low"] is None else f"{one['std']:.2f}"
         rows.append(f"| {key} | {one['mean']:.2f} | {spread} | {interval} |")
     limit = getattr(agent.model, "cost_limit", None)
     constrained = getattr(agent.model, "constrained", False) and limit is not None
+    worst = " on the worst step" if "worst" in results else ""
     page = CARD.format(
         name=name,
         env=agent.env_id,
@@ -180,7 +182,7 @@ def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]
         episodes=results["episodes"],
         actions="sampled" if flags.stochastic else "most likely",
         rows="\n".join(rows),
-        limit=f"; the agent was trained under a limit of {limit}" if constrained else "",
+        limit=f"; the agent was trained under a limit of {limit}{worst}" if constrained else "",
         command=command(agent.run),
         hyperparams=yaml.safe_dump(agent.run.hyperparams()),
     )

@@ -273,7 +273,8 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
     """
     Return, cost and length as plain data.
 
-    :return: the number of ``episodes``, and for ``return``, ``cost`` and ``length`` the ``mean``,
+    :return: the number of ``episodes``, and for ``return``, ``cost`` and ``length``, and ``worst``,
+        the highest cost of a step, of an agent that limits that, the ``mean``,
         ``std``, the 95 % interval of the mean (``low``, ``high``) and the ``values``, one an
         episode; None where there are too few episodes for it
     """
@@ -290,6 +291,7 @@ def _columns(evaluation: Evaluation) -> dict[str, np.ndarray]:
         "return": evaluation.returns,
         "cost": evaluation.costs,
         "length": evaluation.lengths,
+        **({"worst": evaluation.worst} if evaluation.limit_on == "max" else {}),
     }
 
 
@@ -305,8 +307,8 @@ def _means(evaluation: Evaluation, agent: Agent) -> str:
     if isinstance(agent.model, Constrained) and agent.model.constrained:
         keys = agent.model.cost_keys
         if len(keys) > 1:  # each has its limit, their sum has none
-            columns |= dict(zip(keys, evaluation.key_costs.T, strict=True))
-        names = keys if len(keys) > 1 else ("cost",)
+            columns |= dict(zip(keys, evaluation.limited.T, strict=True))
+        names = keys if len(keys) > 1 else ("worst" if evaluation.limit_on == "max" else "cost",)
         limits = dict(zip(names, agent.model.cost_limits, strict=True))
     rows = [f"Mean ± std of {count} episodes, 95 % interval of the mean:"]
     if count == 1:

@@ -142,6 +142,7 @@ class Epochs(BaseCallback):
             which any ended (None if none did), their number ``episodes``, ``cost_rate``,
             cumulative cost ÷ steps of the whole run, ``physics_errors``, the number of episodes
             that ended because the physics diverged, ``cost_limit`` (None: unconstrained),
+            ``limit_on`` of an algorithm that limits the worst step,
             ``seconds`` of training, and :func:`provenance`. ``learned``, absent from a straight
             run, is the steps at which it was made longer, since warm-up and schedules were those
             of shorter runs until then
@@ -161,6 +162,7 @@ class Epochs(BaseCallback):
             "n_timesteps": self.model.num_timesteps,
             "physics_errors": monitor.physics_errors,
             "cost_limit": limit,
+            **({"limit_on": "max"} if getattr(algorithm, "limit_on", "sum") == "max" else {}),
             "seconds": round(self._elapsed(), 3),
             **({"learned": self.learned} if self.learned else {}),
             **self._provenance,

@@ -444,7 +444,9 @@ def summary(
 
     costs, limit = result["interval"], result["cost_limit"]
     interval = "" if np.isnan(costs.low) else f"   [{costs.low:.3f}, {costs.high:.3f}]"
-    if isinstance(limit, int | float):  # several limits are of parts of the cost
+    if result.get("limit_on") == "max":
+        interval += f"   limit on the worst step {limit}"
+    elif isinstance(limit, int | float):  # several limits are of parts of the cost
         interval += f"   {costs.against(limit)}"
     lines = [
         f"{'Finished' if finished else 'Interrupted'} at {result['n_timesteps']:,} steps, "

@@ -152,7 +152,7 @@ class Evaluations(BaseCallback):
             seed=evaluation_seed(self.experiment.flags.seed),
             cost_keys=self.settings.cost_keys,
         )
-        row = [float(result.returns.mean()), *result.key_costs.mean(axis=0).tolist()]
+        row = [float(result.returns.mean()), *result.limited.mean(axis=0).tolist()]
         if not np.isfinite(row).all():
             raise FloatingPointError(f"an evaluation gave {row}")
         self.history.append(row)

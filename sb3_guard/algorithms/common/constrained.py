@@ -50,6 +50,9 @@ class Constrained(BaseAlgorithm):
     paper: ClassVar[str] = ""
     #: Whether training depends on costs at all.
     constrained: ClassVar[bool] = True
+    #: What of an episode's costs the limits bound: their sum, or the highest one of a step. Then
+    #: the cost of a step is what it adds to the highest before it, which is 0 at first.
+    limit_on: ClassVar[Literal["sum", "max"]] = "sum"
     #: Arguments of SB3's constructors that the class fills in itself.
     fixed_arguments: ClassVar[frozenset[str]] = frozenset()
 
@@ -87,6 +90,7 @@ class Constrained(BaseAlgorithm):
 
         # Running episodes outlive rollouts, and a run may be saved between two.
         self.running_costs: np.ndarray | None = None  # [n_envs, m]
+        self.running_charges: np.ndarray | None = None  # [n_envs, m], what a limit is held against
         self.running_lengths: np.ndarray | None = None  # [n_envs]
         # What the last step cost, 0 before the first one of an episode.
         self.last_costs: np.ndarray | None = None  # [n_envs, m]
@@ -192,6 +196,7 @@ class Constrained(BaseAlgorithm):
         # The environments are reset under the same condition.
         if reset_num_timesteps or self._last_obs is None:
             self.running_costs = np.zeros((self.n_envs, n_costs))
+            self.running_charges = np.zeros((self.n_envs, n_costs))
             self.running_lengths = np.zeros(self.n_envs, dtype=np.int64)
             self.last_costs = np.zeros((self.n_envs, n_costs))
             self._begin_statistics()
@@ -219,20 +224,25 @@ class Constrained(BaseAlgorithm):
         super()._update_info_buffer(infos, dones)
         assert dones is not None and self.ep_cost_buffer is not None
         assert self.running_costs is not None and self.running_lengths is not None
+        assert self.running_charges is not None
         # A vectorised environment without anything to say may leave infos out.
         infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
         costs, seen = read_costs(infos, self.cost_keys, self.missing_cost == "zero")
         self._cost_seen_lately |= seen
-        self.step_costs = costs  # [n_envs, m], for the buffer
+        # [n_envs, m], for the buffer; of the highest cost so far, what the step adds to it
+        self.step_costs = costs
+        if self.limit_on == "max":
+            self.step_costs = np.maximum(costs - self.running_charges, 0.0)
         self.total_costs += costs.sum(axis=0)
         self.running_costs += costs
+        self.running_charges += self.step_costs
         self.running_lengths += 1
         self.last_costs = np.where(dones[:, None], 0.0, costs)
         for i in np.flatnonzero(dones):
-            self._ended_costs.append(self.running_costs[i].copy())
+            self._ended_costs.append(self.running_charges[i].copy())
             self._ended_lengths.append(int(self.running_lengths[i]))
-            self.ep_cost_buffer.append(self._ended_costs[-1])
-            self.running_costs[i] = 0.0
+            self.ep_cost_buffer.append(self.running_costs[i].copy())
+            self.running_costs[i] = self.running_charges[i] = 0.0
             self.running_lengths[i] = 0
 
     def _estimate_costs(self, rate: np.ndarray | None = None) -> bool:

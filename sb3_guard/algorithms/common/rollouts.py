@@ -20,6 +20,7 @@ from stable_baselines3.common.utils import obs_as_tensor, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
+from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
 from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.constrained import Constrained
@@ -235,9 +236,10 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             self.cost_critic.optimizer, self.lr_schedule(self._current_progress_remaining)
         )
         batch = self.rollout_buffer.whole()
+        learnt = self.critic_rows(batch.cost_returns)
         loss = Regression.of_network(self.cost_critic).fit(
-            batch.observations,
-            batch.cost_returns,
+            rows(batch.observations, learnt),
+            batch.cost_returns[learnt],
             getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,
             getattr(self, "batch_size", None) if batch_size is None else batch_size,
             self.cost_rng,
@@ -245,6 +247,14 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         self._check_finite("cost_value_loss", loss)
         self.logger.record("train/cost_value_loss", loss)
         self._record_violation()
+
+    def critic_rows(self, targets: th.Tensor) -> slice | th.Tensor:
+        """Which rows of the rollout the cost critic learns from: all.
+
+        :param targets: its cost returns, shape [N, m]
+        :return: an index of rows
+        """
+        return slice(None)
 
     def _check_finite(self, name: str, loss: float) -> None:
         """

@@ -1,7 +1,5 @@
 """Safety-Gymnasium's tasks, compared with what its release 1.0.0 did from the same states."""
 
-import functools
-
 import gymnasium
 import numpy as np
 import pytest
@@ -17,12 +15,14 @@ EXACT = 1e-6  # relative; observations in the files have 21 bits
 FORCES = ("accelerometer", "touch")
 SOLVED = 2e-3
 
-trace = functools.cache(Trace)
+
+@pytest.fixture(scope="module", params=NAVIGATION)
+def t(request):
+    """One trace at a time: each has hundreds of simulations, which reserve 15 MB each."""
+    return Trace(request.param)
 
 
-@pytest.mark.parametrize("name", NAVIGATION)
-def test_observations_of_every_state(name):
-    t = trace(name)
+def test_observations_of_every_state(t):
     rows = np.arange(t.states)
     t.set(rows, rows)
     ours, theirs = t.engine.observe(np.float64), t["obs"]
@@ -37,9 +37,7 @@ def test_observations_of_every_state(name):
             assert worst.max() < EXACT, component
 
 
-@pytest.mark.parametrize("name", NAVIGATION)
-def test_rewards_costs_goals_and_deaths_of_every_step(name):
-    t = trace(name)
+def test_rewards_costs_goals_and_deaths_of_every_step(t):
     engine, n = t.engine, len(t.before)
     assert n >= 200
     t.set(t.before, t.before)
@@ -84,7 +82,7 @@ def test_every_event_that_the_task_knows_is_in_the_trace(name):
     [("Point", 1e-6, 1e-6), ("Car", 1e-6, 1e-5), ("Ant", 1e-3, 0.1), ("Doggo", 1e-6, 1e-5)],
 )
 def test_one_control_step_of_another_mujoco(robot, usual, most):
-    t = trace(f"{robot}Goal0")
+    t = Trace(f"{robot}Goal0")
     n = len(t.before)
     t.set(t.before, t.before)
     actions = np.zeros((t.states, t.engine.robot.action_size))

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -14,11 +13,11 @@ import pandas as pd
 import pytest
 import yaml
 from cost_envs import CostPoint
-from kill_tuner import campaign, faults
+from kill_tuner import campaign, faults, work
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState, create_trial
-from processes import fork, join, wait_for
+from processes import fresh, wait_for
 from test_bad_input import empty, refused  # noqa: F401 (a fixture)
 
 from sb3_guard import cli, train, tune
@@ -502,13 +501,15 @@ def states_or_none(folder) -> dict:
 
 
 def test_a_killed_workers_trial_is_done_at_the_next_start(tmp_path, folder, monkeypatch):
-    pretend(monkeypatch, lambda values, seed: time.sleep(60))
-    first = fork(lambda argv: run(tmp_path, *argv), ["--n-trials", "1"], tmp_path / "0.txt")
-    wait_for(lambda: "RUNNING" in states_or_none(folder))
-    os.kill(first, signal.SIGKILL)
-    join(first)
+    command = ["-n", "1e8", "--n-trials", "1"]
+    arguments = [*TOY, *SMALL, "-f", str(tmp_path), "--pruner", "none", *command]
+    worker = fresh(work, arguments, tmp_path / "0.txt")
+    wait_for(lambda: "RUNNING" in states_or_none(folder) or not worker.is_alive(), 300)
+    worker.kill()
+    worker.join()
+    assert states(folder) == {"RUNNING": 1}, (tmp_path / "0.txt").read_text()
     pretend(monkeypatch, by_kl)
-    assert run(tmp_path, "--n-trials", "1") == 0
+    assert run(tmp_path, *command) == 0
     assert states(folder) == {"FAIL": 1, "COMPLETE": 1}
     assert study_in(folder).trials[1].params["target_kl"] == SHIPPED_KL
     left = {path.name for path in (folder / "study.journal.locks").iterdir()}

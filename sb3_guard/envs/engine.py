@@ -341,10 +341,8 @@ class Engine:
         )
 
     def close(self) -> None:
-        """Part with the parts, so that the memory is free as soon as nobody uses the engine."""
+        """Refuse any further step or reset."""
         self._process = None
-        for part in self.parts:
-            vars(part).pop("sim", None)
 
     def _check_open(self) -> None:
         """

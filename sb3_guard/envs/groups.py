@@ -9,6 +9,7 @@ where both do.
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -72,7 +73,7 @@ class Group:
         reachable: bool = False,
         **footprint: Any,
     ) -> None:
-        self.part: Part = part
+        self.part: Any = weakref.proxy(part)  # which has this group
         self.name, self.size, self.solid = name, float(part.size), shape is not None
         fields = {
             "placements": part.placements,

@@ -23,6 +23,7 @@ restored whole.
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
@@ -167,7 +168,8 @@ class Part(Parameters):
 
     def bind(self, sim: Simulation) -> None:
         """Take live views of the running simulations."""
-        self.sim = sim
+        # the engine is freed, with many megabytes, as soon as nobody but its parts refers to it
+        self.sim = weakref.proxy(sim)
         for group in self.groups:
             group.bind(sim)
 

@@ -1,9 +1,12 @@
-"""How far one control step of ours is from Safety-Gymnasium 1.0.0's, from the same states.
+"""How far our tasks are from Safety-Gymnasium 1.0.0's, over all that was recorded of it.
 
-``python scripts/compare_safety_gymnasium.py`` prints, per robot, the largest deviations over all
-recorded steps (``tests/data/safety_gymnasium``): while it touches nothing but the floor, and while
-it, or something else, touches an object. Numbers in the files are rounded to 1e-6 m and, of
-velocities, to 11 bits: they can't be told apart more closely. The causes are in docs/fidelity.md.
+``python scripts/compare_safety_gymnasium.py`` prints two tables, of all 52 ids
+(``tests/data/safety_gymnasium``), with a column or two rows for each robot. What is observed and
+rewarded in a recorded state: the largest differences, relative to the value or to 0.01 if that is
+more; observations in the files have 21 bits, 4.8e-7. And one control step from a recorded state, by
+the physics of another MuJoCo, while the robot and everything else touch nothing but the floor, and
+while something touches an object; places in the files have 20 bits after the point, so that half of
+that, 4.8e-7 m, is no difference. The causes are in docs/fidelity.md.
 """
 
 from __future__ import annotations
@@ -20,24 +23,57 @@ from safety_traces import Trace
 from sb3_guard.envs.suites.safety_gymnasium import LEVELS, NAMES
 from sb3_guard.zoo.tables import table
 
+# what the components of an observation begin with, in the order of the table's rows
+QUANTITIES = {
+    "lidars": (
+        "goal_",
+        "box_",
+        "button_",
+        "circle_",
+        "hazards_",
+        "vases_",
+        "pillars_",
+        "gremlins_",
+    ),
+    "velocimeter, gyro, magnetometer": ("velocimeter", "gyro", "magnetometer"),
+    "joints, height, turning": ("joint", "height", "angular_velocity", "ball"),
+    "accelerometer": ("accelerometer",),
+    "touch": ("touch",),
+}
+FORCES = ("accelerometer", "touch")
 
-def deviations(name: str) -> tuple[np.ndarray, np.ndarray]:
+
+def observed(t: Trace) -> dict[str, float]:
+    """The largest difference of each quantity."""
+    error, out = t.observation_error(), {}
+    for component, where in t.engine.observation_layout.items():
+        (quantity,) = (q for q, names in QUANTITIES.items() if component.startswith(names))
+        worst = error[:, where].max(axis=1)
+        kinds = {quantity: np.ones_like(t.rough)}
+        if quantity in FORCES:
+            kinds = {quantity: ~t.rough, f"{quantity}, where contacts differ": t.rough}
+        for kind, rows in kinds.items():
+            out[kind] = max(out.get(kind, 0.0), worst[rows].max(initial=0.0))
+    ours, _ = t.rewards()
+    out["reward"] = float((np.abs(ours - t["reward"]) / np.maximum(np.abs(ours), 0.01)).max())
+    return out
+
+
+def moved(t: Trace) -> tuple[np.ndarray, np.ndarray]:
     """How far the robot is off after each step, [n], and whether it met something, [n] bool."""
-    t = Trace(name)
     n, engine = len(t.before), t.engine
     t.set(t.after, t.before)
-    met = t.rough[:n].copy()
+    met = t.find_rough()[:n]
     met |= np.any([t[key] for key in t.arrays if key.startswith("touched_")] or [met], axis=0)
     t.set(t.before, t.before)
     met |= t.find_rough()[:n]
     actions = np.zeros((t.states, engine.robot.action_size))
     actions[:n] = t.actions
     engine.step(actions)
-    robot = len(engine.robot._start)
     others = 7 * sum(
         group.bodies.num for p in engine.parts for group in p.groups if group.bodies.free
     )
-    robot -= others
+    robot = engine.model.nq - others
     ours = engine.batch.bind("qpos")[:n, :robot]
     return np.abs(ours - t["qpos"][t.after, :robot]).max(axis=1), met
 
@@ -46,16 +82,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--match", default="", help="only names that contain this")
     args = parser.parse_args()
-    rows = []
+    worst: dict[str, dict[str, float]] = {}
+    steps = []
     for robot in NAMES:
-        found = [deviations(f"{robot}{level}") for level in LEVELS if args.match in robot + level]
+        names = [robot + level for level in LEVELS if args.match in robot + level]
+        found = []
+        for name in names:
+            t = Trace(name)
+            for quantity, value in observed(t).items():
+                row = worst.setdefault(quantity, {})
+                row[robot] = max(row.get(robot, 0.0), value)
+            found.append(moved(t))
         if not found:
             continue
         off, met = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        for what, which in (("free", ~met), ("touching", met)):
+        for what, which in (("free", ~met), ("touching an object", met)):
             values = [f"{np.quantile(off[which], q):.1e}" for q in (0.5, 0.95, 1.0)]
-            rows.append([robot, what, str(int(which.sum())), *values])
-    print(table(["robot", "", "steps", "median, m or rad", "95 %", "largest"], rows))
+            steps.append([robot, what, f"{int(which.sum()):,}", *values])
+    order = [q for first in (*QUANTITIES, "reward") for q in worst if q.startswith(first)]
+    rows = [[q, *(f"{worst[q][r]:.1e}" if r in worst[q] else "-" for r in NAMES)] for q in order]
+    print(table(["largest difference", *NAMES], rows))
+    print(table(["robot", "", "steps", "median, m or rad", "95 %", "largest"], steps))
 
 
 if __name__ == "__main__":

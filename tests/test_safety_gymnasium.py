@@ -10,10 +10,8 @@ from sb3_guard.envs.suites.safety_gymnasium import LEVELS, NAMES
 
 NAVIGATION = [f"{robot}{level}" for robot in NAMES for level in LEVELS]
 EXACT = 1e-6  # relative; observations in the files have 21 bits
-# Forces. The solver stops at a tolerance, in each version somewhere else; and where bodies meet
-# whose contacts MuJoCo 4 finds otherwise than 2.3.3 does, they have nothing in common.
+# Where bodies meet whose contacts MuJoCo 4 finds otherwise than 2.3.3 does, these differ.
 FORCES = ("accelerometer", "touch")
-SOLVED = 2e-3
 
 
 @pytest.fixture(scope="module", params=NAVIGATION)
@@ -23,29 +21,19 @@ def t(request):
 
 
 def test_observations_of_every_state(t):
-    rows = np.arange(t.states)
-    t.set(rows, rows)
-    ours, theirs = t.engine.observe(np.float64), t["obs"]
-    assert ours.shape == theirs.shape
-    error = np.abs(ours - theirs) / np.maximum(np.abs(theirs), 0.01)
+    error = t.observation_error()
+    assert t.rough.mean() < 0.3
     for component, where in t.engine.observation_layout.items():
         worst = error[:, where].max(axis=1)
         if component.startswith(FORCES):
-            assert (worst[~t.rough] < SOLVED).all(), component
-            assert (worst[~t.rough] < EXACT).mean() > 0.9, component
-        else:
-            assert worst.max() < EXACT, component
+            worst = worst[~t.rough]
+        assert worst.max() < EXACT, component
 
 
 def test_rewards_costs_goals_and_deaths_of_every_step(t):
     engine, n = t.engine, len(t.before)
     assert n >= 200
-    t.set(t.before, t.before)
-    before = engine.task.measure().copy()
-    t.set(t.after, t.before)
-    now = engine.task.measure()
-    met = engine.task.succeeded(now)[:n]
-    reward = engine.task.reward(before, now)[:n] + engine.task.bonus * met
+    reward, met = t.rewards()
     np.testing.assert_allclose(reward, t["reward"], rtol=EXACT, atol=1e-9)
     np.testing.assert_array_equal(met, t["goal_met"])
     np.testing.assert_array_equal(engine.robot.terminated()[:n], t["terminated"])
@@ -90,6 +78,19 @@ def test_one_control_step_of_another_mujoco(robot, usual, most):
     t.engine.step(actions)
     off = np.abs(t.engine.batch.bind("qpos")[:n] - t["qpos"][t.after]).max(axis=1)
     assert np.quantile(off, 0.9) < usual and off.max() < most
+
+
+def test_gremlins_turn_as_much_when_pushed():
+    """What a weld holds against, which MuJoCo 4 weighs otherwise than 2.3.3."""
+    t = Trace("PointButton1")
+    n = len(t.before)
+    t.set(t.before, t.before)
+    actions = np.zeros((t.states, 2))
+    actions[:n] = t.actions
+    t.engine.step(actions)
+    ours, theirs = t.engine.batch.bind("qpos")[:n], t["qpos"][t.after]
+    turns = np.abs(ours - theirs)[:, 3:].reshape(n, 4, 7)[..., 3:]
+    assert t["cost_gremlins"].sum() > 10 and turns.max() < 5e-3
 
 
 def test_ids_and_time_limits():

@@ -35,6 +35,9 @@ BOX = mujoco.mjtGeom.mjGEOM_BOX
 CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
 SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 WELD = [0.02, 1.5]  # solref, s and damping ratio, of welded bodies
+# How strongly a weld turns a box, 1/m times half of its edge: √(mass · edge² / 4 / inertia), as if
+# MuJoCo weighed a turn by the mass, which it did until 2.3.3, and Safety-Gymnasium relies on.
+TURN = math.sqrt(1.5)
 MOST = 1000  # objects in a group: layouts compare every pair
 
 
@@ -167,7 +170,8 @@ class Bodies:
                 name1=f"{name}/{i}/mover",
                 name2=f"{name}/{i}",
                 solref=WELD,
-                data=[0, 0, 0, 0, 0, self._lift, 1, 0, 0, 0, 1, 0],  # anchor, offset, turn, torque
+                # anchor, offset, turn, torque
+                data=[0, 0, 0, 0, 0, self._lift, 1, 0, 0, 0, TURN / self._lift, 0],
             )
 
     def bind(self, sim: Simulation) -> None:

@@ -1,0 +1,115 @@
+"""Write the tables of results into the pages, from the logs: ``python scripts/make_tables.py``.
+
+``docs/data/NAME.tar.xz`` holds the logs of a grid of runs, as ``benchmark`` writes them, without
+models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
+a page stands what this makes of them. ``--pack FOLDER NAME`` packs the logs of a folder.
+"""
+
+import argparse
+import re
+import tarfile
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from sb3_guard.zoo.figures import Data, save
+from sb3_guard.zoo.paper import draw
+from sb3_guard.zoo.runs import read_results
+from sb3_guard.zoo.statistics import aggregate, with_safety
+from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
+
+DOCS = Path(__file__).parents[1] / "docs"
+DATA = DOCS / "data"
+BLOCK = re.compile(r"(<!-- runs: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml")
+
+
+@cache
+def runs(name: str) -> pd.DataFrame:
+    """The runs of a packed grid, with what is asked about their safety."""
+    with tempfile.TemporaryDirectory() as folder:
+        with tarfile.open(DATA / f"{name}.tar.xz") as archive:
+            archive.extractall(folder, filter="data")
+        found = read_results([folder])
+        assert not found.left_out, found.left_out
+        return with_safety(found.runs)
+
+
+def tables(name: str) -> str:
+    """A table for each suite of a grid, with the published values where there are some."""
+    means = aggregate(runs(name))
+    published = pd.read_csv(DATA / "published.csv", index_col=["suite", "algo"])
+    parts = []
+    for suite, rows in means.groupby("suite", sort=False):
+        known = published.loc[suite] if suite in published.index else published.iloc[:0]
+        digits = 2 if rows["return_last"].abs().max() < 100 else 0
+        columns: dict[str, Any] = {
+            "algorithm": "label",
+            "seeds": whole("seeds"),
+            "return": lambda row, n=digits: spread(row["return_last"], row["return_last_se"], n),
+            "episode cost": lambda row: spread(row["cost_last"], row["cost_last_se"], 1),
+            "episodes above the limit": lambda row: number(100 * row["above_limit"], 0) + "\xa0%",
+            "95 % of costs": lambda row: number(row["cost_p95"], 0),
+            "cost of training": whole("cost_total"),
+        }
+        if len(known):
+            columns["published return"] = lambda row, of=known: _published(of, row["algo"])
+            columns["published cost"] = lambda row, of=known: (
+                number(of.loc[row["algo"], "cost"], 0) if row["algo"] in of.index else "–"
+            )
+        parts.append(f"**{suite}**\n\n{markdown(spelled(rows, columns))}")
+    return "\n\n".join(parts)
+
+
+def _published(known: pd.DataFrame, algo: str) -> str:
+    if algo not in known.index:
+        return "–"
+    row = known.loc[algo]
+    return spread(row["return"], row["return_std"], 2 if abs(row["return"]) < 1 else 1)
+
+
+def filled(page: str) -> str:
+    """A page with its tables made anew."""
+    return BLOCK.sub(lambda m: f"{m[1]}\n{tables(m[2])}\n\n{m[3]}", page)
+
+
+def pages() -> dict[Path, str]:
+    """Every page that has such a table, as it should be."""
+    texts = {path: path.read_text() for path in sorted(DOCS.glob("*.md"))}
+    return {path: filled(text) for path, text in texts.items() if BLOCK.search(text)}
+
+
+def pack(folder: Path, name: str) -> None:
+    """Pack the logs of finished runs, the same bytes for the same logs."""
+
+    def plain(info: tarfile.TarInfo) -> tarfile.TarInfo:
+        info.mtime, info.uid, info.gid, info.uname, info.gname = 0, 0, 0, "", ""
+        return info
+
+    done = sorted(path.parent for path in folder.rglob("result.json"))
+    with tarfile.open(DATA / f"{name}.tar.xz", "w:xz", preset=9) as archive:
+        for path in (path for run in done for path in sorted(run.rglob("*"))):
+            if path.name in LOGS:
+                archive.add(path, Path(name) / path.relative_to(folder), filter=plain)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--pack", nargs=2, metavar=("FOLDER", "NAME"), help="pack a folder's logs")
+    args = parser.parse_args()
+    if args.pack:
+        pack(Path(args.pack[0]), args.pack[1])
+    for path, text in pages().items():
+        path.write_text(text)
+        print(path)
+        for _, name, _ in BLOCK.findall(text):
+            for drawing in draw("pareto", Data(runs(name))):
+                if drawing.figure is not None:
+                    save(drawing.figure, DOCS / "images" / f"{drawing.name}.png")
+
+
+if __name__ == "__main__":
+    main()

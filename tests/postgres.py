@@ -42,6 +42,11 @@ class Server:
         log = str(self.data.parent / "server.log")
         self._run("pg_ctl", "start", "-w", "-D", str(self.data), "-o", options, "-l", log)
 
+    @property
+    def runs(self) -> bool:
+        """Whether it was started and not stopped."""
+        return (self.data / "postmaster.pid").exists()
+
     def stop(self, mode: str = "fast") -> None:
         """
         Stop it.
@@ -76,7 +81,7 @@ def running() -> Iterator[Server]:
         try:
             yield one
         finally:
-            if (one.data / "postmaster.pid").exists():
+            if one.runs:
                 one.stop()
     finally:
         shutil.rmtree(outer)

@@ -1,6 +1,5 @@
 """RL-Zoo's algorithms on cost environments, and RL-Zoo's own command with ours."""
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 from test_resume import assert_same_run, crash, runs_of
 
 from sb3_guard import CPO, enjoy, train
+from sb3_guard.zoo import rl_zoo3
 from sb3_guard.zoo.algos import algorithm, baselines
 from sb3_guard.zoo.hyperparams import shipped_file
 from sb3_guard.zoo.usage import UsageError
@@ -35,7 +35,13 @@ def arguments(algo: str, folder: Path) -> list[str]:
     return [*TOY, *SMALL, "--algo", algo, "-n", "180", *params, "-f", str(folder)]
 
 
-@pytest.mark.parametrize("algo", PARAMS)
+@pytest.mark.parametrize(
+    "algo",
+    [
+        algo if algo in ("ppo_lstm", "sac") else pytest.param(algo, marks=pytest.mark.slow)
+        for algo in PARAMS
+    ],
+)
 def test_trains_with_costs_logged(algo, tmp_path):
     extra = ["--eval-freq", "60", "--log-interval", "1"]
     extra += ["--env-kwargs", "hazard:(-1.0, 0.0)"]  # where episodes start: each has a cost
@@ -50,7 +56,7 @@ def test_trains_with_costs_logged(algo, tmp_path):
     assert enjoy.main([*TOY[:4], "--algo", algo, "-f", str(tmp_path), "--n-episodes", "1"]) == 0
 
 
-@pytest.mark.parametrize("algo", ["ppo", "sac", "td3"])
+@pytest.mark.parametrize("algo", ["ppo", "sac", pytest.param("td3", marks=pytest.mark.slow)])
 def test_killed_and_resumed(algo, tmp_path, monkeypatch):
     assert train.main([*arguments(algo, tmp_path / "whole"), "--eval-freq", "50"]) == 0
     crash(monkeypatch, [*arguments(algo, tmp_path / "cut"), "--eval-freq", "50"], 101)
@@ -80,17 +86,16 @@ def test_what_cannot_be_measured_is_refused():
         algorithm("pppo")
 
 
-def test_rl_zoos_command_with_our_algorithm(tmp_path):
+def test_rl_zoos_command_with_our_algorithm(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [])
     command = (
-        "-m sb3_guard.zoo.rl_zoo3 train --algo guard_trpo --env SafetyPointGoal1-v0 -n 400 "
+        "train --algo guard_trpo --env SafetyPointGoal1-v0 -n 400 "
         "--eval-freq 200 --eval-episodes 1 -f"
     ).split()
     params = ["-params", "n_envs:2", "n_steps:100", "n_critic_updates:2"]
-    done = subprocess.run(
-        [sys.executable, *command, str(tmp_path), *params], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert "cost_rate" in done.stdout and "Evaluation after 200 steps" in done.stdout
+    assert rl_zoo3.main([*command, str(tmp_path), *params]) == 0
+    out = capsys.readouterr().out
+    assert "cost_rate" in out and "Evaluation after 200 steps" in out
     run = tmp_path / "guard_trpo" / "SafetyPointGoal1-v0_1"
     assert (run / "best_model.zip").is_file()
     # From the entry 'Safety*', a pattern that RL-Zoo itself does not know.
@@ -103,8 +108,6 @@ def test_rl_zoos_command_with_our_algorithm(tmp_path):
 
 
 def test_rl_zoos_search_in_our_space(tmp_path, monkeypatch):
-    from sb3_guard.zoo import rl_zoo3
-
     seen = []
     learn = CPO.learn
 
@@ -131,7 +134,5 @@ def test_rl_zoos_search_in_our_space(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("arguments", [[], ["enjoy"]])
 def test_rl_zoos_other_commands_are_not_there(arguments):
-    from sb3_guard.zoo import rl_zoo3
-
     with pytest.raises(UsageError, match=r"sb3_guard\.enjoy"):
         rl_zoo3.main(arguments)

@@ -386,13 +386,10 @@ def test_an_arm_trains_plays_and_records(tmp_path):
         gl_backend()
     except RenderingError as error:
         pytest.skip(str(error))
-    command = "-m sb3_guard.train --algo cpo --env Goal_Arm6_8Hazards -n 120 --seed 0 -f".split()
+    command = "--algo cpo --env Goal_Arm6_8Hazards -n 120 --seed 0 --verbose 0 -f".split()
     small = "--env-kwargs max_episode_steps:10 --eval-freq 60 --eval-episodes 2".split()
     params = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3"]
-    done = subprocess.run(
-        [sys.executable, *command, str(tmp_path), *small, *params], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    assert train.main([*command, str(tmp_path), *small, *params]) == 0
     run = tmp_path / "cpo" / "Goal_Arm6_8Hazards-v0_1"
     assert json.loads((run / "result.json").read_text())["episodes"] == 6
     video, played = tmp_path / "film.mp4", tmp_path / "played.json"
@@ -633,27 +630,21 @@ def test_help_shows_an_example(command, capsys):
     assert f"sb3_guard.{command} " in examples or f"sb3-guard {command}" in examples
 
 
-def test_completion_in_bash(tmp_path):
-    script = tmp_path / "completion.bash"
-    done = subprocess.run(
-        [sys.executable, "-m", "sb3_guard.completion", "bash"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    script.write_text(done.stdout)
-
-    def completed(line: str) -> set[str]:
+def test_completion_in_bash(tmp_path, capsys):
+    assert cli.main(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    asked = ("sb3-guard tr", "sb3-guard train --algo ", "sb3-guard enjoy --env Goal_Arm6_8G",
+             "sb3-guard enjoy --re")  # fmt: skip
+    for line in asked:
         words = line.split(" ")
-        ask = (
-            f"source {script}; COMP_WORDS=({' '.join(words[:-1])} '{words[-1]}'); "
-            f"COMP_CWORD={len(words) - 1}; _shtab_sb3_guard; printf '%s\\n' \"${{COMPREPLY[@]}}\""
+        script += (
+            f"\nCOMP_WORDS=({' '.join(words[:-1])} '{words[-1]}'); COMP_CWORD={len(words) - 1}\n"
+            "COMPREPLY=(); _shtab_sb3_guard; echo ${COMPREPLY[@]}"
         )
-        out = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=True)
-        return set(out.stdout.split())
-
-    assert completed("sb3-guard tr") == {"train"}
-    assert {"cpo", "pcpo", "trpo_lag", "ppo"} <= completed("sb3-guard train --algo ")
-    assert completed("sb3-guard enjoy --env Goal_Arm6_8G") == {"Goal_Arm6_8Ghosts-v0"}
-    assert "--record" in completed("sb3-guard enjoy --re")
+    done = subprocess.run(["bash"], input=script, capture_output=True, text=True, check=True)
+    first, algos, envs, flags = (set(line.split()) for line in done.stdout.splitlines())
+    assert first == {"train"} and envs == {"Goal_Arm6_8Ghosts-v0"} and "--record" in flags
+    assert {"cpo", "pcpo", "trpo_lag", "ppo"} <= algos
 
 
 @pytest.mark.parametrize("command", ["train", "enjoy"])

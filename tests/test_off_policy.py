@@ -232,7 +232,7 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
 )
 def test_bad_input(cls: Any, more: Any, error: str) -> None:
     with pytest.raises(ValueError, match=error):
-        cls("MlpPolicy", **{"env": points(1), **more})
+        cls("MlpPolicy", **{"env": points(1), **settings(), **more})
 
 
 @both
@@ -240,7 +240,12 @@ def test_it_finds_a_known_optimum(cls: Any) -> None:
     """Defaults but for a small network and a high rate, which spare time."""
     problem, steps = problems()["bandit"], 8_000
     env, outcomes = problem.make_env(), Outcomes(steps)
-    fast: dict[str, Any] = {"learning_rate": 3e-3, "batch_size": 64, "seed": 0, "device": "cpu"}
+    fast: dict[str, Any] = {
+        "learning_rate": 3e-3,
+        "batch_size": 64,
+        "seed": 0,
+        "buffer_size": steps,
+    }
     # SAC's temperature would need longer to come down from 1.
     fast |= {"action_noise": noise()} if cls is TD3Lag else {"ent_coef": 0.01}
     policy = {"net_arch": [32, 32]}

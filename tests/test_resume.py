@@ -317,38 +317,43 @@ def lines(path: Path) -> int:
     return path.read_text().count("\n") if path.exists() else 0
 
 
-def test_kill_minus_nine(undisturbed, tmp_path):
+def test_kill_minus_nine(tmp_path):
     """The same with a real process and a real kill, at whatever moment it comes."""
-    start = command(*TOY, *SHORT, *SMALL, "-n", "1800", "-f", str(tmp_path))
+    arguments = [*TOY, *SHORT, *SMALL, "--eval-freq", "300", "-n", "1200"]
+    start = command(*arguments, "-f", str(tmp_path / "cut"))
     with subprocess.Popen(start, env=environment(), stderr=subprocess.PIPE) as process:
-        wait_for(lambda: any(lines(one) > 15 for one in tmp_path.rglob("0.*.csv")), process)
+        wait_for(lambda: any(lines(one) > 5 for one in tmp_path.rglob("0.*.csv")), process)
         process.kill()
     assert process.returncode == -signal.SIGKILL
-    assert train.main(["-i", str(runs_of(tmp_path))]) == 0
-    assert_same_run(undisturbed(1800), tmp_path)
+    assert train.main(["-i", str(runs_of(tmp_path / "cut"))]) == 0
+    assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
+    assert_same_run(tmp_path / "whole", tmp_path / "cut")
 
 
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
-def test_asked_to_stop(number, undisturbed, tmp_path):
+def test_asked_to_stop(number, undisturbed, tmp_path, monkeypatch, capsys):
     """A polite stop finishes the rollout, leaves a checkpoint and a model, and is resumed."""
-    arguments = [*TOY, *SHORT, *SMALL, "-n", "1800", "--verbose", "1"]
-    arguments += ["--checkpoint-every", "1000"]
-    start = command(*arguments, "-f", str(tmp_path))
-    with subprocess.Popen(
-        start, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        wait_for(lambda: any(lines(one) > 20 for one in tmp_path.rglob("0.*.csv")), process)
-        process.send_signal(number)
-        out, err = process.communicate(timeout=300)
-    assert process.returncode == 128 + number
+    whole = Epochs._on_step
+
+    def step(self):
+        if self.num_timesteps == 100:
+            os.kill(os.getpid(), number)
+        return whole(self)
+
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "300", "--verbose", "1", "--checkpoint-every", "1000"]
+    with monkeypatch.context() as patch:
+        patch.setattr(Epochs, "_on_step", step)
+        assert train.main([*arguments, "-f", str(tmp_path)]) == 128 + number
+    out, err = capsys.readouterr()
     assert "Stopping after this rollout" in err and "Traceback" not in err
     run = runs_of(tmp_path)
     assert f"continue with      -i {run}" in out
     assert (run / "CostPoint-v0.zip").exists() and not (run / "result.json").exists()
+    assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 120
     assert train.main(["-i", str(run), "--verbose", "0"]) == 0
-    assert_same_run(undisturbed(1800), tmp_path)
+    assert_same_run(undisturbed(300), tmp_path)
 
 
 @pytest.mark.parametrize("stopped", [True, False], ids=["by the signal", "alone"])

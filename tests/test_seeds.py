@@ -18,14 +18,14 @@ def test_no_seed_is_drawn_twice():
     assert row_seeds(3, 30)[:5] == row_seeds(3, 5)  # more rows don't change the first
 
 
-@pytest.mark.parametrize("vec_env", ["dummy", "native"])
-@pytest.mark.parametrize("algo", ["cpo", "sac"])
+@pytest.mark.parametrize(("algo", "vec_env"), [("cpo", "native"), ("sac", "dummy")])
 def test_first_observations_of_seeds_0_and_1_differ(algo, vec_env):
     """With SB3's seed + i, row 1 of seed 0 was row 0 of seed 1."""
     env = {"dummy": "CostPoint-v0", "native": "Goal_Point_8Hazards"}[vec_env]
     firsts = []
     for seed in (0, 1):
         params = {"n_envs": 4, "n_timesteps": 8}
+        params |= {"buffer_size": 40} if algo == "sac" else {}
         flags, values = prepare(
             RunFlags(algo=algo, env=env, seed=seed, device="cpu", hyperparams=params, eval_freq=1,
                      n_eval_envs=4)

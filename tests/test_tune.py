@@ -451,10 +451,11 @@ def test_a_seeded_search_is_the_same_again(tmp_path, monkeypatch):
 # Nothing is lost
 
 
+@pytest.mark.slow
 def test_no_trial_is_lost_whatever_is_killed(tmp_path):
     """`python scripts/kill_tuner.py` does the same for longer."""
-    study = campaign(str(tmp_path / "journal"), tmp_path, n_trials=6, n_workers=2, kills=2)
-    assert faults(study, 6) == []
+    study = campaign(str(tmp_path / "journal"), tmp_path, n_trials=12, n_workers=3, kills=6)
+    assert faults(study, 12) == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -1,9 +1,12 @@
 """Workers that share a study through a real PostgreSQL server on loopback."""
 
+import copy
+import itertools
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import optuna
 import pytest
@@ -12,10 +15,10 @@ from optuna.trial import TrialState
 from postgres import Server, free_port, programs, running
 
 from sb3_guard import tune
-from sb3_guard.zoo import trials
+from sb3_guard.zoo import studies, trials
 from sb3_guard.zoo.studies import Database, Study
 
-pytest.importorskip("psycopg", reason="psycopg is not installed")
+psycopg = pytest.importorskip("psycopg", reason="psycopg is not installed")
 pytestmark = pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
 
 TOY = (
@@ -25,12 +28,31 @@ TOY = (
 ).split()
 
 
-@pytest.fixture
-def server() -> Iterator[Server]:
+NUMBERS = itertools.count()
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Server]:
     if programs() is None:
         pytest.skip("there is no PostgreSQL server here (no initdb)")
     with running() as one:
         yield one
+
+
+@pytest.fixture
+def server(cluster: Server) -> Iterator[Server]:
+    """A new database of the server, which may be stopped."""
+    one, name = copy.copy(cluster), f"test_{next(NUMBERS)}"
+    execute(cluster, f"CREATE DATABASE {name}")
+    one.url = cluster.url.replace("/postgres", f"/{name}")
+    yield one
+    if not one.runs:
+        one.start()
+
+
+def execute(server: Server, statement: str) -> None:
+    with psycopg.connect(server.url, autocommit=True) as connection:
+        connection.execute(statement)
 
 
 def states(server: Server) -> Counter[str]:
@@ -46,23 +68,26 @@ def test_no_trial_is_lost_whatever_is_killed(server, tmp_path):
 
 
 def test_silence_is_forgiven_after_an_outage(server, monkeypatch):
-    storages = [Database(server.url, heartbeat=1) for _ in range(2)]
+    storages = [Database(server.url, heartbeat=60) for _ in range(2)]
     optuna.create_study(study_name="beats", storage=storages[0])
     one, other = (Study("beats", storage, 1) for storage in storages)
     one._thread_local.in_optimize_loop = True
+
+    def pass_an_hour() -> None:
+        execute(server, "UPDATE trial_heartbeats SET heartbeat = heartbeat - interval '1 hour'")
 
     def seen_by_other() -> list[str]:
         optuna.storages.fail_stale_trials(other)
         return [trial.state.name for trial in other.trials]
 
     trial = one.ask()  # whose heart never beats again
-    time.sleep(4.5)  # longer than three beats
-    storages[1]._trusted_from = time.monotonic() + 60
+    pass_an_hour()
+    storages[1]._trusted_from = float("inf")  # as after an outage
     assert seen_by_other() == ["RUNNING"]
     storages[0].record_heartbeat(trial._trial_id)
     storages[1]._trusted_from = 0.0
     assert seen_by_other() == ["RUNNING"]
-    time.sleep(4.5)
+    pass_an_hour()
     assert seen_by_other() == ["FAIL"]
     other._repeat_lost_trials()
     assert seen_by_other() == ["FAIL", "WAITING"]
@@ -86,12 +111,17 @@ def interrupt_at(monkeypatch, steps: int, action: Callable[[], object]) -> None:
 
 
 def test_an_outage_is_waited_for_at_the_start_and_later(server, tmp_path, monkeypatch, capsys):
-    def restart() -> None:
-        server.stop("immediate")
-        threading.Timer(1.0, server.start).start()
+    lock = threading.Lock()
 
-    interrupt_at(monkeypatch, 70, restart)
-    restart()
+    def pause(seconds: float) -> None:
+        with lock:  # the heart's thread notices, too
+            if not server.runs:
+                server.start()
+
+    clock = SimpleNamespace(monotonic=time.monotonic, sleep=pause)
+    monkeypatch.setattr(studies, "time", clock)
+    interrupt_at(monkeypatch, 70, lambda: server.stop("immediate"))
+    server.stop("immediate")
     assert tune.main([*TOY, "--storage", server.url, "-f", str(tmp_path)]) == 0
     out, err = capsys.readouterr()
     assert out.count("is out of reach, trying again") >= 2 and "is back after" in out
@@ -133,7 +163,7 @@ def test_wrong_addresses(tmp_path, capsys, url, parts):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_database_that_is_not_there_is_not_waited_for(server, tmp_path, capsys):
-    url = server.url.replace("/postgres", "/nowhere")
+def test_a_database_that_is_not_there_is_not_waited_for(cluster, tmp_path, capsys):
+    url = cluster.url.replace("/postgres", "/nowhere")
     assert tune.main([*TOY, "--storage", url, "-f", str(tmp_path)]) == 2
     assert '"nowhere" does not exist' in capsys.readouterr().err

@@ -28,7 +28,7 @@ def enjoy(flags: Flags) -> int:
         )
     render_mode = "rgb_array" if flags.record is not None else None
     if render_mode is None and not flags.no_render:
-        if _has_display():
+        if flags.window or _has_display():
             render_mode = "human"
         elif flags.verbose > 0:
             print("There is no display: nothing is shown. --record makes a video.", file=sys.stderr)

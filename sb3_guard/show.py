@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
 import yaml
 
@@ -81,8 +82,36 @@ class Flags(Command):
         "-o", metavar="FILE.png", help="picture to write (default: <env>.png)"
     )
     camera: str = flag(default="fixed", help=f"one of {', '.join(CAMERAS)}")
+    window: bool = flag(
+        default=False,
+        help="watch the robot act at random in MuJoCo's viewer instead: Space pauses, Tab opens "
+        "menus, F shows contact forces",
+    )
     seed: int = flag(default=0, help="of the episode in the picture")
     gym_packages: list[str] = flag(default=[], metavar="MODULE", help="modules that add parts")
+
+
+def watch(flags: Flags) -> int:
+    """
+    Let a robot act at random in a window, until that is closed.
+
+    :return: exit status
+    :raises UsageError: there is no such environment, or no display
+    """
+    chosen = {"render_mode": "human", "camera": flags.camera, **(flags.env_kwargs or {})}
+    try:
+        env = gymnasium.make(env_spec(flags.env), disable_env_checker=True, **chosen)
+        env.reset(seed=flags.seed)
+        env.action_space.seed(flags.seed)
+        while True:
+            *_, terminated, truncated, _ = env.step(env.action_space.sample())
+            if terminated or truncated:
+                env.reset()
+    except KeyboardInterrupt:
+        env.close()
+        return 0
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise UsageError(one_line(error)) from None
 
 
 def show(flags: Flags) -> int:
@@ -95,6 +124,8 @@ def show(flags: Flags) -> int:
     import_packages(flags.gym_packages)
     if flags.camera not in CAMERAS:
         raise UsageError(f"unknown camera {flags.camera!r}: {did_you_mean(flags.camera, CAMERAS)}")
+    if flags.window:
+        return watch(flags)
     file = Path(flags.env)
     try:
         spec = env_spec(flags.env)

@@ -1,5 +1,8 @@
 """Pictures show what is there, and looking changes nothing."""
 
+import os
+import threading
+import time
 from dataclasses import dataclass
 
 import gymnasium
@@ -166,9 +169,28 @@ def test_a_window_needs_a_display(monkeypatch):
     env = gymnasium.make("Goal_Point_8Hazards-v0", render_mode="human")
     with pytest.raises(rendering.RenderingError, match=r"needs a display.*not set"):
         env.reset(seed=0)
-    monkeypatch.setenv("DISPLAY", ":77")  # there, but it does not open
-    with pytest.raises(rendering.RenderingError, match=r"needs a display.*:77"):
+    monkeypatch.setenv("DISPLAY", ":4077")  # there, but it does not open
+    with pytest.raises(rendering.RenderingError, match=r"needs a display.*:4077"):
         env.reset(seed=0)
+
+
+@pytest.mark.skipif(not os.environ.get("DISPLAY"), reason="there is no display")
+def test_a_window_says_return_and_cost_and_can_be_paused_and_closed(monkeypatch):
+    env = gymnasium.make("Goal_Point_8Hazards-v0", render_mode="human")
+    env.reset(seed=0)
+    renderer, told = env.unwrapped._renderer, []
+    monkeypatch.setattr(renderer._viewer, "set_texts", told.append)
+    _, reward, *_, info = env.step(np.ones(2))
+    assert told[0][2:] == ("return\ncost", f"{reward:.2f}\n{info['cost']:.2f}")
+    renderer._key(ord(" "))
+    began = time.monotonic()
+    threading.Timer(0.5, renderer._key, [ord(" ")]).start()
+    env.step(np.ones(2))
+    assert time.monotonic() - began >= 0.5
+    renderer._viewer.close()
+    with pytest.raises(KeyboardInterrupt):
+        env.step(np.ones(2))
+    env.close()
 
 
 def test_no_backend_is_a_clear_error(monkeypatch):

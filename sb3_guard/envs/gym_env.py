@@ -256,6 +256,7 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         self._simulate(scenario, params, 1, None, render_mode, flatten, width, height, camera)
         self.observation_space = observation_space(self.engine, flatten)
         self.action_space = action_space(self.engine)
+        self._so_far = np.zeros(2)  # return and cost of the episode, for a window
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -265,6 +266,7 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         if seed is not None or self.engine.rngs[0] is not self.np_random:
             self.engine.seed(0, self.np_random)
         self.engine.reset(ROW)
+        self._so_far[:] = 0.0
         if self.render_mode == "human":
             self.render()
         return self.view(self.engine.observe(), self.look(), 0), {}
@@ -281,6 +283,7 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
             raise ValueError(f"action has shape {action.shape}, expected {self.action_space.shape}")
         self.engine.extras.check_clock(int(self.engine.steps[0]))
         outcome = self.engine.step(action[None])
+        self._so_far += outcome.reward[0], outcome.cost[0]
         if self.render_mode == "human":
             self.render()
         return (
@@ -292,7 +295,11 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         )
 
     def render(self) -> Array | None:
-        """A frame, [height, width, 3] uint8, or a look at the window; never advances physics."""
+        """A frame, [height, width, 3] uint8, or a look at the window; never advances physics.
+
+        In the window Space pauses, Tab opens MuJoCo's menus, F shows contact forces; closing it is
+        a KeyboardInterrupt.
+        """
         if self.render_mode is None:
             gymnasium.logger.warn(
                 "render() needs a render_mode: gymnasium.make(id, render_mode='rgb_array')"
@@ -300,7 +307,8 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
             return None
         if self._renderer is None:
             self._renderer = Renderer(self.engine, *self._window, self.render_mode)
-        return self._renderer.render(0)
+        total, cost = self._so_far
+        return self._renderer.render(0, {"return": f"{total:.2f}", "cost": f"{cost:.2f}"})
 
     def close(self) -> None:
         """Free the renderers and end the simulation: a step after it is an error."""

@@ -12,6 +12,9 @@ import importlib
 import os
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -132,9 +135,16 @@ class Renderer:
                 )
             from mujoco import viewer
 
+            self._paused, self._pace = False, (0.0, 0.0)
+            others = set(threading.enumerate())
             self._viewer = viewer.launch_passive(
-                engine.model, self._data, show_left_ui=False, show_right_ui=False
+                engine.model,
+                self._data,
+                key_callback=self._key,
+                show_left_ui=False,
+                show_right_ui=False,
             )
+            self._threads = set(threading.enumerate()) - others
             self._look_at(self._viewer.cam, self._data)  # at first; the mouse moves it
             return
         self._option = mujoco.MjvOption()
@@ -151,16 +161,38 @@ class Renderer:
         visual.offwidth, visual.offheight = largest
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
-    def render(self, row: int) -> Array | None:
-        """Draw one row: a frame [height, width, 3] uint8, or None when shown in a window."""
+    def render(self, row: int, words: Mapping[str, str] | None = None) -> Array | None:
+        """Draw one row: a frame [height, width, 3] uint8, or None when shown in a window.
+
+        A window shows it no faster than it happens, and waits while Space has paused it.
+
+        :param words: what stands in a window's corner
+        :raises KeyboardInterrupt: the window was closed
+        """
         if not self._human:
             return self.frame(row)
+        viewer, words = self._viewer, words or {}
         self._engine.batch.get_data(row, self._data)
-        with self._viewer.lock():
-            self._viewer.user_scn.ngeom = 0
-            self._paint(self._viewer.user_scn, self._data, row)
-        self._viewer.sync()
+        with viewer.lock():
+            viewer.user_scn.ngeom = 0
+            self._paint(viewer.user_scn, self._data, row)
+        viewer.set_texts((None, None, "\n".join(words), "\n".join(words.values())))
+        viewer.sync()
+        began, since = self._pace
+        ahead = self._data.time - began - (time.monotonic() - since)  # s
+        if ahead > 0:
+            time.sleep(ahead)
+        else:  # an episode has begun, or the machine is slow
+            self._pace = self._data.time, time.monotonic()
+        while self._paused and viewer.is_running():
+            time.sleep(0.02)
+        if not viewer.is_running():
+            raise KeyboardInterrupt("the window was closed")
         return None
+
+    def _key(self, code: int) -> None:
+        if code == ord(" "):
+            self._paused = not self._paused
 
     def film(self, row: int, count: int) -> list[Array]:
         """Pictures from the last call's state to the present one, evenly spaced in time.
@@ -256,6 +288,8 @@ class Renderer:
         """Free the window or the OpenGL context."""
         if self._human:
             self._viewer.close()
+            for thread in self._threads:  # it must not draw while Python ends
+                thread.join(timeout=5.0)
         else:
             self._gl.make_current()
             self._context.free()

@@ -93,7 +93,12 @@ class EnjoyFlags(AgentFlags):
         "agent in the current folder)",
     )  # fmt: skip
     json: str | None = flag(metavar="FILE", group=OUTPUT, help="write the statistics there as JSON")
-    no_render: bool = flag(default=False, group=OUTPUT, help="open no window")
+    window: bool = flag(
+        default=False, group=OUTPUT, exclusive="window",
+        help="MuJoCo's viewer, the default where there is a display: Space pauses, Tab opens "
+        "menus, F shows contact forces",
+    )  # fmt: skip
+    no_render: bool = flag(default=False, group=OUTPUT, exclusive="window", help="open no window")
     verbose: Literal[0, 1] = flag(default=1, group=OUTPUT, help="0: the means only")
 
 

@@ -2,6 +2,7 @@
 
 import random
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch as th
 from cost_envs import CostPoint, TabularCMDP
 from known_optima import problems, solve
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from torch.distributions import Normal
@@ -242,6 +244,35 @@ def test_rcpo_takes_the_whole_step() -> None:
     assert model.logger.name_to_value["train/line_search_step"] == 1.0
 
 
+def test_rcpo_may_put_the_penalty_into_the_reward(tmp_path: Path) -> None:
+    """One critic learns r - Σ λ_i c_i, and there is no other; the penalty is λ in the logs."""
+    model = make(RCPO, 2, penalized_reward=True, cost_limit=[0.5, 1.0], lambda_init=0.3)
+    seen: dict[str, Any] = {}
+
+    class Keep(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_rollout_end(self) -> None:
+            seen["rewards"] = self.model.rollout_buffer.rewards.copy()
+            seen["costs"] = self.model.rollout_buffer.costs.copy()
+
+    model.learn(128, callback=Keep())
+    logged = model.logger.name_to_value
+    prices = [logged[f"train/price/{key}"] for key in model.cost_keys]
+    assert min(prices) > 0.0 and seen["costs"].sum() > 0.0
+    expected = seen["rewards"] - seen["costs"] @ np.array(prices, np.float32)
+    np.testing.assert_allclose(model.rollout_buffer.rewards, expected, rtol=1e-5)
+    # undiscounted within the rollout: what an episode's first step is worth to the critic
+    gains = [expected[t, 0] * model.gamma**t for t in range(30)]
+    assert model.rollout_buffer.returns[0] == pytest.approx(sum(gains), rel=1e-4)
+    assert "cost_critic" not in model.get_parameters()
+    model.save(tmp_path / "model")
+    again = RCPO.load(tmp_path / "model", env=model.env, device="cpu")
+    again.learn(128, reset_num_timesteps=False)
+    assert again.penalized_reward and not hasattr(again, "cost_critic")
+
+
 def test_epochs_stop_by_the_mean_over_the_rollout() -> None:
     """A pass of two minibatches is taken whole, though the second is beyond the bound already."""
     steps = {}
@@ -288,8 +319,10 @@ def test_focops_takes_no_clip_range() -> None:
 # Known optima
 
 
-@pytest.mark.parametrize("key", KEYS)
-def test_a_known_optimum(key: str) -> None:
+@pytest.mark.parametrize(
+    ("key", "kwargs"), [*((key, {}) for key in KEYS), ("rcpo", {"penalized_reward": True})], ids=str
+)
+def test_a_known_optimum(key: str, kwargs: dict[str, Any]) -> None:
     """The five-step table under three quarters of its optimum's cost, multipliers as they come.
 
     The networks learn faster than by default, which takes seconds in place of minutes.
@@ -301,5 +334,5 @@ def test_a_known_optimum(key: str) -> None:
     fast: dict[str, Any] = {"learning_rate": 3e-3, "batch_size": problem.n_envs * problem.n_steps}
     if key in ("crpo", "rcpo"):
         fast = {"learning_rate": 3e-3, "n_critic_updates": 20}
-    outcome = solve(ALGORITHMS[key], problem, 0, **fast)
+    outcome = solve(ALGORITHMS[key], problem, 0, **fast, **kwargs)
     assert outcome.good, outcome

@@ -1,8 +1,9 @@
 """CPPO-PID: PPO whose price of the cost is a PID controller's."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from sb3_guard.algorithms.common.first_order import PenalizedPPO
+from sb3_guard.algorithms.common.lagrangian import RELATIVE
 
 
 class CPPOPID(PenalizedPPO):
@@ -25,23 +26,8 @@ class CPPOPID(PenalizedPPO):
         "proportional_gain": {"low": 0.0, "high": 4.0},
         "derivative_gain": {"low": 0.0, "high": 4.0},
     }
-
-    def __init__(
-        self,
-        *args: Any,
-        lambda_lr: float = 0.5,
-        proportional_gain: float = 2.0,
-        derivative_gain: float = 2.0,
-        lambda_smoothing: float = 0.5,
-        lambda_units: Literal["relative", "cost"] = "relative",
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            *args,
-            lambda_lr=lambda_lr,
-            proportional_gain=proportional_gain,
-            derivative_gain=derivative_gain,
-            lambda_smoothing=lambda_smoothing,
-            lambda_units=lambda_units,
-            **kwargs,
-        )
+    defaults: ClassVar[dict[str, Any]] = {
+        **RELATIVE,
+        "derivative_gain": 2.0,
+        "lambda_smoothing": 0.5,
+    }

@@ -32,25 +32,21 @@ class CUP(Lagrangian, FirstOrder):
         "lambda_lr": {"low": 0.005, "high": 0.2, "log": True},
         "proportional_gain": {"low": 0.0, "high": 1.0},
     }
+    # A sixth of other methods' gains: at γ = 0.99 and λ = 0.95 the factor above is six.
+    defaults: ClassVar[dict[str, Any]] = {
+        "lambda_lr": 0.08,
+        "proportional_gain": 0.33,
+        "lambda_units": "relative",
+    }
 
     def __init__(
         self,
         *args: Any,
-        # A sixth of other methods' gains: at γ = 0.99 and λ = 0.95 the factor above is six.
-        lambda_lr: float = 0.08,
-        proportional_gain: float = 0.33,
-        lambda_units: Literal["relative", "cost"] = "relative",
         projection_kl: Literal["forward", "reverse"] = "forward",
         **kwargs: Any,
     ) -> None:
         self.projection_kl = projection_kl
-        super().__init__(
-            *args,
-            lambda_lr=lambda_lr,
-            proportional_gain=proportional_gain,
-            lambda_units=lambda_units,
-            **kwargs,
-        )
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

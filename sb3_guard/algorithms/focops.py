@@ -1,6 +1,6 @@
 """FOCOPS: the best policy near the old one, known in closed form, is followed by gradient steps."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.distributions import Distribution
@@ -9,7 +9,7 @@ from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.first_order import FirstOrder
-from sb3_guard.algorithms.common.lagrangian import Lagrangian
+from sb3_guard.algorithms.common.lagrangian import RELATIVE, Lagrangian
 
 
 class FOCOPS(Lagrangian, FirstOrder):
@@ -39,7 +39,7 @@ class FOCOPS(Lagrangian, FirstOrder):
         "proportional_gain": {"low": 0.0, "high": 4.0},
         "temperature": {"low": 0.5, "high": 5.0, "log": True},
     }
-
+    defaults: ClassVar[dict[str, Any]] = RELATIVE
     fixed_arguments: ClassVar[frozenset[str]] = frozenset({"clip_range", "clip_range_vf"})
 
     def __init__(
@@ -47,20 +47,11 @@ class FOCOPS(Lagrangian, FirstOrder):
         *args: Any,
         temperature: float = 1.5,
         trust_region: float = 0.02,
-        lambda_lr: float = 0.5,
-        proportional_gain: float = 2.0,
-        lambda_units: Literal["relative", "cost"] = "relative",
         **kwargs: Any,
     ) -> None:
         self.temperature = temperature
         self.trust_region = trust_region
-        super().__init__(
-            *args,
-            lambda_lr=lambda_lr,
-            proportional_gain=proportional_gain,
-            lambda_units=lambda_units,
-            **kwargs,
-        )
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

@@ -1,8 +1,9 @@
 """PPO-Lagrangian: the cost joins PPO's objective at a price that follows the violation."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from sb3_guard.algorithms.common.first_order import PenalizedPPO
+from sb3_guard.algorithms.common.lagrangian import RELATIVE
 
 
 class PPOLag(PenalizedPPO):
@@ -23,19 +24,4 @@ class PPOLag(PenalizedPPO):
         "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
         "proportional_gain": {"low": 0.0, "high": 4.0},
     }
-
-    def __init__(
-        self,
-        *args: Any,
-        lambda_lr: float = 0.5,
-        proportional_gain: float = 2.0,
-        lambda_units: Literal["relative", "cost"] = "relative",
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            *args,
-            lambda_lr=lambda_lr,
-            proportional_gain=proportional_gain,
-            lambda_units=lambda_units,
-            **kwargs,
-        )
+    defaults: ClassVar[dict[str, Any]] = RELATIVE

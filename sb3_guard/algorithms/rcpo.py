@@ -1,11 +1,14 @@
 """RCPO: natural gradient steps on the penalised reward, the penalty learnt slowly."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
+from stable_baselines3.common.utils import obs_as_tensor
 
+from sb3_guard.algorithms.common.advantage import discounted_returns
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
+from sb3_guard.algorithms.common.lagrangian import RELATIVE, Lagrangian, inverse
 from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
 
 
@@ -18,6 +21,10 @@ class RCPO(Lagrangian, TrustRegion):
 
     on two time scales: the policy takes a natural step of length √(2δ), without a line search, on
     ``A - Σ λ_i A_Ci``, and the multipliers follow the violation more slowly.
+
+    :param penalized_reward: put the penalty into the reward, as the paper does: one critic learns
+        r - Σ λ_i c_i, and there is none of the costs. Relative multipliers are then in units of the
+        standard deviations of rewards- and costs-to-go
     """
 
     label, family, paper = "RCPO", "Lagrangian", "Tessler et al. 2019"
@@ -25,24 +32,39 @@ class RCPO(Lagrangian, TrustRegion):
         "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
         "proportional_gain": {"low": 0.0, "high": 4.0},
     }
+    defaults: ClassVar[dict[str, Any]] = RELATIVE
 
-    def __init__(
-        self,
-        *args: Any,
-        lambda_lr: float = 0.5,
-        proportional_gain: float = 2.0,
-        lambda_units: Literal["relative", "cost"] = "relative",
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            *args,
-            lambda_lr=lambda_lr,
-            proportional_gain=proportional_gain,
-            lambda_units=lambda_units,
-            **kwargs,
-        )
+    def __init__(self, *args: Any, penalized_reward: bool = False, **kwargs: Any) -> None:
+        self.penalized_reward = penalized_reward
+        self.uses_cost_critic = not penalized_reward
+        super().__init__(*args, **kwargs)
+
+    def train(self) -> None:
+        if self.penalized_reward:
+            self._penalize()
+        super().train()
+
+    @th.no_grad()
+    def _penalize(self) -> None:
+        """Take the priced costs off the rollout's rewards, and estimate the advantages anew."""
+        buffer = self.rollout_buffer
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        dones = self._last_episode_starts
+
+        def spread(values: np.ndarray) -> np.ndarray:
+            to_go = discounted_returns(
+                values, buffer.episode_starts, np.zeros_like(values[0]), dones, self.gamma
+            )
+            return to_go.std(axis=(0, 1), dtype=np.float64)
+
+        price = self.price((spread(buffer.rewards) or 1.0) * inverse(spread(buffer.costs)))
+        buffer.rewards = buffer.rewards - buffer.costs @ price
+        last = self.policy.predict_values(obs_as_tensor(self._last_obs, self.device))
+        buffer.compute_returns_and_advantage(last, dones)
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
+        if self.penalized_reward:
+            return super().surrogate(batch, ratio)
         deviation = batch.cost_advantages.std(dim=0, correction=0).double().cpu().numpy()
         price = th.as_tensor(self.price(inverse(deviation))).to(batch.cost_advantages)
         advantages = batch.advantages - batch.cost_advantages @ price

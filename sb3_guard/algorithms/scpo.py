@@ -33,9 +33,7 @@ class SCPO(LinearisedLimits):
     limit_on: ClassVar[Literal["sum", "max"]] = "max"
     # The increments add up to the highest cost undiscounted alone.
     fixed_arguments: ClassVar[frozenset[str]] = LinearisedLimits.fixed_arguments | {"cost_gamma"}
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, cost_gamma=1.0, **kwargs)
+    defaults: ClassVar[dict[str, Any]] = {"cost_gamma": 1.0}
 
     def critic_rows(self, targets: th.Tensor) -> slice | th.Tensor:
         assert self.cost_rng is not None

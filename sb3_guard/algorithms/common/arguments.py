@@ -1,12 +1,14 @@
 """What a constructor takes, said once: signatures and docstrings are composed along the MRO.
 
-Every class spells out its own arguments and hands the others on by ``*args, **kwargs``. What
+Every class spells out its own arguments and hands the others on by ``*args, **kwargs``; where only
+the values differ from those of its bases it states them in ``defaults``. What
 ``inspect.signature``, Shift-Tab in a notebook and the documentation show is the whole list.
 """
 
 import inspect
 import re
 from collections.abc import Mapping
+from functools import wraps
 from types import FunctionType
 from typing import Any
 
@@ -29,6 +31,23 @@ def own_arguments(cls: type) -> list[inspect.Parameter]:
     return list(signature.parameters.values())[1:]
 
 
+def defaults_of(cls: type) -> dict[str, Any]:
+    """Default values that a class and its bases state in ``defaults``, the nearest one's first."""
+    stated = (vars(one).get("defaults", {}) for one in reversed(cls.__mro__))
+    return {name: value for each in stated for name, value in each.items()}
+
+
+def taking_defaults(cls: type) -> FunctionType:
+    """The constructor of a class, given what ``defaults`` states unless a call says otherwise."""
+    construct, defaults = cls.__init__, vars(cls)["defaults"]  # type: ignore[misc]
+
+    @wraps(construct)
+    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
+        construct(self, *args, **{**defaults, **kwargs})
+
+    return __init__  # type: ignore[return-value]
+
+
 def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signature:
     """All arguments of a class: its own, then those of the constructors that it hands on to.
 
@@ -49,6 +68,9 @@ def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signatu
             break
         if own and inspect.Parameter.VAR_POSITIONAL not in kinds:
             positional = False
+    for name, default in defaults_of(cls).items():
+        if name in found:
+            found[name] = found[name].replace(default=default)
     # Without a default it comes first; what follows * need not.
     ordered = sorted(found.values(), key=lambda each: each.kind)
     return inspect.Signature(ordered)

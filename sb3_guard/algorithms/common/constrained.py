@@ -20,6 +20,7 @@ from sb3_guard.algorithms.common.arguments import (
     check_names,
     documentation,
     signature,
+    taking_defaults,
     with_defaults,
 )
 from sb3_guard.algorithms.common.checks import check_choice, check_per_cost, is_number
@@ -53,6 +54,8 @@ class Constrained(BaseAlgorithm):
     #: What of an episode's costs the limits bound: their sum, or the highest one of a step. Then
     #: the cost of a step is what it adds to the highest before it, which is 0 at first.
     limit_on: ClassVar[Literal["sum", "max"]] = "sum"
+    #: Default values of keyword arguments, where they differ from those of the bases.
+    defaults: ClassVar[dict[str, Any]] = {}
     #: Arguments of SB3's constructors that the class fills in itself.
     fixed_arguments: ClassVar[frozenset[str]] = frozenset()
 
@@ -60,6 +63,8 @@ class Constrained(BaseAlgorithm):
         super().__init_subclass__(**kwargs)
         if "label" not in vars(cls):
             cls.label = cls.__name__
+        if "defaults" in vars(cls):
+            cls.__init__ = taking_defaults(cls)  # type: ignore[method-assign]
         composed = signature(cls, cls.fixed_arguments)
         cls.__signature__ = composed  # type: ignore[attr-defined]
         cls.__doc__ = documentation(cls, composed.parameters)

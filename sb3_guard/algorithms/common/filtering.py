@@ -43,7 +43,7 @@ class FilteredTrustRegion(TrustRegion):
         "CnnPolicy": FilteredCnnPolicy,
         "MultiInputPolicy": FilteredMultiInputPolicy,
     }
-    uses_cost_critic: ClassVar[bool] = False
+    uses_cost_critic = False
 
     policy: FilteredPolicy
 

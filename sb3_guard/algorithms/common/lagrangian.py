@@ -18,6 +18,9 @@ def _only_of_its_kind(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> d
     return state if adam == was_adam else optimizer.state_dict()
 
 
+# Gains that keep positive limits whatever the unit of cost, for policies that learn from rollouts.
+RELATIVE = {"lambda_lr": 0.5, "proportional_gain": 2.0, "lambda_units": "relative"}
+
 SLOW = 0.95  # what the slow average of J_C keeps in an update
 
 

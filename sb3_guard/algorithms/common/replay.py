@@ -5,7 +5,7 @@ Q_C(s, a) = c + γ_C Q_C(s', a'); the episodes that ended since the last update 
 """
 
 import copy
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch as th
@@ -248,26 +248,21 @@ class LagrangianReplay(Lagrangian, CostReplay):
         "lambda_init": {"low": 0.0, "high": 2.0},
         "proportional_gain": {"low": 0.0, "high": 4.0},
     }
+    defaults: ClassVar[dict[str, Any]] = {
+        "lambda_lr": 0.02,
+        "proportional_gain": 1.0,
+        "lambda_smoothing": 0.9,
+        "lambda_units": "relative",
+    }
 
     def __init__(
         self,
         *args: Any,
         lambda_starts: int = 0,
-        lambda_lr: float = 0.02,
-        proportional_gain: float = 1.0,
-        lambda_smoothing: float = 0.9,
-        lambda_units: Literal["relative", "cost"] = "relative",
         **kwargs: Any,
     ) -> None:
         self.lambda_starts = lambda_starts
-        super().__init__(
-            *args,
-            lambda_lr=lambda_lr,
-            proportional_gain=proportional_gain,
-            lambda_smoothing=lambda_smoothing,
-            lambda_units=lambda_units,
-            **kwargs,
-        )
+        super().__init__(*args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

@@ -72,7 +72,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},
     }
     #: Whether a critic of the costs is built and trained.
-    uses_cost_critic: ClassVar[bool] = True
+    uses_cost_critic: bool = True
     #: What critics learn: SB3's λ-returns, or discounted rewards- and costs-to-go.
     returns: ClassVar[Literal["lambda", "discounted"]] = "lambda"
 

@@ -19,13 +19,31 @@ from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.part import Part
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
-from sb3_guard.list import KINDS, yes
+from sb3_guard.list import KINDS, summary, yes
 from sb3_guard.show import action_table, observation_table
 from sb3_guard.zoo.markdown import table
 
 ROOT = Path(__file__).parents[1]
 # Robots that tell the sizes of an observation apart: in the plane, in space, with several lidars.
 SIZED = ("Point", "Drone", "Arm3", "Arm6")
+GROUPS: dict[str, dict[str, type[Part]]] = {
+    "robot": guard(ROBOTS),
+    "task": guard(TASKS),
+    "constraint": guard(CONSTRAINTS),
+}
+CAPTIONS = {
+    "robot": "Each in `Goal_<Robot>_8Hazards`. The ring of beads is its lidar: the more solid a "
+    "bead, the nearer the object there. The dart on the floor points where the robot looks.",
+    "task": "Each with Point among eight hazards.",
+    "constraint": "Each with the task Goal and Point. While a robot pays, it glows red, and so "
+    "does the border of the arena.",
+}
+LOOKS = {
+    "constraint_ghosts_spatial": "Ghosts in the air: `Goal_Drone_8Ghosts`",
+    "constraint_ghosts_solid": "Solid ghosts: `ghosts={'solid': True}`",
+    "task_chase_solid": "Solid targets: `chase={'solid': True}`",
+    "task_push_box": "A box to push: `push={'object': 'box'}`",
+}
 ABOUT = {
     "task": "What a robot is rewarded for. Any task goes with any robot and any "
     "[constraints](constraints.md), as the first word of an id: `Push_Ant_8Hazards-v0`.",
@@ -95,10 +113,41 @@ def overview(kind: str, names: Iterable[str]) -> str:
         listed = re.sub(
             rf"^\| {name} +\|", f"| [{name}]({kind}s/{name.lower()}.md) |", listed, flags=re.M
         )
-    pictures = "\n".join(f"![{name}](images/{kind}_{name.lower()}.png)" for name in names)
     tree = "\n".join(f"{kind}s/{name.lower()}" for name in names)
     toctree = f"```{{toctree}}\n:hidden:\n\n{tree}\n```"
-    return "\n\n".join([f"# {kind.title()}s", ABOUT[kind], listed, pictures, toctree]) + "\n"
+    parts = [f"# {kind.title()}s", ABOUT[kind], listed, thumbnails(kind), toctree]
+    return "\n\n".join(parts) + "\n"
+
+
+def thumbnails(kind: str) -> str:
+    """A picture and a caption of each part of a kind, three beside each other."""
+    cells: list[tuple[str, str]] = []
+    for name, part in GROUPS[kind].items():
+        about = re.sub(r" \([A-Z][^()]*\d{4}[^()]*\)", "", summary(part)).replace("``", "`")
+        caption = f"[**{name}**]({kind}s/{name.lower()}.md)<br>{about}"
+        cells.append((f"![{name}](images/{kind}_{name.lower()}.png)", caption))
+    rows: list[list[str]] = []
+    for k in range(0, len(cells), 3):
+        three = [*cells[k : k + 3], ("", ""), ("", "")][:3]
+        rows += [[image for image, _ in three], [caption for _, caption in three]]
+    return table(rows[0], rows[1:])
+
+
+def gallery() -> str:
+    """The page that shows everything."""
+    parts = [
+        "# Gallery",
+        "![TRPO, which ignores cost, and CPO in the same place](images/trained.gif)",
+        "Two of the package's agents in the same place: TRPO ignores cost, CPO keeps a limit. "
+        "`sb3-guard show Goal_Ant_8Ghosts --window` opens any environment in MuJoCo's viewer, "
+        "`sb3-guard enjoy --pretrained --record` films an agent. Pictures: "
+        "`python scripts/render_gallery.py`.",
+    ]
+    for kind in GROUPS:
+        parts += [f"## {kind.title()}s", CAPTIONS[kind], thumbnails(kind)]
+    parts += ["## Other looks", table([f"![{one}](images/{one}.png)" for one in LOOKS],
+                                      [[caption for caption in LOOKS.values()]])]  # fmt: skip
+    return "\n\n".join(parts) + "\n"
 
 
 def pictures(kind: str, name: str) -> str:
@@ -149,14 +198,13 @@ def examples() -> str:
 
 def pages() -> dict[str, str]:
     """Every page by its path below docs/."""
-    kinds = {"robot": guard(ROBOTS), "task": guard(TASKS), "constraint": guard(CONSTRAINTS)}
     singles = {
         f"{kind}s/{name.lower()}.md": page(kind, name, part)
-        for kind, parts in kinds.items()
+        for kind, parts in GROUPS.items()
         for name, part in parts.items()
     }
-    overviews = {f"{kind}s.md": overview(kind, kinds[kind]) for kind in ABOUT}
-    return {**singles, **overviews, "examples.md": examples()}
+    overviews = {f"{kind}s.md": overview(kind, GROUPS[kind]) for kind in ABOUT}
+    return {**singles, **overviews, "gallery.md": gallery(), "examples.md": examples()}
 
 
 def main() -> None:

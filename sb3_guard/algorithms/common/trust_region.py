@@ -38,6 +38,7 @@ from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.checks import check_integer, check_number, is_number
 from sb3_guard.algorithms.common.critics import Regression
 from sb3_guard.algorithms.common.fast.actor import actor_of
+from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
 from sb3_guard.algorithms.common.rollouts import CostRollouts
 
@@ -374,3 +375,35 @@ class TrustRegion(CostRollouts):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         """Learn what else the algorithm has to learn, after the policy has moved."""
+
+
+class PenalizedTrustRegion(Lagrangian, TrustRegion):
+    """Trust-region steps on (A - Σ λ_i A_Ci) / (1 + Σ λ_i)."""
+
+    search_space: ClassVar[dict[str, Any]] = {
+        "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
+        "proportional_gain": {"low": 0.0, "high": 4.0},
+        "derivative_gain": {"low": 0.0, "high": 4.0},
+    }
+
+    def __init__(
+        self,
+        *args: Any,
+        lambda_lr: float = 0.5,
+        proportional_gain: float = 2.0,
+        lambda_units: Literal["relative", "cost"] = "relative",
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            *args,
+            lambda_lr=lambda_lr,
+            proportional_gain=proportional_gain,
+            lambda_units=lambda_units,
+            **kwargs,
+        )
+
+    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
+        deviation = batch.cost_advantages.std(dim=0, correction=0).double().cpu().numpy()
+        price = th.as_tensor(self.price(inverse(deviation))).to(batch.cost_advantages)
+        advantages = batch.advantages - batch.cost_advantages @ price
+        return (ratio * advantages).mean() / (1.0 + price.sum())

@@ -18,7 +18,7 @@ def objective(trial: optuna.Trial) -> float:
         n_steps=1000,
         cost_limit=LIMIT,
         target_kl=trial.suggest_float("target_kl", 0.005, 0.05, log=True),
-        lambda_lr=trial.suggest_float("lambda_lr", 1e-3, 1e-1, log=True),
+        lambda_lr=trial.suggest_float("lambda_lr", 0.02, 1.0, log=True),
         seed=0,
     ).learn(200_000)
     evaluation = evaluate_policy(model, env, n_eval_episodes=10, seed=1)

@@ -34,7 +34,7 @@ SETTINGS: dict[type[TrustRegion], dict[str, Any]] = {
     TRPO: {},
     CPO: {},
     PCPO: {},
-    TRPOLag: {**RAW, "lambda_lr": 0.5, "proportional_gain": 3.0},
+    TRPOLag: {},
     TRPOIPO: {**RAW, "t": 100.0, "max_multiplier": 2.0, "units": "cost"},
     TRPOFAC: {**RAW, **SLOW, "lambda_lr": 0.01, "lambda_init": 1.0},
 }
@@ -276,7 +276,6 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
     cost half of that or less, but TRPO-USL: its policy learns to push against the correction.
     """
     settings: dict[str, dict[str, Any]] = {
-        "trpo_lag": {"lambda_lr": 0.05},
         "trpo_fac": {**SLOW, "lambda_lr": 1e-2},
         "trpo_usl": {"cost_gamma": 0.9},
     }

@@ -301,7 +301,13 @@ DIFFERENT = {
     "trpo": {},
     "cpo": {**LIMIT, "margin_lr": (0.0, None)},
     "pcpo": {**LIMIT, "margin_lr": (0.0, None), "line_search": (False, True)},
-    "trpo_lag": {**LIMIT, "lambda_update": ("after", None)},
+    "trpo_lag": {
+        **LIMIT,
+        "lambda_lr": (0.005, None),
+        "lambda_update": ("after", None),
+        "lambda_units": ("cost", None),
+        "proportional_gain": (0.0, None),
+    },
     "trpo_fac": {
         **LIMIT,
         "lambda_lr": (0.0001, None),

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from cost_envs import CostPoint
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 
 from sb3_guard.algorithms import TRPO, TRPOFAC, TRPOLag, TrustRegion
 from sb3_guard.algorithms.common.costs import CostEstimate, discounted_limit
@@ -15,6 +16,7 @@ from sb3_guard.algorithms.common.lagrangian import Multiplier
 from sb3_guard.algorithms.trpo_fac import StateMultiplier
 
 KEYS = ("cost", "cost_1")
+RAW = {"lambda_units": "cost", "proportional_gain": 0.0}  # plain ascent, as published
 
 
 def make(cls: type[TrustRegion], n_costs: int = 1, **kwargs: Any) -> Any:
@@ -76,7 +78,7 @@ def test_each_cost_has_its_own_multiplier() -> None:
 @pytest.mark.parametrize("moment", ["before", "after"])
 def test_the_multiplier_ascends_before_or_after_the_step(moment: str) -> None:
     """λ of update k is η times the violations of the updates up to it, in episode units."""
-    model = make(TRPOLag, cost_limit=2.0, lambda_lr=0.1, lambda_update=moment)
+    model = make(TRPOLag, cost_limit=2.0, lambda_lr=0.1, lambda_update=moment, **RAW)
     prices, violations = [], []
     step, fit = model.step, model.fit
     model.step = lambda region: prices.append(float(model.multiplier.value[0])) or step(region)
@@ -92,12 +94,23 @@ def test_the_multiplier_ascends_before_or_after_the_step(moment: str) -> None:
 
 
 def test_the_lagrangian_by_hand() -> None:
-    model = make(TRPOLag, n_costs=2)
+    model = make(TRPOLag, n_costs=2, **RAW)
     model.multiplier.value.copy_(th.tensor([0.5, 2.0]))
     batch = _batch(th.zeros(3, 4), [1.0, -1.0, 2.0], [[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]])
     ratio = th.tensor([1.0, 2.0, 0.5])
     # A - λ·A_C = (0.5, -3, 4.5); weighted (0.5, -6, 2.25); mean -13/12; divided by 1 + 2.5
     assert float(model.surrogate(batch, ratio)) == pytest.approx(-13 / 12 / 3.5)
+
+
+def test_the_relative_lagrangian_by_hand() -> None:
+    """The same with λ in standard deviations: cost advantages of 100 and -100 count as (1, -1)."""
+    model = make(TRPOLag)
+    model.set_logger(Logger(None, []))
+    model.multiplier.value.fill_(0.5)
+    batch = _batch(th.zeros(2, 4), [1.0, -1.0], [[100.0], [-100.0]])
+    # A - λ·A_C/100 = (0.5, -0.5); weighted (0.5, -1); mean -1/4; divided by 1 + 0.5
+    found = float(model.surrogate(batch, th.tensor([1.0, 2.0])))
+    assert found == pytest.approx(-0.25 / 1.5, rel=1e-5)
 
 
 def test_without_multiplier_it_is_trpo() -> None:
@@ -206,7 +219,8 @@ def test_the_state_wise_lagrangian_by_hand() -> None:
 def test_at_a_limit_of_zero(cls: type[TrustRegion], cost_scale: float) -> None:
     """Multipliers never fall there; without any cost TRPO-Lagrangian's stays zero."""
     env = make_vec_env(lambda: CostPoint(cost_scale=cost_scale, hazard=(-1.0, 0.0)), 4, seed=0)
-    model: Any = cls("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0)
+    raw = RAW if cls is TRPOLag else {}
+    model: Any = cls("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0, **raw)
     logged = []
     train = model.train
     model.train = lambda: (train(), logged.append(dict(model.logger.name_to_value)))
@@ -240,7 +254,7 @@ def test_another_optimizer_of_the_multiplier_begins_afresh(
     before: str, after: str, tmp_path: Path
 ) -> None:
     """And goes on from the multiplier of the file; one of the same kind from its moments."""
-    model = make(TRPOLag, n_critic_updates=1, lambda_optimizer=before).learn(800)
+    model = make(TRPOLag, n_critic_updates=1, lambda_optimizer=before, **RAW).learn(800)
     model.save(tmp_path / "model")
     for kind in (before, after):
         again: Any = TRPOLag.load(

@@ -1,6 +1,6 @@
 """RCPO: natural gradient steps on the penalised reward, the penalty learnt slowly."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -8,11 +8,11 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.advantage import discounted_returns
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.lagrangian import RELATIVE, Lagrangian, inverse
-from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
+from sb3_guard.algorithms.common.lagrangian import inverse
+from sb3_guard.algorithms.common.trust_region import PenalizedTrustRegion, Trial, TrustRegion
 
 
-class RCPO(Lagrangian, TrustRegion):
+class RCPO(PenalizedTrustRegion):
     """Reward-constrained policy optimisation (Tessler et al., 2019, arXiv 1805.11074).
 
     ::
@@ -28,11 +28,6 @@ class RCPO(Lagrangian, TrustRegion):
     """
 
     label, family, paper = "RCPO", "Lagrangian", "Tessler et al. 2019"
-    search_space: ClassVar[dict[str, Any]] = {
-        "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
-        "proportional_gain": {"low": 0.0, "high": 4.0},
-    }
-    defaults: ClassVar[dict[str, Any]] = RELATIVE
 
     def __init__(self, *args: Any, penalized_reward: bool = False, **kwargs: Any) -> None:
         self.penalized_reward = penalized_reward
@@ -64,11 +59,8 @@ class RCPO(Lagrangian, TrustRegion):
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
         if self.penalized_reward:
-            return super().surrogate(batch, ratio)
-        deviation = batch.cost_advantages.std(dim=0, correction=0).double().cpu().numpy()
-        price = th.as_tensor(self.price(inverse(deviation))).to(batch.cost_advantages)
-        advantages = batch.advantages - batch.cost_advantages @ price
-        return (ratio * advantages).mean() / (1.0 + price.sum())
+            return TrustRegion.surrogate(self, batch, ratio)
+        return super().surrogate(batch, ratio)
 
     def accept(self, trial: Trial) -> bool:
         return True

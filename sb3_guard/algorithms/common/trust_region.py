@@ -382,28 +382,20 @@ class PenalizedTrustRegion(Lagrangian, TrustRegion):
 
     search_space: ClassVar[dict[str, Any]] = {
         "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
-        "proportional_gain": {"low": 0.0, "high": 4.0},
+        "proportional_gain": {"low": 0.5, "high": 10.0, "log": True},
         "derivative_gain": {"low": 0.0, "high": 4.0},
+        "lambda_smoothing": {"low": 0.0, "high": 0.9},
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        lambda_lr: float = 0.5,
-        proportional_gain: float = 2.0,
-        lambda_units: Literal["relative", "cost"] = "relative",
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(
-            *args,
-            lambda_lr=lambda_lr,
-            proportional_gain=proportional_gain,
-            lambda_units=lambda_units,
-            **kwargs,
-        )
+    defaults: ClassVar[dict[str, Any]] = {
+        "lambda_lr": 0.3,
+        "proportional_gain": 10.0,
+        "lambda_smoothing": 0.5,
+        "lambda_units": "relative",
+    }
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
         deviation = batch.cost_advantages.std(dim=0, correction=0).double().cpu().numpy()
         price = th.as_tensor(self.price(inverse(deviation))).to(batch.cost_advantages)
         advantages = batch.advantages - batch.cost_advantages @ price
-        return (ratio * advantages).mean() / (1.0 + price.sum())
+        return (ratio * advantages).mean() / (1.0 + float(self.multiplier.value.sum()))

@@ -20,6 +20,7 @@ from stable_baselines3.common.utils import obs_as_tensor, update_learning_rate
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
+from sb3_guard.algorithms.common.advantage import discounted_returns
 from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
 from sb3_guard.algorithms.common.checks import check_number
@@ -89,6 +90,8 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         self.cost_gae_lambda = cost_gae_lambda
         # Shuffles the cost critic's batches: it takes no numbers from anybody else's stream.
         self.cost_rng: np.random.Generator | None = None
+        # What the cost critic measures costs in, [m]; 0 until a rollout has any.
+        self.cost_units: np.ndarray | None = None
         # (step, env, observation) of every episode cut by a time limit
         self._timeouts: list[tuple[int, int, Any]] = []
         self._rng_at_rollout: tuple[Any, Any, th.Tensor] | None = None
@@ -206,19 +209,42 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     @th.no_grad()
     def _estimate_advantages(self) -> None:
         """Value the rollout's states and finish the cost half of the buffer."""
-        buffer = self.rollout_buffer
+        buffer, units = self.rollout_buffer, self._cost_units()
         values = self.cost_critic.predict(buffer.observations_by_time(self.device))
-        buffer.cost_values = values.cpu().numpy().reshape(buffer.costs.shape)
+        buffer.cost_values = units * values.cpu().numpy().reshape(buffer.costs.shape)
         # Undiscounted, the cost of an episode is a finite sum: what might come after its time is no
         # part of it, and a critic that is fitted to its own values has no fixed point.
         for step, i, observation in self._timeouts if buffer.cost_gamma < 1.0 else ():
             terminal, _ = self.policy.obs_to_tensor(observation)
             buffer.cost_bootstraps[step, i] = (
-                buffer.cost_gamma * self.cost_critic(terminal)[0].cpu().numpy()
+                buffer.cost_gamma * units * self.cost_critic(terminal)[0].cpu().numpy()
             )
         assert self._last_obs is not None and self._last_episode_starts is not None
         last = self.cost_critic(obs_as_tensor(self._last_obs, self.device)).cpu().numpy()
-        buffer.compute_cost_returns_and_advantage(last, self._last_episode_starts)
+        buffer.compute_cost_returns_and_advantage(units * last, self._last_episode_starts)
+
+    def _cost_units(self) -> np.ndarray:
+        """What the cost critic measures costs in, shape (m,), float32.
+
+        The root mean square of the discounted costs-to-go in the first rollout that has any, so
+        that what it learns does not depend on the unit of cost.
+        """
+        buffer = self.rollout_buffer
+        if self.cost_units is None:
+            self.cost_units = np.zeros(buffer.n_costs, np.float32)
+        if not self.cost_units.all():
+            assert self._last_episode_starts is not None
+            ahead = discounted_returns(
+                buffer.costs,
+                buffer.episode_starts,
+                np.zeros_like(buffer.costs[0]),
+                self._last_episode_starts,
+                buffer.cost_gamma,
+            )
+            size = np.sqrt(np.mean(np.square(ahead, dtype=np.float64), axis=(0, 1)))
+            unknown = self.cost_units == 0.0
+            self.cost_units[unknown] = size[unknown]
+        return np.where(self.cost_units > 0.0, self.cost_units, np.float32(1.0))
 
     # Learning
 
@@ -239,7 +265,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         learnt = self.critic_rows(batch.cost_returns)
         loss = Regression.of_network(self.cost_critic).fit(
             rows(batch.observations, learnt),
-            batch.cost_returns[learnt],
+            (batch.cost_returns / th.as_tensor(self._cost_units()).to(batch.cost_returns))[learnt],
             getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,
             getattr(self, "batch_size", None) if batch_size is None else batch_size,
             self.cost_rng,

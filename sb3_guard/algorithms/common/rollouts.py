@@ -209,7 +209,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     @th.no_grad()
     def _estimate_advantages(self) -> None:
         """Value the rollout's states and finish the cost half of the buffer."""
-        buffer, units = self.rollout_buffer, self._cost_units()
+        buffer, units = self.rollout_buffer, self._choose_cost_units()
         values = self.cost_critic.predict(buffer.observations_by_time(self.device))
         buffer.cost_values = units * values.cpu().numpy().reshape(buffer.costs.shape)
         # Undiscounted, the cost of an episode is a finite sum: what might come after its time is no
@@ -223,8 +223,8 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         last = self.cost_critic(obs_as_tensor(self._last_obs, self.device)).cpu().numpy()
         buffer.compute_cost_returns_and_advantage(units * last, self._last_episode_starts)
 
-    def _cost_units(self) -> np.ndarray:
-        """What the cost critic measures costs in, shape (m,), float32.
+    def _choose_cost_units(self) -> np.ndarray:
+        """What the cost critic measures costs in, shape (m,), float32, from a rollout just filled.
 
         The root mean square of the discounted costs-to-go in the first rollout that has any, so
         that what it learns does not depend on the unit of cost.
@@ -244,7 +244,11 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             size = np.sqrt(np.mean(np.square(ahead, dtype=np.float64), axis=(0, 1)))
             unknown = self.cost_units == 0.0
             self.cost_units[unknown] = size[unknown]
-        return np.where(self.cost_units > 0.0, self.cost_units, np.float32(1.0))
+        return self._units()
+
+    def _units(self) -> np.ndarray:
+        one = np.ones(len(self.cost_keys), np.float32)
+        return one if self.cost_units is None else np.where(self.cost_units, self.cost_units, one)
 
     # Learning
 
@@ -262,10 +266,11 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             self.cost_critic.optimizer, self.lr_schedule(self._current_progress_remaining)
         )
         batch = self.rollout_buffer.whole()
+        units = th.as_tensor(self._units()).to(batch.cost_returns)
         learnt = self.critic_rows(batch.cost_returns)
         loss = Regression.of_network(self.cost_critic).fit(
             rows(batch.observations, learnt),
-            (batch.cost_returns / th.as_tensor(self._cost_units()).to(batch.cost_returns))[learnt],
+            (batch.cost_returns / units)[learnt],
             getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,
             getattr(self, "batch_size", None) if batch_size is None else batch_size,
             self.cost_rng,

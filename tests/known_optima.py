@@ -17,6 +17,7 @@ from cost_envs import TabularCMDP
 from gymnasium import spaces
 from scipy.optimize import minimize
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 
@@ -357,7 +358,9 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
     env = problem.make_env(seed, scale)
     limits = scale * np.array(problem.limits)
     outcomes = Outcomes(problem.total_timesteps)
-    settings = {"n_steps": problem.n_steps, "seed": seed, "device": "cpu", **kwargs}
+    settings = {"seed": seed, "device": "cpu", **kwargs}
+    if issubclass(cls, OnPolicyAlgorithm):
+        settings.setdefault("n_steps", problem.n_steps)
     cls("MlpPolicy", env, cost_limit=limits.tolist(), cost_keys=env.cost_keys, **settings).learn(
         problem.total_timesteps, callback=outcomes
     )

@@ -303,10 +303,11 @@ DIFFERENT = {
     "pcpo": {**LIMIT, "margin_lr": (0.0, None), "line_search": (False, True)},
     "trpo_lag": {
         **LIMIT,
-        "lambda_lr": (0.005, None),
+        "lambda_lr": (0.005, 0.1),
         "lambda_update": ("after", None),
         "lambda_units": ("cost", None),
-        "proportional_gain": (0.0, None),
+        "proportional_gain": (0.0, 0.5),
+        "derivative_gain": (0.0, 0.5),
     },
     "trpo_fac": {
         **LIMIT,

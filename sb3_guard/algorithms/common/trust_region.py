@@ -382,7 +382,7 @@ class PenalizedTrustRegion(Lagrangian, TrustRegion):
 
     search_space: ClassVar[dict[str, Any]] = {
         "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
-        "proportional_gain": {"low": 1.0, "high": 20.0, "log": True},
+        "proportional_gain": {"low": 0.1, "high": 20.0, "log": True},
         "derivative_gain": {"low": 0.0, "high": 4.0},
         "lambda_smoothing": {"low": 0.0, "high": 0.9},
     }

@@ -1,12 +1,13 @@
 """The bases carry algorithms of anyone's: PPO-Lagrangian as the example has it, SAC with costs."""
 
+import inspect
 import json
 import os
 import random
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -16,7 +17,14 @@ from ppo_lagrangian import PPOLagrangian
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_guard.algorithms import ALGORITHMS, CPO, Constrained, FirstOrder, register_algorithm
+from sb3_guard.algorithms import (
+    ALGORITHMS,
+    CPO,
+    Constrained,
+    FirstOrder,
+    PPOLag,
+    register_algorithm,
+)
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -127,6 +135,25 @@ def test_costs_of_an_off_policy_algorithm(tmp_path: Path) -> None:
 def state_of_off_policy(model: Any) -> list[Any]:
     tensors = [*model.policy.state_dict().values(), th.get_rng_state()]
     return [*(tensor.tolist() for tensor in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
+
+
+def test_defaults_are_stated_where_only_they_differ() -> None:
+    """The signature shows them, a call overrides them, and so does a class further down."""
+
+    class Hasty(PPOLag):
+        defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.7, "n_steps": 32}
+
+    class Hastier(Hasty):
+        defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.9}
+
+    for cls, rate in ((PPOLag, 0.5), (Hasty, 0.7), (Hastier, 0.9)):
+        taken = inspect.signature(cls).parameters
+        assert taken["lambda_lr"].default == rate and taken["lambda_units"].default == "relative"
+        assert list(taken)[:3] == ["policy", "env", "learning_rate"]
+        model = cls("MlpPolicy", points(2), batch_size=16)
+        assert model.lambda_lr == rate and model.lambda_units == "relative"
+        assert model.n_steps == taken["n_steps"].default == (2048 if cls is PPOLag else 32)
+        assert cls("MlpPolicy", points(2), batch_size=16, lambda_lr=0.1).lambda_lr == 0.1
 
 
 # Algorithms from outside the package

@@ -183,7 +183,12 @@ class Lagrangian(Constrained):
         for name in ("lambda_lr", "lambda_init", "proportional_gain", "derivative_gain"):
             check_number(name, getattr(self, name))
         if self.lambda_max is not None:
-            check_number("lambda_max", self.lambda_max, float(self.lambda_init))
+            check_number("lambda_max", self.lambda_max)
+            if self.lambda_max < self.lambda_init:
+                raise ValueError(
+                    f"lambda_max={self.lambda_max!r}: must be at least lambda_init="
+                    f"{self.lambda_init!r}, where the multipliers begin, or None for no bound"
+                )
         check_number("lambda_smoothing", self.lambda_smoothing, 0.0, 1.0)
         check_integer("lambda_delay", self.lambda_delay)
         check_choice("lambda_units", self.lambda_units, "relative", "cost")

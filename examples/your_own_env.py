@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 
-from sb3_guard import CPO, TRPOLag, evaluate_policy, make_vec_env
+from sb3_guard import CPO, SACLag, TRPOLag, evaluate_policy, make_vec_env
 from sb3_guard.common.adapters import CostFromFunction
 
 
@@ -26,6 +26,9 @@ class Shore(gymnasium.Env):
 gymnasium.register("Shore-v0", entry_point=Shore, max_episode_steps=50)
 model = CPO("MlpPolicy", make_vec_env("Shore-v0", 4), n_steps=500, cost_limit=2.0, seed=0)
 print("costs of episodes:", evaluate_policy(model.learn(100_000), model.env).costs)
+
+replaying = SACLag("MlpPolicy", model.env, buffer_size=100_000, cost_limit=2.0, seed=0)
+print("off-policy:", evaluate_policy(replaying.learn(100_000), model.env).costs)
 
 pole = make_vec_env("CartPole-v1", 4, wrapper_class=lambda env: CostFromFunction(
     env, lambda obs, action, next_obs, info: abs(next_obs[0]) > 0.5))  # fmt: skip

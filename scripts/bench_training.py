@@ -1,30 +1,44 @@
 """Print what an update costs, where its time goes, and what that makes of the paper's runs.
 
-``python scripts/bench_training.py`` measures all algorithms at the paper's settings (30,000 steps
-an update, 80 full-batch steps of each critic) beside a bare physics loop timed in the same run; the
-best of several updates counts. The safety layers are measured switched on.
+``python scripts/bench_training.py`` measures on-policy algorithms with the settings of their files
+(30,000 steps an update; in trust regions 80 full-batch steps of each critic) beside a bare physics
+loop timed in the same run; the best of several updates counts. The safety layers are measured
+switched on. ``--beside-sb3`` compares first-order and off-policy algorithms with SB3's PPO, SAC and
+TD3 of the same settings instead: updates of the two by turns, the median of the ratios.
 """
 
 from __future__ import annotations
 
 import argparse
+import inspect
 import os
 import resource
 import subprocess
 import sys
 import time
+from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the commands do; read by torch's import
 
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_guard import ALGORITHMS, make_vec_env
 from sb3_guard.envs.physics import profiling_clock
 from sb3_guard.zoo.hyperparams import build, check, read_hyperparams
 
 N_ENVS, N_STEPS = 30, 1000
+# What one of SB3's algorithms becomes, and how much longer its update may then take.
+BESIDE: dict[type[BaseAlgorithm], dict[str, float]] = {
+    PPO: {"ppo_lag": 1.4, "cppo_pid": 1.4, "focops": 1.6, "cup": 1.6, "p3o": 1.6},
+    SAC: {"sac_lag": 1.4},
+    TD3: {"td3_lag": 1.4},
+}
+ON_POLICY = [key for key, cls in ALGORITHMS.items() if issubclass(cls, OnPolicyAlgorithm)]
 # Seconds an update may take on two free cores.
 MARKS = {"trpo": 2.5, "cpo": 3.5}
 CLOCK = profiling_clock()
@@ -61,15 +75,62 @@ def start_seconds(*arguments: str) -> float:
     return min(times)
 
 
+def beside_sb3(env_id: str, rounds: int) -> None:
+    """A line per pair: seconds of an update, or of 50 gradient steps, and the ratio."""
+    print("| algorithm | SB3's, s | ours, s | ratio | mark |\n|---|---|---|---|---|")
+    for theirs, keys in BESIDE.items():
+        for key, mark in keys.items():
+            pair = [trained(cls, env_id) for cls in (theirs, ALGORITHMS[key])]
+            times = np.array([[seconds_of_update(model) for model in pair] for _ in range(rounds)])
+            ratio = np.median(times[:, 1] / times[:, 0])
+            best = times.min(axis=0)
+            print(f"| {key} | {best[0]:.2f} | {best[1]:.2f} | {ratio:.2f} | {mark} |", flush=True)
+
+
+def trained(algorithm: type[BaseAlgorithm], env_id: str) -> BaseAlgorithm:
+    """A model with its defaults and something to learn from; limits are exceeded."""
+    env = make_vec_env(env_id, 10, seed=0)
+    settings: dict[str, Any] = {"learning_starts": 100, "buffer_size": 20_000, "gradient_steps": 1}
+    if issubclass(algorithm, OnPolicyAlgorithm):
+        settings = {"n_steps": 500}
+    if algorithm in ALGORITHMS.values():
+        settings |= {"cost_limit": 1e-3, "lambda_init": 1.0}
+        taken = inspect.signature(algorithm).parameters
+        settings = {name: value for name, value in settings.items() if name in taken}
+    return algorithm("MlpPolicy", env, seed=0, **settings).learn(2000)  # type: ignore[call-arg]
+
+
+def seconds_of_update(model: BaseAlgorithm) -> float:
+    """Time of the next update alone, collecting left out."""
+    spent = 0.0
+    update = type(model).train
+
+    def timed(*args: object) -> None:
+        nonlocal spent
+        started = time.perf_counter()
+        update(model, *args)
+        spent += time.perf_counter() - started
+
+    model.train = timed  # type: ignore[method-assign, attr-defined]
+    steps = 5000 if isinstance(model, OnPolicyAlgorithm) else 500
+    model.learn(steps, reset_num_timesteps=False)
+    del model.train  # type: ignore[attr-defined]
+    return spent
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--algos", nargs="+", default=list(ALGORITHMS), choices=ALGORITHMS)
+    parser.add_argument("--algos", nargs="+", default=ON_POLICY, choices=ON_POLICY)
     parser.add_argument("--env", default="Goal_Point_8Hazards-v0")
     parser.add_argument("--updates", type=int, default=6, help="updates per algorithm")
     parser.add_argument("--threads", type=int, default=None, help="torch and physics threads")
+    parser.add_argument("--beside-sb3", action="store_true", help="ratios to PPO, SAC and TD3")
     args = parser.parse_args()
     if args.threads:
         torch.set_num_threads(args.threads)
+    if args.beside_sb3:
+        beside_sb3(args.env, args.updates)
+        return
     print(f"{args.env}, {N_ENVS} envs x {N_STEPS} steps, torch threads {torch.get_num_threads()}")
     header = "| algorithm | collect, s | actor, s | critics, s | update, s | collected steps/s | "
     header += "of bare physics | minutes for 6e6 steps | mark for an update, s |"

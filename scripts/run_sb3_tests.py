@@ -1,8 +1,9 @@
 """Run the tests of Stable-Baselines3 and sb3-contrib with our algorithms in place of theirs.
 
 ``python scripts/run_sb3_tests.py`` fetches the two source distributions of the installed versions
-into a temporary folder and runs every test module that trains an on-policy algorithm, once for each
-of our classes, which stand where the module says ``A2C``, ``PPO`` or ``TRPO``. It prints what
+into a temporary folder and runs every test module that trains an algorithm like ours, once for each
+of our classes: trust regions stand where the module says ``A2C``, ``PPO`` or ``TRPO``, first-order
+ones for ``PPO``, off-policy ones for ``SAC`` or ``TD3``. It prints what
 passed per module and class, and for every test that failed whether that is ours or does not apply,
 and why (``DOES_NOT_APPLY``); it fails if one is ours. ``--source DIR`` takes distributions that are
 unpacked there already.
@@ -17,6 +18,7 @@ import argparse
 import fnmatch
 import importlib.metadata
 import importlib.util
+import inspect
 import itertools
 import json
 import multiprocessing
@@ -42,26 +44,28 @@ import stable_baselines3
 from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard.algorithms import ALGORITHMS, TrustRegion
+from sb3_guard.algorithms import ALGORITHMS, FirstOrder, SACLag, TD3Lag, TrustRegion
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 from sb3_guard.algorithms.common.policies import FilteredPolicy
 
 PACKAGES = {"sb3": "stable_baselines3", "contrib": "sb3_contrib"}
 # The classes that ours stand in for, with what they are made with where a test says nothing: as
 # theirs, except that A2C's 5 steps per update are few for a trust-region step.
-REPLACED: dict[str, dict[str, dict[str, Any]]] = {
-    "sb3": {"A2C": {"n_steps": 16, "normalize_advantage": False}, "PPO": {}},
-    "contrib": {"TRPO": {}},
+A2C = {"n_steps": 16, "normalize_advantage": False}
+REPLACED: dict[type, dict[str, dict[str, dict[str, Any]]]] = {
+    TrustRegion: {"sb3": {"A2C": A2C, "PPO": {}}, "contrib": {"TRPO": {}}},
+    FirstOrder: {"sb3": {"PPO": {}}, "contrib": {}},
+    SACLag: {"sb3": {"SAC": {}}, "contrib": {}},
+    TD3Lag: {"sb3": {"TD3": {}}, "contrib": {}},
 }
-# What their classes take and ours have no use for: losses of actor and critic are not mixed here.
-THEIR_ARGUMENTS = ("n_epochs", "ent_coef", "vf_coef", "max_grad_norm", "sub_sampling_factor")
+# What their classes take and ours have no use for, beside ``fixed_arguments``.
+THEIR_ARGUMENTS = {"n_epochs", "sub_sampling_factor"}
 OUR_ARGUMENTS = {"cost_limit": 50.0, "n_critic_updates": 20}
 # Their costs are noise: as in hyperparams/trpo_ipo.yml, lest they weigh ten times the reward.
 OF_CLASS: dict[str, dict[str, Any]] = {"TRPOIPO": {"max_multiplier": 0.5}}
 # Of images nothing is learnt in these tests, and each pass over a rollout of them takes long.
 OF_IMAGES = {"n_critic_updates": 2, "cg_max_steps": 3}
-# Those that take PPO's steps are PPO but for costs; tests/test_first_order.py compares the bits.
-CLASSES = {cls.__name__: cls for cls in ALGORITHMS.values() if issubclass(cls, TrustRegion)}
+CLASSES = {cls.__name__: cls for cls in ALGORITHMS.values()}
 
 #: Why a test that fails says nothing about our classes: pattern of "package/module::test" or
 #: "package/module::test with class", and the reason
@@ -98,16 +102,20 @@ _made = False  # whether the test under way has made one of our models
 def stand_in(cls: type, name: str, defaults: dict[str, Any]) -> type:
     """One of our classes that takes the arguments of theirs, on environments without costs."""
     filtered = issubclass(cls, FilteredTrustRegion)
+    taken = inspect.signature(cls).parameters
 
     class StandIn(cls):  # type: ignore[misc, valid-type]
         def __init__(self, policy: Any, env: Any, *args: Any, **kwargs: Any) -> None:
             global _made
             _made = True
-            for argument in THEIR_ARGUMENTS:
-                kwargs.pop(argument, None)
+            for argument in THEIR_ARGUMENTS | cls.fixed_arguments:
+                if argument not in taken:
+                    kwargs.pop(argument, None)
             small = OF_IMAGES if policy == "CnnPolicy" else {}
             own = OF_CLASS.get(cls.__name__, {})
-            kwargs = {**OUR_ARGUMENTS, **own, **small, **defaults, **kwargs}
+            ours = {**OUR_ARGUMENTS, **own, **small}
+            ours = {argument: value for argument, value in ours.items() if argument in taken}
+            kwargs = {**ours, **defaults, **kwargs}
             if filtered and isinstance(policy, type) and not issubclass(policy, FilteredPolicy):
                 policy = type(f"Filtered{policy.__name__}", (FilteredPolicy, policy), {})
             try:
@@ -124,6 +132,11 @@ def stand_in(cls: type, name: str, defaults: dict[str, Any]) -> type:
 
     StandIn.__name__ = StandIn.__qualname__ = name
     return StandIn
+
+
+def replaced_by(cls: type) -> dict[str, dict[str, dict[str, Any]]]:
+    """Their classes that one of ours stands in for, by package and name, with defaults."""
+    return next(theirs for base, theirs in REPLACED.items() if issubclass(cls, base))
 
 
 def holds(value: Any, depth: int = 3) -> Iterator[type]:
@@ -163,7 +176,7 @@ class Plugin:
         self.report = report
         self.ours: set[type] = set()
         for package, key in ((stable_baselines3, "sb3"), (sb3_contrib, "contrib")):
-            for replaced, defaults in REPLACED[key].items():
+            for replaced, defaults in replaced_by(CLASSES[name])[key].items():
                 ours = stand_in(CLASSES[name], replaced, defaults)
                 setattr(package, replaced, ours)
                 self.ours.add(ours)
@@ -226,7 +239,7 @@ def fetch(folder: Path) -> None:
 def place(source: Path, folder: Path) -> list[Path]:
     """Copy the tests away from the packages, so that the installed ones are tested.
 
-    :return: the modules that mention one of the replaced classes
+    :return: their test modules
     """
     modules = []
     for key, package in PACKAGES.items():
@@ -239,11 +252,14 @@ def place(source: Path, folder: Path) -> list[Path]:
         if importlib.util.find_spec("ale_py") is None:
             # test_utils imports it for wrappers of Atari games, in which nothing is trained.
             (tests / "ale_py.py").touch()
-        names = re.compile(rf"\b({'|'.join(REPLACED[key])})\b")
-        modules += [
-            path for path in sorted(tests.glob("test_*.py")) if names.search(path.read_text())
-        ]
+        modules += sorted(tests.glob("test_*.py"))
     return modules
+
+
+def mentions(module: Path, name: str) -> bool:
+    """Whether a module names a class that one of ours stands in for."""
+    theirs = replaced_by(CLASSES[name])[module.parent.parent.name]
+    return any(re.search(rf"\b{each}\b", module.read_text()) for each in theirs)
 
 
 def run(module: Path, name: str, report: Path, seconds: float) -> list[dict[str, Any]]:
@@ -316,10 +332,12 @@ def table(modules: Sequence[Path], args: argparse.Namespace, folder: Path) -> in
         key = f"{module.parent.parent.name}/{module.stem}"
         if args.modules and not any(fnmatch.fnmatchcase(key, each) for each in args.modules):
             continue
+        if not any(mentions(module, name) for name in args.classes):
+            continue
         cells = []
         for name in args.classes:
             report = folder / f"{key.replace('/', '-')}-{name}.jsonl"
-            rows = run(module, name, report, args.timeout)
+            rows = run(module, name, report, args.timeout) if mentions(module, name) else []
             counts: Counter[str] = Counter()
             for row in rows:
                 where, outcome = f"{key}::{row['test']}", row["outcome"]

@@ -76,7 +76,7 @@ def start_seconds(*arguments: str) -> float:
 
 
 def beside_sb3(env_id: str, rounds: int) -> None:
-    """A line per pair: seconds of an update of 1,280 steps, or of 50 gradient steps, and the ratio."""
+    """A line per pair: seconds of an update of 1,280 steps or of 50 gradient steps, and ratio."""
     print("| algorithm | SB3's, s | ours, s | ratio | mark |\n|---|---|---|---|---|")
     for theirs, keys in BESIDE.items():
         for key, mark in keys.items():

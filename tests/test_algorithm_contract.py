@@ -42,6 +42,10 @@ CLASSES = [cls for cls in ALGORITHMS.values() if issubclass(cls, OnPolicyAlgorit
 TRUST_REGION = [cls for cls in CLASSES if issubclass(cls, TrustRegion)]
 
 
+# One of each base and kind of cost; what no class has of its own is shown by these.
+SOME = ("CPO", "SCPO", "TRPOFAC", "TRPOSL", "PPOLag")
+
+
 def each(*values: Any, classes: list[Any] = CLASSES) -> list[Any]:
     """CPO with every value, the others with the first one; the rest of the product is slow."""
     slow = pytest.mark.slow
@@ -50,6 +54,15 @@ def each(*values: Any, classes: list[Any] = CLASSES) -> list[Any]:
         for cls in classes
         for i, value in enumerate(values)
         for marks in [() if cls is CPO or i == 0 else slow]
+    ]
+
+
+def some(*values: Any, classes: list[Any] = CLASSES) -> list[Any]:
+    """As :func:`each`, of the classes in ``SOME``; those of the others are slow."""
+    every = each(*(values or ((),)), classes=classes)
+    return [
+        one if one.values[0].__name__ in SOME else pytest.param(*one.values, marks=pytest.mark.slow)
+        for one in every
     ]
 
 
@@ -146,7 +159,7 @@ def test_spaces(
 
 @pytest.mark.parametrize(
     ("cls", "policy", "observation_space", "kwargs"),
-    each(
+    some(
         ("MlpPolicy", BOX, {"share_features_extractor": False}),
         ("CnnPolicy", IMAGE, {}),
         ("CnnPolicy", IMAGE, {"share_features_extractor": False}),
@@ -185,7 +198,7 @@ class _Normed(FlattenExtractor):
         return self.dropout(self.norm(super().forward(observations)))
 
 
-@pytest.mark.parametrize(("cls", "share"), each(True, False, classes=TRUST_REGION))
+@pytest.mark.parametrize(("cls", "share"), some(True, False, classes=TRUST_REGION))
 def test_batch_norm_and_dropout_act_while_fitting_alone(
     cls: type[TrustRegion], share: bool
 ) -> None:
@@ -225,7 +238,7 @@ def test_batch_norm_and_dropout_act_while_fitting_alone(
         assert th.equal(*values)
 
 
-@pytest.mark.parametrize(("cls", "squash"), each(True, False, classes=TRUST_REGION))
+@pytest.mark.parametrize(("cls", "squash"), some(True, False, classes=TRUST_REGION))
 def test_gsde(cls: type[TrustRegion], squash: bool) -> None:
     model = small(
         cls, points(), use_sde=True, sde_sample_freq=7, policy_kwargs={"squash_output": squash}
@@ -254,7 +267,7 @@ def test_what_a_model_is(cls: type[TrustRegion]) -> None:
 
 @pytest.mark.parametrize(
     ("cls", "n_envs", "episode_length", "n_steps"),
-    each((3, 10**6, 20), (1, 30, 40), (2, 45, 20), (2, 1, 10)),
+    some((3, 10**6, 20), (1, 30, 40), (2, 45, 20), (2, 1, 10)),
 )
 def test_episodes_and_rollouts_of_any_length(
     cls: type[TrustRegion], n_envs: int, episode_length: int, n_steps: int
@@ -270,7 +283,7 @@ def test_episodes_and_rollouts_of_any_length(
     assert len(model.ep_cost_buffer) == min(100, n_envs * (steps // episode_length))
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_episode_costs_are_sums_of_raw_costs_across_rollouts(cls: type[TrustRegion]) -> None:
     model = small(cls, points(2, episode_length=40))
     steps: list[list[float]] = []
@@ -286,7 +299,7 @@ def test_episode_costs_are_sums_of_raw_costs_across_rollouts(cls: type[TrustRegi
     assert model.total_cost == pytest.approx(costs.sum())
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_vec_normalize_leaves_costs_raw(cls: type[TrustRegion], tmp_path: Path) -> None:
     raw: list[float] = []
 
@@ -330,7 +343,7 @@ def test_a_limit_of_zero_with_and_without_cost(cls: type[TrustRegion], cost_scal
     assert np.isfinite(numbers).all()
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_frame_stacks(cls: type[TrustRegion]) -> None:
     """With costs of time-outs in the last frames, and a filter that acts on stacked ones."""
     model = small(cls, VecFrameStack(points(), 3)).learn(160)
@@ -554,7 +567,7 @@ def test_parameters_travel(cls: type[TrustRegion]) -> None:
         b.set_parameters({"policy": parameters(a)["policy"]})
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_load_with_another_number_of_envs(cls: type[TrustRegion], tmp_path: Path) -> None:
     small(cls, points(2), n_critic_updates=1).learn(80).save(tmp_path / "model")
     model = cls.load(tmp_path / "model", env=points(3), device="cpu")
@@ -588,7 +601,7 @@ def test_a_copy_learns_on_its_own() -> None:
         assert all(moved), name
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_set_env_starts_new_episodes(cls: type[TrustRegion]) -> None:
     model = small(cls, points(2, episode_length=1000), n_critic_updates=1)
     model._warned = {"no episode has ended yet and the environment states no max_episode_steps"}
@@ -657,7 +670,7 @@ def test_resumed_equals_uninterrupted(
             assert resumed.logger.name_to_value[key] == value, key
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_same_seed_same_training(cls: type[TrustRegion]) -> None:
     runs = [parameters(small(cls, points(), seed=seed).learn(160)) for seed in (3, 3, 4)]
     assert_equal(runs[0], runs[1])
@@ -688,7 +701,7 @@ class _Dumps(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_callbacks_see_the_locals_of_sb3(cls: type[TrustRegion]) -> None:
     seen: dict[type, tuple[dict[str, Any], dict[str, Any]]] = {}
     for kind in (PPO, cls):
@@ -716,7 +729,7 @@ def test_a_progress_bar_is_shown(capfd: pytest.CaptureFixture[str]) -> None:
     assert "80/80" in "".join(capfd.readouterr())
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_the_device_is_chosen_as_sb3_does(cls: type[TrustRegion]) -> None:
     model = cls("MlpPolicy", points())
     assert model.device == get_device("auto")
@@ -814,7 +827,7 @@ def test_logs(cls: type[TrustRegion]) -> None:
     assert dump["rollout/cost_rate"] == pytest.approx(model.total_cost / model.num_timesteps)
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_silent_unless_asked(
     cls: type[TrustRegion], capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -826,7 +839,7 @@ def test_silent_unless_asked(
     assert [path.name for path in tmp_path.iterdir()] == [f"{cls.__name__}_1"]
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_learning_rate_schedules_reach_every_critic(cls: type[TrustRegion]) -> None:
     model = small(cls, points(), learning_rate=lambda remaining: 0.01 * remaining).learn(160)
     assert model.logger.name_to_value["train/learning_rate"] == 0.0
@@ -837,7 +850,7 @@ def test_learning_rate_schedules_reach_every_critic(cls: type[TrustRegion]) -> N
         assert critic.optimizer.param_groups[0]["lr"] == 0.0
 
 
-@pytest.mark.parametrize("cls", CLASSES)
+@pytest.mark.parametrize("cls", some())
 def test_a_callback_may_stop_and_training_go_on(cls: type[TrustRegion]) -> None:
     model = small(cls, points())
     model.learn(400, callback=lambda local, _: local["self"].num_timesteps < 120)

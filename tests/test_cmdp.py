@@ -142,8 +142,14 @@ def test_the_constrained_optimum_is_reached(
     assert np.all(cost <= 1.05 * limits)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("cls", CONSTRAINED)
+@pytest.mark.parametrize(
+    ("cls", "seed"),
+    [
+        pytest.param(cls, seed, marks=() if (cls, seed) == (CPO, 0) else pytest.mark.slow)
+        for cls in CONSTRAINED
+        for seed in (0, 1)
+    ],
+)
 def test_the_bandit_ends_at_its_constrained_optimum(cls: type[TrustRegion], seed: int) -> None:
     bandit, limit = LinearCostBandit(), 0.5
     modes = solve_bandit(cls, LinearCostBandit, seed, cost_limit=limit)

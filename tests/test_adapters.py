@@ -541,7 +541,8 @@ def test_adapters_need_neither_torch_nor_mujoco():
 
 
 # MuJoCo 2.3 and 3 have no `mujoco.batch`
-@pytest.mark.parametrize("absent", ["mujoco", pytest.param("mujoco.batch", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("absent", ["mujoco", "mujoco.batch"])
 def test_environments_of_others_are_made_and_trained_on_without_mujoco_4(absent):
     run = without(
         absent,

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from errno import ENOSPC
 from types import SimpleNamespace
 
@@ -438,23 +439,31 @@ def test_a_terminal_that_is_not_utf_8(tmp_path):
     assert len(done.stderr) < 520
 
 
-@pytest.mark.parametrize("output", ["closed", "full"])
-def test_output_that_nobody_takes(output, tmp_path):
-    """As with ``| head -3``, which is no process that died; a full disk there is not the run's."""
-    if output == "full":
-        writer = os.open("/dev/full", os.O_WRONLY)
-    else:
-        reader, writer = os.pipe()
-        os.close(reader)
-    command = "-m sb3_guard.train --algo ppo --env CostPoint-v0 -n 64 --eval-freq -1 --device cpu"
+OUTPUT = (
+    "--algo ppo --env CostPoint-v0 -n 64 --eval-freq -1 --device cpu --gym-packages registered_envs "
+    "-params n_steps:32 batch_size:32 n_envs:1 -f"
+).split()
+
+
+def test_standard_output_on_a_full_disk(tmp_path, monkeypatch, capsys):
+    """Is not the run's."""
+    full = open("/dev/full", "w", buffering=1)  # noqa: SIM115
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", full)
+        assert train.main([*OUTPUT, str(tmp_path)]) == 2
+    assert "error: can't write to standard output" in capsys.readouterr().err
+    with suppress(OSError):
+        full.close()
+
+
+def test_output_that_nobody_reads(tmp_path):
+    """As with ``| head -3``, which is no process of environments that died."""
+    reader, writer = os.pipe()
+    os.close(reader)
     done = subprocess.run(
-        [sys.executable, *command.split(), "-params", "n_steps:32", "batch_size:32", "n_envs:1",
-         "--gym-packages", "registered_envs", "-f", str(tmp_path)],
+        [sys.executable, "-m", "sb3_guard.train", *OUTPUT, str(tmp_path)],
         stdout=writer, stderr=subprocess.PIPE,
         env={**os.environ, "PYTHONPATH": os.path.dirname(__file__)},
     )  # fmt: skip
     os.close(writer)
-    if output == "full":
-        assert b"error: can't write to standard output" in done.stderr
-    else:
-        assert done.returncode == 141 and b"subproc" not in done.stderr
+    assert done.returncode == 141 and b"subproc" not in done.stderr

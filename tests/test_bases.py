@@ -2,10 +2,7 @@
 
 import inspect
 import json
-import os
 import random
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,9 +14,11 @@ from ppo_lagrangian import PPOLagrangian
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
+from sb3_guard import train
 from sb3_guard.algorithms import (
     ALGORITHMS,
     CPO,
+    TRPO,
     Constrained,
     FirstOrder,
     PPOLag,
@@ -159,19 +158,22 @@ def test_defaults_are_stated_where_only_they_differ() -> None:
 # Algorithms from outside the package
 
 
-def test_a_users_algorithm_trains_by_command(tmp_path: Path) -> None:
+def test_a_users_algorithm_trains_by_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Registered by a module of the user's, with hyper-parameters from there."""
-    (tmp_path / "custom_algorithm.py").write_text((EXAMPLES / "custom_algorithm.py").read_text())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(ALGORITHMS, "trpo_price", TRPO)  # to be forgotten afterwards
+    del ALGORITHMS["trpo_price"]
+    path = tmp_path / "my_algorithm.py"
+    path.write_text((EXAMPLES / "custom_algorithm.py").read_text())
     command = (
-        "-m sb3_guard.train --gym-packages custom_algorithm --algo trpo_price --verbose 0 "
-        "-conf custom_algorithm.py --env Goal_Point_8Hazards -n 80 --eval-freq -1 --seed 0 "
+        "--gym-packages my_algorithm --algo trpo_price --verbose 0 -conf my_algorithm.py "
+        "--env Goal_Point_8Hazards -n 80 --eval-freq -1 --seed 0 "
         "-params n_envs:2 n_steps:20 n_critic_updates:1"
     )
-    done = subprocess.run(
-        [sys.executable, *command.split()], cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert train.main(command.split()) == 0
     run = tmp_path / "logs" / "trpo_price" / "Goal_Point_8Hazards-v0_1"
     result = json.loads((run / "result.json").read_text())
     assert (result["n_timesteps"], result["cost_limit"]) == (80, 5.0)

@@ -102,7 +102,7 @@ def solve_tabular(cls: type[TrustRegion], n_costs: int, seed: int, **kwargs: Any
         **SETTINGS[cls],
         **kwargs,
     }
-    model = cls("MlpPolicy", env, **settings).learn(40_000)
+    model = cls("MlpPolicy", env, **settings).learn(30_000)
     with th.no_grad():
         states = th.arange(world.observation_space.n)
         policy = model.policy.get_distribution(states).distribution.probs
@@ -205,7 +205,7 @@ def test_fac_keeps_the_limit_in_every_context(seed: int) -> None:
         return LinearCostBandit(offset=[1.0, -1.0])
 
     bandit, limit = make(), 1.0
-    modes = solve_bandit(TRPOFAC, make, seed, updates=120, cost_limit=limit, n_critic_updates=30)
+    modes = solve_bandit(TRPOFAC, make, seed, updates=120, cost_limit=limit, n_critic_updates=15)
     turn = slice(20, 120)
     actions = np.array(modes.actions)[turn]  # [100, 2, 2]
     costs = (actions @ bandit.normal + bandit.offset).mean(axis=0)

@@ -453,9 +453,17 @@ def test_tables_sort_in_a_browser(small, tmp_path, monkeypatch):
     assert state == "descending"
 
 
-def test_the_command_runs_as_a_module(small, tmp_path):
+def test_the_command_runs_as_a_module_and_loads_no_torch(small, tmp_path):
+    table = tmp_path / "r.csv"
+    code = (
+        "import runpy, sys\n"
+        "try:\n"
+        "    runpy.run_module('sb3_guard.plot', run_name='__main__', alter_sys=True)\n"
+        "finally:\n"
+        "    print([m for m in ('torch', 'rl_zoo3') if m in sys.modules])"
+    )
     run = subprocess.run(
-        [sys.executable, "-m", "sb3_guard.plot", str(small), "--table", str(tmp_path / "r.csv")],
+        [sys.executable, "-c", code, str(small), "--table", str(table)],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
-    assert run.stdout == f"wrote {tmp_path / 'r.csv'}\n" and run.stderr == ""
+    assert run.stdout == f"wrote {table}\n[]\n" and run.stderr == ""

@@ -2,8 +2,6 @@
 
 import json
 import math
-import subprocess
-import sys
 
 import pandas as pd
 import pytest
@@ -221,16 +219,3 @@ def test_damaged_curve(tmp_path, content):
     file.unlink() if content is None else file.write_text(content)
     with pytest.raises(UsageError, match=r"0\.monitor\.csv"):
         read_curve(file.parent)
-
-
-def test_reading_results_loads_no_torch(tmp_path):
-    fake_run(tmp_path)
-    code = (
-        "import sys, sb3_guard.zoo.runs as runs, sb3_guard.zoo.paper, sb3_guard.plot\n"
-        "runs.read_results(sys.argv[1:])\n"
-        "print([m for m in ('torch', 'rl_zoo3') if m in sys.modules])"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True
-    )
-    assert run.stdout.strip() == "[]"

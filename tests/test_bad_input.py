@@ -440,14 +440,14 @@ def test_a_terminal_that_is_not_utf_8(tmp_path):
 
 
 OUTPUT = (
-    "--algo ppo --env CostPoint-v0 -n 64 --eval-freq -1 --device cpu --gym-packages registered_envs "
-    "-params n_steps:32 batch_size:32 n_envs:1 -f"
+    "--algo ppo --env CostPoint-v0 -n 64 --eval-freq -1 --device cpu "
+    "--gym-packages registered_envs -params n_steps:32 batch_size:32 n_envs:1 -f"
 ).split()
 
 
 def test_standard_output_on_a_full_disk(tmp_path, monkeypatch, capsys):
     """Is not the run's."""
-    full = open("/dev/full", "w", buffering=1)  # noqa: SIM115
+    full = open("/dev/full", "w", buffering=1)
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", full)
         assert train.main([*OUTPUT, str(tmp_path)]) == 2

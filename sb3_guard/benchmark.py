@@ -1,6 +1,5 @@
 """Train a grid, suites × algorithms × seeds: ``python -m sb3_guard.benchmark --preset main8``."""
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +8,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import yaml
 
-from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.zoo.flags import HOST, IDENTITY, command, flag
 from sb3_guard.zoo.run_flags import (
     FILES,
@@ -19,7 +17,7 @@ from sb3_guard.zoo.run_flags import (
     RunFlags,
     TrainingFlags,
 )
-from sb3_guard.zoo.usage import UsageError, one_line, positive
+from sb3_guard.zoo.usage import UsageError, explained, factor, positive, read_mapping, seed_number
 
 if TYPE_CHECKING:
     from sb3_guard.zoo.grid import Run
@@ -27,16 +25,6 @@ if TYPE_CHECKING:
 # The file that says what a grid is, in its folder; `--grid` reads such a file.
 RECORD = "grid.yml"
 GRID = "the grid"
-
-
-def factor(value: Any) -> float:
-    """A number above 0."""
-    try:
-        if 0 < float(value) < float("inf"):
-            return float(value)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"{value!r} is not allowed; it must be a number above 0")
 
 
 @dataclass
@@ -68,8 +56,9 @@ class Flags(EvaluationFlags, TrainingFlags):
         help="algorithms; 'all' is the eight of the paper (default: all, or the preset's)",
     )  # fmt: skip
     seeds: list[int] = flag(
-        default=[0, 1], metavar="K", role=IDENTITY, group=GRID, help="a run each (default: 0 1)"
-    )
+        default=[0, 1], kind=seed_number, metavar="K", role=IDENTITY, group=GRID,
+        help="a run each (default: 0 1)",
+    )  # fmt: skip
     scale: float = flag(
         default=1.0, kind=factor, metavar="X", role=IDENTITY, group=GRID,
         help="factor of every run's length, e.g. 0.1",
@@ -139,14 +128,8 @@ def with_file(flags: Flags) -> Flags:
     path = Path(flags.grid or Path(flags.log_folder) / RECORD)
     if not flags.grid and (flags.given & {"suites", "preset"} or not path.is_file()):
         return flags
-    try:
-        content = load_yaml(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(f"there is no grid file {path}") from None
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise UsageError(f"can't read {path} as YAML: {one_line(error)}") from error
-    if not isinstance(content, dict):
-        raise UsageError(f"{path} must map flags to values, such as 'suites: [Goal_Point_8Ghosts]'")
+    form = "flags to values, such as 'suites: [Goal_Point_8Ghosts]'"
+    content = read_mapping(path, "grid file", form)
     but = ("grid", "log_folder", "trust", "dry_run", "scheduler", "verbose")
     filed = Flags.read(content, path, but)
     given = {name: getattr(filed, name) for name in filed.given}
@@ -167,15 +150,11 @@ def record(folder: Path, grid: dict[str, Any]) -> Path | None:
     from sb3_guard.common.files import replacing
 
     text = yaml.safe_dump(grid, sort_keys=False)
-    try:
+    with explained(f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"):
         folder.mkdir(parents=True, exist_ok=True)
         kept = _keep(folder, yaml.safe_load(text))
         with replacing(folder / RECORD) as file:
             file.write(text.encode())
-    except OSError as error:
-        raise UsageError(
-            f"can't write to log folder {str(folder)!r}: {error.strerror}; choose another with -f"
-        ) from error
     return kept
 
 

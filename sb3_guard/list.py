@@ -13,7 +13,7 @@ from sb3_guard.envs.suites.guard import LADDER
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.flags import Command, command, flag
 from sb3_guard.zoo.markdown import table
-from sb3_guard.zoo.usage import UsageError, import_packages
+from sb3_guard.zoo.usage import UsageError, explained, import_packages
 
 
 def summary(part: type) -> str:
@@ -128,11 +128,9 @@ def show_lists(flags: Flags) -> int:
                 "values: for example --ladder Goal_Point Hazards"
             )
         ids = [f"{flags.ladder[0]}_{num}{flags.ladder[1]}-v0" for num in LADDER]
-        try:
+        with explained("--ladder", ValueError):
             for env_id in ids:
                 Scenario.parse(env_id)
-        except ValueError as error:
-            raise UsageError(str(error)) from None
         print("\n".join(ids))
         return 0
     print("\n\n".join(KINDS[kind]() for kind in ([flags.kind] if flags.kind else KINDS)))

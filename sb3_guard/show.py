@@ -14,7 +14,7 @@ from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.flags import Command, command, flag
 from sb3_guard.zoo.markdown import table
-from sb3_guard.zoo.usage import UsageError, import_packages, one_line
+from sb3_guard.zoo.usage import UsageError, explained, import_packages
 
 
 def observation_table(env: GuardVectorEnv) -> str:
@@ -127,7 +127,7 @@ def show(flags: Flags) -> int:
     if flags.window:
         return watch(flags)
     file = Path(flags.env)
-    try:
+    with explained("can't show it", ValueError, TypeError, RuntimeError):
         spec = env_spec(flags.env)
         if "scenario" not in spec.kwargs:
             raise UsageError(
@@ -143,19 +143,14 @@ def show(flags: Flags) -> int:
         }
         env = GuardVectorEnv(**kwargs)
         env.begin([flags.seed])
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise UsageError(one_line(error)) from None
     data = {key: value for key, value in env.scenario.to_dict().items() if value}
     print(yaml.safe_dump(data, sort_keys=False))
     print(observation_table(env), action_table(env), sep="\n\n")
     path = Path(flags.output) if flags.output else Path(f"{file.stem.removesuffix('-v0')}.png")
-    try:
-        frame = env.frame(0)
+    with explained("no picture", RenderingError, OSError, ValueError):
         from matplotlib import image
 
-        image.imsave(path, np.ascontiguousarray(frame))
-    except (RenderingError, OSError, ValueError) as error:
-        raise UsageError(f"no picture: {one_line(error)}") from None
+        image.imsave(path, np.ascontiguousarray(env.frame(0)))
     print(f"\nwrote {path}")
     warning = unsteady(env)
     if warning is not None:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from sb3_guard.zoo.flags import command, flag
 from sb3_guard.zoo.run_flags import RUNNING, TRUST, WHAT, RunFlags
-from sb3_guard.zoo.usage import UsageError, positive
+from sb3_guard.zoo.usage import UsageError, positive, seed_number
 
 
 @dataclass
@@ -24,7 +24,7 @@ class Flags(RunFlags):
   python -m sb3_guard.train -i logs/cpo/Goal_Point_8Hazards-v0_1 -n 2e6      and for longer
 """
     seeds: list[int] | None = flag(
-        metavar="K", group=WHAT, exclusive="seeds",
+        kind=seed_number, metavar="K", group=WHAT, exclusive="seeds",
         help="a run for each of these seeds, <env>_<seed + 1>, several at once; the same command "
         "continues with what is not done",
     )  # fmt: skip

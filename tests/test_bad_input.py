@@ -100,7 +100,7 @@ TRAIN = [
     (["--algo", "ppo", "-params", "n_steps:1e12"], ["ppo can't be made", "allocate", "10000000"]),
     (["--gym-packages", "../x"], ["'../x' is no module's name"]),
     (["--gym-packages", ""], ["'' is no module's name"]),
-    (["-conf", "absent.yml"], ["there is no hyper-parameter file absent.yml"]),
+    (["-conf", "absent.yml"], ["can't read hyper-parameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown flag --sede", "--seed"]),
     (["cpo"], ["'cpo' belongs to no flag", "--help"]),
@@ -180,7 +180,7 @@ def test_track_without_a_key(capsys, empty, monkeypatch):
 def test_corrupt_yaml(capsys, tmp_path):
     (tmp_path / "bad.yml").write_text("default:\n  n_steps: [1, 2\nx: }")
     arguments = ["-conf", str(tmp_path / "bad.yml"), "-f", str(tmp_path / "logs")]
-    refused(train.main, arguments, capsys, "bad.yml is not valid YAML", "line")
+    refused(train.main, arguments, capsys, "bad.yml as YAML", "line")
     assert not (tmp_path / "logs").exists()
 
 

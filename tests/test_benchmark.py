@@ -196,7 +196,7 @@ REFUSED = [
     (["--suites", "Goal_Point_8Hazards", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
     (["--algos", "cpo", "pcpq"], ["unknown algorithm 'pcpq'", "did you mean 'pcpo'?"]),
     (["--preset", "main9"], ["--preset", "leave out"]),
-    (["--seeds", "-1"], ["--seeds: -1", "from 0"]),
+    (["--seeds", "-1"], ["--seeds: '-1'", "at least 0"]),
     (["--seeds", "one"], ["--seeds", "'one'"]),
     (["--scale", "0"], ["--scale", "above 0"]),
     (["--scale", "half"], ["--scale", "'half'"]),
@@ -207,7 +207,7 @@ REFUSED = [
     (["--device", "abacus"], ["abacus"]),
     (["--jobs", "0"], ["--jobs", "at least 1"]),
     (["--scheduler", "x", "--jobs", "2"], ["--nworkers"]),
-    (["--grid", "absent.yml"], ["there is no grid file absent.yml"]),
+    (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
     (["--suite", "x"], ["unknown flag --suite", "--suites"]),
     (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
 ]

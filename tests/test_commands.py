@@ -600,9 +600,7 @@ def test_show_knows_an_observed_camera_and_lets_its_options_be_changed(tmp_path,
     assert ["camera", "image 24 × 32 × 3", "[0, 255]", "red, green, blue"] in cells
     assert image.imread(picture).shape[:2] == (30, 40)
     assert cli.main([*show, "flatten:True"]) == 2
-    assert capsys.readouterr().err == (
-        "error: observe.camera = (32, 24) needs flatten=False, a Dict observation\n"
-    )
+    assert "observe.camera = (32, 24) needs flatten=False" in capsys.readouterr().err
 
 
 def test_show_knows_what_users_registered(tmp_path, monkeypatch, capsys):

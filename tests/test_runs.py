@@ -80,7 +80,7 @@ def test_folders_may_overlap_and_numbers_sort_as_numbers(tmp_path):
 
 DAMAGE = {
     "unfinished": lambda run: (run / "result.json").unlink(),
-    "can't be read": lambda run: (run / "result.json").write_text('{"return": 1'),
+    "is damaged": lambda run: (run / "result.json").write_text('{"return": 1'),
     "can't decode": lambda run: (run / "result.json").write_bytes(b"\xff\xfe\x00"),
     "should be a mapping": lambda run: (run / "result.json").write_text("[1]"),
     "it has no n_timesteps": lambda run: (run / "result.json").write_text("{}"),

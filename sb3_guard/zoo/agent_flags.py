@@ -1,21 +1,13 @@
 """The flags of the commands that take a trained agent: ``enjoy`` and ``hub``."""
 
-import argparse
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from sb3_guard.zoo.flags import Command, flag
 from sb3_guard.zoo.run_flags import TRUST
-from sb3_guard.zoo.usage import UsageError, positive, steps
+from sb3_guard.zoo.usage import UsageError, positive, seed_number
 
 WHICH, PLAYED, OUTPUT, PUSH = "which agent", "what is played", "output", "push"
-
-
-def episode_seed(value: Any) -> int:
-    """A seed from 0 to 2**32 - 1."""
-    if 0 <= steps(value) < 2**32:
-        return steps(value)
-    raise argparse.ArgumentTypeError(f"{value!r} is not allowed; it must be from 0 to 2**32 - 1")
 
 
 @dataclass
@@ -55,7 +47,7 @@ class AgentFlags(Command):
         default=False, group=PLAYED, exclusive="actions", help="sampled actions"
     )
     seed: int = flag(
-        default=0, kind=episode_seed, group=PLAYED, help="seed of the episodes (default: 0)"
+        default=0, kind=seed_number, group=PLAYED, help="seed of the episodes (default: 0)"
     )
     env_kwargs: dict[str, Any] | None = flag(
         group=PLAYED, help="arguments of the environment, over those of training"

@@ -24,7 +24,7 @@ from sb3_guard.common.files import replacing
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.make_envs import seed_rows
 from sb3_guard.zoo.resumable import capture, restore
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained
 
 MEMBER = "run_state.pkl"
 NORMALIZER = "vecnormalize.pkl"
@@ -205,13 +205,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"there is no {path}: the run was stopped before its first rollout; "
             "start it again without -i"
         )
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = archive.namelist()
-            state = pickle.loads(archive.read(MEMBER)) if MEMBER in members else None
-    except Exception as error:
-        # A damaged pickle can raise anything.
-        raise UsageError(f"{path} is damaged and can't be read: {one_line(error)}") from error
+    with explained(f"{path} is damaged and can't be read"), zipfile.ZipFile(path) as archive:
+        members = archive.namelist()
+        state = pickle.loads(archive.read(MEMBER)) if MEMBER in members else None
     if state is None:
         # The end of a cut file may look like one of the archives inside it.
         whole = "data" in members
@@ -237,16 +233,11 @@ def read_normalizer(path: Path) -> VecNormalize:
 
     :raises UsageError: the file is absent or damaged, or there are none in it
     """
-    try:
+    with explained(f"can't read the observation statistics of the agent from {path}"):
         if path.suffix == ".zip":
             with zipfile.ZipFile(path) as archive:
                 return pickle.loads(archive.read(NORMALIZER))
         return pickle.loads(path.read_bytes())
-    except Exception as error:
-        # A damaged pickle can raise anything.
-        raise UsageError(
-            f"can't read the observation statistics of the agent from {path}: {one_line(error)}"
-        ) from error
 
 
 def load_model(
@@ -261,7 +252,7 @@ def load_model(
     :param env: environment to go on training in; None: to predict only
     :raises UsageError: the file is damaged, of another algorithm, or does not fit the environment
     """
-    try:
+    with explained(f"can't load {path} as {algorithm.__name__}"):
         model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
         if env is not None and isinstance(model, OffPolicyAlgorithm):
             with zipfile.ZipFile(path) as archive:
@@ -269,8 +260,6 @@ def load_model(
                     with archive.open(REPLAY_BUFFER) as member:
                         model.replay_buffer = pickle.load(member)
         return model
-    except Exception as error:
-        raise UsageError(f"can't load {path} as {algorithm.__name__}: {one_line(error)}") from error
 
 
 def restore_run(model: BaseAlgorithm, state: dict[str, Any]) -> None:

@@ -93,9 +93,6 @@ def expand(
     :param scale: factor of every run's length
     :raises UsageError: a name or value is wrong for any of the runs
     """
-    for seed in seeds:
-        if not 0 <= seed < 2**32 - 1:
-            raise UsageError(f"--seeds: {seed} is not allowed; it must be from 0 to 2**32 - 2")
     given = dict(args["hyperparams"] or {})
     known = {algo: _hyperparams(algo) for algo in dict.fromkeys(algo for _, algo in pairs)}
     for name in given:

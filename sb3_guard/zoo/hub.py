@@ -14,7 +14,7 @@ import yaml
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
 from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
-from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_mapping
+from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data
 from sb3_guard.zoo.usage import UsageError, one_line
 
 # Said before an agent is downloaded.
@@ -243,7 +243,7 @@ def install(downloaded: Path, name: str, flags: HubFlags) -> RunFolder:
                 "--algo and --env"
             )
     env = folder_name(flags.env)
-    trained = read_mapping(downloaded / "args.yml")
+    trained = read_data(downloaded / "args.yml")
     if (trained.get("algo"), folder_name(str(trained.get("env")))) != (flags.algo, env):
         raise UsageError(
             f"the repository's agent is {trained.get('algo')} on {trained.get('env')} by its "

@@ -14,15 +14,15 @@ import runpy
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -37,7 +37,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.trust import entries, evaluate, import_class, wrapper
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained, read_mapping
 
 # What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -81,24 +81,23 @@ def read_file(path: str | Path) -> dict[str, Any]:
     :raises UsageError: it is absent, not readable or not of that form
     """
     name = str(path)
+    form = (
+        "environments, or 'default', to hyper-parameters ('default:' and below it lines such as "
+        "'  n_steps: 1000')"
+    )
     if name.endswith((".yml", ".yaml")):
-        content = _read_yaml(Path(path))
-    else:
-        try:
-            if name.endswith(".py"):
-                content = runpy.run_path(name).get("hyperparams")
-            else:
-                content = getattr(importlib.import_module(name), "hyperparams", None)
-        except Exception as error:
-            raise UsageError(
-                f"can't read hyper-parameters from {name}: {one_line(error)}; give a .yml file, "
-                f"a Python file or module, or {PAPER!r}"
-            ) from error
-    if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
-        raise UsageError(
-            f"{name} must map environments, or 'default', to hyper-parameters "
-            "('default:' and below it lines such as '  n_steps: 1000')"
+        # What is cached is not for others to change.
+        content = read_mapping(
+            name, "hyper-parameter file", form, lambda text: copy.deepcopy(_parse_yaml(text))
         )
+    else:
+        fix = f"give a .yml file, a Python file or module, or {PAPER!r}"
+        with explained(f"can't read hyper-parameters from {name}", fix=fix):
+            python = name.endswith(".py")
+            module = runpy.run_path(name) if python else vars(importlib.import_module(name))
+        content = module.get("hyperparams", {None: None})
+    if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
+        raise UsageError(f"{name} must map {form}")
     for entry, values in content.items():
         for key in values:
             if not isinstance(key, str):
@@ -108,17 +107,6 @@ def read_file(path: str | Path) -> dict[str, Any]:
 
 # A grid reads the same few files hundreds of times, and parsing takes milliseconds.
 _parse_yaml = lru_cache(maxsize=64)(load_yaml)
-
-
-def _read_yaml(path: Path) -> Any:
-    try:
-        return copy.deepcopy(_parse_yaml(path.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        raise UsageError(f"there is no hyper-parameter file {path}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"can't read {path}: {one_line(error)}") from error
-    except yaml.YAMLError as error:
-        raise UsageError(f"{path} is not valid YAML: {one_line(error)}") from error
 
 
 def shipped_file(algo: str) -> Path:
@@ -225,12 +213,12 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
             raise UsageError(
                 f"{algo} has no hyper-parameter {name!r}; {did_you_mean(name, sorted(known))}"
             )
+        words, make = _kind(known[name])
         try:
-            checked[name] = _coerce(value, known[name])
+            checked[name] = make(value)
         except TypeError:
             raise UsageError(
-                f"hyper-parameter {name}: {value!r} is not allowed; "
-                f"it must be {_describe(known[name])}"
+                f"hyper-parameter {name}: {value!r} is not allowed; it must be {words}"
             ) from None
     if isinstance(checked.get("env_kwargs"), str):
         checked["env_kwargs"] = evaluate("env_kwargs", checked["env_kwargs"])
@@ -253,99 +241,74 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     return dict(sorted(checked.items()))
 
 
-def _coerce(value: Any, hint: Any) -> Any:
-    """``value`` as a ``hint``; numbers that YAML reads as text (``1e-3``) and whole floats fit."""
+def _kind(hint: Any) -> tuple[str, Callable[[Any], Any]]:
+    """
+    What an annotation allows: in words, and what makes it of a value, or raises TypeError.
+
+    Numbers that YAML reads as text (``1e-3``) and whole floats fit; objects that a file can't hold
+    are named by text.
+    """
     origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        # The arm that fits without change wins: 1 stays an int where int and float are allowed.
-        for arm in args:
-            if _is_exactly(value, arm):
-                return _coerce(value, arm)
-        for arm in args:
-            try:
-                return _coerce(value, arm)
-            except TypeError:
-                continue
-        raise TypeError
-    if hint is None or hint is type(None):
-        if value is None:
-            return None
-        raise TypeError
-    if origin is typing.Literal:
-        if value in args:
-            return value
-        raise TypeError
-    if hint is bool or hint is str:
-        if isinstance(value, hint):
-            return value
-        raise TypeError
-    if hint is int or hint is float:
-        return _number(value, hint)
-    container = origin or hint
-    if isinstance(container, type) and issubclass(container, Mapping):
+    kind = origin or hint
+    names = {bool: "True or False", str: "text", None: "None", types.NoneType: "None"}
+    if kind in (typing.Union, types.UnionType):
+        return _any_of({arm: _kind(arm) for arm in args})
+    if kind in (int, float):
+        return "a whole number" if kind is int else "a number", partial(_number, kind=kind)
+    if kind in (list, tuple, Sequence):
+        words, make = _kind(args[0] if args else Any)
+        each = f" ({words} each)" if args and args[0] is not ... else ""
+        is_list = _only(lambda value: isinstance(value, list | tuple))
+        return f"a list{each}", lambda value: [make(one) for one in is_list(value)]
+    if kind is typing.Literal:
+        return " or ".join(map(repr, args)), _only(lambda value: value in args)
+    if kind in names:
+        return names[kind], _only(lambda value: isinstance(value, hint or types.NoneType))
+    if isinstance(kind, type) and issubclass(kind, Mapping):
         # Text is evaluated when the model is made: `dict(activation_fn=nn.ReLU)`.
-        if isinstance(value, Mapping) or (isinstance(value, str) and value.startswith("dict(")):
-            return value
-        raise TypeError
-    if container in (list, tuple, Sequence):
-        if not isinstance(value, (list, tuple)):
+        dicts = lambda value: isinstance(value, str) and value.startswith("dict(")  # noqa: E731
+        return "a mapping", _only(lambda value: isinstance(value, Mapping) or dicts(value))
+    if kind in (type, Callable):
+        words = "the dotted name of a class" if kind is type else "a schedule such as lin_0.001"
+        named = lambda value: "." in value or value.startswith("lin_")  # noqa: E731
+        return words, _only(lambda value: isinstance(value, str) and named(value))
+    free = hint is Any or not isinstance(hint, type)
+    data = str | bool | int | float
+    return getattr(hint, "__name__", str(hint)), _only(lambda v: free or not isinstance(v, data))
+
+
+def _only(fits: Callable[[Any], bool]) -> Callable[[Any], Any]:
+    """What returns values that fit as they are."""
+
+    def make(value: Any) -> Any:
+        if not fits(value):
             raise TypeError
-        inner = args[0] if args else Any
-        return [_coerce(one, inner) for one in value]
-    if hint is Any or isinstance(hint, (str, typing.TypeVar)):
         return value
-    if type in (origin, hint) or Callable in (origin, hint):
-        # A class by its dotted name, or a schedule such as lin_0.001.
-        if isinstance(value, str) and ("." in value or value.startswith("lin_")):
-            return value
+
+    return make
+
+
+def _any_of(arms: Mapping[Any, tuple[str, Callable[[Any], Any]]]) -> tuple[str, Callable]:
+    """The kind of a union of others."""
+
+    def make(value: Any) -> Any:
+        # The arm that fits without change wins: 1 stays an int where int and float are allowed.
+        for arm in sorted(arms, key=lambda arm: type(value) is not arm):
+            with suppress(TypeError):
+                return arms[arm][1](value)
         raise TypeError
-    if isinstance(value, (str, bool, int, float)) and isinstance(hint, type):
-        raise TypeError
-    return value
+
+    return " or ".join(dict.fromkeys(words for words, _ in arms.values())), make
 
 
 def _number(value: Any, kind: type) -> int | float:
-    if isinstance(value, str):
-        try:
-            value = float(value)
-        except ValueError:
-            raise TypeError from None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except ValueError:
+        raise TypeError from None
+    if math.isnan(number) or (kind is int and not number.is_integer()):
         raise TypeError
-    if kind is int:
-        if not float(value).is_integer():
-            raise TypeError
-        return int(value)
-    return float(value)
-
-
-def _is_exactly(value: Any, hint: Any) -> bool:
-    return isinstance(hint, type) and type(value) is hint and value == value
-
-
-def _describe(hint: Any) -> str:
-    """A type annotation in words."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        words = [_describe(arm) for arm in args]
-        return " or ".join(dict.fromkeys(words))
-    if origin is typing.Literal:
-        return " or ".join(repr(one) for one in args)
-    names = {int: "a whole number", float: "a number", bool: "True or False", str: "text"}
-    if hint in names:
-        return names[hint]
-    if hint is None or hint is type(None):
-        return "None"
-    container = origin or hint
-    if isinstance(container, type) and issubclass(container, Mapping):
-        return "a mapping"
-    if container in (list, tuple, Sequence):
-        return f"a list{f' ({_describe(args[0])} each)' if args and args[0] is not ... else ''}"
-    if type in (origin, hint):
-        return "the dotted name of a class"
-    if Callable in (origin, hint):
-        return "a schedule such as lin_0.001"
-    return getattr(hint, "__name__", str(hint))
+    return int(value) if kind is int else number
 
 
 @dataclass
@@ -390,10 +353,8 @@ class Setup:
         """
         found = entries("callback", self.callback)
         classes = [import_class("callback", path, BaseCallback) for path, _ in found]
-        try:
+        with explained("a callback can't be made"):
             return [cls(**kwargs) for cls, (_, kwargs) in zip(classes, found, strict=True)]
-        except Exception as error:  # a user's class may raise anything
-            raise UsageError(f"a callback can't be made: {one_line(error)}") from error
 
     def action_noise(self, actions: int) -> ActionNoise | None:
         """
@@ -427,27 +388,22 @@ def build(values: Mapping[str, Any]) -> Setup:
             model[name] = evaluate(name, value)
         elif isinstance(value, str) and name.endswith("_class"):
             model[name] = import_class(name, value, BaseBuffer)
-    normalize = values.get("normalize") or None
-    if isinstance(normalize, str):
-        normalize = evaluate("normalize", normalize)
-    if normalize is True:
-        normalize = {}
-    if normalize is not None and "gamma" in values:
-        # Returns are scaled by the discount they are learned with.
-        normalize = {"gamma": values["gamma"], **normalize}
-    monitor_kwargs = values.get("monitor_kwargs") or {}
-    if isinstance(monitor_kwargs, str):
-        monitor_kwargs = evaluate("monitor_kwargs", monitor_kwargs)
+    normalize, monitor_kwargs = (
+        evaluate(name, values[name]) if isinstance(values.get(name), str) else values.get(name)
+        for name in ("normalize", "monitor_kwargs")
+    )
+    # Returns are scaled by the discount they are learned with.
+    learned = {"gamma": values["gamma"]} if "gamma" in values else {}
     return Setup(
         model=model,
         n_envs=values["n_envs"],
         n_timesteps=values["n_timesteps"],
-        normalize=normalize,
+        normalize={**learned, **({} if normalize is True else normalize)} if normalize else None,
         frame_stack=values.get("frame_stack"),
         env_kwargs=dict(values.get("env_kwargs") or {}),
         env_wrapper=wrapper("env_wrapper", values.get("env_wrapper"), gym.Wrapper),
         vec_env_wrapper=wrapper("vec_env_wrapper", values.get("vec_env_wrapper"), VecEnvWrapper),
-        monitor_kwargs=monitor_kwargs,
+        monitor_kwargs=monitor_kwargs or {},
         callback=values.get("callback"),
         selection_limit=values.get("selection_limit"),
         noise_type=values.get("noise_type"),
@@ -458,9 +414,6 @@ def build(values: Mapping[str, Any]) -> Setup:
 def _schedule(name: str, value: str) -> Callable[[float], float]:
     from rl_zoo3 import linear_schedule
 
-    try:
+    what = f"hyper-parameter {name}: {value!r} is not a schedule"
+    with explained(what, ValueError, fix="write e.g. lin_0.001"):
         return linear_schedule(value.removeprefix("lin_"))
-    except ValueError:
-        raise UsageError(
-            f"hyper-parameter {name}: {value!r} is not a schedule; write e.g. lin_0.001"
-        ) from None

@@ -3,7 +3,7 @@
 import signal
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import gymnasium as gym
@@ -25,7 +25,7 @@ from sb3_guard.common.adapters import is_safety_gymnasium
 from sb3_guard.common.vec_env import find_scenario, make_vec_env
 from sb3_guard.zoo.hyperparams import Setup
 from sb3_guard.zoo.resumable import ResumableEnv
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained
 
 
 def _errors_of_ours() -> tuple[type[Exception], type[Exception]]:
@@ -90,12 +90,10 @@ def canonical_id(env_id: str) -> tuple[str, bool]:
             'module of yours, sb3_guard.register("Mine-v0", '
             f"sb3_guard.Scenario.load({env_id!r})), then --gym-packages my_module --env Mine-v0"
         )
-    try:
+    with explained("--env", ValueError, gym.error.Error):
         ours = find_scenario(env_id) is not None
         if not ours and not is_safety_gymnasium(env_id) and ":" not in env_id:
             gym.spec(env_id)
-    except (ValueError, gym.error.Error) as error:
-        raise UsageError(one_line(error)) from error
     if ours and not env_id.rpartition("-v")[2].isdigit():
         env_id = f"{env_id}-v0"
     return env_id, ours
@@ -170,26 +168,26 @@ def make_envs(
     def wrap(env: gym.Env) -> gym.Env:
         return ResumableEnv(env if setup.env_wrapper is None else setup.env_wrapper(env))
 
-    try:
-        with _interrupts_left_to_us():
-            env = make_vec_env(
-                env_id,
-                n_envs,
-                seed,
-                vec_env=vec_env,
-                env_kwargs=dict(env_kwargs),
-                num_threads=num_threads,
-                render_mode=render_mode,
-                wrapper_class=None if vec_env == "native" else wrap,
-                monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
-            )
-    except (*BAD_ARGUMENTS, *PROCESS_DIED) as error:
-        raise UsageError(f"can't make {env_id}: {one_line(error)}") from error
-    try:
-        return _wrap(env, setup, evaluation, normalizer)
-    except BAD_ARGUMENTS as error:
-        env.close()
-        raise UsageError(f"can't wrap {env_id}: {one_line(error)}") from error
+    with (
+        explained(f"can't make {env_id}", *BAD_ARGUMENTS, *PROCESS_DIED),
+        _interrupts_left_to_us(),
+    ):
+        env = make_vec_env(
+            env_id,
+            n_envs,
+            seed,
+            vec_env=vec_env,
+            env_kwargs=dict(env_kwargs),
+            num_threads=num_threads,
+            render_mode=render_mode,
+            wrapper_class=None if vec_env == "native" else wrap,
+            monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
+        )
+    with ExitStack() as made, explained(f"can't wrap {env_id}", *BAD_ARGUMENTS):
+        made.callback(env.close)
+        wrapped = _wrap(env, setup, evaluation, normalizer)
+        made.pop_all()
+    return wrapped
 
 
 def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: VecNormalize | None) -> VecEnv:

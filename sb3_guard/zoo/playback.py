@@ -3,7 +3,7 @@
 import itertools
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from sb3_guard.zoo.run_folder import (
     run_path,
 )
 from sb3_guard.zoo.trust import require_trust
-from sb3_guard.zoo.usage import UsageError, import_packages, one_line
+from sb3_guard.zoo.usage import UsageError, explained, import_packages
 
 VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
 #: The trained agents that the package ships: a log folder, written by ``scripts/pretrain.py``.
@@ -226,22 +226,21 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         episodes = 1 if flags.record is not None else 5
     if flags.verbose > 0:
         print(f"Playing {agent.path} on {agent.env_id}")
-    try:
-        with camera(agent.env, video, render_mode) as shoot:
-            evaluation = evaluate_policy(
-                agent.model,
-                agent.env,
-                n_eval_episodes=episodes or flags.n_timesteps or 1,
-                deterministic=not flags.stochastic,
-                seed=flags.seed,
-                max_steps=flags.n_timesteps,
-                on_step=shoot,
-                on_episode=(lambda *one: print(_episode(*one))) if flags.verbose > 0 else None,
-            )
-    except ERRORS_OF_OURS as error:
-        raise UsageError(f"can't play {agent.env_id}: {one_line(error)}") from error
-    finally:
-        agent.env.close()
+    with (
+        closing(agent.env),
+        explained(f"can't play {agent.env_id}", *ERRORS_OF_OURS),
+        camera(agent.env, video, render_mode) as shoot,
+    ):
+        evaluation = evaluate_policy(
+            agent.model,
+            agent.env,
+            n_eval_episodes=episodes or flags.n_timesteps or 1,
+            deterministic=not flags.stochastic,
+            seed=flags.seed,
+            max_steps=flags.n_timesteps,
+            on_step=shoot,
+            on_episode=(lambda *one: print(_episode(*one))) if flags.verbose > 0 else None,
+        )
     print(_means(evaluation, agent))
     if flags.verbose > 0:
         for one in evaluation.unfinished:
@@ -352,7 +351,8 @@ def camera(env: VecEnv, video: Path | None, render_mode: str | None) -> Iterator
     every = max(1, int(fps / 25))  # 25 pictures a second are enough
     video.parent.mkdir(parents=True, exist_ok=True)
     partial = video.with_name(f".{video.name}.part.mp4")
-    try:
+    with ExitStack() as last, explained(f"can't write {video}", OSError):
+        last.callback(partial.unlink, missing_ok=True)
         writer = imageio_ffmpeg.write_frames(
             str(partial), (width, height), fps=fps / every, macro_block_size=2
         )
@@ -364,25 +364,17 @@ def camera(env: VecEnv, video: Path | None, render_mode: str | None) -> Iterator
                 for picture in _film(env):
                     writer.send(np.ascontiguousarray(picture))
 
-        try:
+        with closing(writer):
             yield shoot
-        finally:
-            writer.close()
         partial.replace(video)
-    except OSError as error:
-        raise UsageError(f"can't write {video}: {one_line(error)}") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _render(env: VecEnv) -> np.ndarray | None:
     if env.render_mode == "human":
         env.render()
         return None
-    try:
+    with explained("can't render", RuntimeError, ImportError, AttributeError):
         return env.get_images()[0]
-    except (RuntimeError, ImportError, AttributeError) as error:
-        raise UsageError(f"can't render: {one_line(error)}") from error
 
 
 def _film(env: VecEnv) -> list[np.ndarray]:

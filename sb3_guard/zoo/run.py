@@ -20,7 +20,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
 
@@ -55,7 +54,7 @@ from sb3_guard.zoo.progress import Epochs
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, is_disk_error, require_writable
 from sb3_guard.zoo.tracking import Tracker
-from sb3_guard.zoo.usage import ForeignError, UsageError, interrupts, one_line
+from sb3_guard.zoo.usage import ForeignError, UsageError, explained, interrupts, one_line
 
 
 class Experiment:
@@ -136,13 +135,10 @@ class Experiment:
         vec_env = "dummy" if self.vec_env == "subproc" else self.vec_env
         env = self._make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
         try:
-            env.reset()
-            env.action_space.seed(self.flags.seed)
-            info = env.step(np.array([env.action_space.sample()]))[3][0]
-        except BAD_ARGUMENTS as error:
-            raise UsageError(
-                f"{self.flags.env} fails at its first step: {one_line(error)}"
-            ) from error
+            with explained(f"{self.flags.env} fails at its first step", *BAD_ARGUMENTS):
+                env.reset()
+                env.action_space.seed(self.flags.seed)
+                info = env.step(np.array([env.action_space.sample()]))[3][0]
         finally:
             env.close()
         if not getattr(self.algorithm, "constrained", False):
@@ -164,23 +160,18 @@ class Experiment:
             return load_model(self.algorithm, self._saved, self.env, flags.device)
         arguments = copy.deepcopy(self.setup.model)  # some algorithms add to their policy_kwargs
         arguments["seed"] = flags.seed
-        try:
-            if flags.trained_agent:
-                # What the networks are is for the saved agent to say.
-                for name in ("policy", "policy_kwargs"):
-                    arguments.pop(name, None)
-                path = Path(flags.trained_agent)
-                return load_model(self.algorithm, path, self.env, flags.device, **arguments)
-            noise = self._action_noise()
-            if noise is not None:
-                arguments["action_noise"] = noise
-            return self.algorithm(env=self.env, device=flags.device, **arguments)
-        except (*BAD_ARGUMENTS, RuntimeError, MemoryError) as error:
-            raise UsageError(f"{flags.algo} can't be made: {one_line(error)}") from error
-
-    def _action_noise(self) -> ActionNoise | None:
+        if flags.trained_agent:
+            # What the networks are is for the saved agent to say.
+            for name in ("policy", "policy_kwargs"):
+                arguments.pop(name, None)
+            path = Path(flags.trained_agent)
+            return load_model(self.algorithm, path, self.env, flags.device, **arguments)
         space = self.env.action_space
-        return self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
+        noise = self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
+        if noise is not None:
+            arguments["action_noise"] = noise
+        with explained(f"{flags.algo} can't be made", *BAD_ARGUMENTS, RuntimeError, MemoryError):
+            return self.algorithm(env=self.env, device=flags.device, **arguments)
 
     def _warm_start_normalizer(self) -> VecNormalize | None:
         """Observation statistics that belong to the agent given by ``-i model.zip``."""
@@ -403,10 +394,8 @@ def _check_device(name: str) -> None:
 
     :raises UsageError: torch has no such device
     """
-    try:
+    with explained(f"--device {name!r} is not allowed", RuntimeError):
         device = th.device("cpu" if name == "auto" else name)
-    except RuntimeError as error:
-        raise UsageError(f"--device {name!r} is not allowed: {one_line(error)}") from None
     if device.type == "cuda" and (device.index or 0) >= th.cuda.device_count():
         raise UsageError(
             f"--device {name!r}: torch sees {th.cuda.device_count()} GPUs here; use auto or cpu"

@@ -1,39 +1,20 @@
 """The flags of a run, as ``args.yml`` in its folder keeps them; other commands share some."""
 
-import argparse
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 from sb3_guard.zoo.flags import HOST, IDENTITY, Command, flag
-from sb3_guard.zoo.usage import UsageError, positive, steps
+from sb3_guard.zoo.usage import (
+    UsageError,
+    amount,
+    interval,
+    positive,
+    seed_or_random,
+    steps,
+)
 
 WHAT, EVALUATION, FILES, RUNNING = "what is trained", "evaluation", "files", "running"
 TRUST = "let files of a run or grid name code that is not this package's, RL-Zoo's or SB3's"
-
-
-def seconds(value: Any) -> float:
-    """A time of at least 0 seconds."""
-    try:
-        if float(value) >= 0:
-            return float(value)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"{value!r} is not allowed; it must be at least 0 seconds")
-
-
-def interval(value: Any) -> int:
-    """A number of rollouts: -1 as usual, -2 never."""
-    if steps(value) in (0, -2, -1) or steps(value) > 0:
-        if steps(value) != 0:
-            return steps(value)
-    raise argparse.ArgumentTypeError(f"{value!r} is not allowed; it must be at least 1, or -2")
-
-
-def seed_number(value: Any) -> int:
-    """A seed that NumPy and torch take; negative: a random one."""
-    if steps(value) < 2**32:
-        return steps(value)
-    raise argparse.ArgumentTypeError(f"{value!r} is not allowed; it must be less than 2**32")
 
 
 @dataclass
@@ -95,7 +76,7 @@ class EvaluationFlags(Command):
         help="keep a model every N steps, rl_model_<N>_steps.zip; -1 none (default: -1)",
     )  # fmt: skip
     checkpoint_every: float = flag(
-        default=10.0, kind=seconds, metavar="S", role=HOST, group=FILES,
+        default=10.0, kind=amount, metavar="S", role=HOST, group=FILES,
         help="least seconds between checkpoints to resume from (default: 10)",
     )  # fmt: skip
     tensorboard_log: str = flag(
@@ -129,7 +110,7 @@ class RunFlags(EvaluationFlags, TrainingFlags):
         help="environment id; the version may be left out (default: Goal_Point_8Hazards)",
     )  # fmt: skip
     seed: int = flag(
-        default=-1, kind=seed_number, role=IDENTITY, group=WHAT, exclusive="seeds",
+        default=-1, kind=seed_or_random, role=IDENTITY, group=WHAT, exclusive="seeds",
         help="random seed (default: -1, a random one)",
     )  # fmt: skip
     trained_agent: str = flag(

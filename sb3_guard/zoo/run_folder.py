@@ -21,7 +21,7 @@ from sb3_guard.common.files import replacing
 from sb3_guard.plain_yaml import Bounded
 from sb3_guard.zoo.flags import IDENTITY
 from sb3_guard.zoo.run_flags import RunFlags
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained, one_line, read_mapping
 
 CHECKPOINT = "checkpoint.zip"
 # What the system says when a disk is full, read-only or broken.
@@ -55,6 +55,10 @@ class _Loader(Bounded, _SafeLoader):
     """Plain data, and the ordered mappings that RL-Zoo writes."""
 
 
+def _load(text: str) -> Any:
+    return yaml.load(text, Loader=_Loader)
+
+
 _Loader.add_constructor(
     "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
     lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0]),
@@ -68,19 +72,13 @@ def plain(value: Any) -> Any:
     return [plain(one) for one in value] if isinstance(value, list | tuple) else value
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
+def read_data(path: Path) -> dict[str, Any]:
     """
     The plain data of a run's file, RL-Zoo's included.
 
     :raises UsageError: it can't be read, or is no mapping
     """
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UsageError(f"can't read {path}: {one_line(error)}") from error
-    if not isinstance(content, dict):
-        raise UsageError(f"{path} is damaged: it should be a mapping")
-    return content
+    return read_mapping(path, "the run's file", "names to values", _load)
 
 
 def folder_name(env_id: str) -> str:
@@ -124,17 +122,13 @@ def require_writable(folder: Path, flag: str) -> None:
     :param flag: the flag that names it, for the message
     :raises UsageError: no file can be made in it, or in what exists of the path to it
     """
-    try:
-        existing = folder.absolute()
-        while not existing.exists():
-            existing = existing.parent
+    what = f"{flag}: can't write to folder {str(folder)!r}"
+    with explained(what, OSError, fix="choose another"):
+        whole = folder.absolute()
+        existing = next(one for one in (whole, *whole.parents) if one.exists())
         # Permission bits mean little to root and on special file systems: only trying tells.
         with tempfile.TemporaryFile(dir=existing):
             pass
-    except OSError as error:
-        raise UsageError(
-            f"{flag}: can't write to folder {str(folder)!r}: {error.strerror}; choose another"
-        ) from error
 
 
 class RunFolder:
@@ -180,7 +174,8 @@ class RunFolder:
         files = _dump(flags.values(), hyperparams)
         parent = Path(flags.log_folder) / flags.algo
         suffix = f"_{uuid.uuid4()}" if flags.uuid else ""
-        try:
+        what = f"can't write to log folder {flags.log_folder!r}"
+        with explained(what, OSError, fix="choose another with -f"):
             parent.mkdir(parents=True, exist_ok=True)
             if number is None:
                 path = claim(parent, name, suffix)
@@ -190,11 +185,6 @@ class RunFolder:
             params.mkdir(parents=True, exist_ok=True)
             (params / "command.txt").write_text(command, encoding="utf-8")
             _write(params, files)
-        except OSError as error:
-            raise UsageError(
-                f"can't write to log folder {flags.log_folder!r}: {error.strerror}; "
-                "choose another with -f"
-            ) from error
         return cls(path)
 
     @classmethod
@@ -236,7 +226,7 @@ class RunFolder:
 
     def args(self) -> dict[str, Any]:
         """The flags the run was started with."""
-        return read_mapping(self.params / "args.yml")
+        return read_data(self.params / "args.yml")
 
     def flags(self) -> RunFlags:
         """
@@ -263,7 +253,7 @@ class RunFolder:
 
     def hyperparams(self) -> dict[str, Any]:
         """The hyper-parameters the run was started with."""
-        return read_mapping(self.params / "config.yml")
+        return read_data(self.params / "config.yml")
 
     def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
         """Replace what :meth:`create` wrote, e.g. when a finished run is to go on for longer."""
@@ -280,25 +270,20 @@ class RunFolder:
 
         :raises UsageError: there is none, or it is damaged
         """
-        try:
+        fix = f"sb3-guard train -i {self.path} writes it again"
+        with explained("result.json is damaged", OSError, ValueError, fix=fix):
             result = json.loads(self.result.read_bytes())
-        except (OSError, ValueError) as error:
-            raise self._damaged(f"can't be read: {one_line(error)}") from error
-        if not isinstance(result, dict):
-            raise self._damaged("is damaged: it should be a mapping")
-        for key in ("n_timesteps", *MEASURES):
-            if key not in result:
-                raise self._damaged(f"is damaged: it has no {key}")
-            value = result[key]
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if key == "n_timesteps" and (not number or not isinstance(value, int)):
-                raise self._damaged(f"is damaged: {key} = {value!r} should be whole")
-            if value is not None and (not number or not math.isfinite(value)):
-                raise self._damaged(f"is damaged: {key} = {value!r} should be a number")
+            if not isinstance(result, dict):
+                raise ValueError("it should be a mapping")
+            for key in ("n_timesteps", *MEASURES):
+                if key not in result:
+                    raise ValueError(f"it has no {key}")
+                value, whole = result[key], key == "n_timesteps"
+                if type(value) not in ((int,) if whole else (int, float, type(None))) or (
+                    value is not None and not math.isfinite(value)
+                ):
+                    raise ValueError(f"{key} = {value!r} should be a {'whole ' * whole}number")
         return result
-
-    def _damaged(self, how: str) -> UsageError:
-        return UsageError(f"result.json {how}; sb3-guard train -i {self.path} writes it again")
 
     def read_result(self) -> dict[str, Any] | None:
         """The result of a complete run; None if there is none, or it is damaged."""
@@ -326,16 +311,15 @@ def lock(folder: Path) -> Iterator[None]:
     lease = SoftFileLease(path, lease_duration=SILENCE, on_compromise=_lost, is_singleton=False)
     if elsewhere:
         print(f"{folder} has a lock of {holder['host']}: waiting for a sign of life of its process")
-    try:
-        lease.acquire(timeout=WAIT if elsewhere else 0)
-    except Timeout:
-        holder = owner(folder)
-        raise RunInUse(
-            f"{folder} is in use by process {holder.get('pid')} on {holder.get('host')}; "
-            f"if that is gone, remove {path}"
-        ) from None
-    except OSError as error:
-        raise UsageError(f"can't write to {folder}: {error.strerror}") from error
+    with explained(f"can't write to {folder}", OSError):
+        try:
+            lease.acquire(timeout=WAIT if elsewhere else 0)
+        except Timeout:
+            holder = owner(folder)
+            raise RunInUse(
+                f"{folder} is in use by process {holder.get('pid')} on {holder.get('host')}; "
+                f"if that is gone, remove {path}"
+            ) from None
     try:
         yield
     finally:
@@ -362,26 +346,13 @@ def _lost(compromise: Any) -> None:
     os._exit(1)
 
 
-def in_use(folder: Path) -> bool:
-    """Whether another process has the lock of a run; it may be gone a moment later."""
-    try:
-        with lock(folder):
-            return False
-    except RunInUse:
-        return True
-
-
 def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, bytes]:
     """The configuration files, by name."""
+    fix = "write classes and calls as text, such as policy_kwargs: dict(activation_fn=nn.ReLU)"
     files = {}
     for name, content in (("config.yml", hyperparams), ("args.yml", args)):
-        try:
+        with explained(f"{name} can hold plain data only", yaml.YAMLError, fix=fix):
             files[name] = yaml.dump(dict(content), Dumper=_SafeDumper).encode()
-        except yaml.YAMLError as error:
-            raise UsageError(
-                f"{name} can hold plain data only; write classes and calls as text, such as "
-                f"policy_kwargs: dict(activation_fn=nn.ReLU) ({one_line(error)})"
-            ) from error
     return files
 
 

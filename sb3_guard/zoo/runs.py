@@ -18,7 +18,7 @@ import pandas as pd
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.run_folder import MEASURES, RunFolder
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained, one_line
 
 REFERENCE = "trpo"  # scores are relative to it
 # Columns of the figures of merit, and their key in result.json
@@ -367,10 +367,8 @@ def read_episodes(path: str | Path) -> pd.DataFrame:
     :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
     """
     file = Path(path) / "0.monitor.csv"
-    try:
+    with explained(f"can't read {file}", OSError, ValueError, KeyError):
         table = pd.read_csv(file, skiprows=1)[["r", "l", "c"]].astype(float)
-    except (OSError, ValueError, KeyError) as error:
-        raise UsageError(f"can't read {file}: {one_line(error)}") from error
     if not len(table) or table.isna().any(axis=None):
         raise UsageError(f"can't use {file}: it has no episodes, or cut ones")
     steps = table["l"].cumsum()

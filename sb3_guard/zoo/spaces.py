@@ -15,18 +15,17 @@ samplers serve for RL-Zoo's algorithms, and :func:`rl_zoo_sampler` makes one of 
 import json
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import optuna
-import yaml
 from optuna.samplers import BaseSampler, GPSampler, NSGAIISampler, RandomSampler, TPESampler
 
-from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.hyperparams import NOISE_KEYS, RUN_KEYS, parameters
 from sb3_guard.zoo.trust import evaluate
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained, read_mapping
 
 Space = Mapping[str, Any]
 
@@ -61,16 +60,11 @@ def read_space(path: str) -> dict[str, Any]:
 
     :raises UsageError: it can't be read, or an entry is neither a range nor a list
     """
-    try:
-        with open(path, encoding="utf-8") as file:
-            content = load_yaml(file.read())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UsageError(f"--search-space: can't read {path}: {one_line(error)}") from error
-    if not isinstance(content, dict) or not content:
-        raise UsageError(
-            f"--search-space: {path} must map names of hyper-parameters to ranges or lists, such "
-            "as 'target_kl: {low: 0.002, high: 0.05, log: true}'"
-        )
+    form = (
+        "names of hyper-parameters to ranges or lists, such as "
+        "'target_kl: {low: 0.002, high: 0.05, log: true}'"
+    )
+    content = read_mapping(path, "--search-space", form)
     return {str(name): _checked(str(name), entry, path) for name, entry in content.items()}
 
 
@@ -80,7 +74,7 @@ def _checked(name: str, entry: Any, where: str) -> Any:
 
     :raises UsageError: it is neither a range nor a list
     """
-    try:
+    with explained(f"search space: {name} in {where}", ValueError):
         if isinstance(entry, list):
             if len(entry) < 2:
                 raise ValueError("a list needs at least two options")
@@ -101,8 +95,6 @@ def _checked(name: str, entry: Any, where: str) -> Any:
         if log and low <= 0:
             raise ValueError(f"low: {low} must be above 0 on a logarithmic scale")
         return {"low": low, "high": high, "log": log}
-    except ValueError as error:
-        raise UsageError(f"search space: {name} in {where}: {error}") from None
 
 
 def _bound(entry: Mapping[str, Any], key: str) -> int | float:
@@ -110,15 +102,11 @@ def _bound(entry: Mapping[str, Any], key: str) -> int | float:
     if key not in entry:
         raise ValueError(f"there is no {key!r}")
     value = entry[key]
-    try:
+    with suppress(TypeError, ValueError):
         number = value if type(value) is int else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if isinstance(value, bool):
-        number = math.nan
-    if not math.isfinite(number):
-        raise ValueError(f"{key}: {value!r} is not a finite number")
-    return number
+        if math.isfinite(number) and not isinstance(value, bool):
+            return number
+    raise ValueError(f"{key}: {value!r} is not a finite number")
 
 
 def _label(option: Any) -> Any:

@@ -18,7 +18,7 @@ from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder, is_run, lock, plain, run_path
 from sb3_guard.zoo.trust import require_trust
-from sb3_guard.zoo.usage import UsageError, import_packages
+from sb3_guard.zoo.usage import UsageError, explained, import_packages
 
 
 def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
@@ -89,10 +89,8 @@ def complete(
     """
     import_packages(flags.gym_packages)
     path = run_path(flags.log_folder, flags.algo, flags.env, number)
-    try:
+    with explained(f"can't make folder {path}", OSError):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"can't make folder {path}: {error.strerror}") from error
     with lock(path):
         if is_run(path):
             folder = RunFolder(path)

@@ -13,7 +13,7 @@ import pandas as pd
 from sb3_guard.common.files import replacing
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.markdown import escaped, table
-from sb3_guard.zoo.usage import UsageError
+from sb3_guard.zoo.usage import UsageError, explained
 
 # A column's name, or a function of a row; by heading
 Cell = str | Callable[[Any], str]
@@ -190,14 +190,10 @@ def written(path: Path) -> Iterator[BufferedRandom]:
 
     :raises UsageError: it can't be written
     """
-    try:
+    with explained(f"can't write to {str(path)!r}", OSError, fix="choose another place"):
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:
             yield file
-    except OSError as error:
-        raise UsageError(
-            f"can't write to {str(path)!r}: {error.strerror}; choose another place"
-        ) from error
 
 
 def check_table(path: Path) -> None:

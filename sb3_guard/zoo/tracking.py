@@ -7,7 +7,7 @@ from typing import Any
 
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import explained, one_line
 
 
 class Tracker:
@@ -42,7 +42,8 @@ class Tracker:
             if resumed and path is not None and path.exists():
                 known = path.read_text().strip()
             name = f"{flags.env}__{flags.algo}__{flags.seed}__{int(time.time())}"
-            try:
+            fix = "log in with: wandb login, set WANDB_MODE=offline, or leave out --track"
+            with explained("--track: Weights & Biases can't be used", fix=fix):
                 self._run = wandb.init(
                     id=known,
                     resume="allow" if known else None,
@@ -54,11 +55,6 @@ class Tracker:
                     config={**flags.values(), "hyperparams": self.hyperparams},
                     sync_tensorboard=True,
                 )
-            except Exception as error:  # its client raises what it likes
-                raise UsageError(
-                    f"--track: Weights & Biases can't be used: {one_line(error)}; log in with: "
-                    "wandb login, set WANDB_MODE=offline, or leave out --track"
-                ) from error
         if folder is not None and path is not None:
             path.write_text(self._run.id)
             self._run.config.update({"folder": str(folder.path)}, allow_val_change=True)

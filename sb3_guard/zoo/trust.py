@@ -7,13 +7,14 @@ RL-Zoo, Stable-Baselines3 and what they stand on are used; any other needs ``--t
 """
 
 import importlib
+import operator
 import os
 from collections.abc import Callable, Iterator, Mapping
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained
 from sb3_guard.zoo.values import read_expression
 
 KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
@@ -52,10 +53,8 @@ def import_class(name: str, path: str, base: type) -> Any:
     :raises UsageError: there is no such class, or it is another kind of thing
     """
     module, _, attribute = path.rpartition(".")
-    try:
+    with explained(f"{name}: there is no class {path!r}"):
         found = getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # a module may raise anything
-        raise UsageError(f"{name}: there is no class {path!r}: {one_line(error)}") from error
     if not (isinstance(found, type) and issubclass(found, base)):
         raise UsageError(f"{name}: {path!r} is not allowed; it must be a {base.__name__}")
     return found
@@ -69,17 +68,14 @@ def torch_class(path: str) -> Any:
     """
     import torch as th
 
-    root, *names = path.split(".")
-    value: Any = {"th": th, "torch": th, "nn": th.nn}.get(root)
+    root, _, names = path.partition(".")
     try:
-        for one in names:
-            value = getattr(value, one)
+        value = operator.attrgetter(names)({"th": th, "torch": th, "nn": th.nn}.get(root))
     except AttributeError as error:
         raise ValueError(f"{path}: {error}") from None
     # torch's modules hold others, such as subprocess: what was found must be torch's own.
-    if not isinstance(value, (type, th.dtype)) or not (
-        isinstance(value, th.dtype) or value.__module__.split(".")[0] == "torch"
-    ):
+    own = isinstance(value, type) and value.__module__.split(".")[0] == "torch"
+    if not own and not isinstance(value, th.dtype):
         raise ValueError(f"{path} is no class of torch")
     return value
 
@@ -90,13 +86,10 @@ def evaluate(name: str, text: str) -> Any:
 
     :raises UsageError: it is more than literals and classes of torch
     """
-    try:
+    what = f"hyper-parameter {name}: {text!r} can't be evaluated"
+    allowed = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
+    with explained(what, ValueError, fix=allowed):
         return read_expression(text, torch_class)
-    except ValueError as error:
-        raise UsageError(
-            f"hyper-parameter {name}: {text!r} can't be evaluated: {one_line(error)}; "
-            "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
-        ) from error
 
 
 def _foreign(args: Mapping[str, Any], values: Mapping[str, Any]) -> Iterator[str]:

@@ -1,13 +1,11 @@
 """The flags of tuning."""
 
-import argparse
-import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from sb3_guard.zoo.flags import flag
-from sb3_guard.zoo.run_flags import WHAT, TrainingFlags, seconds, seed_number
-from sb3_guard.zoo.usage import UsageError, positive
+from sb3_guard.zoo.run_flags import WHAT, TrainingFlags
+from sb3_guard.zoo.usage import UsageError, amount, count, positive, seed_number, seed_or_random
 
 SEARCH, WHERE = "search", "storage and workers"
 EXAMPLES = """examples:
@@ -20,28 +18,6 @@ EXAMPLES = """examples:
 The same command continues a study that was stopped, and joins one that runs: --n-trials counts the
 trials of the study, not of the process.
 """
-
-
-def limit(value: Any) -> float:
-    """A finite number of at least 0."""
-    try:
-        if 0 <= float(value) < math.inf:
-            return float(value)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"{value!r} is not allowed; it must be at least 0")
-
-
-def count(value: Any) -> int:
-    """A whole number of at least 0."""
-    if limit(value).is_integer():
-        return int(limit(value))
-    raise argparse.ArgumentTypeError(f"{value!r} is not a whole number")
-
-
-def fixed_seed(value: Any) -> int:
-    """A seed that is not random."""
-    return seed_number(count(value))
 
 
 @dataclass
@@ -57,7 +33,7 @@ class TuneFlags(TrainingFlags):
         help="environment id; the version may be left out (default: Goal_Point_8Hazards)",
     )  # fmt: skip
     cost_limit: list[float] | None = flag(
-        kind=limit, metavar="D", group=WHAT,
+        kind=amount, metavar="D", group=WHAT,
         help="highest episode cost of a feasible trial, one for all or one per cost "
         "(default: selection_limit, else the algorithm's cost_limit, but at least 1)",
     )  # fmt: skip
@@ -75,7 +51,7 @@ class TuneFlags(TrainingFlags):
         help="finished trials of the study in all, pruned ones included (default: 50)",
     )  # fmt: skip
     seeds: list[int] = flag(
-        default=[0], kind=fixed_seed, metavar="S", group=SEARCH, exclusive="seeds",
+        default=[0], kind=seed_number, metavar="S", group=SEARCH, exclusive="seeds",
         help="seeds that every trial trains with (default: 0)",
     )  # fmt: skip
     n_seeds: int | None = flag(
@@ -83,7 +59,7 @@ class TuneFlags(TrainingFlags):
         help="the first so many seeds: 0 1 2 …",
     )  # fmt: skip
     seed: int = flag(
-        default=-1, kind=seed_number, group=SEARCH,
+        default=-1, kind=seed_or_random, group=SEARCH,
         help="seed of the sampler (default: -1, a random one)",
     )  # fmt: skip
     sampler: Literal["tpe", "gp", "nsgaii", "random"] = flag(
@@ -121,7 +97,7 @@ class TuneFlags(TrainingFlags):
         "long loses its trial to another (default: 60)",
     )  # fmt: skip
     storage_timeout: float = flag(
-        default=300.0, kind=seconds, metavar="S", group=WHERE,
+        default=300.0, kind=amount, metavar="S", group=WHERE,
         help="seconds to wait for a PostgreSQL server that is down (default: 300)",
     )  # fmt: skip
     n_jobs: int = flag(

@@ -4,6 +4,7 @@ import argparse
 import difflib
 import errno
 import importlib
+import math
 import os
 import re
 import signal
@@ -12,8 +13,12 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NoReturn
 
+import yaml
+
+from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.zoo.values import parse_value
 
 LONGEST = 500  # characters of an error that are printed
@@ -35,6 +40,45 @@ def one_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
+@contextmanager
+def explained(what: str, *errors: type[BaseException], fix: str = "") -> Iterator[None]:
+    """
+    Say in one line what a block could not do, why, and how to mend it.
+
+    :param what: what it could not do, e.g. ``can't read x.yml``
+    :param errors: the errors meant; none: all, where the code is a user's
+    :raises UsageError: instead of them
+    """
+    try:
+        yield
+    except UsageError:
+        raise
+    except Exception as error:
+        if errors and not isinstance(error, errors):
+            raise
+        why = getattr(error, "strerror", None) or one_line(error)
+        raise UsageError(f"{what}: {why}" + (fix and f"; {fix}")) from error
+
+
+def read_mapping(
+    path: str | Path, what: str, form: str, load: Callable[[str], Any] = load_yaml
+) -> dict[Any, Any]:
+    """
+    The plain data of a YAML file.
+
+    :param what: what the file is, for the message
+    :param form: what it must be, likewise
+    :param load: makes the data of the text
+    :raises UsageError: it can't be read, or is not a mapping
+    """
+    errors = OSError, ValueError, yaml.YAMLError
+    with explained(f"can't read {what} {path} as YAML", *errors):
+        content = load(Path(path).read_text(encoding="utf-8"))
+    if not isinstance(content, dict):
+        raise UsageError(f"{what} {path} is damaged: it must map {form}")
+    return content
+
+
 def import_packages(names: Sequence[str]) -> None:
     """
     Import modules that register environments (``--gym-packages``), the current folder's too.
@@ -44,17 +88,13 @@ def import_packages(names: Sequence[str]) -> None:
     if names and os.getcwd() not in sys.path:  # as with python -m, also for the script sb3-guard
         sys.path.insert(0, os.getcwd())
     for name in names:
-        try:
+        if not all(part.isidentifier() for part in name.split(".")):
+            raise UsageError(
+                f"--gym-packages: {name!r} is no module's name; it must be like my_envs or "
+                "package.my_envs, importable from the current folder"
+            )
+        with explained(f"--gym-packages: can't import {name!r}", ImportError):
             importlib.import_module(name)
-        except (ImportError, TypeError, ValueError) as error:
-            if not re.fullmatch(r"\w+(\.\w+)*", name):
-                raise UsageError(
-                    f"--gym-packages: {name!r} is no module's name; it must be like my_envs or "
-                    "package.my_envs, importable from the current folder"
-                ) from None
-            if not isinstance(error, ImportError):
-                raise  # from within the module
-            raise UsageError(f"--gym-packages: can't import {name!r}: {one_line(error)}") from error
 
 
 class Parser(argparse.ArgumentParser):
@@ -140,23 +180,41 @@ def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
             signal.signal(one, handler)
 
 
-def steps(text: str) -> int:
-    """A number of steps: ``300000``, ``3e5``."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.5
-    if not value.is_integer():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, such as 300000 or 3e5")
-    return int(value)
+def number(
+    allowed: str, fits: Callable[[float], bool], kind: Callable[[float], float] = int
+) -> Callable[[Any], Any]:
+    """
+    What makes a number of a flag's text; ``3e5`` is a whole one, too.
+
+    :param allowed: which numbers, in words
+    :param fits: whether it is one of them; not asked for those that are not whole
+    :param kind: ``int`` or ``float``
+    """
+
+    def read(text: Any) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if kind is int and not value.is_integer():
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not a whole number, such as 300000 or 3e5"
+            )
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f"{text!r} is not allowed; it must be {allowed}")
+        return kind(value)
+
+    return read
 
 
-def positive(text: str) -> int:
-    """A number of at least 1, ``3e5`` allowed."""
-    value = steps(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; it must be at least 1")
-    return value
+steps = number("a whole number", lambda n: True)
+positive = number("at least 1", lambda n: n >= 1)
+count = number("at least 0", lambda n: n >= 0)
+amount = number("at least 0", lambda n: 0 <= n < math.inf, float)
+factor = number("above 0", lambda n: 0 < n < math.inf, float)
+seed_number = number("at least 0 and less than 2**32", lambda n: 0 <= n < 2**32)
+seed_or_random = number("less than 2**32; if negative, it is random", lambda n: n < 2**32)
+interval = number("at least 1, or -2 for never", lambda n: n >= 1 or n in (-1, -2))
 
 
 def parse_pairs(pairs: Sequence[str], what: str = "key:value") -> dict[str, Any]:

@@ -1,15 +1,14 @@
 """A logger whose files can be continued where a checkpoint was taken."""
 
-import csv
-import io
-import itertools
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from stable_baselines3.common.logger import (
+    CSVOutputFormat,
     HumanOutputFormat,
     KVWriter,
     Logger,
@@ -20,7 +19,7 @@ from stable_baselines3.common.logger import (
 from sb3_guard.common.files import replacing
 
 
-class ProgressCSV(KVWriter):
+class ProgressCSV(CSVOutputFormat):
     """
     SB3's ``progress.csv``, able to go on after a number of rows.
 
@@ -33,65 +32,45 @@ class ProgressCSV(KVWriter):
     """
 
     def __init__(self, path: str | os.PathLike[str], rows: int | None = None):
-        self.path = Path(path)
-        self.rows = rows or 0
-        self.keys: list[str] = []
-        kept = self._read(self.rows) if self.rows else []
-        self._replace(kept)
+        super().__init__(os.devnull)
+        self.path, self.rows = Path(path), rows or 0
+        self._begin([])
 
-    def _read(self, rows: int) -> list[dict[str, str]]:
-        """The first rows of the file."""
-        what = f"{self.path} had {rows} rows when the run was saved"
+    def _begin(self, new: list[str]) -> None:
+        """Replace the file by its first rows, with more columns, and open it for what comes."""
+        kept = self._read() if self.rows else pd.DataFrame()
+        self.keys = [*kept.columns, *new]
+        with replacing(self.path) as file:
+            if self.keys:
+                kept.reindex(columns=self.keys, fill_value="").to_csv(file, index=False)
+        self.file.close()
+        self.file = open(self.path, "a", encoding="utf-8")
+
+    def _read(self) -> pd.DataFrame:
+        what = f"{self.path} had {self.rows} rows when the run was saved"
         try:
-            with open(self.path, encoding="utf-8", newline="") as file:
-                reader = csv.DictReader(file)
-                kept = list(itertools.islice(reader, rows))
-                self.keys = list(reader.fieldnames or [])
-        except (OSError, ValueError, csv.Error) as error:
+            # This engine tells short rows from empty cells.
+            options: Any = {"dtype": str, "keep_default_na": False, "engine": "python"}
+            kept = pd.read_csv(self.path, nrows=self.rows, **options)
+        except (OSError, ValueError) as error:
             raise ValueError(f"{what}, and can't be read now: {error}") from error
-        whole = all(None not in row and None not in row.values() for row in kept)
-        if len(kept) < rows or not whole:
+        whole = isinstance(kept.index, pd.RangeIndex) and kept.notna().all(axis=None)
+        if len(kept) < self.rows or not whole:
             raise ValueError(
                 f"{what} and has {len(kept) if whole else 'damaged ones'} now: put it back, or the "
                 "run can't be continued in this folder"
             )
         return kept
 
-    def _replace(self, rows: Sequence[Mapping[str, str]]) -> None:
-        """Write the file anew and open it for what comes."""
-        with replacing(self.path) as binary:
-            file = io.TextIOWrapper(binary, encoding="utf-8", newline="")
-            writer = csv.DictWriter(file, self.keys, restval="", lineterminator="\n")
-            if self.keys:
-                writer.writeheader()
-            writer.writerows(rows)
-            file.flush()
-            file.detach()
-        self.file = open(self.path, "a", encoding="utf-8", newline="")
-
     def write(
-        self,
-        key_values: dict[str, Any],
-        key_excluded: dict[str, tuple[str, ...]],
-        step: int = 0,
+        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
     ) -> None:
         """Append a row."""
-        values = filter_excluded_keys(key_values, key_excluded, "csv")
-        row = {key: "" if value is None else str(value) for key, value in values.items()}
-        new = sorted(row.keys() - set(self.keys))
+        new = filter_excluded_keys(key_values, key_excluded, "csv").keys() - set(self.keys)
         if new:
-            kept = self._read(self.rows) if self.rows else []
-            self.keys += new
-            self.file.close()
-            self._replace(kept)
-        writer = csv.DictWriter(self.file, self.keys, restval="", lineterminator="\n")
-        writer.writerow(row)
-        self.file.flush()
+            self._begin(sorted(new))
+        super().write(key_values, key_excluded, step)
         self.rows += 1
-
-    def close(self) -> None:
-        """Close the file."""
-        self.file.close()
 
 
 class RunLogger(Logger):

@@ -1,13 +1,14 @@
 """Train a grid, suites × algorithms × seeds: ``python -m sb3_guard.benchmark --preset main8``."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import yaml
 
+from sb3_guard.common.files import replacing
 from sb3_guard.zoo.flags import HOST, IDENTITY, command, flag
 from sb3_guard.zoo.run_flags import (
     FILES,
@@ -140,51 +141,6 @@ def with_file(flags: Flags) -> Flags:
     return Flags.of(given)
 
 
-def record(folder: Path, grid: dict[str, Any]) -> Path | None:
-    """
-    Write down what was asked for, so that the folder is enough to continue.
-
-    :return: the new name of the record of another grid that this one is not a part of; None: none
-    :raises UsageError: the folder can't be written to
-    """
-    from sb3_guard.common.files import replacing
-
-    text = yaml.safe_dump(grid, sort_keys=False)
-    with explained(f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"):
-        folder.mkdir(parents=True, exist_ok=True)
-        kept = _keep(folder, yaml.safe_load(text))
-        with replacing(folder / RECORD) as file:
-            file.write(text.encode())
-    return kept
-
-
-def _keep(folder: Path, new: Mapping[str, Any]) -> Path | None:
-    """Rename the record in a grid's folder, unless a new one has all its runs or it was kept."""
-    try:
-        text = (folder / RECORD).read_text()
-        old = yaml.safe_load(text)
-    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError):
-        return None
-    if not isinstance(old, dict) or _contains(new, old):
-        return None
-    number = 1
-    while (kept := folder / f"grid-{number}.yml").exists():
-        if kept.read_bytes() == text.encode():
-            return None
-        number += 1
-    (folder / RECORD).rename(kept)
-    return kept
-
-
-def _contains(new: Mapping[str, Any], old: Mapping[str, Any]) -> bool:
-    """Whether one grid has all the runs of another, as far as their flags tell."""
-    lists = {"suites": ["all"], "algos": ["all"], "seeds": Flags().seeds}
-    if any(new.get(name) != old.get(name) for name in {*new, *old} - lists.keys()):
-        return False
-    pairs = [(new.get(name, every), old.get(name, every)) for name, every in lists.items()]
-    return all("all" in mine or {*its} <= {*mine} for mine, its in pairs)
-
-
 def show_plan(runs: Sequence["Run"]) -> None:
     """Print the runs and how far they are."""
     for one in runs:
@@ -223,12 +179,11 @@ def benchmark(flags: Flags) -> int:
         show_plan(runs)
         return 0
     try_out(runs)
-    kept = record(folder, flags.asked_for())
-    if kept is not None and flags.verbose:
-        print(
-            f"{folder} belonged to another grid, whose record is now {kept.name}; continue that "
-            f"one with: sb3-guard benchmark -f {folder} --grid {kept}"
-        )
+    with explained(f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"):
+        # What was asked for, so that the folder is enough to continue.
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(folder / RECORD) as file:
+            file.write(yaml.safe_dump(flags.asked_for(), sort_keys=False).encode())
     how = {name: getattr(flags, name) for name in ("jobs", "scheduler") if name in flags.given}
     again = f"continue with: sb3-guard benchmark -f {folder}"
     again += "".join(f" --{name} {value}" for name, value in how.items())

@@ -123,8 +123,12 @@ class Campaign:
 
 def workers(process: psutil.Popen) -> list[psutil.Process]:
     """The processes that a command has started, except for multiprocessing's own."""
-    children = process.children(recursive=True)
-    return [one for one in children if "resource_tracker" not in " ".join(one.cmdline())]
+    found = []
+    for one in process.children(recursive=True):
+        with suppress(psutil.NoSuchProcess):  # ended meanwhile
+            if "resource_tracker" not in " ".join(one.cmdline()):
+                found.append(one)
+    return found
 
 
 def outcome(run: Path) -> tuple[dict[str, object], list[pd.DataFrame]]:

@@ -161,37 +161,6 @@ def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
     assert capsys.readouterr().out.startswith(f"done    {run}  60 steps")
 
 
-@pytest.mark.parametrize(
-    ("change", "kept"),
-    [
-        ([], False),
-        (["--seeds", "0", "1"], False),  # a grid may grow
-        (["--suites", "CostPoint-v0", "Filmed-v0", "--algos", "trpo"], False),
-        (["--suites", "Filmed-v0"], True),
-        (["--algos", "cpo"], True),
-        (["--checkpoint-every", "0"], True),
-    ],
-)
-def test_an_earlier_grid_of_the_folder_is_not_forgotten(change, kept, tmp_path, here, capsys):
-    arguments = [*GRID[:2], "--algos", "trpo", "--seeds", "0", *SMALL, "-n", "60"]
-    arguments += ["-f", str(tmp_path)]
-    assert benchmark.main(arguments) == 0
-    before = (tmp_path / "grid.yml").read_text()
-    capsys.readouterr()
-    assert benchmark.main([*arguments, *change]) == 0
-    assert (tmp_path / "grid-1.yml").exists() == kept
-    out = capsys.readouterr().out
-    if kept:
-        assert (tmp_path / "grid-1.yml").read_text() == before
-        line = f"sb3-guard benchmark -f {tmp_path} --grid {tmp_path / 'grid-1.yml'}"
-        assert line in out
-        assert benchmark.main([*line.split()[2:], "--dry-run"]) == 0
-        assert "1 runs (1 done" in capsys.readouterr().out
-        for flags in (line.split()[2:], [*arguments, *change], line.split()[2:]):  # to and fro
-            assert benchmark.main(flags) == 0
-        assert len(list(tmp_path.glob("grid-*.yml"))) == 2
-
-
 REFUSED = [
     (["--suites", "Goal_Point_8Hazards", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
     (["--algos", "cpo", "pcpq"], ["unknown algorithm 'pcpq'", "did you mean 'pcpo'?"]),

@@ -28,7 +28,7 @@ from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, RunInUse, is_disk_error, is_run, run_path
 from sb3_guard.zoo.start import complete, prepare, refuse_another
-from sb3_guard.zoo.usage import UsageError, interrupts, one_line
+from sb3_guard.zoo.usage import UsageError, explained, interrupts, one_line
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -95,11 +95,10 @@ def expand(
     """
     given = dict(args["hyperparams"] or {})
     known = {algo: _hyperparams(algo) for algo in dict.fromkeys(algo for _, algo in pairs)}
-    for name in given:
-        if not any(name in names for names in known.values()):
-            every = sorted(set().union(*known.values()))
-            who = next(iter(known)) if len(known) == 1 else "none of the algorithms"
-            raise UsageError(f"{who} has a hyper-parameter {name!r}; {did_you_mean(name, every)}")
+    every = set[str]().union(*known.values())
+    for name in given.keys() - every:
+        hint = did_you_mean(name, sorted(every))
+        raise UsageError(f"none of the algorithms has a hyper-parameter {name!r}; {hint}")
     prepared = {}
     args = {**args, "progress": False, "num_threads": max(args["num_threads"], 1)}
     for env_id, algo in pairs:
@@ -231,44 +230,40 @@ def workers(jobs: int | None, scheduler: str | None, folder: Path) -> Iterator["
     # What goes wrong is said here, in a line; Dask's own words would bury that.
     for name in ("distributed", "distributed.client", "distributed.nanny"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    if scheduler is None:
-        # Whatever ends a run's process counts as one of its failures.
-        settings = {
-            "distributed.scheduler.allowed-failures": 0,
-            "distributed.scheduler.http.routes": [],
-            "distributed.worker.http.routes": [],
-        }
-        with (
-            dask.config.set(settings),
-            LocalCluster(
-                n_workers=jobs or CPU_COUNT,
-                threads_per_worker=1,
-                memory_limit=None,
-                dashboard_address="127.0.0.1:0",
-                security=True,  # else whoever has an account on this machine may give it work
-                silence_logs=logging.CRITICAL,
-                preload=[LONE],
-                env={"PYTHONWARNINGS": "ignore"},
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,
-        ):
-            try:
-                yield client
-            except KeyboardInterrupt:  # do not let the runs finish their rollouts
-                for worker in multiprocessing.active_children():
-                    worker.kill()
-                raise
+    if scheduler is not None:
+        what = f"no Dask scheduler answers at {scheduler}"
+        with explained(what, OSError, ValueError, fix="start one with: dask scheduler"):
+            client = Client(scheduler, timeout=10, set_as_default=False)
+        with client:
+            _check(client, folder)
+            yield client
         return
-    try:
-        client = Client(scheduler, timeout=10, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
-        raise UsageError(
-            f"no Dask scheduler answers at {scheduler}: {one_line(error)}; "
-            "start one with: dask scheduler"
-        ) from error
-    with client:
-        _check(client, folder)
-        yield client
+    # Whatever ends a run's process counts as one of its failures.
+    settings = {
+        "distributed.scheduler.allowed-failures": 0,
+        "distributed.scheduler.http.routes": [],
+        "distributed.worker.http.routes": [],
+    }
+    with (
+        dask.config.set(settings),
+        LocalCluster(
+            n_workers=jobs or CPU_COUNT,
+            threads_per_worker=1,
+            memory_limit=None,
+            dashboard_address="127.0.0.1:0",
+            security=True,  # else whoever has an account on this machine may give it work
+            silence_logs=logging.CRITICAL,
+            preload=[LONE],
+            env={"PYTHONWARNINGS": "ignore"},
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        try:
+            yield client
+        except KeyboardInterrupt:  # do not let the runs finish their rollouts
+            for worker in multiprocessing.active_children():
+                worker.kill()
+            raise
 
 
 # Ctrl-C in a terminal reaches a whole group of processes; here, it is for the grid alone.
@@ -277,23 +272,16 @@ LONE = "import os; getattr(os, 'setpgrp', int)()"
 
 def _check(client: "Client", folder: Path) -> None:
     """Refuse a cluster whose workers have another version, or do not see the folder."""
-    try:
+    with explained("a Dask worker can't use sb3_guard", fix="install it there"):
         seen = client.run(_looks, folder)
-    except Exception as error:
-        raise UsageError(
-            f"a Dask worker can't use sb3_guard: {one_line(error)}; install it there"
-        ) from error
     for worker, (version, visible) in seen.items():
         if version != __version__:
-            raise UsageError(
-                f"Dask worker {worker} has sb3_guard {version}, this is {__version__}; "
-                "install the same version"
-            )
-        if not visible:
-            raise UsageError(
-                f"Dask worker {worker} does not see the folder {folder}; "
-                "choose one on a disk that all workers share, with -f"
-            )
+            why = f"has sb3_guard {version}, this is {__version__}; install the same version"
+        elif not visible:
+            why = f"does not see the folder {folder}; choose one that all workers share, with -f"
+        else:
+            continue
+        raise UsageError(f"Dask worker {worker} {why}")
 
 
 def _looks(path: Path) -> tuple[str, bool]:
@@ -320,6 +308,8 @@ class Execution:
         self._waiting = [run for run in runs if run.state != "done"]
         self._flight: dict[Future, Run] = {}
         self._slots = len(client.nthreads())
+        for run in self._waiting:
+            run.state = "waiting"
 
     def carry_out(self) -> int:
         """
@@ -328,8 +318,6 @@ class Execution:
         :return: exit status: 0, 1 if runs failed, or 128 + the signal's number when interrupted
         :raises UsageError: the workers are gone
         """
-        for run in self._waiting:
-            run.state = "waiting"
         with interrupts(self._stop):
             while self._waiting or self._flight:
                 self._submit()
@@ -340,17 +328,13 @@ class Execution:
             return 128 + self.signal
         return int(any(run.state != "done" for run in self.runs))
 
-    @property
-    def _stopping(self) -> bool:
-        return bool(self.signal or self.no_disk)
-
     def _stop(self, number: int) -> None:
         self.signal = number
         self.board.say("Stopping after the rollouts under way; once more to stop immediately.")
 
     def _submit(self) -> None:
         """Give each idle worker a run, so that what ends a worker is blamed on one run."""
-        if self._stopping:
+        if self.signal or self.no_disk:
             for run in self._waiting:
                 run.state = "stopped"
             self._waiting.clear()
@@ -367,37 +351,31 @@ class Execution:
             if run.state != "in use":
                 run.state = "running"
                 self.board.note("retrying" if run.attempts else "started", run)
-            command = shlex.join(sys.orig_argv)
-            future = self.client.submit(carry_out, run, command, self.name, pure=False)
+            arguments = run, shlex.join(sys.orig_argv), self.name
+            future = self.client.submit(carry_out, *arguments, pure=False)
             self._flight[future] = run
 
     def _collect(self) -> None:
         for future in [one for one in self._flight if one.done()]:
             run = self._flight.pop(future)
             if future.status == "finished":
-                state, text = future.result()
+                run.state, text = future.result()
             elif future.status == "error":
                 # Those of runs are caught where they run: this is Dask's, of a dead worker.
                 error = one_line(future.exception() or RuntimeError())
-                state, text = "failed", f"its process died, perhaps for want of memory: {error}"
+                run.state, text = "failed", f"its process died, perhaps for want of memory: {error}"
                 _record(run, text)
             else:
                 raise UsageError("the Dask scheduler is gone; the runs keep their checkpoints")
-            self._ended(run, state, text)
-
-    def _ended(self, run: Run, state: str, text: str) -> None:
-        run.state = state
-        if state == "no disk":
-            run.state, self.no_disk = "stopped", text
-        elif state == "in use":
-            self._waiting.append(run)
-        elif state == "failed":
-            run.attempts, run.error = run.attempts + 1, text
-            self.board.note("failed", run)
-            if run.attempts <= RETRIES and not self._stopping:
+            if run.state == "no disk":
+                run.state, self.no_disk = "stopped", text
+            elif run.state == "failed":
+                run.attempts, run.error = run.attempts + 1, text
+            if run.state in ("done", "failed"):
+                self.board.note(run.state, run)
+            again = run.attempts <= RETRIES and not (self.signal or self.no_disk)
+            if run.state == "in use" or (run.state == "failed" and again):
                 self._waiting.append(run)
-        elif state == "done":
-            self.board.note("done", run)
 
 
 def run_grid(
@@ -422,7 +400,7 @@ def run_grid(
     """
     from sb3_guard.zoo.live import Board
 
-    status = 0
+    status, no_disk = 0, ""
     states = [run.state for run in runs]
     with Board(str(folder), verbose) as board:
         board.say(
@@ -431,7 +409,6 @@ def run_grid(
         )
         for algo, names in {run.args["algo"]: run.ignored for run in runs if run.ignored}.items():
             board.say(f"{algo} has no {', '.join(names)}: left out there")
-        execution = None
         if states.count("done") < len(runs):
             with workers(jobs, scheduler, folder) as client:
                 execution = Execution(runs, client, board)
@@ -439,13 +416,14 @@ def run_grid(
                     status = execution.carry_out()
                 except UsageError as error:
                     raise UsageError(f"{one_line(error)}; {again}") from error
+                no_disk = execution.no_disk
     done = sum(run.state == "done" for run in runs)
     board.say(f"{done} of {len(runs)} runs are done in {folder}")
+    if done < len(runs):
+        board.say(again[0].upper() + again[1:])
     for run in runs:
         if run.state == "failed":
             print(f"failed: {run}: {run.error}\n  {run.path / 'error.txt'}", file=sys.stderr)
-    if execution is not None and execution.no_disk:
-        print(f"error: {execution.no_disk}", file=sys.stderr)
-    if done < len(runs):
-        board.say(again[0].upper() + again[1:])
+    if no_disk:
+        print(f"error: {no_disk}", file=sys.stderr)
     return status

@@ -308,7 +308,7 @@ def _number(value: Any, kind: type) -> int | float:
         raise TypeError from None
     if math.isnan(number) or (kind is int and not number.is_integer()):
         raise TypeError
-    return int(value) if kind is int else number
+    return int(number) if kind is int else number
 
 
 @dataclass

@@ -1,12 +1,13 @@
 """How a grid goes: bars on a terminal, plain lines elsewhere; read from the run folders."""
 
-import csv
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import pandas as pd
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
@@ -27,16 +28,13 @@ LOGGED = {
 def read_progress(run: Path) -> dict[str, float]:
     """The last ``steps``, ``return`` and ``cost`` that a run has logged, whoever writes to it."""
     last = {"steps": 0.0}
-    try:
-        with open(run / "progress.csv", newline="", errors="replace") as file:
-            for row in csv.DictReader(file):
-                for name, column in LOGGED.items():
-                    try:
-                        last[name] = float(row.get(column) or "")
-                    except ValueError:  # not logged in this row, or half written
-                        continue
-    except (OSError, csv.Error):
-        pass
+    with suppress(OSError, ValueError):  # absent, empty, or half written
+        table = pd.read_csv(run / "progress.csv", on_bad_lines="skip", encoding_errors="replace")
+        for name, column in LOGGED.items():
+            if column in table:
+                known = pd.to_numeric(table[column], errors="coerce").dropna()
+                if len(known):
+                    last[name] = float(known.iloc[-1])
     return last
 
 
@@ -57,8 +55,8 @@ class Board:
             TextColumn(columns[0]), BarColumn(24), TextColumn(columns[1]), TimeRemainingColumn(),
             console=self.console, disable=not self.console.is_terminal, speed_estimate_period=600,
         )  # fmt: skip
+        self._total = self.bars.add_task("", reached="")
         self._tasks: dict[Run, TaskID] = {}
-        self._total: TaskID | None = None
         self._looked = self._line = time.monotonic()
 
     def __enter__(self) -> "Board":
@@ -77,11 +75,8 @@ class Board:
         line = f"{time.strftime('%H:%M:%S')}  {what}: {run}"
         if what == "done":
             result = RunFolder(run.path).read_result() or {}
-            line += "".join(
-                f", {name} {result[name]:.2f}"
-                for name in ("return", "cost")
-                if result.get(name) is not None
-            )
+            known = [name for name in ("return", "cost") if result.get(name) is not None]
+            line += "".join(f", {name} {result[name]:.2f}" for name in known)
         elif what == "failed":
             line += f": {run.error}"
         self.say(line)
@@ -99,33 +94,25 @@ class Board:
         if clock - self._line > LINE_EVERY and self.bars.disable:
             self._line = clock
             self.say(f"{time.strftime('%H:%M:%S')}  {summary(runs)}")
-        if self.bars.disable:
-            return
-        reached: float = sum(self._look(run) for run in runs)
-        if self._total is None:
-            self._total = self.bars.add_task(
-                "", total=sum(run.steps for run in runs), completed=int(reached),
-                reached="",
-            )  # fmt: skip
-        title = f"{self.title}: {summary(runs)}"
-        self.bars.update(self._total, completed=int(reached), description=title)
+        if not self.bars.disable:
+            reached = sum(self._show(run) for run in runs)
+            title = f"{self.title}: {summary(runs)}"
+            total = sum(run.steps for run in runs)
+            self.bars.update(self._total, completed=reached, total=total, description=title)
 
-    def _look(self, run: "Run") -> float:
-        """How many steps a run has done; a bar for it while it is under way."""
-        if run.state == "done":
-            if run in self._tasks:
-                self.bars.remove_task(self._tasks.pop(run))
-            return run.steps
-        last = read_progress(run.path)
-        if run.state in ("running", "in use"):
-            if run not in self._tasks:
-                self._tasks[run] = self.bars.add_task(str(run), total=run.steps, reached="")
-            words = [f"{last['steps']:,.0f} steps"]
-            words += [f"{name} {last[name]:.2f}" for name in ("return", "cost") if name in last]
-            shown: dict[str, Any] = {"completed": last["steps"], "reached": ", ".join(words)}
-            self.bars.update(self._tasks[run], **shown)
-        elif run in self._tasks:
-            self.bars.remove_task(self._tasks.pop(run))
+    def _show(self, run: "Run") -> float:
+        """A bar for a run while it is under way; how many steps it has done."""
+        last = {"steps": float(run.steps)} if run.state == "done" else read_progress(run.path)
+        shown = run.state in ("running", "in use")
+        if run not in self._tasks:
+            self._tasks[run] = self.bars.add_task(
+                str(run), total=run.steps, visible=False, reached=""
+            )
+        words = [f"{last['steps']:,.0f} steps"]
+        words += [f"{name} {last[name]:.2f}" for name in ("return", "cost") if name in last]
+        self.bars.update(
+            self._tasks[run], completed=last["steps"], visible=shown, reached=", ".join(words)
+        )
         return last["steps"]
 
 

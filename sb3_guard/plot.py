@@ -4,14 +4,12 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from sb3_guard.zoo.flags import Command, command, flag
 from sb3_guard.zoo.usage import Parser, UsageError, positive
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from sb3_guard.zoo.figures import Data
 
 
@@ -105,7 +103,7 @@ def plot(flags: Flags) -> int:
     from sb3_guard.zoo import runs as reading
     from sb3_guard.zoo.figures import Data
     from sb3_guard.zoo.statistics import with_safety
-    from sb3_guard.zoo.tables import write_table, written
+    from sb3_guard.zoo.tables import tables, terminal, write_table, written
 
     files, kinds = _check(flags)
     found = reading.read_results(flags.folders)
@@ -141,7 +139,8 @@ def plot(flags: Flags) -> int:
     for why in data.unread.values():
         print(f"left out of the curves: {why}", file=sys.stderr)
     if not (flags.figure or files or flags.report):
-        _print(runs[~runs["path"].isin(list(data.unread))], runs)
+        for title, table in tables(runs).items():
+            print(f"\n{title}\n\n{terminal(table)}")
     return status
 
 
@@ -163,16 +162,6 @@ def _draw(data: "Data", kinds: Sequence[str], flags: Flags) -> int:
         if drawing.missing:
             print(f"{drawing.name}: missing: {drawing.missing}", file=sys.stderr)
     return status
-
-
-def _print(readable: "pd.DataFrame", runs: "pd.DataFrame") -> None:
-    """Tables for the terminal."""
-    from sb3_guard.zoo.statistics import learning
-    from sb3_guard.zoo.tables import LEARNING, spelled, tables, terminal
-
-    shown: dict[str, Any] = {"Learning": spelled(learning(readable), LEARNING), **tables(runs)}
-    for title, table in shown.items():
-        print(f"\n{title}\n\n{terminal(table)}")
 
 
 main = command(Flags, plot)

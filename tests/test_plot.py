@@ -283,7 +283,7 @@ def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys):
     assert cli.main(["plot", str(small), "-o", str(out)]) == 0
     assert [path.name for path in out.iterdir()] == [f"curves_{POINT}.png"]
     printed, err = capsys.readouterr()
-    for text in ("| return, first | last", "return J_r", "5.00\xa0±\xa00.00", "PPO", "above limit"):
+    for text in ("return J_r", "5.00\xa0±\xa00.00", "PPO", "above limit"):
         assert text in printed
     assert "left out of the curves: can't use" in err and "v0_2/0.monitor.csv" in err
     assert "| CPO       | 0     | 2 " in printed  # its result counts all the same

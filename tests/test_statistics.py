@@ -15,7 +15,6 @@ from sb3_guard.zoo.statistics import (
     by_family,
     interval,
     iqm,
-    learning,
     mean_curve,
     normalize,
     overall,
@@ -68,15 +67,6 @@ def test_unconstrained_runs_are_judged_by_the_others_limit(tmp_path):
     assert with_safety(runs)[list(SAFETY)].iloc[2].isna().all()
     several = runs.assign(cost_limit=[math.nan, 4.0, 5.0])
     assert math.isnan(with_safety(several)["above_limit"][0])
-
-
-def test_learning_compares_first_with_last(tmp_path):
-    fake_run(tmp_path, returns=60.0)
-    (row,) = learning(read_results([tmp_path]).runs, epochs=2).to_dict("records")
-    assert (row["label"], row["J_r_first"], row["J_r_last"]) == pytest.approx(("CPO", 15, 55))
-    # A mean of two epochs of ten episodes of variance v has the variance v / 20.
-    v = read_curve(tmp_path / "cpo" / f"{HAZARDS}-v0_1", 100)["variance"][0]
-    assert row["gain"] == pytest.approx(40 / math.sqrt(2 * v / 20))
 
 
 # Over seeds

@@ -280,27 +280,23 @@ def pareto_front(costs: np.ndarray, returns: np.ndarray) -> np.ndarray:
     return order[returns[order] > best[:-1]]
 
 
-def add_legend(figure: Figure) -> None:
-    """One legend for all panels, above them, where it covers nothing."""
+def finish(figure: Figure, missing: str) -> None:
+    """Add one legend for all panels, above them, where it covers nothing, and what is missing."""
     entries: dict[str, Any] = {}
     for axis in figure.axes:
         for handle, name in zip(*axis.get_legend_handles_labels(), strict=True):
             entries.setdefault(name, handle)
-    rows = -(-len(entries) // max(round(figure.get_figwidth() / 2), 1))
-    columns = -(-len(entries) // rows)
-    figure.legend(
-        [*entries.values()], [*entries], loc="outside upper center", ncols=columns, handlelength=2.6
-    )
-
-
-def finish(drawing: Drawing) -> Drawing:
-    """Write below a figure what it lacks."""
-    if drawing.missing and drawing.figure is not None:
-        width = int(drawing.figure.get_figwidth() * 14)
-        text = textwrap.shorten(f"Missing: {drawing.missing}", 4 * width, placeholder=" …")
+    if entries:
+        rows = -(-len(entries) // max(round(figure.get_figwidth() / 2), 1))
+        figure.legend(
+            [*entries.values()], [*entries], loc="outside upper center",
+            ncols=-(-len(entries) // rows), handlelength=2.6,
+        )  # fmt: skip
+    if missing:
+        width = int(figure.get_figwidth() * 14)
+        text = textwrap.shorten(f"Missing: {missing}", 4 * width, placeholder=" …")
         text = "\n".join(textwrap.wrap(text, width))
-        drawing.figure.supxlabel(text, x=0.01, ha="left", fontsize=7, alpha=0.8)
-    return drawing
+        figure.supxlabel(text, x=0.01, ha="left", fontsize=7, alpha=0.8)
 
 
 def file_name(suite: str) -> str:
@@ -322,8 +318,7 @@ def curves_of(data: Data, suites: Sequence[str], name: str, missing: str) -> Dra
         for axis, metric in zip(row, METRICS, strict=True):
             draw_curves(axis, data, suite, metric)
         row[1].set_title(suite, fontweight="bold")
-    add_legend(figure)
-    return finish(Drawing(name, figure, missing))
+    return Drawing(name, figure, missing)
 
 
 def curves(data: Data) -> Iterator[Drawing]:
@@ -343,7 +338,6 @@ def pareto(data: Data) -> Iterator[Drawing]:
             continue
         figure = Figure(figsize=(0.7 * WIDTH, 0.6 * WIDTH), layout="constrained")
         draw_pareto(figure.subplots(), data, suite)
-        add_legend(figure)
         yield Drawing(name, figure)
 
 
@@ -381,8 +375,7 @@ def profiles(data: Data) -> Iterator[Drawing]:
         sign = "≥" if score == "reward" else "≤"
         axis.set(xlabel=f"{SCORE_AXES[score]}, τ", ylabel=f"part of runs {sign} τ")
         axis.set_ylim(-0.02, 1.02)
-    add_legend(figure)
-    yield finish(Drawing("profiles", figure, missing))
+    yield Drawing("profiles", figure, missing)
 
 
 def iqm(data: Data) -> Iterator[Drawing]:
@@ -409,7 +402,7 @@ def iqm(data: Data) -> Iterator[Drawing]:
         axis.margins(0.06)
         axis.axvline(1, color=INK, linewidth=1, linestyle=(0, (1, 2)))
         axis.grid(axis="y", visible=False)
-    yield finish(Drawing("iqm", figure, missing))
+    yield Drawing("iqm", figure, missing)
 
 
 # Files

@@ -19,7 +19,6 @@ from sb3_guard.zoo.figures import (
     Data,
     Drawing,
     Look,
-    add_legend,
     curves,
     curves_of,
     finish,
@@ -94,8 +93,7 @@ def q2(data: Data) -> Iterator[Drawing]:
                 axis.plot(pair, values, marker=look.marker, **look.line)
         axis.set(ylabel=SCORE_AXES[score], title="Goal, Point", xlim=(-0.3, 1.3))
         mark_trpo(axis)
-    add_legend(figure)
-    yield finish(Drawing("q2", figure, missing))
+    yield Drawing("q2", figure, missing)
 
 
 def mark_trpo(axis: Axes) -> None:
@@ -162,8 +160,7 @@ def draw_spiders(
         axis.set_title(title, fontweight="bold", fontsize=8)
     for axis in grid.flat[len(spiders) :]:
         axis.remove()
-    add_legend(figure)
-    return finish(Drawing(name, figure, missing))
+    return Drawing(name, figure, missing)
 
 
 def by_robot(data: Data, name: str, lines: Iterable[str], algos: Sequence[str]) -> Drawing:
@@ -188,8 +185,7 @@ def by_robot(data: Data, name: str, lines: Iterable[str], algos: Sequence[str]) 
         axis.tick_params(axis="x", labelsize=7)
         axis.margins(x=0.06)
         mark_trpo(axis)
-    add_legend(figure)
-    return finish(Drawing(name, figure, missing))
+    return Drawing(name, figure, missing)
 
 
 def q4(data: Data) -> Iterator[Drawing]:
@@ -254,4 +250,8 @@ def draw(kind: str, data: Data) -> list[Drawing]:
     :param kind: a key of :data:`FIGURES`
     """
     with mpl.rc_context(STYLE):
-        return list(FIGURES[kind](data))
+        drawings = list(FIGURES[kind](data))
+        for drawing in drawings:
+            if drawing.figure is not None:
+                finish(drawing.figure, drawing.missing)
+    return drawings

@@ -384,19 +384,12 @@ def read_curve(path: str | Path, epoch: float = math.nan) -> pd.DataFrame:
     :param path: the run folder
     :param epoch: steps per point; NaN or too few: 1/200 of the run
     :return: ``step`` (the end of an epoch), ``J_r`` and ``M_c`` (means over the episodes that ended
-        in it), ``rho_c`` (cumulative cost ÷ steps of all episodes until then), ``episodes`` and
-        ``variance`` (of their returns)
+        in it), and ``rho_c`` (cumulative cost ÷ steps of all episodes until then)
     :raises UsageError: see :func:`read_episodes`
     """
     table = read_episodes(path)
     total = table["step"].iloc[-1]
     rollout = epoch if epoch > 0 else total / CURVE_POINTS
     size = rollout * max(1, math.ceil(total / rollout / CURVE_POINTS))
-    curve = table.groupby(np.ceil(table["step"] / size) * size).agg(
-        J_r=("J_r", "mean"),
-        M_c=("M_c", "mean"),
-        rho_c=("rho_c", "last"),
-        episodes=("J_r", "size"),
-        variance=("J_r", "var"),
-    )
-    return curve.rename_axis("step").reset_index()
+    epochs = table.groupby(np.ceil(table["step"] / size) * size)
+    return epochs.agg({"J_r": "mean", "M_c": "mean", "rho_c": "last"}).reset_index()

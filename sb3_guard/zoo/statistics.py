@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import trim_mean
 
-from sb3_guard.zoo.runs import METRICS, REFERENCE, compared, read_curve, read_episodes
+from sb3_guard.zoo.runs import METRICS, REFERENCE, compared, read_episodes
 from sb3_guard.zoo.usage import UsageError
 
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
@@ -111,30 +111,6 @@ def with_safety(runs: pd.DataFrame) -> pd.DataFrame:
 
     rows = [row(run) for run in runs.to_dict("records")]
     return runs.assign(**pd.DataFrame(rows, columns=list(SAFETY), index=runs.index, dtype=float))
-
-
-def learning(runs: pd.DataFrame, epochs: int = 5) -> pd.DataFrame:
-    """
-    Means of the first and last epochs of each run, and their difference in standard errors.
-
-    :param runs: runs whose curves can be read
-    :param epochs: how many count as first and as last
-    """
-    rows = []
-    for run in runs.to_dict("records"):
-        curve = read_curve(run["path"], run["epoch"])
-        first, last = curve.head(epochs), curve.tail(epochs)
-        variance = sum(
-            (part["variance"] / part["episodes"]).sum() / len(part) ** 2 for part in (first, last)
-        )
-        gain = last["J_r"].mean() - first["J_r"].mean()
-        rows.append(
-            {name: run[name] for name in ("suite", "label", "seed", "steps", "rho_c")}
-            | {f"{name}_first": first[name].mean() for name in ("J_r", "M_c")}
-            | {f"{name}_last": last[name].mean() for name in ("J_r", "M_c")}
-            | {"gain": gain / math.sqrt(variance) if variance > 0 else math.nan}
-        )
-    return pd.DataFrame(rows)
 
 
 # Over seeds

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from importlib.util import find_spec
 from io import BufferedRandom
 from pathlib import Path
@@ -56,7 +55,7 @@ def number(value: Any, digits: int = 2) -> str:
     return "–" if pd.isna(value) else f"{value:,.{digits}f}".replace("-", "−")
 
 
-def spread(value: float, error: float, digits: int = 2) -> str:
+def spread(value: float, error: float | None, digits: int = 2) -> str:
     """A number ± its error, which no line break separates from it."""
     text = number(value, digits)
     return text if pd.isna(error) else f"{text}\xa0±\xa0{number(error, digits)}"
@@ -87,13 +86,14 @@ def whole(name: str) -> Callable[[Any], str]:
     return lambda row: number(row[name], 0)
 
 
-def _mean(name: str) -> Callable[[Any], str]:
+def _with_interval(name: str, middle: str = "") -> Callable[[Any], str]:
+    """A cell with a value, its standard deviation if there is one, and its interval."""
     digits = DIGITS.get(name, 2)
 
     def cell(row: Any) -> str:
-        text = spread(row[name], row[f"{name}_std"], digits)
-        ends = [number(row[f"{name}_{end}"], digits) for end in ("low", "high")]
-        return text if pd.isna(row[f"{name}_std"]) else f"{text} [{ends[0]}, {ends[1]}]"
+        text = spread(row[name + middle], row.get(f"{name}_std"), digits)
+        low, high = (row[f"{name}_{end}"] for end in ("low", "high"))
+        return text if pd.isna(low) else f"{text} [{number(low, digits)}, {number(high, digits)}]"
 
     return cell
 
@@ -130,7 +130,7 @@ def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
         "Results": spelled(
             scores,
             {**who, "seeds": whole("seeds"), "steps": whole("steps")}
-            | {heading: _mean(name) for name, heading in HEADINGS.items()}
+            | {heading: _with_interval(name) for name, heading in HEADINGS.items()}
             | shown,
         ),
         "Safety": spelled(means, {**who, **SAFETY_HEADINGS}),
@@ -139,37 +139,17 @@ def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
         return result
     families = by_family(scores)
     if len(families):
-        columns: Columns = {
-            "suite": "suite",
-            "family": "family",
-            "algorithms": whole("algorithms"),
-            **shown,
-        }
-        result["Families, relative to TRPO"] = spelled(families, columns)
+        columns: Columns = {"suite": "suite", "family": "family", "algorithms": whole("algorithms")}
+        result["Families, relative to TRPO"] = spelled(families, columns | shown)
     if scores["suite"].nunique() > 1:
         columns = {"algorithm": "label"}
         for score, heading in SCORE_HEADINGS.items():
-            columns[heading] = partial(_mean_of, score=score)
-            columns[f"{heading}, IQM"] = partial(_iqm_of, score=score)
+            columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"
+            columns[f"{heading}, IQM"] = _with_interval(score, "_iqm")
         result["All suites, relative to TRPO"] = spelled(overall(runs, means), columns)
     return result
 
 
-def _mean_of(row: Any, score: str) -> str:
-    return f"{number(row[score])} ({row[f'{score}_n']})"
-
-
-def _iqm_of(row: Any, score: str) -> str:
-    text = number(row[f"{score}_iqm"])
-    ends = [number(row[f"{score}_{end}"]) for end in ("low", "high")]
-    return text if pd.isna(row[f"{score}_low"]) else f"{text} [{ends[0]}, {ends[1]}]"
-
-
-LEARNING: Columns = {
-    "suite": "suite", "algorithm": "label", "seed": whole("seed"), "steps": whole("steps"),
-    "return, first": "J_r_first", "last": "J_r_last", "gain, s.e.": lambda r: number(r["gain"], 1),
-    "cost, first": "M_c_first", "cost, last": "M_c_last", "cost rate": "rho_c",
-}  # fmt: skip
 RUNS: Columns = {
     "suite": "suite", "algorithm": "label", "seed": whole("seed"), "limit": _limit,
     "steps": whole("steps"), **{heading: name for name, heading in HEADINGS.items()},

@@ -16,7 +16,7 @@ from registered_envs import Broken, Filmed
 from sb3_guard import CPO, enjoy, train
 from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.zoo import playback
-from sb3_guard.zoo.run_folder import read_mapping
+from sb3_guard.zoo.run_folder import read_data
 from sb3_guard.zoo.usage import UsageError
 
 TOY = ["--gym-packages", "registered_envs", "--env", "CostPoint-v0"]
@@ -190,7 +190,7 @@ def test_a_yaml_bomb(capsys, tmp_path):
     (tmp_path / "bomb.yml").write_text("\n".join(lines))
     refused(train.main, ["-conf", str(tmp_path / "bomb.yml")], capsys, "e+10 values")
     with pytest.raises(UsageError, match="values"):
-        read_mapping(tmp_path / "bomb.yml")
+        read_data(tmp_path / "bomb.yml")
 
 
 def test_a_csv_that_was_changed(capsys, run):

@@ -1,7 +1,7 @@
 """The flags of a command, each stated once, as a field of a dataclass.
 
 From the field come the parser, the default, the help, the typed attribute, the check of the same
-value in a file, a row of the documentation, and whether it is part of what a run *is*::
+value in a file, and whether it is part of what a run *is*::
 
     @dataclass
     class Flags(Command):
@@ -165,20 +165,6 @@ class Command:
     def names(cls, *roles: str) -> set[str]:
         """Names of the flags, of these roles only if any are named."""
         return {f.name for f, _ in cls._flags() if not roles or f.metadata["role"] in roles}
-
-    @classmethod
-    def documentation(cls) -> str:
-        """The flags as a Markdown table."""
-        rows = ["| flag | what it says | default |", "|---|---|---|"]
-        for field, _ in cls._flags():
-            meta, default = field.metadata, _default(field)
-            if meta["help"] is not None:
-                names = (
-                    [field.name] if meta["positional"] else [f"`{one}`" for one in _names(field)]
-                )
-                shown = "" if default in (None, False, "", []) else f"`{default}`"
-                rows.append(f"| {', '.join(names)} | {meta['help']} | {shown} |")
-        return "\n".join(rows)
 
     @classmethod
     def _flags(cls) -> Iterator[tuple[dataclasses.Field[Any], Any]]:

@@ -144,7 +144,7 @@ def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     if scores["suite"].nunique() > 1:
         columns = {"algorithm": "label"}
         for score, heading in SCORE_HEADINGS.items():
-            columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"
+            columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"  # type: ignore[misc]
             columns[f"{heading}, IQM"] = _with_interval(score, "_iqm")
         result["All suites, relative to TRPO"] = spelled(overall(runs, means), columns)
     return result

@@ -11,9 +11,6 @@ import yaml
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.flags import HOST, IDENTITY, command, flag
 from sb3_guard.zoo.run_flags import (
-    FILES,
-    RUNNING,
-    TRUST,
     EvaluationFlags,
     RunFlags,
     TrainingFlags,
@@ -25,7 +22,6 @@ if TYPE_CHECKING:
 
 # The file that says what a grid is, in its folder; `--grid` reads such a file.
 RECORD = "grid.yml"
-GRID = "the grid"
 
 
 @dataclass
@@ -33,6 +29,27 @@ class Flags(EvaluationFlags, TrainingFlags):
     """
     Train a grid of suites, algorithms and seeds. Runs that are done are skipped, runs that were
     interrupted are resumed.
+
+    The grid:
+
+    :param suites: environment ids
+    :param preset: one of the paper's grids instead: paper45, main8, q1 … q8, ladder
+    :param algos: algorithms; 'all' is the eight of the paper (default: all, or the preset's)
+    :param seeds: a run each (default: 0 1)
+    :param scale: factor of every run's length, e.g. 0.1
+    :param grid: YAML file with these flags, e.g. 'suites: [a, b]'
+
+    Files:
+
+    :param log_folder: the grid's folder (default: logs/benchmark)
+
+    Running:
+
+    :param trust: let files of a run or grid name code that is not this package's, RL-Zoo's or SB3's
+    :param dry_run: list the runs and do nothing
+    :param jobs: runs at once, a process with one thread each (default: as many as there are cores)
+    :param scheduler: of a Dask cluster, e.g. tcp://node1:8786 (default: run on this machine)
+    :param verbose: 0: errors only (default: 1)
     """
 
     prog: ClassVar[str] = "sb3-guard benchmark"
@@ -45,48 +62,18 @@ class Flags(EvaluationFlags, TrainingFlags):
   python -m sb3_guard.benchmark --preset paper45 --scheduler tcp://node1:8786
 """
 
-    suites: list[str] | None = flag(
-        metavar="ENV", role=IDENTITY, group=GRID, help="environment ids"
-    )
-    preset: str | None = flag(
-        metavar="NAME", role=IDENTITY, group=GRID,
-        help="one of the paper's grids instead: paper45, main8, q1 … q8, ladder",
-    )  # fmt: skip
-    algos: list[str] | None = flag(
-        metavar="ALGO", role=IDENTITY, group=GRID,
-        help="algorithms; 'all' is the eight of the paper (default: all, or the preset's)",
-    )  # fmt: skip
-    seeds: list[int] = flag(
-        default=[0, 1], kind=seed_number, metavar="K", role=IDENTITY, group=GRID,
-        help="a run each (default: 0 1)",
-    )  # fmt: skip
-    scale: float = flag(
-        default=1.0, kind=factor, metavar="X", role=IDENTITY, group=GRID,
-        help="factor of every run's length, e.g. 0.1",
-    )  # fmt: skip
-    grid: str | None = flag(
-        metavar="FILE", role=HOST, group=GRID,
-        help="YAML file with these flags, e.g. 'suites: [a, b]'",
-    )  # fmt: skip
-    log_folder: str = flag(
-        "-f", default="logs/benchmark", metavar="DIR", role=HOST, group=FILES,
-        help="the grid's folder (default: logs/benchmark)",
-    )  # fmt: skip
-    trust: bool = flag(default=False, role=HOST, group=RUNNING, help=TRUST)
-    dry_run: bool = flag(
-        default=False, role=HOST, group=RUNNING, help="list the runs and do nothing"
-    )
-    jobs: int | None = flag(
-        kind=positive, metavar="N", role=HOST, group=RUNNING,
-        help="runs at once, a process with one thread each (default: as many as there are cores)",
-    )  # fmt: skip
-    scheduler: str | None = flag(
-        metavar="ADDRESS", role=HOST, group=RUNNING,
-        help="of a Dask cluster, e.g. tcp://node1:8786 (default: run on this machine)",
-    )  # fmt: skip
-    verbose: Literal[0, 1] = flag(
-        default=1, role=HOST, group=RUNNING, help="0: errors only (default: 1)"
-    )
+    suites: list[str] | None = flag(metavar="ENV", role=IDENTITY)
+    preset: str | None = flag(metavar="NAME", role=IDENTITY)
+    algos: list[str] | None = flag(metavar="ALGO", role=IDENTITY)
+    seeds: list[int] = flag(default=[0, 1], kind=seed_number, metavar="K", role=IDENTITY)
+    scale: float = flag(default=1.0, kind=factor, metavar="X", role=IDENTITY)
+    grid: str | None = flag(metavar="FILE", role=HOST)
+    log_folder: str = flag("-f", default="logs/benchmark", metavar="DIR", role=HOST)
+    trust: bool = flag(default=False, role=HOST)
+    dry_run: bool = flag(default=False, role=HOST)
+    jobs: int | None = flag(kind=positive, metavar="N", role=HOST)
+    scheduler: str | None = flag(metavar="ADDRESS", role=HOST)
+    verbose: Literal[0, 1] = flag(default=1, role=HOST)
 
     def asked_for(self) -> dict[str, Any]:
         """What the grid is, as its record keeps it: the flags given that do not say how it runs."""

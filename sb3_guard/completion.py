@@ -12,14 +12,18 @@ from sb3_guard.zoo.usage import UsageError
 
 @dataclass
 class Flags(Command):
-    """Print a script that completes commands, flags, algorithms and suites."""
+    """
+    Print a script that completes commands, flags, algorithms and suites.
+
+    :param shell: whose script
+    """
 
     prog: ClassVar[str] = "sb3-guard completion"
     examples: ClassVar[str] = """examples:
   eval "$(sb3-guard completion bash)"
   sb3-guard completion zsh > ~/.zfunc/_sb3-guard
 """
-    shell: Literal["bash", "zsh", "tcsh"] = flag(positional=True, help="whose script")
+    shell: Literal["bash", "zsh", "tcsh"] = flag(positional=True)
 
 
 def whole() -> argparse.ArgumentParser:

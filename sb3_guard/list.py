@@ -95,7 +95,13 @@ def _kind(text: str) -> str:
 
 @dataclass
 class Flags(Command):
-    """Print suites, robots, tasks and constraints."""
+    """
+    Print suites, robots, tasks and constraints.
+
+    :param kind: only these
+    :param ladder: ids of growing difficulty: more and more of a constraint
+    :param gym_packages: modules that add parts
+    """
 
     prog: ClassVar[str] = "sb3-guard list"
     examples: ClassVar[str] = """examples:
@@ -103,14 +109,9 @@ class Flags(Command):
   sb3-guard list robots
   sb3-guard list --ladder Goal_Point Hazards
 """
-    kind: str | None = flag(
-        positional=True, nargs="?", kind=_kind, choices=list(KINDS), help="only these"
-    )
-    ladder: list[str] | None = flag(
-        nargs="*", metavar="TASK_ROBOT CONSTRAINT",
-        help="ids of growing difficulty: more and more of a constraint",
-    )  # fmt: skip
-    gym_packages: list[str] = flag(default=[], metavar="MODULE", help="modules that add parts")
+    kind: str | None = flag(positional=True, nargs="?", kind=_kind, choices=list(KINDS))
+    ladder: list[str] | None = flag(nargs="*", metavar="TASK_ROBOT CONSTRAINT")
+    gym_packages: list[str] = flag(default=[], metavar="MODULE")
 
 
 def show_lists(flags: Flags) -> int:

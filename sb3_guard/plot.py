@@ -15,7 +15,20 @@ if TYPE_CHECKING:
 
 @dataclass
 class Flags(Command):
-    """Make tables, figures and a page of the runs in log folders."""
+    """
+    Make tables, figures and a page of the runs in log folders.
+
+    :param folders: log folders (default: logs)
+    :param figure: figures to draw, see below; all: all that there are runs for
+    :param output: for figures (default: figures)
+    :param format: of figures (default: png)
+    :param table: tables to write: .csv and .parquet a row per run, .md and .tex means and scores
+    :param report: one page with everything
+    :param env: only these suites
+    :param cost_limit: only runs of this limit (several costs: of these limits), and unconstrained
+        ones
+    :param steps: where an algorithm has runs of several lengths on a suite, those of N steps
+    """
 
     prog: ClassVar[str] = "sb3-guard plot"
     examples: ClassVar[str] = """examples:
@@ -27,34 +40,15 @@ class Flags(Command):
 figures:
 """
 
-    folders: list[str] = flag(
-        default=["logs"], positional=True, nargs="*", metavar="DIR",
-        help="log folders (default: logs)",
-    )  # fmt: skip
-    figure: list[str] = flag(
-        default=[], metavar="NAME",
-        help="figures to draw, see below; all: all that there are runs for",
-    )  # fmt: skip
-    output: str = flag(
-        "-o", default="figures", metavar="DIR", help="for figures (default: figures)"
-    )
-    format: list[str] = flag(
-        default=["png"], choices=["png", "svg", "pdf"], help="of figures (default: png)"
-    )
-    table: list[str] = flag(
-        default=[], metavar="FILE",
-        help="tables to write: .csv and .parquet a row per run, .md and .tex means and scores",
-    )  # fmt: skip
-    report: str | None = flag(metavar="FILE.html", help="one page with everything")
-    env: list[str] | None = flag(metavar="ID", help="only these suites")
-    cost_limit: list[float] | None = flag(
-        metavar="D",
-        help="only runs of this limit (several costs: of these limits), and unconstrained ones",
-    )
-    steps: int | None = flag(
-        kind=positive, metavar="N",
-        help="where an algorithm has runs of several lengths on a suite, those of N steps",
-    )  # fmt: skip
+    folders: list[str] = flag(default=["logs"], positional=True, nargs="*", metavar="DIR")
+    figure: list[str] = flag(default=[], metavar="NAME")
+    output: str = flag("-o", default="figures", metavar="DIR")
+    format: list[str] = flag(default=["png"], choices=["png", "svg", "pdf"])
+    table: list[str] = flag(default=[], metavar="FILE")
+    report: str | None = flag(metavar="FILE.html")
+    env: list[str] | None = flag(metavar="ID")
+    cost_limit: list[float] | None = flag(metavar="D")
+    steps: int | None = flag(kind=positive, metavar="N")
 
     @classmethod
     def parser(cls) -> Parser:

@@ -1,6 +1,7 @@
 """One environment in full: ``sb3-guard show Goal_Ant_8Ghosts`` prints it and writes a picture."""
 
 import sys
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -68,7 +69,18 @@ def unsteady(env: GuardVectorEnv) -> str | None:
 
 @dataclass
 class Flags(Command):
-    """Print an environment's scenario, observations and actions; write a picture."""
+    """
+    Print an environment's scenario, observations and actions; write a picture.
+
+    :param env: an id of ours, or a scenario file (.yml)
+    :param env_kwargs: change parameters
+    :param output: picture to write (default: <env>.png)
+    :param camera: fixed, track or top (default: fixed)
+    :param window: watch the robot act at random in MuJoCo's viewer instead: Space pauses, Tab opens
+        menus, F shows contact forces
+    :param seed: of the episode in the picture
+    :param gym_packages: modules that add parts
+    """
 
     prog: ClassVar[str] = "sb3-guard show"
     examples: ClassVar[str] = """examples:
@@ -76,19 +88,13 @@ class Flags(Command):
   sb3-guard show my_scenario.yml -o mine.png
   sb3-guard show Goal_Drone_8Hazards --env-kwargs "ghosts:{'num': 4}" --camera track
 """
-    env: str = flag(positional=True, help="an id of ours, or a scenario file (.yml)")
-    env_kwargs: dict[str, Any] | None = flag(help="change parameters")
-    output: str | None = flag(
-        "-o", metavar="FILE.png", help="picture to write (default: <env>.png)"
-    )
-    camera: str = flag(default="fixed", help=f"one of {', '.join(CAMERAS)}")
-    window: bool = flag(
-        default=False,
-        help="watch the robot act at random in MuJoCo's viewer instead: Space pauses, Tab opens "
-        "menus, F shows contact forces",
-    )
-    seed: int = flag(default=0, help="of the episode in the picture")
-    gym_packages: list[str] = flag(default=[], metavar="MODULE", help="modules that add parts")
+    env: str = flag(positional=True)
+    env_kwargs: dict[str, Any] | None = flag()
+    output: str | None = flag("-o", metavar="FILE.png")
+    camera: str = flag(default="fixed")
+    window: bool = flag(default=False)
+    seed: int = flag(default=0)
+    gym_packages: list[str] = flag(default=[], metavar="MODULE")
 
 
 def watch(flags: Flags) -> int:
@@ -99,19 +105,20 @@ def watch(flags: Flags) -> int:
     :raises UsageError: there is no such environment, or no display
     """
     chosen = {"render_mode": "human", "camera": flags.camera, **(flags.env_kwargs or {})}
-    try:
+    with (
+        explained("can't show it", ValueError, TypeError, RuntimeError),
+        ExitStack() as last,
+        suppress(KeyboardInterrupt),
+    ):
         env = gymnasium.make(env_spec(flags.env), disable_env_checker=True, **chosen)
+        last.callback(env.close)
         env.reset(seed=flags.seed)
         env.action_space.seed(flags.seed)
         while True:
             *_, terminated, truncated, _ = env.step(env.action_space.sample())
             if terminated or truncated:
                 env.reset()
-    except KeyboardInterrupt:
-        env.close()
-        return 0
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise UsageError(one_line(error)) from None
+    return 0
 
 
 def show(flags: Flags) -> int:

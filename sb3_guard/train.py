@@ -6,13 +6,25 @@ from pathlib import Path
 from typing import ClassVar
 
 from sb3_guard.zoo.flags import command, flag
-from sb3_guard.zoo.run_flags import RUNNING, TRUST, WHAT, RunFlags
+from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.usage import UsageError, positive, seed_number
 
 
 @dataclass
 class Flags(RunFlags):
-    """Train an agent, log costs beside returns, and keep the best safe model."""
+    """
+    Train an agent, log costs beside returns, and keep the best safe model.
+
+    What is trained:
+
+    :param seeds: a run for each of these seeds, <env>_<seed + 1>, several at once; the same command
+        continues with what is not done
+    :param trust: let files of a run or grid name code that is not this package's, RL-Zoo's or SB3's
+
+    Running:
+
+    :param jobs: runs at once, a process with one thread each (default: as many as there are cores)
+    """
 
     prog: ClassVar[str] = "sb3-guard train"
     examples: ClassVar[str] = """examples:
@@ -23,16 +35,9 @@ class Flags(RunFlags):
   python -m sb3_guard.train -i logs/cpo/Goal_Point_8Hazards-v0_1             continue a killed run
   python -m sb3_guard.train -i logs/cpo/Goal_Point_8Hazards-v0_1 -n 2e6      and for longer
 """
-    seeds: list[int] | None = flag(
-        kind=seed_number, metavar="K", group=WHAT, exclusive="seeds",
-        help="a run for each of these seeds, <env>_<seed + 1>, several at once; the same command "
-        "continues with what is not done",
-    )  # fmt: skip
-    trust: bool = flag(default=False, group=WHAT, help=TRUST)
-    jobs: int | None = flag(
-        kind=positive, metavar="N", group=RUNNING,
-        help="runs at once, a process with one thread each (default: as many as there are cores)",
-    )  # fmt: skip
+    seeds: list[int] | None = flag(kind=seed_number, metavar="K", exclusive="seeds")
+    trust: bool = flag(default=False)
+    jobs: int | None = flag(kind=positive, metavar="N")
 
 
 def train(flags: Flags) -> int:

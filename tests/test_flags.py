@@ -13,16 +13,30 @@ from sb3_guard.zoo.usage import UsageError, positive
 
 @dataclass
 class Toy(Command):
-    """Play with flags."""
+    """
+    Play with flags.
 
-    kind: Literal["big", "small"] = flag(default="big", positional=True, nargs="?", help="size")
-    length: int = flag("-n", default=-1, kind=positive, metavar="N", role=IDENTITY, help="steps")
-    params: dict[str, Any] | None = flag("-params", help="values", role=IDENTITY)
-    seeds: list[int] = flag(default=[0, 1], help="seeds", exclusive="seed")
-    seed: int = flag(default=0, help="a seed", exclusive="seed")
-    bar: bool | None = flag("-P", role=HOST, help="a bar")
-    dry_run: bool = flag(default=False, help="nothing")
-    rate: float = flag(default=1.0, help="factor")
+    What there is:
+
+    :param kind: size
+    :param length: steps
+    :param params: values
+    :param seeds: seeds
+    :param seed: a seed
+    :param bar: a bar
+    :param dry_run: nothing
+    :param rate: factor, which
+        may be 100 %
+    """
+
+    kind: Literal["big", "small"] = flag(default="big", positional=True, nargs="?")
+    length: int = flag("-n", default=-1, kind=positive, metavar="N", role=IDENTITY)
+    params: dict[str, Any] | None = flag("-params", role=IDENTITY)
+    seeds: list[int] = flag(default=[0, 1], exclusive="seed")
+    seed: int = flag(default=0, exclusive="seed")
+    bar: bool | None = flag("-P", role=HOST)
+    dry_run: bool = flag(default=False)
+    rate: float = flag(default=1.0)
     secret: str | None = flag()
 
 
@@ -81,11 +95,13 @@ def test_what_is_not_allowed_in_a_file(data, message):
         Toy.read(data, "x.yml", but=["seed"])
 
 
-def test_roles_and_tables():
+def test_roles_and_help():
     toy = Toy.parse(["-n", "5"])
     assert toy.values(IDENTITY) == {"length": 5, "params": None}
     assert Toy.names(HOST) == {"bar"}
-    assert "secret" not in Toy.parser().format_help()
+    text = Toy.parser().format_help()
+    assert "secret" not in text and "factor, which may be 100 %" in text
+    assert text.index("Play with flags.\n") < text.index("what there is:") < text.index("a bar")
 
 
 def test_main(capsys):

@@ -5,20 +5,30 @@ value in a file, and whether it is part of what a run *is*::
 
     @dataclass
     class Flags(Command):
-        \"\"\"Train an agent.\"\"\"
+        \"\"\"
+        Train an agent.
 
-        algo: str = flag(default="cpo", help="algorithm", role=IDENTITY)
-        n_timesteps: int = flag("-n", default=-1, kind=positive, metavar="N", help="length")
+        What is trained:
+
+        :param algo: algorithm
+        :param n_timesteps: length
+        \"\"\"
+
+        algo: str = flag(default="cpo", role=IDENTITY)
+        n_timesteps: int = flag("-n", default=-1, kind=positive, metavar="N")
 
     main = command(Flags, train)  # train(flags: Flags) -> exit status
 
-The long name is the field's (``--n-timesteps``); annotations choose how a value is read: ``bool``
+The long name is the field's (``--n-timesteps``), headings and help are the docstring's; a flag that
+has no line there is not shown. Annotations choose how a value is read: ``bool``
 is a switch, ``bool | None`` has a ``--no-…``, ``list[int]`` takes several, ``dict`` takes
 ``key:value``, ``Literal`` one of its values.
 """
 
 import argparse
 import dataclasses
+import inspect
+import re
 import sys
 import types
 import typing
@@ -36,10 +46,8 @@ IDENTITY, START, HOST = "identity", "start", "host"
 def flag(
     *names: str,
     default: Any = None,
-    help: str | None = None,
     role: str = START,
     kind: Callable[[Any], Any] | None = None,
-    group: str = "options",
     exclusive: str | None = None,
     positional: bool = False,
     **argparse_options: Any,
@@ -49,17 +57,15 @@ def flag(
 
     :param names: short names
     :param default: value where the flag is not given; a list or dictionary is copied
-    :param help: None: not shown
     :param role: ``IDENTITY``, ``START`` or ``HOST``
     :param kind: makes the value of its text or number, and raises ``ArgumentTypeError``
-    :param group: heading in ``--help``
     :param exclusive: at most one flag of the same ``exclusive`` can be given
     :param positional: the value is given without the flag's name
     :param argparse_options: for ``add_argument``, e.g. ``metavar``
     """
     meta = {
-        "names": names, "help": help, "role": role, "kind": kind, "group": group,
-        "exclusive": exclusive, "positional": positional, "options": argparse_options,
+        "names": names, "role": role, "kind": kind, "exclusive": exclusive,
+        "positional": positional, "options": argparse_options,
     }  # fmt: skip
     if isinstance(default, list | dict):
         copied = default
@@ -83,23 +89,25 @@ class Command:
         """The flags as a parser; what is not given is absent from its result."""
         result = Parser(
             prog=cls.prog,
-            description=" ".join((cls.__doc__ or "").split()),
+            description=inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0],
             epilog=cls.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             argument_default=argparse.SUPPRESS,
         )
         groups: dict[str, Any] = {}
+        said = cls._said()
         for field, hint in cls._flags():
             meta = field.metadata
-            group = groups.get(meta["group"])
+            heading, help_ = said.get(field.name, ("options", argparse.SUPPRESS))
+            group = groups.get(heading)
             if group is None:
-                group = groups[meta["group"]] = result.add_argument_group(meta["group"])
+                group = groups[heading] = result.add_argument_group(heading)
             if meta["exclusive"]:
                 name = meta["exclusive"]
                 if name not in groups:
                     groups[name] = group.add_mutually_exclusive_group()
                 group = groups[name]
-            options = _options(field, hint)
+            options = {"help": help_, **_options(field, hint)}
             if meta["positional"]:
                 group.add_argument(field.name, **{"default": None, **options})
             else:
@@ -167,6 +175,20 @@ class Command:
         return {f.name for f, _ in cls._flags() if not roles or f.metadata["role"] in roles}
 
     @classmethod
+    def _said(cls) -> dict[str, tuple[str, str]]:
+        """Heading and help of the flags, as the docstrings of the class and its bases have them."""
+        found = {}
+        for base in reversed(cls.__mro__):
+            heading = "options"
+            for part in re.split(r"\n\s*\n|\n(?=\s*:param)", base.__doc__ or ""):
+                text = " ".join(part.split())
+                if flag := re.fullmatch(r":param (\w+): (.*)", text):
+                    found[flag[1]] = heading, flag[2].replace("%", "%%")
+                elif text.endswith(":"):
+                    heading = text[:-1].lower()
+        return found
+
+    @classmethod
     def _flags(cls) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
         hints = typing.get_type_hints(cls)
         for field in dataclasses.fields(cls):
@@ -215,7 +237,7 @@ def _options(field: "dataclasses.Field[Any]", hint: Any) -> dict[str, Any]:
     """What argparse needs to know of a flag."""
     meta, bare = field.metadata, _bare(hint)
     origin, arguments = typing.get_origin(bare), typing.get_args(bare)
-    options: dict[str, Any] = {"help": meta["help"] or argparse.SUPPRESS}
+    options: dict[str, Any] = {}
     if bare is bool:
         options["action"] = "store_true" if bare is hint else argparse.BooleanOptionalAction
     elif (origin or bare) is dict:

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from sb3_guard.zoo.flags import flag
-from sb3_guard.zoo.run_flags import WHAT, TrainingFlags
+from sb3_guard.zoo.run_flags import TrainingFlags
 from sb3_guard.zoo.usage import UsageError, amount, count, positive, seed_number, seed_or_random
 
-SEARCH, WHERE = "search", "storage and workers"
 EXAMPLES = """examples:
   python -m sb3_guard.tune --algo trpo_lag --env Goal_Point_8Hazards --n-trials 50 -n 1e6
   python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards -params cost_limit:5 --n-jobs 2
@@ -22,96 +21,72 @@ trials of the study, not of the process.
 
 @dataclass
 class TuneFlags(TrainingFlags):
-    """Find the hyper-parameters with the highest return under a cost limit."""
+    """
+    Find the hyper-parameters with the highest return under a cost limit.
+
+    What is trained:
+
+    :param algo: algorithm, e.g. cpo or ppo (default: cpo)
+    :param env: environment id; the version may be left out (default: Goal_Point_8Hazards)
+    :param cost_limit: highest episode cost of a feasible trial, one for all or one per cost
+        (default: selection_limit, else the algorithm's cost_limit, but at least 1)
+    :param pareto: search the trade-off of return and cost instead; the limit is only drawn
+    :param search_space: YAML file of ranges and lists to search (default: that of the algorithm)
+
+    Search:
+
+    :param n_trials: finished trials of the study in all, pruned ones included (default: 50)
+    :param seeds: seeds that every trial trains with (default: 0)
+    :param n_seeds: the first so many seeds: 0 1 2 …
+    :param seed: seed of the sampler (default: -1, a random one)
+    :param sampler: what chooses hyper-parameters (default: tpe)
+    :param pruner: what ends bad trials early (default: median)
+    :param n_startup_trials: trials before the sampler learns and the pruner prunes (default: 10)
+    :param n_evaluations: evaluations per training (default: one per 100,000 steps, but at least 4)
+    :param eval_episodes: episodes each time (default: 5)
+
+    Storage and workers:
+
+    :param log_folder: where studies go (default: logs)
+    :param study_name: to have several studies (default: <algo>_<env>)
+    :param storage: postgresql://… for workers on many machines, or a journal file (default: a
+        journal file in the study's folder, for one machine)
+    :param heartbeat: seconds between signs of life in PostgreSQL; a worker silent for three times
+        as long loses its trial to another (default: 60)
+    :param storage_timeout: seconds to wait for a PostgreSQL server that is down (default: 300)
+    :param n_jobs: processes that work on it (default: 1)
+    :param num_threads: threads of torch and of the native engine (default: their own choice, or 1
+        if there are several processes)
+    :param verbose: 0 nothing, 1 progress, 2 with tracebacks (default: 1)
+    """
 
     prog: ClassVar[str] = "sb3-guard tune"
     examples: ClassVar[str] = EXAMPLES
 
-    algo: str = flag(default="cpo", group=WHAT, help="algorithm, e.g. cpo or ppo (default: cpo)")
-    env: str = flag(
-        default="Goal_Point_8Hazards-v0", group=WHAT,
-        help="environment id; the version may be left out (default: Goal_Point_8Hazards)",
-    )  # fmt: skip
-    cost_limit: list[float] | None = flag(
-        kind=amount, metavar="D", group=WHAT,
-        help="highest episode cost of a feasible trial, one for all or one per cost "
-        "(default: selection_limit, else the algorithm's cost_limit, but at least 1)",
-    )  # fmt: skip
-    pareto: bool = flag(
-        default=False, group=WHAT,
-        help="search the trade-off of return and cost instead; the limit is only drawn",
-    )  # fmt: skip
-    search_space: str | None = flag(
-        metavar="FILE", group=WHAT,
-        help="YAML file of ranges and lists to search (default: that of the algorithm)",
-    )  # fmt: skip
+    algo: str = flag(default="cpo")
+    env: str = flag(default="Goal_Point_8Hazards-v0")
+    cost_limit: list[float] | None = flag(kind=amount, metavar="D")
+    pareto: bool = flag(default=False)
+    search_space: str | None = flag(metavar="FILE")
 
-    n_trials: int = flag(
-        "--max-total-trials", default=50, kind=positive, metavar="N", group=SEARCH,
-        help="finished trials of the study in all, pruned ones included (default: 50)",
-    )  # fmt: skip
-    seeds: list[int] = flag(
-        default=[0], kind=seed_number, metavar="S", group=SEARCH, exclusive="seeds",
-        help="seeds that every trial trains with (default: 0)",
-    )  # fmt: skip
-    n_seeds: int | None = flag(
-        kind=positive, metavar="N", group=SEARCH, exclusive="seeds",
-        help="the first so many seeds: 0 1 2 …",
-    )  # fmt: skip
-    seed: int = flag(
-        default=-1, kind=seed_or_random, group=SEARCH,
-        help="seed of the sampler (default: -1, a random one)",
-    )  # fmt: skip
-    sampler: Literal["tpe", "gp", "nsgaii", "random"] = flag(
-        default="tpe", group=SEARCH, help="what chooses hyper-parameters (default: tpe)"
-    )
-    pruner: Literal["median", "halving", "none"] = flag(
-        default="median", group=SEARCH, help="what ends bad trials early (default: median)"
-    )
-    n_startup_trials: int = flag(
-        default=10, kind=count, metavar="N", group=SEARCH,
-        help="trials before the sampler learns and the pruner prunes (default: 10)",
-    )  # fmt: skip
-    n_evaluations: int | None = flag(
-        kind=positive, metavar="N", group=SEARCH,
-        help="evaluations per training (default: one per 100,000 steps, but at least 4)",
-    )  # fmt: skip
-    eval_episodes: int = flag(
-        default=5, kind=positive, metavar="N", group=SEARCH, help="episodes each time (default: 5)"
-    )
+    n_trials: int = flag("--max-total-trials", default=50, kind=positive, metavar="N")
+    seeds: list[int] = flag(default=[0], kind=seed_number, metavar="S", exclusive="seeds")
+    n_seeds: int | None = flag(kind=positive, metavar="N", exclusive="seeds")
+    seed: int = flag(default=-1, kind=seed_or_random)
+    sampler: Literal["tpe", "gp", "nsgaii", "random"] = flag(default="tpe")
+    pruner: Literal["median", "halving", "none"] = flag(default="median")
+    n_startup_trials: int = flag(default=10, kind=count, metavar="N")
+    n_evaluations: int | None = flag(kind=positive, metavar="N")
+    eval_episodes: int = flag(default=5, kind=positive, metavar="N")
 
-    log_folder: str = flag(
-        "-f", default="logs", metavar="DIR", group=WHERE, help="where studies go (default: logs)"
-    )
-    study_name: str | None = flag(
-        metavar="NAME", group=WHERE, help="to have several studies (default: <algo>_<env>)"
-    )
-    storage: str | None = flag(
-        metavar="URL", group=WHERE,
-        help="postgresql://… for workers on many machines, or a journal file "
-        "(default: a journal file in the study's folder, for one machine)",
-    )  # fmt: skip
-    heartbeat: int = flag(
-        default=60, kind=positive, metavar="S", group=WHERE,
-        help="seconds between signs of life in PostgreSQL; a worker silent for three times as "
-        "long loses its trial to another (default: 60)",
-    )  # fmt: skip
-    storage_timeout: float = flag(
-        default=300.0, kind=amount, metavar="S", group=WHERE,
-        help="seconds to wait for a PostgreSQL server that is down (default: 300)",
-    )  # fmt: skip
-    n_jobs: int = flag(
-        default=1, kind=positive, metavar="N", group=WHERE,
-        help="processes that work on it (default: 1)",
-    )  # fmt: skip
-    num_threads: int = flag(
-        default=-1, metavar="N", group=WHERE,
-        help="threads of torch and of the native engine (default: their own choice, or 1 if "
-        "there are several processes)",
-    )  # fmt: skip
-    verbose: Literal[0, 1, 2] = flag(
-        default=1, group=WHERE, help="0 nothing, 1 progress, 2 with tracebacks (default: 1)"
-    )
+    log_folder: str = flag("-f", default="logs", metavar="DIR")
+    study_name: str | None = flag(metavar="NAME")
+    storage: str | None = flag(metavar="URL")
+    heartbeat: int = flag(default=60, kind=positive, metavar="S")
+    storage_timeout: float = flag(default=300.0, kind=amount, metavar="S")
+    n_jobs: int = flag(default=1, kind=positive, metavar="N")
+    num_threads: int = flag(default=-1, metavar="N")
+    verbose: Literal[0, 1, 2] = flag(default=1)
 
     def check(self) -> None:
         """

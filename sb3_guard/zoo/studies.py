@@ -31,7 +31,7 @@ from optuna.storages._heartbeat import BaseHeartbeat
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained
 
 Result = TypeVar("Result")
 # Trials that took down so many workers, e.g. for want of memory, are given up.
@@ -121,21 +121,21 @@ class Journal(JournalStorage, BaseHeartbeat):
         self.shown = str(path)
         self._locks = path.with_name(f"{path.name}.locks")
         self._mine: FileLock | None = None
-        try:
+        damage = ValueError, KeyError, TypeError, AttributeError
+        with (
+            explained(f"can't write the study {path}", OSError, fix="choose another with -f"),
+            explained(f"{path} is not a study, or damaged", *damage),
+        ):
             if path.exists():
-                _check_journal(path)
+                _read_journal(path)
             self._locks.mkdir(parents=True, exist_ok=True)
             lock = FileLock(self._locks / "journal", poll_interval=0.01)
             with lock:
-                _mend(path)
+                rest = _read_journal(path) if path.exists() else b""
+                if rest:  # a full disk cut the last line, which would make the journal unreadable
+                    os.truncate(path, path.stat().st_size - len(rest))
             super().__init__(JournalFileBackend(str(path), lock))  # type: ignore[arg-type]
             self._claim = FileLock(self._locks / "claim", poll_interval=0.01)
-        except OSError as error:
-            raise UsageError(
-                f"can't write the study {path}: {error.strerror}; choose another folder with -f"
-            ) from error
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UsageError(f"{path} is not a study, or damaged: {one_line(error)}") from error
 
     def exclusive(self) -> AbstractContextManager[Any]:
         """Be the only process that takes a trial."""
@@ -188,30 +188,19 @@ class Journal(JournalStorage, BaseHeartbeat):
             self._mine = None
 
 
-def _check_journal(path: Path) -> bytes:
+def _read_journal(path: Path) -> bytes:
     """
-    Read a journal.
+    Make sure that a file is a journal, since nothing here may change another one.
 
-    :raises ValueError: it is another kind of file, which nothing here may change
+    :return: what comes after the last whole line
+    :raises ValueError: it is another kind of file
     """
-    content = path.read_bytes()
-    *lines, rest = content.split(b"\n")
-    if rest[: len(_START)] != _START[: len(rest)]:
+    *lines, rest = path.read_bytes().split(b"\n")
+    if rest[: len(_START)] != _START[: len(rest)] or not all(
+        line.startswith(_START) and json.loads(line) for line in lines
+    ):
         raise ValueError("it is not an Optuna journal")
-    for line in lines:
-        if not line.startswith(_START):
-            raise ValueError("it is not an Optuna journal")
-        json.loads(line)
-    return content
-
-
-def _mend(path: Path) -> None:
-    """Cut off what a full disk left of the last line, which would make the journal unreadable."""
-    if path.exists():
-        content = _check_journal(path)
-        end = content.rfind(b"\n") + 1
-        if end < len(content):
-            os.truncate(path, end)
+    return rest
 
 
 class Database(RDBStorage):
@@ -238,26 +227,24 @@ class Database(RDBStorage):
         self._errors = (SQLAlchemyError, StorageInternalError)
         self._grace, self._patience = 3 * heartbeat, patience
         self._exclusive, self._away = False, False
-        try:
+        self.shown, parsed = url.partition("@")[2] or "…", None
+        with suppress(ArgumentError, ValueError):
             parsed = make_url(url)
-        except (ArgumentError, ValueError) as error:
-            raise UsageError(_not_an_address(url.partition("@")[2] or "…")) from error
-        self.shown = parsed.render_as_string(hide_password=True)
-        if parsed.get_backend_name() != "postgresql":
-            raise UsageError(_not_an_address(self.shown))
+            self.shown = parsed.render_as_string(hide_password=True)
+        if parsed is None or parsed.get_backend_name() != "postgresql":
+            raise UsageError(
+                f"--storage {self.shown} is not allowed; it must be "
+                "postgresql://user:password@host/database, or the path of a journal file"
+            )
         if parsed.drivername == "postgresql":
             parsed = parsed.set(drivername="postgresql+psycopg")
         address = parsed.render_as_string(hide_password=False)
-        try:
+        install = "install it with: pip install 'sb3-guard[postgres]'"
+        with explained("--storage postgresql://… needs psycopg", ImportError, fix=install):
             self._claims = create_engine(address, **_ENGINE)
             # Whoever was here before an outage needs a moment until all hearts beat again.
             self._trusted_from = time.monotonic() + self._grace
             self._wait_for(self._make_tables, address, heartbeat)
-        except ImportError as error:
-            raise UsageError(
-                "--storage postgresql://… needs psycopg; install it with: "
-                "pip install 'sb3-guard[postgres]'"
-            ) from error
 
     def _make_tables(self, address: str, heartbeat: int) -> None:
         with self.exclusive():
@@ -385,13 +372,6 @@ def open_storage(storage: str | None, journal: Path, heartbeat: int, patience: f
     if storage is not None and "://" in storage:
         return Database(storage, heartbeat, patience)
     return Journal(journal if storage is None else Path(storage))
-
-
-def _not_an_address(shown: str) -> str:
-    return (
-        f"--storage {shown} is not allowed; it must be postgresql://user:password@host/database, "
-        "or the path of a journal file"
-    )
 
 
 def _root(error: BaseException) -> BaseException:

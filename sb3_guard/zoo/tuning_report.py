@@ -228,24 +228,13 @@ class Report:
 
     def _scatter(self, pyplot: Any, done: Sequence[FrozenTrial]) -> Any:
         """Return against each cost: trials within the limit filled, others hollow."""
-        _, axes = pyplot.subplots(
-            1, len(self.keys), sharey=True, squeeze=False, figsize=(6.4 * len(self.keys), 4.8)
-        )
-        results = [one.user_attrs["result"] for one in done]
+        size = (6.4 * len(self.keys), 4.8)
+        _, axes = pyplot.subplots(1, len(self.keys), sharey=True, squeeze=False, figsize=size)
+        table = self.table(done)
         for i, (axis, key) in enumerate(zip(axes[0], self.keys, strict=True)):
-            for feasible, face, label in (
-                (True, "C0", "trial within the limit"),
-                (False, "none", "over it"),
-            ):
-                shown = [one for one in results if (not one["violation"]) == feasible]
-                if shown:
-                    axis.scatter(
-                        [one[key] for one in shown],
-                        [one["return"] for one in shown],
-                        edgecolors="C0",
-                        facecolors=face,
-                        label=label,
-                    )
+            for feasible, own in table.groupby("feasible", sort=False):
+                face, label = ("C0", "trial within the limit") if feasible else ("none", "over it")
+                axis.scatter(own[key], own["return"], ec="C0", facecolors=face, label=label)
             if self.limits is not None:
                 axis.axvline(self.limits[i], color="C1", linestyle="--", label="cost limit")
             axis.set(xlabel=f"episode {key}", ylabel="return")

@@ -4,8 +4,8 @@ import json
 import shlex
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,12 @@ from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
 from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
 from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data
-from sb3_guard.zoo.usage import UsageError, one_line
+from sb3_guard.zoo.usage import UsageError, explained
 
 # Said before an agent is downloaded.
 TRUST = "agents are programs: load only from people you trust"
 EPISODES = 10  # that the card tells of
+TAGS = ("reinforcement-learning", "safe-reinforcement-learning", "stable-baselines3", "sb3-guard")
 # Flags that name files of this machine
 PATHS = ("log_folder", "tensorboard_log", "conf_file", "trained_agent")
 
@@ -68,14 +69,11 @@ def push(flags: HubFlags) -> int:
     :raises UsageError: there is no such agent, it can't be filmed, or the hub can't be reached
     """
     agent = open_agent(flags, None if flags.no_video else "rgb_array")
-    try:
-        organization = flags.organization
+    with closing(agent.env):
         name = flags.repo_name or model_name(flags.algo, agent.env_id)
-        repo_id = f"{organization}/{name}"
+        repo_id = f"{flags.organization}/{name}"
         folder = Path(flags.to or tempfile.mkdtemp(prefix="sb3_guard_hub_"))
         stage(agent, flags, repo_id, folder)
-    finally:
-        agent.env.close()
     print(f"Ready to upload: {folder}")
     if flags.dry_run:
         return 0
@@ -102,35 +100,24 @@ def stage(agent: Agent, flags: HubFlags, repo_id: str, folder: Path) -> None:
     :raises UsageError: the agent can't be filmed
     """
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(agent.path, folder / f"{model_name(flags.algo, agent.env_id)}.zip")
-    shutil.copyfile(agent.run.params / "config.yml", folder / "config.yml")
+    statistics = agent.normalizer if agent.normalizer.suffix == ".pkl" else Path("none")
+    for source, name in {
+        agent.path: f"{model_name(flags.algo, agent.env_id)}.zip",
+        agent.run.params / "config.yml": "config.yml",
+        agent.run.monitor: agent.run.monitor.name,
+        statistics: "vec_normalize.pkl",
+    }.items():
+        if source.is_file():
+            shutil.copyfile(source, folder / name)
     trained = agent.run.args()
     trained |= {name: Path(trained[name]).name for name in PATHS if trained.get(name)}
     (folder / "args.yml").write_text(yaml.safe_dump(trained), encoding="utf-8")
     (folder / "command.txt").write_text(command(agent.run), encoding="utf-8")
-    if agent.normalizer.suffix == ".pkl" and agent.normalizer.is_file():
-        shutil.copyfile(agent.normalizer, folder / "vec_normalize.pkl")
-    if agent.run.monitor.is_file():
-        shutil.copyfile(agent.run.monitor, folder / agent.run.monitor.name)
-    results = summary(
-        evaluate_policy(
-            agent.model,
-            agent.env,
-            n_eval_episodes=flags.n_episodes or EPISODES,
-            deterministic=not flags.stochastic,
-            seed=flags.seed,
-        )
-    )
+    how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
+    results = summary(evaluate_policy(agent.model, agent.env, flags.n_episodes or EPISODES, **how))
     if not flags.no_video:
         with camera(agent.env, folder / "replay.mp4", "rgb_array") as shoot:
-            evaluate_policy(
-                agent.model,
-                agent.env,
-                n_eval_episodes=1,
-                deterministic=not flags.stochastic,
-                seed=flags.seed,
-                on_step=shoot,
-            )
+            evaluate_policy(agent.model, agent.env, 1, on_step=shoot, **how)
     results["is_deterministic"] = not flags.stochastic
     (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
     (folder / "README.md").write_text(card(agent, flags, repo_id, results), encoding="utf-8")
@@ -143,13 +130,7 @@ def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]
     name = type(agent.model).__name__
     data = ModelCardData(
         library_name="stable-baselines3",
-        tags=[
-            agent.env_id,
-            "reinforcement-learning",
-            "safe-reinforcement-learning",
-            "stable-baselines3",
-            "sb3-guard",
-        ],
+        tags=[agent.env_id, *TAGS],
         model_name=name,
         eval_results=[
             EvalResult(
@@ -191,12 +172,9 @@ def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]
 
 def command(run: RunFolder) -> str:
     """The command line of a run, with the names of files, but not where they lie here."""
-    file = run.params / "command.txt"
-    text = file.read_text(encoding="utf-8").strip() if file.is_file() else ""
-    try:
-        words = shlex.split(text)
-    except ValueError:  # a quotation mark that nothing closes
-        return ""
+    words = []
+    with suppress(OSError, ValueError):  # absent, or a quotation mark that nothing closes
+        words = shlex.split((run.params / "command.txt").read_text(encoding="utf-8"))
     # The interpreter's own path and flags are this machine's: what follows is the command.
     if "-m" in words:
         words = ["python", *words[words.index("-m") :]]
@@ -235,19 +213,17 @@ def install(downloaded: Path, name: str, flags: HubFlags) -> RunFolder:
     :raises UsageError: the model or its settings are not there, or they are another agent's
     """
     model = downloaded / f"{name}.zip"
+    own = "name the agent's own --algo and --env"
     for needed in (model, downloaded / "config.yml", downloaded / "args.yml"):
         if not needed.is_file():
             found = ", ".join(sorted(one.name for one in downloaded.iterdir())) or "nothing"
-            raise UsageError(
-                f"the repository has no {needed.name}, but {found}; name the agent's own "
-                "--algo and --env"
-            )
+            raise UsageError(f"the repository has no {needed.name}, but {found}; {own}")
     env = folder_name(flags.env)
     trained = read_data(downloaded / "args.yml")
     if (trained.get("algo"), folder_name(str(trained.get("env")))) != (flags.algo, env):
         raise UsageError(
             f"the repository's agent is {trained.get('algo')} on {trained.get('env')} by its "
-            f"args.yml, not {flags.algo} on {flags.env}; name its own --algo and --env"
+            f"args.yml, not {flags.algo} on {flags.env}; {own}"
         )
     parent = Path(flags.folder) / flags.algo
     parent.mkdir(parents=True, exist_ok=True)
@@ -266,22 +242,8 @@ def install(downloaded: Path, name: str, flags: HubFlags) -> RunFolder:
     return RunFolder(path)
 
 
-@contextmanager
-def _network(what: str) -> Iterator[None]:
+def _network(what: str) -> AbstractContextManager[None]:
     """Say in one line what the network, the hub or the lack of a login made impossible."""
-    from huggingface_hub.errors import HfHubHTTPError, LocalTokenNotFoundError
-
-    try:
-        yield
-    except LocalTokenNotFoundError as error:
-        raise UsageError(f"{what} needs a login: run `hf auth login` first") from error
-    except HfHubHTTPError as error:
-        raise UsageError(f"{what} failed: {one_line(error)[:300]}") from error
-    except Exception as error:
-        # The HTTP library's own errors: no route, no name, time-outs.
-        if not isinstance(error, OSError) and "httpx" not in type(error).__module__:
-            raise
-        raise UsageError(
-            f"{what} failed, the hub can't be reached: {one_line(error)[:300]}; "
-            "check the network, then run the command again"
-        ) from error
+    # Its client raises what it likes.
+    text = f"{what} failed: the hub can't be reached, or needs a login (hf auth login)"
+    return explained(text, fix="then run the command again")

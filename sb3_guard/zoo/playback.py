@@ -90,33 +90,23 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
 
     :raises UsageError: the run has no such model
     """
-    kept = sorted(run.path.glob("rl_model_*_steps.zip"), key=_steps)
-    if flags.load_best:
-        return _existing(run.path / "best_model.zip"), run.path / "best_model_vecnormalize.pkl"
-    if flags.load_checkpoint is not None:
-        steps = flags.load_checkpoint
-        model = run.path / f"rl_model_{steps}_steps.zip"
-        if model not in kept:
-            known = ", ".join(str(_steps(one)) for one in kept) or "none"
-            raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {known}")
-        return model, run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
+    kept = {int(one.stem.split("_")[2]): one for one in run.path.glob("rl_model_*_steps.zip")}
+    steps = flags.load_checkpoint
     if flags.load_last_checkpoint and kept:
-        steps = _steps(kept[-1])
-        return kept[-1], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
-    if flags.load_last_checkpoint or not run.model.exists():
-        return _existing(run.checkpoint), run.checkpoint
-    return run.model, run.normalizer
-
-
-def _steps(kept: Path) -> int:
-    """The steps that ``rl_model_<steps>_steps.zip`` was kept at."""
-    return int(kept.stem.split("_")[2])
-
-
-def _existing(path: Path) -> Path:
-    if not path.is_file():
-        raise UsageError(f"there is no {path}: the run has not come so far")
-    return path
+        steps = max(kept)
+    model, statistics = run.model, run.normalizer
+    if flags.load_best:
+        model, statistics = run.path / "best_model.zip", run.path / "best_model_vecnormalize.pkl"
+    elif steps is not None:
+        if steps not in kept:
+            known = ", ".join(map(str, sorted(kept))) or "none"
+            raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {known}")
+        model, statistics = kept[steps], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
+    elif flags.load_last_checkpoint or not model.exists():
+        model = statistics = run.checkpoint
+    if not model.is_file():
+        raise UsageError(f"there is no {model}: the run has not come so far")
+    return model, statistics
 
 
 @dataclass

@@ -211,22 +211,21 @@ def test_a_space_from_a_file(tmp_path):
         ("[1, 2", "can't read"),
         ("- a", "must map names"),
         ("x: [1, 2]\nx: [3, 4]", "'x' again"),
-        ("x: 3", "x .*list of options"),
+        ("x: 3", "x: 3 .*list of at least two options"),
         ("x: [1]", "two options"),
-        ("x: {low: 1}", "no 'high'"),
-        ("x: {low: 1, hihg: 2}", "'hihg'; did you mean 'high'"),
-        ("x: {low: 2, high: 1}", "low: 2 .*high: 1"),
-        ("x: {low: 0, high: 1, log: true}", "above 0"),
+        ("x: {low: 1}", "'high'"),
+        ("x: {low: 1, high: 2, lgo: true}", "'lgo'"),
+        ("x: {low: 2, high: 1}", "'low': 2"),
+        ("x: {low: 0, high: 1, log: true}", "low"),
         ("x: {low: .nan, high: 1}", "finite"),
-        ("x: {low: true, high: 2}", "low: True"),
+        ("x: {low: true, high: 2}", "'low': True"),
         ("x: {low: a, high: 1}", "'a'"),
-        ("x: {low: 0, high: 1, log: 1}", "log: 1"),
     ],
 )
 def test_spaces_that_are_none(tmp_path, content, message):
     path = tmp_path / "space.yml"
     path.write_text(content)
-    with pytest.raises(UsageError, match=f"(?s)search.space: .*{message}"):
+    with pytest.raises(UsageError, match=f"(?s)search.space.*{message}"):
         read_space(str(path))
 
 

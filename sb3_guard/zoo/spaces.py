@@ -15,13 +15,12 @@ samplers serve for RL-Zoo's algorithms, and :func:`rl_zoo_sampler` makes one of 
 import json
 import math
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from typing import Any
 
 import optuna
+from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 from optuna.samplers import BaseSampler, GPSampler, NSGAIISampler, RandomSampler, TPESampler
 
-from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.hyperparams import NOISE_KEYS, RUN_KEYS, parameters
 from sb3_guard.zoo.trust import evaluate
@@ -70,43 +69,29 @@ def read_space(path: str) -> dict[str, Any]:
 
 def _checked(name: str, entry: Any, where: str) -> Any:
     """
-    An entry of a space with numbers for bounds.
+    An entry of a space with numbers for bounds, which YAML may read as text (1e-4).
 
     :raises UsageError: it is neither a range nor a list
     """
-    with explained(f"search space: {name} in {where}", ValueError):
-        if isinstance(entry, list):
-            if len(entry) < 2:
-                raise ValueError("a list needs at least two options")
+    fix = "write a list of at least two options, or {low: 0.002, high: 0.05, log: true}"
+    with explained(f"search space: {name}: {entry} in {where}", fix=fix):
+        if isinstance(entry, list) and len(entry) > 1:
             return entry
-        if not isinstance(entry, dict):
-            raise ValueError("write a list of options, or {low: …, high: …, log: true}")
-        for key in entry:
-            if key not in ("low", "high", "log"):
-                raise ValueError(
-                    f"unknown key {key!r}; {did_you_mean(key, ('low', 'high', 'log'))}"
-                )
-        low, high = (_bound(entry, key) for key in ("low", "high"))
-        log = entry.get("log", False)
-        if not isinstance(log, bool):
-            raise ValueError(f"log: {log!r} is not True or False")
-        if not low < high:
-            raise ValueError(f"low: {low} is not below high: {high}")
-        if log and low <= 0:
-            raise ValueError(f"low: {low} must be above 0 on a logarithmic scale")
-        return {"low": low, "high": high, "log": log}
+        known = {**entry, **{key: _bound(entry[key]) for key in ("low", "high")}}
+        return {"log": False, **known} if _distribution(known) else None
 
 
-def _bound(entry: Mapping[str, Any], key: str) -> int | float:
-    """A bound of a range; YAML reads 1e-4 as text."""
-    if key not in entry:
-        raise ValueError(f"there is no {key!r}")
-    value = entry[key]
-    with suppress(TypeError, ValueError):
-        number = value if type(value) is int else float(value)
-        if math.isfinite(number) and not isinstance(value, bool):
-            return number
-    raise ValueError(f"{key}: {value!r} is not a finite number")
+def _bound(value: Any) -> int | float:
+    number = value if type(value) is int else float(str(value))
+    if not math.isfinite(number):
+        raise ValueError(f"{value} is not finite")
+    return number
+
+
+def _distribution(entry: Mapping[str, Any]) -> BaseDistribution:
+    """What Optuna draws from; it refuses bounds that are none."""
+    whole = isinstance(entry["low"], int) and isinstance(entry["high"], int)
+    return (IntDistribution if whole else FloatDistribution)(**entry)
 
 
 def _label(option: Any) -> Any:
@@ -114,25 +99,20 @@ def _label(option: Any) -> Any:
     return json.dumps(option) if isinstance(option, list | dict) else option
 
 
-def _whole(entry: Mapping[str, Any]) -> bool:
-    return isinstance(entry["low"], int) and isinstance(entry["high"], int)
-
-
 def _draw(trial: optuna.Trial, name: str, entry: Any) -> Any:
     if isinstance(entry, list):
         labels = [_label(option) for option in entry]
         return entry[labels.index(trial.suggest_categorical(name, labels))]
-    if _whole(entry):
-        return trial.suggest_int(name, entry["low"], entry["high"], log=entry["log"])
-    return trial.suggest_float(name, entry["low"], entry["high"], log=entry["log"])
+    whole = isinstance(_distribution(entry), IntDistribution)
+    return trial.suggest_int(name, **entry) if whole else trial.suggest_float(name, **entry)
 
 
 def _contains(entry: Any, value: Any) -> bool:
     if isinstance(entry, list):
         return value in entry
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return entry["low"] <= value <= entry["high"] and not (_whole(entry) and value != int(value))
+    whole = isinstance(_distribution(entry), IntDistribution)
+    number = type(value) is int or (type(value) is float and not whole)
+    return number and entry["low"] <= value <= entry["high"]
 
 
 def set_dotted(values: Mapping[str, Any], name: str, value: Any) -> dict[str, Any]:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 # The file that says what a grid is, in its folder; `--grid` reads such a file.
 RECORD = "grid.yml"
+# Flags that no such file states; "jobs", which it may, are not of the record either.
+HOW = ("grid", "log_folder", "trust", "dry_run", "scheduler", "verbose")
 
 
 @dataclass
@@ -77,8 +79,7 @@ class Flags(EvaluationFlags, TrainingFlags):
 
     def asked_for(self) -> dict[str, Any]:
         """What the grid is, as its record keeps it: the flags given that do not say how it runs."""
-        how = {"grid", "log_folder", "trust", "dry_run", "jobs", "scheduler", "verbose"}
-        return {name: getattr(self, name) for name in sorted(self.given - how)}
+        return {name: getattr(self, name) for name in sorted(self.given - {*HOW, "jobs"})}
 
     def pairs(self) -> list[tuple[str, str]]:
         """
@@ -118,8 +119,7 @@ def with_file(flags: Flags) -> Flags:
         return flags
     form = "flags to values, such as 'suites: [Goal_Point_8Ghosts]'"
     content = read_mapping(path, "grid file", form)
-    but = ("grid", "log_folder", "trust", "dry_run", "scheduler", "verbose")
-    filed = Flags.read(content, path, but)
+    filed = Flags.read(content, path, HOW)
     given = {name: getattr(filed, name) for name in filed.given}
     require_trust(path, flags.trust, given, given.get("hyperparams") or {})
     for name in flags.given:

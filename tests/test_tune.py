@@ -208,7 +208,7 @@ def test_a_space_from_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[1, 2", "can't read"),
+        ("[1, 2", "as YAML"),
         ("- a", "must map names"),
         ("x: [1, 2]\nx: [3, 4]", "'x' again"),
         ("x: 3", "x: 3 .*list of at least two options"),

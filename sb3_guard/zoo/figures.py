@@ -105,7 +105,7 @@ class Data:
         self.runs = runs
         #: why the curve of a run can't be drawn, by its path
         self.unread: dict[str, str] = {}
-        self._curves: dict[str, pd.DataFrame | None] = {}
+        self._curves: dict[str, pd.DataFrame] = {}
 
     @cached_property
     def means(self) -> pd.DataFrame:
@@ -162,14 +162,12 @@ class Data:
         """The seeds' learning curves; one that can't be read is left out, see ``unread``."""
         own = self.runs[(self.runs["suite"] == suite) & (self.runs["algo"] == algo)]
         for path, epoch in zip(own["path"], own["epoch"], strict=True):
-            if path not in self._curves:
+            if path not in self._curves and path not in self.unread:
                 try:
                     self._curves[path] = read_curve(path, epoch)
                 except UsageError as error:
-                    self._curves[path] = None
                     self.unread[path] = one_line(error)
-        found = (self._curves[path] for path in own["path"])
-        return [curve for curve in found if curve is not None]
+        return [self._curves[path] for path in own["path"] if path in self._curves]
 
     def score(self, suite: str, algo: str, name: str) -> float:
         """A score of an algorithm or a family, NaN if there is none."""

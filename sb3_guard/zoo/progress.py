@@ -28,21 +28,13 @@ def commit() -> str | None:
 
     :return: None if the code is not under git, as when it was installed
     """
-    folder = Path(sb3_guard.__file__).parent
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(folder), *arguments],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=20,
-        ).stdout.strip()
-
+    git = ["git", "-C", str(Path(sb3_guard.__file__).parent)]
+    describe = "describe --always --dirty --abbrev=40 --exclude=*".split()
+    options: dict[str, Any] = {"capture_output": True, "text": True, "check": True, "timeout": 20}
     try:
         # A virtual environment inside somebody's checkout is not part of that checkout.
-        git("ls-files", "--error-unmatch", "__init__.py")
-        return git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], **options)
+        return str(subprocess.run([*git, *describe], **options).stdout.strip())
     except (OSError, subprocess.SubprocessError):
         return None
 

@@ -6,6 +6,7 @@ of ``python -m rl_zoo3.train``. In RL-Zoo's table ``trpo`` stays sb3-contrib's a
 :mod:`sb3_guard.zoo.spaces`; ``python -m sb3_guard.tune`` searches under a cost limit.
 """
 
+import argparse
 import sys
 import warnings
 from collections.abc import Sequence
@@ -105,9 +106,12 @@ def train(argv: Sequence[str]) -> int:
     register()
     arguments = list(argv)
     ours = {key_in_rl_zoo(algo): algo for algo in safe_algorithms()}
-    named = _value_of(arguments, "--algo")
-    if named in ours and not {"-conf", "--conf-file"} & set(arguments):
-        arguments += ["-conf", str(shipped_file(ours[named]))]
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo")
+    parser.add_argument("-conf", "--conf-file")
+    given = parser.parse_known_args(arguments)[0]
+    if given.algo in ours and given.conf_file is None:
+        arguments += ["-conf", str(shipped_file(ours[given.algo]))]
     # RL-Zoo has no hooks for these two, and names them in this module.
     manager: Any = rl_zoo3.exp_manager
     manager.make_vec_env, manager.EvalCallback = make_vec_env, CostEvalCallback
@@ -135,15 +139,6 @@ def train(argv: Sequence[str]) -> int:
     sys.argv = ["rl_zoo3.train", *arguments]
     rl_zoo3.train.train()
     return 0
-
-
-def _value_of(arguments: Sequence[str], flag: str) -> str | None:
-    for position, argument in enumerate(arguments):
-        if argument == flag:
-            return next(iter(arguments[position + 1 :]), None)
-        if argument.startswith(f"{flag}="):
-            return argument.partition("=")[2]
-    return None
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -326,7 +326,8 @@ class Experiment:
                 print("\nStopping after this rollout; once more to stop at once.", file=sys.stderr)
 
         began = time.monotonic()
-        with interrupts(stop) as received:
+        with interrupts(stop) as received, ExitStack() as last:
+            last.callback(epochs.on_training_end)  # leaves the terminal tidy
             finished = self._learn(callbacks, received)
         with replacing(folder.model) as file:
             self.model.save(file)
@@ -381,10 +382,6 @@ class Experiment:
                 f"training stopped at {self.model.num_timesteps} steps: {one_line(error)[:600]} "
                 "(--verbose 2 shows where)"
             ) from error
-        finally:
-            for callback in callbacks:
-                if isinstance(callback, Epochs):
-                    callback.on_training_end()  # leaves the terminal tidy
         return True
 
 

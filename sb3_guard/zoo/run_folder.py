@@ -151,6 +151,14 @@ class RunFolder:
             raise UsageError(f"{path} is not a run folder: it should hold one <env>/args.yml")
         self.params = arguments[0].parent
         self.name = self.params.name
+        #: the csv of all training episodes
+        self.monitor = path / "0.monitor.csv"
+        #: what a killed run resumes from
+        self.checkpoint = path / CHECKPOINT
+        #: the final model, and its observation statistics if it was trained with VecNormalize
+        self.model, self.normalizer = path / f"{self.name}.zip", self.params / "vecnormalize.pkl"
+        #: written last: its presence says that the run is complete
+        self.result = path / "result.json"
 
     @classmethod
     def create(
@@ -198,31 +206,6 @@ class RunFolder:
         if not path.exists():
             raise UsageError(f"there is no run folder or file {path}")
         return cls(path if path.is_dir() else path.parent)
-
-    @property
-    def monitor(self) -> Path:
-        """The csv of all training episodes."""
-        return self.path / "0.monitor.csv"
-
-    @property
-    def checkpoint(self) -> Path:
-        """What a killed run resumes from."""
-        return self.path / CHECKPOINT
-
-    @property
-    def model(self) -> Path:
-        """The final model."""
-        return self.path / f"{self.name}.zip"
-
-    @property
-    def normalizer(self) -> Path:
-        """Observation statistics of the final model, if it was trained with VecNormalize."""
-        return self.params / "vecnormalize.pkl"
-
-    @property
-    def result(self) -> Path:
-        """Written last: its presence says that the run is complete."""
-        return self.path / "result.json"
 
     def args(self) -> dict[str, Any]:
         """The flags the run was started with."""

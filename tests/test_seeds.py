@@ -31,8 +31,8 @@ def test_first_observations_of_seeds_0_and_1_differ(algo, vec_env):
                      n_eval_envs=4)
         )  # fmt: skip
         experiment = Experiment(flags, values)
-        experiment.eval_env.seed(evaluation_seed(seed))
-        firsts += [experiment.env.reset(), experiment.eval_env.reset()]
+        experiment.evaluation.eval_env.seed(evaluation_seed(seed))
+        firsts += [experiment.env.reset(), experiment.evaluation.eval_env.reset()]
         again = Experiment(flags, values)
         np.testing.assert_array_equal(again.env.reset(), firsts[-2])
         again.close()

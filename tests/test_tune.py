@@ -641,7 +641,7 @@ WRONG = [
     (["--pruner", "medium"], ["--pruner", "'medium'", "halving"]),
     (["--cost-limit", "-1"], ["--cost-limit", "-1", "at least 0"]),
     (["--cost-limit", "nan"], ["--cost-limit", "nan", "at least 0"]),
-    (["--cost-limit", "1", "2"], ["selection_limit", "2 entries"]),
+    (["--cost-limit", "1", "2"], ["selection_limit=[1.0, 2.0]"]),
     (["--pareto", "--pruner", "median"], ["no pruning with --pareto"]),
     (["--algo", "trpo_lga"], ["'trpo_lga'", "did you mean 'trpo_lag'?"]),
     (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),

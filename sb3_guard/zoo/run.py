@@ -85,7 +85,6 @@ class Experiment:
         self.restates = False
         self.tracker = Tracker(flags, hyperparams) if flags.track else None
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
-        self._check_selection_limit()
         _check_device(flags.device)
         if self._tensorboard_folder is not None:
             require_writable(self._tensorboard_folder, "--tensorboard-log")
@@ -103,7 +102,7 @@ class Experiment:
             self.model = self._make_model()
             seed_rows(self.env, flags.seed)
             self.model.verbose = max(flags.verbose - 1, 0)
-            self.eval_env = self._make_eval_envs() if flags.eval_freq > 0 else None
+            self.evaluation = self._make_evaluation() if flags.eval_freq > 0 else None
         except BaseException:
             self.env.close()
             raise
@@ -120,15 +119,6 @@ class Experiment:
             normalizer=self._warm_start_normalizer(),
             **kwargs,
         )
-
-    def _check_selection_limit(self) -> None:
-        limit = self.setup.selection_limit
-        if isinstance(limit, list) and len(limit) != len(self.cost_keys):
-            raise UsageError(
-                f"hyper-parameter selection_limit: {limit} has {len(limit)} entries, but there "
-                f"{'is one cost' if len(self.cost_keys) == 1 else 'are several costs'}, "
-                f"{', '.join(self.cost_keys)}; give one number, or a list of one per cost"
-            )
 
     def _try_environment(self, env_kwargs: Mapping[str, Any]) -> None:
         """Make one environment and take a step, so that nothing fails later for want of a cost."""
@@ -181,18 +171,30 @@ class Experiment:
         found = sorted(Path(agent).parent.glob("*/vecnormalize.pkl"))
         return read_normalizer(found[0]) if found else None
 
-    def _make_eval_envs(self) -> VecEnv:
-        number = self.flags.n_eval_envs
+    def _make_evaluation(self) -> CostEvalCallback:
+        flags, number, kwargs = self.flags, self.flags.n_eval_envs, self.flags.eval_env_kwargs
         if number is None:
             # All episodes at once where that is cheap; a process each would not be.
-            number = self.flags.eval_episodes if self.vec_env == "native" else 1
-        kwargs = self.flags.eval_env_kwargs
-        return self._make_envs(
+            number = flags.eval_episodes if self.vec_env == "native" else 1
+        seed = evaluation_seed(flags.seed)
+        env = self._make_envs(
             number,
-            evaluation_seed(self.flags.seed),
+            seed,
             evaluation=True,
             env_kwargs=self.setup.env_kwargs if kwargs is None else kwargs,
         )
+        evaluation = CostEvalCallback(
+            env,
+            selection_limit=self.setup.selection_limit,
+            seed=seed,
+            n_eval_episodes=flags.eval_episodes,
+            eval_freq=max(flags.eval_freq // self.setup.n_envs, 1),
+            verbose=int(flags.verbose > 0 and self._prints_tables),
+        )
+        evaluation.model = self.model
+        with explained("hyper-parameter", ValueError):
+            evaluation.limits()
+        return evaluation
 
     def _make_callbacks(self, folder: RunFolder) -> tuple[Checkpoints, Epochs, list[BaseCallback]]:
         flags, n_envs = self.flags, self.setup.n_envs
@@ -209,19 +211,10 @@ class Experiment:
                     save_vecnormalize=True,
                 )
             )
-        if self.eval_env is not None:
-            others.append(
-                CostEvalCallback(
-                    self.eval_env,
-                    selection_limit=self.setup.selection_limit,
-                    seed=evaluation_seed(flags.seed),
-                    n_eval_episodes=flags.eval_episodes,
-                    eval_freq=max(flags.eval_freq // n_envs, 1),
-                    log_path=folder.path,
-                    best_model_save_path=folder.path,
-                    verbose=int(flags.verbose > 0 and self._prints_tables),
-                )
-            )
+        if self.evaluation is not None:
+            self.evaluation.log_path = str(folder.path / "evaluations")
+            self.evaluation.best_model_save_path = str(folder.path)
+            others.append(self.evaluation)
         others += self.callbacks
         checkpoints = Checkpoints(
             folder.checkpoint,
@@ -272,9 +265,13 @@ class Experiment:
         finally:
             self.close()
 
+    @property
+    def _envs(self) -> list[VecEnv]:
+        return [self.env, *([] if self.evaluation is None else [self.evaluation.eval_env])]
+
     def _lost_a_process(self) -> bool:
         """Whether a process of the environments has died; a dying one is waited for."""
-        envs = [env.unwrapped for env in (self.env, self.eval_env) if env is not None]
+        envs = [env.unwrapped for env in self._envs]
         processes = [one for env in envs if isinstance(env, SubprocVecEnv) for one in env.processes]
         for one in processes:
             one.join(timeout=0.2)
@@ -282,10 +279,9 @@ class Experiment:
 
     def close(self) -> None:
         """Release the environments, and let Weights & Biases have what it has not yet."""
-        for env in (self.env, self.eval_env):
+        for env in self._envs:
             with suppress(*PROCESS_DIED):
-                if env is not None:
-                    env.close()
+                env.close()
         if self.tracker is not None:
             self.tracker.finish()
 

@@ -141,8 +141,8 @@ class Evaluations(BaseCallback):
             self.ended = not self._evaluate()
 
     def _evaluate(self) -> bool:
-        env = self.experiment.eval_env
-        assert env is not None
+        assert self.experiment.evaluation is not None
+        env = self.experiment.evaluation.eval_env
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, env)
         result = evaluate_policy(

@@ -23,7 +23,6 @@ from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvin
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial
 
-from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.hyperparams import check, read_hyperparams
 from sb3_guard.zoo.make_envs import canonical_id
@@ -96,10 +95,8 @@ def prepare(flags: TuneFlags) -> tuple[Settings, Search]:
         run_flags(flags, settings, flags.seeds[0]), {**base, "n_timesteps": n_timesteps}
     )
     try:
-        assert experiment.eval_env is not None
-        rule = CostEvalCallback(experiment.eval_env, selection_limit=base.get("selection_limit"))
-        rule.model = experiment.model
-        limits = rule.limits().tolist()
+        assert experiment.evaluation is not None
+        limits = experiment.evaluation.limits().tolist()
     finally:
         experiment.close()
     return replace(

@@ -202,7 +202,7 @@ GRID_FILES = [
         "suites: [Goal_Point_8Hazards]\nscale: [1, 2]",
         "scale: [1, 2] is not allowed; it must be",
     ),
-    ("suites: [Goal_Point_8Hazards]\ntrack: maybe", "'maybe' is not allowed; it must be true or"),
+    ("suites: [Goal_Point_8Hazards]\ntrack: maybe", "'maybe' is not allowed; it must be True or"),
     ("suites: [Goal_Point_8Hazards]\nn_timesteps: true", "n_timesteps: True is not allowed"),
     ("suites: [Goal_Point_8Hazards]\nhyperparams: [a]", "not of the form key:value"),
     ("suites: [Goal_Point_8Hazards]\nseeds: [zero]", "g.yml: seeds: ['zero'] is not allowed"),

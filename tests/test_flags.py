@@ -85,9 +85,9 @@ def test_a_files_values_are_checked_the_same_way():
         ({"length": True}, "length: True is not allowed"),
         ({"seeds": []}, "seeds: .*one value or a list"),
         ({"seeds": [1, 2.5]}, "seeds: .*not allowed"),
-        ({"dry_run": "yes"}, "dry_run: 'yes' is not allowed; it must be true or false"),
+        ({"dry_run": "yes"}, "dry_run: 'yes' is not allowed; it must be True or False"),
         ({"params": 3}, "3 is not of the form key:value"),
-        ({"kind": "medium"}, "kind: 'medium' is not allowed; it must be big or small"),
+        ({"kind": "medium"}, "kind: 'medium' is not allowed; it must be 'big' or 'small'"),
     ],
 )
 def test_what_is_not_allowed_in_a_file(data, message):

@@ -37,6 +37,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import KeyValues, Parser, UsageError, parse_pairs, run
+from sb3_guard.zoo.values import kind_of
 
 # Roles of a flag: it says what a run is, how it is started, or how it is hosted and watched,
 # which may change when the run is resumed.
@@ -259,17 +260,8 @@ def _typed(hint: Any, kind: Callable[[Any], Any] | None, value: Any) -> Any:
         return dict(value) if isinstance(value, Mapping) else parse_pairs(_several(value))
     if origin is list:
         return [_typed(arguments[0], kind, one) for one in _several(value)]
-    allowed = bool if bare is bool else (str, int, float)
-    if origin is Literal:
-        if value not in arguments:
-            raise ValueError
-        return value
-    if isinstance(value, bool) != (bare is bool) or not isinstance(value, allowed):
-        raise TypeError
-    made = (kind or bare)(value)
-    if bare is int and float(value) != made:
-        raise ValueError
-    return made
+    made = kind_of(bare)[1](value)
+    return kind(value) if kind else made
 
 
 def _several(value: Any) -> list[Any]:
@@ -284,6 +276,4 @@ def _words(hint: Any) -> str:
         return "a mapping or a list of key:value"
     if typing.get_origin(bare) is list:
         return "one value or a list of them"
-    if typing.get_origin(bare) is Literal:
-        return " or ".join(map(str, typing.get_args(bare)))
-    return {bool: "true or false", int: "a whole number", float: "a number"}.get(bare, "text")
+    return kind_of(bare)[0]

@@ -9,15 +9,11 @@ it.
 import copy
 import importlib
 import inspect
-import math
 import runpy
-import types
-import typing
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,6 +34,7 @@ from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.trust import entries, evaluate, import_class, wrapper
 from sb3_guard.zoo.usage import UsageError, explained, read_mapping
+from sb3_guard.zoo.values import kind_of
 
 # What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -213,7 +210,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
             raise UsageError(
                 f"{algo} has no hyper-parameter {name!r}; {did_you_mean(name, sorted(known))}"
             )
-        words, make = _kind(known[name])
+        words, make = kind_of(known[name])
         try:
             checked[name] = make(value)
         except TypeError:
@@ -239,76 +236,6 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
                 f"hyper-parameter {name}: {value} is not allowed; it must be at least 1"
             )
     return dict(sorted(checked.items()))
-
-
-def _kind(hint: Any) -> tuple[str, Callable[[Any], Any]]:
-    """
-    What an annotation allows: in words, and what makes it of a value, or raises TypeError.
-
-    Numbers that YAML reads as text (``1e-3``) and whole floats fit; objects that a file can't hold
-    are named by text.
-    """
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    kind = origin or hint
-    names = {bool: "True or False", str: "text", None: "None", types.NoneType: "None"}
-    if kind in (typing.Union, types.UnionType):
-        return _any_of({arm: _kind(arm) for arm in args})
-    if kind in (int, float):
-        return "a whole number" if kind is int else "a number", partial(_number, kind=kind)
-    if kind in (list, tuple, Sequence):
-        words, make = _kind(args[0] if args else Any)
-        each = f" ({words} each)" if args and args[0] is not ... else ""
-        is_list = _only(lambda value: isinstance(value, list | tuple))
-        return f"a list{each}", lambda value: [make(one) for one in is_list(value)]
-    if kind is typing.Literal:
-        return " or ".join(map(repr, args)), _only(lambda value: value in args)
-    if kind in names:
-        return names[kind], _only(lambda value: isinstance(value, hint or types.NoneType))
-    if isinstance(kind, type) and issubclass(kind, Mapping):
-        # Text is evaluated when the model is made: `dict(activation_fn=nn.ReLU)`.
-        dicts = lambda value: isinstance(value, str) and value.startswith("dict(")  # noqa: E731
-        return "a mapping", _only(lambda value: isinstance(value, Mapping) or dicts(value))
-    if kind in (type, Callable):
-        words = "the dotted name of a class" if kind is type else "a schedule such as lin_0.001"
-        named = lambda value: "." in value or value.startswith("lin_")  # noqa: E731
-        return words, _only(lambda value: isinstance(value, str) and named(value))
-    free = hint is Any or not isinstance(hint, type)
-    data = str | bool | int | float
-    return getattr(hint, "__name__", str(hint)), _only(lambda v: free or not isinstance(v, data))
-
-
-def _only(fits: Callable[[Any], bool]) -> Callable[[Any], Any]:
-    """What returns values that fit as they are."""
-
-    def make(value: Any) -> Any:
-        if not fits(value):
-            raise TypeError
-        return value
-
-    return make
-
-
-def _any_of(arms: Mapping[Any, tuple[str, Callable[[Any], Any]]]) -> tuple[str, Callable]:
-    """The kind of a union of others."""
-
-    def make(value: Any) -> Any:
-        # The arm that fits without change wins: 1 stays an int where int and float are allowed.
-        for arm in sorted(arms, key=lambda arm: type(value) is not arm):
-            with suppress(TypeError):
-                return arms[arm][1](value)
-        raise TypeError
-
-    return " or ".join(dict.fromkeys(words for words, _ in arms.values())), make
-
-
-def _number(value: Any, kind: type) -> int | float:
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except ValueError:
-        raise TypeError from None
-    if math.isnan(number) or (kind is int and not number.is_integer()):
-        raise TypeError
-    return int(number) if kind is int else number
 
 
 @dataclass

@@ -1,11 +1,16 @@
-"""Values written as text: literals and ``dict(name=value)``, read from the syntax tree.
+"""Values as text, read from the syntax tree, and as annotations of types allow them.
 
 Text comes from command lines, and from files that travel with agents. Nothing here is evaluated,
 so reading a value never runs anything.
 """
 
 import ast
-from collections.abc import Callable
+import math
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 
@@ -55,3 +60,73 @@ def parse_value(text: str) -> Any:
         return read_expression(text)
     except ValueError:
         return text
+
+
+def kind_of(hint: Any) -> tuple[str, Callable[[Any], Any]]:
+    """
+    What an annotation allows: in words, and what makes it of a value, or raises TypeError.
+
+    Numbers that YAML reads as text (``1e-3``) and whole floats fit; objects that a file can't hold
+    are named by text.
+    """
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    kind = origin or hint
+    names = {bool: "True or False", str: "text", None: "None", types.NoneType: "None"}
+    if kind in (typing.Union, types.UnionType):
+        return _any_of({arm: kind_of(arm) for arm in args})
+    if kind in (int, float):
+        return "a whole number" if kind is int else "a number", partial(_number, kind=kind)
+    if kind in (list, tuple, Sequence):
+        words, make = kind_of(args[0] if args else Any)
+        each = f" ({words} each)" if args and args[0] is not ... else ""
+        is_list = _only(lambda value: isinstance(value, list | tuple))
+        return f"a list{each}", lambda value: [make(one) for one in is_list(value)]
+    if kind is typing.Literal:
+        return " or ".join(map(repr, args)), _only(lambda value: value in args)
+    if kind in names:
+        return names[kind], _only(lambda value: isinstance(value, hint or types.NoneType))
+    if isinstance(kind, type) and issubclass(kind, Mapping):
+        # Text is evaluated when the model is made: `dict(activation_fn=nn.ReLU)`.
+        dicts = lambda value: isinstance(value, str) and value.startswith("dict(")  # noqa: E731
+        return "a mapping", _only(lambda value: isinstance(value, Mapping) or dicts(value))
+    if kind in (type, Callable):
+        words = "the dotted name of a class" if kind is type else "a schedule such as lin_0.001"
+        named = lambda value: "." in value or value.startswith("lin_")  # noqa: E731
+        return words, _only(lambda value: isinstance(value, str) and named(value))
+    free = hint is Any or not isinstance(hint, type)
+    data = str | bool | int | float
+    return getattr(hint, "__name__", str(hint)), _only(lambda v: free or not isinstance(v, data))
+
+
+def _only(fits: Callable[[Any], bool]) -> Callable[[Any], Any]:
+    """What returns values that fit as they are."""
+
+    def make(value: Any) -> Any:
+        if not fits(value):
+            raise TypeError
+        return value
+
+    return make
+
+
+def _any_of(arms: Mapping[Any, tuple[str, Callable[[Any], Any]]]) -> tuple[str, Callable]:
+    """The kind of a union of others."""
+
+    def make(value: Any) -> Any:
+        # The arm that fits without change wins: 1 stays an int where int and float are allowed.
+        for arm in sorted(arms, key=lambda arm: type(value) is not arm):
+            with suppress(TypeError):
+                return arms[arm][1](value)
+        raise TypeError
+
+    return " or ".join(dict.fromkeys(words for words, _ in arms.values())), make
+
+
+def _number(value: Any, kind: type) -> int | float:
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except ValueError:
+        raise TypeError from None
+    if math.isnan(number) or (kind is int and not number.is_integer()):
+        raise TypeError
+    return int(number) if kind is int else number

@@ -17,7 +17,6 @@ def _tune(flags: TuneFlags) -> int:
     return tune(flags)
 
 
-parser = TuneFlags.parser
 main = command(TuneFlags, _tune)
 
 if __name__ == "__main__":

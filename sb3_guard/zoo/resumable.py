@@ -57,41 +57,31 @@ class ResumableEnv(gym.Wrapper):
             vars(base).update(last)
 
 
-def capture(venv: VecEnv) -> list[Any]:
+def capture(layer: VecEnv) -> list[Any]:
     """
     The state of a vectorised environment: of its wrappers from the outside in, then its own.
 
     :return: picklable parts; the last one is None if the environment itself can't tell its state
     """
-    parts: list[Any] = []
-    layer: Any = venv
-    while isinstance(layer, VecEnvWrapper):
-        own = hasattr(type(layer), "state")
-        parts.append(layer.state() if own else _attributes(layer))
-        layer = layer.venv
-    if hasattr(type(layer), "state"):
-        return [*parts, layer.state()]
+    own: Any = layer if hasattr(type(layer), "state") else None
+    if isinstance(layer, VecEnvWrapper):
+        return [_attributes(layer) if own is None else own.state(), *capture(layer.venv)]
     try:
-        states = layer.env_method("state")
+        states = layer.env_method("state") if own is None else own.state()
     except AttributeError:
-        return [*parts, None]
-    return [*parts, None if any(state is None for state in states) else states]
+        return [None]
+    return [None if own is None and None in states else states]
 
 
-def restore(venv: VecEnv, parts: list[Any]) -> None:
+def restore(layer: Any, parts: list[Any]) -> None:
     """Put an environment that was made the same way, and reset, into a captured state."""
-    *wrappers, own = parts
-    layer: Any = venv
-    for part in wrappers:
-        if hasattr(type(layer), "restore"):
-            layer.restore(part)
-        else:
-            vars(layer).update(part)
-        layer = layer.venv
-    if own is None:
-        return
-    if hasattr(type(layer), "restore"):
-        layer.restore(own)
+    part, *rest = parts
+    if hasattr(type(layer), "restore") and part is not None:
+        layer.restore(part)
+    elif rest:
+        vars(layer).update(part)
     else:
-        for index, state in enumerate(own):
+        for index, state in enumerate(part or []):
             layer.env_method("restore", state, indices=index)
+    if rest:
+        restore(layer.venv, rest)

@@ -1,7 +1,6 @@
 """What a command says when it can't do what was asked: one line, exit status 2, no traceback."""
 
 import argparse
-import difflib
 import errno
 import importlib
 import math
@@ -19,6 +18,7 @@ from typing import Any, NoReturn
 import yaml
 
 from sb3_guard.plain_yaml import load_yaml
+from sb3_guard.spelling import nearest
 from sb3_guard.zoo.values import parse_value
 
 LONGEST = 500  # characters of an error that are printed
@@ -110,8 +110,8 @@ class Parser(argparse.ArgumentParser):
         if unknown:
             flag = unknown[1].split("=")[0]
             flags = [one for one in self._option_string_actions if one.startswith("--")]
-            near = difflib.get_close_matches(flag, flags, n=1)
-            hint = f"did you mean {near[0]}?" if near else "see --help"
+            near = nearest(flag, flags)
+            hint = f"did you mean {near}?" if near else "see --help"
             raise UsageError(f"unknown flag {flag}; {hint}")
         extra = re.match(r"unrecognized arguments: (\S+)", message)
         if extra:

@@ -254,18 +254,11 @@ class RunFolder:
         :raises UsageError: there is none, or it is damaged
         """
         fix = f"sb3-guard train -i {self.path} writes it again"
-        with explained("result.json is damaged", OSError, ValueError, fix=fix):
-            result = json.loads(self.result.read_bytes())
-            if not isinstance(result, dict):
-                raise ValueError("it should be a mapping")
-            for key in ("n_timesteps", *MEASURES):
-                if key not in result:
-                    raise ValueError(f"it has no {key}")
-                value, whole = result[key], key == "n_timesteps"
-                if type(value) not in ((int,) if whole else (int, float, type(None))) or (
-                    value is not None and not math.isfinite(value)
-                ):
-                    raise ValueError(f"{key} = {value!r} should be a {'whole ' * whole}number")
+        with explained("result.json is damaged", fix=fix):
+            result: dict[str, Any] = json.loads(self.result.read_bytes())
+            for key, value in {key: result[key] for key in ("n_timesteps", *MEASURES)}.items():
+                if value is not None and not math.isfinite(value):
+                    raise ValueError(f"{key} = {value!r} should be a number")
         return result
 
     def read_result(self) -> dict[str, Any] | None:

@@ -76,7 +76,7 @@ def read_results(folders: Sequence[str | Path]) -> Results:
                 continue
             try:
                 rows[path.resolve()] = read_run(path)
-            except (UsageError, OSError) as error:
+            except (UsageError, OSError, ValueError, TypeError) as error:
                 left_out[str(path)] = one_line(error)
     runs = pd.DataFrame([*rows.values()], columns=list(COLUMNS))
     runs = runs.astype(dict.fromkeys(TEXTS, "string"))
@@ -122,14 +122,13 @@ def read_run(path: Path) -> dict[str, Any]:
     known = _SUITE.fullmatch(env)
     limit = result.get("cost_limit", config.get("cost_limit"))
     limits = limit if isinstance(limit, list) else [] if limit is None else [limit]
-    limits = [_number({"cost_limit": one}, "cost_limit") for one in limits]
+    limits = [_number(one) for one in limits]
     settings = {name: config.get(name) for name in SETTINGS}
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
     whole = all(isinstance(one, int) for one in rollout)
     names = {key: result.get(key) or "" for key in ("label", "family")}
     names = names if names["label"] else described(algo)
-    versions = result.get("versions")
-    versions = versions if isinstance(versions, dict) else {}
+    versions = result.get("versions") or {}
     numbers = {**METRICS, **{k: k for k in ("episodes", "physics_errors", "seconds")}}
     return {
         "suite": env.removesuffix("-v0") if known else env,
@@ -139,7 +138,7 @@ def read_run(path: Path) -> dict[str, Any]:
         "family": str(names["family"]).replace("unconstrained", ""),
         "seed": seed,
         "steps": result["n_timesteps"],
-        **{name: _number(result, key) for name, key in numbers.items()},
+        **{name: _number(result.get(key)) for name, key in numbers.items()},
         "cost_limit": limits[0] if len(limits) == 1 else math.nan,
         "limits": _limits(limits) if limits else None,
         "epoch": math.prod(rollout) if whole else math.nan,
@@ -180,13 +179,8 @@ def _last_words(path: Path) -> str:
     return f"; its error.txt ends in {lines[-1]!r}" if lines else ""
 
 
-def _number(result: Mapping[str, Any], key: str) -> float:
-    value = result.get(key)
-    if value is None:
-        return math.nan
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise UsageError(f"result.json is damaged: {key} = {value!r} should be a number")
-    return float(value)
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
 
 
 def _limits(limits: Iterable[float]) -> str:

@@ -1,16 +1,14 @@
 """What there is: ``sb3-guard list`` prints suites, robots, tasks and constraints."""
 
-import argparse
 import re
 import sys
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.suites import SUITES, Suite
 from sb3_guard.envs.suites.guard import LADDER
-from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.flags import Command, command, flag
 from sb3_guard.zoo.markdown import table
 from sb3_guard.zoo.usage import UsageError, explained, import_packages
@@ -87,12 +85,6 @@ def constraints() -> str:
 KINDS = {"suites": suites, "robots": robots, "tasks": tasks, "constraints": constraints}
 
 
-def _kind(text: str) -> str:
-    if text not in KINDS:
-        raise argparse.ArgumentTypeError(f"there is no list {text!r}; {did_you_mean(text, KINDS)}")
-    return text
-
-
 @dataclass
 class Flags(Command):
     """
@@ -109,7 +101,9 @@ class Flags(Command):
   sb3-guard list robots
   sb3-guard list --ladder Goal_Point Hazards
 """
-    kind: str | None = flag(positional=True, nargs="?", kind=_kind, choices=list(KINDS))
+    kind: Literal["suites", "robots", "tasks", "constraints"] | None = flag(
+        positional=True, nargs="?"
+    )
     ladder: list[str] | None = flag(nargs="*", metavar="TASK_ROBOT CONSTRAINT")
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
 

@@ -12,7 +12,6 @@ import yaml
 
 from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
-from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.flags import Command, command, flag
 from sb3_guard.zoo.markdown import table
 from sb3_guard.zoo.usage import UsageError, explained, import_packages
@@ -91,7 +90,7 @@ class Flags(Command):
     env: str = flag(positional=True)
     env_kwargs: dict[str, Any] | None = flag()
     output: str | None = flag("-o", metavar="FILE.png")
-    camera: str = flag(default="fixed")
+    camera: str = flag(default="fixed", choices=CAMERAS)
     window: bool = flag(default=False)
     seed: int = flag(default=0)
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
@@ -129,8 +128,6 @@ def show(flags: Flags) -> int:
     :raises UsageError: there is no such environment, or no picture can be made
     """
     import_packages(flags.gym_packages)
-    if flags.camera not in CAMERAS:
-        raise UsageError(f"unknown camera {flags.camera!r}: {did_you_mean(flags.camera, CAMERAS)}")
     if flags.window:
         return watch(flags)
     file = Path(flags.env)

@@ -556,7 +556,7 @@ def test_a_ladder_of_difficulty(capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["robot"], "there is no list 'robot'; did you mean 'robots'? allowed: suites, robots,"),
+        (["robot"], "invalid choice: 'robot' (choose from"),
         (["--ladder"], "not 0 values: for example --ladder Goal_Point Hazards"),
         (["--ladder", "Goal_Point"], "not 1 values: for example --ladder Goal_Point Hazards"),
         (["--ladder", "goal_point", "hazards"], "did you mean 'Goal_Point_1Hazards'?"),

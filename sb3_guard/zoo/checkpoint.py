@@ -79,7 +79,7 @@ class Checkpoints(BaseCallback):
         self.log_interval = max(log_interval, 1)
         self.what = dict(what or {})
         #: asked at each boundary whether to stop with a checkpoint, by a grid
-        self.asked: Callable[[], bool] | None = None
+        self.asked: Callable[[], bool] = lambda: False
         #: set from a signal handler: stop with a checkpoint at the next boundary
         self.stop = False
         self.rollouts = 0  # all of the run's
@@ -98,8 +98,7 @@ class Checkpoints(BaseCallback):
     def _on_rollout_start(self) -> None:
         pause = max(self.every, self._took / LARGEST_SHARE if self.every > 0 else 0.0)
         due = time.monotonic() - self._last >= pause
-        if self.asked is not None:
-            self.stop |= self.asked()
+        self.stop |= self.asked()
         if self.stop or (due and self.rollouts % self.log_interval == 0):
             # gSDE has drawn its noise by now; the algorithm remembers how things were before.
             self.write(

@@ -79,10 +79,6 @@ class Experiment:
         #: the checkpoint to continue from
         self.state = None if folder is None else read_checkpoint(folder.checkpoint)
         self._saved = None if folder is None else folder.checkpoint
-        #: training ends after the rollout under way when this says so
-        self.asked_to_stop: Callable[[], bool] | None = None
-        #: its folder is to state flags and hyper-parameters anew once training can go on
-        self.restates = False
         self.tracker = Tracker(flags, hyperparams) if flags.track else None
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
         _check_device(flags.device)
@@ -223,7 +219,6 @@ class Experiment:
             log_interval=flags.log_interval,
             what=folder.what(),
         )
-        checkpoints.asked = self.asked_to_stop
         # The checkpoint comes first: it must see the others as the last rollout left them.
         return checkpoints, epochs, [checkpoints, *others]
 
@@ -232,16 +227,23 @@ class Experiment:
         # The progress bar shows the same live; two displays would be one too many.
         return self.flags.verbose > (1 if self.flags.progress else 0)
 
-    def train(self, folder: RunFolder) -> int:
+    def train(
+        self,
+        folder: RunFolder,
+        asked_to_stop: Callable[[], bool] = lambda: False,
+        restate: bool = False,
+    ) -> int:
         """
         Train to the end, or to an interrupt, and report.
 
         :param folder: the run's folder, owned by this process
+        :param asked_to_stop: training ends after the rollout under way when this says so
+        :param restate: state flags and hyper-parameters anew once training can go on
         :return: exit status: 0, or 128 + the signal's number when interrupted
         :raises UsageError: training can't go on, or the disk is full or read-only
         """
         try:
-            return self._train(folder)
+            return self._train(folder, asked_to_stop, restate)
         except PROCESS_DIED as error:
             if not self._lost_a_process():
                 raise  # the pipe of somebody else, such as that of standard output
@@ -285,7 +287,7 @@ class Experiment:
         if self.tracker is not None:
             self.tracker.finish()
 
-    def _train(self, folder: RunFolder) -> int:
+    def _train(self, folder: RunFolder, asked: Callable[[], bool], restate: bool) -> int:
         state, verbose = self.state, self.flags.verbose > 0
         if verbose:
             print(f"Run folder: {folder.path} (seed {self.flags.seed})")
@@ -307,11 +309,12 @@ class Experiment:
             raise UsageError(one_line(error)) from error
         self.model.set_logger(logger)
         checkpoints, epochs, callbacks = self._make_callbacks(folder)
+        checkpoints.asked = asked
         if state is not None:
             checkpoints.restore(state)
             # In this order, and only now: a result in the folder is always that of its config.
             folder.result.unlink(missing_ok=True)
-            if self.restates:
+            if restate:
                 folder.write_config(self.flags.values(), self.hyperparams)
                 checkpoints.what = folder.what()
             restore_run(self.model, state)

@@ -102,9 +102,7 @@ def complete(
         # Without a checkpoint nothing of it is worth keeping, and it restarts in its place.
         begun = folder.checkpoint.exists()
         quiet = dataclasses.replace(flags, progress=False, verbose=0)
-        experiment = Experiment(quiet, values, folder if begun else None)
-        experiment.asked_to_stop = asked_to_stop
-        return experiment.train(folder)
+        return Experiment(quiet, values, folder if begun else None).train(folder, asked_to_stop)
 
 
 def refuse_another(folder: RunFolder, flags: RunFlags, values: Mapping[str, Any]) -> None:
@@ -113,17 +111,12 @@ def refuse_another(folder: RunFolder, flags: RunFlags, values: Mapping[str, Any]
 
     :raises UsageError: it holds another, or is damaged
     """
-    found = differences(folder.what(), what(flags.values(IDENTITY), values))
+    found = differences(folder.what(), plain({**flags.values(IDENTITY), **values}))
     if found:
         said = [f"{name}: {a} there, {b} here" for name, a, b in found[:3]]
         raise UsageError(
             f"{folder.path} holds another run ({'; '.join(said)}); choose another folder with -f"
         )
-
-
-def what(identity: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """What makes a run the run it is, as its files say it."""
-    return {**plain(identity), **plain(values)}
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -187,9 +180,7 @@ def resume(given: RunFlags, trusted: bool = False) -> int:
                 "a larger -n continues it"
             )
             return 0
-        experiment = Experiment(flags, values, folder)
-        experiment.restates = True
-        return experiment.train(folder)
+        return Experiment(flags, values, folder).train(folder, restate=True)
 
 
 def _refuse_edited(folder: RunFolder, state: Mapping[str, Any]) -> None:

@@ -125,7 +125,9 @@ def thumbnails(kind: str) -> str:
     for name, part in GROUPS[kind].items():
         about = re.sub(r" \([A-Z][^()]*\d{4}[^()]*\)", "", summary(part)).replace("``", "`")
         caption = f"[**{name}**]({kind}s/{name.lower()}.md)<br>{about}"
-        cells.append((f"![{name}](images/{kind}_{name.lower()}.png)", caption))
+        stem = f"{kind}_{name.lower()}"
+        moves = (ROOT / "docs" / "images" / f"{stem}.gif").exists()
+        cells.append((f"![{name}](images/{stem}.{'gif' if moves else 'png'})", caption))
     rows: list[list[str]] = []
     for k in range(0, len(cells), 3):
         three = [*cells[k : k + 3], ("", ""), ("", "")][:3]

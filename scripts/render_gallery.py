@@ -1,4 +1,4 @@
-"""Draw every robot, task and constraint, and film two agents: fills docs/images.
+"""Draw every robot, task and constraint, film what moves and two agents: fills docs/images.
 
 ``python scripts/render_gallery.py`` draws all; ``--only trained`` makes one file anew.
 """
@@ -27,6 +27,12 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "constraint_ghosts_solid": ("Goal_Point_8Ghosts", {"ghosts": {"solid": True}}),
     "task_chase_solid": ("Chase_Point_8Hazards", {"chase": {"solid": True}}),
     "task_push_box": ("Push_Point_8Hazards", {"push": {"object": "box"}}),
+}
+MOVING = {
+    "constraint_ghosts": "Goal_Point_8Ghosts",
+    "constraint_gremlins": "Goal_Point_8Gremlins",
+    "task_chase": "Chase_Point_8Hazards",
+    "task_defense": "Defense_Point_8Hazards",
 }
 # Small robots are shown nearer: the middle of a picture that is so many times as large
 ZOOM = {"Arm3": 1.0, "Arm6": 1.0, "Humanoid": 1.3, "Hopper": 1.4}
@@ -95,8 +101,27 @@ def animation(path: Path, seed: int) -> None:
     for left, key in ((0, "trpo"), (408, "cpo")):
         for frame, half in zip(frames, film(key, seed), strict=True):
             frame.paste(half, (left, 0))
-    # one palette for all frames, so that only what moves is written again
-    palette = Image.fromarray(np.vstack([np.asarray(f) for f in frames[::12]])).quantize(128)
+    save(frames, path)
+
+
+def clip(name: str, path: Path, seed: int) -> None:
+    """Write a small film of what moves by itself, around a robot that turns."""
+    env = GuardVectorEnv(1, name, render_mode="rgb_array", width=600, height=500)
+    env.reset(seed=seed)
+    frames = []
+    for step in range(40 * 4 * PERIOD):
+        if step % (4 * PERIOD) == 0:
+            frames.append(Image.fromarray(env.frame(0)).resize((300, 250)))
+        env.step(np.array([[0.0, 0.2]]))
+    env.close()
+    save(frames, path)
+
+
+def save(frames: list[Image.Image], path: Path) -> None:
+    """Write a film with one palette for all frames, so that only what moves is written again."""
+    palette = Image.fromarray(np.vstack([np.asarray(f) for f in frames[::12]])).quantize(
+        96, Image.Quantize.FASTOCTREE
+    )
     first, *others = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
     first.save(path, save_all=True, append_images=others, duration=DELAY, loop=0, optimize=True)
     print(f"{path} {path.stat().st_size / 1024:.0f} KiB")
@@ -107,13 +132,16 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/images"))
     parser.add_argument("--seed", type=int, default=3, help="of the pictures")
     parser.add_argument("--film-seed", type=int, help="of the film (default: a typical one)")
-    parser.add_argument("--only", choices=["pictures", "trained"], help="draw these only")
+    parser.add_argument("--only", choices=["pictures", "clips", "trained"], help="draw these only")
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
-    if args.only != "pictures":
+    if args.only in (None, "trained"):
         seed = typical() if args.film_seed is None else args.film_seed
         animation(args.output / "trained.gif", seed)
-    if args.only == "trained":
+    if args.only in (None, "clips"):
+        for stem, env_id in MOVING.items():
+            clip(env_id, args.output / f"{stem}.gif", args.seed)
+    if args.only in ("clips", "trained"):
         return
     for robot in guard(ROBOTS):
         path = args.output / f"robot_{robot.lower()}.png"

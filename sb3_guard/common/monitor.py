@@ -1,5 +1,6 @@
 """Episode statistics with costs, for every vectorised environment."""
 
+import inspect
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -71,6 +72,14 @@ class CostMonitor(VecMonitor):
         self._clear()
         if filename is not None:
             self.log_to(filename)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # of its class, and nothing that can be pickled
+        return {key: value for key, value in vars(self).items() if key != "class_attributes"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.class_attributes = dict(inspect.getmembers(type(self)))
+        vars(self).update(state)
 
     def _clear(self) -> None:
         self.episode_returns: np.ndarray = np.zeros(self.num_envs)

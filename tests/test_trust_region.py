@@ -471,6 +471,27 @@ def test_a_trial_says_what_the_candidate_changes() -> None:
     assert max(abs(cost) for _, _, cost in changes) > 1e-4
 
 
+def test_a_steps_promise_is_logged_beside_what_it_brought() -> None:
+    env = make_vec_env(lambda: CostPoint(20, hazard=(-1.0, 0.0)), 2, seed=0)
+    model = CPO("MlpPolicy", env, n_steps=40, n_critic_updates=1, seed=0, device="cpu")
+    logs: list[dict[str, float]] = []
+    costs: list[float] = []
+    train = model.train
+
+    def spy() -> None:
+        train()
+        logs.append(dict(model.logger.name_to_value))
+        costs.append(model.costs.episode_cost[0])
+
+    model.train = spy
+    model.learn(240)
+    assert "train/cost_change" not in logs[0]
+    for before, now in ((0, 1), (1, 2)):
+        promised = 20.0 * logs[before]["train/cost_surrogate"]
+        assert logs[now]["train/cost_change_promised"] == pytest.approx(promised, rel=1e-5)
+        assert logs[now]["train/cost_change"] == pytest.approx(costs[now] - costs[before])
+
+
 def test_the_step_respects_the_trust_region_and_improves() -> None:
     model = _toy(TRPO, target_kl=0.01)
     kls, gains = [], []

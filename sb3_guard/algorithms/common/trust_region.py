@@ -181,6 +181,8 @@ class TrustRegion(CostRollouts):
         self.line_search_shrinking_factor = line_search_shrinking_factor
         self.n_critic_updates = n_critic_updates
         self.normalize_advantage = normalize_advantage
+        # J_C at the last update, and by how much its step was to change it; each of shape (m,)
+        self.promise: tuple[np.ndarray, np.ndarray] | None = None
         super().__init__(
             policy,
             env,
@@ -302,6 +304,17 @@ class TrustRegion(CostRollouts):
         self._record_violation()
         if self.constrained and self.uses_cost_critic:
             self._record_per_cost("train/cost_surrogate", trial.cost_change)
+            self._record_promise(trial)
+
+    def _record_promise(self, trial: Trial) -> None:
+        """Record what the last step promised J_C and what it brought; keep this one's promise."""
+        assert self.costs is not None
+        cost = self.costs.episode_cost
+        if self.promise is not None:
+            before, promised = self.promise
+            self._record_per_cost("train/cost_change_promised", promised)
+            self._record_per_cost("train/cost_change", cost - before)
+        self.promise = (cost, trial.cost_change * self.costs.horizon)
 
     @th.no_grad()
     def _line_search(self, region: Region, x: th.Tensor, before: float) -> tuple[float, Trial]:

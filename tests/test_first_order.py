@@ -296,6 +296,30 @@ def test_epochs_stop_by_the_mean_over_the_rollout() -> None:
     assert steps == {"minibatch": 1, "epoch": 2}
 
 
+def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
+    """The first goes beyond the bound in a pass; the second, hardly priced, stays and takes all."""
+    still: dict[str, Any] = {"lambda_init": 1e-9, "lambda_lr": 0.0, "proportional_gain": 0.0}
+    model = make(
+        CUP, target_kl=1e-4, kl_stop="epoch", n_epochs=4, learning_rate=0.3, **still,
+        policy_kwargs={"optimizer_class": th.optim.SGD},
+    )  # fmt: skip
+    calls = {"loss": 0, "projection": 0}
+
+    def counting(name: str) -> Any:
+        function = getattr(model, name)
+
+        def count(*args: Any) -> th.Tensor:
+            calls[name] += 1
+            return function(*args)
+
+        return count
+
+    for name in calls:
+        setattr(model, name, counting(name))
+    model.learn(128)
+    assert calls == {"loss": 2, "projection": 8}
+
+
 # Bad input
 
 

@@ -24,6 +24,8 @@ class CUP(Lagrangian, FirstOrder):
     violations. The factor comes from the paper's bound with generalised advantages, and grows
     without bound as γ → 1.
 
+    With ``target_kl`` each of the two steps stops by its distance from where it began.
+
     :param projection_kl: ``"forward"`` as above; ``"reverse"`` for KL(π ‖ π_{k+½})
     """
 
@@ -67,7 +69,7 @@ class CUP(Lagrangian, FirstOrder):
         super().train()  # PPO's, on the rewards
         if bool(self._price.any()):
             self._improved = self.snapshot()
-            self.descend(self.projection, values=False)
+            self.descend(self.projection, values=False, start=self._improved)
 
     def projection(
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution

@@ -120,25 +120,38 @@ class FirstOrder(CostRollouts, PPO):
         old.set_training_mode(False)
         return old
 
-    def descend(self, loss: Loss, n_epochs: int | None = None, values: bool = True) -> None:
+    def descend(
+        self,
+        loss: Loss,
+        n_epochs: int | None = None,
+        values: bool = True,
+        start: ActorCriticPolicy | None = None,
+    ) -> None:
         """Take passes of minibatches down a loss.
 
         :param loss: called as :meth:`loss` is
         :param n_epochs: passes; None for the algorithm's own
         :param values: whether the reward critic and the entropy bonus learn along
+        :param start: the policy whose distance stops the passes; None for the one that acted
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         history: dict[str, list[float]] = {}
         for _ in range(self.n_epochs if n_epochs is None else n_epochs):
-            stop = self._descend_once(loss, values, history)
+            stop = self._descend_once(loss, values, history, start)
             self._n_updates += 1
             if stop:
                 break
         for name, numbers in history.items():
             self.logger.record(f"train/{name}", float(np.mean(numbers)))
 
-    def _descend_once(self, loss: Loss, values: bool, history: dict[str, list[float]]) -> bool:
+    def _descend_once(
+        self,
+        loss: Loss,
+        values: bool,
+        history: dict[str, list[float]],
+        start: ActorCriticPolicy | None,
+    ) -> bool:
         """One pass; whether it was the last."""
         history["approx_kl"] = []  # of the last pass alone, as SB3 logs it
         for batch in self.rollout_buffer.get(self.batch_size):
@@ -155,7 +168,7 @@ class FirstOrder(CostRollouts, PPO):
                 losses["value_loss"] = self._value_loss(batch, predicted.flatten())
                 total = total + self.ent_coef * losses["entropy_loss"]
                 total = total + self.vf_coef * losses["value_loss"]
-            divergence = _approximate_kl(log_prob.detach() - batch.old_log_prob)
+            divergence = self._divergence(batch, log_prob.detach(), start)
             for name, value in {**losses, "approx_kl": divergence}.items():
                 history.setdefault(name, []).append(value.item())
             too_far = self.target_kl is not None and float(divergence) > 1.5 * self.target_kl
@@ -168,15 +181,18 @@ class FirstOrder(CostRollouts, PPO):
         return (
             self.kl_stop == "epoch"
             and self.target_kl is not None
-            and self._mean_kl() > self.target_kl
+            and self._mean_kl(start) > self.target_kl
         )
 
-    def _evaluate(self, batch: CostRolloutBufferSamples) -> tuple[th.Tensor, ...]:
+    def _evaluate(
+        self, batch: CostRolloutBufferSamples, policy: ActorCriticPolicy | None = None
+    ) -> tuple[th.Tensor, ...]:
         """Values, log-probabilities and entropies; the distribution is ``policy.action_dist``."""
+        policy = self.policy if policy is None else policy
         actions = batch.actions
         if isinstance(self.action_space, spaces.Discrete):
             actions = actions.long().flatten()
-        return self.policy.evaluate_actions(batch.observations, actions)  # type: ignore
+        return policy.evaluate_actions(batch.observations, actions)  # type: ignore
 
     def _value_loss(self, batch: CostRolloutBufferSamples, values: th.Tensor) -> th.Tensor:
         if self.clip_range_vf is not None:
@@ -186,14 +202,25 @@ class FirstOrder(CostRollouts, PPO):
         return F.mse_loss(batch.returns, values)
 
     @th.no_grad()
-    def _mean_kl(self) -> float:
-        """KL of the whole rollout, estimated as SB3 does a minibatch's."""
+    def _divergence(
+        self,
+        batch: CostRolloutBufferSamples,
+        log_prob: th.Tensor,
+        start: ActorCriticPolicy | None,
+    ) -> th.Tensor:
+        """KL(start ‖ policy), estimated on the actions taken as SB3 does."""
+        old = batch.old_log_prob if start is None else self._evaluate(batch, start)[1]
+        return _approximate_kl(log_prob - old)
+
+    @th.no_grad()
+    def _mean_kl(self, start: ActorCriticPolicy | None) -> float:
+        """The same of the whole rollout."""
         batch = self.rollout_buffer.whole()
         total = 0.0
         for index in chunks(len(batch.actions)):
             part = CostRolloutBufferSamples(*(rows(field, index) for field in batch))
             _, log_prob, _ = self._evaluate(part)
-            total += float(_approximate_kl(log_prob - part.old_log_prob)) * len(log_prob)
+            total += float(self._divergence(part, log_prob, start)) * len(log_prob)
         return total / len(batch.actions)
 
 

@@ -53,26 +53,21 @@ def train(flags: Flags) -> int:
         flags.progress = sys.stderr.isatty() and flags.verbose > 0
     run = RunFlags.shared(flags)
     run.given = given
-    if flags.seeds is not None:
-        return _train_seeds(flags, run)
-    if flags.jobs is not None:
-        raise UsageError("--jobs goes with several seeds, such as --seeds 0 1 2")
+    if flags.seeds is None:
+        if flags.jobs is not None:
+            raise UsageError("--jobs goes with several seeds, such as --seeds 0 1 2")
 
-    from sb3_guard.zoo.start import continues_run, resume, start
+        from sb3_guard.zoo.start import continues_run, resume, start
 
-    if run.trained_agent and continues_run(run.trained_agent):
-        return resume(run, flags.trust)
-    return start(run)
-
-
-def _train_seeds(flags: Flags, run: RunFlags) -> int:
-    for name, given in (("-i", run.trained_agent), ("--uuid", run.uuid)):
-        if given:
+        if run.trained_agent and continues_run(run.trained_agent):
+            return resume(run, flags.trust)
+        return start(run)
+    for name, value in (("-i", run.trained_agent), ("--uuid", run.uuid)):
+        if value:
             raise UsageError(f"{name} is for a single run; leave it out, or --seeds")
 
     from sb3_guard.zoo.grid import expand, plan, run_grid, try_out
 
-    assert flags.seeds is not None
     runs = expand([(run.env, run.algo)], flags.seeds, run.values())
     plan(runs)
     try_out(runs)

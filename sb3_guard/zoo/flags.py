@@ -164,11 +164,7 @@ class Command:
 
     def values(self, *roles: str) -> dict[str, Any]:
         """The flags by name, of these roles only if any are named."""
-        return {
-            field.name: getattr(self, field.name)
-            for field, _ in self._flags()
-            if not roles or field.metadata["role"] in roles
-        }
+        return {name: getattr(self, name) for name in sorted(self.names(*roles))}
 
     @classmethod
     def names(cls, *roles: str) -> set[str]:

@@ -1,9 +1,7 @@
 """Environments for the commands: found, made, and wrapped as a run's hyper-parameters say."""
 
-import signal
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import gymnasium as gym
@@ -25,7 +23,7 @@ from sb3_guard.common.adapters import is_safety_gymnasium
 from sb3_guard.common.vec_env import find_scenario, make_vec_env
 from sb3_guard.zoo.hyperparams import Setup
 from sb3_guard.zoo.resumable import ResumableEnv
-from sb3_guard.zoo.usage import UsageError, explained
+from sb3_guard.zoo.usage import UsageError, explained, interrupts_ignored
 
 
 def _errors_of_ours() -> tuple[type[Exception], type[Exception]]:
@@ -121,19 +119,6 @@ def choose_vec_env(wanted: str | None, ours: bool, wrapped: bool) -> str:
     return wanted or ("native" if ours and not wrapped else "dummy")
 
 
-@contextmanager
-def _interrupts_left_to_us() -> Iterator[None]:
-    """Let worker processes ignore Ctrl-C, so that the rollout under way can be finished."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def make_envs(
     env_id: str,
     setup: Setup,
@@ -170,7 +155,7 @@ def make_envs(
 
     with (
         explained(f"can't make {env_id}", *BAD_ARGUMENTS, *PROCESS_DIED),
-        _interrupts_left_to_us(),
+        interrupts_ignored(),  # a rollout under way can be finished
     ):
         env = make_vec_env(
             env_id,

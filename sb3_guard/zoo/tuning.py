@@ -41,7 +41,7 @@ from sb3_guard.zoo.studies import (
 from sb3_guard.zoo.trials import GIVEN, Objective, Settings, Stopped, run_flags
 from sb3_guard.zoo.tune_flags import TuneFlags
 from sb3_guard.zoo.tuning_report import Report, short
-from sb3_guard.zoo.usage import UsageError, import_packages, interrupts, run
+from sb3_guard.zoo.usage import UsageError, import_packages, interrupts, interrupts_ignored, run
 
 MOST_FAILURES = 3  # in a row, until it is not the hyper-parameters' fault
 POLL = 1.0  # seconds between two looks at what other workers do
@@ -282,13 +282,9 @@ def _other_workers(flags: TuneFlags, n: int) -> Iterator[None]:
     """Let more processes work on the study; they stop when this one does."""
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=_work_beside, args=(flags,)) for _ in range(n)]
-    ignored = signal.getsignal(signal.SIGINT)
-    if others:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited; Ctrl-C reaches this process
-    for one in others:
-        one.start()
-    if others:
-        signal.signal(signal.SIGINT, ignored)
+    with interrupts_ignored():  # by those that inherit it; Ctrl-C reaches this process
+        for one in others:
+            one.start()
     try:
         yield
     finally:

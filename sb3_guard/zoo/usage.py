@@ -180,6 +180,19 @@ def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
             signal.signal(one, handler)
 
 
+@contextmanager
+def interrupts_ignored() -> Iterator[None]:
+    """Let processes that are started in the block ignore Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def number(
     allowed: str, fits: Callable[[float], bool], kind: Callable[[float], float] = int
 ) -> Callable[[Any], Any]:

@@ -7,7 +7,7 @@ and markers tell algorithms apart without them.
 
 import io
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,12 +72,16 @@ STYLE: dict[Any, Any] = {
 }  # fmt: skip
 
 
+# A figure, or None where there is nothing to draw, and the runs it lacks, for people
+Drawn = tuple[Figure | None, str]
+
+
 class Drawing(NamedTuple):
-    """A figure and what it lacks."""
+    """A figure with its name, and what it lacks."""
 
     name: str
-    figure: Figure | None  # None: there is nothing to draw
-    missing: str = ""  # the runs it lacks, for people
+    figure: Figure | None
+    missing: str
 
 
 class Look(NamedTuple):
@@ -297,46 +301,37 @@ def finish(figure: Figure, missing: str) -> None:
         figure.supxlabel(text, x=0.01, ha="left", fontsize=7, alpha=0.8)
 
 
-def file_name(suite: str) -> str:
-    """A suite as part of a file's name."""
-    return suite.replace("/", "-").replace(":", "-")
-
-
 # Figures
 
 
-def curves_of(data: Data, suites: Sequence[str], name: str, missing: str) -> Drawing:
-    """One row of three panels per suite."""
+def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
+    """One row of three panels per suite that has runs."""
     drawn = [suite for suite in suites if any(data.curves(suite, a) for a in data.algos(suite))]
     if not drawn:
-        return Drawing(name, None, missing)
+        return None
     figure = Figure(figsize=(WIDTH, 0.8 + 2.2 * len(drawn)), layout="constrained")
     grid = figure.subplots(len(drawn), 3, squeeze=False)
     for row, suite in zip(grid, drawn, strict=True):
         for axis, metric in zip(row, METRICS, strict=True):
             draw_curves(axis, data, suite, metric)
         row[1].set_title(suite, fontweight="bold")
-    return Drawing(name, figure, missing)
+    return figure
 
 
-def curves(data: Data) -> Iterator[Drawing]:
+def curves(data: Data, suite: str) -> Drawn:
     """Return, episode cost and cost rate against steps, a figure per suite."""
-    for suite in data.suites:
-        # Which algorithms to run is the user's choice here: others are not missing.
-        drawing = curves_of(data, [suite], f"curves_{file_name(suite)}", "")
-        yield drawing if drawing.figure else drawing._replace(missing=f"0.monitor.csv of {suite}")
+    # Which algorithms to run is the user's choice here: others are not missing.
+    figure = curves_of(data, [suite])
+    return figure, "" if figure else f"0.monitor.csv of {suite}"
 
 
-def pareto(data: Data) -> Iterator[Drawing]:
+def pareto(data: Data, suite: str) -> Drawn:
     """Return against cost with the Pareto front and the cost limit, a figure per suite."""
-    for suite in data.suites:
-        name = f"pareto_{file_name(suite)}"
-        if not len(data.means[data.means["suite"] == suite].dropna(subset=["M_c", "J_r"])):
-            yield Drawing(name, None, suite)
-            continue
-        figure = Figure(figsize=(0.7 * WIDTH, 0.6 * WIDTH), layout="constrained")
-        draw_pareto(figure.subplots(), data, suite)
-        yield Drawing(name, figure)
+    if not len(data.means[data.means["suite"] == suite].dropna(subset=["M_c", "J_r"])):
+        return None, suite
+    figure = Figure(figsize=(0.7 * WIDTH, 0.6 * WIDTH), layout="constrained")
+    draw_pareto(figure.subplots(), data, suite)
+    return figure, ""
 
 
 def _reached(values: np.ndarray, axis: int, tau: np.ndarray, score: str) -> np.ndarray:
@@ -348,13 +343,12 @@ def _reached(values: np.ndarray, axis: int, tau: np.ndarray, score: str) -> np.n
     return 1 - part if score == "reward" else part
 
 
-def profiles(data: Data) -> Iterator[Drawing]:
+def profiles(data: Data) -> Drawn:
     """Performance profiles: the part of all runs that reach a score, with 95 % bands."""
     single = normalize(data.runs, data.means)
     missing = data.missing(data.suites, [REFERENCE])
     if single[list(SCORES.values())].isna().all(axis=None):
-        yield Drawing("profiles", None, missing)
-        return
+        return None, missing
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     for axis, score in zip(figure.subplots(1, 3), SCORES.values(), strict=True):
         finite = single[score].dropna()
@@ -373,17 +367,16 @@ def profiles(data: Data) -> Iterator[Drawing]:
         sign = "≥" if score == "reward" else "≤"
         axis.set(xlabel=f"{SCORE_AXES[score]}, τ", ylabel=f"part of runs {sign} τ")
         axis.set_ylim(-0.02, 1.02)
-    yield Drawing("profiles", figure, missing)
+    return figure, missing
 
 
-def iqm(data: Data) -> Iterator[Drawing]:
+def iqm(data: Data) -> Drawn:
     """Interquartile means of the scores over runs and suites, with 95 % intervals."""
     missing = data.missing(data.suites, [REFERENCE])
     table = overall(data.runs, data.means).set_index("algo")
     table = table.dropna(subset=[f"{score}_iqm" for score in SCORES.values()], how="all")
     if not len(table):
-        yield Drawing("iqm", None, missing)
-        return
+        return None, missing
     figure = Figure(figsize=(WIDTH, 1.2 + 0.32 * len(table)), layout="constrained")
     rows = np.arange(len(table))[::-1]
     for axis, score in zip(figure.subplots(1, 3, sharey=True), SCORES.values(), strict=True):
@@ -400,7 +393,7 @@ def iqm(data: Data) -> Iterator[Drawing]:
         axis.margins(0.06)
         axis.axvline(1, color=INK, linewidth=1, linestyle=(0, (1, 2)))
         axis.grid(axis="y", visible=False)
-    yield Drawing("iqm", figure, missing)
+    return figure, missing
 
 
 # Files

@@ -1,6 +1,7 @@
 """The figures of the GUARD paper's questions, Q1–Q8 (arXiv 2305.13681), and their suites."""
 
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -18,6 +19,7 @@ from sb3_guard.zoo.figures import (
     WIDTH,
     Data,
     Drawing,
+    Drawn,
     Look,
     curves,
     curves_of,
@@ -57,12 +59,12 @@ POLYGONS = {
 }
 
 
-def q1(data: Data) -> Iterator[Drawing]:
+def q1(data: Data) -> Drawn:
     """Overall results: learning curves of the paper's eight main suites."""
-    yield curves_of(data, MAIN8, "q1", data.missing(MAIN8, ALGOS))
+    return curves_of(data, MAIN8), data.missing(MAIN8, ALGOS)
 
 
-def q2(data: Data) -> Iterator[Drawing]:
+def q2(data: Data) -> Drawn:
     """Difficulty of constraints: TRPO's cost per robot, and every algorithm, Hazards to Ghosts."""
     pair = ("Hazards", "Ghosts")
     bars = [f"Goal_{robot}_8{kind}" for robot in ROBOTS for kind in pair]
@@ -72,8 +74,7 @@ def q2(data: Data) -> Iterator[Drawing]:
     have = data.scores.index
     robots = [r for r in ROBOTS if any((f"Goal_{r}_8{k}", REFERENCE) in have for k in pair)]
     if not robots:
-        yield Drawing("q2", None, missing)
-        return
+        return None, missing
     figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
     left, *others = figure.subplots(1, 3, width_ratios=(1.7, 1, 1))
     for offset, kind, color, hatch in zip((-0.2, 0.2), pair, COLORS, ("", "//"), strict=False):
@@ -93,7 +94,7 @@ def q2(data: Data) -> Iterator[Drawing]:
                 axis.plot(pair, values, marker=look.marker, **look.line)
         axis.set(ylabel=SCORE_AXES[score], title="Goal, Point", xlim=(-0.3, 1.3))
         mark_trpo(axis)
-    yield Drawing("q2", figure, missing)
+    return figure, missing
 
 
 def mark_trpo(axis: Axes) -> None:
@@ -103,14 +104,13 @@ def mark_trpo(axis: Axes) -> None:
     axis.set_ylim(min(0, low), max(1.06, high))
 
 
-def q3(data: Data) -> Iterator[Drawing]:
+def q3(data: Data) -> Drawn:
     """Families of algorithms: reward, cost and cost rate on four suites, a polygon per family."""
     missing = data.missing(RADAR4, ALGOS)
     have = data.by_family.index.get_level_values("suite")
     shown = [s for s in RADAR4 if s in have and not np.isnan(data.score(s, REFERENCE, "cost"))]
     if not shown:
-        yield Drawing("q3", None, missing)
-        return
+        return None, missing
     spiders = {
         suite: {
             family: [data.score(suite, family, score) for score in SCORES.values()]
@@ -119,16 +119,14 @@ def q3(data: Data) -> Iterator[Drawing]:
         for suite in shown
     }
     spokes = {suite: [*SPOKES.values()] for suite in shown}
-    yield draw_spiders("q3", spiders, spokes, data.looks, missing)
+    return draw_spiders(spiders, spokes, data.looks), missing
 
 
 def draw_spiders(
-    name: str,
     spiders: dict[str, dict[str, list[float]]],
     spokes: dict[str, list[str]],
     looks: dict[str, Look],
-    missing: str,
-) -> Drawing:
+) -> Figure:
     """
     Spider plots, TRPO's boundary at 1; a missing value leaves a gap.
 
@@ -160,10 +158,10 @@ def draw_spiders(
         axis.set_title(title, fontweight="bold", fontsize=8)
     for axis in grid.flat[len(spiders) :]:
         axis.remove()
-    return Drawing(name, figure, missing)
+    return figure
 
 
-def by_robot(data: Data, name: str, lines: Iterable[str], algos: Sequence[str]) -> Drawing:
+def by_robot(data: Data, lines: Iterable[str], algos: Sequence[str]) -> Drawn:
     """Scores on Goal with 8 hazards, robots by degrees of freedom."""
     suites = {robot: f"Goal_{robot}_8Hazards" for robot in ROBOTS}
     missing = data.missing(suites.values(), (REFERENCE, *algos))
@@ -174,7 +172,7 @@ def by_robot(data: Data, name: str, lines: Iterable[str], algos: Sequence[str]) 
         if any(not np.isnan(data.score(suite, line, s)) for line in lines for s in SCORES.values())
     ]
     if not shown:
-        return Drawing(name, None, missing)
+        return None, missing
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     ticks = [f"{robot}\n{ROBOTS[robot]}" for robot in shown]
     for axis, score in zip(figure.subplots(1, 2), ("reward", "cost"), strict=True):
@@ -185,30 +183,30 @@ def by_robot(data: Data, name: str, lines: Iterable[str], algos: Sequence[str]) 
         axis.tick_params(axis="x", labelsize=7)
         axis.margins(x=0.06)
         mark_trpo(axis)
-    return Drawing(name, figure, missing)
+    return figure, missing
 
 
-def q4(data: Data) -> Iterator[Drawing]:
+def q4(data: Data) -> Drawn:
     """Task complexity: each family on robots of more and more degrees of freedom."""
-    yield by_robot(data, "q4", data.families, ALGOS[1:])
+    return by_robot(data, data.families, ALGOS[1:])
 
 
-def q5(data: Data) -> Iterator[Drawing]:
+def q5(data: Data) -> Drawn:
     """Adaptive multiplier: TRPO-Lagrangian against TRPO-FAC."""
-    yield by_robot(data, "q5", ("trpo_lag", "trpo_fac"), ("trpo_lag", "trpo_fac"))
+    return by_robot(data, ("trpo_lag", "trpo_fac"), ("trpo_lag", "trpo_fac"))
 
 
-def q6(data: Data) -> Iterator[Drawing]:
+def q6(data: Data) -> Drawn:
     """Feasibility projection: CPO against PCPO."""
-    yield by_robot(data, "q6", ("cpo", "pcpo"), ("cpo", "pcpo"))
+    return by_robot(data, ("cpo", "pcpo"), ("cpo", "pcpo"))
 
 
-def q7(data: Data) -> Iterator[Drawing]:
+def q7(data: Data) -> Drawn:
     """Linearised cost dynamics: TRPO-USL against TRPO-SL."""
-    yield by_robot(data, "q7", ("trpo_usl", "trpo_sl"), ("trpo_usl", "trpo_sl"))
+    return by_robot(data, ("trpo_usl", "trpo_sl"), ("trpo_usl", "trpo_sl"))
 
 
-def q8(data: Data) -> Iterator[Drawing]:
+def q8(data: Data) -> Drawn:
     """Every algorithm, every task: five task options, each a mean over the robots there are."""
     suites = {o: [name.format(robot) for robot in ROBOTS] for o, name in OPTIONS.items()}
     missing = data.missing([suite for names in suites.values() for suite in names], ALGOS)
@@ -230,16 +228,13 @@ def q8(data: Data) -> Iterator[Drawing]:
             option if n == len(ROBOTS) else f"{option}\n({n}/{len(ROBOTS)})"
             for option, n in zip(suites, number, strict=True)
         ]
-    yield (
-        draw_spiders("q8", spiders, spokes, POLYGONS, missing)
-        if spiders
-        else Drawing("q8", None, missing)
-    )
+    return draw_spiders(spiders, spokes, POLYGONS) if spiders else None, missing
 
 
-FIGURES = {
-    **{function.__name__: function for function in (curves, pareto, profiles, iqm)},
-    **{function.__name__: function for function in (q1, q2, q3, q4, q5, q6, q7, q8)},
+PER_SUITE = (curves, pareto)
+FIGURES: dict[str, Callable[..., Drawn]] = {
+    function.__name__: function
+    for function in (*PER_SUITE, profiles, iqm, q1, q2, q3, q4, q5, q6, q7, q8)
 }
 
 
@@ -249,9 +244,12 @@ def draw(kind: str, data: Data) -> list[Drawing]:
 
     :param kind: a key of :data:`FIGURES`
     """
+    function, drawings = FIGURES[kind], []
     with mpl.rc_context(STYLE):
-        drawings = list(FIGURES[kind](data))
-        for drawing in drawings:
-            if drawing.figure is not None:
-                finish(drawing.figure, drawing.missing)
+        for suite in data.suites if function in PER_SUITE else [""]:
+            figure, missing = function(data, *([suite] if suite else []))
+            if figure is not None:
+                finish(figure, missing)
+            name = re.sub("[/:]", "-", f"{kind}_{suite}" if suite else kind)
+            drawings.append(Drawing(name, figure, missing))
     return drawings

@@ -680,7 +680,7 @@ def test_a_study_is_continued_as_it_was_begun(tmp_path, folder, monkeypatch, cap
     capsys.readouterr()
     for other, part in (
         (["--cost-limit", "5"], "begun with"),
-        (["-n", "120"], "n timesteps 240, not 120"),
+        (["-n", "120"], "n_timesteps 240, not 120"),
         (["-params", "n_steps:60"], "hyperparams n_steps 30, not 60"),
     ):
         refused(lambda argv: run(tmp_path, *argv), other, capsys, part, "--study-name")

@@ -27,6 +27,7 @@ from sb3_guard.zoo.make_envs import PROCESS_DIED, evaluation_seed
 from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.spaces import Search
+from sb3_guard.zoo.start import differences
 from sb3_guard.zoo.studies import STOPPED
 from sb3_guard.zoo.tune_flags import TuneFlags
 from sb3_guard.zoo.tuning_report import short
@@ -84,16 +85,14 @@ class Settings:
 
         :raises UsageError: they are not the same
         """
-        for name, value in asdict(self).items():
-            old = saved.get(name)
-            if old == value:
-                continue
-            what = name.replace("_", " ")
-            if isinstance(value, dict) and isinstance(old, dict):
-                key = next(k for k in sorted({*old, *value}) if old.get(k) != value.get(k))
-                what, old, value = f"{what} {key}", old.get(key), value.get(key)
+
+        def flat(one: Mapping[str, Any]) -> dict[str, Any]:
+            own = {f"hyperparams {name}": value for name, value in one["hyperparams"].items()}
+            return {**one, "hyperparams": None, **own}
+
+        for name, old, value in differences(flat(saved), flat(asdict(self))):
             raise UsageError(
-                f"study {study!r} was begun with {what} {old}, not {value}: "
+                f"study {study!r} was begun with {name} {old}, not {value}: "
                 "continue it as it was begun, or begin another with --study-name"
             )
 

@@ -5,7 +5,6 @@ import os
 import runpy
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -654,16 +653,16 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         f"    {command}.main(['--help'])\n"
         "except SystemExit as end:\n"
         "    assert end.code == 0\n"
+        "import time\n"
         "print(sorted({'torch', 'rl_zoo3', 'stable_baselines3'} & sys.modules.keys()))\n"
+        "print(time.process_time())\n"
     )
-    began = time.monotonic()
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=300
     )
-    assert done.stdout.splitlines()[-1] == "[]"
-    assert "--env" in done.stdout
-    # 0.5 s on an idle machine; generous, since tests run side by side.
-    assert time.monotonic() - began < 10
+    *text, heavy, seconds = done.stdout.splitlines()
+    assert heavy == "[]" and "--env" in "\n".join(text)
+    assert float(seconds) < 5  # of the processor, whatever else runs; usually 0.5
 
 
 def test_threads_wait_without_spinning(monkeypatch):

@@ -114,7 +114,7 @@ def test_the_notebook_runs(tmp_path):
     for cell in notebook.cells:
         cell.source = shorten(cell.source).replace("frames=150", "frames=3")
     notebook.cells.insert(0, nbformat.v4.new_code_cell(SHORT_EPISODES))
-    NotebookClient(notebook, timeout=120, resources={"metadata": {"path": tmp_path}}).execute()
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": tmp_path}}).execute()
     made = {path.name for path in tmp_path.iterdir()}
     assert made == {"cpo_hazards", "cpo_ghosts", "hazards.mp4", "ghosts.mp4"}
     kinds = [output for cell in notebook.cells for output in cell.get("outputs", [])]

@@ -404,7 +404,7 @@ def test_a_robot_module_shows_its_robot(tmp_path: Path) -> None:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )
     if "no OpenGL backend works" in run.stderr:

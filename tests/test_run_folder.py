@@ -192,7 +192,7 @@ def test_a_sleeper_whose_run_was_taken_over_ends(tmp_path):
         f"folder = pathlib.Path({str(tmp_path)!r})\n"
         "with run_folder.lock(folder):\n"
         '    (folder / ".lock").unlink()\n'
-        "    time.sleep(30)\n"
+        "    time.sleep(120)\n"
         "    print('alive')\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)

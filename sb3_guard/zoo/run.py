@@ -193,20 +193,15 @@ class Experiment:
         return evaluation
 
     def _make_callbacks(self, folder: RunFolder) -> tuple[Checkpoints, Epochs, list[BaseCallback]]:
-        flags, n_envs = self.flags, self.setup.n_envs
+        flags = self.flags
         epochs = Epochs(self.setup.n_timesteps, bar=bool(flags.progress))
         others: list[BaseCallback] = [epochs]
         if not isinstance(self.model, Constrained):
             others.append(LogCosts())
         if flags.save_freq > 0:
-            others.append(
-                CheckpointCallback(
-                    max(flags.save_freq // n_envs, 1),
-                    str(folder.path),
-                    name_prefix="rl_model",
-                    save_vecnormalize=True,
-                )
-            )
+            every = max(flags.save_freq // self.setup.n_envs, 1)
+            path = str(folder.path)
+            others.append(CheckpointCallback(every, path, save_vecnormalize=True))
         if self.evaluation is not None:
             self.evaluation.log_path = str(folder.path / "evaluations")
             self.evaluation.best_model_save_path = str(folder.path)

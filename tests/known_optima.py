@@ -357,11 +357,14 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
     """
     env = problem.make_env(seed, scale)
     limits = scale * np.array(problem.limits)
+    bound = limits
+    if problem.statewise and cls.limit_on == "sum":  # the same limit for each step of an episode
+        bound = limits * env.world.horizon
     outcomes = Outcomes(problem.total_timesteps)
     settings = {"seed": seed, "device": "cpu", **kwargs}
     if issubclass(cls, OnPolicyAlgorithm):
         settings.setdefault("n_steps", problem.n_steps)
-    cls("MlpPolicy", env, cost_limit=limits.tolist(), cost_keys=env.cost_keys, **settings).learn(
+    cls("MlpPolicy", env, cost_limit=bound.tolist(), cost_keys=env.cost_keys, **settings).learn(
         problem.total_timesteps, callback=outcomes
     )
     costs = np.mean(outcomes.worst if problem.statewise else outcomes.costs, axis=0)

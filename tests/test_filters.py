@@ -38,6 +38,8 @@ def points(n_envs: int = 2, **kwargs: Any) -> VecEnv:
 
 def make(cls: Any, env: Any = None, policy: Any = "MlpPolicy", **kwargs: Any) -> Any:
     defaults = {"n_steps": 40, "n_critic_updates": 3, "seed": 0, "device": "cpu", "warmup": 1}
+    if cls is TRPOSL:
+        defaults["tolerance"] = 0.0  # a model that has hardly learnt would correct nothing
     return cls(policy, env or points(), **{**defaults, **kwargs})
 
 
@@ -607,7 +609,7 @@ def test_as_many_steps_without_cost_are_drawn_as_with() -> None:
 
 def test_the_exact_penalty_lowers_the_expected_excess() -> None:
     """Its surrogate's gradient is that of the expected penalty of sampled actions."""
-    model = make(TRPOUSL, points(2), kappa=2.0, threshold=0.1, n_steps=40).learn(80)
+    model = make(TRPOUSL, points(2), kappa=2.0, threshold=0.1, correction_penalty=0.0).learn(80)
     batch = model._batch()
     ratio = th.ones(80, requires_grad=True)
     (found,) = th.autograd.grad(model.surrogate(batch, ratio), ratio)
@@ -616,6 +618,49 @@ def test_the_exact_penalty_lowers_the_expected_excess() -> None:
     expected = (batch.advantages - 2.0 * (penalty - penalty.mean())) / 80
     assert penalty.std() > 0.0
     th.testing.assert_close(found, expected)
+
+
+def test_the_policy_pays_for_corrections() -> None:
+    """By κ times their length, centred: its surrogate's gradient, row by row."""
+    model = make(TRPOUSL, points(2), threshold=0.0, warmup=0, correction_penalty=3.0).learn(80)
+    batch = model._batch()
+    ratio = th.ones(80, requires_grad=True)
+    (found,) = th.autograd.grad(model.surrogate(batch, ratio), ratio)
+    lengths = (model._executed(batch) - model._sampled(batch)).norm(dim=1)
+    assert lengths.std() > 0.0
+    expected = (batch.advantages - 3.0 * (lengths - lengths.mean())) / 80
+    th.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize(("cost", "noise", "moves"), [(0.2, 0.0, True), (0.2, 0.4, False)])
+@pytest.mark.parametrize("slope", [0.3, 0.5])
+def test_what_is_below_the_models_error_is_not_corrected(
+    cost: float, noise: float, moves: bool, slope: float
+) -> None:
+    """ĉ = 0.2 + slope · a at a = 1, threshold 0.3: 0.5 and 0.7 are above it, by less than 0.4."""
+    layer = make(TRPOSL, points(2)).policy.action_filter
+    outputs = th.tensor([[slope, 0.0, 0.0, 0.0]])  # g, h and drift
+    layer.network.forward = lambda observations: outputs
+    layer.threshold.fill_(0.3)
+    layer.noise.fill_(noise)
+    action = np.array([[1.0, 0.0]])
+    executed = layer.correct(th.zeros(1, 4), action, np.array([[cost]]))
+    assert (np.abs(executed - action).max() > 0.1) == moves
+    # far above threshold and error it corrects all the same, if actions matter more than the error
+    executed = layer.correct(th.zeros(1, 4), action, np.array([[5.0]]))
+    assert (np.abs(executed - action).max() > 0.1) == (slope > noise)
+
+
+def test_the_models_error_is_that_of_its_predictions() -> None:
+    model = make(TRPOSL, tolerance=3.0, drift=True).learn(160)
+    layer, batch = model.policy.action_filter, model._batch()
+    with th.no_grad():
+        outputs = layer.network(batch.observations)
+    slopes, drift = outputs[:, :2], outputs[:, 3]
+    actions = th.as_tensor(model.policy.to_unit(batch.executed_actions.numpy()))
+    predicted = batch.previous_costs[:, 0] + (slopes * actions).sum(dim=1) + drift
+    expected = 3.0 * float((predicted - batch.costs[:, 0]).square().mean().sqrt())
+    assert float(layer.noise) == pytest.approx(expected, rel=1e-4) and expected > 0.0
 
 
 class OwnPolicy(ActorCriticPolicy):
@@ -646,6 +691,8 @@ def test_policies_of_ones_own(cls: Any) -> None:
         (TRPOUSL, {"rate": 0.0}, "rate=0.0"),
         (TRPOUSL, {"tolerance": -0.1}, "tolerance=-0.1"),
         (TRPOUSL, {"kappa": -1.0}, "kappa=-1.0"),
+        (TRPOSL, {"tolerance": -1.0}, "tolerance=-1.0"),
+        (TRPOUSL, {"correction_penalty": -1.0}, "correction_penalty=-1.0"),
     ],
 )
 def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) -> None:
@@ -665,6 +712,7 @@ def test_it_stops_before_the_wall(cls: type[FilteredTrustRegion], seed: int) -> 
         gae_lambda=0.9,
         # A wall asks for no more than a few steps of foresight.
         cost_gamma=0.8,
+        correction_penalty=0.0,  # the policy alone is to run into the wall
         cost_limit=0.3,  # a centimetre beyond the wall, in each of the 30 steps
         target_kl=0.05,
         learning_rate=3e-3,

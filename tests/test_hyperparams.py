@@ -298,6 +298,12 @@ TABLE = {
 # Where the default is another one: (the paper's, ours).
 LIMIT = {"cost_limit": (0.0, 2.0)}
 DIFFERENT = {
+    "trpo_sl": {
+        **LIMIT,
+        "tolerance": (0.0, None),
+        "correction_penalty": (0.0, None),
+    },
+    "trpo_usl": {**LIMIT, "correction_penalty": (0.0, None)},
     "trpo": {},
     "cpo": {**LIMIT, "margin_lr": (0.0, None)},
     "pcpo": {**LIMIT, "margin_lr": (0.0, None), "line_search": (False, True)},

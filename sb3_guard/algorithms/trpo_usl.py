@@ -44,6 +44,8 @@ class TRPOUSL(FilteredTrustRegion):
     :param steps: K
     :param rate: η, in units of the action space, which runs from -1 to 1
     :param kappa: weight of the exact penalty; 0 for none, as in GUARD
+    :param correction_penalty: weight of the length of a correction in the policy's objective, in
+        standard deviations of the advantage; 0 for none, as in the paper
     """
 
     label, family, paper = "TRPO-USL", "hierarchical", "Zhang et al. 2022"

@@ -124,8 +124,9 @@ class SafetyLayer(ActionFilter):
     """Projects actions on half-spaces of a cost that is linear in the action (Dalal et al., 2018).
 
     The model is ``ĉ_i(s, a) = c_i + g_i(s) · a``, where c_i is what the last step cost and g a
-    network; the layer executes the nearest action of the box with ĉ_i ≤ threshold_i. A second
-    output ``h_i(s) ≈ c_i`` stands in where the last cost is not known.
+    network; the layer executes the nearest action of the box with ĉ_i ≤ threshold_i. It
+    leaves alone what exceeds that by at most noise_i, or where a unit of every action changes ĉ_i
+    by at most noise_i. A second output ``h_i(s) ≈ c_i`` stands in where the last cost is not known.
 
     :param policy: the policy that carries the filter
     :param n_costs: number m of constraints
@@ -139,6 +140,9 @@ class SafetyLayer(ActionFilter):
         self.drift = drift
         outputs = n_costs * (self.n_actions + 1 + drift)
         super().__init__(StateNetwork(policy, outputs), n_costs)
+        self.register_buffer("noise", th.zeros(n_costs, dtype=th.float64))
+
+    noise: th.Tensor
 
     def _split(self, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Slopes g [B, m, k], last costs h [B, m], drifts b [B, m]."""
@@ -146,6 +150,21 @@ class SafetyLayer(ActionFilter):
         slopes = pieces[..., : self.n_actions]
         drifts = pieces[..., -1] if self.drift else th.zeros_like(pieces[..., 0])
         return slopes, pieces[..., self.n_actions], drifts
+
+    @th.no_grad()
+    def error(
+        self, observations: PyTorchObs, actions: th.Tensor, last: th.Tensor, costs: th.Tensor
+    ) -> th.Tensor:
+        """Root mean square error of ĉ, shape [m].
+
+        :param observations: batch of B observations
+        :param actions: executed ones, in units of the action space, shape [B, k]
+        :param last: what the steps before cost, shape [B, m]
+        :param costs: what these steps cost, shape [B, m]
+        """
+        slopes, _, drifts = self._split(self.network.predict(observations))
+        predicted = last + (slopes * actions[:, None]).sum(dim=2) + drifts
+        return (predicted - costs).square().mean(dim=0).sqrt()
 
     def regression(self) -> Regression:
         """Fits batches (observations, executed actions, last costs) to (costs, last costs)."""
@@ -169,10 +188,14 @@ class SafetyLayer(ActionFilter):
             for each in self._split(self.network(observations))
         )
         clipped = np.clip(actions.astype(np.float64), -1.0, 1.0)
+        noise = self.noise.cpu().numpy()
         limits = self.threshold.cpu().numpy() - (last if costs is None else costs) - drifts
+        excess = np.einsum("bmk,bk->bm", slopes, clipped) - limits
+        certain = ((excess <= 0.0) | (excess > noise)) & (np.abs(slopes).sum(axis=2) > noise)
+        slopes = np.where(certain[..., None], slopes, 0.0)
         if limits.shape[1] == 1:
             return clip_along(clipped, slopes[:, 0], limits[:, 0])
-        broken = (np.einsum("bmk,bk->bm", slopes, clipped) > limits).any(axis=1)
+        broken = (certain & (excess > 0.0)).any(axis=1)
         for i in np.flatnonzero(broken):
             clipped[i] = nearest_in_box(clipped[i], slopes[i], limits[i])
         return clipped

@@ -36,6 +36,9 @@ class FilteredTrustRegion(TrustRegion):
         number of steps
     :param threshold: cost, in the units of the filter's model, that is not corrected; one number or
         one per cost key; None derives it from ``cost_limit``
+    :param correction_penalty: κ: the policy ascends ``E[ratio · (A - κ |x - a|)]``, x the executed
+        and a the sampled action in units of the action space, or it learns to push against the
+        filter; 0 for none, as in the papers
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -52,8 +55,10 @@ class FilteredTrustRegion(TrustRegion):
         *args: Any,
         warmup: int | float = 1 / 3,
         threshold: float | Sequence[float] | None = None,
+        correction_penalty: float = 1.0,
         **kwargs: Any,
     ) -> None:
+        self.correction_penalty = correction_penalty
         self.warmup = warmup
         self.threshold = threshold
         # Steps after which the filter is switched on; known once `learn` was called.
@@ -79,6 +84,7 @@ class FilteredTrustRegion(TrustRegion):
             check_integer("warmup", self.warmup, 0)
         else:
             check_number("warmup", self.warmup, 0.0, 1.0, "[]")
+        check_number("correction_penalty", self.correction_penalty)
         if self.threshold is not None:
             check_per_cost("threshold", self.threshold, tuple(self.cost_keys))
 
@@ -146,9 +152,20 @@ class FilteredTrustRegion(TrustRegion):
         """The sampled actions likewise, clipped to the box, shape [B, k]."""
         return self._unit(self.policy.executable(batch.actions.cpu().numpy()))
 
+    def _corrections(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """How far the executed actions are from the sampled ones, shape [B]."""
+        return (self._executed(batch) - self._sampled(batch)).norm(dim=1)
+
+    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
+        objective = super().surrogate(batch, ratio)
+        lengths = self._corrections(batch)
+        if self.correction_penalty == 0.0 or not lengths.any():
+            return objective
+        return objective - self.correction_penalty * (ratio * (lengths - lengths.mean())).mean()
+
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         """Log what was corrected; leaves then fit their model."""
-        lengths = (self._executed(batch) - self._sampled(batch)).norm(dim=1)
+        lengths = self._corrections(batch)
         corrected = lengths > 1e-5
         self.logger.record("train/corrected_fraction", corrected.float().mean().item())
         norm = lengths[corrected].mean().item() if corrected.any() else 0.0

@@ -2,7 +2,8 @@
 
 ``docs/data/NAME.tar.xz`` holds the logs of a grid of runs, as ``benchmark`` writes them, without
 models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
-a page stands what this makes of them. ``--pack FOLDER NAME`` packs the logs of a folder.
+a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``.
+``--pack FOLDER NAME`` packs the logs of a folder.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
-BLOCK = re.compile(r"(<!-- runs: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- runs: (\S+)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml")
 
 
@@ -38,12 +39,14 @@ def runs(name: str) -> pd.DataFrame:
         return with_safety(found.runs)
 
 
-def tables(name: str) -> str:
+def tables(name: str, only: str | None) -> str:
     """A table for each suite of a grid, with the published values where there are some."""
     means = aggregate(runs(name))
     published = pd.read_csv(DATA / "published.csv", index_col=["suite", "algo"])
     parts = []
     for suite, rows in means.groupby("suite", sort=False):
+        if only not in (None, suite):
+            continue
         known = published.loc[suite] if suite in published.index else published.iloc[:0]
         digits = 2 if rows["return_last"].abs().max() < 100 else 0
         columns: dict[str, Any] = {
@@ -52,15 +55,19 @@ def tables(name: str) -> str:
             "return": lambda row, n=digits: spread(row["return_last"], row["return_last_se"], n),
             "episode cost": lambda row: spread(row["cost_last"], row["cost_last_se"], 1),
             "episodes above the limit": lambda row: number(100 * row["above_limit"], 0) + "\xa0%",
-            "95 % of costs": lambda row: number(row["cost_p95"], 0),
+            "95 % of costs below": lambda row: number(row["cost_p95"], 0),
             "cost of training": whole("cost_total"),
         }
+        if only:
+            for heading in ("seeds", "95 % of costs below", "cost of training"):
+                del columns[heading]
         if len(known):
             columns["published return"] = lambda row, of=known: _published(of, row["algo"])
             columns["published cost"] = lambda row, of=known: (
                 number(of.loc[row["algo"], "cost"], 0) if row["algo"] in of.index else "–"
             )
-        parts.append(f"**{suite}**\n\n{markdown(spelled(rows, columns))}")
+        heading = "" if only else f"**{suite}**\n\n"
+        parts.append(heading + markdown(spelled(rows, columns)))
     return "\n\n".join(parts)
 
 
@@ -73,12 +80,13 @@ def _published(known: pd.DataFrame, algo: str) -> str:
 
 def filled(page: str) -> str:
     """A page with its tables made anew."""
-    return BLOCK.sub(lambda m: f"{m[1]}\n{tables(m[2])}\n\n{m[3]}", page)
+    return BLOCK.sub(lambda m: f"{m[1]}\n{tables(m[2], m[3])}\n\n{m[4]}", page)
 
 
 def pages() -> dict[Path, str]:
     """Every page that has such a table, as it should be."""
-    texts = {path: path.read_text() for path in sorted(DOCS.glob("*.md"))}
+    files = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))]
+    texts = {path: path.read_text() for path in files}
     return {path: filled(text) for path, text in texts.items() if BLOCK.search(text)}
 
 
@@ -105,7 +113,9 @@ def main() -> None:
     for path, text in pages().items():
         path.write_text(text)
         print(path)
-        for _, name, _ in BLOCK.findall(text):
+        for _, name, only, _ in BLOCK.findall(text):
+            if only:
+                continue
             for drawing in draw("pareto", Data(runs(name))):
                 if drawing.figure is not None:
                     save(drawing.figure, DOCS / "images" / f"{drawing.name}.png")

@@ -121,3 +121,8 @@ def test_commands_named_in_the_readme_exist():
         assert importlib.util.find_spec(module), module
     for path in re.findall(r"python (scripts/\w+\.py)", text):
         assert os.access(ROOT / path, os.R_OK), path
+
+
+def test_tables_of_results_are_made_of_their_logs():
+    for path, text in script("make_tables").pages().items():
+        assert path.read_text() == text, "run `python scripts/make_tables.py`"

@@ -105,10 +105,10 @@ def seconds_of_update(model: BaseAlgorithm) -> float:
     spent = 0.0
     update = type(model).train
 
-    def timed(*args: object) -> None:
+    def timed(*args: Any, **kwargs: Any) -> None:
         nonlocal spent
         started = time.process_time()
-        update(model, *args)
+        update(model, *args, **kwargs)
         spent += time.process_time() - started
 
     model.train = timed  # type: ignore[method-assign, attr-defined]

@@ -144,6 +144,8 @@ def test_the_actors_loss_by_hand() -> None:
     batch = model.replay_buffer.sample(8)
     loss, values = th.randn(8, 1), th.arange(8.0).reshape(8, 1)
     actions = th.rand(8, 2)
+    model.cost_critic.optimizer.param_groups[0]["lr"] = 0.0
+    model.fit_cost_critic(batch, batch.actions)  # which keeps the deviation of this batch
     with th.no_grad():
         spread = values.std(correction=0) / model.cost_critic(*batch[:2]).std(0, correction=0)
         costs = model.cost_critic(batch.observations, actions)

@@ -139,6 +139,7 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
                 "there are on-policy algorithms such as PPOLag"
             )
         self.cost_gamma = cost_gamma
+        self.cost_deviation = np.zeros(0, np.float32)  # of Q_C in the last batch, shape (m,)
         super().__init__(policy, env, *args, **kwargs)
 
     # Construction and saving
@@ -225,11 +226,16 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         with th.no_grad():
             after = critic.larger(critic.target(batch.next_observations, next_actions))
             target = batch.costs + (1 - batch.dones) * gamma * after  # [B, m]
-        values = th.cat(critic.online(batch.observations, batch.actions), dim=1)
+        # the actor's step then goes through it without gradients of its weights
+        critic.online.requires_grad_(True)
+        each = critic.online(batch.observations, batch.actions)
+        self.cost_deviation = critic.larger(each).detach().std(dim=0, correction=0).cpu().numpy()
+        values = th.cat(each, dim=1)
         loss = F.mse_loss(values.unflatten(1, (-1, 2)), target[:, :, None].expand(-1, -1, 2))
         critic.optimizer.zero_grad()
         loss.backward()
         critic.optimizer.step()
+        critic.online.requires_grad_(False)
         return loss.item()
 
 
@@ -287,11 +293,8 @@ class LagrangianReplay(Lagrangian, CostReplay):
         :param values: Q of the batch's own actions, shape [B, 1]
         :return: shape [B, 1]
         """
-        with th.no_grad():
-            costs = self.cost_critic(batch.observations, batch.actions)
-        deviations = costs.std(dim=0, correction=0).double().cpu().numpy()
-        spread = (float(values.detach().std(correction=0)) or 1.0) * inverse(deviations)
-        price = self.price(spread)
+        spread = float(values.detach().std(correction=0)) or 1.0
+        price = self.price(spread * inverse(self.cost_deviation.astype(np.float64)))
         if not price.any():
             return loss
         weights = th.as_tensor(price, device=loss.device)

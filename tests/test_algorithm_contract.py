@@ -793,16 +793,18 @@ SB3_KEYS = {
     "rollout/ep_cost_mean",
     "rollout/cost_rate",
 }
-COST_CRITIC_KEYS = {"train/cost_value_loss", "train/cost_surrogate"}
+COST_CRITIC_KEYS = {"train/cost_value_loss", "train/cost_surrogate"} | {
+    f"train/cost_change{end}" for end in ("", "_promised")
+}
 FILTER_KEYS = {"train/corrected_fraction", "train/correction_norm", "train/cost_model_loss"}
 OWN_KEYS: dict[str, set[str]] = {
     "TRPO": set(),
     "CPO": {"train/cpo_case", "train/nu", "train/lambda_kl", "train/cost_margin"},
     "PCPO": {"train/projection", "train/cost_margin"},
-    "TRPOLag": {"train/multiplier"},
+    "TRPOLag": {"train/multiplier", "train/price"},
     "TRPOFAC": {"train/multiplier", "train/multiplier_std"},
     "TRPOIPO": {"train/multiplier"},
-    "TRPOSL": FILTER_KEYS,
+    "TRPOSL": FILTER_KEYS | {"train/cost_model_error"},
     "TRPOUSL": FILTER_KEYS,
     "CRPO": {"train/rectifies"},
     "RCPO": {"train/multiplier", "train/price"},

@@ -87,7 +87,7 @@ def test_what_cannot_be_measured_is_refused():
 
 
 def test_rl_zoos_command_with_our_algorithm(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", [])
+    monkeypatch.setattr(sys, "argv", ["train"])
     command = (
         "train --algo guard_trpo --env SafetyPointGoal1-v0 -n 400 "
         "--eval-freq 200 --eval-episodes 1 -f"
@@ -116,7 +116,7 @@ def test_rl_zoos_search_in_our_space(tmp_path, monkeypatch):
         return learn(self, *args, **kwargs)
 
     monkeypatch.setattr(CPO, "learn", noted)
-    monkeypatch.setattr(sys, "argv", [])
+    monkeypatch.setattr(sys, "argv", ["train"])
     command = (
         "train --algo cpo --env CostPoint-v0 --gym-packages registered_envs -n 60 --device cpu "
         "--optimize --no-optim-plots --n-trials 2 --n-evaluations 1 --eval-episodes 1 --seed 1 -f"

@@ -5,7 +5,9 @@ model alternate, and the best slice of each counts; of a reset, the best of five
 ``python scripts/bench_engine.py`` prints the marks for one suite, ``--all`` a table of every suite,
 ``--suites`` one of those whose ids match. On a machine with neighbours ``--rounds 5`` goes through
 the table five times and takes the best of each figure, which may be of different rounds: noise
-comes and goes in minutes.
+comes and goes in minutes; with ``--threads 1``, timed by what one core had for it, it hardly counts.
+``--beside PYTHON`` runs the real Safety-Gymnasium, in the environment that
+``scripts/check_safety_gymnasium.py`` sets up, in turn with our task of the same id, on one core.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import argparse
 import fnmatch
 import math
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -37,23 +40,30 @@ def as_shipped(on: bool) -> None:
         CLOCK.value = SHIPPED if on else None
 
 
-def best(functions: dict[str, Callable[[], int]], seconds: float, slices: int) -> dict[str, float]:
+def best(
+    functions: dict[str, Callable[[], int]],
+    seconds: float,
+    slices: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, float]:
     """Env-steps/s of each function: the best of alternating slices."""
     rates = dict.fromkeys(functions, 0.0)
     for _ in range(slices):
         for name, function in functions.items():
             as_shipped(name == "bare")
-            start, steps = time.perf_counter(), 0
-            while time.perf_counter() - start < seconds / slices:
+            start, steps = clock(), 0
+            while clock() - start < seconds / slices:
                 steps += function()
-            rates[name] = max(rates[name], steps / (time.perf_counter() - start))
+            rates[name] = max(rates[name], steps / (clock() - start))
     return rates
 
 
-def batch_rates(env_id: str, n: int, seconds: float, slices: int) -> dict[str, float]:
+def batch_rates(
+    env_id: str, n: int, seconds: float, slices: int, threads: int | None = None
+) -> dict[str, float]:
     """Full vector step against a bare loop of the same Batch, N = n."""
     scenario = env_spec(env_id).kwargs["scenario"]
-    full = GuardVecEnv(scenario, n)
+    full = GuardVecEnv(scenario, n, num_threads=threads)
     full.seed(0)
     full.reset()
     engine = full.envs.engine
@@ -81,7 +91,8 @@ def batch_rates(env_id: str, n: int, seconds: float, slices: int) -> dict[str, f
 
     # staggered episodes, as in a long training
     engine.steps[:] = np.arange(n) * (full.envs.max_episode_steps // n)
-    return best({"full": step_full, "bare": step_bare}, seconds, slices)
+    clock = time.process_time if threads == 1 else time.perf_counter
+    return best({"full": step_full, "bare": step_bare}, seconds, slices, clock)
 
 
 def single_rates(env_id: str, seconds: float, slices: int) -> dict[str, float]:
@@ -126,6 +137,53 @@ def reset_seconds(env_id: str, n: int = 100, repeats: int = 5) -> float:
     return float(seconds.min(axis=0).mean())
 
 
+# Steps per second of CPU time, and seconds of a reset, for each line that comes in
+REAL = """
+import sys, time
+import numpy, safety_gymnasium
+env = safety_gymnasium.make(sys.argv[1])
+rng = numpy.random.default_rng(0)
+for _ in sys.stdin:
+    start = time.process_time()
+    env.reset(seed=0)
+    begun = time.process_time()
+    for _ in range(300):
+        env.step(rng.uniform(-1, 1, env.action_space.shape))
+    print(300 / (time.process_time() - begun), begun - start, flush=True)
+"""
+
+
+def beside(python: str, env_id: str, turns: int = 5) -> None:
+    """Print our steps per second of one core's time, and those of the real package."""
+    command = [python, "-W", "ignore", "-c", REAL, env_id]
+    real = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    assert real.stdin is not None and real.stdout is not None
+    ours, theirs, longest = 0.0, 0.0, math.inf
+    scenario = env_spec(env_id).kwargs["scenario"]
+    rng = np.random.default_rng(0)
+    for _ in range(turns):
+        env = GuardVectorEnv(30, scenario, num_threads=1)
+        env.reset(seed=0)
+        start = time.process_time()
+        for _ in range(100):
+            env.step(rng.uniform(-1, 1, env.action_space.shape))
+        ours = max(ours, 3000 / (time.process_time() - start))
+        env.close()
+        print(file=real.stdin, flush=True)
+        rate, seconds = map(float, real.stdout.readline().split())
+        theirs, longest = max(theirs, rate), min(longest, seconds)
+    real.stdin.close()
+    real.wait()
+    reset = reset_seconds(env_id, n=20)
+    print(f"{env_id}, per second of one core: steps, of whole episodes of 1,000 with their reset")
+    whole, own = 1000 / (1000 / theirs + longest), 1000 / (1000 / ours + reset)
+    print(f"the package  {theirs:>7,.0f} {whole:>7,.0f}, a reset {longest:.2f} s")
+    print(f"ours, N = 30 {ours:>7,.0f} {own:>7,.0f}, a reset {1e3 * reset:.2f} ms")
+    print(f"times as many {ours / theirs:>6.1f} {own / whole:>7.1f}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="Goal_Point_8Hazards-v0", help="the suite to measure")
@@ -137,10 +195,14 @@ def main() -> None:
         metavar="PATTERN",
         help="a table of the suites whose ids match, such as '*_Arm?_*'",
     )
+    table.add_argument("--beside", metavar="PYTHON", help="that Python's Safety-Gymnasium instead")
     parser.add_argument("--seconds", type=float, default=6.0, help="time for each figure")
     parser.add_argument("--slices", type=int, default=20, help="slices that alternate")
     parser.add_argument("--rounds", type=int, default=1, help="times through a table")
+    parser.add_argument("--threads", type=int, help="1: by the time that one core had for it")
     args = parser.parse_args()
+    if args.beside:
+        return beside(args.beside, args.env)
     patterns = ["*"] if args.all else args.suites or []
     if args.rounds < 1:
         parser.error(f"--rounds {args.rounds} must be at least 1")
@@ -157,7 +219,7 @@ def main() -> None:
             for turn in range(args.rounds):
                 for i, env_id in enumerate(suites, 1):
                     print(f"\rround {turn + 1}, {i} of {len(suites)} ", end="", file=sys.stderr)
-                    rates = batch_rates(env_id, 30, args.seconds / 6, args.slices)
+                    rates = batch_rates(env_id, 30, args.seconds / 6, args.slices, args.threads)
                     full[env_id] = max(full[env_id], rates["full"])
                     bare[env_id] = max(bare[env_id], rates["bare"])
                     reset[env_id] = min(reset[env_id], 1e3 * reset_seconds(env_id))
@@ -173,7 +235,7 @@ def main() -> None:
     rates = single_rates(args.env, args.seconds, args.slices)
     for n in (1, 30, 128):
         if n > 1:
-            rates = batch_rates(args.env, n, args.seconds, args.slices)
+            rates = batch_rates(args.env, n, args.seconds, args.slices, args.threads)
         ratio = rates["full"] / rates["bare"]
         print(f"N = {n:>3}  {rates['full']:>9,.0f}  {rates['bare']:>9,.0f}  {ratio:.2f}")
     print(f"reset {1e3 * reset_seconds(args.env):.2f} ms, layout, state and first observation")

@@ -63,6 +63,7 @@ class Trace:
         """Put row i into state ``rows[i]``, with the goal and the timer of state ``task[i]``."""
         engine, batch, n = self.engine, self.engine.batch, len(rows)
         world = self["world"][rows]
+        batch.clear(np.arange(n))
         batch.bind("qpos")[:n], batch.bind("qvel")[:n] = self["qpos"][rows], self["qvel"][rows]
         batch.bind("qacc_warmstart")[:n] = 0.0
         batch.bind("time")[:n] = self["time"][rows]

@@ -133,6 +133,34 @@ def test_sensors_of_bodies_that_fall_asleep_are_up_to_date():
     assert 0.09 < ours.sensordata[0, 2] < 0.11
 
 
+def test_objects_asleep_stay_where_they_are_and_are_restored_bit_for_bit():
+    scenario = Scenario.parse("SafetyPointGoal2-v0")
+    asleep, awake, resumed = (
+        scenario.override(arena={"sleep": sleep}).build(3, num_threads=1)
+        for sleep in (True, False, True)
+    )
+    rng = np.random.default_rng(0)
+    for engine in (asleep, awake):
+        for row in range(3):
+            engine.seed(row, np.random.default_rng(row))
+        engine.reset(np.arange(3))
+        engine.batch.bind("qpos")
+    trees = asleep.batch.bind("tree_asleep")
+    resumed.batch.bind("qpos")
+    for step in range(40):
+        actions = rng.uniform(-1, 1, (3, 2))
+        asleep.step(actions)
+        awake.step(actions)
+        if step == 20:
+            assert (trees[:, 1:] >= 0).sum() >= 28  # of thirty vases
+            resumed.restore(asleep.state())
+        elif step > 20:
+            resumed.step(actions)
+            np.testing.assert_array_equal(resumed.batch.qpos, asleep.batch.qpos)
+    np.testing.assert_allclose(asleep.batch.qpos, awake.batch.qpos, atol=1e-6)
+    assert (asleep.batch.qpos != awake.batch.qpos).any()
+
+
 def test_models_that_are_refused_leave_the_batch_as_it_was():
     ours, theirs = pair("Goal_Point_8Hazards")
     with pytest.raises(ValueError, match="a model per simulation"):

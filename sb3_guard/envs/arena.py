@@ -18,6 +18,7 @@ INTEGRATORS = {
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
+STILL = 1e-6  # m/s: slower than what any cost tells from rest
 WALL = 0.3  # m, height of walls as they are drawn around robots in the plane
 
 
@@ -72,6 +73,10 @@ class Arena(Part):
     integrator: str | None = param(
         None, "how MuJoCo integrates a physics step", choices=(None, *INTEGRATORS)
     )
+    sleep: bool = param(
+        False,
+        "whether free objects at rest, slower than 1e-6 m/s, cost no time until they are touched",
+    )
     condim: int = param(
         3, "dimensions of friction of the floor and of objects", choices=(1, 3, 4, 6)
     )
@@ -97,6 +102,9 @@ class Arena(Part):
             spec.option.timestep = timestep  # attach() keeps the parent's options
         if integrator is not None:
             spec.option.integrator = INTEGRATORS[integrator]
+        if self.sleep:
+            spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+            spec.option.sleep_tolerance = STILL
         spec.default.geom.condim = self.condim
         if self.walls == "none":
             return

@@ -410,7 +410,7 @@ class Engine:
     def state(self) -> dict[str, Any]:
         """Everything that the coming steps depend on, as plain arrays and mappings."""
         return {
-            "batch": self.batch.state.copy(),
+            "batch": self.batch.snapshot(),
             "arrays": {name: a.copy() for name, a in self._arrays.items()},
             "rngs": [rng.bit_generator.state for rng in self.rngs],
             "origins": dict(self._origins),

@@ -60,8 +60,8 @@ class Physics(Batch):
         super().__init__(model, nsim, nthread, persistent=True)
         self.frame_skip, self.stage = frame_skip, stage
         self._switched: mujoco.MjModel | None = None
-        sleep = model.opt.enableflags & SLEEP
-        if nsim > 1 and stage != NONE and not (model.nhistory or model.nplugin or sleep):
+        self._sleeps = bool(model.opt.enableflags & SLEEP)
+        if nsim > 1 and stage != NONE and not (model.nhistory or model.nplugin or self._sleeps):
             self._switched = copy.copy(model)
             super().set_models(self._switched)
             self._models = None  # not the caller's: named views write per-simulation fields
@@ -114,8 +114,20 @@ class Physics(Batch):
         self.forward(ids, stage=ACC)
         self._warned[ids] = self._warnings[ids]
 
+    def snapshot(self) -> Array:
+        """A copy of ``state``, to restore from.
+
+        It does not hold who is asleep: all wake up here, as they do in :meth:`restore`.
+        """
+        state: Array = self.state.copy()
+        if self._sleeps:
+            self.restore(state)
+        return state
+
     def restore(self, state: Array) -> None:
-        """Continue from a copy of ``state``, bit for bit."""
+        """Continue from a :meth:`snapshot`, bit for bit."""
+        if self._sleeps:
+            self.reset(stage=NONE)
         self.state[:] = state
         self.forward(stage=ACC)
         self.state[:] = state  # without the solver's warm start of the new computation

@@ -5,7 +5,7 @@ model alternate, and the best slice of each counts; of a reset, the best of five
 ``python scripts/bench_engine.py`` prints the marks for one suite, ``--all`` a table of every suite,
 ``--suites`` one of those whose ids match. On a machine with neighbours ``--rounds 5`` goes through
 the table five times and takes the best of each figure, which may be of different rounds: noise
-comes and goes in minutes; with ``--threads 1``, timed by what one core had for it, it hardly counts.
+comes and goes in minutes; with ``--threads 1``, by the time that one core had, it hardly counts.
 ``--beside PYTHON`` runs the real Safety-Gymnasium, in the environment that
 ``scripts/check_safety_gymnasium.py`` sets up, in turn with our task of the same id, on one core.
 """

@@ -75,7 +75,8 @@ class Arena(Part):
     )
     sleep: bool = param(
         False,
-        "whether free objects at rest, slower than 1e-6 m/s, cost no time until they are touched",
+        "whether free objects at rest, slower than 1e-6 m/s, cost no time until they are touched; "
+        "checkpoints wake them, so the last bits of a run depend on when they are written",
     )
     condim: int = param(
         3, "dimensions of friction of the floor and of objects", choices=(1, 3, 4, 6)

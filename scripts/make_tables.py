@@ -25,6 +25,7 @@ from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
 BLOCK = re.compile(r"(<!-- runs: (\S+)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+PUBLISHED_STEPS = 1_000_000
 LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml")
 
 
@@ -41,13 +42,16 @@ def runs(name: str) -> pd.DataFrame:
 
 def tables(name: str, only: str | None) -> str:
     """A table for each suite of a grid, with the published values where there are some."""
-    means = aggregate(runs(name))
+    found = runs(name)
+    means = aggregate(found)
+    speeds = (found["steps"] / found["seconds"]).groupby([found["suite"], found["algo"]]).max()
     published = pd.read_csv(DATA / "published.csv", index_col=["suite", "algo"])
     parts = []
     for suite, rows in means.groupby("suite", sort=False):
         if only not in (None, suite):
             continue
-        known = published.loc[suite] if suite in published.index else published.iloc[:0]
+        compared = suite in published.index and (rows["steps"] == PUBLISHED_STEPS).all()
+        known = published.loc[suite] if compared else published.iloc[:0]
         digits = 2 if rows["return_last"].abs().max() < 100 else 0
         columns: dict[str, Any] = {
             "algorithm": "label",
@@ -57,9 +61,10 @@ def tables(name: str, only: str | None) -> str:
             "episodes above the limit": lambda row: number(100 * row["above_limit"], 0) + "\xa0%",
             "95 % of costs below": lambda row: number(row["cost_p95"], 0),
             "cost of training": whole("cost_total"),
+            "steps/s": lambda row, of=speeds[suite]: number(of[row["algo"]], 0),
         }
         if only:
-            for heading in ("seeds", "95 % of costs below", "cost of training"):
+            for heading in ("seeds", "95 % of costs below", "cost of training", "steps/s"):
                 del columns[heading]
         if len(known):
             columns["published return"] = lambda row, of=known: _published(of, row["algo"])
@@ -75,7 +80,8 @@ def _published(known: pd.DataFrame, algo: str) -> str:
     if algo not in known.index:
         return "–"
     row = known.loc[algo]
-    return spread(row["return"], row["return_std"], 2 if abs(row["return"]) < 1 else 1)
+    digits = 2 if abs(row["return"]) < 1 else 1 if abs(row["return"]) < 100 else 0
+    return spread(row["return"], row["return_std"], digits)
 
 
 def filled(page: str) -> str:

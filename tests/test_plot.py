@@ -327,6 +327,13 @@ def test_a_table_of_runs_has_those_asked_for(small, tmp_path, capsys):
     assert plot.main([*means, "--cost-limit", "5"]) == 0
 
 
+def test_suites_may_have_limits_of_their_own(small, tmp_path):
+    fake_run(small, "cpo", "SafetyPointGoal1-v0", cost_limit=25.0)
+    assert plot.main([str(small), "--table", str(tmp_path / "r.md")]) == 0
+    text = (tmp_path / "r.md").read_text()
+    assert "| 25 " in text and "| 0 " in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

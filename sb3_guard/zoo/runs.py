@@ -253,16 +253,16 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The runs that may be averaged: of runs that are the same, seed included, the last one counts.
 
-    :raises UsageError: there are several cost limits, several lengths of an algorithm on a suite,
-        or several ``env_kwargs`` on a suite
+    :raises UsageError: a suite has several cost limits or ``env_kwargs``, or an algorithm on it
+        several lengths
     """
-    limits = _limits_of(runs)
-    if len(limits) > 1:
-        raise UsageError(
-            f"there are runs at several cost limits, {', '.join(limits)}, which can't be averaged; "
-            f"choose one, such as --cost-limit {limits[0]}"
-        )
     for suite, group in runs.groupby("suite"):
+        limits = _limits_of(group)
+        if len(limits) > 1:
+            raise UsageError(
+                f"there are runs on {suite} at several cost limits, {', '.join(limits)}, which "
+                f"can't be averaged; choose one, such as --cost-limit {limits[0]}"
+            )
         worlds = group.drop_duplicates("world")
         if len(worlds) > 1:
             named = "; ".join(

@@ -97,12 +97,14 @@ def with_safety(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The table of runs with the columns of :func:`safety`; NaN where episodes can't be read.
 
-    Unconstrained runs are judged by the limit of the others, if that is the same for all of them.
+    Unconstrained runs are judged by the limit of the others on their suite, if that is the same for
+    all of them.
     """
-    limits = runs["cost_limit"].dropna().unique()
-    common = limits[0] if len(limits) == 1 else math.nan
+    limits = runs.groupby("suite")["cost_limit"].unique().map(lambda all_: all_[~np.isnan(all_)])
 
     def row(run: Any) -> dict[str, float]:
+        others = limits[run["suite"]]
+        common = others[0] if len(others) == 1 else math.nan
         limit = common if pd.isna(run["limits"]) else run["cost_limit"]
         try:
             return safety(read_episodes(run["path"]), run["epoch"], limit)

@@ -7,7 +7,7 @@ python -m sb3_guard.train --gym-packages custom_algorithm --algo trpo_price \
 import torch as th
 
 from sb3_guard import make_vec_env, register_algorithm
-from sb3_guard.algorithms import TrustRegion
+from sb3_guard.algorithms import TrustRegion, hyperparameter
 
 
 class TRPOPrice(TrustRegion):
@@ -18,9 +18,7 @@ class TRPOPrice(TrustRegion):
 
     label, family = "TRPO at a price", "Lagrangian"
 
-    def __init__(self, *args, price=1.0, **kwargs):
-        self.price = price
-        super().__init__(*args, **kwargs)
+    price: float = hyperparameter(1.0)
 
     def surrogate(self, batch, ratio):
         costs = batch.cost_advantages.sum(dim=1)

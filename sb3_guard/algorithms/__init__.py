@@ -4,6 +4,7 @@ from importlib import import_module
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
@@ -119,5 +120,6 @@ __all__ = [
     "TD3Lag",
     "TRPOLag",
     "TrustRegion",
+    "hyperparameter",
     "register_algorithm",
 ]

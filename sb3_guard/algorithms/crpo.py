@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 
@@ -29,13 +29,7 @@ class CRPO(TrustRegion):
         "tolerance": {"low": 0.0, "high": 0.2},
     }
 
-    def __init__(self, *args: Any, tolerance: float = 0.0, **kwargs: Any) -> None:
-        self.tolerance = tolerance
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_number("tolerance", self.tolerance)
+    tolerance: float = hyperparameter(0.0)
 
     @property
     def violated(self) -> int | None:

@@ -6,8 +6,8 @@ import torch as th
 from stable_baselines3.common.distributions import Distribution
 
 from sb3_guard.algorithms.common.actor import kl
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_choice
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 
@@ -41,18 +41,10 @@ class CUP(Lagrangian, FirstOrder):
         "lambda_units": "relative",
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        projection_kl: Literal["forward", "reverse"] = "forward",
-        **kwargs: Any,
-    ) -> None:
-        self.projection_kl = projection_kl
-        super().__init__(*args, **kwargs)
+    projection_kl: Literal["forward", "reverse"] = hyperparameter("forward")
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        check_choice("projection_kl", self.projection_kl, "forward", "reverse")
         if self.gamma == 1.0:
             raise ValueError(
                 "gamma=1.0: CUP weighs costs by (1 - γλ)/(1 - γ), which has no bound there; use a "

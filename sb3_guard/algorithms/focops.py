@@ -6,8 +6,8 @@ import torch as th
 from stable_baselines3.common.distributions import Distribution
 
 from sb3_guard.algorithms.common.actor import kl
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import RELATIVE, Lagrangian
 
@@ -42,21 +42,8 @@ class FOCOPS(Lagrangian, FirstOrder):
     defaults: ClassVar[dict[str, Any]] = RELATIVE
     fixed_arguments: ClassVar[frozenset[str]] = frozenset({"clip_range", "clip_range_vf"})
 
-    def __init__(
-        self,
-        *args: Any,
-        temperature: float = 1.5,
-        trust_region: float = 0.02,
-        **kwargs: Any,
-    ) -> None:
-        self.temperature = temperature
-        self.trust_region = trust_region
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_number("temperature", self.temperature, ends="()")
-        check_number("trust_region", self.trust_region, ends="()")
+    temperature: float = hyperparameter(1.5, ends="()")
+    trust_region: float = hyperparameter(0.02, ends="()")
 
     def train(self) -> None:
         self._price = th.as_tensor(self.price(self.centre_costs()), device=self.device)

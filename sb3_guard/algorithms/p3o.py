@@ -6,8 +6,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_choice, check_number
 from sb3_guard.algorithms.common.first_order import FirstOrder
 
 
@@ -33,21 +33,8 @@ class P3O(FirstOrder):
         "penalty": {"low": 2.0, "high": 50.0, "log": True},
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        penalty: float = 20.0,
-        penalty_units: Literal["relative", "cost"] = "relative",
-        **kwargs: Any,
-    ) -> None:
-        self.penalty = penalty
-        self.penalty_units = penalty_units
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_number("penalty", self.penalty, ends="()")
-        check_choice("penalty_units", self.penalty_units, "relative", "cost")
+    penalty: float = hyperparameter(20.0, ends="()")
+    penalty_units: Literal["relative", "cost"] = hyperparameter("relative")
 
     def train(self) -> None:
         assert self.costs is not None

@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch as th
 
-from sb3_guard.algorithms.common.checks import check_choice
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.margin import Margin
 from sb3_guard.algorithms.common.natural_gradient import projected_step
 from sb3_guard.algorithms.common.trust_region import Region, Trial
@@ -36,20 +36,8 @@ class PCPO(Margin):
         "margin_lr": [0.0, 0.05, 0.1, 0.2],
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        projection: Literal["kl", "l2"] = "kl",
-        line_search: bool = True,
-        **kwargs: Any,
-    ) -> None:
-        self.projection = projection
-        self.line_search = line_search
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_choice("projection", self.projection, "kl", "l2")
+    projection: Literal["kl", "l2"] = hyperparameter("kl")
+    line_search: bool = hyperparameter(True)
 
     def step(self, region: Region) -> th.Tensor:
         g, B, c, delta = region.gradient, region.cost_gradients, region.violation, region.delta

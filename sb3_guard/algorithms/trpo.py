@@ -1,6 +1,6 @@
 """TRPO: the baseline, which maximises return and ignores cost."""
 
-from typing import Any, Literal
+from typing import Any, ClassVar
 
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
@@ -21,11 +21,4 @@ class TRPO(TrustRegion):
     label, family, paper = "TRPO", "unconstrained", "Schulman et al. 2015"
 
     constrained, uses_cost_critic = False, False
-
-    def __init__(
-        self,
-        *args: Any,
-        missing_cost: Literal["error", "zero"] = "zero",
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*args, missing_cost=missing_cost, **kwargs)
+    defaults: ClassVar[dict[str, Any]] = {"missing_cost": "zero"}

@@ -10,9 +10,9 @@ from stable_baselines3.common.utils import update_learning_rate
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
 from sb3_guard.algorithms.common.costs import discounted_limit
 from sb3_guard.algorithms.common.critics import StateNetwork
 from sb3_guard.algorithms.common.trust_region import TrustRegion
@@ -97,31 +97,11 @@ class TRPOFAC(TrustRegion):
         "lambda_epochs": {"low": 1, "high": 20, "log": True},
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        lambda_lr: float = 3e-3,
-        lambda_epochs: int = 10,
-        lambda_init: float | None = None,
-        mode: Literal["statewise", "expected"] = "statewise",
-        units: Literal["relative", "cost"] = "relative",
-        **kwargs: Any,
-    ) -> None:
-        self.lambda_lr = lambda_lr
-        self.lambda_epochs = lambda_epochs
-        self.lambda_init = lambda_init
-        self.mode = mode
-        self.units = units
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_number("lambda_lr", self.lambda_lr)
-        check_integer("lambda_epochs", self.lambda_epochs)
-        if self.lambda_init is not None:
-            check_number("lambda_init", self.lambda_init, ends="()")
-        check_choice("mode", self.mode, "statewise", "expected")
-        check_choice("units", self.units, "relative", "cost")
+    lambda_lr: float = hyperparameter(3e-3)
+    lambda_epochs: int = hyperparameter(10)
+    lambda_init: float | None = hyperparameter(None, ends="()")
+    mode: Literal["statewise", "expected"] = hyperparameter("statewise")
+    units: Literal["relative", "cost"] = hyperparameter("relative")
 
     def _setup_model(self) -> None:
         super()._setup_model()

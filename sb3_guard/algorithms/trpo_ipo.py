@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch as th
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_choice, check_number
 from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
 
 TINY = 1e-12
@@ -56,24 +56,9 @@ class TRPOIPO(TrustRegion):
         "max_multiplier": {"low": 0.5, "high": 20.0, "log": True},
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        t: float = 20.0,
-        max_multiplier: float = 2.0,
-        units: Literal["relative", "cost"] = "relative",
-        **kwargs: Any,
-    ) -> None:
-        self.t = t
-        self.max_multiplier = max_multiplier
-        self.units = units
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_number("t", self.t, ends="()")
-        check_number("max_multiplier", self.max_multiplier, ends="()")
-        check_choice("units", self.units, "relative", "cost")
+    t: float = hyperparameter(20.0, ends="()")
+    max_multiplier: float = hyperparameter(2.0, ends="()")
+    units: Literal["relative", "cost"] = hyperparameter("relative")
 
     def _unit(self) -> np.ndarray:
         """What excesses are measured in, shape (m,): the limit, or J_C where the limit is 0."""

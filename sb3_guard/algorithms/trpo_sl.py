@@ -6,9 +6,9 @@ import numpy as np
 import torch as th
 
 from sb3_guard.algorithms.common.action_filters import SafetyLayer
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 
 
@@ -49,20 +49,8 @@ class TRPOSL(FilteredTrustRegion):
         "tolerance": {"low": 0.0, "high": 4.0},
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        tolerance: float = 1.0,
-        drift: bool = False,
-        **kwargs: Any,
-    ) -> None:
-        self.tolerance = tolerance
-        self.drift = drift
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_number("tolerance", self.tolerance)
+    tolerance: float = hyperparameter(1.0)
+    drift: bool = hyperparameter(False)
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -9,8 +9,8 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.action_filters import UnrolledSafetyLayer
 from sb3_guard.algorithms.common.advantage import gae
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_integer, check_number
 from sb3_guard.algorithms.common.costs import discounted_limit
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 
@@ -56,27 +56,10 @@ class TRPOUSL(FilteredTrustRegion):
         "tolerance": {"low": 0.005, "high": 0.5, "log": True},
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        tolerance: float = 0.05,
-        steps: int = 20,
-        rate: float = 0.05,
-        kappa: float = 0.0,
-        **kwargs: Any,
-    ) -> None:
-        self.tolerance = tolerance
-        self.steps = steps
-        self.rate = rate
-        self.kappa = kappa
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_integer("steps", self.steps)
-        for name in ("tolerance", "kappa"):
-            check_number(name, getattr(self, name))
-        check_number("rate", self.rate, ends="()")
+    tolerance: float = hyperparameter(0.05)
+    steps: int = hyperparameter(20)
+    rate: float = hyperparameter(0.05, ends="()")
+    kappa: float = hyperparameter(0.0)
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -30,6 +30,7 @@ from stable_baselines3.common.noise import (
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.trust import entries, evaluate, import_class, wrapper
@@ -170,17 +171,7 @@ def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] 
 
 def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
     """The hyper-parameters an algorithm takes, from its constructor and those it hands on to."""
-    found: dict[str, inspect.Parameter] = {}
-    for cls in algorithm.__mro__:
-        constructor = cls.__dict__.get("__init__")
-        if constructor is None:
-            continue
-        own = inspect.signature(constructor, eval_str=True).parameters.values()
-        for one in own:
-            if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD):
-                found.setdefault(one.name, one)
-        if all(one.kind is not one.VAR_KEYWORD for one in own):
-            break
+    found = signature(algorithm, getattr(algorithm, "fixed_arguments", frozenset())).parameters
     return {name: one for name, one in found.items() if name not in NOT_HYPERPARAMETERS}
 
 

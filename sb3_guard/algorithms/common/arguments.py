@@ -1,22 +1,90 @@
 """What a constructor takes, said once: signatures and docstrings are composed along the MRO.
 
-Every class spells out its own arguments and hands the others on by ``*args, **kwargs``; where only
-the values differ from those of its bases it states them in ``defaults``. What
+A class states its hyper-parameters as attributes, each once: name, type, default and range::
+
+    temperature: float = hyperparameter(1.5, ends="()")
+
+What else a constructor takes it spells out, and hands the others on by ``*args, **kwargs``; where
+only the values differ from those of its bases, a class states them in ``defaults``. What
 ``inspect.signature``, Shift-Tab in a notebook and the documentation show is the whole list.
 """
 
 import inspect
 import re
+import types
+import typing
 from collections.abc import Mapping
 from functools import wraps
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
 from sb3_guard.spelling import did_you_mean
 
 # Arguments that SB3's own base classes take from the algorithms, not from users.
 _INTERNAL = {"supported_action_spaces", "monitor_wrapper", "support_multi_env", "sde_support"}
 _HANDS_ON = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+class Hyperparameter(NamedTuple):
+    """See :func:`hyperparameter`."""
+
+    default: Any
+    low: float | None
+    high: float
+    ends: str
+
+    def check(self, name: str, value: Any, hint: Any) -> None:
+        """
+        :raises ValueError: ``value`` is not what the annotation and the range allow
+        """
+        union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+        kinds = {*(typing.get_args(hint) if union else (hint,))} - {types.NoneType}
+        if value is None and types.NoneType in typing.get_args(hint):
+            return
+        if typing.get_origin(hint) is typing.Literal:
+            check_choice(name, value, *typing.get_args(hint))
+        elif kinds == {int}:
+            check_integer(name, value, 1 if self.low is None else int(self.low))
+        elif kinds == {float}:
+            check_number(name, value, self.low or 0.0, self.high, self.ends)
+
+
+def hyperparameter(
+    default: Any, low: float | None = None, high: float = np.inf, ends: str = "[)"
+) -> Any:
+    """A hyper-parameter, as an attribute of a class that stands on ``Constrained``.
+
+    The constructor takes it by name. Integers, numbers and literals are checked by the annotation
+    and the range before the model is built; what else has to be checked is for
+    ``_check_hyperparameters``.
+
+    :param default: its value where the call says nothing
+    :param low: least value; None: 1 for integers, 0 for numbers
+    :param high: greatest number
+    :param ends: brackets of the interval of numbers
+    """
+    return Hyperparameter(default, low, high, ends)
+
+
+def stated(cls: type) -> dict[str, Hyperparameter]:
+    """The hyper-parameters that a class and its bases state as attributes."""
+    return {
+        name: one
+        for base in reversed(cls.__mro__)
+        for name, one in vars(base).items()
+        if isinstance(one, Hyperparameter)
+    }
+
+
+def _annotations(cls: type) -> dict[str, Any]:
+    """Those written in this very class, evaluated where that is possible."""
+    try:
+        return inspect.get_annotations(cls, eval_str=True)
+    except (NameError, TypeError):  # what only a type checker can resolve
+        return inspect.get_annotations(cls)
 
 
 def own_arguments(cls: type) -> list[inspect.Parameter]:
@@ -56,12 +124,18 @@ def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signatu
     """
     found: dict[str, inspect.Parameter] = {}
     positional = True
+    only = inspect.Parameter.KEYWORD_ONLY
     for one in cls.__mro__:
+        for name, value in vars(one).items():
+            if isinstance(value, Hyperparameter) and name not in fixed:
+                hint = _annotations(one).get(name, inspect.Parameter.empty)
+                parameter = inspect.Parameter(name, only, default=value.default, annotation=hint)
+                found.setdefault(name, parameter)
         own = own_arguments(one)
         for each in own:
             if each.kind in _HANDS_ON or each.name in fixed | _INTERNAL:
                 continue
-            kind = each.kind if positional else inspect.Parameter.KEYWORD_ONLY
+            kind = each.kind if positional else only
             found.setdefault(each.name, each.replace(kind=kind))
         kinds = {each.kind for each in own}
         if own and inspect.Parameter.VAR_KEYWORD not in kinds:

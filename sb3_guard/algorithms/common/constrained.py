@@ -19,21 +19,24 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sb3_guard.algorithms.common.arguments import (
     check_names,
     documentation,
+    hyperparameter,
     signature,
+    stated,
     taking_defaults,
     with_defaults,
 )
-from sb3_guard.algorithms.common.checks import check_choice, check_per_cost, is_number
+from sb3_guard.algorithms.common.checks import check_per_cost, is_number
 from sb3_guard.algorithms.common.costs import CostEstimate, read_costs
 
 
 class Constrained(BaseAlgorithm):
     """Cost keys, limits and episode costs beside an algorithm of Stable-Baselines3.
 
-    Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. Constructors set their own
-    attributes first and then hand the other arguments on: SB3 builds the model at the end of its
-    own. The signature, the docstring and the name under which ``learn`` logs are composed for
-    every subclass.
+    Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. A subclass states its
+    hyper-parameters as attributes (:func:`~sb3_guard.algorithms.common.arguments.hyperparameter`);
+    one that needs a constructor sets its own attributes first and then hands the other arguments
+    on: SB3 builds the model at the end of its own. The signature, the docstring and the name under
+    which ``learn`` logs are composed for every subclass.
 
     :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key.
         The attribute may be set anew at any time, and holds from the next update on
@@ -59,6 +62,10 @@ class Constrained(BaseAlgorithm):
     #: Arguments of SB3's constructors that the class fills in itself.
     fixed_arguments: ClassVar[frozenset[str]] = frozenset()
 
+    cost_limit: float | Sequence[float] = hyperparameter(0.0)
+    cost_keys: Sequence[str] = hyperparameter(("cost",))
+    missing_cost: Literal["error", "zero"] = hyperparameter("error")
+
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "label" not in vars(cls):
@@ -81,17 +88,9 @@ class Constrained(BaseAlgorithm):
         check_names(cls, kwargs)
         return super().__new__(cls)
 
-    def __init__(
-        self,
-        *args: Any,
-        cost_limit: float | Sequence[float] = 0.0,
-        cost_keys: Sequence[str] = ("cost",),
-        missing_cost: Literal["error", "zero"] = "error",
-        **kwargs: Any,
-    ) -> None:
-        self.cost_limit = cost_limit
-        self.cost_keys = cost_keys
-        self.missing_cost = missing_cost
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        for name, one in stated(type(self)).items():
+            setattr(self, name, kwargs.pop(name, one.default))
 
         # Running episodes outlive rollouts, and a run may be saved between two.
         self.running_costs: np.ndarray | None = None  # [n_envs, m]
@@ -118,7 +117,10 @@ class Constrained(BaseAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         """Refuse values that could only fail later or silently do harm."""
-        check_choice("missing_cost", self.missing_cost, "error", "zero")
+        stated_ones = stated(type(self))
+        for name, parameter in inspect.signature(type(self)).parameters.items():
+            if name in stated_ones:
+                stated_ones[name].check(name, getattr(self, name), parameter.annotation)
         if (
             isinstance(self.cost_keys, str)
             or len(self.cost_keys) < 1

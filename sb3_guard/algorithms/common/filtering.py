@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import obs_as_tensor
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.checks import check_integer, check_number, check_per_cost
 from sb3_guard.algorithms.common.policies import (
@@ -48,19 +49,13 @@ class FilteredTrustRegion(TrustRegion):
     }
     uses_cost_critic = False
 
+    warmup: int | float = hyperparameter(1 / 3)
+    threshold: float | Sequence[float] | None = hyperparameter(None)
+    correction_penalty: float = hyperparameter(1.0)
+
     policy: FilteredPolicy
 
-    def __init__(
-        self,
-        *args: Any,
-        warmup: int | float = 1 / 3,
-        threshold: float | Sequence[float] | None = None,
-        correction_penalty: float = 1.0,
-        **kwargs: Any,
-    ) -> None:
-        self.correction_penalty = correction_penalty
-        self.warmup = warmup
-        self.threshold = threshold
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         # Steps after which the filter is switched on; known once `learn` was called.
         self.filter_from: int | None = None
         super().__init__(*args, **kwargs)
@@ -84,7 +79,6 @@ class FilteredTrustRegion(TrustRegion):
             check_integer("warmup", self.warmup, 0)
         else:
             check_number("warmup", self.warmup, 0.0, 1.0, "[]")
-        check_number("correction_penalty", self.correction_penalty)
         if self.threshold is not None:
             check_per_cost("threshold", self.threshold, tuple(self.cost_keys))
 

@@ -18,9 +18,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import explained_variance
 from torch.nn import functional as F
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
+from sb3_guard.algorithms.common.checks import check_integer, check_number
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.rollouts import CostRollouts
 
@@ -48,15 +49,10 @@ class FirstOrder(CostRollouts, PPO):
         "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},
     }
 
-    def __init__(
-        self, *args: Any, kl_stop: Literal["minibatch", "epoch"] = "minibatch", **kwargs: Any
-    ) -> None:
-        self.kl_stop = kl_stop
-        super().__init__(*args, **kwargs)
+    kl_stop: Literal["minibatch", "epoch"] = hyperparameter("minibatch")
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        check_choice("kl_stop", self.kl_stop, "minibatch", "epoch")
         for name in ("n_steps", "batch_size", "n_epochs"):
             check_integer(name, getattr(self, name))
         for name in ("gamma", "gae_lambda"):

@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3.common.utils import update_learning_rate
 from torch import nn
 
-from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
 
 
@@ -151,49 +151,24 @@ class Lagrangian(Constrained):
         "lambda_init": {"low": 0.0, "high": 2.0},
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        lambda_lr: float = 0.005,
-        lambda_init: float = 0.0,
-        lambda_max: float | None = None,
-        lambda_optimizer: Literal["sgd", "adam"] = "sgd",
-        lambda_update: Literal["before", "after"] = "before",
-        proportional_gain: float = 0.0,
-        derivative_gain: float = 0.0,
-        lambda_smoothing: float = 0.0,
-        lambda_delay: int = 1,
-        lambda_units: Literal["relative", "cost"] = "cost",
-        **kwargs: Any,
-    ) -> None:
-        self.lambda_lr = lambda_lr
-        self.lambda_init = lambda_init
-        self.lambda_max = lambda_max
-        self.lambda_optimizer = lambda_optimizer
-        self.lambda_update = lambda_update
-        self.proportional_gain = proportional_gain
-        self.derivative_gain = derivative_gain
-        self.lambda_smoothing = lambda_smoothing
-        self.lambda_delay = lambda_delay
-        self.lambda_units = lambda_units
-        super().__init__(*args, **kwargs)
+    lambda_lr: float = hyperparameter(0.005)
+    lambda_init: float = hyperparameter(0.0)
+    lambda_max: float | None = hyperparameter(None)
+    lambda_optimizer: Literal["sgd", "adam"] = hyperparameter("sgd")
+    lambda_update: Literal["before", "after"] = hyperparameter("before")
+    proportional_gain: float = hyperparameter(0.0)
+    derivative_gain: float = hyperparameter(0.0)
+    lambda_smoothing: float = hyperparameter(0.0, high=1.0)
+    lambda_delay: int = hyperparameter(1)
+    lambda_units: Literal["relative", "cost"] = hyperparameter("cost")
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        for name in ("lambda_lr", "lambda_init", "proportional_gain", "derivative_gain"):
-            check_number(name, getattr(self, name))
-        if self.lambda_max is not None:
-            check_number("lambda_max", self.lambda_max)
-            if self.lambda_max < self.lambda_init:
-                raise ValueError(
-                    f"lambda_max={self.lambda_max!r}: must be at least lambda_init="
-                    f"{self.lambda_init!r}, where the multipliers begin, or None for no bound"
-                )
-        check_number("lambda_smoothing", self.lambda_smoothing, 0.0, 1.0)
-        check_integer("lambda_delay", self.lambda_delay)
-        check_choice("lambda_units", self.lambda_units, "relative", "cost")
-        check_choice("lambda_optimizer", self.lambda_optimizer, "sgd", "adam")
-        check_choice("lambda_update", self.lambda_update, "before", "after")
+        if self.lambda_max is not None and self.lambda_max < self.lambda_init:
+            raise ValueError(
+                f"lambda_max={self.lambda_max!r}: must be at least lambda_init="
+                f"{self.lambda_init!r}, where the multipliers begin, or None for no bound"
+            )
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -1,11 +1,9 @@
 """Steps that keep linearised cost limits: CPO's, for any cost whose sum is to be bounded."""
 
-from typing import Any
-
 import numpy as np
 import torch as th
 
-from sb3_guard.algorithms.common.checks import check_number
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.margin import Margin
 from sb3_guard.algorithms.common.natural_gradient import Case, constrained_step
 from sb3_guard.algorithms.common.trust_region import Region, Trial
@@ -23,19 +21,9 @@ class LinearisedLimits(Margin):
         be reached, of the root of the sum above
     """
 
-    def __init__(
-        self,
-        *args: Any,
-        cost_reduction: float = 0.0,
-        **kwargs: Any,
-    ) -> None:
-        self.cost_reduction = cost_reduction
-        self._case = Case.INACTIVE
-        super().__init__(*args, **kwargs)
+    cost_reduction: float = hyperparameter(0.0)
 
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_number("cost_reduction", self.cost_reduction)
+    _case = Case.INACTIVE
 
     def step(self, region: Region) -> th.Tensor:
         g, B, c, delta = region.gradient, region.cost_gradients, region.violation, region.delta

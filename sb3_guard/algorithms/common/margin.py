@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 
@@ -22,14 +22,11 @@ class Margin(TrustRegion):
     :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the papers
     """
 
-    def __init__(self, *args: Any, margin_lr: float = 0.1, **kwargs: Any) -> None:
-        self.margin_lr = margin_lr
+    margin_lr: float = hyperparameter(0.1)
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.margin: np.ndarray | None = None  # m, in units of an episode's cost, shape (m,)
         super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_number("margin_lr", self.margin_lr)
 
     def violation(self) -> np.ndarray:
         assert self.costs is not None

@@ -18,7 +18,8 @@ from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.checks import check_integer, check_number
+from sb3_guard.algorithms.common.arguments import hyperparameter
+from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 
@@ -122,15 +123,12 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         "train_freq": [1, 4, 8, 16],
     }
 
+    cost_gamma: float | None = hyperparameter(None, high=1.0)
+
     replay_buffer: CostReplayBuffer | CostDictReplayBuffer
 
     def __init__(
-        self,
-        policy: str | type[BasePolicy],
-        env: GymEnv | str,
-        *args: Any,
-        cost_gamma: float | None = None,
-        **kwargs: Any,
+        self, policy: str | type[BasePolicy], env: GymEnv | str, *args: Any, **kwargs: Any
     ) -> None:
         space = getattr(env, "action_space", None)
         if space is not None and not isinstance(space, spaces.Box):
@@ -138,7 +136,6 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
                 f"{type(self).__name__} needs continuous actions (Box), not {space}: for others "
                 "there are on-policy algorithms such as PPOLag"
             )
-        self.cost_gamma = cost_gamma
         self.cost_deviation = np.zeros(0, np.float32)  # of Q_C in the last batch, shape (m,)
         super().__init__(policy, env, *args, **kwargs)
 
@@ -146,8 +143,8 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        name = "gamma" if self.cost_gamma is None else "cost_gamma"
-        check_number(name, getattr(self, name), 0.0, 1.0)
+        if self.cost_gamma is None:
+            check_number("gamma", self.gamma, 0.0, 1.0)
         if self.n_steps != 1:
             raise ValueError(f"n_steps={self.n_steps!r}: must be 1, costs are replayed by step")
         buffer_class = self.replay_buffer_class
@@ -261,18 +258,7 @@ class LagrangianReplay(Lagrangian, CostReplay):
         "lambda_units": "relative",
     }
 
-    def __init__(
-        self,
-        *args: Any,
-        lambda_starts: int = 0,
-        **kwargs: Any,
-    ) -> None:
-        self.lambda_starts = lambda_starts
-        super().__init__(*args, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_integer("lambda_starts", self.lambda_starts, 0)
+    lambda_starts: int = hyperparameter(0, low=0)
 
     def ascend(self) -> None:
         if self.num_timesteps >= self.lambda_starts:

@@ -21,9 +21,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecEnvWrapper
 
 from sb3_guard.algorithms.common.advantage import discounted_returns
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
-from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.fast.threads import one_thread
@@ -77,17 +77,12 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     #: What critics learn: SB3's λ-returns, or discounted rewards- and costs-to-go.
     returns: ClassVar[Literal["lambda", "discounted"]] = "lambda"
 
+    cost_gamma: float | None = hyperparameter(None, high=1.0, ends="[]")
+    cost_gae_lambda: float | None = hyperparameter(None, high=1.0, ends="[]")
+
     rollout_buffer: CostRolloutBuffer | CostDictRolloutBuffer
 
-    def __init__(
-        self,
-        *args: Any,
-        cost_gamma: float | None = None,
-        cost_gae_lambda: float | None = None,
-        **kwargs: Any,
-    ) -> None:
-        self.cost_gamma = cost_gamma
-        self.cost_gae_lambda = cost_gae_lambda
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         # Shuffles the cost critic's batches: it takes no numbers from anybody else's stream.
         self.cost_rng: np.random.Generator | None = None
         # What the cost critic measures costs in, [m]; 0 until a rollout has any.
@@ -102,9 +97,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        for name in ("cost_gamma", "cost_gae_lambda"):
-            if getattr(self, name) is not None:
-                check_number(name, getattr(self, name), 0.0, 1.0, "[]")
         buffer_class = self.rollout_buffer_class
         if buffer_class is not None and not issubclass(
             buffer_class, CostRolloutBuffer | CostDictRolloutBuffer

@@ -43,7 +43,7 @@ def check_alike(ours, theirs, steps=40):
 )
 def test_sensors_once_in_a_control_step_change_no_bit(suite):
     ours, theirs = pair(suite)
-    assert ours._switched is not None
+    assert ours._late
     assert ours.models is None  # users see none but their own
     check_alike(ours, theirs)
 
@@ -61,7 +61,7 @@ def test_physics_steps_evaluate_no_sensors(monkeypatch):
     ours.advance()
     np.testing.assert_array_equal(seen, [before])  # MuJoCo has not written any
     assert (ours.sensordata != before).any()
-    assert not ours._switched.opt.disableflags & SENSOR
+    assert not ours._copy.opt.disableflags & SENSOR
 
 
 @pytest.mark.parametrize("randomize", ["field", "named view", "constants", "models"])
@@ -81,7 +81,7 @@ def test_users_may_randomize_the_physics(randomize):
             models[1].opt.gravity[2] = -5.0
             batch.set_models(models)
     check_alike(ours, theirs)
-    assert ours._switched is None  # all sensors in every physics step again
+    assert ours._copy is None  # all sensors in every physics step again
     if randomize != "constants":
         assert (ours.qpos[0] != ours.qpos[1]).any()
 
@@ -133,39 +133,77 @@ def test_sensors_of_bodies_that_fall_asleep_are_up_to_date():
     assert 0.09 < ours.sensordata[0, 2] < 0.11
 
 
-def test_objects_asleep_stay_where_they_are_and_are_restored_bit_for_bit():
-    scenario = Scenario.parse("SafetyPointGoal2-v0")
-    asleep, awake, resumed = (
-        scenario.override(arena={"sleep": sleep}).build(3, num_threads=1)
-        for sleep in (True, False, True)
-    )
-    rng = np.random.default_rng(0)
-    for engine in (asleep, awake):
-        for row in range(3):
-            engine.seed(row, np.random.default_rng(row))
-        engine.reset(np.arange(3))
-        engine.batch.bind("qpos")
-    trees = asleep.batch.bind("tree_asleep")
-    resumed.batch.bind("qpos")
-    for step in range(40):
-        actions = rng.uniform(-1, 1, (3, 2))
-        asleep.step(actions)
-        awake.step(actions)
-        if step == 20:
-            assert (trees[:, 1:] >= 0).sum() >= 28  # of thirty vases
-            resumed.restore(asleep.state())
-        elif step > 20:
-            resumed.step(actions)
-            np.testing.assert_array_equal(resumed.batch.qpos, asleep.batch.qpos)
-    np.testing.assert_allclose(asleep.batch.qpos, awake.batch.qpos, atol=1e-6)
-    assert (asleep.batch.qpos != awake.batch.qpos).any()
+PILES = """
+<mujoco>
+  <option timestep="0.004" integrator="implicitfast" sleep_tolerance="1e-4">
+    <flag sleep="enable"/>
+  </option>
+  <worldbody>
+    <geom type="plane" size="2 2 1"/>
+    <body pos="-0.5 0 0.1">
+      <joint name="push" type="slide" axis="1 0 0" damping="1"/>
+      <geom type="box" size="0.1 0.3 0.09" mass="1"/>
+    </body>
+    <body pos="0 0 0.05"><freejoint/><geom type="box" size="0.05 0.05 0.05" mass="0.1"/></body>
+    <body pos="0 0 0.15"><freejoint/><geom type="box" size="0.05 0.05 0.05" mass="0.1"/></body>
+    <body pos="0.2 0 0.05"><freejoint/><geom type="box" size="0.05 0.05 0.05" mass="0.1"/></body>
+    <body pos="0 0.2 0.3"><freejoint/><geom type="box" size="0.05 0.05 0.05" mass="0.1"/></body>
+  </worldbody>
+  <actuator><motor joint="push" gear="4"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("randomize", [None, "field", "models"])
+def test_sleep_is_restored_bit_for_bit(randomize):
+    """Every third physics step: asleep alone, asleep in a pile, and soon to be."""
+    model = mujoco.MjModel.from_xml_string(PILES)
+    ours, restored, left_alone = (Physics(model, N, 1, frame_skip=3) for _ in range(3))
+    batches = (ours, restored, left_alone)
+    fields = ("qpos", "qvel", "xpos", "qacc", "cvel", "tree_asleep")
+    for batch in batches:
+        if randomize == "field":
+            batch.expand("opt.gravity")[:, 2] = [-9.81, -9.0, -8.0]
+        elif randomize == "models":
+            batch.set_models([model, batch.get_model(1), model])
+        for name in fields:
+            batch.bind(name)
+        batch.forward()
+    rng, seen, snapshots = np.random.default_rng(0), set(), []
+    for step in range(400):
+        if step % 40 == 0:
+            push = rng.choice([-1.0, 0.0, 1.0], (N, 1))
+        seen.update(ours.tree_asleep.ravel().tolist())
+        if step % 2 == 0:
+            snapshots.append(ours.snapshot())
+            restored.restore(snapshots[rng.integers(len(snapshots))])  # others asleep
+            restored.restore(snapshots[-1])
+        for batch in batches:
+            batch.ctrl = push
+            batch.advance()
+        np.testing.assert_array_equal(ours.state, left_alone.state)
+        np.testing.assert_array_equal(ours.state, restored.state)
+        for name in fields[2:-1]:
+            np.testing.assert_array_equal(ours.bind(name), restored.bind(name), err_msg=name)
+        same = [np.where(b.tree_asleep == -1, -2, b.tree_asleep) for b in (ours, restored)]
+        np.testing.assert_array_equal(*same)
+    assert model.opt.sleep_tolerance == 1e-4
+    assert seen >= {*range(-11, -1), 1, 2, 3, 4}, seen
+
+
+@pytest.mark.parametrize("suite", ["SafetyPointGoal2-v0", "SafetyCarPush2-v0"])
+def test_sensors_once_in_a_control_step_while_bodies_sleep(suite):
+    ours, theirs = pair(suite)
+    assert ours._late
+    check_alike(ours, theirs)
+    assert (ours.tree_asleep >= 0).any()
 
 
 def test_models_that_are_refused_leave_the_batch_as_it_was():
     ours, theirs = pair("Goal_Point_8Hazards")
     with pytest.raises(ValueError, match="a model per simulation"):
         ours.set_models([ours.model])
-    assert ours._switched is not None
+    assert ours._late
     check_alike(ours, theirs)
     for batch in (ours, theirs):
         batch.expand("opt.gravity")
@@ -183,7 +221,7 @@ def test_simulations_that_mujoco_gives_up_are_told(monkeypatch, nsim, verb):
     monkeypatch.setattr(Batch, verb, fail)
     failed = engine.batch.advance()
     assert failed.tolist() == [False] * (nsim - 1) + [True]
-    assert nsim == 1 or not engine.batch._switched.opt.disableflags & SENSOR
+    assert nsim == 1 or not engine.batch._copy.opt.disableflags & SENSOR
 
 
 def test_an_interrupt_leaves_the_sensors_on(monkeypatch):
@@ -196,5 +234,5 @@ def test_an_interrupt_leaves_the_sensors_on(monkeypatch):
         patch.setattr(Batch, "step", interrupt)
         with pytest.raises(KeyboardInterrupt):
             ours.advance()
-    assert not ours._switched.opt.disableflags & SENSOR
+    assert not ours._copy.opt.disableflags & SENSOR
     check_alike(ours, theirs)

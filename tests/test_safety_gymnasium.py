@@ -94,6 +94,38 @@ def test_gremlins_turn_as_much_when_pushed():
     assert t["cost_gremlins"].sum() > 10 and turns.max() < 5e-3
 
 
+@pytest.mark.parametrize(
+    ("name", "lidar"), [("PointGoal2", "vases_lidar"), ("PointPush1", "box_lidar")]
+)
+def test_sleep_changes_no_step(name, lidar):
+    """From every state of episodes in which what sleeps is driven at, beside all awake."""
+    scenario = Scenario.parse(f"Safety{name}-v0")
+    asleep, awake = (
+        scenario.override(arena={"sleep": sleep}).build(4, num_threads=1) for sleep in (True, False)
+    )
+    for engine in (asleep, awake):
+        for row in range(4):
+            engine.seed(row, np.random.default_rng(row))
+        engine.reset(np.arange(4))
+    slept = woken = costs = 0
+    for step in range(300):
+        seen = asleep.observe()[:, asleep.observation_layout[lidar]].argmax(axis=1)
+        turn = np.where(seen < 8, 1.0, -1.0)
+        drive = np.where((seen < 3) | (seen > 12), 1.0, 0.0) * (step % 100 > 30)
+        actions = np.stack([drive, turn], axis=1)
+        sleepers = asleep.batch.tree_asleep >= 0
+        awake.restore({**asleep.state(), "batch": asleep.batch.state.copy()})
+        a, b = (engine.step(actions) for engine in (asleep, awake))
+        slept += sleepers.sum()
+        woken += (sleepers & (asleep.batch.tree_asleep < 0)).sum()
+        costs += int(a.cost.sum())
+        np.testing.assert_allclose(a.reward, b.reward, rtol=EXACT, atol=1e-9)
+        np.testing.assert_array_equal(a.cost, b.cost)
+        off = np.abs(asleep.observe(np.float64) - awake.observe(np.float64))
+        assert off.max() < EXACT
+    assert slept > 200 and woken >= 4 and costs > 0, (slept, woken, costs)
+
+
 def test_ids_and_time_limits():
     assert set(env_ids("safety_gymnasium")) == {f"Safety{name}-v0" for name in NAVIGATION}
     for name in NAVIGATION:

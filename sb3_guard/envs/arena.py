@@ -18,7 +18,7 @@ INTEGRATORS = {
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
-STILL = 1e-6  # m/s: slower than what any cost tells from rest
+STILL = 1e-8  # m/s: 2e-10 m in a control step, less than what any test tells from rest
 WALL = 0.3  # m, height of walls as they are drawn around robots in the plane
 
 
@@ -75,8 +75,7 @@ class Arena(Part):
     )
     sleep: bool = param(
         False,
-        "whether free objects at rest, slower than 1e-6 m/s, cost no time until they are touched; "
-        "checkpoints wake them, so the last bits of a run depend on when they are written",
+        "whether free objects at rest, slower than 1e-8 m/s, cost no time until they are touched",
     )
     condim: int = param(
         3, "dimensions of friction of the floor and of objects", choices=(1, 3, 4, 6)

@@ -423,7 +423,7 @@ class Engine:
         """
         theirs = {"physics": state["batch"].shape}
         theirs |= {name: array.shape for name, array in state["arrays"].items()}
-        own = {"physics": self.batch.state.shape}
+        own = {"physics": self.batch.snapshot().shape}
         own |= {name: array.shape for name, array in self._arrays.items()}
         if theirs != own:
             raise ValueError(f"the state has arrays {theirs}; those of this engine are {own}")

@@ -22,6 +22,8 @@ ACC = int(mujoco.mjtStage.mjSTAGE_ACC)  # touch, accelerometer and contacts desc
 NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
 SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+REST = int(mujoco.mjMINAWAKE)  # physics steps at rest after which a body may fall asleep
+_NEVER = (mujoco.mjtSleepPolicy.mjSLEEP_NEVER, mujoco.mjtSleepPolicy.mjSLEEP_AUTO_NEVER)
 # CONTACTFULL, CNSTRFULL, BADQPOS, BADQVEL, BADQACC: the result is not to be trusted
 _BAD = slice(int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
 
@@ -34,9 +36,9 @@ class Physics(Batch):
     with the same results bit for bit. The switch is in a copy of the model that the batch runs on.
     Every physics step evaluates the sensors where that copy cannot be, because someone gives
     simulations fields or models of their own; where it could make a difference, because sensors
-    have a history, bodies sleep, plugins read sensors or nothing is computed at the new state; and
-    for a lone simulation, where it gains little. A physics callback in C (``mjcb_control``) reads
-    them as of the last control step.
+    have a history or may fall asleep with what they are on, plugins read sensors or nothing is
+    computed at the new state; and for a lone simulation, where it gains little. A physics callback
+    in C (``mjcb_control``) reads them as of the last control step.
 
     :param model: the model
     :param nsim: number of simulations N
@@ -59,11 +61,15 @@ class Physics(Batch):
         mujoco.set_mju_user_warning(_ignore_warning)
         super().__init__(model, nsim, nthread, persistent=True)
         self.frame_skip, self.stage = frame_skip, stage
-        self._switched: mujoco.MjModel | None = None
+        self._copy: mujoco.MjModel | None = None
         self._sleeps = bool(model.opt.enableflags & SLEEP)
-        if nsim > 1 and stage != NONE and not (model.nhistory or model.nplugin or self._sleeps):
-            self._switched = copy.copy(model)
-            super().set_models(self._switched)
+        self._late = nsim > 1 and stage != NONE and not (model.nhistory or model.nplugin)
+        if self._sleeps:
+            self._late = self._late and _sensors_stay_awake(model)
+            self._asleep = self.bind("tree_asleep")
+        if self._late or self._sleeps:
+            self._copy = copy.copy(model)
+            super().set_models(self._copy)
             self._models = None  # not the caller's: named views write per-simulation fields
         self._warnings = self.warning[:, _BAD, 1]  # live counts since the batch was made
         self._warned = self._warnings.copy()
@@ -76,10 +82,10 @@ class Physics(Batch):
         :return: which simulations diverged or were given up, [N] bool; they are to be reset
         """
         failed = np.zeros(self.nsim, dtype=bool)
-        if self._switched is None:
+        if self._copy is None or not self._late:
             self._steps(failed, before, self.stage)
         else:
-            option = self._switched.opt
+            option = self._copy.opt
             flags = option.disableflags
             option.disableflags = flags | SENSOR
             try:
@@ -115,23 +121,55 @@ class Physics(Batch):
         self._warned[ids] = self._warnings[ids]
 
     def snapshot(self) -> Array:
-        """A copy of ``state``, to restore from.
-
-        It does not hold who is asleep: all wake up here, as they do in :meth:`restore`.
-        """
+        """A copy of ``state`` and, behind it, of who is asleep, to restore from."""
         state: Array = self.state.copy()
-        if self._sleeps:
-            self.restore(state)
-        return state
+        return np.hstack([state, self._asleep]) if self._sleeps else state
 
-    def restore(self, state: Array) -> None:
+    def restore(self, snapshot: Array) -> None:
         """Continue from a :meth:`snapshot`, bit for bit."""
+        state = snapshot[:, : self.nstate]
         if self._sleeps:
-            self.reset(stage=NONE)
+            self._put_to_sleep(state, snapshot[:, self.nstate :])
         self.state[:] = state
         self.forward(stage=ACC)
         self.state[:] = state  # without the solver's warm start of the new computation
         self._warned[:] = self._warnings
+
+    def _put_to_sleep(self, state: Array, asleep: Array) -> None:
+        """Put to sleep the bodies that were, and restore how long the others have been at rest.
+
+        MuJoCo's state does not hold this, and nothing writes it. So all are woken and physics steps
+        taken, each from ``state``, in which bodies count as at rest however fast they are, except
+        where a force of -0.0 is applied, which changes no result: MuJoCo compares its bytes with 0.
+
+        :param state: [N, nstate]
+        :param asleep: MuJoCo's ``tree_asleep``, [N, trees]: at least 0 is asleep; else the physics
+            steps at rest - 11, where -2 means the same as -1: the next at rest is the last awake
+        """
+        rest = np.where(asleep >= 0, REST, np.minimum(asleep, -2) + REST + 1)
+        trees, force = self.model.body_treeid, self.bind("xfrc_applied")
+        self.reset(stage=NONE)
+        tolerances = self._sleep_tolerances(np.full(self.nsim, np.inf))
+        try:
+            for left in range(REST)[::-1]:
+                self.state[:] = state
+                force[(rest <= left)[:, trees] & (trees >= 0)] = -0.0
+                self.step()
+        finally:
+            self._sleep_tolerances(tolerances)
+
+    def _sleep_tolerances(self, new: Array) -> Array:
+        """Set the speed, m/s, below which bodies are at rest; return what it was, [N] both."""
+        if self._copy is None and self.models is None:
+            field = self.expand("opt.sleep_tolerance")
+            old: Array = field.copy()
+            field[:] = new
+            return old
+        options = [(self._copy or self._model_of(i)).opt for i in range(self.nsim)]
+        old = np.array([option.sleep_tolerance for option in options])
+        for option, value in zip(options, new, strict=True):
+            option.sleep_tolerance = value
+        return old
 
     def expand(self, name: str) -> Array:
         self._release()
@@ -144,11 +182,11 @@ class Physics(Batch):
 
     def set_models(self, models: mujoco.MjModel | Sequence[mujoco.MjModel] | None) -> None:
         super().set_models(models)
-        self._switched = None  # not before: the batch reads it as long as the call may fail
+        self._copy = None  # not before: the batch reads it as long as the call may fail
 
     def _release(self) -> None:
         """Run on the batch's own model again: only its fields can differ between simulations."""
-        if self._switched is not None:
+        if self._copy is not None:
             self.set_models(None)
 
 
@@ -158,6 +196,27 @@ def _run(call: Callable[..., None], failed: Array, **arguments: int) -> None:
         call(**arguments)
     except SimulationError as error:
         failed[error.ids] = True
+
+
+def _sensors_stay_awake(model: mujoco.MjModel) -> bool:
+    """Whether every sensor is on a body that never sleeps, or relates something to one."""
+    never = np.append(np.isin(model.tree_sleep_policy, _NEVER), False)  # the last: no tree
+    bodies = {
+        mujoco.mjtObj.mjOBJ_BODY: np.arange(model.nbody),
+        mujoco.mjtObj.mjOBJ_XBODY: np.arange(model.nbody),
+        mujoco.mjtObj.mjOBJ_JOINT: model.jnt_bodyid,
+        mujoco.mjtObj.mjOBJ_GEOM: model.geom_bodyid,
+        mujoco.mjtObj.mjOBJ_SITE: model.site_bodyid,
+    }
+    awake = np.zeros(model.nsensor, dtype=bool)
+    for kinds, ids in (
+        (model.sensor_objtype, model.sensor_objid),
+        (model.sensor_reftype, model.sensor_refid),
+    ):
+        for kind, body in bodies.items():
+            on = kinds == kind
+            awake[on] |= never[model.body_treeid[body[ids[on]]]]
+    return bool(awake.all())
 
 
 def _ignore_warning(message: str) -> None:

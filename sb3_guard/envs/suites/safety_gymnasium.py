@@ -128,6 +128,8 @@ def _scenario(robot: str, level: str) -> dict[str, Any]:
     size, constraints = LEVELS[level]
     seen = {*SEEN.get(task, ()), *constraints}
     lidars = [f"{thing}_lidar" for thing in ORDER if thing in seen]
+    # where something may lie still, and is more work than the robot
+    sleep = robot != "Ant" and bool(seen & {"vases", "box"})
     body = ROBOTS[f"Safety{robot}"]
     assert issubclass(body, SafetyRobot)
     return {
@@ -138,7 +140,7 @@ def _scenario(robot: str, level: str) -> dict[str, Any]:
         "robot_params": STARTS.get(task, {}),
         "lidar": {"falloff": "linear", "range": 6.0 if task == "Circle" else 3.0},
         "layout": {"order": ["robot", *ORDER], "overlap": True},
-        "arena": {"size": size, "condim": 6},
+        "arena": {"size": size, "condim": 6, "sleep": sleep},
         "observe": {"components": [*body.components, *lidars]},
         "cost": "any",
     }

@@ -32,10 +32,10 @@ from stable_baselines3.common.vec_env import (
 from sb3_guard.algorithms import ALGORITHMS, CPO, RCPO, TRPO, TRPOFAC, TRPOSL, TRPOUSL, TrustRegion
 from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.buffers import CostRolloutBuffer
-from sb3_guard.algorithms.common.costs import read_costs
 from sb3_guard.algorithms.common.critics import CostCritic
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
+from sb3_guard.costs import read_costs
 
 # Those off policy have a file of their own, test_off_policy.py.
 CLASSES = [cls for cls in ALGORITHMS.values() if issubclass(cls, OnPolicyAlgorithm)]

@@ -9,17 +9,18 @@ MuJoCo. Wrappers that use the cost are in ``budgets.py``.
 from __future__ import annotations
 
 import copy
-import math
 import pkgutil
 import re
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils import RecordConstructorArgs
+
+from sb3_guard.costs import missing, number
+from sb3_guard.spelling import nearest
 
 #: ``cost(obs, action, next_obs, info)``, see :class:`CostFromFunction`
 CostFunction = Callable[[Any, Any, Any, dict[str, Any]], Any]
@@ -61,8 +62,8 @@ def make_safety_gymnasium(env_id: str, **kwargs: Any) -> gym.Env:
     spec = gym.registry.get(name)
     if spec is None:
         known = [key for key in gym.registry if _SAFETY_GYMNASIUM_ID.fullmatch(key)]
-        near = get_close_matches(name, known, n=1)
-        hint = f": did you mean {near[0]!r}?" if near else ""
+        near = nearest(name, known)
+        hint = "" if near is None else f": did you mean {near!r}?"
         raise gym.error.NameNotFound(f"Safety-Gymnasium has no environment {name!r}{hint}")
     if str(spec.entry_point).endswith(":make_gymnasium_environment"):
         return gym.make(name, **kwargs)
@@ -96,17 +97,6 @@ def _broken(env_id: str, error: Exception) -> DependencyNotInstalled:
     )
 
 
-def number(value: Any, name: str) -> float:
-    """One cost as a float: an int, bool, NumPy scalar or array of one number will do."""
-    try:
-        number = float(value.item() if isinstance(value, np.ndarray) else value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if isinstance(value, str) or not math.isfinite(number):
-        raise ValueError(f"{name} is {value!r}: a cost must be a finite number")
-    return number
-
-
 def _parts(value: Any, name: str) -> dict[str, float] | None:
     """The costs in a dictionary, list, tuple or array by name or number; None for one number."""
     if isinstance(value, Mapping):
@@ -123,20 +113,6 @@ def _charged(info: Mapping[str, Any], value: Any, name: str) -> dict[str, Any]:
         return {**info, "cost": number(value, name)}
     named = {f"cost_{part}": cost for part, cost in parts.items()}
     return {**info, **named, "cost": float(sum(parts.values()))}
-
-
-def entry(info: Mapping[str, Any], key: str, missing_cost: str = "error") -> Any:
-    if key in info:
-        return info[key]
-    if missing_cost == "zero":
-        return 0.0
-    present = sorted(map(str, info))
-    near = get_close_matches(key, present, n=1)
-    hint = f" (nearest: {near[0]!r})" if near else ""
-    raise ValueError(
-        f"info has no cost key {key!r}; its keys are {present}{hint}. Name the right one; "
-        "CostFromInfo(..., missing_cost='zero') is for a key that is absent when nothing is charged"
-    )
 
 
 class CostFromStep(gym.Wrapper, RecordConstructorArgs):
@@ -226,7 +202,11 @@ class CostFromInfo(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: a key is missing and may not be, or its value is not a cost
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
-        values = {key: entry(info, key, self.missing_cost) for key in self.keys}
+        if self.missing_cost == "error":
+            for key in self.keys:
+                if key not in info:
+                    raise missing(info, key)
+        values = {key: info.get(key, 0.0) for key in self.keys}
         if len(values) == 1:
             [(key, value)] = values.items()
             return obs, reward, terminated, truncated, _charged(info, value, f"info[{key!r}]")

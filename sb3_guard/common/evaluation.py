@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.algorithms.common.costs import read_costs
 from sb3_guard.common.monitor import total_cost
+from sb3_guard.costs import read_costs
 
 
 class Estimate(NamedTuple):

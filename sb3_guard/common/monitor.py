@@ -1,5 +1,6 @@
 """Episode statistics with costs, for every vectorised environment."""
 
+import copy
 import inspect
 import os
 import time
@@ -12,14 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_guard.common.vec_budgets import end_rows
-
-
-def _number(value: Any) -> float:
-    """A cost as a float: also of an array of one number."""
-    try:
-        return float(np.asarray(value).item())
-    except (TypeError, ValueError):
-        raise ValueError(f"the environment's cost is {value!r}; it must be a number") from None
+from sb3_guard.costs import number, read_costs
 
 
 def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) -> float:
@@ -30,8 +24,16 @@ def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) ->
     """
     cost = info.get("cost")
     if cost is None:
-        return float(sum(_number(info.get(key, 0.0)) for key in cost_keys))
-    return _number(cost)
+        return sum(number(info.get(key, 0.0), f"info[{key!r}]") for key in cost_keys)
+    return number(cost, "info['cost']")
+
+
+# What a run continues with: names in CostMonitor.state, and the attributes
+KEPT = {
+    "returns": "episode_returns", "lengths": "episode_lengths", "costs": "episode_costs",
+    "key_costs": "_key_costs", "episode_count": "episode_count", "total_cost": "total_cost",
+    "total_steps": "total_steps", "physics_errors": "physics_errors", "t_start": "t_start",
+}  # fmt: skip
 
 
 class CostMonitor(VecMonitor):
@@ -102,8 +104,7 @@ class CostMonitor(VecMonitor):
         self.total_cost += sum(costs)
         self.total_steps += self.num_envs
         if self._columns:
-            for sums, key in zip(self._key_costs, self.cost_keys, strict=True):
-                sums += [_number(info.get(key, 0.0)) for info in infos]
+            self._key_costs += read_costs(infos, self.cost_keys, zero_if_missing=True)[0].T
         if dones.any():
             # Infos may be the environment's own objects: a copy gets the new entry.
             infos = list(infos)
@@ -165,31 +166,14 @@ class CostMonitor(VecMonitor):
 
     def state(self) -> dict[str, Any]:
         """What :meth:`restore` needs to go on counting: sums under way, totals, csv length."""
+        kept = {name: copy.copy(getattr(self, attribute)) for name, attribute in KEPT.items()}
         writer = self.results_writer
-        return {
-            "returns": self.episode_returns.copy(),
-            "lengths": self.episode_lengths.copy(),
-            "costs": self.episode_costs.copy(),
-            "key_costs": self._key_costs.copy(),
-            "episode_count": self.episode_count,
-            "total_cost": self.total_cost,
-            "total_steps": self.total_steps,
-            "physics_errors": self.physics_errors,
-            "t_start": self.t_start,
-            "offset": None if writer is None else writer.file_handler.tell(),
-        }
+        return {**kept, "offset": None if writer is None else writer.file_handler.tell()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on counting from :meth:`state`; the csv is continued by :meth:`log_to`."""
-        self.episode_returns = state["returns"].copy()
-        self.episode_lengths = state["lengths"].copy()
-        self.episode_costs = state["costs"].copy()
-        self._key_costs = state["key_costs"].copy()
-        self.episode_count = state["episode_count"]
-        self.total_cost = state["total_cost"]
-        self.total_steps = state["total_steps"]
-        self.physics_errors = state["physics_errors"]
-        self.t_start = state["t_start"]
+        for name, attribute in KEPT.items():
+            setattr(self, attribute, copy.copy(state[name]))
 
 
 def find_monitor(env: VecEnv) -> CostMonitor:

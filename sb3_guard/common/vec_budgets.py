@@ -12,7 +12,9 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.common.budgets import check, costs_of, join, with_numbers
+from sb3_guard.checks import check_number
+from sb3_guard.common.budgets import join, with_numbers
+from sb3_guard.costs import read_costs
 
 
 def end_rows(venv: VecEnv, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
@@ -112,10 +114,12 @@ class VecRemainingBudget(_Observing):
         unsafe_reward: float | None = None,
         cost_key: str = "cost",
     ) -> None:
-        self.budget = check("budget", budget, 0.0, above=True)
-        self.discount = check("discount", discount, 0.0, 1.0, above=True)
+        check_number("budget", budget, ends="()")
+        self.budget = float(budget)
+        check_number("discount", discount, 0.0, 1.0, "(]")
+        self.discount = float(discount)
         if unsafe_reward is not None:
-            unsafe_reward = check("unsafe_reward", unsafe_reward)
+            check_number("unsafe_reward", unsafe_reward, -np.inf, ends="()")
         self.unsafe_reward = unsafe_reward
         self.cost_key = cost_key
         super().__init__(venv, "budget", 1)
@@ -125,8 +129,8 @@ class VecRemainingBudget(_Observing):
 
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
-        costs = costs_of(infos, self.cost_key)
-        self.numbers = (self.numbers - costs[:, None] / self.budget) / self.discount
+        costs, _ = read_costs(infos, [self.cost_key])  # [N, 1]
+        self.numbers = (self.numbers - costs / self.budget) / self.discount
         if self.unsafe_reward is not None:
             unsafe = np.float32(self.unsafe_reward)
             rewards = np.where(self.numbers[:, 0] < 0.0, unsafe, rewards)
@@ -147,7 +151,7 @@ class VecMaxCost(_Observing):
 
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
-        costs = np.stack([costs_of(infos, key) for key in self.cost_keys], axis=1)
+        costs, _ = read_costs(infos, self.cost_keys)
         increase = np.maximum(costs - self.numbers, 0.0).tolist()
         self.numbers = np.maximum(self.numbers, costs)
         names = [f"{key}_increase" for key in self.cost_keys]
@@ -173,8 +177,10 @@ class VecEarlyTermination(VecEnvWrapper):
         self, venv: VecEnv, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
     ) -> None:
         super().__init__(venv)
-        self.budget = check("budget", budget, 0.0)
-        self.final_reward = check("final_reward", final_reward)
+        check_number("budget", budget)
+        self.budget = float(budget)
+        check_number("final_reward", final_reward, -np.inf, ends="()")
+        self.final_reward = float(final_reward)
         self.cost_key = cost_key
         self.episode_costs = np.zeros(venv.num_envs)
 
@@ -184,7 +190,7 @@ class VecEarlyTermination(VecEnvWrapper):
 
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
-        self.episode_costs += costs_of(infos, self.cost_key)
+        self.episode_costs += read_costs(infos, [self.cost_key])[0][:, 0]
         over = self.episode_costs > self.budget
         if over.any():
             infos = list(infos)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_guard.algorithms.common.checks import check_choice, check_integer, check_number
+from sb3_guard.checks import check_choice, check_integer, check_number
 from sb3_guard.spelling import did_you_mean
 
 # Arguments that SB3's own base classes take from the algorithms, not from users.

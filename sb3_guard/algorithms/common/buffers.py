@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.advantage import discounted_returns, gae
-from sb3_guard.algorithms.common.checks import check_choice
+from sb3_guard.checks import check_choice
 
 
 class CostRolloutBufferSamples(NamedTuple):

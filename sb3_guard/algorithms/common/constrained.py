@@ -25,8 +25,9 @@ from sb3_guard.algorithms.common.arguments import (
     taking_defaults,
     with_defaults,
 )
-from sb3_guard.algorithms.common.checks import check_per_cost, is_number
-from sb3_guard.algorithms.common.costs import CostEstimate, read_costs
+from sb3_guard.algorithms.common.costs import CostEstimate
+from sb3_guard.checks import check_per_cost, is_number
+from sb3_guard.costs import read_costs
 
 
 class Constrained(BaseAlgorithm):

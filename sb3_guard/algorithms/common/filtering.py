@@ -14,13 +14,13 @@ from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_integer, check_number, check_per_cost
 from sb3_guard.algorithms.common.policies import (
     FilteredCnnPolicy,
     FilteredMultiInputPolicy,
     FilteredPolicy,
 )
 from sb3_guard.algorithms.common.trust_region import TrustRegion
+from sb3_guard.checks import check_integer, check_number, check_per_cost
 
 
 class FilteredTrustRegion(TrustRegion):

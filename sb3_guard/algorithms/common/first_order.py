@@ -21,9 +21,9 @@ from torch.nn import functional as F
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_integer, check_number
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.rollouts import CostRollouts
+from sb3_guard.checks import check_integer, check_number
 
 #: ``loss(batch, ratio, distribution)``, see :meth:`FirstOrder.loss`
 Loss = Callable[[CostRolloutBufferSamples, th.Tensor, Distribution], th.Tensor]

@@ -19,9 +19,9 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
-from sb3_guard.algorithms.common.checks import check_number
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
+from sb3_guard.checks import check_number
 
 
 class CostReplayBufferSamples(NamedTuple):

@@ -36,12 +36,12 @@ from stable_baselines3.common.utils import explained_variance
 from sb3_guard.algorithms.common.actor import Actor, actor_modules
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.checks import check_integer, check_number, is_number
 from sb3_guard.algorithms.common.critics import Regression
 from sb3_guard.algorithms.common.fast.actor import actor_of
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
 from sb3_guard.algorithms.common.rollouts import CostRollouts
+from sb3_guard.checks import check_integer, check_number, is_number
 
 
 class Trial(NamedTuple):

@@ -68,10 +68,10 @@ TRAIN = [
     (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError", "hazards"]),
     (["--eval-env-kwargs", "hazards:{'num':200}"], ["LayoutError", "hazards"]),
     (["--env", "CostPoint-v0", "--gym-packages", "registered_envs", "--vec-env", "native"],
-     ["--vec-env native", "dummy or subproc"]),
+     ["'CostPoint-v0' is not an sb3_guard environment", "'dummy' or 'subproc'"]),
     (["--vec-env", "fast"], ["--vec-env", "'fast'", "native"]),
     (["-params", "env_wrapper:gymnasium.wrappers.FlattenObservation", "--vec-env", "native"],
-     ["--vec-env native can't apply env_wrapper"]),
+     ["env_wrapper of a run", "'dummy' or 'subproc'"]),
     # an environment without the cost key
     ([*TOY, "--env", "NoCost-v0"], ["no cost 'cost'", "depth", "cost_keys", "missing_cost:zero"]),
     ([*TOY, "-params", "cost_keys:['heat']"], ["no cost 'heat'"]),

@@ -11,7 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
-from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
+from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.costs import discounted_limit
 from sb3_guard.algorithms.common.critics import StateNetwork
@@ -51,8 +51,8 @@ class StateMultiplier(nn.Module):
     @th.no_grad()
     def predict(self, observations: PyTorchObs) -> th.Tensor:
         """:meth:`forward` without gradients, in slices that bound the memory."""
-        slices = chunks(n_rows(observations))
-        return th.cat([self(rows(observations, index)) for index in slices])
+        each = [network.predict(observations) for network in self.networks]  # type: ignore
+        return F.softplus(th.cat(each, dim=1))
 
     def ascend(self, observations: PyTorchObs, excess: th.Tensor) -> None:
         """One step up the mean over the batch of ``Σ_i λ_i(s) · excess_i``.

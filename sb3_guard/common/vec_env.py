@@ -139,11 +139,7 @@ class GuardVecEnv(VecEnv):
         for name, costs in out.costs.items():
             for info, cost in zip(infos, costs.tolist(), strict=True):
                 info[name] = cost
-        for name, happened in (
-            ("goal_met", out.goal_met),
-            ("goal_unplaced", out.unplaced),
-            ("physics_error", out.physics_error),
-        ):
+        for name, happened in out.events.items():
             if np.count_nonzero(happened):
                 for row in np.flatnonzero(happened).tolist():
                     infos[row][name] = True
@@ -259,7 +255,8 @@ def make_vec_env(
             )
         if wrapped:
             raise ValueError(
-                "wrapper_class needs vec_env 'dummy' or 'subproc': native envs share one batch"
+                "wrapper_class, or env_wrapper of a run, needs vec_env 'dummy' or 'subproc': "
+                "native envs share one batch"
             )
         assert spec is not None
         registered = {k: v for k, v in spec.kwargs.items() if k != "scenario"}

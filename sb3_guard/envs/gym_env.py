@@ -210,12 +210,7 @@ def step_info(outcome: Outcome, row: int) -> dict[str, Any]:
     info: dict[str, Any] = {"cost": float(outcome.cost[row])}
     for name, cost in outcome.costs.items():
         info[name] = float(cost[row])
-    if outcome.goal_met[row]:
-        info["goal_met"] = True
-    if outcome.unplaced[row]:
-        info["goal_unplaced"] = True
-    if outcome.physics_error[row]:
-        info["physics_error"] = True
+    info |= {name: True for name, rows in outcome.events.items() if rows[row]}
     for name, rows in outcome.ended_by.items():
         if rows[row]:
             info["terminated_by"] = name

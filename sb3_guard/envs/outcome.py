@@ -32,3 +32,12 @@ class Outcome:
     unplaced: Array
     physics_error: Array
     ended_by: dict[str, Array]
+
+    @property
+    def events(self) -> dict[str, Array]:
+        """What info says of the rows in which it happened, by key, [N] bool each."""
+        return {
+            "goal_met": self.goal_met,
+            "goal_unplaced": self.unplaced,
+            "physics_error": self.physics_error,
+        }

@@ -153,7 +153,8 @@ class Part(Parameters):
 
         :raises ValueError: it does not exist in this space, or heights of what is on the floor
         """
-        space = self.space or world.robot.workspace
+        only = self.spaces[0] if len(self.spaces) == 1 else None
+        space = self.space or only or world.robot.workspace
         if space not in self.spaces:
             raise ValueError(
                 f"{self.name} exists in {' and '.join(self.spaces)} space, not in {space} space; "

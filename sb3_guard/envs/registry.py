@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
@@ -156,35 +156,29 @@ def _check_robot(name: str, robot: type[Robot]) -> None:
     def positive(value: Any) -> bool:
         return isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0
 
-    timestep: Any = robot.timestep
-    if timestep is not None and (not positive(timestep) or math.isinf(timestep)):
-        raise ValueError(
-            f"robot {name!r}: timestep = {timestep!r} must be a positive number of seconds, such "
-            "as 0.002"
-        )
-    if robot.integrator not in (None, *INTEGRATORS):
-        hint = did_you_mean(str(robot.integrator), INTEGRATORS)
-        raise ValueError(f"robot {name!r}: integrator = {robot.integrator!r}: {hint}")
+    def finite(value: Any) -> bool:
+        return value is None or (positive(value) and value < math.inf)
+
+    def texts(value: Any) -> bool:
+        return isinstance(value, (list, tuple)) and bool(value) and all(map(_is_text, value))
+
+    rules: dict[str, tuple[Callable[[Any], bool], str]] = {
+        "timestep": (finite, "a positive number of seconds, such as 0.002"),
+        "integrator": (lambda v: v in (None, *INTEGRATORS), f"one of {', '.join(INTEGRATORS)}"),
+        "workspace": (lambda v: v in ("planar", "spatial"), "'planar' or 'spatial'"),
+        "reach": (
+            positive,
+            "a positive number of metres; leave it out for a robot that can go anywhere",
+        ),
+    }
+    if issubclass(robot, MJCFRobot):
+        rules["lidar_bodies"] = texts, "a list of names of bodies, such as ['robot']"
+        rules["center"] = _is_text, "the name of a body"
     check_count(f"robot {name!r}: frame_skip", robot.frame_skip)
-    workspace = getattr(robot, "workspace", None)
-    if workspace not in ("planar", "spatial"):
-        raise ValueError(f"robot {name!r}: workspace = {workspace!r} must be 'planar' or 'spatial'")
-    reach: Any = robot.reach
-    if not positive(reach):
-        raise ValueError(
-            f"robot {name!r}: reach = {reach!r} must be a positive number of metres; leave it out "
-            "for a robot that can go anywhere"
-        )
-    if not issubclass(robot, MJCFRobot):
-        return
-    bodies = robot.lidar_bodies
-    if not isinstance(bodies, (list, tuple)) or not bodies or not all(_is_text(b) for b in bodies):
-        raise ValueError(
-            f"robot {name!r}: lidar_bodies = {bodies!r} must be a list of names of bodies, such as "
-            "['robot']"
-        )
-    if not _is_text(robot.center):
-        raise ValueError(f"robot {name!r}: center = {robot.center!r} must be the name of a body")
+    for key, (fits, what) in rules.items():
+        value = getattr(robot, key, None)
+        if not fits(value):
+            raise ValueError(f"robot {name!r}: {key} = {value!r} must be {what}")
 
 
 def _is_text(value: Any) -> bool:

@@ -160,12 +160,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         infos: dict[str, Any] = {"cost": out.cost, "_cost": everyone}
         for name, cost in out.costs.items():
             infos[name], infos[f"_{name}"] = cost, everyone
-        happened = {
-            "goal_met": out.goal_met,
-            "goal_unplaced": out.unplaced,
-            "physics_error": out.physics_error,
-        }
-        for name, rows in happened.items():
+        for name, rows in out.events.items():
             if rows.any():
                 infos[name] = infos[f"_{name}"] = rows
         for name, rows in out.ended_by.items():

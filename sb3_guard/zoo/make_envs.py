@@ -101,21 +101,11 @@ def choose_vec_env(wanted: str | None, ours: bool, wrapped: bool) -> str:
     """
     The kind of vectorised environment: native where it is possible, unless asked otherwise.
 
-    :param wanted: what the flag says, None if it says nothing
+    :param wanted: what the flag says, None if it says nothing; :func:`make_envs` refuses native
+        where it is not possible
     :param ours: the environment is one of ours
     :param wrapped: single environments get a wrapper, which native ones can't
-    :raises UsageError: native is asked for and not possible
     """
-    if wanted == "native" and not ours:
-        raise UsageError(
-            "--vec-env native works for sb3_guard's own environments only; "
-            "use --vec-env dummy or subproc"
-        )
-    if wanted == "native" and wrapped:
-        raise UsageError(
-            "--vec-env native can't apply env_wrapper, since its environments are one batch; "
-            "use --vec-env dummy or subproc"
-        )
     return wanted or ("native" if ours and not wrapped else "dummy")
 
 
@@ -165,7 +155,7 @@ def make_envs(
             env_kwargs=dict(env_kwargs),
             num_threads=num_threads,
             render_mode=render_mode,
-            wrapper_class=None if vec_env == "native" else wrap,
+            wrapper_class=wrap if vec_env != "native" or setup.env_wrapper else None,
             monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
         )
     with ExitStack() as made, explained(f"can't wrap {env_id}", *BAD_ARGUMENTS):

@@ -14,7 +14,7 @@ import re
 import types
 import typing
 from collections.abc import Mapping
-from functools import wraps
+from functools import update_wrapper, wraps
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -191,14 +191,8 @@ def with_defaults(function: FunctionType, **defaults: Any) -> FunctionType:
         defaults.get(name, default)
         for name, default in zip(names[len(names) - len(old) :], old, strict=True)
     ]
-    copy = FunctionType(
-        function.__code__,
-        function.__globals__,
-        function.__name__,
-        tuple(new),
-        function.__closure__,
-    )
-    copy.__annotations__ = function.__annotations__
-    copy.__doc__, copy.__module__ = function.__doc__, function.__module__
-    copy.__qualname__ = function.__qualname__
+    code, scope = function.__code__, function.__globals__
+    copy = FunctionType(code, scope, None, tuple(new), function.__closure__)
+    update_wrapper(copy, function)
+    del copy.__wrapped__  # type: ignore[attr-defined]  # whose defaults a signature would show
     return copy

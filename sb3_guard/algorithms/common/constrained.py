@@ -192,8 +192,8 @@ class Constrained(BaseAlgorithm):
         total_timesteps: int,
         callback: MaybeCallback = None,
         reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
+        *args: Any,
+        **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
         n_costs = len(self.cost_keys)
         if self.ep_cost_buffer is None or reset_num_timesteps:
@@ -209,7 +209,7 @@ class Constrained(BaseAlgorithm):
             self.last_costs = np.zeros((self.n_envs, n_costs))
             self._begin_statistics()
         steps, callbacks = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            total_timesteps, callback, reset_num_timesteps, *args, **kwargs
         )
         among = callbacks.callbacks if isinstance(callbacks, CallbackList) else [callbacks]
         if self.constrained and any(type(one) is EvalCallback for one in among):

@@ -9,7 +9,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
@@ -97,16 +96,9 @@ class FilteredTrustRegion(TrustRegion):
         self._set_threshold(self.policy.action_filter.threshold.cpu().numpy())
 
     def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
+        self, total_timesteps: int, *args: Any, **kwargs: Any
     ) -> tuple[int, BaseCallback]:
-        prepared = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        prepared = super()._setup_learn(total_timesteps, *args, **kwargs)
         if self.filter_from is None:
             steps = self.warmup
             self.filter_from = (

@@ -21,7 +21,6 @@ class Boundary(Constraint):
     family = "safety_gymnasium"
     trespassable = True
     movable = "no"
-    space = "planar"
     spaces = ("planar",)
     color = (0.9, 0.7, 0.1)
 

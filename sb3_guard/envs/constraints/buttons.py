@@ -25,7 +25,6 @@ class Buttons(Obstacles):
     color = (1.0, 0.5, 0.1)
     trespassable = False
     movable = "no"
-    space = "planar"
     spaces = ("planar",)
     solid = True
     usual_keepout = 0.3

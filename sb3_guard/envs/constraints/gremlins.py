@@ -25,7 +25,6 @@ class Gremlins(Obstacles):
     color = (0.55, 0.1, 0.9)
     trespassable = False
     movable = "active"
-    space = "planar"
     spaces = ("planar",)
     solid = True
     moves = True

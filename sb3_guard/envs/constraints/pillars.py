@@ -19,7 +19,6 @@ class Pillars(Obstacles):
     color = (0.45, 0.45, 0.5)
     trespassable = False
     movable = "no"
-    space = "planar"
     spaces = ("planar",)
     solid = True
     usual_keepout = 0.3

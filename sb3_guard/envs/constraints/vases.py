@@ -27,7 +27,6 @@ class Vases(Obstacles):
     color = (0.1, 0.8, 0.85)
     trespassable = False
     movable = "passive"
-    space = "planar"
     spaces = ("planar",)
     solid = True
     free = True

@@ -32,7 +32,6 @@ class Button(Task):
     interactive = False
     contact = True
     targets = "one"
-    space = "planar"
     spaces = ("planar",)
     solid = True
 

@@ -25,7 +25,6 @@ class Circle(Task):
     interactive = False
     contact = False
     targets = "one"
-    space = "planar"
     spaces = ("planar",)
     color = (0.2, 0.7, 0.3)
 

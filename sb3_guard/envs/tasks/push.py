@@ -34,7 +34,6 @@ class Push(Destination):
     name = "push"
     interactive = True
     contact = True
-    space = "planar"
     spaces = ("planar",)
 
     object: str = param(

@@ -23,7 +23,6 @@ class Run(Task):
     interactive = False
     contact = False
     targets = "one"
-    space = "planar"
     spaces = ("planar",)
 
     target: tuple[float, float] = param((0.0, -1000.0), "where to, (x, y) m")

@@ -4,8 +4,6 @@ Importing this package registers the environments with Gymnasium; everything els
 used.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import Any
 

@@ -6,8 +6,6 @@ in a function of yours. All are Gymnasium wrappers of single environments and ne
 MuJoCo. Wrappers that use the cost are in ``budgets.py``.
 """
 
-from __future__ import annotations
-
 import copy
 import pkgutil
 import re

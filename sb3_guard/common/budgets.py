@@ -6,8 +6,6 @@ need neither torch nor MuJoCo; ``vec_budgets.py`` has the same for all environme
 at once.
 """
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Sequence

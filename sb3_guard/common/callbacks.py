@@ -295,7 +295,8 @@ class CostEvalCallback(EvalCallback):
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from :meth:`state`; ``evaluations.npz`` is written anew to match."""
         for name, attribute in KEPT.items():
-            setattr(self, attribute, copy.copy(state[name]))
+            if name in state:  # the checkpoint may be older than the entry
+                setattr(self, attribute, copy.copy(state[name]))
         self._remember(self.best_score)
         if self.evaluations_timesteps:
             self.write_history()

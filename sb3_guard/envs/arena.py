@@ -1,7 +1,5 @@
 """Where everything happens: the floor, what lights and shows it, and the physics options."""
 
-from __future__ import annotations
-
 import importlib.resources
 from dataclasses import dataclass
 

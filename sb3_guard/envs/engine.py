@@ -6,8 +6,6 @@ of the parts, and hands out what one control step brought. It knows no automatic
 limit: those belong to the gymnasium classes above it.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Observations that belong to no robot, task or constraint, all off by default."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ What takes many operations is done on points by coordinate: [3, K, N] instead of
 NumPy's inner loops run along the rows and not along x, y, z, which is several times faster.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 Array = np.ndarray

@@ -6,8 +6,6 @@ only their part moves them, free ones where the robot may, and free ones welded 
 where both do.
 """
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """One environment with Gymnasium's interface: the batch of one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

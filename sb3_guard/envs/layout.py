@@ -7,8 +7,6 @@ hundreds of restarts. Here an object that finds no room among 128 draws takes th
 disturbs the fewest others, and those are drawn again.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

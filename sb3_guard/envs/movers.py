@@ -1,7 +1,5 @@
 """Objects that move by themselves: ghosts, and the targets of Chase and Defense."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco

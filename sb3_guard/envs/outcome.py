@@ -1,7 +1,5 @@
 """What one control step brings, for the gymnasium classes to hand on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.part import Array

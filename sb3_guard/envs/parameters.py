@@ -4,8 +4,6 @@ A bad name, type or value fails where the part is made, in one line that names t
 value and what is allowed. Plain JSON and YAML values are enough: lists become tuples.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

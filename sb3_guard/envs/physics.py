@@ -4,8 +4,6 @@ It advances them by control steps, evaluates the sensors once in each, and tells
 diverged.
 """
 
-from __future__ import annotations
-
 import copy
 import ctypes
 from collections.abc import Callable, Sequence

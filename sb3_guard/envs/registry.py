@@ -4,8 +4,6 @@ Adding one to its table here, or with :func:`register_robot`, :func:`register_ta
 :func:`register_constraint` from outside, is all it takes to use it in ids, scenarios and commands.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import math

@@ -161,18 +161,7 @@ class Scenario:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which ``Scenario(**data)`` makes this scenario again."""
-        return {
-            "robot": self.robot,
-            "task": self.task,
-            "constraints": {k: dict(v) for k, v in self.constraints.items()},
-            "robot_params": dict(self.robot_params),
-            "task_params": dict(self.task_params),
-            "lidar": dict(self.lidar),
-            "layout": dict(self.layout),
-            "observe": dict(self.observe),
-            "arena": dict(self.arena),
-            "cost": self.cost,
-        }
+        return {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
 
     def override(self, cost: str | None = None, **params: Params | None) -> Scenario:
         """This scenario with parameters of its parts changed or constraints added.

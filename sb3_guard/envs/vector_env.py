@@ -1,7 +1,5 @@
 """Many environments with Gymnasium's vector interface, on one batch."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

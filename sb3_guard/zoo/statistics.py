@@ -35,14 +35,12 @@ def iqm(values: Any, axis: int = 0) -> Any:
 def interval(
     groups: Sequence[np.ndarray],
     statistic: Callable[..., np.ndarray] = np.mean,
-    level: float = 0.95,
 ) -> tuple[Any, Any]:
     """
-    A percentile bootstrap interval, stratified: each group is resampled by itself.
+    A 95 % percentile bootstrap interval, stratified: each group is resampled by itself.
 
     :param groups: values of independent runs, [n_g] each; NaN are left out
     :param statistic: called with ``axis=1`` on [B, Σ n_g] resamples; returns [B, …]
-    :param level: part of the resamples inside
     :return: lower and upper end, each of the statistic's shape; NaN where no group has two values,
         since one seed says nothing about another
     """
@@ -56,7 +54,7 @@ def interval(
         if len(group)
     ]
     values = statistic(np.concatenate(draws, axis=1), axis=1)
-    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    low, high = np.quantile(values, [0.025, 0.975], axis=0)
     return low, high
 
 

@@ -1,6 +1,7 @@
 """Networks beside the policy that learn from costs, and the regression that fits them."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -85,6 +86,7 @@ class CostCritic(StateNetwork):
     """Expected discounted cost-to-go V_c(s), one output per constraint."""
 
 
+@dataclass
 class Regression:
     """Least-squares fit of a network to a batch, full-batch by default.
 
@@ -102,25 +104,17 @@ class Regression:
     :param still: submodules of ``module`` that behave as in evaluation all the same
     """
 
-    def __init__(
-        self,
-        module: nn.Module,
-        values: Callable[[Any], th.Tensor],
-        parameters: Sequence[th.Tensor],
-        optimizer: th.optim.Optimizer,
-        inputs: Callable[[Any], th.Tensor] | None = None,
-        layers: Sequence[nn.Linear] | None = None,
-        readout: Callable[[th.Tensor, Any], th.Tensor] | None = None,
-        still: Sequence[nn.Module] = (),
-    ) -> None:
-        self.module = module
-        self.values = values
-        self.parameters = list(parameters)
-        self.optimizer = optimizer
-        self.inputs = inputs
-        self.network = TanhMlp(layers) if layers is not None else None
-        self.readout = readout
-        self.still = still
+    module: nn.Module
+    values: Callable[[Any], th.Tensor]
+    parameters: Sequence[th.Tensor]
+    optimizer: th.optim.Optimizer
+    inputs: Callable[[Any], th.Tensor] | None = None
+    layers: Sequence[nn.Linear] | None = None
+    readout: Callable[[th.Tensor, Any], th.Tensor] | None = None
+    still: Sequence[nn.Module] = ()
+
+    def __post_init__(self) -> None:
+        self.network = None if self.layers is None else TanhMlp(self.layers)
 
     @classmethod
     def of_value(cls, policy: ActorCriticPolicy) -> "Regression":

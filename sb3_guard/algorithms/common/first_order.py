@@ -119,21 +119,19 @@ class FirstOrder(CostRollouts, PPO):
     def descend(
         self,
         loss: Loss,
-        n_epochs: int | None = None,
         values: bool = True,
         start: ActorCriticPolicy | None = None,
     ) -> None:
         """Take passes of minibatches down a loss.
 
         :param loss: called as :meth:`loss` is
-        :param n_epochs: passes; None for the algorithm's own
         :param values: whether the reward critic and the entropy bonus learn along
         :param start: the policy whose distance stops the passes; None for the one that acted
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         history: dict[str, list[float]] = {}
-        for _ in range(self.n_epochs if n_epochs is None else n_epochs):
+        for _ in range(self.n_epochs):
             stop = self._descend_once(loss, values, history, start)
             self._n_updates += 1
             if stop:

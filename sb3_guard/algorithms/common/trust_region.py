@@ -18,6 +18,7 @@ estimated its costs. What an algorithm may replace:
 """
 
 import time
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -57,6 +58,7 @@ class Trial(NamedTuple):
     cost_change: np.ndarray
 
 
+@dataclass(eq=False)
 class Region:
     """The update's local picture: a linear surrogate inside a quadratic trust region.
 
@@ -69,23 +71,13 @@ class Region:
     :param cg_max_steps: conjugate-gradient iterations per solve
     """
 
-    def __init__(
-        self,
-        actor: Actor,
-        batch: CostRolloutBufferSamples,
-        gradient: th.Tensor,
-        violation: np.ndarray,
-        delta: float,
-        damping: float,
-        cg_max_steps: int,
-    ) -> None:
-        self.actor = actor
-        self.batch = batch
-        self.gradient = gradient
-        self.violation = violation
-        self.delta = delta
-        self.damping = damping
-        self.cg_max_steps = cg_max_steps
+    actor: Actor
+    batch: CostRolloutBufferSamples
+    gradient: th.Tensor
+    violation: np.ndarray
+    delta: float
+    damping: float
+    cg_max_steps: int
 
     @cached_property
     def cost_gradients(self) -> th.Tensor:

@@ -1,7 +1,5 @@
 """Boundary: lines that the robot can cross, but pays for being beyond."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

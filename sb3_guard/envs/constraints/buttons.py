@@ -1,7 +1,5 @@
 """Buttons: what must not be pressed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco

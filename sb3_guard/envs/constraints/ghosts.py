@@ -1,7 +1,5 @@
 """Ghosts: zones that come after the robot, or bodies that bump into it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs import motion

@@ -1,7 +1,5 @@
 """Gremlins: boxes that go round in circles whatever the robot does."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Hazards: zones that do not move and cost the robot its depth inside them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.constraints.obstacles import Obstacles

@@ -1,7 +1,5 @@
 """What constraints of many like objects have in common: a price for entering or touching them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Pillars: columns that stand in the way."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco

@@ -1,7 +1,5 @@
 """Speed: a limit to how fast the robot may move."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

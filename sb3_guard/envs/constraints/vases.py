@@ -1,7 +1,5 @@
 """Vases: light boxes that must not be touched or moved."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

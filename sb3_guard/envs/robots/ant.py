@@ -1,7 +1,5 @@
 """Ant: four legs of two hinges each, eight torques."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

@@ -1,7 +1,5 @@
 """What arms share: they stand still and are as near to things as their nearest link."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Arm3: an arm of three hinges, each turned at a commanded speed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.arm import Arm

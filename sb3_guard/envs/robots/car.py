@@ -1,7 +1,5 @@
 """Car: two driven wheels and a ball; the simplest robot with a free root."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

@@ -1,7 +1,5 @@
 """Doggo: four legs of three hinges each under a loose waist."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

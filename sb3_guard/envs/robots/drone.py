@@ -1,7 +1,5 @@
 """Drone: four propellers, the robot that moves freely in space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

@@ -6,8 +6,6 @@ seed s begins as that environment does. Derived quantities, such as the place of
 read as ``mj_step`` leaves them there: of the last physics step's beginning.
 """
 
-from __future__ import annotations
-
 import importlib.resources
 import warnings
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Hopper: a torso on one leg at a fixed height."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

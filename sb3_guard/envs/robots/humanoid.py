@@ -1,7 +1,5 @@
 """Humanoid: the proportions of a person, two legs of three hinges each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

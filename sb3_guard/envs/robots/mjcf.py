@@ -1,7 +1,5 @@
 """A robot's MJCF file on its way into a world: read, looked over, given its contact bits."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

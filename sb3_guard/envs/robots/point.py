@@ -1,7 +1,5 @@
 """Point: two actions, thrust along its nose and turn; the easiest robot to train."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

@@ -18,8 +18,6 @@ A class with ``complete = True`` has a file that is a whole world: its floor and
 used, names are as in the file, and the robot begins where the file puts it.
 """
 
-from __future__ import annotations
-
 import importlib.resources
 import math
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ GUARD's robots of the same names are other ones: its Car and Ant differ in shape
 Doggo is twice as large. Points differ in the friction of the nose alone.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Swimmer: three links that crawl by a wave along the body."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

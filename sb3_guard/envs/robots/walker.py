@@ -1,7 +1,5 @@
 """Walker: two legs of five hinges each under a bar at a fixed height."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.robots.robot import MJCFRobot

@@ -5,8 +5,6 @@ A family is a :class:`~sb3_guard.envs.suites.suite.Suite` in a module of its own
 the commands, with the keywords that change parameters.
 """
 
-from __future__ import annotations
-
 import re
 
 from sb3_guard.envs.suites import guard, safety_gymnasium, velocity

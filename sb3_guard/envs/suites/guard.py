@@ -3,8 +3,6 @@
 Names say what they mean: any task, robot, number and constraint make an environment.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import fields
 from itertools import product

@@ -3,8 +3,6 @@
 The names are its own: ``SafetyPointGoal1-v0``. What a level adds to a task is in :data:`LEVELS`.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

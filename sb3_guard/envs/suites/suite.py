@@ -1,7 +1,5 @@
 """What a family of named environments is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any

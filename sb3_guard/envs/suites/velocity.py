@@ -4,8 +4,6 @@ Robots, rewards and deaths are those of Gymnasium's v4 environments; a step cost
 was faster than its limit. Facts: Safety-Gymnasium 1.0.0 (Ji et al. 2023).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from sb3_guard.envs.suites.suite import Suite

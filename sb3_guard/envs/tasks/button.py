@@ -1,7 +1,5 @@
 """Button: press the one that is lit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco

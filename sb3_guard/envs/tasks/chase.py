@@ -1,7 +1,5 @@
 """Chase: come close to targets that run away."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Circle: run around the origin."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

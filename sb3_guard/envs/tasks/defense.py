@@ -1,7 +1,5 @@
 """Defense: keep targets out of a protected area."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

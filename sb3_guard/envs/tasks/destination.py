@@ -1,7 +1,5 @@
 """What tasks with a place to reach have in common: the place, and a new one once it is reached."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Forward: run along the x axis, with little effort."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Goal: reach a place; the next one appears as soon as it is reached."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs import geometry

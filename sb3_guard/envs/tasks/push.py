@@ -1,7 +1,5 @@
 """Push: bring a ball, or a box, to a place."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Run: get on towards a place that is far away."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

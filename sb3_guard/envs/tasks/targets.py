@@ -1,7 +1,5 @@
 """What tasks with targets that flee have in common."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sb3_guard.envs.groups import MOST, Group

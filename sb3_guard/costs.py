@@ -35,9 +35,10 @@ def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ValueErro
     near = nearest(key, present)
     hint = "" if near is None else f" (nearest: {near!r})"
     return ValueError(
-        f"{whose} has no cost key {key!r}; its keys are {present}{hint}. Name the right one, or "
-        "pass missing_cost='zero' if the key appears only when there is a cost; "
-        "sb3_guard.common.adapters has wrappers for a cost that is elsewhere or has to be computed"
+        f"{whose} has no cost key {key!r}; its keys are {present}{hint}. Name the right one, as "
+        "with cost_keys=(...), or pass missing_cost='zero' if the key appears only when there is a "
+        "cost; sb3_guard.common.adapters has wrappers for a cost that is elsewhere or has to be "
+        "computed"
     )
 
 

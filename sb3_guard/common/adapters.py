@@ -59,7 +59,7 @@ def make_safety_gymnasium(env_id: str, **kwargs: Any) -> gym.Env:
     name = env_id.removeprefix("safety_gymnasium:")
     spec = gym.registry.get(name)
     if spec is None:
-        known = [key for key in gym.registry if _SAFETY_GYMNASIUM_ID.fullmatch(key)]
+        known = [key for key in gym.registry if is_safety_gymnasium(key)]
         near = nearest(name, known)
         hint = "" if near is None else f": did you mean {near!r}?"
         raise gym.error.NameNotFound(f"Safety-Gymnasium has no environment {name!r}{hint}")

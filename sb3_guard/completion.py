@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from sb3_guard.zoo.flags import Command, command, flag
-from sb3_guard.zoo.usage import UsageError
+from sb3_guard.zoo.usage import explained
 
 
 @dataclass
@@ -52,12 +52,9 @@ def completion(flags: Flags) -> int:
     :return: exit status
     :raises UsageError: shtab is not installed
     """
-    try:
+    fix = "install it with: pip install 'sb3-guard[completion]'"
+    with explained("completion needs shtab", ImportError, fix=fix):
         import shtab
-    except ImportError:
-        raise UsageError(
-            "completion needs shtab; install it with: pip install 'sb3-guard[completion]'"
-        ) from None
     print(shtab.complete(whole(), flags.shell))
     return 0
 

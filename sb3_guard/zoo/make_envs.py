@@ -6,18 +6,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.preprocessing import (
-    is_image_space,
-    is_image_space_channels_first,
-)
-from stable_baselines3.common.vec_env import (
-    VecEnv,
-    VecFrameStack,
-    VecNormalize,
-    VecTransposeImage,
-    is_vecenv_wrapped,
-)
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_guard.common.adapters import is_safety_gymnasium
 from sb3_guard.common.vec_env import find_scenario, make_vec_env
@@ -178,13 +168,5 @@ def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: VecNormalize 
         env.norm_reward = False
     if setup.frame_stack is not None:
         env = VecFrameStack(env, setup.frame_stack)
-    # SB3 would do this itself, but then training and evaluation would be wrapped differently.
-    space = env.observation_space
-    parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
-    needs_transpose = any(
-        is_image_space(one) and not is_image_space_channels_first(one)  # type: ignore[arg-type]
-        for one in parts
-    )
-    if needs_transpose and not is_vecenv_wrapped(env, VecTransposeImage):
-        env = VecTransposeImage(env)
-    return env
+    # SB3 would transpose images itself, but training and evaluation are to be wrapped alike.
+    return BaseAlgorithm._wrap_env(env, monitor_wrapper=False)

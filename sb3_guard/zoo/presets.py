@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from sb3_guard.envs.suites import env_ids
 from sb3_guard.envs.suites.guard import LADDER, SUITE_ROBOTS
 from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.paper import ALGOS as ALL
 from sb3_guard.zoo.paper import MAIN8, RADAR4
 from sb3_guard.zoo.usage import UsageError
 
-# The paper's algorithms.
-ALL = ("trpo", "cpo", "pcpo", "trpo_lag", "trpo_fac", "trpo_ipo", "trpo_sl", "trpo_usl")
 PAPER45 = tuple(
     env_id for env_id in env_ids("guard") if "_8Hazards" in env_id or env_id.startswith("Goal_")
 )

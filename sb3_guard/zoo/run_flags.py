@@ -5,8 +5,8 @@ from typing import Any, Literal, Self
 
 from sb3_guard.zoo.flags import HOST, IDENTITY, Command, flag
 from sb3_guard.zoo.usage import (
-    UsageError,
     amount,
+    explained,
     interval,
     positive,
     seed_or_random,
@@ -132,9 +132,6 @@ class RunFlags(EvaluationFlags, TrainingFlags):
         :raises UsageError: a package is absent that a flag needs
         """
         if self.track:
-            try:
+            fix = "install it with: pip install wandb"
+            with explained("--track needs wandb", ImportError, fix=fix):
                 import wandb  # noqa: F401
-            except ImportError:
-                raise UsageError(
-                    "--track needs wandb; install it with: pip install wandb"
-                ) from None

@@ -1,20 +1,9 @@
 """The base of all algorithms here: trust-region policy optimisation with five places to differ.
 
 One update reads like the algorithm box of the papers: find a step within a trust region around the
-old policy, search along it, fit the critics; ``on_policy.py`` has collected the rollout and
-estimated its costs. What an algorithm may replace:
-
-``surrogate(batch, ratio)``
-    what is ascended; the mean of ratio times advantage.
-``step(region)``
-    where to go, given the gradients, the violations and products with F⁻¹; the natural gradient
-    of length √(2δ).
-``accept(trial)``
-    whether a candidate on the way is good enough; KL at most δ and a surrogate no worse.
-``correct(observations, actions)``
-    what is executed in place of an action; the action itself.
-``fit(batch)``
-    what else is learnt after the policy moved; nothing.
+old policy, search along it, fit the critics; ``rollouts.py`` has collected the rollout and
+estimated its costs. What an algorithm may replace stands at the end of :class:`TrustRegion`:
+``surrogate``, ``step``, ``accept`` and ``fit``; and ``correct``, which it has from there.
 """
 
 import time

@@ -297,6 +297,7 @@ TABLE = {
 }
 # Where the default is another one: (the paper's, ours).
 LIMIT = {"cost_limit": (0.0, 2.0)}
+LAMBDA = {"cost_gae_lambda": (0.97, None)}  # it is another one on Safety-Gymnasium's tasks
 DIFFERENT = {
     "trpo_sl": {
         **LIMIT,
@@ -305,10 +306,11 @@ DIFFERENT = {
     },
     "trpo_usl": {**LIMIT, "correction_penalty": (0.0, None)},
     "trpo": {},
-    "cpo": {**LIMIT, "margin_lr": (0.0, None)},
-    "pcpo": {**LIMIT, "margin_lr": (0.0, None), "line_search": (False, True)},
+    "cpo": {**LIMIT, **LAMBDA, "margin_lr": (0.0, None)},
+    "pcpo": {**LIMIT, **LAMBDA, "margin_lr": (0.0, None), "line_search": (False, True)},
     "trpo_lag": {
         **LIMIT,
+        **LAMBDA,
         "lambda_lr": (0.005, 0.1),
         "lambda_update": ("after", None),
         "lambda_units": ("cost", None),

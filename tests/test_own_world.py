@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
 from gymnasium.envs import mujoco as their_robots
-from worlds import own_parts, world
+from worlds import gymnasium_robot, own_parts, world
 
 from sb3_guard.common.vec_env import GuardVecEnv
 from sb3_guard.envs import GuardVectorEnv, Scenario, make, register_constraint, register_robot
@@ -55,7 +54,7 @@ def hopper():
 
 
 def test_a_robot_in_its_own_world_steps_as_in_gymnasium(hopper):
-    ours, theirs = hopper.build(3), gymnasium.make("Hopper-v4").unwrapped
+    ours, theirs = hopper.build(3), gymnasium_robot("Hopper-v4")
     theirs.reset(seed=0)
     theirs.set_state(theirs.init_qpos, theirs.init_qvel)
     ours.reset(np.arange(3))

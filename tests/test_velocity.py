@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from worlds import gymnasium_robot
 
 from sb3_guard.envs import GuardVectorEnv, Scenario, env_ids, make
 from sb3_guard.envs.suites.velocity import TABLE
@@ -15,13 +16,12 @@ LIMITS = {  # Safety-Gymnasium 1.0.0: v0, v1, m/s
     "Swimmer": (0.04845, 0.2282),
     "Walker2d": (1.7075, 2.3415),
 }
-pytestmark = pytest.mark.filterwarnings("ignore:.*out of date")
 
 
 @pytest.mark.parametrize("name", TABLE)
 def test_every_step_is_gymnasiums_bit_for_bit(name):
     """Starts of the same seed, observations, rewards, deaths, new starts; speeds and costs."""
-    theirs = [gymnasium.make(f"{name}-v4").unwrapped for _ in range(2)]
+    theirs = [gymnasium_robot(f"{name}-v4") for _ in range(2)]
     ours = GuardVectorEnv(2, f"Safety{name}Velocity-v1")
     engine, limit = ours.engine, LIMITS[name][1]
     ours.reset(seed=5)

@@ -1,10 +1,13 @@
 """Small worlds for the tests of tasks and constraints."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import gymnasium
 import mujoco
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 
 from sb3_guard.envs import Scenario, registry
 from sb3_guard.envs.engine import Engine
@@ -23,6 +26,14 @@ def own_parts() -> Iterator[None]:
         for table, known in zip(tables, before, strict=True):
             table.clear()
             table.update(known)
+
+
+def gymnasium_robot(env_id: str) -> gymnasium.Env:
+    """Gymnasium's own environment, without the warnings that there is a newer one."""
+    spec = gymnasium.spec(env_id)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return load_env_creator(spec.entry_point)(**spec.kwargs)
 
 
 def world(suite: str, n: int = 1, seed: int = 0, num_threads: int = 1, **params: object) -> Engine:

@@ -7,7 +7,6 @@ read as ``mj_step`` leaves them there: of the last physics step's beginning.
 """
 
 import importlib.resources
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -18,9 +17,6 @@ import numpy as np
 from sb3_guard.envs.observation import Observations, Values
 from sb3_guard.envs.part import Array, Generators, Simulation
 from sb3_guard.envs.robots.robot import MJCFRobot
-
-# of half_cheetah.xml, which is Gymnasium's to change
-warnings.filterwarnings("ignore", message="compiler attribute 'settotalmass'")
 
 
 @dataclass

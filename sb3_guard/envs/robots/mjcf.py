@@ -23,6 +23,8 @@ def read(path: Path, root: str, complete: bool) -> mujoco.MjSpec:
     """
     try:
         spec = mujoco.MjSpec.from_file(str(path))
+        if spec.compiler.settotalmass > 0:
+            _state_masses(spec)
         spec.compile()  # attach() drops without a word what refers to something missing
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
@@ -35,6 +37,18 @@ def read(path: Path, root: str, complete: bool) -> mujoco.MjSpec:
             f"the file's own world with complete=True, root={root!r}"
         )
     return spec
+
+
+def _state_masses(spec: mujoco.MjSpec) -> None:
+    """Write the masses that ``settotalmass`` asks for into the bodies: MuJoCo is to drop it."""
+    total, spec.compiler.settotalmass = spec.compiler.settotalmass, -1.0
+    model = spec.compile()
+    mujoco.mj_setTotalmass(model, total)
+    for body in spec.bodies[1:]:
+        body.explicitinertial = True
+        body.mass, body.inertia = model.body_mass[body.id], model.body_inertia[body.id]
+        body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
 
 
 def honour_options(option: mujoco.MjOption, world: mujoco.MjOption) -> None:

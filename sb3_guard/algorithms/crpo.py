@@ -34,7 +34,6 @@ class CRPO(TrustRegion):
     @property
     def violated(self) -> int | None:
         """Index of the cost that is to be lowered; None while the limits hold."""
-        assert self.costs is not None
         limits = self.cost_limits
         cost = self.costs.episode_cost
         excess = cost - limits * (1.0 + self.tolerance)

@@ -37,7 +37,6 @@ class P3O(FirstOrder):
     penalty_units: Literal["relative", "cost"] = hyperparameter("relative")
 
     def train(self) -> None:
-        assert self.costs is not None
         unit = self.centre_costs()
         if self.penalty_units == "cost":
             unit = np.ones_like(unit)

@@ -36,7 +36,6 @@ class SCPO(LinearisedLimits):
     defaults: ClassVar[dict[str, Any]] = {"cost_gamma": 1.0}
 
     def critic_rows(self, targets: th.Tensor) -> slice | th.Tensor:
-        assert self.cost_rng is not None
         positive = (targets > 0.0).any(dim=1)
         rare, others = positive.nonzero().ravel(), (~positive).nonzero().ravel()
         if len(rare) == 0 or len(others) <= len(rare):
@@ -46,5 +45,4 @@ class SCPO(LinearisedLimits):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
-        assert self.costs is not None
         self._record_per_cost("rollout/ep_max_cost_mean", self.costs.episode_cost)

@@ -120,7 +120,6 @@ class TRPOFAC(TrustRegion):
         return (ratio * (batch.advantages - (price * batch.cost_advantages).sum(dim=1))).mean()
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
-        assert self.costs is not None
         if self.mode == "statewise":
             gamma = self.rollout_buffer.cost_gamma
             limit = discounted_limit(self.cost_limits, self.costs.horizon, gamma)

@@ -62,14 +62,12 @@ class TRPOIPO(TrustRegion):
 
     def _unit(self) -> np.ndarray:
         """What excesses are measured in, shape (m,): the limit, or J_C where the limit is 0."""
-        assert self.costs is not None
         if self.units == "cost":
             return np.ones(len(self.cost_limits))
         limits = self.cost_limits
         return np.where(limits > 0.0, limits, np.maximum(self.costs.episode_cost, TINY))
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
-        assert self.costs is not None
         change = (ratio - 1.0) @ batch.cost_advantages / len(ratio)  # [m]
         horizon, unit = self.costs.horizon, th.as_tensor(self._unit()).to(change)
         excess = horizon * (th.as_tensor(self.costs.violation).to(change) + change) / unit
@@ -80,13 +78,11 @@ class TRPOIPO(TrustRegion):
         return (ratio * batch.advantages).mean() + penalty
 
     def accept(self, trial: Trial) -> bool:
-        assert self.costs is not None
         violation = self.costs.violation
         stays_inside = ~(violation < 0.0) | (violation + trial.cost_change < 0.0)
         return super().accept(trial) and bool(np.all(stays_inside))
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
-        assert self.costs is not None
         slack = -self.costs.violation * self.costs.horizon / self._unit()
         steepest = 1.0 / (self.t * self.max_multiplier)
         self._record_per_cost("train/multiplier", 1.0 / (self.t * np.maximum(slack, steepest)))

@@ -60,7 +60,7 @@ class TRPOSL(FilteredTrustRegion):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
-        assert self.costs is not None and isinstance(self.policy.action_filter, SafetyLayer)
+        assert isinstance(self.policy.action_filter, SafetyLayer)
         self._set_threshold(self.cost_limits / self.costs.horizon)
         costly = (batch.costs != 0.0).any(dim=1)
         some, none = costly.nonzero().flatten(), (~costly).nonzero().flatten()

@@ -85,7 +85,6 @@ class TRPOUSL(FilteredTrustRegion):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
-        assert self.costs is not None
         gamma = self.rollout_buffer.cost_gamma
         limit = discounted_limit(self.cost_limits, self.costs.horizon, gamma)
         if bool((batch.costs < 0.0).any()):

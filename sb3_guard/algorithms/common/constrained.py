@@ -93,20 +93,21 @@ class Constrained(BaseAlgorithm):
         for name, one in stated(type(self)).items():
             setattr(self, name, kwargs.pop(name, one.default))
 
-        # Running episodes outlive rollouts, and a run may be saved between two.
-        self.running_costs: np.ndarray | None = None  # [n_envs, m]
-        self.running_charges: np.ndarray | None = None  # [n_envs, m], what a limit is held against
-        self.running_lengths: np.ndarray | None = None  # [n_envs]
+        # Running episodes outlive rollouts, and a run may be saved between two; set by `learn`.
+        none: Any = None
+        self.running_costs: np.ndarray = none  # [n_envs, m]
+        self.running_charges: np.ndarray = none  # [n_envs, m], what a limit is held against
+        self.running_lengths: np.ndarray = none  # [n_envs]
         # What the last step cost, 0 before the first one of an episode.
         self.last_costs: np.ndarray | None = None  # [n_envs, m]
         # Somebody else has reset the environments, so the next `learn` begins new episodes.
         self.begin_anew = False
-        self.total_costs: np.ndarray | None = None  # [m]
-        self.ep_cost_buffer: deque[np.ndarray] | None = None
+        self.total_costs: np.ndarray = none  # [m]
+        self.ep_cost_buffer: deque[np.ndarray] = none
         self.horizon: float | None = None  # T when an episode last ended
         self.cost_seen = False
-        #: J_C, T and the violations, as last estimated
-        self.costs: CostEstimate | None = None
+        #: J_C, T and the violations, as last estimated; there is an estimate in every update
+        self.costs: CostEstimate = none
         #: Whether the estimate has not been followed yet by what follows it (a multiplier)
         self.costs_are_new = False
         self.timing: dict[str, float] = {}
@@ -230,9 +231,7 @@ class Constrained(BaseAlgorithm):
     ) -> None:
         """Called by SB3 once per step, just before it stores the transition."""
         super()._update_info_buffer(infos, dones)
-        assert dones is not None and self.ep_cost_buffer is not None
-        assert self.running_costs is not None and self.running_lengths is not None
-        assert self.running_charges is not None
+        assert dones is not None
         # A vectorised environment without anything to say may leave infos out.
         infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
         costs, seen = read_costs(infos, self.cost_keys, self.missing_cost == "zero")
@@ -282,7 +281,7 @@ class Constrained(BaseAlgorithm):
         return True
 
     def _horizon_before_any_episode(self) -> float:
-        assert self.env is not None and self.running_lengths is not None
+        assert self.env is not None
         limits: list[Any] = []
         try:
             # TimeLimit's number first: around an environment without a spec there is no other.
@@ -325,7 +324,6 @@ class Constrained(BaseAlgorithm):
             self._record_per_cost("train/constraint_violation", excess)
 
     def dump_logs(self, *args: Any) -> None:
-        assert self.ep_cost_buffer is not None and self.total_costs is not None
         if self.constrained or self.cost_seen:
             if self.ep_cost_buffer:
                 self._record_per_cost("rollout/ep_cost_mean", np.mean(self.ep_cost_buffer, axis=0))

@@ -29,12 +29,10 @@ class Margin(TrustRegion):
         super().__init__(*args, **kwargs)
 
     def violation(self) -> np.ndarray:
-        assert self.costs is not None
         margin = 0.0 if self.margin is None else self.margin
         return self.costs.violation + margin / self.costs.horizon
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
-        assert self.costs is not None
         limits = self.cost_limits
         before = np.zeros(len(limits)) if self.margin is None else self.margin
         missed = self.costs.episode_cost - limits

@@ -84,7 +84,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         # Shuffles the cost critic's batches: it takes no numbers from anybody else's stream.
-        self.cost_rng: np.random.Generator | None = None
+        self.cost_rng: np.random.Generator = None  # type: ignore[assignment]
         # What the cost critic measures costs in, [m]; 0 until a rollout has any.
         self.cost_units: np.ndarray | None = None
         # (step, env, observation) of every episode cut by a time limit

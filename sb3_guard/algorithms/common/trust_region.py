@@ -252,7 +252,6 @@ class TrustRegion(CostRollouts):
         )
 
     def _update_actor(self, batch: CostRolloutBufferSamples) -> None:
-        assert self.costs is not None
         actor = actor_of(self.policy, batch.observations, batch.actions)
         ratio = th.ones_like(batch.advantages).requires_grad_()
         objective = self.surrogate(batch, ratio)
@@ -279,7 +278,6 @@ class TrustRegion(CostRollouts):
 
     def _record_promise(self, trial: Trial) -> None:
         """Record what the last step promised J_C and what it brought; keep this one's promise."""
-        assert self.costs is not None
         cost = self.costs.episode_cost
         if self.promise is not None:
             before, promised = self.promise
@@ -350,7 +348,6 @@ class TrustRegion(CostRollouts):
 
     def violation(self) -> np.ndarray:
         """What the step has to take away from each cost surrogate, (J_C - d) / T, shape (m,)."""
-        assert self.costs is not None
         return self.costs.violation
 
     def accept(self, trial: Trial) -> bool:

@@ -100,7 +100,7 @@ def perceived(kind: str, name: str) -> str:
         task, constraint = (name, "Hazards") if kind == "task" else ("Goal", name)
         engine = GuardVectorEnv(1, f"{task}_{robot}_8{constraint}").engine
         part = engine.task if kind == "task" else engine.constraints[0]
-        for what, channel in engine.channels_of(part).items():
+        for what, channel in engine.observer.channels_of(part).items():
             bounds = f"[{channel.low:g}, {channel.high:g}]"
             rows.setdefault(what, [f"`{what}`", bounds, channel.unit]).append(str(channel.size))
     return table(["observation", "bounds", "unit", *SIZED], list(rows.values()))

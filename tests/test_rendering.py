@@ -109,7 +109,7 @@ def test_halos_show_the_lidars_that_are_observed(task):
     if task == "Button":
         env.engine.task.wait[:] = 5  # none is lit
     obs = env.engine.observe()[0]
-    shown = [tuple(closeness) for closeness, _, _ in env.engine.lidar_readings(0)]
+    shown = [tuple(closeness) for closeness, _, _ in env.engine.observer.readings(0)]
     layout = env.observation_layout
     expected = [obs[where] for name, where in layout.items() if name.endswith("_lidar")]
     np.testing.assert_allclose(sorted(shown), sorted(map(tuple, expected)), 1e-6)
@@ -280,7 +280,7 @@ def test_the_robots_own_camera_sees_neither_halo_nor_tint(monkeypatch):
     assert hazards.cost() > 0
     assert amount(paying, BLUE) > 20  # zones are seen
     hazards.weight = 0.0
-    monkeypatch.setattr(engine, "lidar_readings", lambda row: [])
+    monkeypatch.setattr(engine.observer, "readings", lambda row: [])
     np.testing.assert_array_equal(renderer.frame(0), paying)
     renderer.close()
 

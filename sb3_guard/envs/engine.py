@@ -139,8 +139,12 @@ class Engine:
             part.bind(self)
             check_moving(part, self.num_envs)
         self._motion = Motion(self.parts)
-        self._observer = Observer(self.robot, self.parts, lidar, self.extras.components)
-        self.observation_size = self._observer.size
+        self.observer = Observer(self.robot, self.parts, lidar, self.extras.components)
+        self.observation_size = self.observer.size
+        # of each named component, in the order of the flat observation: where it lies; its size,
+        # bounds and unit
+        self.observation_layout: dict[str, slice] = self.observer.slices
+        self.channels: dict[str, Channel] = self.observer.channels
         # what moves before every physics step instead of before a control step
         self._quick = [part for part in self.parts if part.every == "physics"]
         self._slow = [part for part in self.parts if part.every != "physics"]
@@ -196,27 +200,9 @@ class Engine:
             self.places(name)[row, 0] = place
         return place is not None
 
-    def channels_of(self, part: Part) -> dict[str, Channel]:
-        """Size, bounds and unit of what one part lets the robot observe, by name."""
-        return self._observer.channels_of(part)
-
-    def lidar_readings(self, row: int) -> list[tuple[Array, int, tuple[float, float, float]]]:
-        """Every lidar of a row: closeness [bodies · bins], bins around, and color."""
-        return self._observer.readings(row)
-
-    @property
-    def observation_layout(self) -> dict[str, slice]:
-        """Where each named component lies in the flat observation."""
-        return dict(self._observer.slices)
-
-    @property
-    def channels(self) -> dict[str, Channel]:
-        """Size, bounds and unit of each named component, in the order of the flat observation."""
-        return dict(self._observer.channels)
-
     def observe(self, dtype: DTypeLike = np.float32) -> Array:
         """The flat observation of every row, [N, D], a new array; float64 before the cast."""
-        return self._observer.observe(dtype)
+        return self.observer.observe(dtype)
 
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Give one row its generator; its layouts and its movers draw from nothing else."""

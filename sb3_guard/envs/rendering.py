@@ -276,7 +276,7 @@ class Renderer:
             part.draw(painter, row)
         if not self._explain:  # the rest is not in the world
             return
-        for lidar in engine.lidar_readings(row):
+        for lidar in engine.observer.readings(row):
             painter.ring(*lidar)
         painter.heading()
         pays = any(c.cost()[row] > 0 for c in engine.constraints)

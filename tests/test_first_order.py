@@ -150,12 +150,12 @@ def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
 
 
 class Given:
-    """A policy whose distributions are given, in place of one that was kept."""
+    """Distributions that are given, in place of those that a policy had."""
 
     def __init__(self, mean: th.Tensor) -> None:
         self.mean = mean
 
-    def get_distribution(self, observations: Any) -> Any:
+    def at(self, places: Any) -> Any:
         return gaussian(self.mean)
 
 
@@ -170,7 +170,7 @@ def gaussian(mean: th.Tensor) -> Any:
 
 def batch(advantages: list[float], cost_advantages: list[list[float]]) -> Any:
     class Batch:
-        observations = None
+        places = None
 
     made: Any = Batch()
     made.advantages = th.tensor(advantages)

@@ -24,13 +24,14 @@ from torch import nn
 from sb3_guard.algorithms import CPO, TRPO, TrustRegion
 from sb3_guard.algorithms.common.actor import (
     Actor,
+    Before,
     actor_parameters,
     kl,
     value_parameters,
 )
 from sb3_guard.algorithms.common.batches import CHUNK, chunks
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
-from sb3_guard.algorithms.common.fast.actor import TanhActor, actor_of, tanh_actor
+from sb3_guard.algorithms.common.fast.actor import TanhActor, actor_of, distribution_of, tanh_actor
 from sb3_guard.algorithms.common.fast.mlp import TanhMlp
 from sb3_guard.algorithms.common.natural_gradient import assign, flatten
 
@@ -155,6 +156,41 @@ def test_kl_is_of_the_old_to_the_new_policy(head: str) -> None:
     assert divergence == pytest.approx(expected, rel=1e-4)
     expected_ratio = th.exp(new.log_prob(actions) - old.log_prob(actions))
     th.testing.assert_close(ratio, expected_ratio.detach(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_written_out_policy_has_autograds_gradient(head: str) -> None:
+    policy = make_policy(HEADS[head])
+    observations, actions = make_batch(policy, 40)
+    parameters, weights = actor_parameters(policy), th.randn(40)
+    gradients, methods = [], [distribution_of(policy), policy.get_distribution]
+    assert methods[0] != methods[1]
+    for method in methods:
+        distribution = method(observations)
+        objective = th.exp(distribution.log_prob(actions)) @ weights
+        gradients.append(flatten(th.autograd.grad(objective, parameters)))
+    th.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_what_a_policy_was_is_kept_row_by_row(head: str) -> None:
+    """In more rows than are looked at together; the policy learns on."""
+    policy = make_policy(HEADS[head])
+    observations, actions = make_batch(policy, CHUNK + 40)
+    before, old = Before(policy, observations, actions), copy.deepcopy(policy)
+    assign(actor_parameters(policy), flatten(actor_parameters(policy)) + 0.1)
+    places = th.tensor([3, CHUNK + 7, 0])
+    with th.no_grad():
+        expected = old.get_distribution(observations[places])
+        log_prob = expected.log_prob(actions[places])
+        th.testing.assert_close(before.log_prob[places], log_prob)
+        th.testing.assert_close(before.at(places).log_prob(actions[places]), log_prob)
+        zero = kl(before.at(places), expected)
+        assert (
+            float(zero.abs().max())
+            < 1e-6
+            < float(kl(before.at(places), policy.get_distribution(observations[places])).min())
+        )
 
 
 class _Noisy(ActorCriticPolicy):

@@ -8,6 +8,7 @@ from stable_baselines3.common.distributions import Distribution
 from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 
@@ -51,6 +52,10 @@ class CUP(Lagrangian, FirstOrder):
                 "discount factor below 1, such as 0.99, or PPOLag, which takes any"
             )
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        fuse(self.policy.optimizer)  # which takes twice as many steps as PPO's
+
     @property
     def factor(self) -> float:
         """(1 - γλ)/(1 - γ), with the discount and the λ of the advantages."""
@@ -67,9 +72,7 @@ class CUP(Lagrangian, FirstOrder):
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution
     ) -> th.Tensor:
         """What the second step descends on a minibatch: a scalar."""
-        with th.no_grad():
-            improved = self._improved.get_distribution(batch.observations)
-        pair = improved, distribution
+        pair = self._improved.at(batch.places), distribution
         divergence = kl(*(pair if self.projection_kl == "forward" else pair[::-1]))
         cost = ratio * (batch.cost_advantages @ self._price)
         return (divergence + self.factor * cost).mean()

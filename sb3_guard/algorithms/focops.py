@@ -53,9 +53,7 @@ class FOCOPS(Lagrangian, FirstOrder):
     def loss(
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution
     ) -> th.Tensor:
-        with th.no_grad():
-            old = self._old.get_distribution(batch.observations)
-        divergence = kl(distribution, old)
+        divergence = kl(distribution, self._old.at(batch.places))
         near = (divergence.detach() <= self.trust_region).to(divergence)
         advantages = batch.advantages - batch.cost_advantages @ self._price
         return (near * (divergence - ratio * advantages / self.temperature)).mean()

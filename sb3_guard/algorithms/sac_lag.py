@@ -44,10 +44,12 @@ class SACLag(LagrangianReplay, SAC):
         logs["critic_loss"] = critic_loss.item()  # type: ignore[union-attr]
         logs["cost_critic_loss"] = self.fit_cost_critic(batch, next_actions)
 
-        chosen, _ = th.min(th.cat(self.critic(batch.observations, actions), dim=1), 1, keepdim=True)
-        loss = self.penalized(alpha * log_prob - chosen, batch, actions, values[0]).mean()
         self.actor.optimizer.zero_grad()
-        loss.backward()
+        with self.critics_constant():
+            chosen = th.cat(self.critic(batch.observations, actions), dim=1)
+            chosen, _ = th.min(chosen, dim=1, keepdim=True)
+            loss = self.penalized(alpha * log_prob - chosen, batch, actions, values[0]).mean()
+            loss.backward()
         self.actor.optimizer.step()
         logs["actor_loss"] = loss.item()
 

@@ -42,10 +42,11 @@ class TD3Lag(LagrangianReplay, TD3):
 
         if self._n_updates % self.policy_delay == 0:
             actions = self.actor(batch.observations)
-            chosen = self.critic.q1_forward(batch.observations, actions)
-            loss = self.penalized(-chosen, batch, actions, values[0]).mean()
             self.actor.optimizer.zero_grad()
-            loss.backward()
+            with self.critics_constant():
+                chosen = self.critic.q1_forward(batch.observations, actions)
+                loss = self.penalized(-chosen, batch, actions, values[0]).mean()
+                loss.backward()
             self.actor.optimizer.step()
             logs["actor_loss"] = loss.item()
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)

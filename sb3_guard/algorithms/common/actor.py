@@ -4,7 +4,8 @@ Any ``ActorCriticPolicy`` works, through autograd; ``fast/actor.py`` has the sam
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import gymnasium as gym
 import torch as th
@@ -69,6 +70,55 @@ def value_parameters(policy: ActorCriticPolicy) -> list[th.Tensor]:
 def _zero_observation(policy: ActorCriticPolicy) -> PyTorchObs:
     empty = gym.vector.utils.create_empty_array(policy.observation_space, n=1)
     return obs_as_tensor(empty, policy.device)  # type: ignore[arg-type]
+
+
+def combined(
+    distributions: Sequence[Distribution], function: Callable[[list[th.Tensor]], th.Tensor]
+) -> Distribution:
+    """The distribution whose parameters a function makes of those of others, of one kind.
+
+    :param function: maps tensors of shapes [B_i, …], one per distribution, to one of [B, …]
+    """
+
+    def of(parts: Sequence[th.distributions.Distribution]) -> th.distributions.Distribution:
+        names = parts[0].arg_constraints.keys()
+        arguments = {
+            name: function([getattr(part, name) for part in parts])
+            for name in (["logits"] if "logits" in names else names)
+        }
+        return type(parts[0])(**arguments, validate_args=False)
+
+    inner: list[Any] = [each.distribution for each in distributions]
+    result = copy.copy(distributions[0])
+    several = isinstance(inner[0], list)
+    result.distribution = (
+        [of(parts) for parts in zip(*inner, strict=True)] if several else of(inner)
+    )
+    return result
+
+
+class Before:
+    """A policy as it was, on the rows of a rollout: distances from it are measured as it learns.
+
+    :param policy: any actor-critic policy
+    :param observations: batch of N observations
+    :param actions: sampled actions, as the policy's distribution takes them
+    """
+
+    @th.no_grad()
+    def __init__(
+        self, policy: ActorCriticPolicy, observations: PyTorchObs, actions: th.Tensor
+    ) -> None:
+        policy.set_training_mode(False)
+        slices = chunks(n_rows(observations))
+        # The policy hands out one distribution object again and again.
+        parts = [copy.copy(policy.get_distribution(rows(observations, each))) for each in slices]
+        self.distribution = combined(parts, th.cat)
+        self.log_prob = self.distribution.log_prob(actions)  # [N]
+
+    def at(self, places: th.Tensor) -> Distribution:
+        """Its distributions at some of the rows."""
+        return combined([self.distribution], lambda tensors: tensors[0][places])
 
 
 class Actor:

@@ -27,9 +27,10 @@ class CostRolloutBufferSamples(NamedTuple):
     cost_returns: th.Tensor  # [B, m]
     previous_costs: th.Tensor  # [B, m], of the step before; 0 at the start of an episode
     executed_actions: th.Tensor  # [B, action_dim], or [B, 0] where nothing corrects actions
+    places: th.Tensor  # [B], where in the whole rollout the rows are
 
 
-_FIELDS = CostRolloutBufferSamples._fields[6:]
+_FIELDS = CostRolloutBufferSamples._fields[6:-1]
 _SB3_FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 
 
@@ -146,8 +147,11 @@ class _Costs:
 
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> CostRolloutBufferSamples:
         samples = super()._get_samples(batch_inds, env)  # type: ignore[misc]
-        arrays = (getattr(self, name)[batch_inds] for name in _FIELDS)
-        return CostRolloutBufferSamples(*samples, *(self.to_torch(array) for array in arrays))
+        arrays = (*(getattr(self, name)[batch_inds] for name in _FIELDS), batch_inds)
+        # indexing has copied them
+        return CostRolloutBufferSamples(
+            *samples, *(self.to_torch(array, copy=False) for array in arrays)
+        )
 
 
 class CostRolloutBuffer(_Costs, RolloutBuffer):  # type: ignore[misc]

@@ -18,6 +18,7 @@ from sb3_guard.algorithms.common.actor import actor_modules, value_parameters
 from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
 from sb3_guard.algorithms.common.fast.actor import parameterless
 from sb3_guard.algorithms.common.fast.mlp import TanhMlp, squared_error
+from sb3_guard.algorithms.common.fast.optimizers import fuse
 
 
 class StateNetwork(nn.Module):
@@ -53,6 +54,7 @@ class StateNetwork(nn.Module):
             lr=policy.optimizer.param_groups[0]["lr"],  # type: ignore[call-arg]
             **policy.optimizer_kwargs,
         )
+        fuse(self.optimizer)
 
     def extract_features(self, observations: PyTorchObs) -> th.Tensor:
         """Preprocessed and extracted features of observations, shape [B, features_dim]."""

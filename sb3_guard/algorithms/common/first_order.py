@@ -5,7 +5,6 @@ stopping and logs are PPO's, bit for bit: with the loss it comes with, the class
 that need no other loss than PPO's stand on ``CostRollouts`` and SB3's own ``PPO`` instead.
 """
 
-import copy
 from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
@@ -14,13 +13,15 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.distributions import Distribution
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import explained_variance
 from torch.nn import functional as F
 
+from sb3_guard.algorithms.common.actor import Before
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.fast.actor import distribution_of
+from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.rollouts import CostRollouts
 from sb3_guard.checks import check_integer, check_number
@@ -101,32 +102,22 @@ class FirstOrder(CostRollouts, PPO):
         buffer.cost_advantages = buffer.cost_advantages - buffer.cost_advantages.mean(axis=(0, 1))
         return inverse(deviation)
 
-    def snapshot(self) -> ActorCriticPolicy:
-        """The policy as it is now, to measure distances from while the other one learns."""
-        policy = self.policy
-        kept = {name: getattr(policy, name) for name in ("optimizer", "action_dist")}
-        try:
-            # The one is of no use to a copy, the other may hold parts of a graph.
-            policy.optimizer = policy.action_dist = None  # type: ignore[assignment]
-            old = copy.deepcopy(policy)
-        finally:
-            for name, value in kept.items():
-                setattr(policy, name, value)
-        old.action_dist = copy.copy(kept["action_dist"])
-        old.set_training_mode(False)
-        return old
+    def snapshot(self) -> Before:
+        """The policy as it is now on the rollout, to measure distances from while it learns."""
+        batch = self.rollout_buffer.whole()
+        return Before(self.policy, batch.observations, self._taken(batch))
 
     def descend(
         self,
         loss: Loss,
         values: bool = True,
-        start: ActorCriticPolicy | None = None,
+        start: Before | None = None,
     ) -> None:
         """Take passes of minibatches down a loss.
 
         :param loss: called as :meth:`loss` is
         :param values: whether the reward critic and the entropy bonus learn along
-        :param start: the policy whose distance stops the passes; None for the one that acted
+        :param start: where the distance that stops the passes is from; None for the policy that acted
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
@@ -144,18 +135,25 @@ class FirstOrder(CostRollouts, PPO):
         loss: Loss,
         values: bool,
         history: dict[str, list[float]],
-        start: ActorCriticPolicy | None,
+        start: Before | None,
     ) -> bool:
         """One pass; whether it was the last."""
         history["approx_kl"] = []  # of the last pass alone, as SB3 logs it
+        policy = distribution_of(self.policy)
+        parameters = list(self.policy.parameters())
         for batch in self.rollout_buffer.get(self.batch_size):
-            predicted, log_prob, entropy = self._evaluate(batch)
+            if values:
+                predicted, log_prob, entropy = self._evaluate(batch)
+                distribution = self.policy.action_dist
+            else:
+                distribution = policy(batch.observations)
+                log_prob = distribution.log_prob(self._taken(batch))
             advantages = batch.advantages
             if self.normalize_advantage and len(advantages) > 1:
                 advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
                 batch = batch._replace(advantages=advantages)
             ratio = th.exp(log_prob - batch.old_log_prob)
-            losses = {"policy_gradient_loss": loss(batch, ratio, self.policy.action_dist)}
+            losses = {"policy_gradient_loss": loss(batch, ratio, distribution)}
             total = losses["policy_gradient_loss"]
             if values:
                 losses["entropy_loss"] = -th.mean(-log_prob if entropy is None else entropy)
@@ -170,7 +168,7 @@ class FirstOrder(CostRollouts, PPO):
                 return True
             self.policy.optimizer.zero_grad()
             total.backward()
-            th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
             self.policy.optimizer.step()
         return (
             self.kl_stop == "epoch"
@@ -178,15 +176,15 @@ class FirstOrder(CostRollouts, PPO):
             and self._mean_kl(start) > self.target_kl
         )
 
-    def _evaluate(
-        self, batch: CostRolloutBufferSamples, policy: ActorCriticPolicy | None = None
-    ) -> tuple[th.Tensor, ...]:
-        """Values, log-probabilities and entropies; the distribution is ``policy.action_dist``."""
-        policy = self.policy if policy is None else policy
-        actions = batch.actions
+    def _taken(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """The actions as the policy's distribution takes them."""
         if isinstance(self.action_space, spaces.Discrete):
-            actions = actions.long().flatten()
-        return policy.evaluate_actions(batch.observations, actions)  # type: ignore
+            return batch.actions.long().flatten()
+        return batch.actions
+
+    def _evaluate(self, batch: CostRolloutBufferSamples) -> tuple[th.Tensor, ...]:
+        """Values, log-probabilities and entropies; the distribution is ``policy.action_dist``."""
+        return self.policy.evaluate_actions(batch.observations, self._taken(batch))  # type: ignore
 
     def _value_loss(self, batch: CostRolloutBufferSamples, values: th.Tensor) -> th.Tensor:
         if self.clip_range_vf is not None:
@@ -200,14 +198,14 @@ class FirstOrder(CostRollouts, PPO):
         self,
         batch: CostRolloutBufferSamples,
         log_prob: th.Tensor,
-        start: ActorCriticPolicy | None,
+        start: Before | None,
     ) -> th.Tensor:
         """KL(start ‖ policy), estimated on the actions taken as SB3 does."""
-        old = batch.old_log_prob if start is None else self._evaluate(batch, start)[1]
+        old = batch.old_log_prob if start is None else start.log_prob[batch.places]
         return _approximate_kl(log_prob - old)
 
     @th.no_grad()
-    def _mean_kl(self, start: ActorCriticPolicy | None) -> float:
+    def _mean_kl(self, start: Before | None) -> float:
         """The same of the whole rollout."""
         batch = self.rollout_buffer.whole()
         total = 0.0

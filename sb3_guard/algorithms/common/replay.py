@@ -5,6 +5,8 @@ Q_C(s, a) = c + γ_C Q_C(s', a'); the episodes that ended since the last update 
 """
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -20,6 +22,7 @@ from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.checks import check_number
 
@@ -87,6 +90,7 @@ class CostQ(nn.Module):
             lr=learning_rate,  # type: ignore[call-arg]
             **policy.optimizer_kwargs,
         )
+        fuse(self.optimizer)
 
     @staticmethod
     def larger(values: tuple[th.Tensor, ...]) -> th.Tensor:
@@ -223,8 +227,6 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         with th.no_grad():
             after = critic.larger(critic.target(batch.next_observations, next_actions))
             target = batch.costs + (1 - batch.dones) * gamma * after  # [B, m]
-        # the actor's step then goes through it without gradients of its weights
-        critic.online.requires_grad_(True)
         each = critic.online(batch.observations, batch.actions)
         self.cost_deviation = critic.larger(each).detach().std(dim=0, correction=0).cpu().numpy()
         values = th.cat(each, dim=1)
@@ -232,8 +234,20 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         critic.optimizer.zero_grad()
         loss.backward()
         critic.optimizer.step()
-        critic.online.requires_grad_(False)
         return loss.item()
+
+    @contextmanager
+    def critics_constant(self) -> Iterator[None]:
+        """Let the actor's gradient go through the critics without gradients of their weights."""
+        networks = (*self.critic.q_networks, self.cost_critic.online)  # type: ignore[attr-defined]
+        weights = [w for each in networks for w in each.parameters() if w.requires_grad]
+        for weight in weights:
+            weight.requires_grad_(False)
+        try:
+            yield
+        finally:
+            for weight in weights:
+                weight.requires_grad_(True)
 
 
 class LagrangianReplay(Lagrangian, CostReplay):

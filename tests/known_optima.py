@@ -8,7 +8,7 @@ algorithms on them with their defaults.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -19,6 +19,8 @@ from scipy.optimize import minimize
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_guard.algorithms import FirstOrder
 
 
 class World:
@@ -371,6 +373,20 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
     return Outcome(float(np.mean(outcomes.returns)) / problem.best, costs / limits)
 
 
+def budget(cls: type, problem: Problem) -> Problem:
+    """The problem with as many steps as an algorithm's defaults need.
+
+    SB3's rate of 3e-4 moves a log standard deviation by no more than that in a gradient step, so
+    first-order algorithms get four times the updates of trust regions; off-policy ones get a
+    gradient step for each of 10,000 steps of one environment.
+    """
+    if issubclass(cls, FirstOrder):
+        return replace(problem, updates=4 * problem.updates)
+    if not issubclass(cls, OnPolicyAlgorithm):
+        return replace(problem, n_envs=1, n_steps=1, updates=10_000)
+    return problem
+
+
 def _table(
     shares: Sequence[float],
     n_states: int,
@@ -428,7 +444,3 @@ def problems() -> dict[str, Problem]:
         "contexts": _bandit((1.0,), target=(0.6, 0.4), normals=[[1, 1]], offsets=[[1.0], [-1.0]]),
         "wall": Problem(WallWorld, (0.5,), 1.25, 3.0, n_steps=60, statewise=True),
     }
-
-
-#: A limit of whole episodes, as most algorithms understand it.
-EPISODE = ("bandit", "bandit-2", "table", "table-2", "table-3", "chain", "street")

@@ -126,3 +126,5 @@ def test_commands_named_in_the_readme_exist():
 def test_tables_of_results_are_made_of_their_logs():
     for path, text in script("make_tables").pages().items():
         assert path.read_text() == text, "run `python scripts/make_tables.py`"
+    for path, text in script("known_optima").pages().items():
+        assert path.read_text() == text, "run `python scripts/known_optima.py --seeds`"

@@ -347,6 +347,16 @@ def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) ->
         make(cls, **kwargs)
 
 
+@pytest.mark.parametrize("key", [*KEYS, "scpo"])
+def test_limits_and_bounds_that_contradict_are_named(key: str) -> None:
+    cls = ALGORITHMS[key]
+    with pytest.raises(ValueError, match=r"cost_limit=.*one for each of the 1 cost keys"):
+        make(cls, cost_limit=[1.0, 2.0])
+    if issubclass(cls, Lagrangian):
+        with pytest.raises(ValueError, match=r"lambda_max=1.0: .* lambda_init=2.0"):
+            make(cls, lambda_init=2.0, lambda_max=1.0)
+
+
 def test_focops_takes_no_clip_range() -> None:
     with pytest.raises(TypeError, match="FOCOPS takes no argument 'clip_range'"):
         make(FOCOPS, clip_range=0.2)

@@ -77,7 +77,7 @@ def test_speed_tricks_are_known_where_they_are_chosen_alone():
     fast = "sb3_guard.algorithms.common.fast"
     others = [m for m in MODULES if not m.startswith(fast) and touches(m, fast)]
     assert {m.rpartition(".")[2] for m in others} == {
-        "action_filters", "critics", "rollouts", "trust_region",
+        "action_filters", "critics", "first_order", "replay", "rollouts", "trust_region",
     }  # fmt: skip
 
 

@@ -8,7 +8,6 @@ from stable_baselines3.common.distributions import Distribution
 from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 
@@ -42,6 +41,8 @@ class CUP(Lagrangian, FirstOrder):
         "lambda_units": "relative",
     }
 
+    fuse_adam = True  # it takes twice as many steps as PPO's
+
     projection_kl: Literal["forward", "reverse"] = hyperparameter("forward")
 
     def _check_hyperparameters(self) -> None:
@@ -51,10 +52,6 @@ class CUP(Lagrangian, FirstOrder):
                 "gamma=1.0: CUP weighs costs by (1 - γλ)/(1 - γ), which has no bound there; use a "
                 "discount factor below 1, such as 0.99, or PPOLag, which takes any"
             )
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        fuse(self.policy.optimizer)  # which takes twice as many steps as PPO's
 
     @property
     def factor(self) -> float:

@@ -81,12 +81,13 @@ def combined(
     """
 
     def of(parts: Sequence[th.distributions.Distribution]) -> th.distributions.Distribution:
-        names = parts[0].arg_constraints.keys()
+        kind: Any = type(parts[0])
+        names = kind.arg_constraints.keys()
         arguments = {
             name: function([getattr(part, name) for part in parts])
             for name in (["logits"] if "logits" in names else names)
         }
-        return type(parts[0])(**arguments, validate_args=False)
+        return kind(**arguments, validate_args=False)
 
     inner: list[Any] = [each.distribution for each in distributions]
     result = copy.copy(distributions[0])

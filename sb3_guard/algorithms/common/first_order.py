@@ -61,7 +61,15 @@ class FirstOrder(CostRollouts, PPO):
         if self.target_kl is not None:
             check_number("target_kl", self.target_kl, ends="()")
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.fuse_adam:
+            fuse(self.policy.optimizer)
+
     # What an algorithm replaces
+
+    #: Whether Adam takes its steps as one operation: faster, and PPO's up to rounding alone.
+    fuse_adam: ClassVar[bool] = False
 
     def loss(
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution
@@ -117,7 +125,7 @@ class FirstOrder(CostRollouts, PPO):
 
         :param loss: called as :meth:`loss` is
         :param values: whether the reward critic and the entropy bonus learn along
-        :param start: where the distance that stops the passes is from; None for the policy that acted
+        :param start: the policy whose distance stops the passes; None for the one that acted
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)

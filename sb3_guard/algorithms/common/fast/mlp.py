@@ -117,9 +117,7 @@ class Written(th.autograd.Function):
     """A tanh network as one operation of autograd, which its passes above are the two halves of."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any, network: TanhMlp, x: th.Tensor, *parameters: th.Tensor
-    ) -> th.Tensor:
+    def forward(ctx: Any, network: TanhMlp, x: th.Tensor, *parameters: th.Tensor) -> th.Tensor:
         """
         :param x: a constant, shape [n, d]
         :param parameters: ``network.parameters``

@@ -82,7 +82,7 @@ def test_bad_ids_say_what_is_wrong(name, message):
             "robot.sensing = 'robot' must be a list of texts or null$",
         ),
         ({"goal": {"ends": None}}, "goal.ends = None must be true or false$"),
-        ({"observe": {"remaining": True}}, "observe.remaining = True must be the number of steps"),
+        ({"observe": {"remaining": True}}, "observe.remaining = True must be an integer or null"),
         ({"observe": {"camera": [8, 8.5]}}, "must be a list of 2 integers or null$"),
         (
             {"chase": {"num": 3}},

@@ -182,7 +182,10 @@ class CostEvalCallback(EvalCallback):
             return (True, float(evaluations[0].returns.mean()))
         return (False, -violation)
 
-    def _evaluate(self, deterministic: bool) -> Evaluation:
+    def evaluate(self, deterministic: bool = True) -> Evaluation:
+        """The model's episodes, of its most likely actions or of sampled ones."""
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
         return evaluate_policy(
             self.model,
             self.eval_env,
@@ -201,10 +204,8 @@ class CostEvalCallback(EvalCallback):
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
             return True
-        if self.model.get_vec_normalize_env() is not None:
-            sync_envs_normalization(self.training_env, self.eval_env)
-        evaluation = self._evaluate(self.deterministic)
-        noisy = [self._evaluate(False)] if self.both else []
+        evaluation = self.evaluate(self.deterministic)
+        noisy = [self.evaluate(False)] if self.both else []
         for other in noisy:
             self.logger.record("eval/stochastic_reward", float(other.returns.mean()))
             self.logger.record("eval/stochastic_ep_cost", float(other.costs.mean()))

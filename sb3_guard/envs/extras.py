@@ -42,11 +42,6 @@ class Extras(Part):
     )
 
     def __post_init__(self) -> None:
-        if isinstance(self.remaining, bool):
-            raise ValueError(
-                f"observe.remaining = {self.remaining!r} must be the number of steps of an "
-                "episode, the same as max_episode_steps, such as 1000; or null"
-            )
         super().__post_init__()
         names = self.components
         if names is not None and (not names or len(set(names)) < len(names)):

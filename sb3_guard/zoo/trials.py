@@ -17,13 +17,11 @@ import optuna
 from optuna.exceptions import TrialPruned, UpdateFinishedTrialError
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import sync_envs_normalization
 
-from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.envs.layout import LayoutError
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.hyperparams import check
-from sb3_guard.zoo.make_envs import PROCESS_DIED, evaluation_seed
+from sb3_guard.zoo.make_envs import PROCESS_DIED
 from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.spaces import Search
@@ -141,16 +139,7 @@ class Evaluations(BaseCallback):
 
     def _evaluate(self) -> bool:
         assert self.experiment.evaluation is not None
-        env = self.experiment.evaluation.eval_env
-        if self.model.get_vec_normalize_env() is not None:
-            sync_envs_normalization(self.training_env, env)
-        result = evaluate_policy(
-            self.model,
-            env,
-            n_eval_episodes=self.settings.eval_episodes,
-            seed=evaluation_seed(self.experiment.flags.seed),
-            cost_keys=self.settings.cost_keys,
-        )
+        result = self.experiment.evaluation.evaluate()
         row = [float(result.returns.mean()), *result.limited.mean(axis=0).tolist()]
         if not np.isfinite(row).all():
             raise FloatingPointError(f"an evaluation gave {row}")

@@ -71,28 +71,18 @@ def make_safety_gymnasium(env_id: str, **kwargs: Any) -> gym.Env:
 def _import_safety_gymnasium(env_id: str) -> Any:
     try:
         import safety_gymnasium  # type: ignore[import-not-found]
-    except ModuleNotFoundError as error:
-        if error.name != "safety_gymnasium":
-            raise _broken(env_id, error) from error
-        raise DependencyNotInstalled(
-            f"{env_id!r} needs the package safety-gymnasium, which is not installed. It wants "
-            "MuJoCo 2.3 and Gymnasium 0.29, so it lives in an environment of its own: "
-            "scripts/check_safety_gymnasium.py sets one up (docs/your_environment.md)"
-        ) from error
     except Exception as error:
         # Beside newer packages its import fails in many ways: attributes gone, dataclasses refused.
-        raise _broken(env_id, error) from error
+        absent = isinstance(error, ModuleNotFoundError) and error.name == "safety_gymnasium"
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise DependencyNotInstalled(
+            f"{env_id!r} needs the package safety-gymnasium, which "
+            + ("is not installed" if absent else f"can't be imported here ({reason})")
+            + ". It wants MuJoCo 2.3, Gymnasium 0.29 and a mended source from Python 3.11 on: "
+            "scripts/check_safety_gymnasium.py sets up an environment that works "
+            "(docs/your_environment.md)"
+        ) from error
     return safety_gymnasium
-
-
-def _broken(env_id: str, error: Exception) -> DependencyNotInstalled:
-    reason = " ".join(str(error).split())
-    return DependencyNotInstalled(
-        f"{env_id!r} needs safety-gymnasium, which is installed but can't be imported here "
-        f"({type(error).__name__}: {reason}). It wants MuJoCo 2.3, Gymnasium 0.29 and a mended "
-        "source from Python 3.11 on: scripts/check_safety_gymnasium.py sets up an environment that "
-        "works (docs/your_environment.md)"
-    )
 
 
 def _parts(value: Any, name: str) -> dict[str, float] | None:

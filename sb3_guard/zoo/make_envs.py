@@ -27,7 +27,6 @@ def _errors_of_ours() -> tuple[type[Exception], type[Exception]]:
 
 
 ERRORS_OF_OURS = _errors_of_ours()
-VEC_ENVS = ("native", "dummy", "subproc")
 # What constructors of environments and models raise when their arguments are wrong.
 BAD_ARGUMENTS = (
     ValueError,

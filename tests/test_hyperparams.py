@@ -297,7 +297,7 @@ TABLE = {
 }
 # Where the default is another one: (the paper's, ours).
 LIMIT = {"cost_limit": (0.0, 2.0)}
-LAMBDA = {"cost_gae_lambda": (0.97, None)}  # it is another one on Safety-Gymnasium's tasks
+LAMBDA = {"cost_gae_lambda": (0.97, 0.5)}
 DIFFERENT = {
     "trpo_sl": {
         **LIMIT,
@@ -325,6 +325,7 @@ DIFFERENT = {
     },
     "trpo_ipo": {
         **LIMIT,
+        **LAMBDA,
         "t": (0.01, None),
         "max_multiplier": (0.5, None),
         "units": ("cost", None),

@@ -4,6 +4,8 @@ BIN := $(VENV)/bin
 ALGO ?= cpo
 ENV ?= Goal_Point_8Hazards
 STEPS ?= 1000000
+# What CPO keeps there within these steps; hyperparams/*.yml have the others.
+LIMIT ?= $(if $(filter cpo_Goal_Point_8Hazards,$(ALGO)_$(ENV)),5)
 ARGS ?=
 
 .PHONY: train test test-slow test-lowest check format type docs gallery bench clean
@@ -16,7 +18,8 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	touch $@
 
 train: $(VENV)/ready
-	$(BIN)/python -m sb3_guard.train --algo $(ALGO) --env $(ENV) -n $(STEPS) --progress $(ARGS)
+	$(BIN)/python -m sb3_guard.train --algo $(ALGO) --env $(ENV) -n $(STEPS) --progress \
+		$(if $(LIMIT),-params cost_limit:$(LIMIT)) $(ARGS)
 
 test: $(VENV)/ready
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow" $(ARGS)

@@ -1,11 +1,12 @@
 """Make the trained agents that the package ships: ``python scripts/pretrain.py``.
 
 Trains what is missing with the library's own command, writes a small copy of each agent to
-``sb3_guard/pretrained`` in the layout of a log folder, and draws their curves. With ``-f`` it takes
-runs that are there, made by exactly this command::
+``sb3_guard/pretrained`` in the layout of a log folder, and plays it for 100 episodes with its noise
+and 100 without. Constrained agents are trained at a lower limit than the one they are shipped with,
+and are to keep that in both. With ``-f`` it takes runs that are there, made by exactly this::
 
     python -m sb3_guard.train --algo cpo --env Goal_Point_8Hazards -n 1e6 --seed 1 \
-        --eval-freq -1 --num-threads 1
+        --eval-freq -1 --num-threads 1 -params cost_limit:4
 """
 
 from __future__ import annotations
@@ -15,23 +16,19 @@ import io
 import json
 import shutil
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.ticker import EngFormatter
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard import train
+from sb3_guard import evaluate_policy, make_vec_env, train
 from sb3_guard.zoo.algos import algorithm
-from sb3_guard.zoo.figures import AXES, COLORS
 from sb3_guard.zoo.playback import PRETRAINED
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, run_path
-from sb3_guard.zoo.runs import described, read_curve
 
 
 class Agent(NamedTuple):
@@ -40,6 +37,8 @@ class Agent(NamedTuple):
     algo: str
     env: str
     seed: int
+    trained_at: float | None = None  # cost limit
+    limit: float | None = None  # which it is to keep
 
     @property
     def command(self) -> str:
@@ -47,21 +46,22 @@ class Agent(NamedTuple):
         return (
             f"python -m sb3_guard.train --algo {self.algo} --env {self.env} -n 1e6 "
             f"--seed {self.seed} --eval-freq -1 --num-threads 1"
+            + (f" -params cost_limit:{self.trained_at:g}" if self.trained_at else "")
         )
 
     @property
     def flags(self) -> dict[str, Any]:
         """The same as a run's ``args.yml`` has it."""
         return {"algo": self.algo, "env": f"{self.env}-v0", "n_timesteps": 1_000_000,
-                "seed": self.seed, "eval_freq": -1, "num_threads": 1, "hyperparams": None,
+                "seed": self.seed, "eval_freq": -1, "num_threads": 1,
+                "hyperparams": {"cost_limit": self.trained_at} if self.trained_at else None,
                 "env_kwargs": None, "conf_file": None}  # fmt: skip
 
 
 AGENTS = (
-    Agent("cpo", "Goal_Point_8Hazards", 1),
-    Agent("pcpo", "Goal_Point_8Hazards", 1),
+    Agent("cpo", "Goal_Point_8Hazards", 1, trained_at=4, limit=5),
+    Agent("cpo", "Goal_Point_8Ghosts", 0, trained_at=4, limit=5),
     Agent("trpo", "Goal_Point_8Hazards", 0),
-    Agent("cpo", "Goal_Point_8Ghosts", 0),
 )
 # What only training needs: loaded without it, an agent begins a new training where it stands.
 TRAINING_ONLY = (
@@ -125,34 +125,36 @@ def export(run: RunFolder, agent: Agent) -> RunFolder:
         file.write_text(file.read_text().replace(str(PRETRAINED), "logs"))
     cls = algorithm(agent.algo)
     model = cls.load(run.model, device="cpu")
+    if agent.limit is not None:
+        model.cost_limit = agent.limit
     slim(model, copy.model)
     observations = np.random.default_rng(0).normal(size=(100, *model.observation_space.shape))
     want, got = (one.predict(observations, deterministic=True)[0]
                  for one in (cls.load(run.model), cls.load(copy.model)))  # fmt: skip
     np.testing.assert_array_equal(want, got)
     result = json.loads(run.result.read_text())
+    if agent.limit is not None:
+        result |= {"trained_at": agent.trained_at, "cost_limit": agent.limit}
     copy.write_result({key: v for key, v in result.items() if key not in ("platform", "seconds")})
     return copy
 
 
-def draw(runs: Mapping[Agent, RunFolder], path: Path) -> None:
-    """Return and episode cost of the agents while they were trained."""
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
-    colors = dict(zip(sorted({agent.algo for agent in runs}), COLORS, strict=False))
-    for agent, run in runs.items():
-        curve = read_curve(run.path, 30_000)
-        style = {"color": colors[agent.algo], "linestyle": "--" if "Ghosts" in agent.env else "-"}
-        name = f"{described(agent.algo)['label']}, {agent.env}, seed {agent.seed}"
-        for axis, metric in zip(axes, ("J_r", "M_c"), strict=True):
-            axis.plot(curve["step"], curve[metric], label=name, **style)
-            axis.set(xlabel="steps", ylabel=AXES[metric])
-            axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-            axis.spines[["top", "right"]].set_visible(False)
-            axis.grid(alpha=0.2)
-    axes[1].set_ylim(bottom=0)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=2,
-                  frameon=False)  # fmt: skip
-    figure.savefig(path, dpi=100)
+def played(run: RunFolder, agent: Agent) -> Iterator[str]:
+    """What an agent gets and pays in 100 episodes with its noise and 100 without, ± standard error.
+
+    :raises SystemExit: it does not keep its limit
+    """
+    model = algorithm(agent.algo).load(run.model, device="cpu")
+    for seed, deterministic in enumerate((False, True)):
+        env = make_vec_env(agent.env, 100, seed=10_000 * (seed + 1))
+        found = evaluate_policy(model, env, 100, deterministic=deterministic)
+        env.close()
+        both = (
+            f"{one.mean():.2f} ± {one.std(ddof=1) / 10:.2f}" for one in (found.returns, found.costs)
+        )
+        yield ("without noise" if deterministic else "with noise") + " {}, cost {}".format(*both)
+        if agent.limit is not None and found.costs.mean() > agent.limit:
+            raise SystemExit(f"{agent.algo} on {agent.env} does not keep {agent.limit}")
 
 
 def main() -> None:
@@ -161,14 +163,14 @@ def main() -> None:
         "-f", "--folders", nargs="+", default=["logs/pretrained"],
         help="log folders: a run is taken from the first that has it, or trained into the first",
     )  # fmt: skip
-    parser.add_argument("-o", "--picture", type=Path, default=Path("docs/images/pretrained.png"))
     args = parser.parse_args()
-    runs = {agent: find(agent, args.folders) for agent in AGENTS}
-    for agent, run in runs.items():
-        copy = export(run, agent)
+    for agent in AGENTS:
+        copy = export(find(agent, args.folders), agent)
         size = sum(file.stat().st_size for file in copy.path.rglob("*") if file.is_file())
-        print(f"{copy.path.relative_to(PRETRAINED)} {size / 1024:.0f} KiB")
-    draw(runs, args.picture)
+        at = "" if agent.limit is None else f", limit {agent.limit:g}"
+        print(f"{copy.path.relative_to(PRETRAINED)} {size / 1024:.0f} KiB{at}")
+        for line in played(copy, agent):
+            print(f"  {line}", flush=True)
 
 
 if __name__ == "__main__":

@@ -59,10 +59,11 @@ class Wordy(CostPoint):
 class Broken(CostPoint):
     """Fails after a while."""
 
-    error = RuntimeError("out of order")
+    error: Exception = RuntimeError("out of order")
+    after = 20
 
     def step(self, action: np.ndarray) -> Any:
-        if self.steps > 20:
+        if self.steps > self.after:
             raise self.error
         return super().step(action)
 

@@ -63,6 +63,8 @@ TRAIN = [
     (["--env-kwargs", "hazard:{}"], ["'hazard'", "hazards"]),
     (["--env-kwargs", "hazards:{'num': -1}"], ["num", "-1"]),
     (["--env-kwargs", "hazards:{'size': 'big'}"], ["size", "'big'"]),
+    (["--env-kwargs", "speed:{limit:0.4}", "hazards:{sise:0.4}"], ["'sise'", "'size'"]),
+    (["--env-kwargs", "max_steps:100"], ["'max_steps'", "'max_episode_steps'"]),
     (["--env-kwargs", "hazards"], ["'hazards' is not of the form key:value"]),
     ([*TOY, "--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
     (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError", "hazards"]),
@@ -199,9 +201,13 @@ def test_a_yaml_bomb(capsys, tmp_path):
         read_data(tmp_path / "bomb.yml")
 
 
-def test_a_csv_that_was_changed(capsys, run):
+@pytest.mark.parametrize(
+    "change", [lambda old: old[:-20], lambda old: bytes(range(256)) * len(old), lambda old: None]
+)
+def test_a_csv_that_was_changed(change, capsys, run):
     csv = run / "0.monitor.csv"
-    csv.write_text(csv.read_text()[:-20])
+    content = change(csv.read_bytes())
+    csv.unlink() if content is None else csv.write_bytes(content)
     before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
     refused(train.main, ["-i", str(run), "-n", "120"], capsys, "0.monitor.csv", "was changed since")
     assert before == {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
@@ -401,17 +407,23 @@ def test_kept_model_that_is_not_there(capsys, run, tmp_path):
     [("Flickering-v0", ["training stopped at", "is nan: a cost must be a finite number"]),
      ("Wordy-v0", ["info['cost'] is 'high': a cost must be a finite number"])],
 )  # fmt: skip
-def test_costs_of_a_baseline(env, parts, capsys, tmp_path):
-    arguments = f"--algo ppo --env {env} -n 64 -params n_envs:1 n_steps:64 batch_size:32".split()
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+def test_costs_of_a_baseline(algo, env, parts, capsys, tmp_path):
+    params = "n_steps:64" if algo == "ppo" else "learning_starts:10"
+    arguments = f"--algo {algo} --env {env} -n 64 -params n_envs:1 batch_size:32 {params}".split()
     arguments += ["--gym-packages", "registered_envs", "--eval-freq", "-1", "--device", "cpu"]
     refused(train.main, [*arguments, "-f", str(tmp_path)], capsys, *parts)
     assert not list(tmp_path.rglob("result.json"))
 
 
-@pytest.mark.parametrize("error", [RuntimeError("out of order"), OSError(ENOSPC, "no space")])
-def test_an_exception_of_the_users_keeps_its_traceback(error, capsys, tmp_path, monkeypatch):
-    """A full disk of the environment's is not the run's."""
+@pytest.mark.parametrize(
+    ("error", "after"),
+    [(RuntimeError("out of order"), 20), (OSError(ENOSPC, "no space"), 20), (KeyError("mine"), -1)],
+)
+def test_an_exception_of_the_users_keeps_its_traceback(error, after, capsys, tmp_path, monkeypatch):
+    """A full disk of the environment's is not the run's; the first step is no exception."""
     monkeypatch.setattr(Broken, "error", error)
+    monkeypatch.setattr(Broken, "after", after)
     arguments = "--algo ppo --env Broken-v0 -n 64 -params n_envs:1 n_steps:64 batch_size:32".split()
     arguments += ["--gym-packages", "registered_envs", "--eval-freq", "-1", "--device", "cpu"]
     assert train.main([*arguments, "-f", str(tmp_path)]) == 2

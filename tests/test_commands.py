@@ -450,6 +450,17 @@ def test_a_shipped_agent_is_small_good_and_goes_on_learning(run):
     model.learn(200)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", ["Goal_Point_8Hazards", "Goal_Point_8Ghosts"])
+@pytest.mark.parametrize("noise", [[], ["--stochastic"]])
+def test_a_shipped_agent_keeps_its_limit(env_id, noise, tmp_path):
+    """On average: 200 episodes with a standard error of 0.3."""
+    file = tmp_path / "played.json"
+    which = ["--pretrained", "--no-render", "--verbose", "0", "--env", env_id, *noise]
+    assert enjoy.main([*which, "--n-episodes", "200", "--json", str(file)]) == 0
+    assert 1 < json.loads(file.read_text())["cost"]["mean"] < 5.3
+
+
 def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert enjoy.main(["--pretrained", "-n", "20", "--no-render"]) == 0

@@ -224,6 +224,9 @@ def test_an_evaluation_in_words():
     assert str(evaluation([2.0])).startswith("1 episodes: return 2.000, cost ")
     words = str(evaluation([1, 3]))
     assert words.startswith("2 episodes: return 2.000 ± 1.000 (95 % [1.000, 3.000]), cost ")
+    assert "limit" not in words
+    model = CPO("MlpPolicy", CostPoint(10), n_steps=20, cost_limit=30.0, seed=0)
+    assert str(evaluate_policy(model, CostPoint(10), 2)).endswith(", limit 30: kept")
 
 
 @pytest.mark.parametrize(

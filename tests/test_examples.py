@@ -30,13 +30,13 @@ SAYS = {
     "safety_gymnasium_env": (["return ", "cost "], []),
     "saute": (["PPO 10 episodes", "SAC 10 episodes"], []),
     "several_constraints": (["return", "cost_hazards, limit 5.0", "cost_ghosts, limit 2.0"], []),
-    "train_cpo": (["ep_cost_mean", "return ", "cost "], ["cpo_point.zip"]),
+    "train_cpo": (["ep_cost_mean", ", limit 5: "], ["cpo_point.zip"]),
     "tune_with_optuna": (["0 ", "1 ", "limit"], []),
     "vector_env": (["steps per second, observations (32, 62)", "return and cost"], []),
     "your_own_env": (["costs of episodes: [", "off-policy: [", "steps off the middle: ["], []),
 }
 LENGTHS = {
-    r"[123]00_000": "200",
+    r"[1235]00_000": "200",
     r"n_steps=(1000|500)": "n_steps=20",
     r"batch_size=1000": "batch_size=200",
     r"buffer_size=100_000": "buffer_size=200",

@@ -264,6 +264,7 @@ def test_text_that_names_nothing(name, value, message):
         ("[1, 2]", [1, 2]),
         ("None", None),
         ("{'num': 4}", {"num": 4}),
+        ("{limit:0.4}", {"limit": 0.4}),
         ("dict(num=4, more=dict(a=[1]))", {"num": 4, "more": {"a": [1]}}),
         ("MlpPolicy", "MlpPolicy"),
         ("lin_0.001", "lin_0.001"),

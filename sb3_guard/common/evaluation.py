@@ -77,6 +77,7 @@ class Evaluation:
         shape [K, 3]; they are in none of the others
     :param max_costs: highest cost of a step, by key, shape [E, m]; 0 where none is above it
     :param limit_on: what of the costs the model's limits bound, their ``"sum"`` or ``"max"``
+    :param limits: the model's limits, one for each cost key; empty if it has none
     """
 
     returns: np.ndarray
@@ -87,6 +88,7 @@ class Evaluation:
     unfinished: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     max_costs: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)))
     limit_on: str = "sum"
+    limits: tuple[float, ...] = ()
 
     def __len__(self) -> int:
         return len(self.returns)
@@ -95,8 +97,9 @@ class Evaluation:
         returns, costs = self.estimate(self.returns), self.estimate(self.costs)
         text = f"{len(self)} episodes: return {returns}, cost {costs}"
         if self.limit_on == "max":
-            text += f", worst step {self.estimate(self.worst)}"
-        return text
+            costs = self.estimate(self.worst)
+            text += f", worst step {costs}"
+        return text + (f", {costs.against(self.limits[0])}" if len(self.limits) == 1 else "")
 
     @property
     def limited(self) -> np.ndarray:
@@ -262,4 +265,7 @@ def evaluate_policy(
         unfinished=np.stack([returns, totals, lengths], axis=1)[(left > 0) & (lengths > 0)],
         max_costs=np.array([episode[4] for episode in ended]).reshape(len(ended), len(keys)),
         limit_on=getattr(model, "limit_on", "sum"),
+        limits=tuple(model.cost_limits.tolist())
+        if isinstance(model, Constrained) and model.constrained and keys == tuple(model.cost_keys)
+        else (),
     )

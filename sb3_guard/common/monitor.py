@@ -5,6 +5,7 @@ import inspect
 import os
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -143,17 +144,17 @@ class CostMonitor(VecMonitor):
         :param filename: the csv; its name ends in ``monitor.csv`` (else that is appended)
         :param offset: None begins a new file. A number of bytes, as found in :meth:`state`, keeps
             that much of the file, drops the rows after it and goes on from there
-        :raises ValueError: the file is shorter than ``offset``
+        :raises ValueError: the file is absent, shorter than ``offset``, or no monitor's
         """
         if self.results_writer is not None:
             self.results_writer.close()
         path = os.fspath(filename)
         if offset is not None:
-            size = os.path.getsize(path)
-            if size < offset:
+            kept = Path(path).read_bytes()[:offset] if os.path.exists(path) else b""
+            if len(kept) < offset or not (kept.startswith(b"#{") and kept.endswith(b"\n")):
                 raise ValueError(
-                    f"{path} has {size} bytes but had {offset} when the run was saved: "
-                    "it was changed since, and the run can't be continued in this folder"
+                    f"{path} was changed since the run was saved, when it had {offset} bytes: put "
+                    "it back, or the run can't be continued in this folder"
                 )
             os.truncate(path, offset)
         spec = getattr(self.venv, "spec", None)

@@ -121,10 +121,13 @@ class Experiment:
         vec_env = "dummy" if self.vec_env == "subproc" else self.vec_env
         env = self._make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
         try:
-            with explained(f"{self.flags.env} fails at its first step", *BAD_ARGUMENTS):
+            with explained(f"{self.flags.env} fails at its first step", *ERRORS_OF_OURS):
                 env.reset()
                 env.action_space.seed(self.flags.seed)
                 info = env.step(np.array([env.action_space.sample()]))[3][0]
+        except Exception as error:
+            self._blame(error, "its first step")
+            raise
         finally:
             env.close()
         if not getattr(self.algorithm, "constrained", False):
@@ -247,11 +250,7 @@ class Experiment:
                 f"continue with -i {folder.path}"
             ) from error
         except Exception as error:
-            if from_environment(error):
-                raise ForeignError(
-                    f"{self.flags.env} raised {one_line(error)} at "
-                    f"{self.model.num_timesteps} steps; its traceback:"
-                ) from error
+            self._blame(error, f"{self.model.num_timesteps} steps")
             if isinstance(error, OSError) and is_disk_error(error):
                 what = "standard output" if _stdout_is_full() else str(folder.path)
                 raise UsageError(
@@ -261,6 +260,12 @@ class Experiment:
             raise
         finally:
             self.close()
+
+    def _blame(self, error: Exception, when: str) -> None:
+        """Raise a :class:`ForeignError` if the environment raised the exception."""
+        if not isinstance(error, UsageError) and from_environment(error):
+            what = f"{self.flags.env} raised {one_line(error)} at {when}; its traceback:"
+            raise ForeignError(what) from error
 
     @property
     def _envs(self) -> list[VecEnv]:

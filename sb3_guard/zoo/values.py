@@ -36,7 +36,7 @@ def _value(node: ast.expr, named: Callable[[str], Any] | None) -> Any:
         case ast.Dict(keys=keys, values=values):
             pairs_ = [(key, one) for key, one in zip(keys, values, strict=True) if key is not None]
             if len(pairs_) == len(values):
-                return {ast.literal_eval(key): _value(one, named) for key, one in pairs_}
+                return {_key(key): _value(one, named) for key, one in pairs_}
         case ast.List(elts=items):
             return [_value(item, named) for item in items]
         case ast.Tuple(elts=items):
@@ -48,11 +48,16 @@ def _value(node: ast.expr, named: Callable[[str], Any] | None) -> Any:
     raise ValueError(f"{ast.unparse(node)} is not allowed")
 
 
+def _key(node: ast.expr) -> Any:
+    """A shell takes quotes away, so that ``{limit:0.4}`` is what a user typed or what is left."""
+    return node.id if isinstance(node, ast.Name) else ast.literal_eval(node)
+
+
 def parse_value(text: str) -> Any:
     """
     The value of ``key:value``: a literal or ``dict(a=1)``; anything else is text as it is.
 
-    So ``cost_limit:25``, ``policy:MlpPolicy``, ``hazards:{'num':4}`` and ``learning_rate:lin_1e-3``
+    So ``cost_limit:25``, ``policy:MlpPolicy``, ``hazards:{num:4}`` and ``learning_rate:lin_1e-3``
     need no further quotes, and ``policy_kwargs:dict(activation_fn=nn.ReLU)`` stays text until the
     model is made, as it does in a YAML file.
     """

@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from sb3_guard import ALGORITHMS, make_vec_env
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
+from sb3_guard.envs.suites.velocity import TABLE
 from sb3_guard.zoo.playback import find_pretrained
 
 TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
@@ -28,6 +29,11 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "task_chase_solid": ("Chase_Point_8Hazards", {"chase": {"solid": True}}),
     "task_push_box": ("Push_Point_8Hazards", {"push": {"object": "box"}}),
 }
+SAFETY = {
+    f"safety_{task.lower()}": f"SafetyPoint{task}-v0"
+    for task in ("Goal1", "Button1", "Push1", "Circle1", "Run0")
+}
+SAFETY |= {f"velocity_{robot.lower()}": f"Safety{robot}Velocity-v1" for robot in TABLE}
 MOVING = {
     "constraint_ghosts": "Goal_Point_8Ghosts",
     "constraint_gremlins": "Goal_Point_8Gremlins",
@@ -153,6 +159,9 @@ def main() -> None:
     for constraint in guard(CONSTRAINTS):
         path = args.output / f"constraint_{constraint.lower()}.png"
         picture(f"Goal_Point_8{constraint}", path, "fixed", 1, args.seed)
+    for stem, env_id in SAFETY.items():
+        near = "Run" in env_id or "Velocity" in env_id
+        picture(env_id, args.output / f"{stem}.png", "track" if near else "fixed", 1, args.seed)
     for stem, (env_id, params) in VARIANTS.items():
         picture(env_id, args.output / f"{stem}.png", "fixed", 1, args.seed, **params)
 

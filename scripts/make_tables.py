@@ -2,8 +2,9 @@
 
 ``docs/data/NAME.tar.xz`` holds the logs of a grid of runs, as ``benchmark`` writes them, without
 models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
-a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``.
-``--pack FOLDER NAME`` packs the logs of a folder.
+a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``;
+with ``learnt:`` instead, what the agents earned in the end beside the untrained ones of
+``docs/data/untrained.csv``. ``--pack FOLDER NAME`` packs the logs of a folder.
 """
 
 import argparse
@@ -18,14 +19,16 @@ import pandas as pd
 
 from sb3_guard.zoo.figures import Data, save
 from sb3_guard.zoo.paper import draw
-from sb3_guard.zoo.runs import read_results
+from sb3_guard.zoo.runs import read_episodes, read_results
 from sb3_guard.zoo.statistics import aggregate, with_safety
 from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
-BLOCK = re.compile(r"(<!-- runs: (\S+)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- (runs|learnt): (\S+)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 PUBLISHED_STEPS = 1_000_000
+LAST = 90  # episodes: three rollouts of 30 environments
+APART = 3.0  # standard errors: what counts as learnt
 LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml")
 
 
@@ -37,7 +40,10 @@ def runs(name: str) -> pd.DataFrame:
             archive.extractall(folder, filter="data")
         found = read_results([folder])
         assert not found.left_out, found.left_out
-        return with_safety(found.runs)
+        ends = [read_episodes(path).tail(LAST) for path in found.runs["path"]]
+        returns = pd.DataFrame([end["J_r"] for end in ends]).T
+        means = {"trained": [*returns.mean()], "trained_se": [*returns.sem()]}
+        return with_safety(found.runs).assign(**means)
 
 
 def tables(name: str, only: str | None) -> str:
@@ -76,6 +82,26 @@ def tables(name: str, only: str | None) -> str:
     return "\n\n".join(parts)
 
 
+def learnt(name: str) -> str:
+    """A table of what was learnt on each suite, by one seed, beside random and zero actions."""
+    untrained = pd.read_csv(DATA / "untrained.csv", index_col="suite")
+    untrained.index = untrained.index.str.removesuffix("-v0")
+    rows = runs(name).set_index("suite").join(untrained)
+    rows = rows.loc[[suite for suite in untrained.index if suite in rows.index]].reset_index()
+    error = (rows["trained_se"] ** 2 + rows["random_se"] ** 2) ** 0.5
+    columns: dict[str, Any] = {
+        "suite": "suite",
+        "random": lambda row: spread(row["random"], row["random_se"]),
+        "zero": lambda row: spread(row["zero"], row["zero_se"]),
+        "trained": lambda row: spread(row["trained"], row["trained_se"]),
+        "apart": lambda row: number(row["apart"], 1),
+        "learnt": lambda row: "yes" if row["apart"] >= APART else "no",
+        "episode cost": lambda row: number(row["cost_last"], 1),
+    }
+    rows["apart"] = (rows["trained"] - rows[["random", "zero"]].max(axis=1)) / error
+    return markdown(spelled(rows, columns))
+
+
 def _published(known: pd.DataFrame, algo: str) -> str:
     if algo not in known.index:
         return "–"
@@ -86,7 +112,13 @@ def _published(known: pd.DataFrame, algo: str) -> str:
 
 def filled(page: str) -> str:
     """A page with its tables made anew."""
-    return BLOCK.sub(lambda m: f"{m[1]}\n{tables(m[2], m[3])}\n\n{m[4]}", page)
+
+    def table(match: re.Match[str]) -> str:
+        begin, kind, name, only, end = match.groups()
+        text = learnt(name) if kind == "learnt" else tables(name, only)
+        return f"{begin}\n{text}\n\n{end}"
+
+    return BLOCK.sub(table, page)
 
 
 def pages() -> dict[Path, str]:
@@ -119,8 +151,8 @@ def main() -> None:
     for path, text in pages().items():
         path.write_text(text)
         print(path)
-        for _, name, only, _ in BLOCK.findall(text):
-            if only:
+        for _, kind, name, only, _ in BLOCK.findall(text):
+            if only or kind == "learnt":
                 continue
             # Drawn is what the tables have: the last ten epochs, not the last one.
             found = runs(name)

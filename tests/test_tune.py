@@ -88,7 +88,7 @@ def test_an_algorithm_of_a_user_tunes(tmp_path, monkeypatch):
     """In the space of its class and those of its bases, and from no file."""
 
     class Mine(TRPO):
-        search_space = {"gamma": [0.5, 0.6], "max_grad_norm": {"low": 0.1, "high": 1.0}}  # noqa: RUF012
+        search_space = {"gamma": [0.5, 0.6], "cg_damping": {"low": 0.1, "high": 1.0}}  # noqa: RUF012
 
     monkeypatch.setitem(ALGORITHMS, "mine", Mine)
     space = space_of("mine")
@@ -98,7 +98,7 @@ def test_an_algorithm_of_a_user_tunes(tmp_path, monkeypatch):
     assert run(tmp_path, "--algo", "mine", "--n-trials", "2") == 0
     (folder,) = (tmp_path / "mine").iterdir()
     values = read_hyperparams("mine", "CostPoint-v0", str(folder / "best.yml"))
-    assert values["gamma"] in (0.5, 0.6) and 0.1 <= values["max_grad_norm"] <= 1.0
+    assert values["gamma"] in (0.5, 0.6) and 0.1 <= values["cg_damping"] <= 1.0
 
 
 @pytest.mark.parametrize("algo", ["trpo", "trpo_lag", "crossq"])

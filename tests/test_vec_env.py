@@ -118,7 +118,7 @@ def test_wrappers_and_normalisation_work():
         (
             "Goal_Point_8Hazards",
             {"vec_env": "native", "wrapper_class": gymnasium.wrappers.ClipReward},
-            "wrapper_class needs",
+            "wrapper_class, or env_wrapper",
         ),
         ("Goal_Point_8Hazards", {"env_kwargs": {"hazards": {"num": -1}}}, "must be at least 0"),
     ],

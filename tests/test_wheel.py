@@ -18,7 +18,8 @@ def test_a_wheel_installed_elsewhere_trains_and_plays(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
         agents = [name for name in archive.namelist() if name.startswith("sb3_guard/pretrained/")]
-    assert sum(name.endswith("-v0.zip") for name in agents) == 4
+    shipped = len([*(ROOT / "sb3_guard" / "pretrained").rglob("*-v0.zip")])
+    assert sum(name.endswith("-v0.zip") for name in agents) == shipped > 0
     env = {**os.environ, "PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"}
 
     which = "--algo cpo --env Goal_Ant_8Hazards -f logs".split()

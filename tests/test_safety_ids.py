@@ -94,7 +94,7 @@ def test_saving_changes_nothing_and_what_is_restored_continues_bit_for_bit(env_i
     assert slept or env_id not in SLEEPERS
 
 
-def test_customized_like_every_other_scenario(capsys):
+def test_customized_like_every_other_scenario(capsys, tmp_path, monkeypatch):
     env = gymnasium.make("SafetyPointGoal1-v0", hazards={"num": 4, "size": 0.3})
     hazards = env.unwrapped.scenario.constraints["hazards"]
     assert (hazards["num"], hazards["size"], hazards["keepout"]) == (4, 0.3, 0.18)
@@ -103,6 +103,7 @@ def test_customized_like_every_other_scenario(capsys):
     np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
     with pytest.raises(ValueError, match="hazards"):
         gymnasium.make("SafetyPointGoal1-v0", hazards={"number": 4})
+    monkeypatch.chdir(tmp_path)  # where the picture goes
     show = ["show", "SafetyPointGoal1-v0", "--env-kwargs", "hazards:{'num': 4}"]
     assert cli.main(show) == 0
     assert "  hazards:\n    size: 0.2\n    num: 4\n" in capsys.readouterr().out

@@ -145,7 +145,7 @@ def _scenario(robot: str, level: str) -> dict[str, Any]:
 
 
 _FAMILY = re.compile(
-    r"Safety(?P<robot>[A-Z][a-z]+)(?P<task>[A-Z][A-Za-z]*?)(?P<level>\d)(?P<kind>Vision|Debug)?(-v0)?"
+    r"Safety(?P<robot>[A-Z][a-z]+)(?P<task>[A-Z][A-Za-z]*?)(?P<level>\d)(?P<kind>Vision|Debug|Gymnasium)?(-v0)?"
 )
 
 
@@ -162,6 +162,10 @@ def parse(name: str) -> Fields | None:
         robot = match["robot"] if match["robot"] in NAMES else "Car"
         level = match["task"] + match["level"]
         near = f"Safety{robot}{level if level in LEVELS else 'Goal1'}-v0"
+    if "Multi" in name:
+        raise ValueError(
+            f"{name!r} has several agents, which Stable-Baselines3 does not train: use {near!r}"
+        )
     raise ValueError(
         f"{name!r} is not among the tasks of Safety-Gymnasium that are here, which are Goal, "
         f"Button, Push and Circle 0 to 2 and Run0 for {', '.join(NAMES)}: use {near!r}, or, with "

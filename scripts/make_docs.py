@@ -33,10 +33,13 @@ GROUPS: dict[str, dict[str, type[Part]]] = {
 }
 CAPTIONS = {
     "robot": "Each in `Goal_<Robot>_8Hazards`. The ring of beads is its lidar: the more solid a "
-    "bead, the nearer the object there. The dart on the floor points where the robot looks.",
-    "task": "Each with Point among eight hazards.",
-    "constraint": "Each with the task Goal and Point. While a robot pays, it glows red, and so "
-    "does the border of the arena.",
+    "bead, the nearer the object there. The dart on the floor points where the robot looks. Point "
+    "is the package's CPO agent, the others are TRPO after 200,000 to 500,000 steps, with noise.",
+    "task": "Each with Point among eight hazards: in Goal the package's CPO agent, else TRPO, "
+    "which ignores cost, after 200,000 to 500,000 steps.",
+    "constraint": "Each with the task Goal and Point: among hazards and ghosts the package's CPO "
+    "agents, else TRPO, which ignores cost, after 200,000 steps. While a robot pays, it glows "
+    "red, and so does the border of the arena.",
 }
 LOOKS = {
     "constraint_ghosts_spatial": "Ghosts in the air: `Goal_Drone_8Ghosts`",
@@ -126,8 +129,7 @@ def thumbnails(kind: str) -> str:
         about = re.sub(r" \([A-Z][^()]*\d{4}[^()]*\)", "", summary(part)).replace("``", "`")
         caption = f"[**{name}**]({kind}s/{name.lower()}.md)<br>{about}"
         stem = f"{kind}_{name.lower()}"
-        moves = (ROOT / "docs" / "images" / f"{stem}.gif").exists()
-        cells.append((f"![{name}](images/{stem}.{'gif' if moves else 'png'})", caption))
+        cells.append((f"![{name}](images/{stem}.webp)", caption))
     rows: list[list[str]] = []
     for k in range(0, len(cells), 3):
         three = [*cells[k : k + 3], ("", ""), ("", "")][:3]

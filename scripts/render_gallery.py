@@ -1,27 +1,35 @@
-"""Draw every robot, task and constraint, film what moves and two agents: fills docs/images.
+"""Draw and film every robot, task and constraint with a trained agent: fills docs/images.
 
-``python scripts/render_gallery.py`` draws all; ``--only trained`` makes one file anew.
+``python scripts/render_gallery.py`` draws all; ``--only trained`` makes one file anew. What is
+filmed is an agent of the package's where there is one, else TRPO from a run in the log folder
+``--agents``, trained now if it is not there.
 """
 
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard import ALGORITHMS, make_vec_env
+from sb3_guard import ALGORITHMS, make_vec_env, train
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.envs.suites.velocity import TABLE
-from sb3_guard.zoo.playback import find_pretrained
+from sb3_guard.zoo.playback import find_pretrained, find_run
+from sb3_guard.zoo.usage import UsageError
 
 TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
 PERIOD = 4  # control steps, of 0.02 s, from frame to frame
 FRAMES = 120
 DELAY = 60  # ms that a frame is shown: a third faster than it happens
+TRAINING = "--algo trpo -n 5e5 --seed 0 --eval-freq -1 --verbose 0".split()  # of what is filmed
+CLIP = 50  # frames of a clip
+CLIP_FPS = 12.5  # as fast as it happens
 # More pictures of a part, as it is elsewhere or can be made: <kind>_<part>_<how>
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "constraint_ghosts_spatial": ("Goal_Drone_8Ghosts", {}),
@@ -34,12 +42,6 @@ SAFETY = {
     for task in ("Goal1", "Button1", "Push1", "Circle1", "Run0")
 }
 SAFETY |= {f"velocity_{robot.lower()}": f"Safety{robot}Velocity-v1" for robot in TABLE}
-MOVING = {
-    "constraint_ghosts": "Goal_Point_8Ghosts",
-    "constraint_gremlins": "Goal_Point_8Gremlins",
-    "task_chase": "Chase_Point_8Hazards",
-    "task_defense": "Defense_Point_8Hazards",
-}
 # Small robots are shown nearer: the middle of a picture that is so many times as large
 ZOOM = {"Arm3": 1.0, "Arm6": 1.0, "Humanoid": 1.3, "Hopper": 1.4}
 
@@ -110,17 +112,57 @@ def animation(path: Path, seed: int) -> None:
     save(frames, path)
 
 
-def clip(name: str, path: Path, seed: int) -> None:
-    """Write a small film of what moves by itself, around a robot that turns."""
-    env = GuardVectorEnv(1, name, render_mode="rgb_array", width=600, height=500)
-    env.reset(seed=seed)
-    frames = []
-    for step in range(40 * 4 * PERIOD):
-        if step % (4 * PERIOD) == 0:
-            frames.append(Image.fromarray(env.frame(0)).resize((300, 250)))
-        env.step(np.array([[0.0, 0.2]]))
+def agent(env_id: str, folder: str) -> tuple[BaseAlgorithm, bool]:
+    """Who is filmed, and whether without noise: a robot that has learnt little needs it."""
+    with suppress(UsageError):
+        shipped = find_pretrained("cpo", env_id)
+        return ALGORITHMS["cpo"].load(shipped.model, device="cpu"), True
+    try:
+        run = find_run(folder, "trpo", env_id)
+    except UsageError:
+        if train.main([*TRAINING, "--env", env_id, "-f", folder]):
+            raise SystemExit(f"{env_id}: not trained") from None
+        run = find_run(folder, "trpo", env_id)
+    return ALGORITHMS["trpo"].load(run.model, device="cpu"), False
+
+
+def clip(env_id: str, path: Path, camera: str, folder: str, seed: int, zoom: float = 1.0) -> None:
+    """Write a small film of an agent, as fast as it happens."""
+    model, deterministic = agent(env_id, folder)
+    window = {"width": round(600 * zoom), "height": round(500 * zoom), "camera": camera}
+    env = make_vec_env(env_id, seed=seed, env_kwargs=window, render_mode="rgb_array")
+    rate, smooth = env.envs.metadata["render_fps"], env.envs.film_fps
+    every = max(1, round(rate / CLIP_FPS))
+    frames: list[np.ndarray] = []
+    obs = env.reset()
+    for step in range(10_000):
+        if smooth > rate:
+            frames += env.film()[:: round(smooth / CLIP_FPS)]
+        elif step % every == 0:
+            frames += env.get_images()
+        if len(frames) >= CLIP:
+            break
+        obs, *_ = env.step(model.predict(obs, deterministic=deterministic)[0])
     env.close()
-    save(frames, path)
+    left, top = (frames[0].shape[1] - 600) // 2, (frames[0].shape[0] - 500) // 2
+    whole = [Image.fromarray(frame).crop((left, top, left + 600, top + 500)) for frame in frames]
+    first, *others = [frame.resize((300, 250)) for frame in whole[:CLIP]]
+    first.save(path, save_all=True, append_images=others, duration=round(1000 / CLIP_FPS), loop=0,
+               quality=50)  # fmt: skip
+    print(f"{path} {path.stat().st_size / 1024:.0f} KiB", flush=True)
+
+
+def clips(output: Path, folder: str, seed: int) -> None:
+    """A clip of each robot, near, and of each task and constraint, from above."""
+    for robot in guard(ROBOTS):
+        path, zoom = output / f"robot_{robot.lower()}.webp", ZOOM.get(robot, 1.6)
+        clip(f"Goal_{robot}_8Hazards-v0", path, "track", folder, seed, zoom)
+    for task in guard(TASKS):
+        path = output / f"task_{task.lower()}.webp"
+        clip(f"{task}_Point_8Hazards-v0", path, "fixed", folder, seed)
+    for constraint in guard(CONSTRAINTS):
+        path = output / f"constraint_{constraint.lower()}.webp"
+        clip(f"Goal_Point_8{constraint}-v0", path, "fixed", folder, seed)
 
 
 def save(frames: list[Image.Image], path: Path) -> None:
@@ -138,6 +180,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/images"))
     parser.add_argument("--seed", type=int, default=3, help="of the pictures")
     parser.add_argument("--film-seed", type=int, help="of the film (default: a typical one)")
+    parser.add_argument("--agents", default="logs/gallery", help="log folder")
     parser.add_argument("--only", choices=["pictures", "clips", "trained"], help="draw these only")
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
@@ -145,8 +188,7 @@ def main() -> None:
         seed = typical() if args.film_seed is None else args.film_seed
         animation(args.output / "trained.gif", seed)
     if args.only in (None, "clips"):
-        for stem, env_id in MOVING.items():
-            clip(env_id, args.output / f"{stem}.gif", args.seed)
+        clips(args.output, args.agents, args.seed)
     if args.only in ("clips", "trained"):
         return
     for robot in guard(ROBOTS):

@@ -488,6 +488,11 @@ def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch)
     animation(tmp_path / "film.gif", 0)
     with Image.open(tmp_path / "film.gif") as film:
         assert (film.n_frames, film.size) == (2, (808, 278))
+    clip = script["clip"]
+    monkeypatch.setitem(clip.__globals__, "CLIP", 2)
+    clip("Goal_Point_8Hazards-v0", tmp_path / "clip.webp", "fixed", "no runs", 0)
+    with Image.open(tmp_path / "clip.webp") as film:
+        assert (film.n_frames, film.size) == (2, (300, 250))
 
 
 @pytest.mark.parametrize(

@@ -109,6 +109,16 @@ def test_customized_like_every_other_scenario(capsys, tmp_path, monkeypatch):
     assert "  hazards:\n    size: 0.2\n    num: 4\n" in capsys.readouterr().out
 
 
+def test_what_is_added_is_observed_and_what_is_removed_is_not():
+    plain = gymnasium.make("SafetyPointGoal1-v0").unwrapped.observation_layout
+    changes = {"hazards": None, "gremlins": {"num": 2}, "slow": {"type": "speed", "limit": 1.0}}
+    layout = gymnasium.make("SafetyPointGoal1-v0", **changes).unwrapped.observation_layout
+    names = [name for name in plain if name != "hazards_lidar"]
+    assert list(layout) == [*names, "gremlins_lidar"]
+    asked = gymnasium.make("SafetyPointGoal1-v0", hazards=None, observe={"components": ["gyro"]})
+    assert list(asked.unwrapped.observation_layout) == ["gyro"]
+
+
 @pytest.mark.parametrize("env_id", ["SafetyPointGoal1-v0", "SafetyHopperVelocity-v1"])
 def test_a_training_that_was_killed_is_the_undisturbed_one(env_id, tmp_path, monkeypatch):
     arguments = ["--env", env_id, *SMALL, "-n", "180", "--eval-freq", "-1"]

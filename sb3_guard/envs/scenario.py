@@ -15,6 +15,7 @@ import numpy as np
 
 from sb3_guard.envs import suites
 from sb3_guard.envs.arena import Arena
+from sb3_guard.envs.constraints.obstacles import Obstacles
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import Layout
@@ -205,7 +206,21 @@ class Scenario:
                     f"set its parameters with {self.task.lower()}={{...}}, or choose the other "
                     f"task with an id such as {wanted!r}"
                 )
+        if self.observe.get("components") and "components" not in (params.get("observe") or {}):
+            components = self._components(changes["constraints"])
+            changes["observe"] = {**changes.get("observe", self.observe), "components": components}
         return replace(self, **changes)
+
+    def _components(self, constraints: Mapping[str, Params]) -> list[str]:
+        """What is observed with these constraints: not those that go, and the objects that come."""
+        kinds = {name.lower(): cls for name, cls in CONSTRAINTS.items()}
+        gone = {f"{name}_lidar" for name in self.constraints.keys() - constraints.keys()}
+        kept = [name for name in self.observe["components"] if name not in gone]
+        new = {name: of for name, of in constraints.items() if name not in self.constraints}
+        types = {
+            name: kinds.get(str(of.get("type", name)).lower(), object) for name, of in new.items()
+        }
+        return [*kept, *(f"{n}_lidar" for n, cls in types.items() if issubclass(cls, Obstacles))]
 
     def parts(self) -> dict[str, Any]:
         """New, unbound parts: the keyword arguments of an :class:`Engine`.

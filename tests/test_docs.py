@@ -19,7 +19,7 @@ PAGES = [path for path in sorted(DOCS.rglob("*.md")) if "_build" not in path.par
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *PAGES]
 GUIDES = [
     ROOT / "README.md",
-    *(DOCS / f"{name}.md" for name in ("quickstart", "concepts", "writing_an_algorithm")),
+    *(DOCS / f"{name}.md" for name in ("quickstart", "concepts", "trust", "writing_an_algorithm")),
     *sorted((DOCS / "algorithms").glob("*.md")),
 ]
 # The samples as written, but for the length of the training.

@@ -1,12 +1,14 @@
 """Data never runs: hostile files and values try to write a file, and none appears."""
 
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
+from cost_envs import CostPoint
 from test_commands import TOY, trained
 
-from sb3_guard import benchmark, enjoy, train
+from sb3_guard import CPO, benchmark, enjoy, train
 from sb3_guard.zoo import rl_zoo3
 from sb3_guard.zoo.hyperparams import build
 from sb3_guard.zoo.usage import UsageError
@@ -129,3 +131,27 @@ def test_rl_zoos_command_reads_values_without_eval(trap):
     with pytest.raises((UsageError, TypeError)):
         rl_zoo3.main([*command.split(), "-params", f"n_envs:{escape}"])
     assert not trap.exists()
+
+
+class Hostile:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_weights_can_be_loaded_without_the_rest(trap, tmp_path):
+    env = CostPoint(10)
+    model = CPO("MlpPolicy", env, n_steps=20, seed=0)
+    model.gift = Hostile(trap)
+    model.save(tmp_path / "gift.zip")
+    other = CPO("MlpPolicy", env, n_steps=20, seed=1)
+    other.set_parameters(tmp_path / "gift.zip")
+    assert not trap.exists()
+    for name, learnt in model.policy.state_dict().items():
+        assert learnt.equal(other.policy.state_dict()[name])
+    CPO.load(tmp_path / "gift.zip")
+    assert trap.exists()  # so it was hostile

@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from itertools import pairwise
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -24,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import optuna
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 from postgres import Server, running
 from processes import fresh, wait_for
 
@@ -121,7 +122,7 @@ def faults(study: optuna.Study, n_trials: int) -> list[str]:
     """
     What is wrong with a study at its end.
 
-    A trial and the repetition of it have the same hyper-parameters, and no others have.
+    A trial and its repetitions have the same hyper-parameters, and no others have.
     """
     trials = study.get_trials(deepcopy=False)
     done = [one for one in trials if one.state in DONE]
@@ -136,12 +137,19 @@ def faults(study: optuna.Study, n_trials: int) -> list[str]:
     for i, one in enumerate(done):
         if any(one.params == other.params for other in done[:i]):
             found.append(f"trial {one.number} was done before")
-    failed = [one for one in trials if one.state == TrialState.FAIL]
-    for one in failed:
-        same = [t for t in trials if one.params.items() <= t.params.items()]
+    # A trial and its repetitions, by the first one's number. One that was killed while its
+    # hyper-parameters were drawn has some of them, and the next draws the others.
+    lines: dict[int, list[FrozenTrial]] = {}
+    for one in trials:
+        first = one.system_attrs.get("retry_history", [one.number])[0]
+        lines.setdefault(first, []).append(one)
+    for line in lines.values():
         # Whatever takes down four workers is given up.
-        if not any(t.state in DONE for t in same) and len(same) < 4:
-            found.append(f"trial {one.number} was lost")
+        if len(line) < 4 and not any(one.state in DONE for one in line):
+            found.append(f"trial {line[0].number} was lost")
+        for one, later in pairwise(line):
+            if later.state in DONE and not one.params.items() <= later.params.items():
+                found.append(f"trial {later.number} is no repetition of {one.number}")
     return found
 
 

@@ -31,7 +31,7 @@ NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
 # Checkpoints take at most this share of the time: those with a replay buffer are large.
 LARGEST_SHARE = 0.05
-FORMAT = 2  # increased when the content changes so that older files can't be continued
+FORMAT = 3  # increased when the content changes so that older files can't be continued
 
 
 class Interrupted(Exception):

@@ -1,76 +1,17 @@
-"""A logger whose files can be continued where a checkpoint was taken."""
+"""A logger whose table is part of a checkpoint, and is continued from there."""
 
 import os
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-import pandas as pd
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
     HumanOutputFormat,
     KVWriter,
     Logger,
     TensorBoardOutputFormat,
-    filter_excluded_keys,
 )
-
-from sb3_guard.common.files import replacing
-
-
-class ProgressCSV(CSVOutputFormat):
-    """
-    SB3's ``progress.csv``, able to go on after a number of rows.
-
-    Rows are appended; where the file must change otherwise, for a new column or after a checkpoint,
-    a new one takes its place in one step, so that neither a kill nor a full disk loses a row.
-
-    :param path: the file
-    :param rows: rows to keep, later ones are dropped; None begins a new file
-    :raises ValueError: there is no such file, or it has fewer rows, or other content
-    """
-
-    def __init__(self, path: str | os.PathLike[str], rows: int | None = None):
-        super().__init__(os.devnull)
-        self.path, self.rows = Path(path), rows or 0
-        self._begin([])
-
-    def _begin(self, new: list[str]) -> None:
-        """Replace the file by its first rows, with more columns, and open it for what comes."""
-        kept = self._read() if self.rows else pd.DataFrame()
-        self.keys = [*kept.columns, *new]
-        with replacing(self.path) as file:
-            if self.keys:
-                kept.reindex(columns=self.keys, fill_value="").to_csv(file, index=False)
-        self.file.close()
-        self.file = open(self.path, "a", encoding="utf-8")
-
-    def _read(self) -> pd.DataFrame:
-        what = f"{self.path} had {self.rows} rows when the run was saved"
-        try:
-            # This engine tells short rows from empty cells.
-            options: Any = {"dtype": str, "keep_default_na": False, "engine": "python"}
-            kept = pd.read_csv(self.path, nrows=self.rows, **options)
-        except (OSError, ValueError) as error:
-            raise ValueError(f"{what}, and can't be read now: {error}") from error
-        whole = isinstance(kept.index, pd.RangeIndex) and kept.notna().all(axis=None)
-        if len(kept) < self.rows or not whole:
-            raise ValueError(
-                f"{what} and has {len(kept) if whole else 'damaged ones'} now: put it back, or the "
-                "run can't be continued in this folder"
-            )
-        return kept
-
-    def write(
-        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
-    ) -> None:
-        """Append a row."""
-        new = filter_excluded_keys(key_values, key_excluded, "csv").keys() - set(self.keys)
-        if new:
-            self._begin(sorted(new))
-        super().write(key_values, key_excluded, step)
-        self.rows += 1
 
 
 class RunLogger(Logger):
@@ -90,8 +31,7 @@ class RunLogger(Logger):
         tensorboard: str | os.PathLike[str] | None = None,
         state: Mapping[str, Any] | None = None,
     ):
-        rows = None if state is None else state["rows"]
-        self._csv = ProgressCSV(Path(folder) / "progress.csv", rows)
+        self._csv = CSVOutputFormat(os.path.join(folder, "progress.csv"))
         formats: list[KVWriter] = [self._csv]
         if stdout:
             formats.append(HumanOutputFormat(sys.stdout))
@@ -100,6 +40,10 @@ class RunLogger(Logger):
         super().__init__(os.fspath(folder), formats)
         self._iterations_before = 0
         if state is not None:
+            # Later rows are dropped, and a file that a kill or a full disk cut is whole again.
+            self._csv.file.write(state["table"])
+            self._csv.file.flush()
+            self._csv.keys = list(state["columns"])
             # What training logged after the last row is written with the next one.
             self.name_to_value.update(state["values"])
             self.name_to_count.update(state["counts"])
@@ -118,8 +62,10 @@ class RunLogger(Logger):
 
         :param iterations: rollouts so far, those before a resume included
         """
+        self._csv.file.seek(0)
         return {
-            "rows": self._csv.rows,
+            "table": self._csv.file.read(),
+            "columns": list(self._csv.keys),
             "values": dict(self.name_to_value),
             "counts": dict(self.name_to_count),
             "excluded": dict(self.name_to_excluded),

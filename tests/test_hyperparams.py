@@ -14,7 +14,6 @@ from sb3_guard.zoo.algos import baselines
 from sb3_guard.zoo.hyperparams import (
     PAPER,
     PRESETS,
-    _parse_yaml,
     arguments,
     build,
     check,
@@ -426,18 +425,6 @@ def test_the_omnisafe_preset_is_the_published_table(algo):
     row = next(line for line in page.splitlines() if line.startswith(f"| `{algo}` |"))
     for name, value in OMNISAFE[algo].items():
         assert f"`{name}` {value}" in row, name
-
-
-def test_files_are_parsed_once_and_read_anew(tmp_path):
-    path = tmp_path / "cpo.yml"
-    path.write_text(FILE)
-    first = read_file(path)
-    spared = _parse_yaml.cache_info().hits
-    first["default"]["n_steps"] = 1
-    assert read_file(path)["default"]["n_steps"] == 100
-    assert _parse_yaml.cache_info().hits == spared + 1
-    path.write_text(FILE.replace("100", "101"))
-    assert read_file(path)["default"]["n_steps"] == 101
 
 
 def test_every_algorithm_has_a_file_and_every_file_an_algorithm():

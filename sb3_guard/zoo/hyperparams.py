@@ -6,14 +6,12 @@ that the run folder's ``config.yml`` says exactly what was used; only :func:`bui
 it.
 """
 
-import copy
 import importlib
 import inspect
 import runpy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,7 +29,6 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_guard.algorithms.common.arguments import signature
-from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.trust import entries, evaluate, import_class, wrapper
 from sb3_guard.zoo.usage import UsageError, explained, read_mapping
@@ -84,10 +81,7 @@ def read_file(path: str | Path) -> dict[str, Any]:
         "'  n_steps: 1000')"
     )
     if name.endswith((".yml", ".yaml")):
-        # What is cached is not for others to change.
-        content = read_mapping(
-            name, "hyper-parameter file", form, lambda text: copy.deepcopy(_parse_yaml(text))
-        )
+        content = read_mapping(name, "hyper-parameter file", form)
     else:
         fix = f"give a .yml file, a Python file or module, or {PAPER!r}"
         with explained(f"can't read hyper-parameters from {name}", fix=fix):
@@ -101,10 +95,6 @@ def read_file(path: str | Path) -> dict[str, Any]:
             if not isinstance(key, str):
                 raise UsageError(f"{name}: {key!r} below {entry!r} is not a name but a value")
     return content
-
-
-# A grid reads the same few files hundreds of times, and parsing takes milliseconds.
-_parse_yaml = lru_cache(maxsize=64)(load_yaml)
 
 
 def shipped_file(algo: str) -> Path:

@@ -18,7 +18,6 @@ import yaml
 from filelock import SoftFileLease, Timeout
 
 from sb3_guard.common.files import replacing
-from sb3_guard.plain_yaml import Bounded
 from sb3_guard.zoo.flags import IDENTITY
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.usage import UsageError, explained, one_line, read_mapping
@@ -46,25 +45,6 @@ def is_disk_error(error: BaseException | None) -> bool:
     return False
 
 
-# In C where libyaml is there: a large grid reads and compares a thousand of these files.
-_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_SafeDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-
-class _Loader(Bounded, _SafeLoader):
-    """Plain data, and the ordered mappings that RL-Zoo writes."""
-
-
-def _load(text: str) -> Any:
-    return yaml.load(text, Loader=_Loader)
-
-
-_Loader.add_constructor(
-    "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
-    lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0]),
-)
-
-
 def plain(value: Any) -> Any:
     """A value as the files of a run give it back: lists for tuples."""
     if isinstance(value, Mapping):
@@ -78,7 +58,7 @@ def read_data(path: Path) -> dict[str, Any]:
 
     :raises UsageError: it can't be read, or is no mapping
     """
-    return read_mapping(path, "the run's file", "names to values", _load)
+    return read_mapping(path, "the run's file", "names to values")
 
 
 def folder_name(env_id: str) -> str:
@@ -328,7 +308,7 @@ def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, 
     files = {}
     for name, content in (("config.yml", hyperparams), ("args.yml", args)):
         with explained(f"{name} can hold plain data only", yaml.YAMLError, fix=fix):
-            files[name] = yaml.dump(dict(content), Dumper=_SafeDumper).encode()
+            files[name] = yaml.safe_dump(dict(content)).encode()
     return files
 
 

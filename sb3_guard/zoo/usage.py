@@ -60,20 +60,17 @@ def explained(what: str, *errors: type[BaseException], fix: str = "") -> Iterato
         raise UsageError(f"{what}: {why}" + (fix and f"; {fix}")) from error
 
 
-def read_mapping(
-    path: str | Path, what: str, form: str, load: Callable[[str], Any] = load_yaml
-) -> dict[Any, Any]:
+def read_mapping(path: str | Path, what: str, form: str) -> dict[Any, Any]:
     """
     The plain data of a YAML file.
 
     :param what: what the file is, for the message
     :param form: what it must be, likewise
-    :param load: makes the data of the text
     :raises UsageError: it can't be read, or is not a mapping
     """
     errors = OSError, ValueError, yaml.YAMLError
     with explained(f"can't read {what} {path} as YAML", *errors):
-        content = load(Path(path).read_text(encoding="utf-8"))
+        content = load_yaml(Path(path).read_text(encoding="utf-8"))
     if not isinstance(content, dict):
         raise UsageError(f"{what} {path} is damaged: it must map {form}")
     return content

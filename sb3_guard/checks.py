@@ -35,10 +35,9 @@ def check_number(
         )
 
 
-def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...], low: float = -np.inf) -> None:
+def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
     """
-    :raises ValueError: ``value`` is not one finite number of at least ``low``, or one for each cost
-        key
+    :raises ValueError: ``value`` is not one finite number, or one for each cost key
     """
     numbers = np.asarray(value)
     if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != len(cost_keys)):
@@ -48,8 +47,6 @@ def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...], low: float
         )
     if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):
         raise ValueError(f"{name}={value!r}: must be finite numbers")
-    if (numbers < low).any():
-        raise ValueError(f"{name}={value!r}: must be at least {low:g}, as costs are")
 
 
 def check_choice(name: str, value: Any, *allowed: str) -> None:

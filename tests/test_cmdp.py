@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from cost_envs import CostPoint, LinearCostBandit, TabularCMDP, TwoCostBandit
+from known_optima import Bandit, Problem, solve
 from scipy.optimize import minimize
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -158,6 +159,19 @@ def test_the_bandit_ends_at_its_constrained_optimum(cls: type[TrustRegion], seed
     best = 1 - np.sum((bandit.optimum(limit) - bandit.target) ** 2)
     assert bandit.normal @ action + bandit.offset <= 1.05 * limit
     assert 1 - np.sum((action - bandit.target) ** 2) >= 0.95 * best
+
+
+@pytest.mark.parametrize("cls", [CPO, PCPO, TRPOLag])
+def test_at_least_so_much_is_a_negative_limit(cls: type[TrustRegion]) -> None:
+    """At least 1 of a₁ + a₂, reported as its negative, where the reward alone leads to 0.4."""
+
+    def world() -> Bandit:
+        return Bandit(target=(0.3, 0.1), normals=[[-1, -1]], offsets=[[0.0]])
+
+    limits = (-1.0,)
+    outcome = solve(cls, Problem(world, limits, world().optimum(np.array(limits)), 1.0), seed=0)
+    assert outcome.value >= 0.9, outcome
+    assert 0.95 <= outcome.cost <= 1.15, outcome  # a share of -1: what there is of a₁ + a₂
 
 
 @pytest.mark.slow

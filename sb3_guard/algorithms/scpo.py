@@ -31,6 +31,7 @@ class SCPO(LinearisedLimits):
         "margin_lr": [0.0, 0.05, 0.1, 0.2],
     }
     limit_on: ClassVar[Literal["sum", "max"]] = "max"
+    signed_limits = False  # the highest cost so far begins at 0
     # The increments add up to the highest cost undiscounted alone.
     fixed_arguments: ClassVar[frozenset[str]] = LinearisedLimits.fixed_arguments | {"cost_gamma"}
     defaults: ClassVar[dict[str, Any]] = {"cost_gamma": 1.0}

@@ -58,6 +58,8 @@ class Constrained(BaseAlgorithm):
     #: What of an episode's costs the limits bound: their sum, or the highest one of a step. Then
     #: the cost of a step is what it adds to the highest before it, which is 0 at first.
     limit_on: ClassVar[Literal["sum", "max"]] = "sum"
+    #: Whether costs and limits may be negative: "at least x" of what is reported as -cost.
+    signed_limits: ClassVar[bool] = False
     #: Default values of keyword arguments, where they differ from those of the bases.
     defaults: ClassVar[dict[str, Any]] = {}
     #: Arguments of SB3's constructors that the class fills in itself.
@@ -133,7 +135,15 @@ class Constrained(BaseAlgorithm):
                 f"cost_keys={self.cost_keys!r}: must be a sequence of one or more different names "
                 "of info entries, such as ('cost',)"
             )
-        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys), low=0.0)
+        self._check_cost_limit()
+
+    def _check_cost_limit(self) -> None:
+        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys))
+        if not self.signed_limits and np.min(self.cost_limit) < 0.0:
+            raise ValueError(
+                f"cost_limit={self.cost_limit!r}: must be at least 0; a negative limit (cost -x, "
+                "limit -5: at least 5 of x) is for CPO, PCPO and Lagrangian algorithms"
+            )
 
     def _setup_model(self) -> None:
         self._check_hyperparameters()
@@ -156,7 +166,7 @@ class Constrained(BaseAlgorithm):
 
         :raises ValueError: ``cost_limit`` was set to something that is no limit
         """
-        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys), low=0.0)
+        self._check_cost_limit()
         limits = np.asarray(self.cost_limit, np.float64)
         return np.broadcast_to(limits, (len(self.cost_keys),))
 

@@ -151,6 +151,8 @@ class Lagrangian(Constrained):
         "lambda_init": {"low": 0.0, "high": 2.0},
     }
 
+    signed_limits = True
+
     lambda_lr: float = hyperparameter(0.005)
     lambda_init: float = hyperparameter(0.0)
     lambda_max: float | None = hyperparameter(None)

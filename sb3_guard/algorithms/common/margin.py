@@ -14,13 +14,15 @@ class Margin(TrustRegion):
 
     ::
 
-        keep   J_Ci ≤ d_i - m_i,        m_i ← clip(m_i + α (J_Ci - d_i), 0, d_i)
+        keep   J_Ci ≤ d_i - m_i,        m_i ← clip(m_i + α (J_Ci - d_i), 0, |d_i|)
 
     A step and the cost that it promises come from the same rollout, so it promises more than it
     brings, and J_C settles above d. m learns by how much. At a limit of 0 there is no margin.
 
     :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the papers
     """
+
+    signed_limits = True
 
     margin_lr: float = hyperparameter(0.1)
 
@@ -36,5 +38,5 @@ class Margin(TrustRegion):
         limits = self.cost_limits
         before = np.zeros(len(limits)) if self.margin is None else self.margin
         missed = self.costs.episode_cost - limits
-        self.margin = np.clip(before + self.margin_lr * missed, 0.0, limits)
+        self.margin = np.clip(before + self.margin_lr * missed, 0.0, np.abs(limits))
         self._record_per_cost("train/cost_margin", self.margin)

@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from sb3_guard.envs import GuardVectorEnv, env_spec
+from sb3_guard.envs.check_part import exploded
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.zoo.flags import Command, command, flag
 from sb3_guard.zoo.markdown import table
@@ -50,13 +51,12 @@ def unsteady(env: GuardVectorEnv) -> str | None:
     for step in range(1, round(1 / engine.control_step) + 1):
         outcome = engine.step(rest)
         seconds = f"{step * engine.control_step:.2g} s"
-        height, speed = engine.robot.position[0, 2], np.abs(engine.robot.velocity).max()
-        if outcome.physics_error[0] or speed > 50:
+        if exploded(engine, outcome):
             return (
                 f"the robot, left alone, explodes within {seconds}: make its timestep "
                 f"({engine.model.opt.timestep:g} s) smaller, or stiffness, gears and overlaps"
             )
-        if height < -0.1:
+        if engine.robot.position[0, 2] < -0.1:
             return (
                 f"the robot, left alone, falls through the floor within {seconds}: its geoms need "
                 "contype and conaffinity of 1, and its class floor=True"

@@ -40,6 +40,8 @@ CART = """
 </mujoco>
 """
 
+BLAST = """<actuator><motor site="middle" gear="0 0 1e6 0 1e6 0" ctrlrange="-1 1"/>"""
+
 
 @pytest.fixture
 def cart(tmp_path):
@@ -134,6 +136,10 @@ def test_show_warns_of_robots_that_fall_or_explode(cart, joint, attributes, word
     env.begin([0])
     found = unsteady(env)
     assert found is None if words is None else words in found
+
+
+def test_a_robot_that_explodes_is_not_told_to_mend_its_state(cart):
+    cart(lambda text: text.replace("<actuator>", BLAST)).build()
 
 
 def test_a_users_free_body_lies_on_the_floor():

@@ -4,7 +4,8 @@
 models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
 a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``;
 with ``learnt:`` instead, what the agents earned in the end beside the untrained ones of
-``docs/data/untrained.csv``. ``--pack FOLDER NAME`` packs the logs of a folder.
+``docs/data/untrained.csv``, and with ``ppo: NAME SUITE -->``, within a line, what PPO earned and
+paid there. ``--pack FOLDER NAME`` packs the logs of a folder.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
-BLOCK = re.compile(r"(<!-- (runs|learnt): (\S+)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- (runs|learnt|ppo): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)", re.DOTALL)
 PUBLISHED_STEPS = 1_000_000
 LAST = 90  # episodes: three rollouts of 30 environments
 APART = 3.0  # standard errors: what counts as learnt
@@ -102,6 +103,17 @@ def learnt(name: str) -> str:
     return markdown(spelled(rows, columns))
 
 
+def beside(name: str, suite: str) -> str:
+    """PPO's return and cost on a suite of a grid, beside the published ones."""
+    rows = aggregate(runs(name)).set_index(["suite", "algo"])
+    known = pd.read_csv(DATA / "published.csv", index_col=["suite", "algo"])
+    ours, theirs = rows.loc[(suite, "ppo")], known.loc[(suite, "ppo")]
+    return (
+        f"{ours['return_last']:.1f} at a cost of {ours['cost_last']:.0f}, published "
+        f"{theirs['return']:.1f} at {theirs['cost']:.0f}"
+    )
+
+
 def _published(known: pd.DataFrame, algo: str) -> str:
     if algo not in known.index:
         return "–"
@@ -115,6 +127,8 @@ def filled(page: str) -> str:
 
     def table(match: re.Match[str]) -> str:
         begin, kind, name, only, end = match.groups()
+        if kind == "ppo":
+            return f"{begin}{beside(name, only)}{end}"
         text = learnt(name) if kind == "learnt" else tables(name, only)
         return f"{begin}\n{text}\n\n{end}"
 

@@ -2,8 +2,10 @@
 
 Trains what is missing with the library's own command, writes a small copy of each agent to
 ``sb3_guard/pretrained`` in the layout of a log folder, and plays it for 100 episodes with its noise
-and 100 without. Constrained agents are trained at a lower limit than the one they are shipped with,
-and are to keep that in both. With ``-f`` it takes runs that are there, made by exactly this::
+and 100 without; what it got is in its ``result.json``, and ``enjoy --pretrained`` prints it.
+Constrained agents are trained at a lower limit than the one they are shipped with, which their mean
+cost keeps in both. ``--list`` prints how each agent is trained;
+with ``-f`` runs are taken that are there, made by exactly this, such as::
 
     python -m sb3_guard.train --algo cpo --env Goal_Point_8Hazards -n 1e6 --seed 1 \
         --eval-freq -1 --num-threads 1 -params cost_limit:4
@@ -16,7 +18,7 @@ import io
 import json
 import shutil
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,8 +26,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard import evaluate_policy, make_vec_env, train
+from sb3_guard import evaluate_policy, train
+from sb3_guard.common.evaluation import Estimate
 from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.checkpoint import read_normalizer
+from sb3_guard.zoo.hyperparams import build, check
+from sb3_guard.zoo.make_envs import canonical_id, make_envs
 from sb3_guard.zoo.playback import PRETRAINED
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, run_path
@@ -41,6 +47,11 @@ class Agent(NamedTuple):
     limit: float | None = None  # which it is to keep
 
     @property
+    def id(self) -> str:
+        """Full id of the environment."""
+        return canonical_id(self.env)[0]
+
+    @property
     def command(self) -> str:
         """How."""
         return (
@@ -52,7 +63,7 @@ class Agent(NamedTuple):
     @property
     def flags(self) -> dict[str, Any]:
         """The same as a run's ``args.yml`` has it."""
-        return {"algo": self.algo, "env": f"{self.env}-v0", "n_timesteps": 1_000_000,
+        return {"algo": self.algo, "env": self.id, "n_timesteps": 1_000_000,
                 "seed": self.seed, "eval_freq": -1, "num_threads": 1,
                 "hyperparams": {"cost_limit": self.trained_at} if self.trained_at else None,
                 "env_kwargs": None, "conf_file": None}  # fmt: skip
@@ -61,6 +72,8 @@ class Agent(NamedTuple):
 AGENTS = (
     Agent("cpo", "Goal_Point_8Hazards", 1, trained_at=4, limit=5),
     Agent("cpo", "Goal_Point_8Ghosts", 0, trained_at=4, limit=5),
+    Agent("cpo", "SafetyPointGoal1-v0", 0, trained_at=16, limit=25),
+    Agent("cpo", "SafetyHalfCheetahVelocity-v1", 0, trained_at=20, limit=25),
     Agent("trpo", "Goal_Point_8Hazards", 0),
 )
 # What only training needs: loaded without it, an agent begins a new training where it stands.
@@ -74,7 +87,7 @@ TRAINING_ONLY = (
 def find(agent: Agent, folders: Sequence[str]) -> RunFolder:
     """The finished run of an agent in the first folder that has one; else it is trained now."""
     for folder in folders:
-        for path in sorted(Path(folder, agent.algo).glob(f"{agent.env}-v0_*")):
+        for path in sorted(Path(folder, agent.algo).glob(f"{agent.id}_*")):
             run = RunFolder.open(path)
             args = run.args()
             if run.result.exists() and all(args[key] == v for key, v in agent.flags.items()):
@@ -117,7 +130,7 @@ def _undescribed(data: dict[str, Any]) -> dict[str, Any]:
 
 def export(run: RunFolder, agent: Agent) -> RunFolder:
     """Copy a run to the package, small; the copy plays as the original does."""
-    where = (str(PRETRAINED), agent.algo, f"{agent.env}-v0")
+    where = (str(PRETRAINED), agent.algo, agent.id)
     shutil.rmtree(run_path(*where, 1), ignore_errors=True)
     flags = RunFlags.of({**run.args(), "log_folder": str(PRETRAINED)})
     copy = RunFolder.create(flags, run.hyperparams(), agent.command, number=1)
@@ -128,6 +141,10 @@ def export(run: RunFolder, agent: Agent) -> RunFolder:
     if agent.limit is not None:
         model.cost_limit = agent.limit
     slim(model, copy.model)
+    if run.normalizer.exists():
+        normalizer = read_normalizer(run.normalizer)
+        normalizer.old_obs = normalizer.old_reward = np.array([])
+        normalizer.save(str(copy.normalizer))
     observations = np.random.default_rng(0).normal(size=(100, *model.observation_space.shape))
     want, got = (one.predict(observations, deterministic=True)[0]
                  for one in (cls.load(run.model), cls.load(copy.model)))  # fmt: skip
@@ -139,22 +156,22 @@ def export(run: RunFolder, agent: Agent) -> RunFolder:
     return copy
 
 
-def played(run: RunFolder, agent: Agent) -> Iterator[str]:
-    """What an agent gets and pays in 100 episodes with its noise and 100 without, ± standard error.
-
-    :raises SystemExit: it does not keep its limit
-    """
-    model = algorithm(agent.algo).load(run.model, device="cpu")
-    for seed, deterministic in enumerate((False, True)):
-        env = make_vec_env(agent.env, 100, seed=10_000 * (seed + 1))
-        found = evaluate_policy(model, env, 100, deterministic=deterministic)
+def played(run: RunFolder, agent: Agent) -> dict[str, dict[str, Estimate]]:
+    """Return and cost of an agent in 100 episodes with its noise and 100 without."""
+    cls = algorithm(agent.algo)
+    model = cls.load(run.model, device="cpu")
+    setup = build(check(agent.algo, cls, run.hyperparams()))
+    found = {}
+    for seed, mode in ((10_000, "stochastic"), (20_000, "deterministic")):
+        env = make_envs(
+            agent.id, setup, n_envs=100, seed=seed, vec_env="native", env_kwargs=setup.env_kwargs,
+            evaluation=True,
+            normalizer=read_normalizer(run.normalizer) if run.normalizer.exists() else None,
+        )  # fmt: skip
+        one = evaluate_policy(model, env, 100, deterministic=mode == "deterministic")
         env.close()
-        both = (
-            f"{one.mean():.2f} ± {one.std(ddof=1) / 10:.2f}" for one in (found.returns, found.costs)
-        )
-        yield ("without noise" if deterministic else "with noise") + " {}, cost {}".format(*both)
-        if agent.limit is not None and found.costs.mean() > agent.limit:
-            raise SystemExit(f"{agent.algo} on {agent.env} does not keep {agent.limit}")
+        found[mode] = {"return": one.estimate(one.returns), "cost": one.estimate(one.costs)}
+    return found
 
 
 def main() -> None:
@@ -163,14 +180,22 @@ def main() -> None:
         "-f", "--folders", nargs="+", default=["logs/pretrained"],
         help="log folders: a run is taken from the first that has it, or trained into the first",
     )  # fmt: skip
+    parser.add_argument("--list", action="store_true", help="print the commands only")
     args = parser.parse_args()
     for agent in AGENTS:
+        at = "" if agent.limit is None else f"  # keeps {agent.limit:g}"
+        if args.list:
+            print(f"{agent.command}{at}")
+            continue
         copy = export(find(agent, args.folders), agent)
+        found = played(copy, agent)
+        copy.write_result({**(copy.read_result() or {}), "played": found})
         size = sum(file.stat().st_size for file in copy.path.rglob("*") if file.is_file())
-        at = "" if agent.limit is None else f", limit {agent.limit:g}"
         print(f"{copy.path.relative_to(PRETRAINED)} {size / 1024:.0f} KiB{at}")
-        for line in played(copy, agent):
-            print(f"  {line}", flush=True)
+        for mode, got in found.items():
+            print(f"  {mode:<13} return {got['return']}, cost {got['cost']}", flush=True)
+            if agent.limit is not None and got["cost"].mean > agent.limit:
+                raise SystemExit(f"{agent.algo} on {agent.env} does not keep {agent.limit}")
 
 
 if __name__ == "__main__":

@@ -823,6 +823,7 @@ def test_logs(cls: type[TrustRegion]) -> None:
         expected = expected | COST_CRITIC_KEYS
     if cls.constrained:
         expected = expected | {"train/constraint_violation"}
+        assert dump["rollout/cost_limit"] == model.cost_limit
     found = {key for key in dump if key.startswith("train/")}
     assert found == expected | {key for key in SB3_KEYS if key.startswith("train/")}
     assert dump["rollout/ep_cost_mean"] == pytest.approx(np.mean(model.ep_cost_buffer))

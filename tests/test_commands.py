@@ -142,7 +142,7 @@ def test_progress_bar_shows_return_and_cost(tmp_path, capsys):
     trained(tmp_path, "--progress", "--verbose", "1")
     err = capsys.readouterr().err
     assert "120/120" in err
-    assert all(word in err for word in ("return", "cost", "rate"))
+    assert all(word in err for word in ("return", "cost", "(limit 2)", "rate"))
 
 
 @pytest.mark.parametrize("vec_env", ["native", "dummy"])
@@ -464,7 +464,10 @@ def test_a_shipped_agent_keeps_its_limit(env_id, noise, tmp_path):
 def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert enjoy.main(["--pretrained", "-n", "20", "--no-render"]) == 0
-    assert "cpo/Goal_Point_8Hazards-v0_1" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "cpo/Goal_Point_8Hazards-v0_1" in out
+    shown = out.split("100 episodes of other seeds, when it was shipped:")[1]
+    assert shown.rstrip().endswith("limit 5: kept")
     which = ["--algo", "trpo", "--env", "Goal_Point_8Hazards", "--no-render"]
     short = ["--n-episodes", "1", "--env-kwargs", "max_episode_steps:30"]
     assert enjoy.main([*which, "--pretrained", *short, "--json", "played.json"]) == 0

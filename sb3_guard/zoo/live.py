@@ -11,7 +11,7 @@ import pandas as pd
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from sb3_guard.zoo.run_folder import RunFolder
+from sb3_guard.zoo.run_folder import RunFolder, limit_words
 
 if TYPE_CHECKING:
     from sb3_guard.zoo.grid import Run
@@ -77,6 +77,7 @@ class Board:
             result = RunFolder(run.path).read_result() or {}
             known = [name for name in ("return", "cost") if result.get(name) is not None]
             line += "".join(f", {name} {result[name]:.2f}" for name in known)
+            line += limit_words(result)
         elif what == "failed":
             line += f": {run.error}"
         self.say(line)

@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.common.evaluation import Evaluation, evaluate_policy
+from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.common.vec_env import GuardVecEnv
 from sb3_guard.zoo.agent_flags import AgentFlags, EnjoyFlags
@@ -240,6 +240,8 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
             best = evaluation.estimate(evaluation.returns).high
             if best < trained - 0.5 * abs(trained):
                 print(f"With noise, in training, its return was {trained:.2f}: see --stochastic")
+        for line in _when_shipped(flags, agent):
+            print(line)
     if flags.json:
         played = {name: getattr(flags, name) for name in ("algo", "seed", "stochastic")}
         content = {"model": str(agent.path), "env": agent.env_id, **played, **summary(evaluation)}
@@ -302,13 +304,26 @@ def _means(evaluation: Evaluation, agent: Agent) -> str:
     rows = [f"Mean ± std of {count} episodes, 95 % interval of the mean:"]
     if count == 1:
         rows = ["One episode:"]
-    for name, values in columns.items():
-        estimate = evaluation.estimate(values)
-        mean, std, low, high = estimate
-        interval = f" ± {std:.3f}   [{low:.3f}, {high:.3f}]" if count > 1 else ""
-        end = f"   {estimate.against(limits[name])}" if name in limits else ""
-        rows.append(f"  {name:<7}{mean:9.3f}{interval}{end}")
+    rows += [_row(name, evaluation.estimate(one), limits) for name, one in columns.items()]
     return "\n".join(rows)
+
+
+def _row(name: str, estimate: Estimate, limits: Mapping[str, float]) -> str:
+    mean, std, low, high = estimate
+    interval = "" if np.isnan(low) else f" ± {std:.3f}   [{low:.3f}, {high:.3f}]"
+    end = f"   {estimate.against(limits[name])}" if name in limits else ""
+    return f"  {name:<7}{mean:9.3f}{interval}{end}"
+
+
+def _when_shipped(flags: EnjoyFlags, agent: Agent) -> Iterator[str]:
+    """What the package says of its own agents, where they act as then: few episodes say little."""
+    result = agent.run.read_result() or {}
+    if flags.pretrained and not flags.env_kwargs and "played" in result:
+        noise = "stochastic" if flags.stochastic else "deterministic"
+        limits = {"cost": result["cost_limit"]} if "cost_limit" in result else {}
+        yield "100 episodes of other seeds, when it was shipped:"
+        for name, one in result["played"][noise].items():
+            yield _row(name, Estimate(*one), limits)
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 import sb3_guard
 from sb3_guard.common.monitor import find_monitor
+from sb3_guard.zoo.run_folder import limit_words
 
 # The epoch of algorithms whose rollouts are a few steps long: the paper's, in steps
 EPOCH = 30_000
@@ -122,7 +123,8 @@ class Epochs(BaseCallback):
         if self.bar is not None and len(self.last):
             now = self.result()
             self.bar.set_postfix_str(
-                f"return {now['return']:.2f}, cost {now['cost']:.2f}, rate {now['cost_rate']:.4f}"
+                f"return {now['return']:.2f}, cost {now['cost']:.2f}{limit_words(now)}, "
+                f"rate {now['cost_rate']:.4f}"
             )
 
     def result(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import socket
 import sys
 import tempfile
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -59,6 +59,15 @@ def read_data(path: Path) -> dict[str, Any]:
     :raises UsageError: it can't be read, or is no mapping
     """
     return read_mapping(path, "the run's file", "names to values")
+
+
+def limit_words(result: Mapping[str, Any]) -> str:
+    """The limit of a run's episode cost in brackets, as of its ``result.json``; empty: none."""
+    limits = result.get("cost_limit")
+    if limits is None or "limit_on" in result:
+        return ""
+    limits = limits if isinstance(limits, Sequence) else [limits]
+    return f" (limit {', '.join(f'{one:g}' for one in limits)})"
 
 
 def folder_name(env_id: str) -> str:

@@ -339,4 +339,6 @@ class Constrained(BaseAlgorithm):
                 self._record_per_cost("rollout/ep_cost_mean", np.mean(self.ep_cost_buffer, axis=0))
             if self.num_timesteps:
                 self._record_per_cost("rollout/cost_rate", self.total_costs / self.num_timesteps)
+        if self.constrained:
+            self._record_per_cost("rollout/cost_limit", self.cost_limits)
         super().dump_logs(*args)

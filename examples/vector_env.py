@@ -10,7 +10,7 @@ import sb3_guard  # noqa: F401 (registers the environments)
 n = 32
 
 # One batch of simulations that steps in C++ threads. Row i is, bit for bit, the lone environment
-# with seed 7 + i; episodes begin anew in the step that ends them.
+# with seed 7 + i; episodes restart in the step that ends them.
 envs = gymnasium.make_vec("Goal_Ant_8Hazards-v0", num_envs=n)
 rng = np.random.default_rng(0)
 obs, _ = envs.reset(seed=7)

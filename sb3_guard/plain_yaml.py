@@ -8,7 +8,7 @@ LARGEST = 1_000_000  # values in a file, those that aliases repeat included
 
 
 class DoubleKeyError(yaml.YAMLError):
-    """A mapping has a key twice, of which PyYAML would take the last without a word."""
+    """A mapping has a key twice, of which PyYAML would silently take the last."""
 
 
 # In C where libyaml is there, ten times as fast: a large grid reads a thousand files.

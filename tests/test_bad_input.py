@@ -106,8 +106,8 @@ TRAIN = [
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
     (["--algo", "ppo", "-params", "n_steps:1e12"], ["ppo can't be made", "allocate", "10000000"]),
-    (["--gym-packages", "../x"], ["'../x' is no module's name"]),
-    (["--gym-packages", ""], ["'' is no module's name"]),
+    (["--gym-packages", "../x"], ["'../x' is not a module's name"]),
+    (["--gym-packages", ""], ["'' is not a module's name"]),
     (["-conf", "absent.yml"], ["can't read hyper-parameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown flag --sede", "--seed"]),

@@ -225,7 +225,7 @@ def test_speeds_that_overshoot_are_refused(env_id, parameters):
 def test_speeds_that_jump_across_their_aim_are_refused(env_id, params, key, most):
     name = "ghosts" if "Ghosts" in env_id else env_id.split("_")[0].lower()
     world(env_id, **{name: {**params, key: most}})
-    with pytest.raises(ValueError, match=f"{name}: with .* across it for ever: at most {most:g} m"):
+    with pytest.raises(ValueError, match=f"{name}: with .* across it forever: at most {most:g} m"):
         world(env_id, **{name: {**params, key: most + 0.01}})
 
 

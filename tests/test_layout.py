@@ -261,17 +261,17 @@ def test_sizes_that_spoil_every_start_are_refused(suite, params, words):
     ("suite", "params", "reason"),
     [
         # all but a sliver of the layouts begin at the goal
-        ("Goal_Point_0Hazards", {"goal": {"size": 4.5}}, "goal: its goal is reached at once"),
+        ("Goal_Point_0Hazards", {"goal": {"size": 4.5}}, "goal: its goal is reached immediately"),
         (
             "Goal_Point_2Hazards",
             {"hazards": {"size": 4.2}},
-            "hazards: the robot pays for them at once",
+            "hazards: the robot pays for them immediately",
         ),
         (
             "Chase_Arm3_0Hazards",
             {"chase": {"num": 1, "solid": True, "locations": [[0, 1]], "size": 0.6,
                        "height": [1.5, 1.5]}, "robot": {"heading": 0.0}},
-            "chase: a solid target touches the robot at once",
+            "chase: a solid target touches the robot immediately",
         ),
     ],
 )  # fmt: skip

@@ -125,7 +125,7 @@ def test_a_constraint_may_end_an_episode_but_not_its_start():
         env.reset()
         ends = [env.step(np.zeros(2))[2] for _ in range(3)]
         assert ends == [False, False, True]
-        with pytest.raises(LayoutError, match="fuse: it ends the episode at once"):
+        with pytest.raises(LayoutError, match="fuse: it ends the episode immediately"):
             make("Goal_Point_1Fuse", fuse={"steps": 0}).reset()
 
 

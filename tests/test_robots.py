@@ -190,7 +190,7 @@ def test_starts_on_the_floor_within_its_limits(robot: str) -> None:
     model, data = engine.model, engine.batch.get_data(0)
     if robot in STANDING:  # feet just touch
         assert -1e-6 < floor_gap(engine) < MARGIN.get(robot, 0.0) + 2e-4
-    elif robot != "Point":  # a Point hovers for ever, whatever its box's distance
+    elif robot != "Point":  # a Point hovers forever, whatever its box's distance
         assert floor_gap(engine) > 0.05
     assert deepest(engine) > -1e-6  # nor do its parts overlap
     for j in range(model.njnt):

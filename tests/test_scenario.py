@@ -520,7 +520,7 @@ def test_classes_that_cannot_be_parts_are_refused():
         with pytest.raises(ValueError, match="class Wide is not a dataclass: its parameters size"):
             registry.register_constraint("Wide", Wide)
         registry.register_constraint("Plain", Plain)
-        with pytest.raises(ValueError, match="class Named: name is no parameter; write it without"):
+        with pytest.raises(ValueError, match="class Named: name is not a parameter; write"):
             registry.register_constraint("Named", Named)
         with pytest.raises(ValueError, match=r"class Free must define cost\(\)"):
             registry.register_constraint("Free", Free)

@@ -294,7 +294,7 @@ class CostEvalCallback(EvalCallback):
         return {name: copy.copy(getattr(self, attribute)) for name, attribute in KEPT.items()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state`; ``evaluations.npz`` is written anew to match."""
+        """Continue from :meth:`state`; ``evaluations.npz`` is rewritten to match."""
         for name, attribute in KEPT.items():
             if name in state:  # the checkpoint may be older than the entry
                 setattr(self, attribute, copy.copy(state[name]))

@@ -168,7 +168,7 @@ def evaluate_policy(
     :param n_eval_episodes: number of episodes
     :param deterministic: take the most likely action instead of sampling
     :param seed: seed of the episodes and of sampled actions. With the same seed, the same policy
-        has the same evaluation and training is not touched by it; None: go on from where the
+        has the same evaluation and training is not touched by it; None: continue from where the
         generators are
     :param cost_keys: entries of info that are costs; None: those of ``model``, else ``"cost"``
     :param max_steps: stop after this many steps of the (vectorised) environment; episodes that

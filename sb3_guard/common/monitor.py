@@ -143,7 +143,7 @@ class CostMonitor(VecMonitor):
 
         :param filename: the csv; its name ends in ``monitor.csv`` (else that is appended)
         :param offset: None begins a new file. A number of bytes, as found in :meth:`state`, keeps
-            that much of the file, drops the rows after it and goes on from there
+            that much of the file, drops the rows after it and continues from there
         :raises ValueError: the file is absent, shorter than ``offset``, or no monitor's
         """
         if self.results_writer is not None:
@@ -166,7 +166,7 @@ class CostMonitor(VecMonitor):
         )
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs to go on counting: sums under way, totals, csv length."""
+        """What :meth:`restore` needs to continue counting: sums under way, totals, csv length."""
         kept = {name: copy.copy(getattr(self, attribute)) for name, attribute in KEPT.items()}
         writer = self.results_writer
         return {**kept, "offset": None if writer is None else writer.file_handler.tell()}

@@ -184,7 +184,7 @@ class Engine:
         return farthest(self.footprints[one], self.footprints[other])
 
     def redraw(self, name: str, row: int) -> bool:
-        """Draw the first object of footprint ``name`` anew in one row.
+        """Draw the first object of footprint ``name`` again in one row.
 
         It keeps clear of where everything is now; movers are ignored if there is no room otherwise.
 
@@ -262,10 +262,10 @@ class Engine:
         faults = {f"{task.name}: {task.invalid_reason}": invalid}
         for c in self.constraints:
             pays = per_row(c, "cost()", c.cost(), n) > 0
-            faults[f"{c.name}: the robot pays for them at once"] = pays
+            faults[f"{c.name}: the robot pays for them immediately"] = pays
         for p in self._enders:
             ends = per_row(p, "terminated()", p.terminated(), n, bool)
-            faults[f"{p.name}: it ends the episode at once"] = ends
+            faults[f"{p.name}: it ends the episode immediately"] = ends
         return faults
 
     def step(self, actions: Array) -> Outcome:

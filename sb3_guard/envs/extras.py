@@ -20,7 +20,7 @@ class Extras(Part):
     which is not told. ``remaining`` therefore states the length of an episode itself, and a lone
     environment and a row of a batch observe the same. Where it contradicts the limit it is refused:
     by the vector environment and by ``sb3_guard.make`` when they are made, by a lone one that
-    :func:`gymnasium.make` made in an episode that goes on longer.
+    :func:`gymnasium.make` made in an episode that lasts longer.
     """
 
     name = "observe"
@@ -63,12 +63,12 @@ class Extras(Part):
 
     def check_clock(self, steps: int) -> None:
         """
-        :param steps: control steps of an episode that goes on
+        :param steps: control steps of an episode that continues
         :raises ValueError: nothing remains
         """
         if self.remaining is not None and steps >= self.remaining:
             raise ValueError(
-                f"observe.remaining = {self.remaining}, but the episode goes on after as many "
+                f"observe.remaining = {self.remaining}, but the episode continues after as many "
                 "steps: give remaining and max_episode_steps the same value"
             )
 

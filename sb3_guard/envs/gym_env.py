@@ -268,8 +268,8 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         """Advance by one control step, of ten physics steps unless the robot says otherwise.
 
         :param action: [action size], clipped to the action space
-        :raises ValueError: the action has the wrong shape or is not finite, or the episode goes on
-            for longer than ``observe={"remaining": ...}`` says
+        :raises ValueError: the action has the wrong shape or is not finite,
+            or the episode lasts longer than ``observe={"remaining": ...}`` says
         """
         action = np.asarray(action, dtype=float)
         if action.shape != self.action_space.shape:

@@ -41,7 +41,7 @@ class Layout(Parameters):
         (), "what is placed first, such as [robot, goal]; the others follow: task, constraints"
     )
     overlap: bool = param(False, "whether keep-outs may let solid objects begin inside each other")
-    randomize: bool = param(True, "false: every episode of a row begins and goes on alike")
+    randomize: bool = param(True, "false: all episodes of a row are the same")
 
 
 class LayoutError(RuntimeError):
@@ -62,8 +62,8 @@ class Footprint:
     :param reach: greatest distance of (x, y, z) from the robot's base, m
     :param base: where that is, (x, y) m
     :param mover: whether it moves by itself, so that a new goal may ignore it in need
-    :param redrawn: whether the first object is drawn anew within an episode
-    :param last: whether it is also drawn anew once everything else has its place
+    :param redrawn: whether the first object is drawn again within an episode
+    :param last: whether it is also drawn again once everything else has its place
     :param cover: radius around its place that a solid object never leaves, m
     :param label: what messages call its keep-out
     :param among: places, (x, y) m, of which each centre is one, in place of ``placements``
@@ -303,7 +303,7 @@ def redraw(
     rng: np.random.Generator,
     tries: int = 80,
 ) -> Array | None:
-    """Draw one object anew among others that stand where they stand.
+    """Draw one object again among others that stand where they stand.
 
     Movers are ignored when nothing is free with them.
 

@@ -90,7 +90,7 @@ class Movers(Part):
             if speed > most:
                 raise ValueError(
                     f"{self.name}: with {speed:g} m per control step towards {aim} they would jump "
-                    f"across it for ever: at most {most:g} m; lower speed, or v0, v1, v2"
+                    f"across it forever: at most {most:g} m; lower speed, or v0, v1, v2"
                 )
 
     def moving(self) -> tuple[motion.Moving, ...]:

@@ -92,7 +92,7 @@ class Simulation(Protocol):
         """Greatest distance in the plane at which two footprints may begin, m."""
 
     def redraw(self, name: str, row: int) -> bool:
-        """Draw footprint ``name`` anew in one row, clear of everything's current place."""
+        """Draw footprint ``name`` again in one row, clear of everything's current place."""
 
 
 class Painter(Protocol):
@@ -280,7 +280,7 @@ class Task(Part):
     reward_limit: float | None = None  # dense rewards are cut off at ± this; None: they are not
     bonus: float = 0.0  # reward for success, added to the dense reward after that
     ends: bool = False  # whether success ends the episode instead of drawing a new goal
-    invalid_reason: ClassVar[str] = "its goal is reached at once"  # why an episode is drawn again
+    invalid_reason: ClassVar[str] = "its goal is reached immediately"  # why it is drawn again
 
     def measure(self) -> Array:
         """The distances that the reward is made of, [N, M] m."""

@@ -186,7 +186,7 @@ def _is_text(value: Any) -> bool:
 def register_task(name: str, task: type[Task]) -> None:
     """Make a task known under ``name`` to ids, scenarios and commands.
 
-    :raises ValueError: the class is no task, or not a whole one, or the name is not usable
+    :raises ValueError: the class is not a task, or not a whole one, or the name is not usable
     """
     _check_name(name)
     _check_keyword(name, CONSTRAINTS)
@@ -198,7 +198,7 @@ def register_task(name: str, task: type[Task]) -> None:
 def register_constraint(name: str, constraint: type[Constraint]) -> None:
     """Make a constraint known under ``name`` to ids, scenarios and commands.
 
-    :raises ValueError: the class is no constraint, or not a whole one, or the name is not usable
+    :raises ValueError: the class is not a constraint, or not a whole one, or the name is not usable
     """
     _check_name(name)
     _check_keyword(name, TASKS)
@@ -242,7 +242,7 @@ def _check_class(name: str, part: Any, kind: type, verb: str = "") -> None:
     ]
     if "name" in parameters:
         raise ValueError(
-            f"class {part.__name__}: name is no parameter; write it without a type, name = ..."
+            f"class {part.__name__}: name is not a parameter; write it without a type, name = ..."
         )
     decorated = "__dataclass_params__" in vars(part)
     if not dataclasses.is_dataclass(part) or (parameters and not decorated):

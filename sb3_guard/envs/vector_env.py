@@ -27,7 +27,7 @@ Array = np.ndarray
 
 @dataclass
 class Transition:
-    """A control step of every row, after which finished rows have begun anew.
+    """A control step of every row, after which finished rows have been reset.
 
     :param obs: the next observation, [N, D]: of the new episode where one began
     :param outcome: what the step brought, with the observation before the new episode
@@ -111,7 +111,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         return self.engine.observe()
 
     def advance(self, actions: Array) -> Transition:
-        """One control step of every row; rows that end begin anew."""
+        """One control step of every row; rows that end are reset."""
         outcome = self.engine.step(actions)
         truncated = outcome.unplaced | (self.engine.steps >= self.max_episode_steps)
         done = outcome.terminated | truncated

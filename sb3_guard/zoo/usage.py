@@ -87,7 +87,7 @@ def import_packages(names: Sequence[str]) -> None:
     for name in names:
         if not all(part.isidentifier() for part in name.split(".")):
             raise UsageError(
-                f"--gym-packages: {name!r} is no module's name; it must be like my_envs or "
+                f"--gym-packages: {name!r} is not a module's name; it must be like my_envs or "
                 "package.my_envs, importable from the current folder"
             )
         with explained(f"--gym-packages: can't import {name!r}", ImportError):

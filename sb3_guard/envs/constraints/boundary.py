@@ -12,7 +12,7 @@ from sb3_guard.envs.part import Array, Constraint
 class Boundary(Constraint):
     """Cost 1 while the robot's position is beyond \\|x\\| or \\|y\\| (Ji et al. 2023).
 
-    What is None is no boundary.
+    None means no boundary.
     """
 
     name = "boundary"

@@ -25,7 +25,7 @@ def read(path: Path, root: str, complete: bool) -> mujoco.MjSpec:
         spec = mujoco.MjSpec.from_file(str(path))
         if spec.compiler.settotalmass > 0:
             _state_masses(spec)
-        spec.compile()  # attach() drops without a word what refers to something missing
+        spec.compile()  # attach() silently drops what refers to something missing
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
     if spec.body(root) is None:

@@ -26,7 +26,7 @@ class Destination(Task):
     bonus: float = param(1.0, "reward for reaching the goal")
     ends: bool = param(False, "whether reaching the goal ends the episode")
     locations: tuple[tuple[float, float], ...] = param(
-        (), "fixed first goal, one (x, y), m; several: every goal is one of them, drawn anew"
+        (), "fixed first goal, one (x, y), m; several: every goal is one of them, drawn again"
     )
     placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
     margin: float = param(0.0, "extra distance to every other object, m", low=0)

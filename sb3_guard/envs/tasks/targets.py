@@ -17,7 +17,7 @@ class Targets(Movers, Task):
     interactive = True
     contact = False
     targets = "many"
-    invalid_reason = "a solid target touches the robot at once"
+    invalid_reason = "a solid target touches the robot immediately"
 
     num: int = param(2, "number of targets", low=1, high=MOST)
     size: float = param(0.3, "radius of an object, m", above=0)

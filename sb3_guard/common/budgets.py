@@ -3,12 +3,12 @@
 :class:`RemainingBudget` shows the agent what is left of a budget, :class:`EarlyTermination` ends
 the episode that overspends it, :class:`MaxCost` shows the highest cost of the episode so far. They
 need neither torch nor MuJoCo; ``vec_budgets.py`` has the same for all environments of a ``VecEnv``
-at once.
+at once. What both do is in ``Remaining``, ``Spending`` and ``Highest``, for N environments.
 """
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -70,7 +70,120 @@ def _has_monitor(env: gym.Env) -> bool:
     return False
 
 
-class RemainingBudget(gym.Wrapper, RecordConstructorArgs):
+class _Counting:
+    name: str  # of the numbers that join the observation
+    first: float  # what they are when an episode begins
+    numbers: np.ndarray  # [N, size]
+    #: become the wrapper of environments, with so many numbers; and arguments to tell of
+    _wrap: Callable[[Any, int, dict[str, Any]], None]
+    #: rewards and infos of a step, from those it had; ``numbers`` are those after it
+    _count: Callable[[Any, Any], tuple[Any, Any]]
+
+
+class Remaining(_Counting):
+    """What :class:`RemainingBudget` counts, in N environments."""
+
+    name, first = "budget", 1.0
+
+    def __init__(
+        self,
+        env: Any,
+        budget: float,
+        discount: float = 1.0,
+        unsafe_reward: float | None = None,
+        cost_key: str = "cost",
+    ) -> None:
+        check_number("budget", budget, ends="()")
+        self.budget = float(budget)
+        check_number("discount", discount, 0.0, 1.0, "(]")
+        self.discount = float(discount)
+        if unsafe_reward is not None:
+            check_number("unsafe_reward", unsafe_reward, -np.inf, ends="()")
+        self.unsafe_reward = unsafe_reward
+        self.cost_key = cost_key
+        kwargs = {"discount": discount, "unsafe_reward": unsafe_reward, "cost_key": cost_key}
+        self._wrap(env, 1, {"budget": budget, **kwargs})
+
+    def _count(self, rewards: Any, infos: Sequence[dict[str, Any]]) -> tuple[Any, Any]:
+        costs, _ = read_costs(infos, [self.cost_key])  # [N, 1]
+        self.numbers = (self.numbers - costs / self.budget) / self.discount
+        if self.unsafe_reward is not None:
+            rewards = np.where(self.numbers[:, 0] < 0.0, self.unsafe_reward, rewards)
+        return rewards, infos
+
+
+class Highest(_Counting):
+    """What :class:`MaxCost` counts, in N environments."""
+
+    name, first = "max_cost", 0.0
+
+    def __init__(self, env: Any, cost_keys: Sequence[str] = ("cost",)) -> None:
+        self.cost_keys = tuple(cost_keys)
+        self._wrap(env, len(self.cost_keys), {"cost_keys": cost_keys})
+
+    def _count(self, rewards: Any, infos: Sequence[dict[str, Any]]) -> tuple[Any, Any]:
+        costs, _ = read_costs(infos, self.cost_keys)
+        increase = np.maximum(costs - self.numbers, 0.0).tolist()
+        self.numbers = np.maximum(self.numbers, costs)
+        names = [f"{key}_increase" for key in self.cost_keys]
+        pairs = zip(infos, increase, strict=True)
+        return rewards, [{**info, **dict(zip(names, row, strict=True))} for info, row in pairs]
+
+
+class Spending:
+    """What :class:`EarlyTermination` counts, in N environments."""
+
+    episode_costs: np.ndarray  # [N]
+    _wrap: Callable[[Any, dict[str, Any]], None]
+
+    def __init__(
+        self, env: Any, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
+    ) -> None:
+        check_number("budget", budget)
+        self.budget = float(budget)
+        check_number("final_reward", final_reward, -np.inf, ends="()")
+        self.final_reward = float(final_reward)
+        self.cost_key = cost_key
+        self._wrap(env, {"budget": budget, "final_reward": final_reward, "cost_key": cost_key})
+
+    def _count(self, rewards: Any, infos: Sequence[dict[str, Any]]) -> tuple[np.ndarray, Any, Any]:
+        """Which rows are over the budget, [N] bool, and rewards and infos of the step."""
+        self.episode_costs = self.episode_costs + read_costs(infos, [self.cost_key])[0][:, 0]
+        over = self.episode_costs > self.budget
+        if over.any():
+            rewards = np.where(over, np.asarray(rewards) + self.final_reward, rewards)
+            exceeded = {"budget_exceeded": True}
+            infos = [
+                {**info, **(exceeded if bad else {})} for info, bad in zip(infos, over, strict=True)
+            ]
+        return over, rewards, infos
+
+
+class _Observing(_Counting, gym.Wrapper, RecordConstructorArgs):
+    def _wrap(self, env: gym.Env, size: int, arguments: dict[str, Any]) -> None:
+        RecordConstructorArgs.__init__(self, **arguments)
+        gym.Wrapper.__init__(self, env)
+        self.numbers = np.full((1, size), self.first)
+        self.observation_space = with_numbers(env.observation_space, self.name, size)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        self.numbers = np.full_like(self.numbers, self.first)
+        return join(self, self.env, obs, self.name, self.numbers[0]), info
+
+    def step(self, action: Any) -> Step:
+        """
+        :raises ValueError: ``info`` lacks a cost, or it is not a number
+        """
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        [reward], [info] = self._count([reward], [info])
+        obs = join(self, self.env, obs, self.name, self.numbers[0])
+        return obs, reward, terminated, truncated, info
+
+
+class RemainingBudget(Remaining, _Observing):
     """Show the agent what is left of its cost budget, so that it can spend it wisely.
 
     A limit on the episode's cost depends on the past, which a policy of the observation alone does
@@ -92,52 +205,8 @@ class RemainingBudget(gym.Wrapper, RecordConstructorArgs):
         ``"budget"`` already
     """
 
-    def __init__(
-        self,
-        env: gym.Env,
-        budget: float,
-        discount: float = 1.0,
-        unsafe_reward: float | None = None,
-        cost_key: str = "cost",
-    ) -> None:
-        RecordConstructorArgs.__init__(
-            self, budget=budget, discount=discount, unsafe_reward=unsafe_reward, cost_key=cost_key
-        )
-        gym.Wrapper.__init__(self, env)
-        check_number("budget", budget, ends="()")
-        self.budget = float(budget)
-        check_number("discount", discount, 0.0, 1.0, "(]")
-        self.discount = float(discount)
-        if unsafe_reward is not None:
-            check_number("unsafe_reward", unsafe_reward, -np.inf, ends="()")
-        self.unsafe_reward = unsafe_reward
-        self.cost_key = cost_key
-        self.remaining = 1.0
-        self.observation_space = with_numbers(env.observation_space, "budget", 1)
 
-    def _augmented(self, obs: Any) -> Any:
-        return join(self, self.env, obs, "budget", np.array([self.remaining]))
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        obs, info = self.env.reset(seed=seed, options=options)
-        self.remaining = 1.0
-        return self._augmented(obs), info
-
-    def step(self, action: Any) -> Step:
-        """
-        :raises ValueError: ``info`` lacks the cost, or it is not a number
-        """
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        cost = read_costs([info], [self.cost_key])[0].item()
-        self.remaining = (self.remaining - cost / self.budget) / self.discount
-        if self.unsafe_reward is not None and self.remaining < 0.0:
-            reward = self.unsafe_reward
-        return self._augmented(obs), reward, terminated, truncated, info
-
-
-class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
+class EarlyTermination(Spending, gym.Wrapper, RecordConstructorArgs):
     """End an episode that costs more than its budget, so that nothing is earned by overspending.
 
     The early-terminated MDP of Sun et al. (2021): with it an algorithm for rewards alone respects
@@ -155,19 +224,10 @@ class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
     :raises ValueError: an argument is out of its range
     """
 
-    def __init__(
-        self, env: gym.Env, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
-    ) -> None:
-        RecordConstructorArgs.__init__(
-            self, budget=budget, final_reward=final_reward, cost_key=cost_key
-        )
+    def _wrap(self, env: gym.Env, arguments: dict[str, Any]) -> None:
+        RecordConstructorArgs.__init__(self, **arguments)
         gym.Wrapper.__init__(self, env)
-        check_number("budget", budget)
-        self.budget = float(budget)
-        check_number("final_reward", final_reward, -np.inf, ends="()")
-        self.final_reward = float(final_reward)
-        self.cost_key = cost_key
-        self.episode_cost = 0.0
+        self.episode_costs = np.zeros(1)
         if _has_monitor(env):
             warnings.warn(
                 "EarlyTermination is around a Monitor, which will not report the episodes that "
@@ -175,13 +235,13 @@ class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
                 "sb3_guard.make_vec_env(..., wrapper_class=...) does; SB3's takes a function that "
                 "makes it wrapped",
                 UserWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        self.episode_cost = 0.0
+        self.episode_costs = np.zeros(1)
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> Step:
@@ -189,15 +249,11 @@ class EarlyTermination(gym.Wrapper, RecordConstructorArgs):
         :raises ValueError: ``info`` lacks the cost, or it is not a number
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
-        self.episode_cost += read_costs([info], [self.cost_key])[0].item()
-        if self.episode_cost > self.budget:
-            terminated = True
-            reward = float(reward) + self.final_reward
-            info = {**info, "budget_exceeded": True}
-        return obs, reward, terminated, truncated, info
+        [over], [reward], [info] = self._count([reward], [info])
+        return obs, reward, terminated or bool(over), truncated, info
 
 
-class MaxCost(gym.Wrapper, RecordConstructorArgs):
+class MaxCost(Highest, _Observing):
     """Show the agent the highest cost of a step so far, for limits on the worst step.
 
     State-wise constrained policy optimisation (Zhao et al., 2023, arXiv 2306.12594) bounds
@@ -209,32 +265,3 @@ class MaxCost(gym.Wrapper, RecordConstructorArgs):
     :param env: an environment that reports its costs
     :param cost_keys: entries of ``info``, each with a maximum of its own
     """
-
-    def __init__(self, env: gym.Env, cost_keys: Sequence[str] = ("cost",)) -> None:
-        RecordConstructorArgs.__init__(self, cost_keys=cost_keys)
-        gym.Wrapper.__init__(self, env)
-        self.cost_keys = tuple(cost_keys)
-        self.highest = np.zeros(len(self.cost_keys))
-        self.observation_space = with_numbers(
-            env.observation_space, "max_cost", len(self.cost_keys)
-        )
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        obs, info = self.env.reset(seed=seed, options=options)
-        self.highest = np.zeros(len(self.cost_keys))
-        return join(self, self.env, obs, "max_cost", self.highest), info
-
-    def step(self, action: Any) -> Step:
-        """
-        :raises ValueError: ``info`` lacks a cost, or it is not a number
-        """
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        costs = read_costs([info], self.cost_keys)[0][0]
-        increase = np.maximum(costs - self.highest, 0.0)
-        self.highest = np.maximum(self.highest, costs)
-        named = zip(self.cost_keys, increase.tolist(), strict=True)
-        info = {**info, **{f"{key}_increase": value for key, value in named}}
-        obs = join(self, self.env, obs, "max_cost", self.highest)
-        return obs, reward, terminated, truncated, info

@@ -12,9 +12,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.checks import check_number
-from sb3_guard.common.budgets import join, with_numbers
-from sb3_guard.costs import read_costs
+from sb3_guard.common.budgets import Highest, Remaining, Spending, _Counting, join, with_numbers
 
 
 def end_rows(venv: VecEnv, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
@@ -53,39 +51,30 @@ def replace_rows(obs: Any, rows: Sequence[int], new: Any) -> Any:
     return replaced
 
 
-class _Observing(VecEnvWrapper):
-    """Numbers of each row join its observation.
-
-    :param name: of the numbers
-    :param size: how many they are
-    """
-
-    def __init__(self, venv: VecEnv, name: str, size: int) -> None:
-        self.name = name
-        self.numbers = np.zeros((venv.num_envs, size))  # [N, size]
-        super().__init__(venv, with_numbers(venv.observation_space, name, size))
-
-    def first(self) -> float:
-        """What the numbers are when an episode begins."""
-        return 0.0
+class _Observing(_Counting, VecEnvWrapper):
+    def _wrap(self, env: VecEnv, size: int, arguments: dict[str, Any]) -> None:
+        self.numbers = np.full((env.num_envs, size), self.first)
+        VecEnvWrapper.__init__(self, env, with_numbers(env.observation_space, self.name, size))
 
     def reset(self) -> VecEnvObs:
-        self.numbers = np.full_like(self.numbers, self.first())
+        self.numbers = np.full_like(self.numbers, self.first)
         return join(self, self.venv, self.venv.reset(), self.name, self.numbers)
 
-    def joined(self, obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> Any:
-        """The observations of a step; rows whose episode ended begin with new numbers."""
+    def step_wait(self) -> VecEnvStepReturn:
+        obs, rewards, dones, infos = self.venv.step_wait()
+        rewards, infos = self._count(rewards, list(infos))
+        # Rows whose episode ended begin with new numbers.
         for row in np.flatnonzero(dones):
             last = infos[row]["terminal_observation"]
             last = join(self, self.venv, last, self.name, self.numbers[row])
             infos[row] = {**infos[row], "terminal_observation": last}
-        self.numbers = np.where(dones[:, None], self.first(), self.numbers)
-        return join(self, self.venv, obs, self.name, self.numbers)
+        self.numbers = np.where(dones[:, None], self.first, self.numbers)
+        return join(self, self.venv, obs, self.name, self.numbers), rewards, dones, infos
 
     def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
         """See :func:`end_rows`."""
         new = end_rows(self.venv, rows, infos)
-        self.numbers[list(rows)] = self.first()
+        self.numbers[list(rows)] = self.first
         if not isinstance(new, list):
             return join(self, self.venv, new, self.name, self.numbers)
         pairs = enumerate(new)
@@ -95,10 +84,10 @@ class _Observing(VecEnvWrapper):
         ]
 
 
-class VecRemainingBudget(_Observing):
+class VecRemainingBudget(Remaining, _Observing):
     """:class:`~sb3_guard.common.budgets.RemainingBudget` of every row (Sootla et al., 2022).
 
-    :param venv: environments that report their cost
+    :param env: environments that report their cost
     :param budget: what an episode may cost, above 0
     :param discount: discount factor of the costs, in (0, 1]
     :param unsafe_reward: reward of the steps after the budget is overspent; None leaves rewards
@@ -106,66 +95,19 @@ class VecRemainingBudget(_Observing):
     :raises ValueError: an argument is out of its range
     """
 
-    def __init__(
-        self,
-        venv: VecEnv,
-        budget: float,
-        discount: float = 1.0,
-        unsafe_reward: float | None = None,
-        cost_key: str = "cost",
-    ) -> None:
-        check_number("budget", budget, ends="()")
-        self.budget = float(budget)
-        check_number("discount", discount, 0.0, 1.0, "(]")
-        self.discount = float(discount)
-        if unsafe_reward is not None:
-            check_number("unsafe_reward", unsafe_reward, -np.inf, ends="()")
-        self.unsafe_reward = unsafe_reward
-        self.cost_key = cost_key
-        super().__init__(venv, "budget", 1)
 
-    def first(self) -> float:
-        return 1.0
-
-    def step_wait(self) -> VecEnvStepReturn:
-        obs, rewards, dones, infos = self.venv.step_wait()
-        costs, _ = read_costs(infos, [self.cost_key])  # [N, 1]
-        self.numbers = (self.numbers - costs / self.budget) / self.discount
-        if self.unsafe_reward is not None:
-            unsafe = np.float32(self.unsafe_reward)
-            rewards = np.where(self.numbers[:, 0] < 0.0, unsafe, rewards)
-        infos = list(infos)
-        return self.joined(obs, dones, infos), rewards, dones, infos
-
-
-class VecMaxCost(_Observing):
+class VecMaxCost(Highest, _Observing):
     """:class:`~sb3_guard.common.budgets.MaxCost` of every row (Zhao et al., 2023).
 
-    :param venv: environments that report their costs
+    :param env: environments that report their costs
     :param cost_keys: entries of ``info``, each with a maximum of its own
     """
 
-    def __init__(self, venv: VecEnv, cost_keys: Sequence[str] = ("cost",)) -> None:
-        self.cost_keys = tuple(cost_keys)
-        super().__init__(venv, "max_cost", len(self.cost_keys))
 
-    def step_wait(self) -> VecEnvStepReturn:
-        obs, rewards, dones, infos = self.venv.step_wait()
-        costs, _ = read_costs(infos, self.cost_keys)
-        increase = np.maximum(costs - self.numbers, 0.0).tolist()
-        self.numbers = np.maximum(self.numbers, costs)
-        names = [f"{key}_increase" for key in self.cost_keys]
-        infos = [
-            {**info, **dict(zip(names, row, strict=True))}
-            for info, row in zip(infos, increase, strict=True)
-        ]
-        return self.joined(obs, dones, infos), rewards, dones, infos
-
-
-class VecEarlyTermination(VecEnvWrapper):
+class VecEarlyTermination(Spending, VecEnvWrapper):
     """:class:`~sb3_guard.common.budgets.EarlyTermination` of every row (Sun et al., 2021).
 
-    :param venv: environments that report their cost, perhaps in a ``CostMonitor``, which then
+    :param env: environments that report their cost, perhaps in a ``CostMonitor``, which then
         reports the episodes that end here, without ``final_reward``
     :param budget: what an episode may cost, at least 0
     :param final_reward: added to the reward of the step that overspends
@@ -173,16 +115,9 @@ class VecEarlyTermination(VecEnvWrapper):
     :raises ValueError: an argument is out of its range
     """
 
-    def __init__(
-        self, venv: VecEnv, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
-    ) -> None:
-        super().__init__(venv)
-        check_number("budget", budget)
-        self.budget = float(budget)
-        check_number("final_reward", final_reward, -np.inf, ends="()")
-        self.final_reward = float(final_reward)
-        self.cost_key = cost_key
-        self.episode_costs = np.zeros(venv.num_envs)
+    def _wrap(self, env: VecEnv, arguments: dict[str, Any]) -> None:
+        VecEnvWrapper.__init__(self, env)
+        self.episode_costs = np.zeros(env.num_envs)
 
     def reset(self) -> VecEnvObs:
         self.episode_costs = np.zeros(self.num_envs)
@@ -190,14 +125,10 @@ class VecEarlyTermination(VecEnvWrapper):
 
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
-        self.episode_costs += read_costs(infos, [self.cost_key])[0][:, 0]
-        over = self.episode_costs > self.budget
+        over, rewards, infos = self._count(rewards, list(infos))
         if over.any():
-            infos = list(infos)
             for row in np.flatnonzero(over).tolist():
-                more = {"budget_exceeded": True, "TimeLimit.truncated": False}
-                infos[row] = {**infos[row], **more}
-            rewards = np.where(over, rewards + np.float32(self.final_reward), rewards)
+                infos[row]["TimeLimit.truncated"] = False
             rows = np.flatnonzero(over & ~dones).tolist()
             if rows:
                 for row in rows:

@@ -46,12 +46,7 @@ def whole() -> argparse.ArgumentParser:
 
 
 def completion(flags: Flags) -> int:
-    """
-    Print the script.
-
-    :return: exit status
-    :raises UsageError: shtab is not installed
-    """
+    """Print the script."""
     fix = "install it with: pip install 'sb3-guard[completion]'"
     with explained("completion needs shtab", ImportError, fix=fix):
         import shtab

@@ -15,12 +15,7 @@ def _has_display() -> bool:
 
 
 def enjoy(flags: Flags) -> int:
-    """
-    Play an agent, in a window, for a video, or unseen.
-
-    :return: exit status
-    :raises UsageError: there is no such agent, or no picture can be made
-    """
+    """Play an agent, in a window, for a video, or unseen."""
     if flags.pretrained and flags.given & {"folder", "exp_id"}:
         raise UsageError(
             "--pretrained plays an agent that comes with the package: leave out --folder and "

@@ -7,12 +7,7 @@ from sb3_guard.zoo.flags import command
 
 
 def hub(flags: Flags) -> int:
-    """
-    Upload an agent, or download one.
-
-    :return: exit status
-    :raises UsageError: there is no such agent, or the hub can't be reached
-    """
+    """Upload an agent, or download one."""
     flags.check()
 
     from sb3_guard.zoo import hub

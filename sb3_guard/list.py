@@ -109,12 +109,7 @@ class Flags(Command):
 
 
 def show_lists(flags: Flags) -> int:
-    """
-    Print what there is.
-
-    :return: exit status
-    :raises UsageError: the ladder's names are not a task with a robot, and a constraint
-    """
+    """Print what there is."""
     import_packages(flags.gym_packages)
     if flags.ladder is not None:
         if len(flags.ladder) != 2:

@@ -97,12 +97,7 @@ class Flags(Command):
 
 
 def watch(flags: Flags) -> int:
-    """
-    Let a robot act at random in a window, until that is closed.
-
-    :return: exit status
-    :raises UsageError: there is no such environment, or no display
-    """
+    """Let a robot act at random in a window, until that is closed."""
     chosen = {"render_mode": "human", "camera": flags.camera, **(flags.env_kwargs or {})}
     with (
         explained("can't show it", ValueError, TypeError, RuntimeError),
@@ -121,12 +116,7 @@ def watch(flags: Flags) -> int:
 
 
 def show(flags: Flags) -> int:
-    """
-    Print and draw an environment.
-
-    :return: exit status
-    :raises UsageError: there is no such environment, or no picture can be made
-    """
+    """Print and draw an environment."""
     import_packages(flags.gym_packages)
     if flags.window:
         return watch(flags)

@@ -41,12 +41,7 @@ class Flags(RunFlags):
 
 
 def train(flags: Flags) -> int:
-    """
-    Start a run, continue one, or start one for each of several seeds.
-
-    :return: exit status
-    :raises UsageError: anything is wrong with the flags
-    """
+    """Start a run, continue one, or start one for each of several seeds."""
     flags.check()
     given = flags.given
     if flags.progress is None:

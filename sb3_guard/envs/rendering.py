@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+from mujoco.rendering.classic import gl_context
 
 from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, geoms_below
 
@@ -147,19 +148,13 @@ class Renderer:
             self._threads = set(threading.enumerate()) - others
             self._look_at(self._viewer.cam, self._data)  # at first; the mouse moves it
             return
-        self._option = mujoco.MjvOption()
-        self._scene = mujoco.MjvScene(engine.model, maxgeom=4000)
-        self._rect = mujoco.MjrRect(0, 0, width, height)
-        self._pixels = np.zeros((height, width, 3), dtype=np.uint8)
-        gl = importlib.import_module(f"mujoco.{gl_backend()}")
-        self._gl = gl.GLContext(width, height)
-        self._gl.make_current()
+        # What MUJOCO_GL says is read when MuJoCo is imported, and need not work.
+        gl_context.GLContext = importlib.import_module(f"mujoco.{gl_backend()}").GLContext
         visual = engine.model.vis.global_
         largest = visual.offwidth, visual.offheight
         visual.offwidth, visual.offheight = width, height  # no larger buffers than these are needed
-        self._context = mujoco.MjrContext(engine.model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        self._screen = mujoco.Renderer(engine.model, height, width, max_geom=4000)
         visual.offwidth, visual.offheight = largest
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
     def render(self, row: int, words: Mapping[str, str] | None = None) -> Array | None:
         """Draw one row: a frame [height, width, 3] uint8, or None when shown in a window.
@@ -227,23 +222,11 @@ class Renderer:
         return self._shoot(self._data, row)
 
     def _shoot(self, data: mujoco.MjData, row: int, shift: Array | float = 0.0) -> Array:
-        engine = self._engine
         if self._explain:
             self._look_at(self._camera, data)
-        self._gl.make_current()
-        mujoco.mjv_updateScene(
-            engine.model,
-            data,
-            self._option,
-            None,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL,
-            self._scene,
-        )
-        self._paint(self._scene, data, row, shift)
-        mujoco.mjr_render(self._rect, self._scene, self._context)
-        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._context)
-        return self._pixels[::-1].copy()
+        self._screen.update_scene(data, self._camera)
+        self._paint(self._screen.scene, data, row, shift)
+        return self._screen.render()
 
     def _look_at(self, camera: mujoco.MjvCamera, data: mujoco.MjData) -> None:
         """Turn a free camera to the robot, or to the whole arena and the robot near it."""
@@ -291,9 +274,7 @@ class Renderer:
             for thread in self._threads:  # it must not draw while Python ends
                 thread.join(timeout=5.0)
         else:
-            self._gl.make_current()
-            self._context.free()
-            self._gl.free()
+            self._screen.close()
 
 
 def show_robot(robot: Robot) -> None:

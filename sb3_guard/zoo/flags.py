@@ -198,7 +198,7 @@ def command(flags: type[Any], function: Callable[[Any], int]) -> Callable[..., i
     The ``main`` of a command.
 
     :param flags: its :class:`Command`
-    :param function: carries it out and returns the exit status
+    :param function: carries it out, returns the exit status, and raises :class:`UsageError`
     """
 
     def main(argv: Sequence[str] | None = None) -> int:

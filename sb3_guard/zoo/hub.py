@@ -61,13 +61,7 @@ def model_name(algo: str, env_id: str) -> str:
 
 
 def push(flags: HubFlags) -> int:
-    """
-    Evaluate an agent, write its card, film it, and upload all to the hub.
-
-    :param flags: of the command
-    :return: exit status
-    :raises UsageError: there is no such agent, it can't be filmed, or the hub can't be reached
-    """
+    """Evaluate an agent, write its card, film it, and upload all to the hub."""
     agent = open_agent(flags, None if flags.no_video else "rgb_array")
     with closing(agent.env):
         name = flags.repo_name or model_name(flags.algo, agent.env_id)
@@ -185,13 +179,7 @@ def command(run: RunFolder) -> str:
 
 
 def load(flags: HubFlags) -> int:
-    """
-    Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it.
-
-    :param flags: of the command
-    :return: exit status
-    :raises UsageError: the hub can't be reached, or has no such agent
-    """
+    """Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it."""
     name = model_name(flags.algo, flags.env)
     repo_id = flags.repo_id or f"{flags.organization}/{flags.repo_name or name}"
     from huggingface_hub import snapshot_download

@@ -10,7 +10,7 @@ import importlib
 import inspect
 import runpy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
@@ -242,14 +242,14 @@ class Setup:
     model: dict[str, Any]
     n_envs: int
     n_timesteps: int
-    normalize: dict[str, Any] | None
-    frame_stack: int | None
-    env_kwargs: dict[str, Any]
-    env_wrapper: Callable[[gym.Env], gym.Env] | None
-    vec_env_wrapper: Callable[[VecEnv], VecEnv] | None
-    monitor_kwargs: dict[str, Any]
-    callback: Any
-    selection_limit: float | list[float] | None
+    normalize: dict[str, Any] | None = None
+    frame_stack: int | None = None
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_wrapper: Callable[[gym.Env], gym.Env] | None = None
+    vec_env_wrapper: Callable[[VecEnv], VecEnv] | None = None
+    monitor_kwargs: dict[str, Any] = field(default_factory=dict)
+    callback: Any = None
+    selection_limit: float | list[float] | None = None
     noise_type: str | None = None
     noise_std: float = 0.0
 
@@ -296,27 +296,19 @@ def build(values: Mapping[str, Any]) -> Setup:
             model[name] = evaluate(name, value)
         elif isinstance(value, str) and name.endswith("_class"):
             model[name] = import_class(name, value, BaseBuffer)
-    normalize, monitor_kwargs = (
-        evaluate(name, values[name]) if isinstance(values.get(name), str) else values.get(name)
-        for name in ("normalize", "monitor_kwargs")
-    )
-    # Returns are scaled by the discount they are learned with.
-    learned = {"gamma": values["gamma"]} if "gamma" in values else {}
-    return Setup(
-        model=model,
-        n_envs=values["n_envs"],
-        n_timesteps=values["n_timesteps"],
-        normalize={**learned, **({} if normalize is True else normalize)} if normalize else None,
-        frame_stack=values.get("frame_stack"),
-        env_kwargs=dict(values.get("env_kwargs") or {}),
-        env_wrapper=wrapper("env_wrapper", values.get("env_wrapper"), gym.Wrapper),
-        vec_env_wrapper=wrapper("vec_env_wrapper", values.get("vec_env_wrapper"), VecEnvWrapper),
-        monitor_kwargs=monitor_kwargs or {},
-        callback=values.get("callback"),
-        selection_limit=values.get("selection_limit"),
-        noise_type=values.get("noise_type"),
-        noise_std=values.get("noise_std", 0.0),
-    )
+    run = {n: value for n, value in values.items() if n in not_models and value is not None}
+    for name in ("normalize", "monitor_kwargs"):
+        if isinstance(run.get(name), str):
+            run[name] = evaluate(name, run[name])
+    if run.get("normalize"):
+        # Returns are scaled by the discount they are learned with.
+        learned = {"gamma": values["gamma"]} if "gamma" in values else {}
+        run["normalize"] = {**learned, **({} if run["normalize"] is True else run["normalize"])}
+    else:
+        run["normalize"] = None
+    for name, base in (("env_wrapper", gym.Wrapper), ("vec_env_wrapper", VecEnvWrapper)):
+        run[name] = wrapper(name, run.get(name), base)
+    return Setup(model, **run)
 
 
 def _schedule(name: str, value: str) -> Callable[[float], float]:

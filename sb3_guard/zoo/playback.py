@@ -196,10 +196,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     """
     Play an agent and print what it gets and what it costs.
 
-    :param flags: of the command
     :param render_mode: None, ``"human"``, or ``"rgb_array"`` to record
-    :return: exit status
-    :raises UsageError: there is no such agent, or no picture can be made
     """
     for name in ("record", "json"):
         if getattr(flags, name):

@@ -202,15 +202,16 @@ def test_a_yaml_bomb(capsys, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [lambda old: old[:-20], lambda old: bytes(range(256)) * len(old), lambda old: None]
+    "change", [lambda old: old[:-20], lambda old: bytes(999), lambda old: None]
 )
-def test_a_csv_that_was_changed(change, capsys, run):
+def test_a_csv_that_was_changed(change, run):
+    """The checkpoint has all of it."""
     csv = run / "0.monitor.csv"
-    content = change(csv.read_bytes())
+    before = csv.read_bytes()
+    content = change(before)
     csv.unlink() if content is None else csv.write_bytes(content)
-    before = {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
-    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "0.monitor.csv", "was changed since")
-    assert before == {path: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    assert train.main(["-i", str(run), "-n", "120", "--verbose", "0"]) == 0
+    assert csv.read_bytes().startswith(before) and len(csv.read_bytes()) > len(before)
 
 
 def test_more_than_plain_data(capsys, tmp_path):

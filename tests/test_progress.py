@@ -52,7 +52,7 @@ def test_seconds_go_on_in_a_resumed_run(tmp_path):
 def test_state_counts_seconds_across_processes():
     epochs = Epochs(10)
     epochs.model = SimpleNamespace(num_timesteps=0)
-    epochs.restore({"last": epochs.last, "episodes": [], "seconds": 100.0})
+    epochs.restore({**epochs.state(), "seconds": 100.0})
     epochs._on_training_start()
     assert 100 < epochs.state()["seconds"] < 110
 

@@ -16,14 +16,12 @@ from sb3_guard.common.evaluation import Evaluation, evaluate_policy, share_envir
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 
-# What a run continues with: names in CostEvalCallback.state, and the attributes
-KEPT = {
-    "timesteps": "evaluations_timesteps", "results": "evaluations_results",
-    "lengths": "evaluations_length", "costs": "evaluations_costs",
-    "key_costs": "evaluations_key_costs", "successes": "evaluations_successes",
-    "best_score": "best_score", "last_mean_reward": "last_mean_reward",
-    "last_mean_cost": "last_mean_cost",
-}  # fmt: skip
+# What a run continues with
+KEPT = (
+    "evaluations_timesteps", "evaluations_results", "evaluations_length", "evaluations_costs",
+    "evaluations_key_costs", "evaluations_successes", "best_score", "last_mean_reward",
+    "last_mean_cost",
+)  # fmt: skip
 
 
 class LogCosts(BaseCallback):
@@ -291,13 +289,12 @@ class CostEvalCallback(EvalCallback):
 
     def state(self) -> dict[str, Any]:
         """What :meth:`restore` needs to continue the history and the choice of the best model."""
-        return {name: copy.copy(getattr(self, attribute)) for name, attribute in KEPT.items()}
+        return {name: copy.copy(getattr(self, name)) for name in KEPT}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from :meth:`state`; ``evaluations.npz`` is rewritten to match."""
-        for name, attribute in KEPT.items():
-            if name in state:  # the checkpoint may be older than the entry
-                setattr(self, attribute, copy.copy(state[name]))
+        for name in KEPT:
+            setattr(self, name, copy.copy(state[name]))
         self._remember(self.best_score)
         if self.evaluations_timesteps:
             self.write_history()

@@ -29,12 +29,11 @@ def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) ->
     return number(cost, "info['cost']")
 
 
-# What a run continues with: names in CostMonitor.state, and the attributes
-KEPT = {
-    "returns": "episode_returns", "lengths": "episode_lengths", "costs": "episode_costs",
-    "key_costs": "_key_costs", "episode_count": "episode_count", "total_cost": "total_cost",
-    "total_steps": "total_steps", "physics_errors": "physics_errors", "t_start": "t_start",
-}  # fmt: skip
+# What a run continues with
+KEPT = (
+    "episode_returns", "episode_lengths", "episode_costs", "_key_costs", "episode_count",
+    "total_cost", "total_steps", "physics_errors", "t_start",
+)  # fmt: skip
 
 
 class CostMonitor(VecMonitor):
@@ -137,44 +136,37 @@ class CostMonitor(VecMonitor):
             self.results_writer.write_row(episode)
         return episode
 
-    def log_to(self, filename: str | os.PathLike[str], offset: int | None = None) -> None:
+    def log_to(self, filename: str | os.PathLike[str]) -> None:
         """
-        Write episodes to a csv from now on.
+        Write episodes to a new csv from now on.
 
         :param filename: the csv; its name ends in ``monitor.csv`` (else that is appended)
-        :param offset: None begins a new file. A number of bytes, as found in :meth:`state`, keeps
-            that much of the file, drops the rows after it and continues from there
-        :raises ValueError: the file is absent, shorter than ``offset``, or no monitor's
         """
         if self.results_writer is not None:
             self.results_writer.close()
-        path = os.fspath(filename)
-        if offset is not None:
-            kept = Path(path).read_bytes()[:offset] if os.path.exists(path) else b""
-            if len(kept) < offset or not (kept.startswith(b"#{") and kept.endswith(b"\n")):
-                raise ValueError(
-                    f"{path} was changed since the run was saved, when it had {offset} bytes: put "
-                    "it back, or the run can't be continued in this folder"
-                )
-            os.truncate(path, offset)
         spec = getattr(self.venv, "spec", None)
         self.results_writer = ResultsWriter(
-            path,
+            os.fspath(filename),
             header={"t_start": self.t_start, "env_id": str(spec.id if spec else None)},
             extra_keys=("c", *self._columns, *self.info_keywords),
-            override_existing=offset is None,
         )
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs to continue counting: sums under way, totals, csv length."""
-        kept = {name: copy.copy(getattr(self, attribute)) for name, attribute in KEPT.items()}
+        """What :meth:`restore` needs to continue counting: sums under way, totals, the csv."""
         writer = self.results_writer
-        return {**kept, "offset": None if writer is None else writer.file_handler.tell()}
+        table = None if writer is None else Path(writer.file_handler.name).read_bytes().decode()
+        return {**{name: copy.copy(getattr(self, name)) for name in KEPT}, "table": table}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on counting from :meth:`state`; the csv is continued by :meth:`log_to`."""
-        for name, attribute in KEPT.items():
-            setattr(self, attribute, copy.copy(state[name]))
+        """Continue counting from :meth:`state`; the csv that is written to gets its rows."""
+        for name in KEPT:
+            setattr(self, name, copy.copy(state[name]))
+        if self.results_writer is not None and state["table"] is not None:
+            file = self.results_writer.file_handler
+            file.truncate(0)
+            file.seek(0)
+            file.write(state["table"])
+            file.flush()
 
 
 def find_monitor(env: VecEnv) -> CostMonitor:

@@ -31,7 +31,7 @@ NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
 # Checkpoints take at most this share of the time: those with a replay buffer are large.
 LARGEST_SHARE = 0.05
-FORMAT = 3  # increased when the content changes so that older files can't be continued
+FORMAT = 4  # increased when the content changes so that older files can't be continued
 
 
 class Interrupted(Exception):
@@ -279,12 +279,3 @@ def restore_run(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     set_random_state(state["generators"])
     if state["cuda"] and th.cuda.is_available():
         th.cuda.set_rng_state_all(state["cuda"])
-
-
-def monitor_offset(state: dict[str, Any]) -> int:
-    """How long the monitor's csv was when the checkpoint was taken, bytes."""
-    return next(
-        part["offset"]
-        for part in state["environments"]
-        if isinstance(part, dict) and "offset" in part
-    )

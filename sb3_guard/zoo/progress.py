@@ -179,8 +179,8 @@ class Epochs(BaseCallback):
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state`."""
         self.last = state["last"]
-        self._episodes = list(state.get("episodes", []))
-        self._seconds = state.get("seconds", 0.0)
-        self.learned = list(state.get("learned", []))
-        if state.get("total", self.total) != self.total:
+        self._episodes = list(state["episodes"])
+        self._seconds = state["seconds"]
+        self.learned = list(state["learned"])
+        if state["total"] != self.total:
             self.learned.append(state["steps"])

@@ -33,7 +33,6 @@ from sb3_guard.zoo.checkpoint import (
     Checkpoints,
     Interrupted,
     load_model,
-    monitor_offset,
     read_checkpoint,
     read_normalizer,
     restore_run,
@@ -293,20 +292,14 @@ class Experiment:
             print(f"Run folder: {folder.path} (seed {self.flags.seed})")
         if self.tracker is not None:
             self.tracker.begin(folder, resumed=state is not None)
-        try:
-            find_monitor(self.env).log_to(
-                folder.monitor, offset=None if state is None else monitor_offset(state)
-            )
+        with explained(f"can't write to {folder.path}", OSError):
+            find_monitor(self.env).log_to(folder.monitor)
             logger = RunLogger(
                 folder.path,
                 stdout=self._prints_tables,
                 tensorboard=self._tensorboard(folder),
                 state=None if state is None else state["logger"],
             )
-        except (OSError, ValueError) as error:
-            if is_disk_error(error):
-                raise
-            raise UsageError(one_line(error)) from error
         self.model.set_logger(logger)
         checkpoints, epochs, callbacks = self._make_callbacks(folder)
         checkpoints.asked = asked

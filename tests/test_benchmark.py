@@ -421,7 +421,8 @@ def test_bars_of_what_runs(tmp_path):
         rows.writeheader()
         rows.writerow({"time/total_timesteps": 1_500_000, "rollout/ep_rew_mean": 12.345})
     console = Console(width=200, record=True, force_terminal=True, file=open(os.devnull, "w"))
-    with Board("logs/x", console=console) as board:
+    board = Board("logs/x", console=console)
+    with board.bars:
         board.update(runs, now=True)
         console.print(board.bars)
     text = console.export_text()

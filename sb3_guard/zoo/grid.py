@@ -402,7 +402,8 @@ def run_grid(
 
     status, no_disk = 0, ""
     states = [run.state for run in runs]
-    with Board(str(folder), verbose) as board:
+    board = Board(str(folder), verbose)
+    with board.bars:
         board.say(
             f"{len(runs)} runs in {folder}: {states.count('done')} done, "
             f"{states.count('resume')} to resume, {states.count('new')} new"

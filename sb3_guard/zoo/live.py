@@ -40,7 +40,7 @@ def read_progress(run: Path) -> dict[str, float]:
 
 class Board:
     """
-    Show how a grid goes.
+    Show how a grid goes; ``bars`` are shown within their ``with`` block.
 
     :param title: its folder
     :param verbose: 0: say nothing
@@ -58,13 +58,6 @@ class Board:
         self._total = self.bars.add_task("", reached="")
         self._tasks: dict[Run, TaskID] = {}
         self._looked = self._line = time.monotonic()
-
-    def __enter__(self) -> "Board":
-        self.bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bars.stop()
 
     def say(self, text: str) -> None:
         """Print a line, above the bars if there are any."""

@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms import CRPO, FirstOrder
+from sb3_guard.algorithms import CRPO, TRPOFAC, FirstOrder
 
 
 class World:
@@ -211,7 +211,7 @@ class Worlds(VecEnv):
     """n rows of a world as a vectorised environment whose episodes report their sums.
 
     ``info["episode"]`` has, beside SB3's return and length, the ``costs`` of the episode and the
-    ``worst`` step's, each of shape (m,).
+    ``worst`` step's, each of shape (m,), and the ``first`` state.
 
     :param scale: multiplies every cost
     """
@@ -226,7 +226,7 @@ class Worlds(VecEnv):
 
     def reset(self) -> Any:
         self.time = 0
-        self.state = self.world.start(self.rng, self.num_envs)
+        self.state = self.first = self.world.start(self.rng, self.num_envs)
         self.returns = np.zeros(self.num_envs)
         self.costs = np.zeros((self.num_envs, self.world.n_costs))
         self.worst = np.full((self.num_envs, self.world.n_costs), -np.inf)
@@ -258,6 +258,7 @@ class Worlds(VecEnv):
                     "t": 0.0,
                     "costs": self.costs[i],
                     "worst": self.worst[i],
+                    "first": self.first[i],
                 }
             observation = self.reset()
         return observation, rewards.astype(np.float32), np.full(self.num_envs, over), infos
@@ -289,6 +290,8 @@ class Problem:
     :param n_envs: rows that are trained on
     :param n_steps: steps of each per update
     :param updates: until the policy is judged
+    :param statewise: whether the limits are those of the worst step
+    :param by_context: whether they hold from each first state, not on the average over them
     """
 
     world: Callable[[], World]
@@ -299,6 +302,7 @@ class Problem:
     n_steps: int = 16
     updates: int = 60
     statewise: bool = False
+    by_context: bool = False
 
     def make_env(self, seed: int = 0, scale: float = 1.0) -> Worlds:
         """The environment; ``scale`` multiplies the costs, whose limits go with them."""
@@ -322,6 +326,7 @@ class Outcomes(BaseCallback):
         self.returns: list[float] = []
         self.costs: list[np.ndarray] = []
         self.worst: list[np.ndarray] = []
+        self.firsts: list[Any] = []
 
     def _on_step(self) -> bool:
         if self.num_timesteps > self.begin:
@@ -330,6 +335,7 @@ class Outcomes(BaseCallback):
                     self.returns.append(episode["r"])
                     self.costs.append(episode["costs"])
                     self.worst.append(episode["worst"])
+                    self.firsts.append(episode["first"])
         return True
 
 
@@ -369,7 +375,11 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
     cls("MlpPolicy", env, cost_limit=bound.tolist(), cost_keys=env.cost_keys, **settings).learn(
         problem.total_timesteps, callback=outcomes
     )
-    costs = np.mean(outcomes.worst if problem.statewise else outcomes.costs, axis=0)
+    each = np.array(outcomes.worst if problem.statewise else outcomes.costs)  # [episodes, m]
+    costs = each.mean(axis=0)
+    if problem.by_context:
+        firsts = np.array(outcomes.firsts)
+        costs = np.max([each[firsts == first].mean(axis=0) for first in set(firsts)], axis=0)
     return Outcome(float(np.mean(outcomes.returns)) / problem.best, costs / limits)
 
 
@@ -379,10 +389,10 @@ def budget(cls: type, problem: Problem) -> Problem:
     SB3's rate of 3e-4 moves a log standard deviation by no more than that in a gradient step, so
     first-order algorithms get four times the updates of trust regions. So does CRPO: at the limit
     every other step undoes what the last one did to the cost, and little of a step is left to
-    narrow the policy. Off-policy ones get a gradient step for each of 10,000 steps of one
-    environment.
+    narrow the policy; and TRPO-FAC, whose multipliers are networks that have to be learnt.
+    Off-policy ones get a gradient step for each of 10,000 steps of one environment.
     """
-    if issubclass(cls, FirstOrder | CRPO):
+    if issubclass(cls, FirstOrder | CRPO | TRPOFAC):
         return replace(problem, updates=4 * problem.updates)
     if not issubclass(cls, OnPolicyAlgorithm):
         return replace(problem, n_envs=1, n_steps=1, updates=10_000)
@@ -417,7 +427,8 @@ def _bandit(limits: tuple[float, ...], scale: float = 1.0, **kwargs: Any) -> Pro
     def world() -> Bandit:
         return Bandit(scale=scale, **kwargs)
 
-    return Problem(world, limits, world().optimum(np.array(limits)), scale)
+    best, contexts = world().optimum(np.array(limits)), len(kwargs["offsets"])
+    return Problem(world, limits, best, scale, by_context=contexts > 1)
 
 
 @cache

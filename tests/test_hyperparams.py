@@ -320,7 +320,7 @@ DIFFERENT = {
     "trpo_fac": {
         **LIMIT,
         "lambda_lr": (0.0001, None),
-        "lambda_epochs": (1, None),
+        "lambda_epochs": (1, 10),
         "units": ("cost", None),
     },
     "trpo_ipo": {

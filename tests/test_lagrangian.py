@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from cost_envs import CostPoint
+from known_optima import problems, solve
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 
@@ -136,6 +137,12 @@ def _batch(observations: Any, advantages: list[float], cost_advantages: list[lis
 # The multipliers of TRPO-FAC
 
 
+@pytest.mark.slow
+def test_fac_settles_with_its_defaults() -> None:
+    """At a return of 0.97 of the optimum; without the proportional term it circles."""
+    assert solve(TRPOFAC, problems()["bandit-2"], 0).good
+
+
 def network(n_costs: int = 1, **kwargs: Any) -> StateMultiplier:
     th.manual_seed(0)
     return StateMultiplier(make(TRPO).policy, n_costs, **{"rate": 1e-2, **kwargs})
@@ -207,11 +214,36 @@ def test_what_the_multipliers_ascend_on(mode: Any) -> None:
 
 
 def test_the_state_wise_lagrangian_by_hand() -> None:
-    model = make(TRPOFAC, n_costs=2)
+    model = make(TRPOFAC, n_costs=2, proportional_gain=0.0, trace=False)
     model.multiplier.predict = lambda observations: th.tensor([[0.5, 0.0], [2.0, 1.0], [0.0, 3.0]])
     batch = _batch(th.zeros(3, 4), [1.0, -1.0, 2.0], [[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]])
     # (1 - 0.5, -1 - 1, 2 + 3) times (1, 2, 0.5), mean of (0.5, -4, 2.5)
     assert float(model.surrogate(batch, th.tensor([1.0, 2.0, 0.5]))) == pytest.approx(-1 / 3)
+
+
+def test_states_price_the_actions_after_them() -> None:
+    """Two episodes of three and two steps in one of the environments, one of five in the other."""
+    model = make(TRPOFAC, n_steps=5, gamma=0.5, proportional_gain=0.0, units="cost")
+    buffer = model.rollout_buffer
+    buffer.n_envs = 2
+    buffer.episode_starts = np.array([[1, 1], [0, 0], [0, 0], [1, 0], [0, 0]], np.float32)
+    price = th.tensor([8.0, 1.0, 3.0, 1.0, 0.0, 0.0, 8.0, 0.0, 0.0, 0.0])[:, None]
+    expected = [8.0, 4.0, 3.0, 1.0, 0.5, 0.0, 8.0, 4.0, 2.0, 1.0]
+    model.multiplier.predict = lambda observations: price
+    assert model.price(_batch(th.zeros(10, 4), [0.0], [0.0]))[:, 0].tolist() == expected
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0])
+def test_the_state_wise_violation_is_relative_and_that_of_this_rollout(scale: float) -> None:
+    """d_γ is 2 · (1 - γ²)/(1 - γ) = 3 for a limit of 4 in 2 steps at γ = 0.5."""
+    model = make(TRPOFAC, cost_limit=4.0 * scale, gamma=0.5)
+    model.costs = CostEstimate(np.array([0.0]), 2.0, np.array([0.0]))
+    buffer = model.rollout_buffer
+    # the critic says 1, 2, 9 where the mean of the returns is 1 more than the mean of those
+    buffer.cost_values = scale * np.array([[[1.0]], [[2.0]], [[9.0]]], np.float32)
+    batch = _batch(th.zeros(3, 4), [0.0] * 3, [[0.0]] * 3)
+    batch.cost_returns = scale * th.tensor([[5.0], [5.0], [5.0]])
+    assert model._excess(batch)[:, 0].tolist() == pytest.approx([-1 / 3, 0.0, 1.0], abs=1e-6)
 
 
 @pytest.mark.parametrize("cls", [TRPOLag, TRPOFAC])

@@ -17,6 +17,8 @@ from sb3_guard.algorithms.common.costs import discounted_limit
 from sb3_guard.algorithms.common.critics import StateNetwork
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
+TINY = 1e-12
+
 
 class StateMultiplier(nn.Module):
     """λ_i(s) ≥ 0 for each constraint: networks of the observation with a softplus output.
@@ -78,9 +80,13 @@ class TRPOFAC(TrustRegion):
 
     a limit at every state: the cost-to-go from s, discounted, is to stay below
     ``d_γ = (d/T) (1 - γᵀ)/(1 - γ)``. The policy takes a TRPO step on
-    ``E[ratio · (A - Σ λ_i(s) A_Ci)]``; then Adam raises λ(s) where the returns of the batch exceed
-    d_γ and lowers it elsewhere. A and A_C are both standardised, so λ weighs a standard deviation
-    of the one against one of the other, and the unit of the costs does not matter.
+    ``E[ratio · (A - Σ p_i A_Ci)]``; then Adam raises λ(s) where the returns of the batch exceed
+    d_γ and lowers it elsewhere. The price p of an action begins with
+    ``λ(s) + K_P (V_C(s) - d_γ) / d_γ``, at least 0, the fraction between -1 and 1, which keeps λ
+    from circling the optimum. As the action changes the cost to come of all states before it, its
+    price is the highest of theirs, discounted. A and A_C are both standardised, so λ weighs a
+    standard deviation of the one against one of the other, and the unit of the costs does not
+    matter.
 
     :param lambda_lr: learning rate of the multiplier networks
     :param lambda_epochs: steps of the multiplier networks per update, on the whole rollout
@@ -89,19 +95,25 @@ class TRPOFAC(TrustRegion):
         the GUARD paper writes it: all states then see the same violation
     :param units: ``"relative"`` as above; ``"cost"`` leaves A_C in the unit of the costs, as the
         papers do
+    :param proportional_gain: K_P; 0 in the papers
+    :param trace: whether states price the actions after them; the papers' price is that of the
+        action's own state
     """
 
     label, family, paper = "TRPO-FAC", "Lagrangian", "Ma et al. 2021"
     search_space: ClassVar[dict[str, Any]] = {
         "lambda_lr": {"low": 1e-5, "high": 1e-2, "log": True},
         "lambda_epochs": {"low": 1, "high": 20, "log": True},
+        "proportional_gain": {"low": 0.0, "high": 10.0},
     }
 
     lambda_lr: float = hyperparameter(3e-3)
-    lambda_epochs: int = hyperparameter(10)
+    lambda_epochs: int = hyperparameter(3)
     lambda_init: float | None = hyperparameter(None, ends="()")
     mode: Literal["statewise", "expected"] = hyperparameter("statewise")
     units: Literal["relative", "cost"] = hyperparameter("relative")
+    proportional_gain: float = hyperparameter(5.0)
+    trace: bool = hyperparameter(True)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -114,19 +126,60 @@ class TRPOFAC(TrustRegion):
         return [*state_dicts, "multiplier", "multiplier.optimizer"], tensors
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
-        price = self.multiplier.predict(batch.observations)  # [N, m]
-        if self.units == "relative":
-            price = price / (batch.cost_advantages.std(dim=0) + 1e-12)
+        price = self.price(batch)
         return (ratio * (batch.advantages - (price * batch.cost_advantages).sum(dim=1))).mean()
 
-    def fit(self, batch: CostRolloutBufferSamples) -> None:
+    def price(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """What a unit of each cost's advantage is worth at each step of the rollout, [N, m]."""
+        price = self.multiplier.predict(batch.observations)
+        if self.proportional_gain:
+            excess = self.proportional_gain * self._excess(batch)
+            price = (price + excess).clamp(min=0.0)
+        if self.trace:
+            price = self._trace(price)
+        if self.units == "relative":
+            price = price / (batch.cost_advantages.std(dim=0) + TINY)
+        return price
+
+    def _excess(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """By what part of its limit the cost to come exceeds it, between -1 and 1, [N, m]."""
+        buffer = self.rollout_buffer
+        expected = th.as_tensor(buffer.swap_and_flatten(buffer.cost_values)).to(batch.cost_returns)
+        # the critic has not seen this rollout, whose mean is known
+        expected = expected + (batch.cost_returns - expected).mean(dim=0)
+        excess, limit = self._violation(expected)
+        unit = th.where(limit == 0.0, batch.cost_returns.mean(dim=0), limit).abs()
+        return (excess / (unit + TINY)).clamp(-1.0, 1.0)
+
+    def _trace(self, price: th.Tensor) -> th.Tensor:
+        """The highest price of the steps up to each of its episode, discounted, [N, m].
+
+        An action changes the costs to come of all states before it. A rollout that begins within an
+        episode knows of no step before its first.
+        """
+        buffer = self.rollout_buffer
+        steps = price.reshape(buffer.n_envs, buffer.buffer_size, -1).clone()
+        kept = th.as_tensor(buffer.cost_gamma * (1.0 - buffer.episode_starts)).to(steps)  # [T, n]
+        for t in range(1, buffer.buffer_size):
+            th.maximum(steps[:, t], kept[t, :, None] * steps[:, t - 1], out=steps[:, t])
+        return steps.reshape(price.shape)
+
+    def _violation(self, to_come: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """By how much costs exceed their limit, [N, m], and the limit, [m].
+
+        :param to_come: each step's discounted cost to come, [N, m]
+        """
         if self.mode == "statewise":
             gamma = self.rollout_buffer.cost_gamma
-            limit = discounted_limit(self.cost_limits, self.costs.horizon, gamma)
-            excess = batch.cost_returns - th.as_tensor(limit).to(batch.cost_returns)
+            bound = discounted_limit(self.cost_limits, self.costs.horizon, gamma)
         else:
-            violation = th.as_tensor(self.costs.episode_cost - self.cost_limits)
-            excess = violation.to(batch.cost_returns).expand_as(batch.cost_returns)
+            bound = self.cost_limits
+            to_come = th.as_tensor(self.costs.episode_cost).to(to_come).expand_as(to_come)
+        limit = th.as_tensor(bound).to(to_come)
+        return to_come - limit, limit
+
+    def fit(self, batch: CostRolloutBufferSamples) -> None:
+        excess, _ = self._violation(batch.cost_returns)
         # As with the critics' rate: what the attribute says, not what a file has restored.
         update_learning_rate(self.multiplier.optimizer, self.lambda_lr)
         for _ in range(self.lambda_epochs):

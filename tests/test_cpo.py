@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_guard.algorithms import CPO, TRPO
+from sb3_guard.algorithms import CPO, PCPO, TRPO
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.natural_gradient import Case
 from sb3_guard.algorithms.common.trust_region import Trial
@@ -244,6 +244,23 @@ def test_finite_wherever_nothing_is_at_stake(cost_scale: float, limit: float) ->
     logged = model.logger.name_to_value
     numbers = [value for value in logged.values() if isinstance(value, int | float)]
     assert np.isfinite(numbers).all(), logged
+
+
+class Toll(CostPoint):
+    """Every step costs 1, whatever the agent does."""
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, reward, terminated, truncated, _ = super().step(action)
+        return observation, reward, terminated, truncated, {"cost": 1.0}
+
+
+@pytest.mark.parametrize("cls", [CPO, PCPO])
+def test_a_violation_that_nothing_changes_does_not_end_learning(cls: type[CPO]) -> None:
+    """TRPO's return is 1.8 here; without the reward's part of the steps it stays at 0."""
+    env = make_vec_env(Toll, 8, seed=0)
+    model = cls("MlpPolicy", env, n_steps=100, cost_limit=5.0, n_critic_updates=20, seed=0)
+    model.learn(12_000)
+    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.2
 
 
 def test_without_cost_it_takes_trpos_steps() -> None:

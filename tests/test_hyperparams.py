@@ -298,6 +298,7 @@ TABLE = {
 # Where the default is another one: (the paper's, ours).
 LIMIT = {"cost_limit": (0.0, 2.0)}
 LAMBDA = {"cost_gae_lambda": (0.97, 0.5)}
+AIM = {"margin_lr": (0.0, None), "recovery": (1.0, None)}
 DIFFERENT = {
     "trpo_sl": {
         **LIMIT,
@@ -306,8 +307,8 @@ DIFFERENT = {
     },
     "trpo_usl": {**LIMIT, "correction_penalty": (0.0, None)},
     "trpo": {},
-    "cpo": {**LIMIT, **LAMBDA, "margin_lr": (0.0, None)},
-    "pcpo": {**LIMIT, **LAMBDA, "margin_lr": (0.0, None), "line_search": (False, True)},
+    "cpo": {**LIMIT, **LAMBDA, **AIM},
+    "pcpo": {**LIMIT, **LAMBDA, **AIM, "line_search": (False, True)},
     "trpo_lag": {
         **LIMIT,
         **LAMBDA,
@@ -385,6 +386,7 @@ PPO_LIKE = {
     "learning_rate": 3e-4, "n_epochs": 40, "batch_size": 64, "target_kl": 0.02, "kl_stop": "epoch",
     "max_grad_norm": 40.0,
 }  # fmt: skip
+TRPO_LIKE = {"target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128}
 OMNISAFE: dict[str, dict[str, Any]] = {
     "ppo_lag": {**PPO_LIKE, **LAGRANGIAN, "clip_range": 0.2},
     "cppo_pid": {
@@ -396,11 +398,12 @@ OMNISAFE: dict[str, dict[str, Any]] = {
     },
     "cup": {**PPO_LIKE, **LAGRANGIAN, "target_kl": 0.01, "lambda_max": 2.0},
     "p3o": {**PPO_LIKE, "penalty": 20.0},
-    "cpo": {"target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
-    "pcpo": {"target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
-    "trpo_lag": {**LAGRANGIAN, "target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
-    "rcpo": {**LAGRANGIAN, "target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
-    "crpo": {"target_kl": 0.01, "n_critic_updates": 10, "batch_size": 128},
+    "trpo": TRPO_LIKE,
+    "cpo": {**TRPO_LIKE, "margin_lr": 0.0, "recovery": 1.0},
+    "pcpo": {**TRPO_LIKE, "margin_lr": 0.0, "recovery": 1.0},
+    "trpo_lag": {**LAGRANGIAN, **TRPO_LIKE},
+    "rcpo": {**LAGRANGIAN, **TRPO_LIKE},
+    "crpo": TRPO_LIKE,
 }  # fmt: skip
 
 
@@ -411,6 +414,7 @@ def test_the_omnisafe_preset_is_the_published_table(algo):
     assert (values["gamma"], values["gae_lambda"], values["cost_limit"]) == (0.99, 0.95, 25.0)
     assert values["n_envs"] * values["n_steps"] == 20_000 and values["n_timesteps"] == 10_000_000
     assert values["normalize"]["norm_obs"]
+    assert values.get("cost_gae_lambda", values["gae_lambda"]) == 0.95
     model = ALGORITHMS[algo](env=make_vec_env("Goal_Point_8Hazards", 1), **build(values).model)
     for name, value in OMNISAFE[algo].items():
         if name == "learning_rate":
@@ -421,6 +425,8 @@ def test_the_omnisafe_preset_is_the_published_table(algo):
             assert getattr(model, name) == value, name
     if "lambda_lr" in OMNISAFE[algo]:
         assert model.lambda_units == "cost" and model.lambda_update == "before"
+        gains = ("proportional_gain", "derivative_gain")
+        assert all(getattr(model, name) == OMNISAFE[algo].get(name, 0.0) for name in gains)
     page = (hyperparams_folder().parent / "docs" / "omnisafe.md").read_text()
     row = next(line for line in page.splitlines() if line.startswith(f"| `{algo}` |"))
     for name, value in OMNISAFE[algo].items():

@@ -42,10 +42,12 @@ class Problem:
         v = self.inverse @ self.g
         return np.sqrt(2 * self.delta / (self.g @ v)) * v
 
-    def solve(self, euclidean: bool, dtype: th.dtype = th.float64) -> tuple[np.ndarray, np.ndarray]:
+    def solve(
+        self, euclidean: bool, dtype: th.dtype = th.float64, recovery: float = np.inf
+    ) -> tuple[np.ndarray, np.ndarray]:
         tensors = (self.g, self.B, self.inverse @ self.g, self.B @ self.inverse)
         g, B, v, W = (th.as_tensor(each, dtype=dtype) for each in tensors)
-        x, pull = projected_step(g, B, self.c, v, W, self.delta, euclidean)
+        x, pull = projected_step(g, B, self.c, v, W, self.delta, euclidean, recovery)
         return x.numpy(), pull
 
     def distance(self, x: np.ndarray, euclidean: bool) -> float:
@@ -200,13 +202,24 @@ def test_half_spaces_that_only_seem_to_meet_count_as_contradictory() -> None:
         assert 0.5 * x @ problem.F @ x <= 1.05 * problem.delta
 
 
+def test_a_violation_out_of_reach_counts_as_what_a_step_can_change() -> None:
+    problem = Problem(np.random.default_rng(0), np.array([20.0]))
+    far, _ = problem.solve(False)
+    problem.c = 0.9 * problem.reach
+    near, _ = problem.solve(False)
+    problem.c *= 50
+    x, _ = problem.solve(False, recovery=0.9)
+    np.testing.assert_allclose(x, near)
+    assert np.linalg.norm(far) > 5 * np.linalg.norm(x)
+
+
 @pytest.mark.parametrize("c", [-0.5, 0.0, 0.5])
 def test_without_cost_gradient(c: float) -> None:
-    """The TRPO step where the limit holds, no step where nothing can make it hold."""
+    """The TRPO step, also where the limit is exceeded and nothing can change that."""
     problem = Problem(np.random.default_rng(0), np.zeros(1))
     problem.B[:], problem.c[:] = 0.0, c
     x, pull = problem.solve(False)
-    np.testing.assert_allclose(x, problem.natural if c <= 0.0 else np.zeros(SIZE))
+    np.testing.assert_allclose(x, problem.natural)
     assert not pull.any()
 
 
@@ -225,7 +238,7 @@ def make(**kwargs: Any) -> PCPO:
 @pytest.mark.parametrize("projection", ["kl", "l2"])
 @pytest.mark.parametrize("limit", [0.0, 3.0, 100.0])
 def test_steps_satisfy_the_linearised_limit(projection: Any, limit: float) -> None:
-    model = make(projection=projection, cost_limit=limit, cg_max_steps=60)
+    model = make(projection=projection, cost_limit=limit, cg_max_steps=60, recovery=1.0)
     step, residuals = model.step, []
 
     def spy(region: Any) -> th.Tensor:

@@ -12,9 +12,10 @@ from sb3_guard.algorithms.common.trust_region import Region, Trial
 class LinearisedLimits(Margin):
     """The best step within a trust region that keeps the linearised limits, solved exactly.
 
-    From a policy that no such step can make feasible, the step lowers the violation as much as the
-    region allows: of several limits, ``Σ max(0, c_i + b_iᵀx)²``. Until the limits hold, the line
-    search asks for less cost, or less of that sum, and not for more reward.
+    From a policy that no such step can make feasible, the step lowers the violation, of several
+    limits ``Σ max(0, c_i + b_iᵀx)²``, by ``recovery`` of what the region allows. Until the limits
+    hold, the line search asks for less cost, or less of that sum, and not for more reward. A limit
+    whose cost no step changes is left out.
 
     :param cost_reduction: smallest decrease of a violated cost surrogate that the line search
         accepts, in cost per step; never more than the violation itself. Where several limits can't
@@ -24,18 +25,21 @@ class LinearisedLimits(Margin):
     cost_reduction: float = hyperparameter(0.0)
 
     _case = Case.INACTIVE
+    _moves: np.ndarray | slice = slice(None)
 
     def step(self, region: Region) -> th.Tensor:
         g, B, c, delta = region.gradient, region.cost_gradients, region.violation, region.delta
         v, W = region.solve(g), th.stack([region.solve(b) for b in B])
-        x, self._case, lambda_kl, nu = constrained_step(g, B, c, v, W, delta)
+        x, self._case, lambda_kl, nu, self._moves = constrained_step(
+            g, B, c, v, W, delta, self.recovery
+        )
         self.logger.record("train/cpo_case", int(self._case))
         self.logger.record("train/lambda_kl", lambda_kl)
         self._record_per_cost("train/nu", nu)
         return x
 
     def accept(self, trial: Trial) -> bool:
-        c, change = self.violation(), trial.cost_change
+        c, change = self.violation()[self._moves], trial.cost_change[self._moves]
         if self._case is Case.LOST and len(c) > 1:
             # Limits that contradict each other: less of one violation may be more of another.
             now, then = (float(np.linalg.norm(each.clip(min=0.0))) for each in (c, c + change))

@@ -19,12 +19,19 @@ class Margin(TrustRegion):
     A step and the cost that it promises come from the same rollout, so it promises more than it
     brings, and J_C settles above d. m learns by how much. At a limit of 0 there is no margin.
 
+    Where no step of the trust region keeps the limits, ``recovery`` says how much of the way there
+    that it could go a step is to go. What is left of the region is for the reward, so that a limit
+    that nothing keeps does not end all learning.
+
     :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the papers
+    :param recovery: share of the largest possible decrease of a cost that a step asks for where the
+        limit is out of reach; 1 for all of it
     """
 
     signed_limits = True
 
     margin_lr: float = hyperparameter(0.1)
+    recovery: float = hyperparameter(0.98, high=1.0, ends="(]")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.margin: np.ndarray | None = None  # m, in units of an episode's cost, shape (m,)

@@ -84,11 +84,11 @@ class Case(IntEnum):
     RECOVERABLE = 1  # violated now, satisfiable within the trust region
     BINDING = 2  # satisfied now, the boundary cuts the trust region
     INACTIVE = 3  # satisfied throughout the trust region
-    NO_GRADIENT = 4  # satisfied, and no step changes the cost
+    NO_GRADIENT = 4  # no step changes the cost
 
     @property
     def feasible(self) -> bool:
-        """Whether the old policy satisfies every constraint."""
+        """Whether the old policy satisfies every constraint that a step can change."""
         return self >= Case.BINDING
 
 
@@ -99,16 +99,19 @@ class Step(NamedTuple):
     :param case: how the constraints lie to the trust region
     :param lambda_kl: multiplier λ of the trust region, 0 where lost
     :param nu: multipliers ν of the constraints, shape (m,), 0 where lost
+    :param moves: which constraints a step can change, shape (m,) bool; the others are left out, as
+        a violation that the policy has no part in would otherwise end all learning
     """
 
     x: th.Tensor
     case: Case
     lambda_kl: float
     nu: np.ndarray
+    moves: np.ndarray
 
 
-# A constraint whose cost moves by less than this within the trust region has no usable gradient
-# (units of the cost per step).
+# No step moves a constraint that changes by less than this share of its violation within the trust
+# region.
 _NO_REACH = 1e-7
 # Share of the reward gradient, squared, that must remain across the constraint to be worth
 # following: below it the remainder is rounding error.
@@ -124,13 +127,15 @@ def constrained_step(
     v: th.Tensor,
     W: th.Tensor,
     delta: float,
+    recovery: float = 1.0,
 ) -> Step:
     """The step of highest linearised reward within the constraints and the trust region.
 
     One constraint has a closed form (Achiam et al., 2017, theorem 2, here for ascent); several are
-    solved through the dual. If no point of the trust region satisfies them, the step minimises
-    ``Σ max(0, c_i + b_iᵀx)²`` over the region instead, which for one constraint is the steepest
-    descent of its cost.
+    solved through the dual. If no point of the trust region satisfies them, the point of the region
+    that minimises ``Σ max(0, c_i + b_iᵀx)²`` takes their place, for one constraint the steepest
+    descent of its cost: the step brings a share of the decreases that it brings, and as much reward
+    as the region then allows.
 
     :param g: reward gradient, shape (P,)
     :param B: cost gradients, shape (m, P)
@@ -138,14 +143,29 @@ def constrained_step(
     :param v: F⁻¹g, shape (P,)
     :param W: F⁻¹b_i, shape (m, P)
     :param delta: trust-region radius δ > 0
+    :param recovery: that share, 1 for nothing but recovery
     """
     rows, images = _double(th.cat([g[None], B])), _double(th.cat([v[None], W]))
     gram = (rows @ images.T).numpy()  # [1 + m, 1 + m]
-    a, beta, case, lambda_kl, nu = _solve(
-        (gram + gram.T) / 2, np.asarray(c, dtype=np.float64), delta
-    )
+    c, gram = np.asarray(c, dtype=np.float64), (gram + gram.T) / 2
+    moves = _movable(gram[1:, 1:], c, delta)
+    a, beta, case, lambda_kl, nu = _solve(gram, c, moves, delta)
+    if case is Case.LOST and recovery < 1.0:
+        change = beta @ gram[1:, 1:]  # b_iᵀx of the step that only recovers
+        asked = np.where(change < 0.0, -recovery * change, -change)
+        a, beta, _, lambda_kl, nu = _solve(gram, asked, moves, delta)
     x = a * v + th.as_tensor(beta, dtype=W.dtype).to(W.device) @ W
-    return Step(x, case, lambda_kl, nu)
+    return Step(x, case, lambda_kl, nu, moves)
+
+
+def _reach(S: np.ndarray, delta: float) -> np.ndarray:
+    """By how much each constraint changes within the trust region, from b_iᵀF⁻¹b_j."""
+    return np.sqrt(2 * delta * np.maximum(np.diag(S), 0.0))
+
+
+def _movable(S: np.ndarray, c: np.ndarray, delta: float) -> np.ndarray:
+    """Which constraints a step within the trust region can change, whatever the unit of cost."""
+    return _reach(S, delta) > _NO_REACH * np.abs(c)
 
 
 def _double(tensor: th.Tensor) -> th.Tensor:
@@ -171,6 +191,7 @@ def projected_step(
     W: th.Tensor,
     delta: float,
     euclidean: bool = False,
+    recovery: float = np.inf,
 ) -> tuple[th.Tensor, np.ndarray]:
     """The TRPO step, then the nearest point that satisfies the linearised constraints.
 
@@ -181,7 +202,7 @@ def projected_step(
 
     It may lie outside the trust region. If no point satisfies the constraints, or none within a
     hundred times the way to the farthest of them, the step minimises ``Σ max(0, c_i + b_iᵀx)²``
-    over the region, as :func:`constrained_step` does.
+    over the region.
 
     :param g: reward gradient, shape (P,)
     :param B: cost gradients, shape (m, P)
@@ -190,6 +211,8 @@ def projected_step(
     :param W: F⁻¹b_i, shape (m, P)
     :param delta: trust-region radius δ > 0
     :param euclidean: measure distance by L = I instead of L = F, i.e. to first order by the KL
+    :param recovery: count a violation as at most this share of what a step of the trust region can
+        change it by, so that a limit out of reach does not swallow the reward's part of the step
     :return: the step, shape (P,), and how far it was pulled along each ``-L⁻¹b_i``, shape (m,)
     """
     c = np.asarray(c, dtype=np.float64)
@@ -198,11 +221,12 @@ def projected_step(
     y = (v * (np.sqrt(2 * delta / q) if q > 0.0 else 0.0)).cpu()
     gram = (rows @ images.T).numpy()  # [m, m]
     gram = (gram + gram.T) / 2
-    moves = np.sqrt(2 * delta * np.maximum(np.diag(gram), 0.0)) > _NO_REACH
+    moves = _movable(gram, c, delta)
+    c = np.minimum(c, recovery * _reach(gram, delta)) if np.isfinite(recovery) else c
     excess = c + (rows @ y.double()).numpy()
     x, pull = y, np.zeros(len(c))
-    possible = bool(np.all(moves | (c <= 0.0)))
-    if possible and np.any(excess[moves] > 0.0):
+    possible = True
+    if np.any(excess[moves] > 0.0):
         along = rows if euclidean else images
         S = (rows @ along.T).numpy()[np.ix_(moves, moves)]
         normals, lengths = _unit_normals(S)
@@ -228,24 +252,22 @@ _Solution = tuple[float, np.ndarray, float, np.ndarray]
 
 
 def _solve(
-    gram: np.ndarray, c: np.ndarray, delta: float
+    gram: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float
 ) -> tuple[float, np.ndarray, Case, float, np.ndarray]:
     """Coefficients (a, β) of x = a v + Σ β_i w_i, the case, λ and ν.
 
     :param gram: inner products of (g, b_1, …, b_m) in the metric F⁻¹, shape (1 + m, 1 + m)
     """
     zero = np.zeros(len(c))
-    q, reach = gram[0, 0], np.sqrt(2 * delta * np.maximum(np.diag(gram)[1:], 0.0))
+    q, reach = gram[0, 0], _reach(gram[1:, 1:], delta)
     trpo = np.sqrt(2 * delta / q) if q > 0.0 else 0.0
     lambda_trpo = np.sqrt(max(0.0, q) / (2 * delta))
-    # A constraint that no step can move either always holds or can't be met.
-    moves, satisfied = reach > _NO_REACH, c <= 0.0
-    if satisfied.all():
-        if not moves.any():
-            return trpo, zero, Case.NO_GRADIENT, lambda_trpo, zero
+    if not moves.any():
+        return trpo, zero, Case.NO_GRADIENT, lambda_trpo, zero
+    if np.all(c[moves] <= 0.0):
         inactive = bool(np.all(c[moves] + reach[moves] < 0.0))
         case = Case.INACTIVE if inactive else Case.BINDING
-    elif np.all(moves | satisfied) and _reachable(gram[1:, 1:], c, moves, delta):
+    elif _reachable(gram[1:, 1:], c, moves, delta):
         case = Case.RECOVERABLE
     else:
         return 0.0, -_least_violation(gram[1:, 1:], c, delta, moves), Case.LOST, 0.0, zero
@@ -369,11 +391,8 @@ def _least_violation(S: np.ndarray, c: np.ndarray, delta: float, moves: np.ndarr
 
     For a fixed multiplier μ of the trust region the dual is a non-negative least-squares problem
     whose solution is p μ, stated in unit normals since gradients may differ in length by orders of
-    magnitude; μ by a scalar search, the KL of the step falls as it rises. Constraints without a
-    usable gradient, those not in ``moves``, are left alone.
+    magnitude; μ by a scalar search, the KL of the step falls as it rises.
     """
-    if not moves.any():
-        return np.zeros(len(c))
     normals, lengths = _unit_normals(S[np.ix_(moves, moves)])
     largest, radius = lengths.max(), np.sqrt(2 * delta)
     offsets = c[moves] / (largest * radius)

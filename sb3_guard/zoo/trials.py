@@ -256,7 +256,7 @@ class Objective:
             algorithm(settings.algo),
             {**values, "n_timesteps": settings.n_timesteps},
         )
-        experiment = Experiment(run_flags(self.flags, settings, seed), checked)
+        experiment = Experiment(run_flags(self.flags, settings.env, seed), checked)
 
         def on_step(steps: int) -> None:
             if self.stopped():
@@ -286,7 +286,7 @@ class Objective:
         return evaluations.history, not evaluations.ended
 
 
-def run_flags(flags: TuneFlags, settings: Settings, seed: int) -> RunFlags:
+def run_flags(flags: TuneFlags, env_id: str, seed: int) -> RunFlags:
     """The flags of a trial's training."""
-    own = {"algo": settings.algo, "env": settings.env, "seed": seed}
-    return RunFlags.shared(flags, **own, env_kwargs=None, verbose=0, progress=False)
+    own = {"env": env_id, "seed": seed, "env_kwargs": None, "verbose": 0, "progress": False}
+    return RunFlags.shared(flags, **own)

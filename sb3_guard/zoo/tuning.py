@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +78,15 @@ def prepare(flags: TuneFlags) -> tuple[Settings, Search]:
     search = Search(flags.algo, base, space, fixed)
     for corner in search.corners():
         check(flags.algo, cls, corner)
-    settings = Settings(
+    experiment = Experiment(
+        run_flags(flags, env_id, flags.seeds[0]), {**base, "n_timesteps": n_timesteps}
+    )
+    try:
+        assert experiment.evaluation is not None
+        limits = experiment.evaluation.limits().tolist()
+    finally:
+        experiment.close()
+    return Settings(
         algo=flags.algo,
         env=env_id,
         hyperparams=base,
@@ -87,22 +95,9 @@ def prepare(flags: TuneFlags) -> tuple[Settings, Search]:
         seeds=flags.seeds,
         n_evaluations=n_evaluations,
         eval_episodes=flags.eval_episodes,
-        cost_keys=[],
-        cost_limit=None,
-        pareto=flags.pareto,
-    )
-    experiment = Experiment(
-        run_flags(flags, settings, flags.seeds[0]), {**base, "n_timesteps": n_timesteps}
-    )
-    try:
-        assert experiment.evaluation is not None
-        limits = experiment.evaluation.limits().tolist()
-    finally:
-        experiment.close()
-    return replace(
-        settings,
         cost_keys=list(experiment.cost_keys),
         cost_limit=limits if np.isfinite(limits).all() else None,
+        pareto=flags.pareto,
     ), search
 
 

@@ -438,8 +438,14 @@ def test_a_shipped_agent_is_small_good_and_goes_on_learning(run):
     files = [path for path in run.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 100_000
     text = "".join(path.read_text() for path in files if path.suffix != ".zip")
-    assert "/tmp" not in text and "/work" not in text and f"--env {env_id[:-3]} " in text
+    assert "/tmp" not in text and "/work" not in text and f"--env {env_id[:-3]}" in text
+    result = json.loads((run / "result.json").read_text())
+    cost = result["played"]["stochastic"]["cost"][0]  # mean of 100 episodes
+    assert cost < result.get("cost_limit", np.inf)
     env = make_vec_env(env_id, 20, seed=5, max_episode_steps=300)
+    if (statistics := run / env_id / "vecnormalize.pkl").exists():
+        env = VecNormalize.load(str(statistics), env)
+        env.training = env.norm_reward = False
     model = ALGORITHMS[algo].load(run / f"{env_id}.zip", env=env, device="cpu", n_steps=10)
     assert model.ep_info_buffer is None and not model.policy.optimizer.state
     obs, total = env.reset(), np.zeros(20)
@@ -466,7 +472,7 @@ def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
     assert enjoy.main(["--pretrained", "-n", "20", "--no-render"]) == 0
     out = capsys.readouterr().out
     assert "cpo/Goal_Point_8Hazards-v0_1" in out
-    shown = out.split("100 episodes of other seeds, when it was shipped:")[1]
+    shown = out.split("100 episodes of other seeds, when it was shipped (--deterministic):")[1]
     assert shown.rstrip().endswith("limit 5: kept")
     which = ["--algo", "trpo", "--env", "Goal_Point_8Hazards", "--no-render"]
     short = ["--n-episodes", "1", "--env-kwargs", "max_episode_steps:30"]

@@ -316,11 +316,11 @@ def _when_shipped(flags: EnjoyFlags, agent: Agent) -> Iterator[str]:
     """What the package says of its own agents, where they act as then: few episodes say little."""
     result = agent.run.read_result() or {}
     if flags.pretrained and not flags.env_kwargs and "played" in result:
-        noise = "stochastic" if flags.stochastic else "deterministic"
         limits = {"cost": result["cost_limit"]} if "cost_limit" in result else {}
-        yield "100 episodes of other seeds, when it was shipped:"
-        for name, one in result["played"][noise].items():
-            yield _row(name, Estimate(*one), limits)
+        for mode in ("stochastic", "deterministic"):
+            yield f"100 episodes of other seeds, when it was shipped (--{mode}):"
+            for name, one in result["played"][mode].items():
+                yield _row(name, Estimate(*one), limits)
 
 
 @contextmanager

@@ -45,7 +45,7 @@ class Agent(NamedTuple):
     seed: int
     trained_at: float | None = None  # cost limit
     limit: float | None = None  # which it is to keep
-    also: dict[str, float] = {}  # other settings than today's hyperparams/
+    also: dict[str, float] | None = None  # other settings than today's hyperparams/
     noisy: bool = False  # with its noise only: without, a robot whose speed costs is faster
 
     @property
@@ -56,7 +56,7 @@ class Agent(NamedTuple):
     @property
     def settings(self) -> dict[str, float]:
         """Hyper-parameters that ``hyperparams/`` does not say."""
-        return {**({"cost_limit": self.trained_at} if self.trained_at else {}), **self.also}
+        return {**({"cost_limit": self.trained_at} if self.trained_at else {}), **(self.also or {})}
 
     @property
     def command(self) -> str:
@@ -191,11 +191,8 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the commands only")
     args = parser.parse_args()
     for agent in AGENTS:
-        at = (
-            ""
-            if agent.limit is None
-            else f"  # keeps {agent.limit:g}" + " with its noise" * agent.noisy
-        )
+        noise = " with its noise" if agent.noisy else ""
+        at = "" if agent.limit is None else f"  # keeps {agent.limit:g}{noise}"
         if args.list:
             print(f"{agent.command}{at}")
             continue

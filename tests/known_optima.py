@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms import CRPO, TRPOFAC, FirstOrder
+from sb3_guard.algorithms import CRPO, TRPOFAC, TRPOIPO, FirstOrder
 
 
 class World:
@@ -389,10 +389,11 @@ def budget(cls: type, problem: Problem) -> Problem:
     SB3's rate of 3e-4 moves a log standard deviation by no more than that in a gradient step, so
     first-order algorithms get four times the updates of trust regions. So does CRPO: at the limit
     every other step undoes what the last one did to the cost, and little of a step is left to
-    narrow the policy; and TRPO-FAC, whose multipliers are networks that have to be learnt.
+    narrow the policy; TRPO-IPO, whose steps are cut where they would cross the limit; and TRPO-FAC,
+    whose multipliers are networks that have to be learnt.
     Off-policy ones get a gradient step for each of 10,000 steps of one environment.
     """
-    if issubclass(cls, FirstOrder | CRPO | TRPOFAC):
+    if issubclass(cls, FirstOrder | CRPO | TRPOIPO | TRPOFAC):
         return replace(problem, updates=4 * problem.updates)
     if not issubclass(cls, OnPolicyAlgorithm):
         return replace(problem, n_envs=1, n_steps=1, updates=10_000)

@@ -175,7 +175,7 @@ class TRPOFAC(TrustRegion):
         else:
             bound = self.cost_limits
             to_come = th.as_tensor(self.costs.episode_cost).to(to_come).expand_as(to_come)
-        limit = th.as_tensor(bound).to(to_come)
+        limit = th.tensor(bound).to(to_come)
         return to_come - limit, limit
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:

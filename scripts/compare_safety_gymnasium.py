@@ -6,7 +6,7 @@ rewarded in a recorded state: the largest differences, relative to the value or 
 more; observations in the files have 21 bits, 4.8e-7. And one control step from a recorded state, by
 the physics of another MuJoCo, while the robot and everything else touch nothing but the floor, and
 while something touches an object; places in the files have 20 bits after the point, so that half of
-that, 4.8e-7 m, is no difference. The causes are in docs/fidelity.md.
+that, 4.8e-7 m, is not a difference. The causes are in docs/fidelity.md.
 
 ``--distributions`` compares 400 recorded layouts with 1,000 of ours, and 200 random episodes with
 as many: by chance, 5 % of single comparisons are beyond 0.080 and 0.136.

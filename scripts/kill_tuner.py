@@ -130,7 +130,7 @@ def faults(study: optuna.Study, n_trials: int) -> list[str]:
     if len(done) != n_trials:
         found.append(f"{len(done)} trials are finished, not {n_trials}")
     found += [
-        f"trial {one.number} is {one.state.name.lower()} for ever"
+        f"trial {one.number} is {one.state.name.lower()} forever"
         for one in trials
         if one.state in (TrialState.RUNNING, TrialState.WAITING)
     ]
@@ -149,7 +149,7 @@ def faults(study: optuna.Study, n_trials: int) -> list[str]:
             found.append(f"trial {line[0].number} was lost")
         for one, later in pairwise(line):
             if later.state in DONE and not one.params.items() <= later.params.items():
-                found.append(f"trial {later.number} is no repetition of {one.number}")
+                found.append(f"trial {later.number} is not a repetition of {one.number}")
     return found
 
 

@@ -123,7 +123,7 @@ def _published(known: pd.DataFrame, algo: str) -> str:
 
 
 def filled(page: str) -> str:
-    """A page with its tables made anew."""
+    """A page with its tables remade."""
 
     def table(match: re.Match[str]) -> str:
         begin, kind, name, only, end = match.groups()

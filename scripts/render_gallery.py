@@ -1,6 +1,6 @@
 """Draw and film every robot, task and constraint with a trained agent: fills docs/images.
 
-``python scripts/render_gallery.py`` draws all; ``--only trained`` makes one file anew. What is
+``python scripts/render_gallery.py`` draws all; ``--only trained`` remakes one file. What is
 filmed is an agent of the package's where there is one, else TRPO from a run in the log folder
 ``--agents``, trained now if it is not there.
 """

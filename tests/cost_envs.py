@@ -256,7 +256,7 @@ class CostPoint(gym.Env):
 class RandomCostEnv(gym.Env):
     """Noise in any spaces, for the tests that ask only whether an algorithm runs.
 
-    :param observation_space: sampled anew at each step
+    :param observation_space: sampled again at each step
     :param action_space: any; the reward is the mean of the action
     :param episode_length: steps until the episode is truncated
     """

@@ -398,7 +398,7 @@ def test_the_budget_joins_every_kind_of_observation(shape):
 @pytest.mark.parametrize(("budget", "end"), [(0, 2), (1.0, 3), (1.9, 4), (2.5, 5), (9.0, None)])
 def test_overspending_ends_the_episode(budget, end):
     env = EarlyTermination(Scripted(COSTS), budget, final_reward=-2.0)
-    for _ in range(2):  # the second episode begins anew
+    for _ in range(2):  # the second episode begins again
         env.reset()
         for i in range(1, len(COSTS) + 1):
             _, reward, terminated, truncated, info = env.step(np.zeros(2))

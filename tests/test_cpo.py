@@ -235,7 +235,7 @@ def test_the_horizon_outlives_a_rollout_in_which_nothing_ends() -> None:
 @pytest.mark.parametrize("cost_scale", [0.0, 1.0])
 @pytest.mark.parametrize("limit", [0.0, 5.0])
 def test_finite_wherever_nothing_is_at_stake(cost_scale: float, limit: float) -> None:
-    """d = 0, no cost ever, c = 0 and b = 0: parameters and logs stay numbers, learning goes on."""
+    """d = 0, no cost , c = 0 and b = 0: parameters and logs stay finite, learning continues."""
     model = make(lambda: CostPoint(cost_scale=cost_scale), cost_limit=limit)
     before = [p.detach().clone() for p in model.policy.parameters()]
     model.learn(1200)

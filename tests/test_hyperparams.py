@@ -240,7 +240,7 @@ def test_expressions_are_data_and_classes_of_torch(text, value):
     [
         ("policy_kwargs", "dict(activation_fn=nn.Rellu)", "can't be evaluated.*Rellu"),
         ("policy_kwargs", "dict(a=open('x', 'w'))", "can't be evaluated.*open.* is not allowed"),
-        ("policy_kwargs", "dict(a=th.hub.load)", "th.hub.load is no class of torch"),
+        ("policy_kwargs", "dict(a=th.hub.load)", "th.hub.load is not a class of torch"),
         ("policy_kwargs", "dict(a=nn.Module.__subclasses__())", "is not allowed"),
         ("policy_kwargs", "dict([('a', exit())])", r"dict\(.* is not allowed; .*literals"),
         ("monitor_kwargs", "dict(a=[__import__('os')])", "__import__.* is not allowed"),

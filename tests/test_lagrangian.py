@@ -285,7 +285,7 @@ def test_the_rate_given_to_load_is_the_rate(cls: type[TrustRegion], tmp_path: Pa
 def test_another_optimizer_of_the_multiplier_begins_afresh(
     before: str, after: str, tmp_path: Path
 ) -> None:
-    """And goes on from the multiplier of the file; one of the same kind from its moments."""
+    """And continues from the multiplier of the file; one of the same kind from its moments."""
     model = make(TRPOLag, n_critic_updates=1, lambda_optimizer=before, **RAW).learn(800)
     model.save(tmp_path / "model")
     for kind in (before, after):

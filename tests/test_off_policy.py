@@ -21,7 +21,7 @@ from sb3_guard.algorithms.common.replay import CostReplayBuffer, CostReplayBuffe
 
 
 def settings() -> dict[str, Any]:
-    """Small and quick; SB3 writes into ``policy_kwargs``, so they are made anew."""
+    """Small and quick; SB3 writes into ``policy_kwargs``, so they are remade."""
     return {
         "learning_starts": 60,
         "seed": 0,

@@ -237,7 +237,7 @@ def test_finished_run_goes_on_as_a_longer_one(undisturbed, tmp_path, capsys):
 def test_a_result_is_always_that_of_its_configuration(
     owner, name, result_is_left, tmp_path, monkeypatch
 ):
-    """Whenever a run that is to go on for longer dies."""
+    """Whenever a run that is to be continued for longer dies."""
     assert train.main([*TOY, *SHORT, *SMALL, "-n", "60", "-f", str(tmp_path)]) == 0
     run = RunFolder(runs_of(tmp_path))
 

@@ -446,7 +446,7 @@ def test_a_step_that_is_not_finite_is_not_taken(value: float) -> None:
 
 @pytest.mark.parametrize("size", [-200.0, 1e30, -3e38])
 def test_a_candidate_that_is_no_distribution_is_rejected(size: float) -> None:
-    """exp(log_std) is 0, or the mean is not a number: torch raises at that, training goes on."""
+    """exp(log_std) is 0, or the mean is not a number: torch raises at that, training continues."""
     model = _toy(TRPO, line_search_max_iter=2)
     model.step = lambda region: th.full_like(region.gradient, size)  # type: ignore
     before = _actor_vector(model)

@@ -41,7 +41,7 @@ class RCPO(PenalizedTrustRegion):
 
     @th.no_grad()
     def _penalize(self) -> None:
-        """Take the priced costs off the rollout's rewards, and estimate the advantages anew."""
+        """Take the priced costs off the rollout's rewards, and estimate the advantages again."""
         buffer = self.rollout_buffer
         assert self._last_obs is not None and self._last_episode_starts is not None
         dones = self._last_episode_starts

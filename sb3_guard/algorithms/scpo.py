@@ -23,7 +23,7 @@ class SCPO(LinearisedLimits):
     wrapped in it trains too, by observations that do not tell what has been reached.
 
     Most increments are 0: the cost critic is fitted to all rows whose cost-to-go is positive and as
-    many others, drawn anew for each update.
+    many others, drawn again for each update.
     """
 
     label, family, paper = "SCPO", "State-wise", "Zhao et al. 2023"

@@ -24,7 +24,7 @@ class TRPOSL(FilteredTrustRegion):
     and b, g networks fitted to the costs of the executed actions, so that ĉ predicts the cost of
     this step. What exceeds the threshold by less than ε_i is left alone, and so are states where
     actions change ĉ_i by less; ε_i is ``tolerance`` times the root mean square error of ĉ_i on the
-    last rollout. Steps without cost are so many that as many of them are drawn, anew for each step
+    last rollout. Steps without cost are so many that as many of them are drawn again for each step
     of the optimizer, as there are steps with a cost.
 
     :param policy: policy class or its alias; a class of one's own derives from ``FilteredPolicy``

@@ -137,7 +137,7 @@ class Checkpoints(BaseCallback):
             self._warned = True
             print(
                 "This environment can't save its state (it can't be pickled and has no state()): "
-                "if the run is resumed, its episodes begin anew."
+                "if the run is resumed, its episodes are restarted."
             )
         if not cuda and th.cuda.is_available():
             cuda = th.cuda.get_rng_state_all()
@@ -148,7 +148,7 @@ class Checkpoints(BaseCallback):
             "generators": generators,
             "cuda": cuda or [],
             "environments": environments,
-            # Seeded anew for each evaluation, but a wrapper may remember more than its episode.
+            # Seeded again for each evaluation, but a wrapper may remember more than its episode.
             "evaluation": [capture(env) for env in self._evaluation_envs()],
             "callbacks": [
                 (type(one).__name__, one.n_calls, one.state() if hasattr(one, "state") else None)
@@ -245,10 +245,10 @@ def load_model(
     """
     The model in a model file or checkpoint, as it was.
 
-    Loading alone does not touch the environment: the model goes on from its last observation
+    Loading alone does not touch the environment: the model continues from its last observation
     (`force_reset=False`), which fits only once `restore_run` has put the environment back.
 
-    :param env: environment to go on training in; None: to predict only
+    :param env: environment to continue training in; None: to predict only
     :raises UsageError: the file is damaged, of another algorithm, or does not fit the environment
     """
     with explained(f"can't load {path} as {algorithm.__name__}"):

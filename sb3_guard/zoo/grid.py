@@ -205,7 +205,7 @@ def ask_to_stop(grid: str) -> None:
 
 def _record(run: Run, text: str) -> None:
     now = time.strftime("%Y-%m-%d %H:%M:%S")
-    # The grid's summary says it too, so a record that can't be written is no second failure.
+    # The grid's summary says it too, so a record that can't be written is not a second failure.
     with suppress(OSError), open(run.path / "error.txt", "a") as file:
         file.write(f"--- {now}\n{text}\n")
 
@@ -330,7 +330,7 @@ class Execution:
 
     def _stop(self, number: int) -> None:
         self.signal = number
-        self.board.say("Stopping after the rollouts under way; once more to stop immediately.")
+        self.board.say("Stopping after the rollouts under way; Ctrl-C again stops immediately.")
 
     def _submit(self) -> None:
         """Give each idle worker a run, so that what ends a worker is blamed on one run."""

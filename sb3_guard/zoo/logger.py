@@ -51,7 +51,7 @@ class RunLogger(Logger):
             self._iterations_before = state["iterations"]
 
     def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
-        """Log a value; the number of iterations goes on counting after a resume."""
+        """Log a value; the number of iterations continues after a resume."""
         if key == "time/iterations":
             value += self._iterations_before
         super().record(key, value, exclude)

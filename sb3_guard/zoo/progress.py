@@ -70,7 +70,7 @@ class Epochs(BaseCallback):
         self._episodes: list[tuple[float, float, float, float]] = []
         #: return, cost, length of the episodes of the last epoch in which any ended, [E, 3]
         self.last = np.zeros((0, 3))
-        # Taken now: what lies on disk may change while the run goes on.
+        # Taken now: what lies on disk may change while the run continues.
         self._provenance = provenance()
         #: steps after each part of the run that was to be shorter than it came to be
         self.learned: list[int] = []

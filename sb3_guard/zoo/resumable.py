@@ -1,4 +1,4 @@
-"""The state of environments, so that a resumed run goes on in the middle of its episodes."""
+"""The state of environments, so that a resumed run continues in the middle of its episodes."""
 
 import pickle
 from typing import Any

@@ -1,7 +1,7 @@
 """A training run from flags to result: checked in full first, then made and trained.
 
 RL-Zoo's ``ExperimentManager`` makes the run folder before it has looked at the hyper-parameters,
-and starts counters, seeds and environments anew when it continues; so its pieces are used here
+and resets counters, seeds and environments when it continues; so its pieces are used here
 (schedules, run numbers, file layout, flags) and its class is not.
 """
 
@@ -235,9 +235,9 @@ class Experiment:
 
         :param folder: the run's folder, owned by this process
         :param asked_to_stop: training ends after the rollout under way when this says so
-        :param restate: state flags and hyper-parameters anew once training can go on
+        :param restate: state flags and hyper-parameters again once training can continue
         :return: exit status: 0, or 128 + the signal's number when interrupted
-        :raises UsageError: training can't go on, or the disk is full or read-only
+        :raises UsageError: training can't continue, or the disk is full or read-only
         """
         try:
             return self._train(folder, asked_to_stop, restate)
@@ -315,7 +315,10 @@ class Experiment:
         def stop(number: int) -> None:
             checkpoints.stop = True
             if verbose:
-                print("\nStopping after this rollout; once more to stop at once.", file=sys.stderr)
+                print(
+                    "\nStopping after this rollout; Ctrl-C again stops immediately.",
+                    file=sys.stderr,
+                )
 
         began = time.monotonic()
         with interrupts(stop) as received, ExitStack() as last:

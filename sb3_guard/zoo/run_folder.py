@@ -56,7 +56,7 @@ def read_data(path: Path) -> dict[str, Any]:
     """
     The plain data of a run's file, RL-Zoo's included.
 
-    :raises UsageError: it can't be read, or is no mapping
+    :raises UsageError: it can't be read, or is not a mapping
     """
     return read_mapping(path, "the run's file", "names to values")
 
@@ -164,7 +164,7 @@ class RunFolder:
         :param hyperparams: all hyper-parameters, plain data
         :param command: the command line
         :param number: the number to take, by a caller that has :func:`lock` on the folder, which
-            may exist but is no run yet; None: the next free one
+            may exist but is not a run yet; None: the next free one
         :raises UsageError: the folder can't be written to, or there is more than plain data
         """
         name = folder_name(flags.env)
@@ -228,7 +228,7 @@ class RunFolder:
         return read_data(self.params / "config.yml")
 
     def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
-        """Replace what :meth:`create` wrote, e.g. when a finished run is to go on for longer."""
+        """Replace what :meth:`create` wrote, e.g. to make a finished run longer."""
         _write(self.params, _dump(args, hyperparams))
 
     def write_result(self, result: Mapping[str, Any]) -> None:

@@ -214,7 +214,7 @@ class Objective:
         mean: list[float] = []
 
         def after(history: list[list[float]]) -> bool:
-            """Report the mean of the seeds so far; whether to go on."""
+            """Report the mean of the seeds so far; whether to continue."""
             mean[:] = np.mean([one[-1] for one in [*finished, history]], axis=0).tolist()
             outcome = settings.outcome(mean)
             trial.set_user_attr("result", outcome)

@@ -76,7 +76,7 @@ def torch_class(path: str) -> Any:
     # torch's modules hold others, such as subprocess: what was found must be torch's own.
     own = isinstance(value, type) and value.__module__.split(".")[0] == "torch"
     if not own and not isinstance(value, th.dtype):
-        raise ValueError(f"{path} is no class of torch")
+        raise ValueError(f"{path} is not a class of torch")
     return value
 
 

@@ -123,7 +123,7 @@ def _begin(
             "sb3_guard's; choose another --study-name"
         )
     else:
-        # First of all: a worker may die after any of these lines, and the next one goes on.
+        # First of all: a worker may die after any of these lines, and the next one continues.
         study.set_user_attr(SETTINGS, asdict(settings))
     if not begun:
         # So that the best is never worse than where one came from.
@@ -255,7 +255,7 @@ def _tune(flags: TuneFlags, main: bool) -> int:
         def stop(number: int) -> None:
             objective.stop = True
             if loud:
-                print("\nStopping; once more to stop immediately.", file=sys.stderr)
+                print("\nStopping; Ctrl-C again stops immediately.", file=sys.stderr)
 
         with interrupts(stop) as received:
             if not main:

@@ -153,7 +153,7 @@ def run(command: Callable[[], int]) -> int:
 @contextmanager
 def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
     """
-    Let Ctrl-C and SIGTERM ask for an end in good order; a second one ends at once.
+    Let Ctrl-C and SIGTERM ask for an end in good order; a second one ends immediately.
 
     :param stop: called with the number of the first signal, between two steps of whatever runs
     :return: the numbers of the signals received

@@ -40,7 +40,7 @@ class Constrained(BaseAlgorithm):
     which ``learn`` logs are composed for every subclass.
 
     :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key.
-        The attribute may be set anew at any time, and holds from the next update on
+        The attribute may be set at any time, and holds from the next update on
     :param cost_keys: entries of ``info`` that hold the costs of a step
     :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
         absent key means that nothing was charged
@@ -98,7 +98,7 @@ class Constrained(BaseAlgorithm):
         # Running episodes outlive rollouts, and a run may be saved between two; set by `learn`.
         none: Any = None
         self.running_costs: np.ndarray = none  # [n_envs, m]
-        self.running_charges: np.ndarray = none  # [n_envs, m], what a limit is held against
+        self.running_charges: np.ndarray = none  # [n_envs, m], what a limit bounds
         self.running_lengths: np.ndarray = none  # [n_envs]
         # What the last step cost, 0 before the first one of an episode.
         self.last_costs: np.ndarray | None = None  # [n_envs, m]
@@ -164,7 +164,7 @@ class Constrained(BaseAlgorithm):
     def cost_limits(self) -> np.ndarray:
         """d: what ``cost_limit`` says now, for each cost key, shape (m,).
 
-        :raises ValueError: ``cost_limit`` was set to something that is no limit
+        :raises ValueError: ``cost_limit`` was set to something that is not a limit
         """
         self._check_cost_limit()
         limits = np.asarray(self.cost_limit, np.float64)
@@ -281,7 +281,7 @@ class Constrained(BaseAlgorithm):
         if self.constrained and not self._cost_seen_lately:
             self._warn_once(
                 f"no info had a cost key of {tuple(self.cost_keys)} during a whole rollout: "
-                "training goes on as if nothing cost anything (missing_cost='zero')"
+                "training continues as if nothing cost anything (missing_cost='zero')"
             )
         self.costs = CostEstimate(
             episode_cost, horizon, (episode_cost - self.cost_limits) / horizon

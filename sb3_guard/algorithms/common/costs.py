@@ -1,4 +1,4 @@
-"""The costs of a rollout, held against their limits."""
+"""The costs of a rollout, compared with their limits."""
 
 from typing import NamedTuple
 

@@ -217,7 +217,7 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
             self.logger.record(f"train/{name}", float(np.mean(values)))
 
     def fit_cost_critic(self, batch: CostReplayBufferSamples, next_actions: th.Tensor) -> float:
-        """One step towards c + γ_C (1 - done) Q_C'(s', a'), where a time-out is no end.
+        """One step towards c + γ_C (1 - done) Q_C'(s', a'), a time-out being no end.
 
         :param batch: B transitions
         :param next_actions: a', which the reward's critic has been given too

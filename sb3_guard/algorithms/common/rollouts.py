@@ -56,7 +56,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     """Costs, cost advantages and a cost critic for an on-policy algorithm.
 
     ``class SafePPO(CostRollouts, PPO)`` finds them in ``rollout_buffer`` when ``train`` is called,
-    and ends its ``train`` with :meth:`fit_cost_critic`. The critic is no part of the policy: the
+    and ends its ``train`` with :meth:`fit_cost_critic`. The critic is not part of the policy: the
     policy's optimizer and its gradient clipping never see it.
 
     :param cost_gamma: discount factor of the costs; None for ``gamma``

@@ -174,6 +174,16 @@ def test_ascent_raises_where_the_limit_is_broken_and_lowers_elsewhere() -> None:
     assert (after < before)[~broken].float().mean() > 0.95
 
 
+@pytest.mark.parametrize("ascent", ["output", "value"])
+def test_multipliers_that_have_fallen_rise_again(ascent: Any) -> None:
+    """200 steps down, 60 up: on the outputs alone, which λ's gradient hardly moves down there."""
+    multiplier, observations = network(ascent=ascent), th.randn(100, 4)
+    for excess in [-1.0] * 200 + [1.0] * 60:
+        multiplier.ascend(observations, th.full((100, 1), excess))
+    risen = float(multiplier.predict(observations).mean())
+    assert risen > 1.0 if ascent == "output" else risen < 0.1
+
+
 def test_ascent_is_the_gradient_of_the_mean() -> None:
     """Batches longer than a slice give the gradient of the whole, by plain autograd."""
     multiplier = network(2)

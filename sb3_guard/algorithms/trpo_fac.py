@@ -18,6 +18,7 @@ from sb3_guard.algorithms.common.critics import StateNetwork
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 TINY = 1e-12
+LOWEST = -4.0  # an output that lowers λ no more: 0.018
 
 
 class StateMultiplier(nn.Module):
@@ -28,6 +29,7 @@ class StateMultiplier(nn.Module):
     :param rate: learning rate of their Adam
     :param init: λ that a network without inputs would start at; None leaves the output bias as it
         was drawn, which starts λ near log 2 ≈ 0.69
+    :param ascent: see :class:`TRPOFAC`
     """
 
     def __init__(
@@ -36,8 +38,10 @@ class StateMultiplier(nn.Module):
         n_costs: int,
         rate: float,
         init: float | None = None,
+        ascent: Literal["output", "value"] = "value",
     ) -> None:
         super().__init__()
+        self.ascent = ascent
         self.networks = nn.ModuleList(StateNetwork(policy, 1) for _ in range(n_costs))
         if init is not None:
             for network in self.networks:
@@ -48,7 +52,11 @@ class StateMultiplier(nn.Module):
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         """Multipliers at observations, shape [B, m]."""
-        return F.softplus(th.cat([network(observations) for network in self.networks], dim=1))
+        return F.softplus(self.outputs(observations))
+
+    def outputs(self, observations: PyTorchObs) -> th.Tensor:
+        """What the softplus is of, shape [B, m]."""
+        return th.cat([network(observations) for network in self.networks], dim=1)
 
     @th.no_grad()
     def predict(self, observations: PyTorchObs) -> th.Tensor:
@@ -57,7 +65,7 @@ class StateMultiplier(nn.Module):
         return F.softplus(th.cat(each, dim=1))
 
     def ascend(self, observations: PyTorchObs, excess: th.Tensor) -> None:
-        """One step up the mean over the batch of ``Σ_i λ_i(s) · excess_i``.
+        """One step up the mean over the batch of ``Σ_i λ_i(s) · excess_i``, or of outputs for λ.
 
         :param observations: batch of N observations
         :param excess: how far each state's cost is above its limit, shape [N, m]
@@ -65,7 +73,13 @@ class StateMultiplier(nn.Module):
         self.optimizer.zero_grad(set_to_none=True)
         self.networks.train(True)
         for index in chunks(len(excess)):
-            gain = (self(rows(observations, index)) * excess[index]).sum() / len(excess)
+            part, above = rows(observations, index), excess[index]
+            if self.ascent == "value":
+                moved = self(part)
+            else:
+                moved = self.outputs(part)
+                above = above * ((above > 0.0) | (moved.detach() > LOWEST))
+            gain = (moved * above).sum() / len(excess)
             (-gain).backward()
         self.networks.train(False)
         self.optimizer.step()
@@ -96,6 +110,9 @@ class TRPOFAC(TrustRegion):
     :param units: ``"relative"`` as above; ``"cost"`` leaves A_C in the unit of the costs, as the
         papers do
     :param proportional_gain: K_P; 0 in the papers
+    :param lambda_ascent: ``"output"`` moves what the softplus is of by the violation itself, down
+        to -4, where λ is 0.018; ``"value"`` by the gradient of λ as in the papers, which vanishes
+        as λ does, so that a λ that has fallen stays there
     :param trace: whether states price the actions after them; the papers' price is that of the
         action's own state
     """
@@ -112,13 +129,18 @@ class TRPOFAC(TrustRegion):
     lambda_init: float | None = hyperparameter(None, ends="()")
     mode: Literal["statewise", "expected"] = hyperparameter("statewise")
     units: Literal["relative", "cost"] = hyperparameter("relative")
+    lambda_ascent: Literal["output", "value"] = hyperparameter("output")
     proportional_gain: float = hyperparameter(5.0)
     trace: bool = hyperparameter(True)
 
     def _setup_model(self) -> None:
         super()._setup_model()
         self.multiplier = StateMultiplier(
-            self.policy, len(self.cost_keys), self.lambda_lr, self.lambda_init
+            self.policy,
+            len(self.cost_keys),
+            self.lambda_lr,
+            self.lambda_init,
+            self.lambda_ascent,
         )
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

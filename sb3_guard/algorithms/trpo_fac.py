@@ -129,7 +129,7 @@ class TRPOFAC(TrustRegion):
     lambda_init: float | None = hyperparameter(None, ends="()")
     mode: Literal["statewise", "expected"] = hyperparameter("statewise")
     units: Literal["relative", "cost"] = hyperparameter("relative")
-    lambda_ascent: Literal["output", "value"] = hyperparameter("output")
+    lambda_ascent: Literal["output", "value"] = hyperparameter("value")
     proportional_gain: float = hyperparameter(5.0)
     trace: bool = hyperparameter(True)
 

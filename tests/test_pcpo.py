@@ -43,7 +43,7 @@ class Problem:
         return np.sqrt(2 * self.delta / (self.g @ v)) * v
 
     def solve(
-        self, euclidean: bool, dtype: th.dtype = th.float64, recovery: float = np.inf
+        self, euclidean: bool, dtype: th.dtype = th.float64, recovery: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray]:
         tensors = (self.g, self.B, self.inverse @ self.g, self.B @ self.inverse)
         g, B, v, W = (th.as_tensor(each, dtype=dtype) for each in tensors)

@@ -42,9 +42,7 @@ class PCPO(Margin):
     def step(self, region: Region) -> th.Tensor:
         g, B, c, delta = region.gradient, region.cost_gradients, region.violation, region.delta
         v, W = region.solve(g), th.stack([region.solve(b) for b in B])
-        # 1: the paper's projection, which knows no trust region
-        recovery = self.recovery if self.recovery < 1.0 else np.inf
-        x, pull = projected_step(g, B, c, v, W, delta, self.projection == "l2", recovery)
+        x, pull = projected_step(g, B, c, v, W, delta, self.projection == "l2", self.recovery)
         self._record_per_cost("train/projection", pull)
         return x
 

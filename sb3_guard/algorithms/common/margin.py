@@ -19,13 +19,13 @@ class Margin(TrustRegion):
     A step and the cost that it promises come from the same rollout, so it promises more than it
     brings, and J_C settles above d. m learns by how much. At a limit of 0 there is no margin.
 
-    Where no step of the trust region keeps the limits, ``recovery`` says how much of the way there
-    that it could go a step is to go. What is left of the region is for the reward, so that a limit
-    that nothing keeps does not end all learning.
+    Where no step of the trust region reaches the limits, a step asks for a share, ``recovery``, of
+    the largest possible decrease and leaves the rest of the region to the reward: a limit that
+    nothing keeps does not end all learning.
 
     :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the papers
     :param recovery: share of the largest possible decrease of a cost that a step asks for where the
-        limit is out of reach; 1 for all of it
+        limit is out of reach; 1 for all of it, as in the papers
     """
 
     signed_limits = True

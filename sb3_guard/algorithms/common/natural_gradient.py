@@ -97,8 +97,8 @@ class Step(NamedTuple):
 
     :param x: the step, shape (P,)
     :param case: how the constraints lie to the trust region
-    :param lambda_kl: multiplier λ of the trust region, 0 where lost
-    :param nu: multipliers ν of the constraints, shape (m,), 0 where lost
+    :param lambda_kl: multiplier λ of the trust region, 0 for a step that only recovers
+    :param nu: multipliers ν of the constraints, shape (m,), likewise
     :param moves: which constraints a step can change, shape (m,) bool; the others are left out, as
         a violation that the policy has no part in would otherwise end all learning
     """
@@ -191,7 +191,7 @@ def projected_step(
     W: th.Tensor,
     delta: float,
     euclidean: bool = False,
-    recovery: float = np.inf,
+    recovery: float = 1.0,
 ) -> tuple[th.Tensor, np.ndarray]:
     """The TRPO step, then the nearest point that satisfies the linearised constraints.
 
@@ -212,7 +212,8 @@ def projected_step(
     :param delta: trust-region radius δ > 0
     :param euclidean: measure distance by L = I instead of L = F, i.e. to first order by the KL
     :param recovery: count a violation as at most this share of what a step of the trust region can
-        change it by, so that a limit out of reach does not swallow the reward's part of the step
+        change it by, so that a limit out of reach does not swallow the reward's part of the step;
+        1 for the whole violation
     :return: the step, shape (P,), and how far it was pulled along each ``-L⁻¹b_i``, shape (m,)
     """
     c = np.asarray(c, dtype=np.float64)
@@ -222,7 +223,8 @@ def projected_step(
     gram = (rows @ images.T).numpy()  # [m, m]
     gram = (gram + gram.T) / 2
     moves = _movable(gram, c, delta)
-    c = np.minimum(c, recovery * _reach(gram, delta)) if np.isfinite(recovery) else c
+    if recovery < 1.0:
+        c = np.minimum(c, recovery * _reach(gram, delta))
     excess = c + (rows @ y.double()).numpy()
     x, pull = y, np.zeros(len(c))
     possible = True

@@ -96,7 +96,7 @@ def without_clock(result: dict) -> dict:
 def test_workers_keep_the_memory_they_freed(tmp_path):
     with grid.workers(1, None, tmp_path) as client:
         (trim,) = client.run(os.environ.get, "MALLOC_TRIM_THRESHOLD_").values()
-    assert trim is None  # set, every large array is a new mapping: trainings took half as long again
+    assert trim is None  # Dask sets it: every large array is a new mapping, half as slow again
 
 
 def test_presets_are_the_papers():

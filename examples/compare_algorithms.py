@@ -1,4 +1,4 @@
-"""Train three algorithms and draw return and cost.
+"""Train three algorithms and draw their returns and costs.
 
 `sb3-guard benchmark` and `sb3-guard plot` do this for many suites, algorithms and seeds.
 """
@@ -18,7 +18,7 @@ for name in ("trpo", "cpo", "trpo_lag"):
     model.learn(300_000)
     env.close()
     episodes = load_results(log)  # a row per episode: return r, cost c, length l
-    means = episodes.groupby(episodes.index // 10 * 10_000 + 10_000).mean()  # ten are an update
+    means = episodes.groupby(episodes.index // 10 * 10_000 + 10_000).mean()  # ten per update
     axes[0].plot(means.index, means["r"], label=name)
     axes[1].plot(means.index, means["c"], label=name)
     print(name, means[["r", "c"]].iloc[-1].round(2).to_dict())

@@ -1,4 +1,4 @@
-"""An algorithm of your own, which the commands then train, tune and plot.
+"""An algorithm of your own, which the commands can train, tune and plot.
 
 python -m sb3_guard.train --gym-packages custom_algorithm --algo trpo_price \
     -conf custom_algorithm.py --env Goal_Point_8Hazards -n 1e6

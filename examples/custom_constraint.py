@@ -1,4 +1,4 @@
-"""A constraint of your own, beside those there are."""
+"""A constraint of your own."""
 
 from dataclasses import dataclass
 

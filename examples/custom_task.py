@@ -16,7 +16,7 @@ class Lap(Task):
     name = "lap"
     interactive, contact, targets = False, False, "one"
 
-    def measure(self):  # [N, 2] m: what the reward is made of, before and after a step
+    def measure(self):  # [N, 2] m: what the reward is computed from, before and after a step
         return self.sim.robot.position[:, :2].copy()
 
     def reward(self, before, now):

@@ -1,4 +1,4 @@
-"""Train a policy with a safety layer, and run it where no trainer is."""
+"""Train a policy with a safety layer, and run it without the algorithm."""
 
 import gymnasium
 import numpy as np
@@ -7,7 +7,7 @@ from sb3_guard import TRPOSL, make_vec_env
 from sb3_guard.algorithms.common.policies import FilteredPolicy
 
 env = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=0)
-# From a third of the training on, the layer moves actions whose predicted cost is above 0.
+# After a third of the training, the layer corrects actions whose predicted cost is above 0.
 model = TRPOSL("MlpPolicy", env, n_steps=1000, seed=0).learn(300_000)
 model.policy.save("filtered_policy.pt")
 
@@ -21,7 +21,7 @@ for filtered in (True, False):
         obs, _ = plant.reset(seed=seed)
         cost, over = 0.0, False
         while not over:
-            # What the last step cost makes the layer's prediction exact; else it is estimated.
+            # The layer predicts from the cost of the last step; without it, it estimates that too.
             action, _ = policy.predict(obs, state=(np.array([[cost]]),), deterministic=True)
             obs, _, terminated, truncated, info = plant.step(action)
             cost, over = info["cost"], terminated or truncated

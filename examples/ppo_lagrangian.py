@@ -1,4 +1,4 @@
-"""PPO-Lagrangian in six lines: what the bases are for."""
+"""PPO-Lagrangian in six lines, with the bases for algorithms of your own."""
 
 from stable_baselines3 import PPO
 

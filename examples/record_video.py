@@ -1,4 +1,4 @@
-"""Film an agent, without a display."""
+"""Record a video of an agent, without a display."""
 
 import gymnasium
 import imageio_ffmpeg

@@ -1,13 +1,13 @@
-"""Train on Safety-Gymnasium, as it is.
+"""Train on the original Safety-Gymnasium package.
 
-It needs older versions of MuJoCo and Gymnasium than sb3_guard's own environments do, so it lives
-in a Python environment of its own, which scripts/check_safety_gymnasium.py sets up.
+It needs older versions of MuJoCo and Gymnasium, so scripts/check_safety_gymnasium.py installs it in
+a Python environment of its own. Elsewhere the same lines train on sb3_guard's task of this name.
 """
 
 from sb3_guard import CPO, evaluate_policy, make_vec_env
 
-# Its ids are accepted as they are: the cost, the third of six values that its `step` returns,
-# becomes info["cost"], and cost_hazards and the others stay where they are.
+# The cost, which is the third of six values that the package's `step` returns, becomes
+# info["cost"]; cost_hazards and the others stay in info.
 env = make_vec_env("SafetyPointGoal1-v0", n_envs=4, seed=0)
 model = CPO("MlpPolicy", env, n_steps=1000, cost_limit=25.0, seed=0, verbose=1)
 model.learn(300_000)

@@ -1,4 +1,4 @@
-"""Sauté: PPO and SAC keep a budget that they see, without an algorithm that knows of costs."""
+"""Sauté RL: PPO and SAC, which know nothing of costs, learn to keep a budget that they observe."""
 
 from stable_baselines3 import PPO, SAC
 

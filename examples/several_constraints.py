@@ -2,13 +2,13 @@
 
 from sb3_guard import CPO, evaluate_policy, make_vec_env
 
-costs = ("cost_hazards", "cost_ghosts")  # every constraint reports its own, and "cost" is the sum
+costs = ("cost_hazards", "cost_ghosts")  # each constraint reports its own; "cost" is the sum
 
 env = make_vec_env(
     "Goal_Point_8Hazards",
     n_envs=10,
     seed=0,
-    env_kwargs={"ghosts": {"num": 4, "speed": 0.002}},  # a constraint more, m per control step
+    env_kwargs={"ghosts": {"num": 4, "speed": 0.002}},  # speed: m per control step
     monitor_kwargs={"cost_keys": costs},
 )
 model = CPO("MlpPolicy", env, n_steps=1000, cost_keys=costs, cost_limit=[5.0, 2.0], seed=0)

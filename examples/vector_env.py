@@ -1,4 +1,4 @@
-"""Many environments by hand, with Gymnasium and NumPy alone."""
+"""Step many environments at once, with Gymnasium and NumPy alone."""
 
 import time
 
@@ -9,8 +9,8 @@ import sb3_guard  # noqa: F401 (registers the environments)
 
 n = 32
 
-# One batch of simulations that steps in C++ threads. Row i is, bit for bit, the lone environment
-# with seed 7 + i; episodes restart in the step that ends them.
+# One batch of simulations, stepped by C++ threads. Row i equals, bit for bit, a single environment
+# with seed 7 + i. Episodes restart in the step that ends them.
 envs = gymnasium.make_vec("Goal_Ant_8Hazards-v0", num_envs=n)
 rng = np.random.default_rng(0)
 obs, _ = envs.reset(seed=7)

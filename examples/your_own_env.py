@@ -1,4 +1,4 @@
-"""An environment of your own with a cost, and one whose cost you add."""
+"""An environment of your own that reports a cost, and one to which you add a cost."""
 
 import gymnasium
 import numpy as np
@@ -8,7 +8,7 @@ from sb3_guard.common.adapters import CostFromFunction
 
 
 class Shore(gymnasium.Env):
-    """Right is where the money is, and beyond 0 it is wet. All it takes is info["cost"]."""
+    """The reward grows to the right; beyond 0 there is a cost. All it takes is info["cost"]."""
 
     observation_space = gymnasium.spaces.Box(-2.0, 2.0, (1,))
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))

@@ -32,14 +32,15 @@ GROUPS: dict[str, dict[str, type[Part]]] = {
     "constraint": guard(CONSTRAINTS),
 }
 CAPTIONS = {
-    "robot": "Each in `Goal_<Robot>_8Hazards`. The ring of beads is its lidar: the more solid a "
-    "bead, the nearer the object there. The dart on the floor points where the robot looks. Point "
-    "is the package's CPO agent, the others are TRPO after 200,000 to 500,000 steps, with noise.",
-    "task": "Each with Point among eight hazards: in Goal the package's CPO agent, else TRPO, "
+    "robot": "Each in `Goal_<Robot>_8Hazards`. The ring of beads is its lidar: the more opaque a "
+    "bead, the closer the object in that direction. The dart on the floor shows where the robot "
+    "faces. Point is the package's CPO agent; the others are TRPO after 200,000 to 500,000 steps, "
+    "with noise.",
+    "task": "Each with Point among eight hazards: in Goal the package's CPO agent, elsewhere TRPO, "
     "which ignores cost, after 200,000 to 500,000 steps.",
-    "constraint": "Each with the task Goal and Point: among hazards and ghosts the package's CPO "
-    "agents, else TRPO, which ignores cost, after 200,000 steps. While a robot pays, it glows "
-    "red, and so does the border of the arena.",
+    "constraint": "Each with Point and the task Goal: among hazards and ghosts the package's CPO "
+    "agents, elsewhere TRPO, which ignores cost, after 200,000 steps. While a robot incurs a cost, "
+    "it and the border of the arena turn red.",
 }
 LOOKS = {
     "constraint_ghosts_spatial": "Ghosts in the air: `Goal_Drone_8Ghosts`",
@@ -48,12 +49,12 @@ LOOKS = {
     "task_push_box": "A box to push: `push={'object': 'box'}`",
 }
 ABOUT = {
-    "task": "What a robot is rewarded for. Any task goes with any robot and any "
-    "[constraints](constraints.md), as the first word of an id: `Push_Ant_8Hazards-v0`.",
-    "constraint": "What costs. Any number of constraints goes with any [task](tasks.md) and any "
-    "[robot](robots.md): the first is named in the id, `Goal_Ant_8Ghosts-v0`, the others as "
-    "arguments, `vases={'num': 4}`. Each reports its own cost as `info['cost_<name>']`, and "
-    "`info['cost']` is their sum.",
+    "task": "What a robot is rewarded for. Any task can be combined with any robot and any "
+    "[constraints](constraints.md); it is the first word of an id, as in `Push_Ant_8Hazards-v0`.",
+    "constraint": "What incurs a cost. Any number of constraints can be combined with any "
+    "[task](tasks.md) and any [robot](robots.md): the first is named in the id, "
+    "`Goal_Ant_8Ghosts-v0`, others are arguments, `vases={'num': 4}`. Each reports its own cost as "
+    "`info['cost_<name>']`, and `info['cost']` is their sum.",
 }
 
 
@@ -93,7 +94,7 @@ def speeds(part: type[Movers]) -> str:
         second = part().speed / (robot.frame_skip * robot.timestep)
         robots.setdefault(second, []).append(name)
     each = "; ".join(f"{', '.join(robots[v])} {v:.3g}" for v in sorted(robots, reverse=True))
-    return f"A `speed` of {part().speed:g} m per control step is, in m/s, with {each}."
+    return f"In m/s, a `speed` of {part().speed:g} m per control step is, with {each}."
 
 
 def perceived(kind: str, name: str) -> str:
@@ -143,8 +144,8 @@ def gallery() -> str:
         "# Gallery",
         "![TRPO, which ignores cost, and CPO in the same place](images/trained.gif)",
         "Two of the package's agents in the same place: TRPO ignores cost, CPO keeps a limit. "
-        "`sb3-guard show Goal_Ant_8Ghosts --window` opens any environment in MuJoCo's viewer, "
-        "`sb3-guard enjoy --pretrained --record` films an agent. Pictures: "
+        "`sb3-guard show Goal_Ant_8Ghosts --window` opens any environment in MuJoCo's viewer, and "
+        "`sb3-guard enjoy --pretrained --record` films an agent. The pictures are made by "
         "`python scripts/render_gallery.py`.",
     ]
     for kind in GROUPS:
@@ -189,14 +190,14 @@ def examples() -> str:
     """The page of the files in ``examples/``: what each says of itself, and the file."""
     parts = [
         "# Examples",
-        "Each is a file in `examples/` that runs as it is.",
+        "Each is a file in `examples/` that runs as it is. There is also a "
+        "[notebook](../examples/quickstart.ipynb).",
     ]
     for file in sorted((ROOT / "examples").glob("*.py")):
         says = (ast.get_docstring(ast.parse(file.read_text())) or "").splitlines()[0]
-        what = (says.rpartition(": ")[0] or says).rstrip(".")
         link = f"[examples/{file.name}](../examples/{file.name})"
         code = f"```{{literalinclude}} ../examples/{file.name}\n:language: python\n```"
-        parts += [f"## {file.stem.replace('_', ' ').capitalize()}", f"{what}: {link}.", code]
+        parts += [f"## {says.rstrip('.')}", link, code]
     return "\n\n".join(parts) + "\n"
 
 

@@ -15,8 +15,8 @@ from sb3_guard.envs.part import Array
 class Buttons(Obstacles):
     """Buttons that are all wrong to press (Ray et al. 2019).
 
-    Cost: the number touched, and the wrong buttons that a task of its own has (Button). With that
-    task, ``num=0`` makes its wrong buttons the only ones.
+    Cost: the number touched, including the wrong buttons of the task Button. With that task,
+    ``num=0`` leaves only these.
     """
 
     name = "buttons"

@@ -14,10 +14,10 @@ from sb3_guard.envs.part import Simulation
 class Ghosts(Movers, Obstacles):
     """Zones that follow the robot until they are within r1 of it (Zhao et al. 2024, §4.3).
 
-    Beyond r0 of the origin a ghost goes home at v0; else, beyond r1 of the robot, it comes at v1;
-    within r1 it waits. Cost: Σ max(0, size − distance) over the ghosts, the distance from the
-    robot's position, or from the nearest link of an arm, to the ghost's centre, on the floor in the
-    plane; of solid ones, the number touched.
+    Farther than r0 from the origin, a ghost returns to it at v0; otherwise it approaches the robot
+    at v1 until it is within r1, and waits there. Cost: Σ max(0, size − distance) over the ghosts,
+    where the distance is from the ghost's centre to the robot's position, or to the nearest link of
+    an arm (in the plane for ghosts on the floor). Of solid ghosts: the number touched.
     """
 
     name = "ghosts"

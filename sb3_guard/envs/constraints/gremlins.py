@@ -14,7 +14,7 @@ from sb3_guard.envs.part import Array, Generators, Simulation
 
 @dataclass
 class Gremlins(Obstacles):
-    """Boxes that circle around their places by the simulated clock (Ray et al. 2019).
+    """Boxes that move on circles around their places (Ray et al. 2019).
 
     At time t a gremlin is at travel · (sin ωt, cos ωt) from its place. Cost: the number touched.
     """

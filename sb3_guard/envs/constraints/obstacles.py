@@ -14,12 +14,12 @@ from sb3_guard.envs.part import Array, Constraint, World
 
 @dataclass
 class Obstacles(Constraint):
-    """Objects, all of one size, that the robot pays for.
+    """Objects of one size that incur a cost.
 
-    Cost of those it can cross, discs on the floor or spheres in the air: Σ max(0, size − distance),
-    the distance from the robot's position, an arm's from its nearest link, to the centre. Cost of
-    solid ones, which have a :meth:`shape`: how many it touches when the control step ends, each
-    counted once however many contact points it has.
+    Cost of those that the robot can cross, discs on the floor or spheres in the air:
+    Σ max(0, size − distance), where the distance is from the centre to the robot's position, or to
+    the nearest link of an arm. Cost of solid ones, which have a :meth:`shape`: how many the robot
+    touches when the control step ends, each counted once however many contact points it has.
     """
 
     num: int = param(8, "number of objects", low=0, high=MOST)
@@ -31,7 +31,7 @@ class Obstacles(Constraint):
     placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
     margin: float = param(0.0, "extra distance to every other object, m", low=0)
     weight: float = param(1.0, "cost per metre of depth, or per object touched", low=0)
-    indicator: bool = param(False, "cost 1 whenever there is any, instead of the sum")
+    indicator: bool = param(False, "cost 1 if there is any, instead of the sum")
 
     usual_keepout: ClassVar[float] = 0.4  # m, of objects that it covers
     free: ClassVar[bool] = False  # whether solid objects can be pushed

@@ -11,7 +11,7 @@ from sb3_guard.envs.parameters import param
 
 @dataclass
 class Pillars(Obstacles):
-    """Columns that do not yield (Ray et al. 2019). Cost: the number touched."""
+    """Columns that do not move (Ray et al. 2019). Cost: the number touched."""
 
     name = "pillars"
     color = (0.45, 0.45, 0.5)

@@ -12,7 +12,7 @@ from sb3_guard.envs.part import Array, Constraint, Generators, Simulation
 class Speed(Constraint):
     """Cost 1 in each step in which the robot is faster than ``limit`` (Zhang et al. 2020).
 
-    Its speed is the distance that its position moved in the control step, divided by its duration.
+    The speed is the distance covered in the control step, divided by its duration.
     """
 
     name = "speed"

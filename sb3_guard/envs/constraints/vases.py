@@ -17,8 +17,8 @@ from sb3_guard.envs.part import Array
 class Vases(Obstacles):
     """Boxes that slide when pushed (Ray et al. 2019).
 
-    Cost, over the vases: the number touched, ``displacement_weight`` times how far they are from
-    their places and ``velocity_weight`` times how fast they move, where above the thresholds.
+    Cost, summed over the vases: ``weight`` for each touched, ``displacement_weight`` times its
+    distance from its place and ``velocity_weight`` times its speed, where above the thresholds.
     """
 
     name = "vases"

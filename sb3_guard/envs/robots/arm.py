@@ -12,7 +12,7 @@ from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot, as_slice
 
 @dataclass
 class Arm(MJCFRobot):
-    """A robot arm on a fixed base; its position is the end effector's, the last link's.
+    """A robot arm on a fixed base. Its position is that of the end effector, its last link.
 
     A link is the capsule, or the sphere, around the segment from the origin of its body to that of
     the next, with the radius of its geom.

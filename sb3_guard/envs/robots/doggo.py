@@ -7,7 +7,7 @@ from sb3_guard.envs.robots.robot import MJCFRobot
 
 @dataclass
 class Doggo(MJCFRobot):
-    """A four-legged robot that must hold its weight up: its springs alone let it sink.
+    """A four-legged robot that has to hold itself up: its springs alone let it sink.
 
     Actions: the hips' turn (z) of legs 1 to 4, the hips' swing (y), then the ankles. Legs are
     numbered front left, rear left, rear right, front right. The waist is neither driven nor

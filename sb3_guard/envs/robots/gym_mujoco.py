@@ -21,9 +21,9 @@ from sb3_guard.envs.robots.robot import MJCFRobot
 
 @dataclass
 class GymRobot(MJCFRobot):
-    """A robot in the world of its file, which starts there but for some noise.
+    """A robot in the world of its file, which starts where the file puts it, with some noise.
 
-    It is observed without its place: all of qpos but the first ``hidden`` numbers, then qvel.
+    Its place is not observed: it sees qpos without the first ``hidden`` numbers, then qvel.
     """
 
     family = "velocity"

@@ -20,9 +20,8 @@ class Button(Task):
     """Press the right one of several buttons (Ray et al. 2019).
 
     Reward: the distance gained on the lit button, times ``reward_distance``, plus ``bonus`` when it
-    is touched. Then another one becomes the right one, and in the next ``delay`` control steps none
-    can be pressed rightly or wrongly; until the last of them is over, none is lit and the lidar
-    shows none.
+    is touched. Then another button becomes the right one. In the next ``delay`` control steps
+    pressing a button has no effect, none is lit and the lidar shows none.
     """
 
     name = "button"
@@ -45,11 +44,11 @@ class Button(Task):
     marker: float | None = param(
         None, "radius kept clear for a marker that begins elsewhere, m; null: there is none", low=0
     )
-    again: bool = param(False, "whether the one that was pressed may be the next right one")
+    again: bool = param(False, "whether the button just pressed may be the next right one")
     locked: bool = param(
-        True, "whether after a press the right button does not count either for a while"
+        True, "whether after a press the right button is without effect for a while too"
     )
-    delay: int = param(10, "control steps in which no button counts after one was pressed", low=0)
+    delay: int = param(10, "control steps after a press in which no button counts", low=0)
     reward_distance: float = param(1.0, "reward per metre gained")
     reward_limit: float | None = param(
         10.0, "dense rewards are cut off at ± this; null: they are not", above=0

@@ -12,11 +12,11 @@ from sb3_guard.envs.tasks.targets import Targets
 
 @dataclass
 class Chase(Targets):
-    """Near the nearest of the targets (Zhao et al. 2024, §4.2).
+    """Get close to the nearest of several fleeing targets (Zhao et al. 2024, §4.2).
 
-    Beyond r0 of the origin a target goes home at v0; else it flees at v1 from a robot within r1,
-    and waits otherwise. Reward: the distance gained on the nearest target, an arm's from its
-    nearest link, times ``reward_distance``; none in the first step of an episode.
+    Farther than r0 from the origin, a target returns to it at v0; otherwise it flees at v1 from a
+    robot within r1, or waits. Reward: the distance gained on the nearest target (of an arm, from
+    its nearest link), times ``reward_distance``; none in the first step of an episode.
     """
 
     name = "chase"

@@ -16,9 +16,9 @@ SLATE = (0.30, 0.35, 0.45)
 class Defense(Targets):
     """Drive targets out of a circle around the origin (Zhao et al. 2024, §4.2).
 
-    Beyond r0 of the origin a target goes home at v0; else it flees at v1 from a robot within r1,
-    and makes for the origin at v2 otherwise. Reward, summed over the targets: ‖xy − origin‖ ÷
-    ``radius`` − 1 inside the circle, ``reward_outside`` outside.
+    Farther than r0 from the origin, a target returns to it at v0; otherwise it flees at v1 from a
+    robot within r1, or approaches the origin at v2. Reward, summed over the targets:
+    ‖xy − origin‖ ÷ ``radius`` − 1 inside the circle, ``reward_outside`` outside.
     """
 
     name = "defense"

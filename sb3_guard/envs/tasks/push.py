@@ -21,11 +21,11 @@ YELLOW = (0.95, 0.8, 0.1)
 class Push(Destination):
     """Push an object to a place on the floor (Zhao et al. 2024, §4.2).
 
-    Reward: the distance gained on the object, while the robot is more than ``null_distance`` sizes
-    from it, and the distance that the object gained on the goal, in the plane; plus ``bonus`` when
+    Reward, with distances in the plane: what the robot gains on the object, while it is more than
+    ``null_distance`` object sizes away, and what the object gains on the goal; plus ``bonus`` when
     the object's centre is within ``size`` of the goal.
 
-    The ball stays near where it is let go, or rolls on with a lower ``object_rolling``. The box
+    The ball soon comes to rest, or rolls on with a lower ``object_rolling``. The box
     slides; posts at its corners keep the robot from slipping off its sides.
     """
 
@@ -60,7 +60,7 @@ class Push(Destination):
         None, "extra distance of the object to every other one, m; null: margin", low=0
     )
     null_distance: float = param(
-        2.0, "object sizes from which on nearing the object is not rewarded", low=0
+        2.0, "distance, in object sizes, within which approaching the object earns nothing", low=0
     )
     reward_approach: float = param(1.0, "reward per metre gained on the object")
     object_lidar: bool = param(False, "whether the object is also seen by a lidar")

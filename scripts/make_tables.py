@@ -172,8 +172,9 @@ def main() -> None:
             found = runs(name)
             found = found.assign(J_r=found["return_last"], M_c=found["cost_last"])
             for drawing in draw("pareto", Data(found)):
-                if drawing.figure is not None and f"{drawing.name}.png" in text:
-                    save(drawing.figure, DOCS / "images" / f"{drawing.name}.png")
+                file = f"{name}_{drawing.name}.png"
+                if drawing.figure is not None and file in text:
+                    save(drawing.figure, DOCS / "images" / file)
 
 
 if __name__ == "__main__":

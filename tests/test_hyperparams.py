@@ -312,10 +312,10 @@ DIFFERENT = {
     "trpo_lag": {
         **LIMIT,
         **LAMBDA,
-        "lambda_lr": (0.005, 0.1),
+        "lambda_lr": (0.005, 0.2),
         "lambda_update": ("after", None),
         "lambda_units": ("cost", None),
-        "proportional_gain": (0.0, 0.5),
+        "proportional_gain": (0.0, 1.0),
         "derivative_gain": (0.0, 0.5),
     },
     "trpo_fac": {

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import sb3_guard
 from sb3_guard import make_vec_env
 from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_ids, registry, rendering
 from sb3_guard.envs import scene as scene_module
@@ -351,6 +352,21 @@ def test_bodies_throw_shadows_and_zones_do_not():
     for body, shadow in zip(list(painted.geoms[1:bodies]), shadows, strict=True):
         assert shadow.pos[2] < 0.01 < height
         assert np.linalg.norm(shadow.pos[:2] - body.pos[:2]) < body.pos[2]
+
+
+def test_a_pillar_does_not_hide_the_robot():
+    near = {"keepout": 0.2, "locations": [(0, -0.55)]}
+    env = sb3_guard.make(
+        "Goal_Point_1Pillars-v0",
+        render_mode="rgb_array",
+        camera="track",
+        layout={"overlap": True},
+        robot={"keepout": 0.2, "locations": [(0, 0)]},
+        pillars=near,
+    )
+    env.reset(seed=0)
+    assert amount(env.render(), RED) > 500
+    env.close()
 
 
 def test_a_film_shows_what_happens_between_control_steps():

@@ -226,7 +226,21 @@ class Renderer:
             self._look_at(self._camera, data)
         self._screen.update_scene(data, self._camera)
         self._paint(self._screen.scene, data, row, shift)
+        if self._explain:
+            self._reveal(self._screen.scene, data)
         return self._screen.render()
+
+    def _reveal(self, scene: mujoco.MjvScene, data: mujoco.MjData) -> None:
+        """Make translucent what stands between the camera and the robot."""
+        eye = (scene.camera[0].pos + scene.camera[1].pos) / 2
+        sight = data.geom_xpos[self._geoms].mean(axis=0) - eye
+        hit = np.zeros(1, np.int32)
+        mujoco.mj_ray(self._engine.model, data, eye, sight, None, True, -1, hit)
+        if hit[0] in self._geoms:
+            return
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid == hit[0]:
+                geom.rgba[3], geom.transparent = 0.35, True
 
     def _look_at(self, camera: mujoco.MjvCamera, data: mujoco.MjData) -> None:
         """Turn a free camera to the robot, or to the whole arena and the robot near it."""

@@ -133,7 +133,7 @@ def make_envs(
         return ResumableEnv(env if setup.env_wrapper is None else setup.env_wrapper(env))
 
     with (
-        explained(f"can't make {env_id}", *BAD_ARGUMENTS, *PROCESS_DIED),
+        explained(f"can't make {env_id}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
         interrupts_ignored(),  # a rollout under way can be finished
     ):
         env = make_vec_env(

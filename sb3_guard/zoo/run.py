@@ -126,7 +126,8 @@ class Experiment:
                 info = env.step(np.array([env.action_space.sample()]))[3][0]
         except Exception as error:
             self._blame(error, "its first step")
-            raise
+            with explained(f"{self.flags.env} fails at its first step", ValueError):
+                raise
         finally:
             env.close()
         if not getattr(self.algorithm, "constrained", False):
@@ -245,8 +246,8 @@ class Experiment:
             if not self._lost_a_process():
                 raise  # the pipe of somebody else, such as that of standard output
             raise UsageError(
-                "a process of --vec-env subproc has died, perhaps for want of memory; "
-                f"continue with -i {folder.path}"
+                "a process of --vec-env subproc has died, of what is printed above or for want of "
+                f"memory; continue with -i {folder.path}"
             ) from error
         except Exception as error:
             self._blame(error, f"{self.model.num_timesteps} steps")

@@ -1,9 +1,11 @@
 """Whatever is typed wrongly: one line that helps, exit status 2, nothing written."""
 
 import os
+import pickle
 import shutil
 import subprocess
 import sys
+import zipfile
 from contextlib import suppress
 from errno import ENOSPC
 from types import SimpleNamespace
@@ -16,6 +18,7 @@ from registered_envs import Broken, Filmed
 from sb3_guard import CPO, enjoy, train
 from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.zoo import playback
+from sb3_guard.zoo.checkpoint import MEMBER
 from sb3_guard.zoo.run_folder import read_data
 from sb3_guard.zoo.usage import UsageError
 
@@ -265,6 +268,9 @@ def test_checkpoints_that_are_none(capsys, run):
     refused(train.main, ["-i", str(run), "-n", "120"], capsys, "start it again without -i")
     shutil.copy(run / "CostPoint-v0.zip", run / "checkpoint.zip")
     refused(train.main, ["-i", str(run), "-n", "120"], capsys, "is a model, not a checkpoint")
+    with zipfile.ZipFile(run / "checkpoint.zip", "a") as archive:
+        archive.writestr(MEMBER, pickle.dumps({"other": 1}))
+    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "checkpoint.zip is damaged")
 
 
 def test_corrupt_model(capsys, run, tmp_path):

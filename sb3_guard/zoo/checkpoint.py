@@ -207,9 +207,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     with explained(f"{path} is damaged and can't be read"), zipfile.ZipFile(path) as archive:
         members = archive.namelist()
         state = pickle.loads(archive.read(MEMBER)) if MEMBER in members else None
-    if state is None:
+    if not isinstance(state, dict) or "format" not in state:
         # The end of a cut file may look like one of the archives inside it.
-        whole = "data" in members
+        whole = state is None and "data" in members
         raise UsageError(f"{path} is {'a model, not a checkpoint' if whole else 'damaged'}")
     version = state["format"]
     if version != FORMAT:

@@ -55,7 +55,7 @@ class StateMultiplier(nn.Module):
         return F.softplus(self.outputs(observations))
 
     def outputs(self, observations: PyTorchObs) -> th.Tensor:
-        """What the softplus is of, shape [B, m]."""
+        """The arguments of the softplus, shape [B, m]."""
         return th.cat([network(observations) for network in self.networks], dim=1)
 
     @th.no_grad()
@@ -104,17 +104,17 @@ class TRPOFAC(TrustRegion):
 
     :param lambda_lr: learning rate of the multiplier networks
     :param lambda_epochs: steps of the multiplier networks per update, on the whole rollout
-    :param lambda_init: multiplier to start near; None for about log 2, where softplus is of 0
+    :param lambda_init: multiplier to start near; None starts near log 2, the softplus of 0
     :param mode: ``"statewise"`` as above; ``"expected"`` raises the mean of λ(s) by J_C - d, as
         the GUARD paper writes it: all states then see the same violation
     :param units: ``"relative"`` as above; ``"cost"`` leaves A_C in the unit of the costs, as the
         papers do
     :param proportional_gain: K_P; 0 in the papers
-    :param lambda_ascent: ``"output"`` moves what the softplus is of by the violation itself, down
-        to -4, where λ is 0.018; ``"value"`` by the gradient of λ as in the papers, which vanishes
-        as λ does, so that a λ that has fallen stays there
-    :param trace: whether states price the actions after them; the papers' price is that of the
-        action's own state
+    :param lambda_ascent: ``"output"`` moves the argument of the softplus by the violation itself,
+        down to -4, where λ is 0.018; ``"value"`` by the gradient of λ as in the papers, which
+        vanishes as λ does, so that a λ that has fallen stays there
+    :param trace: whether the prices of earlier states apply to an action too; in the papers its
+        price is that of its own state
     """
 
     label, family, paper = "TRPO-FAC", "Lagrangian", "Ma et al. 2021"

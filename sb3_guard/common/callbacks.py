@@ -49,7 +49,7 @@ class LogCosts(BaseCallback):
 
 class CostEvalCallback(EvalCallback):
     """
-    Evaluate the agent every so often, and keep the best model: safe first, then good.
+    Evaluate the agent regularly, and keep the best model of those that keep the limit.
 
     SB3's callback keeps the model of highest reward, which for a constrained problem is apt to be
     the least safe one. Here models whose mean episode cost plus its standard error is within

@@ -150,14 +150,14 @@ def evaluate_policy(
     Play whole episodes and report return and cost of each.
 
     Each row of a vectorised environment plays its own share of the episodes, fixed beforehand. To
-    take the first ones that end, whichever row they come from, would favour short episodes.
+    take the first ones that end, from any row, would favour short episodes.
 
     Returns and lengths are those of a monitor wrapper where there is one, so that reward
     normalisation outside it does not show. Costs are read as the model reads them in training,
     with its ``missing_cost``; if it has none, as a policy or PPO, an absent cost counts as 0.
 
-    A policy that corrects its actions by what the last step cost says so by a true attribute
-    ``acts_on_cost`` and is given the true last costs, shape [n_envs, m], zeros at the start of an
+    A policy that corrects its actions by the cost of the last step has a true attribute
+    ``acts_on_cost`` and is given these costs, shape [n_envs, m], zeros at the start of an
     episode, as ``predict(..., state=(costs,))``.
 
     A model's own training environment will do: if ``learn`` is called again, it begins new
@@ -168,15 +168,15 @@ def evaluate_policy(
     :param n_eval_episodes: number of episodes
     :param deterministic: take the most likely action instead of sampling
     :param seed: seed of the episodes and of sampled actions. With the same seed, the same policy
-        has the same evaluation and training is not touched by it; None: continue from where the
+        has the same evaluation, and training is not affected; None: continue from where the
         generators are
     :param cost_keys: entries of info that are costs; None: those of ``model``, else ``"cost"``
     :param max_steps: stop after this many steps of the (vectorised) environment; episodes that
         have not ended are left out
     :param on_step: called after each step, e.g. to render
     :param on_episode: called with return, cost and length of each counted episode as it ends
-    :raises ValueError: fewer than one episode is asked for, a cost is no finite number or missing
-        and may not be, or the policy acts on another number of costs than ``cost_keys`` names
+    :raises ValueError: ``n_eval_episodes`` is below 1, a cost is not finite or missing where it
+        must not be, or the policy acts on another number of costs than ``cost_keys`` names
     """
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")

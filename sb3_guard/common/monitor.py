@@ -46,7 +46,7 @@ class CostMonitor(VecMonitor):
     :func:`stable_baselines3.common.monitor.load_results` reads.
 
     The sums of the episodes under way are part of :meth:`state`, so that a resumed training run
-    reports the episodes it was stopped in as if it had never been.
+    reports the episodes in which it was stopped as if nothing had happened.
 
     :param venv: the environment to watch
     :param filename: csv to write, see :meth:`log_to`; None: no file

@@ -90,8 +90,8 @@ def find_scenario(env_id: str | Path | Mapping[str, Any] | Scenario) -> Scenario
 class GuardVecEnv(VecEnv):
     """N environments of ours on one batch of simulations, for Stable-Baselines3.
 
-    Equal, bit for bit, to a ``DummyVecEnv`` of N lone environments with seeds s, s + 1, …, and many
-    times faster.
+    Equals, bit for bit, a ``DummyVecEnv`` of N single environments with seeds s, s + 1, …, and is
+    many times faster.
 
     :param scenario: an id, a scenario, its plain data or its YAML file
     :param num_envs: number of environments N

@@ -138,7 +138,7 @@ class Lidar(Parameters):
         super().__post_init__()
         if self.falloff == "exponential" and self.range is not None:
             raise ValueError(
-                f"lidar.range = {self.range!r} is of a linear falloff: set lidar={{'falloff': "
+                f"lidar.range = {self.range!r} needs a linear falloff: set lidar={{'falloff': "
                 f"'linear', 'range': {self.range!r}}}, or leave it out"
             )
 

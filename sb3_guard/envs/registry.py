@@ -186,7 +186,7 @@ def _is_text(value: Any) -> bool:
 def register_task(name: str, task: type[Task]) -> None:
     """Make a task known under ``name`` to ids, scenarios and commands.
 
-    :raises ValueError: the class is not a task, or not a whole one, or the name is not usable
+    :raises ValueError: the class is not a complete task, or the name is not usable
     """
     _check_name(name)
     _check_keyword(name, CONSTRAINTS)
@@ -198,7 +198,7 @@ def register_task(name: str, task: type[Task]) -> None:
 def register_constraint(name: str, constraint: type[Constraint]) -> None:
     """Make a constraint known under ``name`` to ids, scenarios and commands.
 
-    :raises ValueError: the class is not a constraint, or not a whole one, or the name is not usable
+    :raises ValueError: the class is not a complete constraint, or the name is not usable
     """
     _check_name(name)
     _check_keyword(name, TASKS)

@@ -46,7 +46,7 @@ class Transition:
 
 
 class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
-    """N environments stepped together; row i is a lone environment with seed + i, bit for bit.
+    """N environments stepped together; row i equals a single one with seed + i, bit for bit.
 
     A row that ends is reset in the same step (``AutoresetMode.SAME_STEP``): its last observation
     and info are in ``infos["final_obs"]`` and ``infos["final_info"]``. ``infos["cost"]`` and

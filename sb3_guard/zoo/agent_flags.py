@@ -135,7 +135,7 @@ class HubFlags(AgentFlags):
         """
         Take ``--repo-id`` apart.
 
-        :raises UsageError: nothing says whose repository, or not in the right form
+        :raises UsageError: the repository's owner is missing, or its name has another form
         """
         if self.repo_id is not None:
             organization, slash, name = self.repo_id.partition("/")
@@ -143,4 +143,4 @@ class HubFlags(AgentFlags):
                 raise UsageError(f"--repo-id {self.repo_id!r} must be of the form user/name")
             self.organization, self.repo_name = organization, name
         elif self.organization is None:
-            raise UsageError("whose repository? give -orga NAME, or --repo-id user/name")
+            raise UsageError("the repository has no owner; give -orga NAME, or --repo-id user/name")

@@ -370,7 +370,7 @@ class Execution:
             elif future.status == "error":
                 # Those of runs are caught where they run: this is Dask's, of a dead worker.
                 error = one_line(future.exception() or RuntimeError())
-                run.state, text = "failed", f"its process died, perhaps for want of memory: {error}"
+                run.state, text = "failed", f"its process died, perhaps out of memory: {error}"
                 _record(run, text)
             else:
                 raise UsageError("the Dask scheduler is gone; the runs keep their checkpoints")

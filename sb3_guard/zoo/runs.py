@@ -364,7 +364,7 @@ def read_episodes(path: str | Path) -> pd.DataFrame:
     with explained(f"can't read {file}", OSError, ValueError, KeyError):
         table = pd.read_csv(file, skiprows=1)[["r", "l", "c"]].astype(float)
     if not len(table) or table.isna().any(axis=None):
-        raise UsageError(f"can't use {file}: it has no episodes, or cut ones")
+        raise UsageError(f"can't use {file}: it has no episodes, or is truncated")
     steps = table["l"].cumsum()
     return pd.DataFrame(
         {"step": steps, "J_r": table["r"], "M_c": table["c"], "rho_c": table["c"].cumsum() / steps}

@@ -34,7 +34,7 @@ from optuna.trial import TrialState
 from sb3_guard.zoo.usage import UsageError, explained
 
 Result = TypeVar("Result")
-# Trials that took down so many workers, e.g. for want of memory, are given up.
+# Trials that took down so many workers, for example by running out of memory, are given up.
 MOST_REPEATS = 3
 # How often a trial was stopped on purpose, which does not count.
 STOPPED = "stopped"

@@ -97,7 +97,7 @@ class TuneFlags(TrainingFlags):
         if self.n_seeds is not None:
             self.seeds = list(range(self.n_seeds))
         if len(set(self.seeds)) < len(self.seeds):
-            raise UsageError(f"--seeds {' '.join(map(str, self.seeds))}: one is there twice")
+            raise UsageError(f"--seeds {' '.join(map(str, self.seeds))}: a seed is given twice")
         if self.pareto and self.pruner != "none" and "pruner" in self.given:
             raise UsageError("--pruner: there is no pruning with --pareto; leave it out")
         if self.n_jobs > 1 and self.num_threads < 0:

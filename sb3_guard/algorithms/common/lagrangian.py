@@ -43,8 +43,8 @@ class Multiplier(nn.Module):
     :param adam: let Adam scale the ascent of I instead of taking it as it is
     :param proportional: K_P
     :param derivative: K_D
-    :param smoothing: what the averages keep of themselves in an update; 0 for none
-    :param delay: updates over which the rise of J_C is taken
+    :param smoothing: share of its old value that an average keeps in an update; 0 for none
+    :param delay: number of updates over which the rise of J_C is measured
     :param relative: measure costs in units of the limit (of a slow average of J_C where that is 0)
         and count violations of more than one unit as one, so that neither the unit of cost nor how
         far away training begins matters

@@ -18,8 +18,8 @@ class LinearisedLimits(Margin):
     whose cost no step changes is left out.
 
     :param cost_reduction: smallest decrease of a violated cost surrogate that the line search
-        accepts, in cost per step; never more than the violation itself. Where several limits can't
-        be reached, of the root of the sum above
+        accepts, in cost per step; never more than the violation itself. If several limits
+        can't be reached, it applies to the root of the sum of their squared violations
     """
 
     cost_reduction: float = hyperparameter(0.0)

@@ -92,7 +92,7 @@ class Region:
 
 
 class TrustRegion(CostRollouts):
-    """Trust-region policy optimisation that knows of costs: the spine of every algorithm here.
+    """Trust-region policy optimisation that knows of costs: the base of the TRPO-like algorithms.
 
     On its own it is TRPO (Schulman et al., 2015) as the GUARD paper runs it: KL summed over action
     dimensions, and critics fitted full-batch to discounted returns.

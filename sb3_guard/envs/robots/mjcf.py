@@ -29,11 +29,11 @@ def read(path: Path, root: str, complete: bool) -> mujoco.MjSpec:
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
     if spec.body(root) is None:
-        raise ValueError(f"{path} has no body called {root!r}: call its outermost so")
+        raise ValueError(f"{path} has no body called {root!r}: give its outermost body this name")
     floors = [geom.name for geom in spec.worldbody.geoms if geom.type == _PLANE]
     if floors and not complete:
         raise ValueError(
-            f"{path} has a floor, geom {floors[0]!r}, and the arena has one: take it out, or keep "
+            f"{path} has a floor, geom {floors[0]!r}, and the arena has one: remove it, or keep "
             f"the file's own world with complete=True, root={root!r}"
         )
     return spec

@@ -41,8 +41,8 @@ def parse(name: str) -> Fields | None:
     if "num" not in CONSTRAINTS[match["constraint"]].__dataclass_fields__:  # type: ignore
         if match["num"] != "1":
             raise ValueError(
-                f"{name!r}: {match['constraint']} has no parameter num, so that there is one "
-                f"of it: write 1{match['constraint']}, or give its class a field num"
+                f"{name!r}: {match['constraint']} has no parameter num, so there can only be "
+                f"one: write 1{match['constraint']}, or give its class a field num"
             )
         num = {}
     task = TASKS[match["task"]]

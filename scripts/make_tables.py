@@ -2,10 +2,11 @@
 
 ``docs/data/NAME.tar.xz`` holds the logs of a grid of runs, as ``benchmark`` writes them, without
 models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
-a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``;
-with ``learnt:`` instead, what the agents earned in the end beside the untrained ones of
-``docs/data/untrained.csv``, and with ``ppo: NAME SUITE -->``, within a line, what PPO earned and
-paid there. ``--pack FOLDER NAME`` packs the logs of a folder.
+a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``.
+Instead of ``runs`` there are ``learnt: NAME``, what the agents earned in the end beside the
+untrained ones of ``docs/data/untrained.csv``, ``sweep: NAME SUITE``, what was earned and paid at
+each limit N of ``NAME_limitN.tar.xz``, and, within a line, ``ppo: NAME SUITE``, what PPO earned and
+paid. ``--pack FOLDER NAME`` packs the logs of a folder.
 """
 
 import argparse
@@ -26,7 +27,9 @@ from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
-BLOCK = re.compile(r"(<!-- (runs|learnt|ppo): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(
+    r"(<!-- (runs|learnt|sweep|ppo): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)", re.DOTALL
+)
 PUBLISHED_STEPS = 1_000_000
 LAST = 90  # episodes: three rollouts of 30 environments
 APART = 3.0  # standard errors: what counts as learnt
@@ -103,6 +106,27 @@ def learnt(name: str) -> str:
     return markdown(spelled(rows, columns))
 
 
+def sweep(name: str, suite: str) -> str:
+    """A table of return and cost at each limit that a suite was run with, over all seeds."""
+    found = {}
+    for path in DATA.glob(f"{name}_limit*.tar.xz"):
+        archive = path.name.removesuffix(".tar.xz")
+        rows = aggregate(runs(archive)).set_index("label")
+        found[int(archive.rpartition("_limit")[2])] = rows[rows["suite"] == suite]
+    limits = sorted(found)
+    common = set.intersection(*(set(rows.index) for rows in found.values()))
+    shared = [label for label in found[limits[0]].index if label in common]
+    rows = pd.DataFrame({"limit": limits})
+
+    def cell(row: Any, label: str) -> str:
+        of = found[row["limit"]].loc[label]
+        earned = spread(of["return_last"], of["return_last_se"], 1)
+        return f"{earned} at {spread(of['cost_last'], of['cost_last_se'], 1)}"
+
+    columns = {label: lambda row, label=label: cell(row, label) for label in shared}
+    return markdown(spelled(rows, {"limit": whole("limit"), **columns}))
+
+
 def beside(name: str, suite: str) -> str:
     """PPO's return and cost on a suite of a grid, beside the published ones."""
     rows = aggregate(runs(name)).set_index(["suite", "algo"])
@@ -129,7 +153,10 @@ def filled(page: str) -> str:
         begin, kind, name, only, end = match.groups()
         if kind == "ppo":
             return f"{begin}{beside(name, only)}{end}"
-        text = learnt(name) if kind == "learnt" else tables(name, only)
+        if kind == "sweep":
+            text = sweep(name, only)
+        else:
+            text = learnt(name) if kind == "learnt" else tables(name, only)
         return f"{begin}\n{text}\n\n{end}"
 
     return BLOCK.sub(table, page)
@@ -166,7 +193,7 @@ def main() -> None:
         path.write_text(text)
         print(path)
         for _, kind, name, only, _ in BLOCK.findall(text):
-            if only or kind == "learnt":
+            if only or kind != "runs":
                 continue
             # Drawn is what the tables have: the last ten epochs, not the last one.
             found = runs(name)

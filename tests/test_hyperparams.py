@@ -320,8 +320,11 @@ DIFFERENT = {
     },
     "trpo_fac": {
         **LIMIT,
-        "lambda_lr": (0.0001, None),
-        "lambda_epochs": (1, 10),
+        **LAMBDA,
+        "mode": ("statewise", "expected"),
+        "lambda_lr": (0.0001, 0.0005),
+        "lambda_init": (None, 0.3),
+        "proportional_gain": (0.0, 1.0),
         "units": ("cost", None),
     },
     "trpo_ipo": {

@@ -298,7 +298,7 @@ TABLE = {
 # Where the default is another one: (the paper's, ours).
 LIMIT = {"cost_limit": (0.0, 2.0)}
 LAMBDA = {"cost_gae_lambda": (0.97, 0.5)}
-AIM = {"margin_lr": (0.0, None), "recovery": (1.0, None)}
+MARGIN = {"margin_lr": (0.0, None)}
 DIFFERENT = {
     "trpo_sl": {
         **LIMIT,
@@ -307,8 +307,8 @@ DIFFERENT = {
     },
     "trpo_usl": {**LIMIT, "correction_penalty": (0.0, None)},
     "trpo": {},
-    "cpo": {**LIMIT, **LAMBDA, **AIM},
-    "pcpo": {**LIMIT, **LAMBDA, **AIM, "line_search": (False, True)},
+    "cpo": {**LIMIT, **LAMBDA, **MARGIN, "recovery": (1.0, None)},
+    "pcpo": {**LIMIT, **LAMBDA, **MARGIN, "line_search": (False, True)},
     "trpo_lag": {
         **LIMIT,
         **LAMBDA,

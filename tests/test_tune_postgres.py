@@ -13,6 +13,8 @@ import pytest
 from kill_tuner import campaign, faults
 from optuna.trial import TrialState
 from postgres import Server, free_port, programs, running
+from sqlalchemy import create_engine, text
+from sqlalchemy.exc import PendingRollbackError
 
 from sb3_guard import tune
 from sb3_guard.zoo import studies, trials
@@ -167,3 +169,12 @@ def test_a_database_that_is_not_there_is_not_waited_for(cluster, tmp_path, capsy
     url = cluster.url.replace("/postgres", "/nowhere")
     assert tune.main([*TOY, "--storage", url, "-f", str(tmp_path)]) == 2
     assert '"nowhere" does not exist' in capsys.readouterr().err
+
+
+def test_a_transaction_that_was_cut_is_an_outage():
+    with create_engine("sqlite://").connect() as connection:
+        connection.execute(text("SELECT 1"))
+        connection.invalidate()
+        with pytest.raises(PendingRollbackError) as cut:
+            connection.execute(text("SELECT 1"))
+    assert studies._is_outage(cut.value)

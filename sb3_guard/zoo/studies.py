@@ -388,11 +388,16 @@ def _cause(error: BaseException) -> str:
 
 def _is_outage(error: BaseException) -> bool:
     """Whether the database is away, rather than refusing what it was asked."""
-    from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
+    from sqlalchemy.exc import (
+        DBAPIError,
+        InterfaceError,
+        OperationalError,
+        PendingRollbackError,  # the connection was cut within a transaction, as noticed later
+    )
 
     error = _root(error)
     if any(words in _cause(error) for words in ("authentication failed", "does not exist")):
         return False
-    if isinstance(error, OperationalError | InterfaceError):
+    if isinstance(error, OperationalError | InterfaceError | PendingRollbackError):
         return True
     return isinstance(error, DBAPIError) and error.connection_invalidated

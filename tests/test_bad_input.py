@@ -115,7 +115,7 @@ TRAIN = [
     (["-conf", "absent.yml"], ["can't read hyper-parameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown flag --sede", "--seed"]),
-    (["cpo"], ["'cpo' belongs to no flag", "--help"]),
+    (["cpo"], ["'cpo' does not belong to a flag", "--help"]),
     (["-params", "frame_stack:0"], ["frame_stack: 0", "at least 1"]),
     (["-n", "0"], ["-n", "at least 1"]),
     (["-n", "1.5"], ["'1.5' is not a whole number"]),

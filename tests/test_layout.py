@@ -244,11 +244,11 @@ def test_the_farthest_places_of_two_groups():
 @pytest.mark.parametrize(
     ("suite", "params", "words"),
     [
-        ("Goal_Point_8Hazards", {"goal": {"size": 5}}, r"goal.size = 5 holds .* most 4\.53 m"),
-        ("Goal_Drone_0Hazards", {"goal": {"size": 5}}, r"goal.size = 5 holds .* most 4\.55 m"),
-        ("Goal_Arm3_0Hazards", {"goal": {"size": 9}}, r"goal.size = 9 holds .* most 3\.51 m"),
-        ("Goal_Point_8Hazards", {"hazards": {"size": 5}}, "hazards.size = 5 holds the robot"),
-        ("Goal_Point_8Ghosts", {"ghosts": {"size": 5}}, "ghosts.size = 5 holds the robot"),
+        ("Goal_Point_8Hazards", {"goal": {"size": 5}}, r"goal.size = 5 encloses .* most 4\.53 m"),
+        ("Goal_Drone_0Hazards", {"goal": {"size": 5}}, r"goal.size = 5 encloses .* most 4\.55 m"),
+        ("Goal_Arm3_0Hazards", {"goal": {"size": 9}}, r"goal.size = 9 encloses .* most 3\.51 m"),
+        ("Goal_Point_8Hazards", {"hazards": {"size": 5}}, "hazards.size = 5 encloses the robot"),
+        ("Goal_Point_8Ghosts", {"ghosts": {"size": 5}}, "ghosts.size = 5 encloses the robot"),
         ("Push_Point_8Hazards", {"push": {"size": 5}}, "push.size = 5 holds the ball"),
     ],
 )

@@ -279,7 +279,7 @@ def test_an_id_that_says_what_it_is_cannot_be_given_to_something_else():
         "sb3_guard:Goal_Point_7Hazards_noconti",
     ):
         with pytest.raises(
-            ValueError, match=f"'{name}' says by itself .* choose a name that is not"
+            ValueError, match=f"'{name}' is the name of another .* choose a name that is not"
         ):
             register(name, ant)
     assert gymnasium.registry == before
@@ -423,7 +423,7 @@ def test_what_is_registered_again_takes_its_place(tmp_path):
             ("Sled", lambda name: registry.register_robot(name, xml=other)),
             ("Sled", lambda name: registry.register_robot(name, registry.ROBOTS["Ant"])),
         ):
-            with pytest.raises(ValueError, match=f"'{name.capitalize()}' is known already.*other"):
+            with pytest.raises(ValueError, match=f"'{name.capitalize()}' is already taken.*other"):
                 again(name)
 
 
@@ -557,7 +557,7 @@ def test_bad_registrations_are_refused(tmp_path):
             registry.register_robot("Sled", xml=xml, **attributes)
     with pytest.raises(ValueError, match="go with xml"):
         registry.register_robot("Sled", registry.ROBOTS["Ant"], timestep=0.1)
-    with pytest.raises(ValueError, match="'Point' is known already"):
+    with pytest.raises(ValueError, match="'Point' is already taken"):
         registry.register_robot("point", xml=xml)
     with pytest.raises(ValueError, match="must be a subclass of Constraint"):
         registry.register_constraint("Homes", Goal)

@@ -99,7 +99,7 @@ def register(name: str, scenario: str | Path | Mapping[str, Any] | Scenario | No
             agrees = True  # the name says nothing
         if not agrees:
             raise ValueError(
-                f"{name!r} says by itself which environment it is, and it is not the one given: "
+                f"{name!r} is the name of another environment than the one given: "
                 "choose a name that is not of the form Task_Robot_NConstraint"
             )
     known = gymnasium.registry.get(spec.id)

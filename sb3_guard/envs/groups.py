@@ -312,6 +312,6 @@ def check_size(part: Part, footprint: str, size: float) -> None:
     far = math.hypot(part.sim.farthest(footprint, "robot") + robot.offset, rise)
     if size >= far:
         raise ValueError(
-            f"{part.name}.size = {size} holds the robot wherever an episode begins: it is at "
+            f"{part.name}.size = {size} encloses the robot at the start of every episode: it is at "
             f"most {far:.2f} m away; make size smaller, or placements larger"
         )

@@ -282,7 +282,7 @@ def _add(table: dict[str, Any], name: str, part: type[Part]) -> None:
     """Make a part known; one that is defined again, as by a notebook's cell, takes its place."""
     for other, known in table.items():
         if name.lower() == other.lower() and not (name == other and _same(part, known)):
-            raise ValueError(f"{other!r} is known already, as another class: use another name")
+            raise ValueError(f"{other!r} is already taken by another class: use another name")
     if "name" not in vars(part) and not issubclass(part, Robot):
         part.name = name.lower()
     table[name] = part

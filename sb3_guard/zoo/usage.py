@@ -112,7 +112,7 @@ class Parser(argparse.ArgumentParser):
             raise UsageError(f"unknown flag {flag}; {hint}")
         extra = re.match(r"unrecognized arguments: (\S+)", message)
         if extra:
-            raise UsageError(f"{extra[1]!r} belongs to no flag; see --help")
+            raise UsageError(f"{extra[1]!r} does not belong to a flag; see --help")
         raise UsageError(" ".join(message.split()))
 
 

@@ -35,7 +35,7 @@ class Obstacles(Constraint):
 
     usual_keepout: ClassVar[float] = 0.4  # m, of objects that it covers
     free: ClassVar[bool] = False  # whether solid objects can be pushed
-    welded: bool = False  # whether they can be pushed but are pulled back
+    welded = False  # whether they can be pushed but are pulled back
     moves: ClassVar[bool] = False  # whether they leave their places by themselves
     reachable: ClassVar[bool] = False  # whether they lie within the robot's reach
 

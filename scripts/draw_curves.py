@@ -14,24 +14,21 @@ from sb3_guard.zoo.paper import draw
 from sb3_guard.zoo.runs import read_results
 
 DOCS = Path(__file__).parents[1] / "docs"
-# Archives whose runs are shown together, the suite, and whom an algorithm is beside.
+# An archive, the suite, and whom an algorithm is beside.
 GRIDS = (
-    (("safety_gymnasium",), "SafetyPointGoal1-v0", "ppo"),
-    (("goal_point_1m_limit5", "goal_point_1m_limit0"), "Goal_Point_8Hazards", "trpo"),
+    ("safety_gymnasium", "SafetyPointGoal1-v0", "ppo"),
+    ("guard_limit2", "Goal_Point_8Hazards", "trpo"),
 )
 
 
 def main() -> None:
     left = {page.stem for page in DOCS.glob("algorithms/*.md")}
-    for archives, suite, reference in GRIDS:
+    for name, suite, reference in GRIDS:
         with tempfile.TemporaryDirectory() as folder:
-            for name in archives:
-                with tarfile.open(DOCS / "data" / f"{name}.tar.xz") as archive:
-                    archive.extractall(Path(folder, name), filter="data")
+            with tarfile.open(DOCS / "data" / f"{name}.tar.xz") as archive:
+                archive.extractall(folder, filter="data")
             runs = read_results([folder]).runs
             runs = runs[runs["suite"] == suite]
-            positive = runs["cost_limit"] > 0  # of those at several limits
-            runs = runs[positive | (runs["algo"] == reference)]
             for algo in sorted(left & {*runs["algo"]}):
                 shown = runs[runs["algo"].isin([algo, reference])]
                 (drawing,) = draw("curves", Data(shown))

@@ -10,7 +10,7 @@ from sb3_guard.envs.part import Array, Constraint
 
 @dataclass
 class Boundary(Constraint):
-    """Cost 1 while the robot's position is beyond \\|x\\| or \\|y\\| (Ji et al. 2023).
+    """Cost 1 while the robot is outside lines at ±x or ±y (Ji et al. 2023).
 
     None means no boundary.
     """

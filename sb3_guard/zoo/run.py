@@ -246,8 +246,8 @@ class Experiment:
             if not self._lost_a_process():
                 raise  # the pipe of somebody else, such as that of standard output
             raise UsageError(
-                "a process of --vec-env subproc has died, of what is printed above or for want of "
-                f"memory; continue with -i {folder.path}"
+                "a process of --vec-env subproc has died, because of an error printed above or for "
+                f"lack of memory; continue with -i {folder.path}"
             ) from error
         except Exception as error:
             self._blame(error, f"{self.model.num_timesteps} steps")

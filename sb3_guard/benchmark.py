@@ -87,11 +87,11 @@ class Flags(EvaluationFlags, TrainingFlags):
 
         :raises UsageError: nothing says which, or two flags do
         """
-        from sb3_guard.zoo.presets import ALL, preset
+        from sb3_guard.zoo.presets import ALGOS, preset
 
         algos: list[str] | None = None
         if self.algos is not None:
-            algos = [one for algo in self.algos for one in (ALL if algo == "all" else [algo])]
+            algos = [one for algo in self.algos for one in (ALGOS if algo == "all" else [algo])]
         if self.preset is not None:
             if self.suites is not None:
                 raise UsageError("--preset names suites itself; leave out --suites or --preset")
@@ -101,7 +101,7 @@ class Flags(EvaluationFlags, TrainingFlags):
                 "which grid? Give --suites, --preset or --grid, or the folder of a grid to "
                 f"continue: -f FOLDER (there is no {Path(self.log_folder) / RECORD})"
             )
-        return [(suite, algo) for suite in self.suites for algo in algos or ALL]
+        return [(suite, algo) for suite in self.suites for algo in algos or ALGOS]
 
 
 def with_file(flags: Flags) -> Flags:

@@ -18,7 +18,8 @@ from sb3_guard.envs import Scenario
 from sb3_guard.envs.suites.guard import SUITE_ROBOTS
 from sb3_guard.zoo import figures
 from sb3_guard.zoo.figures import INK, Data, fit_costs, inline_svg, pareto_front, save
-from sb3_guard.zoo.paper import ALGOS, FIGURES, OPTIONS, RADAR4, ROBOTS, draw
+from sb3_guard.zoo.paper import FIGURES, draw
+from sb3_guard.zoo.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.report import report
 from sb3_guard.zoo.runs import read_results, select
 from sb3_guard.zoo.statistics import with_safety

@@ -72,12 +72,8 @@ STYLE: dict[Any, Any] = {
 }  # fmt: skip
 
 
-# A figure, or None where there is nothing to draw, and the runs it lacks, for people
-Drawn = tuple[Figure | None, str]
-
-
 class Drawing(NamedTuple):
-    """A figure with its name, and what it lacks."""
+    """A figure with its name, or None where there is nothing to draw, and the runs it lacks."""
 
     name: str
     figure: Figure | None
@@ -318,20 +314,18 @@ def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
     return figure
 
 
-def curves(data: Data, suite: str) -> Drawn:
+def curves(data: Data, suite: str) -> Figure | None:
     """Return, episode cost and cost rate against steps, a figure per suite."""
-    # Which algorithms to run is the user's choice here: others are not missing.
-    figure = curves_of(data, [suite])
-    return figure, "" if figure else f"0.monitor.csv of {suite}"
+    return curves_of(data, [suite])
 
 
-def pareto(data: Data, suite: str) -> Drawn:
+def pareto(data: Data, suite: str) -> Figure | None:
     """Return against cost with the Pareto front and the cost limit, a figure per suite."""
     if not len(data.means[data.means["suite"] == suite].dropna(subset=["M_c", "J_r"])):
-        return None, suite
+        return None
     figure = Figure(figsize=(0.7 * WIDTH, 0.6 * WIDTH), layout="constrained")
     draw_pareto(figure.subplots(), data, suite)
-    return figure, ""
+    return figure
 
 
 def _reached(values: np.ndarray, axis: int, tau: np.ndarray, score: str) -> np.ndarray:
@@ -343,12 +337,11 @@ def _reached(values: np.ndarray, axis: int, tau: np.ndarray, score: str) -> np.n
     return 1 - part if score == "reward" else part
 
 
-def profiles(data: Data) -> Drawn:
+def profiles(data: Data) -> Figure | None:
     """Performance profiles: the part of all runs that reach a score, with 95 % bands."""
     single = normalize(data.runs, data.means)
-    missing = data.missing(data.suites, [REFERENCE])
     if single[list(SCORES.values())].isna().all(axis=None):
-        return None, missing
+        return None
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     for axis, score in zip(figure.subplots(1, 3), SCORES.values(), strict=True):
         finite = single[score].dropna()
@@ -367,16 +360,15 @@ def profiles(data: Data) -> Drawn:
         sign = "≥" if score == "reward" else "≤"
         axis.set(xlabel=f"{SCORE_AXES[score]}, τ", ylabel=f"part of runs {sign} τ")
         axis.set_ylim(-0.02, 1.02)
-    return figure, missing
+    return figure
 
 
-def iqm(data: Data) -> Drawn:
+def iqm(data: Data) -> Figure | None:
     """Interquartile means of the scores over runs and suites, with 95 % intervals."""
-    missing = data.missing(data.suites, [REFERENCE])
     table = overall(data.runs, data.means).set_index("algo")
     table = table.dropna(subset=[f"{score}_iqm" for score in SCORES.values()], how="all")
     if not len(table):
-        return None, missing
+        return None
     figure = Figure(figsize=(WIDTH, 1.2 + 0.32 * len(table)), layout="constrained")
     rows = np.arange(len(table))[::-1]
     for axis, score in zip(figure.subplots(1, 3, sharey=True), SCORES.values(), strict=True):
@@ -393,7 +385,7 @@ def iqm(data: Data) -> Drawn:
         axis.margins(0.06)
         axis.axvline(1, color=INK, linewidth=1, linestyle=(0, (1, 2)))
         axis.grid(axis="y", visible=False)
-    return figure, missing
+    return figure
 
 
 # Files

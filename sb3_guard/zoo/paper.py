@@ -1,7 +1,7 @@
-"""The figures of the GUARD paper's questions, Q1–Q8 (arXiv 2305.13681), and their suites."""
+"""The figures of the GUARD paper's questions, Q1–Q8 (arXiv 2305.13681)."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import matplotlib as mpl
@@ -19,7 +19,6 @@ from sb3_guard.zoo.figures import (
     WIDTH,
     Data,
     Drawing,
-    Drawn,
     Look,
     curves,
     curves_of,
@@ -29,29 +28,10 @@ from sb3_guard.zoo.figures import (
     pareto,
     profiles,
 )
+from sb3_guard.zoo.presets import GHOSTS, HAZARDS, MAIN8, OPTIONS, PRESETS, RADAR4, ROBOTS
 from sb3_guard.zoo.runs import REFERENCE
 from sb3_guard.zoo.statistics import SCORES
 
-ALGOS = (
-    "trpo", "cpo", "pcpo", "trpo_lag", "trpo_fac", "trpo_ipo", "trpo_sl", "trpo_usl",
-)  # fmt: skip
-MAIN8 = (
-    "Goal_Point_8Hazards", "Goal_Walker_8Hazards", "Goal_Arm3_8Hazards", "Goal_Drone_8Hazards",
-    "Goal_Point_8Ghosts", "Push_Point_8Hazards", "Chase_Point_8Hazards", "Defense_Point_8Hazards",
-)  # fmt: skip
-RADAR4 = ("Goal_Point_8Hazards", "Goal_Point_8Ghosts", "Goal_Ant_8Hazards", "Goal_Ant_8Ghosts")
-# The robots by degrees of freedom, the number of actions
-ROBOTS = {
-    "Point": 2, "Swimmer": 2, "Arm3": 3, "Drone": 4, "Hopper": 5, "Arm6": 6, "Humanoid": 6,
-    "Ant": 8, "Walker": 10,
-}  # fmt: skip
-OPTIONS = {
-    "Goal\nHazards": "Goal_{}_8Hazards",
-    "Goal\nGhosts": "Goal_{}_8Ghosts",
-    "Push": "Push_{}_8Hazards",
-    "Chase": "Chase_{}_8Hazards",
-    "Defense": "Defense_{}_8Hazards",
-}
 SPOKES = {"reward": "reward", "cost": "cost", "cost_rate": "cost\nrate"}
 POLYGONS = {
     score: Look(score.replace("_", " "), color, dashes, "o")
@@ -59,22 +39,17 @@ POLYGONS = {
 }
 
 
-def q1(data: Data) -> Drawn:
+def q1(data: Data) -> Figure | None:
     """Overall results: learning curves of the paper's eight main suites."""
-    return curves_of(data, MAIN8), data.missing(MAIN8, ALGOS)
+    return curves_of(data, MAIN8)
 
 
-def q2(data: Data) -> Drawn:
+def q2(data: Data) -> Figure | None:
     """Difficulty of constraints: TRPO's cost per robot, and every algorithm, Hazards to Ghosts."""
-    pair = ("Hazards", "Ghosts")
-    bars = [f"Goal_{robot}_8{kind}" for robot in ROBOTS for kind in pair]
-    slopes = [f"Goal_Point_8{kind}" for kind in pair]
-    lacks = (data.missing(bars, [REFERENCE]), data.missing(slopes, ALGOS[1:]))
-    missing = "; ".join(filter(None, lacks))
-    have = data.scores.index
+    pair, have = ("Hazards", "Ghosts"), data.scores.index
     robots = [r for r in ROBOTS if any((f"Goal_{r}_8{k}", REFERENCE) in have for k in pair)]
     if not robots:
-        return None, missing
+        return None
     figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
     left, *others = figure.subplots(1, 3, width_ratios=(1.7, 1, 1))
     for offset, kind, color, hatch in zip((-0.2, 0.2), pair, COLORS, ("", "//"), strict=False):
@@ -89,12 +64,12 @@ def q2(data: Data) -> Drawn:
     left.grid(axis="x", visible=False)
     for axis, score in zip(others, ("reward", "cost"), strict=True):
         for algo, look in data.looks.items():
-            values = [data.score(suite, algo, score) for suite in slopes]
+            values = [data.score(suite, algo, score) for suite in (HAZARDS[0], GHOSTS[0])]
             if algo not in data.families and not np.isnan(values).all():
                 axis.plot(pair, values, marker=look.marker, **look.line)
         axis.set(ylabel=SCORE_AXES[score], title="Goal, Point", xlim=(-0.3, 1.3))
         mark_trpo(axis)
-    return figure, missing
+    return figure
 
 
 def mark_trpo(axis: Axes) -> None:
@@ -104,13 +79,12 @@ def mark_trpo(axis: Axes) -> None:
     axis.set_ylim(min(0, low), max(1.06, high))
 
 
-def q3(data: Data) -> Drawn:
+def q3(data: Data) -> Figure | None:
     """Families of algorithms: reward, cost and cost rate on four suites, a polygon per family."""
-    missing = data.missing(RADAR4, ALGOS)
     have = data.by_family.index.get_level_values("suite")
     shown = [s for s in RADAR4 if s in have and not np.isnan(data.score(s, REFERENCE, "cost"))]
     if not shown:
-        return None, missing
+        return None
     spiders = {
         suite: {
             family: [data.score(suite, family, score) for score in SCORES.values()]
@@ -119,7 +93,7 @@ def q3(data: Data) -> Drawn:
         for suite in shown
     }
     spokes = {suite: [*SPOKES.values()] for suite in shown}
-    return draw_spiders(spiders, spokes, data.looks), missing
+    return draw_spiders(spiders, spokes, data.looks)
 
 
 def draw_spiders(
@@ -161,10 +135,9 @@ def draw_spiders(
     return figure
 
 
-def by_robot(data: Data, lines: Iterable[str], algos: Sequence[str]) -> Drawn:
+def by_robot(data: Data, lines: Iterable[str]) -> Figure | None:
     """Scores on Goal with 8 hazards, robots by degrees of freedom."""
-    suites = {robot: f"Goal_{robot}_8Hazards" for robot in ROBOTS}
-    missing = data.missing(suites.values(), (REFERENCE, *algos))
+    suites = dict(zip(ROBOTS, HAZARDS, strict=True))
     lines = [line for line in lines if line in data.looks]
     shown = [
         robot
@@ -172,7 +145,7 @@ def by_robot(data: Data, lines: Iterable[str], algos: Sequence[str]) -> Drawn:
         if any(not np.isnan(data.score(suite, line, s)) for line in lines for s in SCORES.values())
     ]
     if not shown:
-        return None, missing
+        return None
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     ticks = [f"{robot}\n{ROBOTS[robot]}" for robot in shown]
     for axis, score in zip(figure.subplots(1, 2), ("reward", "cost"), strict=True):
@@ -183,33 +156,32 @@ def by_robot(data: Data, lines: Iterable[str], algos: Sequence[str]) -> Drawn:
         axis.tick_params(axis="x", labelsize=7)
         axis.margins(x=0.06)
         mark_trpo(axis)
-    return figure, missing
+    return figure
 
 
-def q4(data: Data) -> Drawn:
+def q4(data: Data) -> Figure | None:
     """Task complexity: each family on robots of more and more degrees of freedom."""
-    return by_robot(data, data.families, ALGOS[1:])
+    return by_robot(data, data.families)
 
 
-def q5(data: Data) -> Drawn:
+def q5(data: Data) -> Figure | None:
     """Adaptive multiplier: TRPO-Lagrangian against TRPO-FAC."""
-    return by_robot(data, ("trpo_lag", "trpo_fac"), ("trpo_lag", "trpo_fac"))
+    return by_robot(data, ("trpo_lag", "trpo_fac"))
 
 
-def q6(data: Data) -> Drawn:
+def q6(data: Data) -> Figure | None:
     """Feasibility projection: CPO against PCPO."""
-    return by_robot(data, ("cpo", "pcpo"), ("cpo", "pcpo"))
+    return by_robot(data, ("cpo", "pcpo"))
 
 
-def q7(data: Data) -> Drawn:
+def q7(data: Data) -> Figure | None:
     """Linearised cost dynamics: TRPO-USL against TRPO-SL."""
-    return by_robot(data, ("trpo_usl", "trpo_sl"), ("trpo_usl", "trpo_sl"))
+    return by_robot(data, ("trpo_usl", "trpo_sl"))
 
 
-def q8(data: Data) -> Drawn:
+def q8(data: Data) -> Figure | None:
     """Every algorithm, every task: five task options, each a mean over the robots there are."""
     suites = {o: [name.format(robot) for robot in ROBOTS] for o, name in OPTIONS.items()}
-    missing = data.missing([suite for names in suites.values() for suite in names], ALGOS)
     spiders: dict[str, dict[str, list[float]]] = {}
     spokes: dict[str, list[str]] = {}
     for algo in (a for a in data.looks if a != REFERENCE and a not in data.families):
@@ -228,11 +200,11 @@ def q8(data: Data) -> Drawn:
             option if n == len(ROBOTS) else f"{option}\n({n}/{len(ROBOTS)})"
             for option, n in zip(suites, number, strict=True)
         ]
-    return draw_spiders(spiders, spokes, POLYGONS) if spiders else None, missing
+    return draw_spiders(spiders, spokes, POLYGONS) if spiders else None
 
 
 PER_SUITE = (curves, pareto)
-FIGURES: dict[str, Callable[..., Drawn]] = {
+FIGURES: dict[str, Callable[..., Figure | None]] = {
     function.__name__: function
     for function in (*PER_SUITE, profiles, iqm, q1, q2, q3, q4, q5, q6, q7, q8)
 }
@@ -245,9 +217,14 @@ def draw(kind: str, data: Data) -> list[Drawing]:
     :param kind: a key of :data:`FIGURES`
     """
     function, drawings = FIGURES[kind], []
+    # Which algorithms to run on a suite of their own is the user's choice: no others are missing.
+    blocks = () if function in PER_SUITE else PRESETS.get(kind, ((data.suites, [REFERENCE]),))
     with mpl.rc_context(STYLE):
         for suite in data.suites if function in PER_SUITE else [""]:
-            figure, missing = function(data, *([suite] if suite else []))
+            figure = function(data, *([suite] if suite else []))
+            missing = "; ".join(filter(None, (data.missing(*block) for block in blocks)))
+            if suite and figure is None:
+                missing = f"episodes of {suite}"
             if figure is not None:
                 finish(figure, missing)
             name = re.sub("[/:]", "-", f"{kind}_{suite}" if suite else kind)

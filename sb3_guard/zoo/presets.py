@@ -1,40 +1,51 @@
-"""The paper's grids, by the question that they answer: which suites, with which algorithms."""
+"""The questions of the GUARD paper (arXiv 2305.13681): which suites and algorithms each needs.
+
+``benchmark --preset`` trains them, and :mod:`sb3_guard.zoo.paper` draws what came of it.
+"""
 
 from collections.abc import Sequence
 
-from sb3_guard.envs.suites import env_ids
-from sb3_guard.envs.suites.guard import LADDER, SUITE_ROBOTS
+from sb3_guard.envs.suites.guard import LADDER
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.paper import ALGOS as ALL
-from sb3_guard.zoo.paper import MAIN8, RADAR4
 from sb3_guard.zoo.usage import UsageError
 
-PAPER45 = tuple(
-    env_id for env_id in env_ids("guard") if "_8Hazards" in env_id or env_id.startswith("Goal_")
-)
-OVERVIEW = tuple(f"{suite}-v0" for suite in MAIN8)
-RADAR = tuple(f"{suite}-v0" for suite in RADAR4)
-HAZARDS = tuple(f"Goal_{robot}_8Hazards-v0" for robot in SUITE_ROBOTS)
-GHOSTS = tuple(f"Goal_{robot}_8Ghosts-v0" for robot in SUITE_ROBOTS)
-RUNGS = tuple(
-    f"Goal_Point_{number}{constraint}-v0"
-    for constraint in ("Hazards", "Ghosts")
-    for number in LADDER
-)
+ALGOS = (
+    "trpo", "cpo", "pcpo", "trpo_lag", "trpo_fac", "trpo_ipo", "trpo_sl", "trpo_usl",
+)  # fmt: skip
+# The robots by degrees of freedom, the number of actions
+ROBOTS = {
+    "Point": 2, "Swimmer": 2, "Arm3": 3, "Drone": 4, "Hopper": 5, "Arm6": 6, "Humanoid": 6,
+    "Ant": 8, "Walker": 10,
+}  # fmt: skip
+OPTIONS = {
+    "Goal\nHazards": "Goal_{}_8Hazards",
+    "Goal\nGhosts": "Goal_{}_8Ghosts",
+    "Push": "Push_{}_8Hazards",
+    "Chase": "Chase_{}_8Hazards",
+    "Defense": "Defense_{}_8Hazards",
+}
+PAPER45 = [suite.format(robot) for suite in OPTIONS.values() for robot in ROBOTS]
+HAZARDS, GHOSTS = PAPER45[: len(ROBOTS)], PAPER45[len(ROBOTS) : 2 * len(ROBOTS)]
+MAIN8 = (
+    "Goal_Point_8Hazards", "Goal_Walker_8Hazards", "Goal_Arm3_8Hazards", "Goal_Drone_8Hazards",
+    "Goal_Point_8Ghosts", "Push_Point_8Hazards", "Chase_Point_8Hazards", "Defense_Point_8Hazards",
+)  # fmt: skip
+RADAR4 = ("Goal_Point_8Hazards", "Goal_Point_8Ghosts", "Goal_Ant_8Hazards", "Goal_Ant_8Ghosts")
+RUNGS = [f"Goal_Point_{number}{kind}" for kind in ("Hazards", "Ghosts") for number in LADDER]
 
 # Blocks of suites × algorithms. Scores are relative to TRPO's, so it is part of each.
-PRESETS: dict[str, tuple[tuple[tuple[str, ...], tuple[str, ...]], ...]] = {
-    "paper45": ((PAPER45, ALL),),
-    "main8": ((OVERVIEW, ALL),),
-    "q1": ((OVERVIEW, ALL),),
-    "q2": ((HAZARDS + GHOSTS, ("trpo",)), ((HAZARDS[0], GHOSTS[0]), ALL)),
-    "q3": ((RADAR, ALL),),
-    "q4": ((HAZARDS, ALL),),
+PRESETS: dict[str, tuple[tuple[Sequence[str], Sequence[str]], ...]] = {
+    "paper45": ((PAPER45, ALGOS),),
+    "main8": ((MAIN8, ALGOS),),
+    "q1": ((MAIN8, ALGOS),),
+    "q2": ((HAZARDS + GHOSTS, ALGOS[:1]), ((HAZARDS[0], GHOSTS[0]), ALGOS[1:])),
+    "q3": ((RADAR4, ALGOS),),
+    "q4": ((HAZARDS, ALGOS),),
     "q5": ((HAZARDS, ("trpo", "trpo_lag", "trpo_fac")),),
     "q6": ((HAZARDS, ("trpo", "cpo", "pcpo")),),
-    "q7": ((HAZARDS, ("trpo", "trpo_sl", "trpo_usl")),),
-    "q8": ((PAPER45, ALL),),
-    "ladder": ((RUNGS, ALL),),
+    "q7": ((HAZARDS, ("trpo", "trpo_usl", "trpo_sl")),),
+    "q8": ((PAPER45, ALGOS),),
+    "ladder": ((RUNGS, ALGOS),),
 }
 
 
@@ -47,11 +58,8 @@ def preset(name: str, algos: Sequence[str] | None = None) -> list[tuple[str, str
     """
     if name not in PRESETS:
         raise UsageError(f"unknown preset {name!r}; {did_you_mean(name, PRESETS)}")
-    return list(
-        dict.fromkeys(
-            (suite, algo)
-            for suites, needed in PRESETS[name]
-            for suite in suites
-            for algo in algos or needed
-        )
-    )
+    blocks = PRESETS[name]
+    pairs = [
+        (f"{one}-v0", algo) for suites, own in blocks for one in suites for algo in algos or own
+    ]
+    return list(dict.fromkeys(pairs))

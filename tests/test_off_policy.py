@@ -11,6 +11,7 @@ from cost_envs import CostPoint
 from gymnasium import spaces
 from known_optima import Outcomes, problems
 from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
@@ -167,6 +168,21 @@ def test_multipliers_follow_ended_episodes_once_and_not_before_their_time(cls: A
     model.learn(180, callback=look)
     assert seen[100] == 0.0  # the episodes until then broke the limit as well
     assert [seen[n] for n in (101, 121, 125, 151)] == pytest.approx([0.1, 0.2, 0.2, 0.3])
+
+
+def test_a_callback_that_stops_loses_no_cost() -> None:
+    """Stopped at the last step of an episode, which SB3 does not store: the episode has ended."""
+
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            return self.num_timesteps % 30 != 0
+
+    model = SACLag("MlpPolicy", points(1), **settings())
+    for _ in range(2):
+        model.learn(100, Stop(), reset_num_timesteps=False)
+    assert model.num_timesteps == 60 and model.running_lengths.tolist() == [0]
+    assert model.total_cost == pytest.approx(sum(float(cost[0]) for cost in model.ep_cost_buffer))
+    assert len(model.ep_cost_buffer) == 2
 
 
 @both

@@ -262,6 +262,10 @@ class Constrained(BaseAlgorithm):
             self.running_costs[i] = self.running_charges[i] = 0.0
             self.running_lengths[i] = 0
 
+    def _count_last_step(self, callback: BaseCallback) -> None:
+        """Read the infos of a step at which a callback stopped training: SB3 only counts it."""
+        self._update_info_buffer(callback.locals["infos"], callback.locals["dones"])
+
     def _estimate_costs(self, rate: np.ndarray | None = None) -> bool:
         """Renew ``costs`` from the episodes that ended since the last time.
 

@@ -179,8 +179,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             if self.uses_cost_critic:
                 self._estimate_advantages()
         else:
-            # A callback stopped training; SB3 has then counted the step but not read its infos.
-            self._update_info_buffer(callback.locals["infos"], callback.locals["dones"])
+            self._count_last_step(callback)
         self.timing["collect"] = time.perf_counter() - started
         return full
 

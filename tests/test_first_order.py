@@ -318,6 +318,9 @@ def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
         setattr(model, name, counting(name))
     model.learn(128)
     assert calls == {"loss": 2, "projection": 8}
+    logged = model.logger.name_to_value
+    assert logged["train/projection_kl"] < model.target_kl < logged["train/approx_kl"]
+    assert logged["train/n_updates"] == model._n_updates == 5
 
 
 # Bad input

@@ -95,9 +95,6 @@ class FirstOrder(CostRollouts, PPO):
         values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
         variance = explained_variance(values.flatten(), returns.flatten())
         self.logger.record("train/explained_variance", variance)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        if hasattr(self.policy, "log_std"):
-            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         self.fit_cost_critic()
 
     def centre_costs(self) -> np.ndarray:
@@ -124,7 +121,8 @@ class FirstOrder(CostRollouts, PPO):
         """Take passes of minibatches down a loss.
 
         :param loss: called as :meth:`loss` is
-        :param values: whether the reward critic and the entropy bonus learn along
+        :param values: whether the reward critic and the entropy bonus learn along; a step without
+            them is logged as a projection
         :param start: the policy whose distance stops the passes; None for the one that acted
         """
         self.policy.set_training_mode(True)
@@ -137,6 +135,9 @@ class FirstOrder(CostRollouts, PPO):
                 break
         for name, numbers in history.items():
             self.logger.record(f"train/{name}", float(np.mean(numbers)))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
 
     def _descend_once(
         self,
@@ -146,7 +147,9 @@ class FirstOrder(CostRollouts, PPO):
         start: Before | None,
     ) -> bool:
         """One pass; whether it was the last."""
-        history["approx_kl"] = []  # of the last pass alone, as SB3 logs it
+        names = "policy_gradient_loss", "approx_kl"
+        loss_name, kl_name = names if values else ("projection_loss", "projection_kl")
+        history[kl_name] = []  # of the last pass alone, as SB3 logs it
         policy = distribution_of(self.policy)
         parameters = list(self.policy.parameters())
         for batch in self.rollout_buffer.get(self.batch_size):
@@ -161,15 +164,15 @@ class FirstOrder(CostRollouts, PPO):
                 advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
                 batch = batch._replace(advantages=advantages)
             ratio = th.exp(log_prob - batch.old_log_prob)
-            losses = {"policy_gradient_loss": loss(batch, ratio, distribution)}
-            total = losses["policy_gradient_loss"]
+            total = loss(batch, ratio, distribution)
+            losses = {loss_name: total}
             if values:
                 losses["entropy_loss"] = -th.mean(-log_prob if entropy is None else entropy)
                 losses["value_loss"] = self._value_loss(batch, predicted.flatten())
                 total = total + self.ent_coef * losses["entropy_loss"]
                 total = total + self.vf_coef * losses["value_loss"]
             divergence = self._divergence(batch, log_prob.detach(), start)
-            for name, value in {**losses, "approx_kl": divergence}.items():
+            for name, value in {**losses, kl_name: divergence}.items():
                 history.setdefault(name, []).append(value.item())
             too_far = self.target_kl is not None and float(divergence) > 1.5 * self.target_kl
             if self.kl_stop == "minibatch" and too_far:

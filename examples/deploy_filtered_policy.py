@@ -8,7 +8,7 @@ from sb3_guard.algorithms.common.policies import FilteredPolicy
 
 env = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=0)
 # After a third of the training, the layer corrects actions whose predicted cost is above 0.
-model = TRPOSL("MlpPolicy", env, n_steps=1000, seed=0).learn(300_000)
+model = TRPOSL("MlpPolicy", env, n_steps=1000, cost_limit=0.0, seed=0).learn(300_000)
 model.policy.save("filtered_policy.pt")
 
 # The file holds the network and its layer: no algorithm, critic or environment is needed.

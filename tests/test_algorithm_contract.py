@@ -29,7 +29,17 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_guard.algorithms import ALGORITHMS, CPO, RCPO, TRPO, TRPOFAC, TRPOSL, TRPOUSL, TrustRegion
+from sb3_guard.algorithms import (
+    ALGORITHMS,
+    CPO,
+    RCPO,
+    TRPO,
+    TRPOFAC,
+    TRPOSL,
+    TRPOUSL,
+    PPOLag,
+    TrustRegion,
+)
 from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.buffers import CostRolloutBuffer
 from sb3_guard.algorithms.common.critics import CostCritic
@@ -72,7 +82,7 @@ IMAGE = spaces.Box(0, 255, (36, 36, 1), np.uint8)
 
 
 def small(cls: type[TrustRegion], env: Any, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
-    defaults: dict[str, Any] = {"n_steps": 40, "seed": 0, "device": "cpu"}
+    defaults: dict[str, Any] = {"n_steps": 40, "seed": 0, "device": "cpu", "cost_limit": 0.0}
     if issubclass(cls, FirstOrder):
         # Whole rollouts: none here is larger than this.
         defaults |= {"n_epochs": kwargs.pop("n_critic_updates", 3), "batch_size": 10_000}
@@ -473,6 +483,7 @@ def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -
         ({"learning_rate": True}, "learning_rate=True"),
         ({"learning_rate": float("inf")}, "learning_rate=inf"),
         ({"missing_cost": "ignore"}, "missing_cost='ignore'"),
+        ({"normalize_advantage": "no"}, "normalize_advantage='no': must be True or False"),
         ({"cost_keys": "cost"}, r"cost_keys='cost'.*sequence"),
         ({"cost_keys": ()}, "cost_keys="),
         ({"cost_keys": ("a", "a")}, "different names"),
@@ -487,6 +498,15 @@ def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -
 def test_bad_values_are_named(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         small(CPO, points(1), **kwargs)
+
+
+def test_without_a_limit_it_says_what_that_means(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="PPOLag without cost_limit: it is 0") as record:
+        PPOLag("MlpPolicy", points(), n_steps=40, batch_size=80).save(tmp_path / "model")
+        PPOLag.load(tmp_path / "model")
+        PPOLag("MlpPolicy", points(), n_steps=40, batch_size=80, cost_limit=0.0)
+        TRPO("MlpPolicy", points(), n_steps=40)
+    assert len(record) == 1
 
 
 def test_a_limit_set_later_is_the_limit() -> None:

@@ -556,8 +556,8 @@ def test_costs_below_zero_are_named_once_where_they_cant_be_learnt() -> None:
     assert len([each for each in record if "below zero" in str(each.message)]) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        make(TRPOUSL, n_critic_updates=1).learn(80)
-        make(TRPOSL, points(2, cost_scale=-1.0), n_critic_updates=1).learn(80)
+        make(TRPOUSL, n_critic_updates=1, cost_limit=1.0).learn(80)
+        make(TRPOSL, points(2, cost_scale=-1.0), n_critic_updates=1, cost_limit=1.0).learn(80)
 
 
 def test_the_cost_model_learns_from_executed_actions() -> None:

@@ -195,7 +195,8 @@ def test_focops_loss_by_hand() -> None:
 @pytest.mark.parametrize("kind", ["forward", "reverse"])
 def test_cup_projection_by_hand(kind: str) -> None:
     """(1 - 0.9·0.5)/(1 - 0.9) = 5.5; ν A_C = 1, -2; ratio · that = 1.2, -1; KL = 0.02, 0.08."""
-    model = make(CUP, gamma=0.9, gae_lambda=0.5, projection_kl=kind)
+    given = {"cost_gamma": 0.9, "cost_gae_lambda": 0.5}  # the rewards' are others
+    model = make(CUP, gamma=1.0, projection_kl=kind, **given)
     assert model.factor == pytest.approx(5.5)
     model._improved, model._price = Given(th.zeros(2, 1)), th.tensor([0.5, 0.25])
     rows = batch([9.0, 9.0], [[1.0, 2.0], [-2.0, -4.0]])
@@ -330,6 +331,7 @@ def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
     ("cls", "kwargs", "message"),
     [
         (CUP, {"gamma": 1.0}, r"gamma=1.0: CUP weighs costs by .*use a discount factor below 1"),
+        (CUP, {"cost_gamma": 1.0}, "cost_gamma=1.0: CUP weighs costs by"),
         (CUP, {"projection_kl": "both"}, "projection_kl='both': must be 'forward' or 'reverse'"),
         (PPOLag, {"lambda_init": 2.0, "lambda_max": 1.0}, "lambda_max=1.0: .* lambda_init=2.0"),
         (PPOLag, {"cost_limit": [1.0, 2.0]}, r"cost_limit=.*one for each of the 1 cost keys"),

@@ -47,16 +47,18 @@ class CUP(Lagrangian, FirstOrder):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        if self.gamma == 1.0:
+        name = "gamma" if self.cost_gamma is None else "cost_gamma"
+        if getattr(self, name) == 1.0:
             raise ValueError(
-                "gamma=1.0: CUP weighs costs by (1 - γλ)/(1 - γ), which has no bound there; use a "
-                "discount factor below 1, such as 0.99, or PPOLag, which takes any"
+                f"{name}=1.0: CUP weighs costs by (1 - γλ)/(1 - γ), which has no bound there; use "
+                "a discount factor below 1, such as 0.99, or PPOLag, which takes any"
             )
 
     @property
     def factor(self) -> float:
-        """(1 - γλ)/(1 - γ), with the discount and the λ of the advantages."""
-        return (1.0 - self.gamma * self.gae_lambda) / (1.0 - self.gamma)
+        """(1 - γλ)/(1 - γ), with the discount and the λ of the cost advantages."""
+        gamma, gae_lambda = self.rollout_buffer.cost_gamma, self.rollout_buffer.cost_gae_lambda
+        return (1.0 - gamma * gae_lambda) / (1.0 - gamma)
 
     def train(self) -> None:
         self._price = th.as_tensor(self.price(self.centre_costs()), device=self.device)

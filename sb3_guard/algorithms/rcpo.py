@@ -1,12 +1,11 @@
 """RCPO: natural gradient steps on the penalised reward, the penalty learnt slowly."""
 
-from typing import Any
-
 import numpy as np
 import torch as th
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.advantage import discounted_returns
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.lagrangian import inverse
 from sb3_guard.algorithms.common.trust_region import PenalizedTrustRegion, Trial, TrustRegion
@@ -29,10 +28,11 @@ class RCPO(PenalizedTrustRegion):
 
     label, family, paper = "RCPO", "Lagrangian", "Tessler et al. 2019"
 
-    def __init__(self, *args: Any, penalized_reward: bool = False, **kwargs: Any) -> None:
-        self.penalized_reward = penalized_reward
-        self.uses_cost_critic = not penalized_reward
-        super().__init__(*args, **kwargs)
+    penalized_reward: bool = hyperparameter(False)
+
+    def _setup_model(self) -> None:
+        self.uses_cost_critic = not self.penalized_reward
+        super()._setup_model()
 
     def train(self) -> None:
         if self.penalized_reward:

@@ -46,6 +46,9 @@ class Hyperparameter(NamedTuple):
             return
         if typing.get_origin(hint) is typing.Literal:
             check_choice(name, value, *typing.get_args(hint))
+        elif kinds == {bool}:
+            if not isinstance(value, bool | np.bool_):
+                raise ValueError(f"{name}={value!r}: must be True or False")
         elif kinds == {int}:
             check_integer(name, value, 1 if self.low is None else int(self.low))
         elif kinds == {float}:

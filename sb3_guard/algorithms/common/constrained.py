@@ -92,6 +92,15 @@ class Constrained(BaseAlgorithm):
         return super().__new__(cls)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._warned: set[str] = set()
+        # `load` builds the model later, with the limit of the file.
+        new = kwargs.get("_init_setup_model", True)
+        if self.constrained and new and "cost_limit" not in kwargs:
+            self._warn_once(
+                f"{type(self).__name__} without cost_limit: it is 0, no cost at all, which hardly "
+                "any policy keeps; choose a positive one, such as half of what an episode of TRPO "
+                "or PPO costs, or write cost_limit=0.0"
+            )
         for name, one in stated(type(self)).items():
             setattr(self, name, kwargs.pop(name, one.default))
 
@@ -113,7 +122,6 @@ class Constrained(BaseAlgorithm):
         #: Whether the estimate has not been followed yet by what follows it (a multiplier)
         self.costs_are_new = False
         self.timing: dict[str, float] = {}
-        self._warned: set[str] = set()
         self._begin_statistics()
         super().__init__(*args, **kwargs)
 

@@ -160,7 +160,7 @@ def benchmark(flags: Flags) -> int:
 
     from sb3_guard.zoo.grid import expand, plan, run_grid, try_out
 
-    runs = expand(flags.pairs(), flags.seeds, of_a_run.values(), flags.scale)
+    runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
     plan(runs)
     if flags.dry_run:
         show_plan(runs)

@@ -63,7 +63,7 @@ def train(flags: Flags) -> int:
 
     from sb3_guard.zoo.grid import expand, plan, run_grid, try_out
 
-    runs = expand([(run.env, run.algo)], flags.seeds, run.values())
+    runs = expand([(run.env, run.algo)], flags.seeds, run)
     plan(runs)
     try_out(runs)
     again = "continue with the same command"

@@ -290,10 +290,10 @@ def test_corrupt_model(capsys, run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (["--seed", "2"], ["--seed 2 contradicts --seed 1"]),
-        (["--algo", "trpo"], ["--algo trpo contradicts --algo cpo"]),
-        (["--env", "NoCost-v0"], ["--env NoCost-v0 contradicts --env CostPoint-v0"]),
-        (["-params", "n_steps:31"], ["-params n_steps:31 contradicts -params n_steps:30"]),
+        (["--seed", "2"], ["seed = 2 contradicts 1"]),
+        (["--algo", "trpo"], ["algo = trpo contradicts cpo"]),
+        (["--env", "NoCost-v0"], ["env = NoCost-v0 contradicts CostPoint-v0"]),
+        (["-params", "n_steps:31"], ["n_steps = 31 contradicts 30"]),
         (["-params", "gama:1"], ["no hyper-parameter 'gama'", "'gamma'"]),
         (["-f", "elsewhere"], ["contradicts"]),
         (["-n", "30"], ["-n 30 is less than the 60 steps"]),

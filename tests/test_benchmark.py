@@ -116,12 +116,11 @@ def test_presets_are_the_papers():
 
 @pytest.mark.parametrize("name", ["q2", "ladder"])
 def test_every_run_of_a_preset_is_valid(name, tmp_path):
-    args = {**RunFlags().values(), "log_folder": str(tmp_path)}
-    runs = grid.expand(preset(name), [0, 1], args)
+    runs = grid.expand(preset(name), [0, 1], RunFlags(log_folder=str(tmp_path)))
     assert len({run.path for run in runs}) == len(runs) == 2 * len(preset(name))
-    assert [run.number for run in runs] == [1] * (len(runs) // 2) + [2] * (len(runs) // 2)
+    assert [run.flags.seed + 1 for run in runs] == [1] * (len(runs) // 2) + [2] * (len(runs) // 2)
     for run in runs:  # the paper's lengths
-        long = "_Ant_" in run.args["env"] or "_Walker_" in run.args["env"]
+        long = "_Ant_" in run.flags.env or "_Walker_" in run.flags.env
         assert run.steps == (30_000_000 if long else 6_000_000)
 
 
@@ -134,12 +133,12 @@ def test_scale_shortens_every_run_alike(tmp_path, capsys):
     assert out[0].split()[:2] == ["new", str(tmp_path / "a" / "cpo" / "Goal_Point_8Hazards-v0_4")]
     assert out[4] == "4 runs (0 done, 0 resume, 4 new), 720,000 steps in all"
     assert list(tmp_path.iterdir()) == []
-    (run,) = grid.expand([("Goal_Point_8Hazards", "trpo_sl")], [0], RunFlags().values(), scale=0.5)
+    (run,) = grid.expand([("Goal_Point_8Hazards", "trpo_sl")], [0], RunFlags(), scale=0.5)
     assert run.values["warmup"] == pytest.approx(1 / 3)  # a ratio of whatever the length is
 
 
 def test_a_hyperparameter_goes_to_those_that_have_it():
-    args = {**RunFlags().values(), "hyperparams": {"cost_limit": 5.0}}
+    args = RunFlags(hyperparams={"cost_limit": 5.0})
     cpo, ppo = grid.expand([("Goal_Point_8Hazards", a) for a in ("cpo", "ppo")], [0], args)
     assert (cpo.values["cost_limit"], cpo.ignored) == (5.0, [])
     assert ("cost_limit" in ppo.values, ppo.ignored) == (False, ["cost_limit"])
@@ -222,6 +221,12 @@ def test_bad_grid_file(content, part, capsys, tmp_path):
     folder = tmp_path / "logs"
     refused(benchmark.main, ["--grid", str(tmp_path / "g.yml"), "-f", str(folder)], capsys, part)
     assert not folder.exists()
+
+
+def test_a_preset_in_a_grid_file_needs_no_trust(capsys, tmp_path):
+    grid = "suites: [Goal_Point_8Hazards]\nalgos: [cpo]\nconf_file: omnisafe"
+    (tmp_path / "g.yml").write_text(grid)
+    assert benchmark.main(["--grid", str(tmp_path / "g.yml"), "--dry-run"]) == 0
 
 
 # what becomes of it
@@ -314,7 +319,7 @@ def test_failures_are_retried_twice(failures, tmp_path, here, monkeypatch, capsy
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
     (tmp_path / "cpo" / "CostPoint-v0_1").mkdir(parents=True)
     assert benchmark.main(arguments) == (0 if failures == 1 else 1)
-    assert sum(run.args["algo"] == "cpo" for run in here.runs) == min(failures + 1, 3)
+    assert sum(run.flags.algo == "cpo" for run in here.runs) == min(failures + 1, 3)
     done = {"trpo/CostPoint-v0_1"} | ({"cpo/CostPoint-v0_1"} if failures == 1 else set())
     assert results(tmp_path).keys() == done
     out, err = capsys.readouterr()
@@ -326,7 +331,7 @@ def test_failures_are_retried_twice(failures, tmp_path, here, monkeypatch, capsy
         assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in out
         # Once more: the failed one is tried again, the other is not.
         assert benchmark.main(["-f", str(tmp_path)]) == 0
-        assert here.runs[-1].args["algo"] == "cpo" and len(here.runs) == 5
+        assert here.runs[-1].flags.algo == "cpo" and len(here.runs) == 5
 
 
 def test_a_dead_worker_is_a_failure_of_its_run(tmp_path, here, capsys):
@@ -353,7 +358,7 @@ def test_a_run_that_another_process_has_is_waited_for(tmp_path, here, monkeypatc
     monkeypatch.setattr(here, "submit", release)
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
     assert benchmark.main(arguments) == 0
-    assert [run.args["algo"] for run in here.runs] == ["cpo", "trpo", "cpo"]
+    assert [run.flags.algo for run in here.runs] == ["cpo", "trpo", "cpo"]
     assert len(results(tmp_path)) == 2
     assert {run.attempts for run in here.runs} == {0}  # to wait is not to fail
 
@@ -369,7 +374,7 @@ def test_a_full_disk_stops_the_grid(tmp_path, here, capsys):
     err = capsys.readouterr().err
     assert f"can't write to {run}: No space left on device" in err and "Traceback" not in err
     assert before.items() <= results(tmp_path).items()
-    assert [run.args["algo"] for run in here.runs] == ["trpo", "cpo"]  # no retries, nothing new
+    assert [run.flags.algo for run in here.runs] == ["trpo", "cpo"]  # no retries, nothing new
     (run / "0.monitor.csv").unlink()  # room is made
     assert benchmark.main(["-f", str(tmp_path)]) == 0
     assert len(results(tmp_path)) == 3
@@ -379,10 +384,10 @@ def test_asked_to_stop(tmp_path, here, monkeypatch, capsys):
     """What runs ends with a checkpoint, what waits does not begin."""
     complete = grid.complete
 
-    def interrupted(args, values, number, command, asked):
+    def interrupted(args, values, command, asked):
         os.kill(os.getpid(), signal.SIGINT)
         grid.ask_to_stop(asked.__closure__[0].cell_contents)
-        return complete(args, values, number, command, asked)
+        return complete(args, values, command, asked)
 
     monkeypatch.setattr(grid, "complete", interrupted)
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
@@ -417,7 +422,7 @@ def test_progress_is_read_from_the_folder(tmp_path):
 
 
 def test_bars_of_what_runs(tmp_path):
-    args = {**RunFlags().values(), "log_folder": str(tmp_path)}
+    args = RunFlags(log_folder=str(tmp_path))
     runs = grid.expand([("Goal_Point_8Hazards", a) for a in ("cpo", "trpo")], [0, 1], args)
     for run, state in zip(runs, ("running", "failed", "done", "waiting"), strict=True):
         run.state = state

@@ -364,7 +364,7 @@ def test_enjoy_imports_what_training_imported(tmp_path, monkeypatch):
     play = ["--algo", "cpo", "--env", "CostPoint-v0", "-f", str(tmp_path), "--no-render"]
     assert enjoy.main([*play, "--n-episodes", "1"]) == 0
     assert enjoy.main([*play, "--n-episodes", "1", "--exp-id", "1"]) == 0
-    assert asked == [["registered_envs"]] * 2
+    assert [one for one in asked if one] == [["registered_envs"]] * 2
 
 
 def test_packages_are_found_in_the_current_folder(tmp_path, monkeypatch):
@@ -509,8 +509,7 @@ def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch)
     [
         (
             ["--algo", "ppo", "--env", "Goal_Ant_8Hazards"],
-            "no trained agent of ppo on Goal_Ant_8Hazards-v0 comes with the package; there are: "
-            "cpo on Goal_Point_8Ghosts-v0, cpo on Goal_Point_8Hazards-v0, ",
+            "one of those there: cpo on Goal_Point_8Ghosts-v0, cpo on Goal_Point_8Hazards-v0, ",
         ),
         (["-f", "logs"], "leave out --folder and --exp-id"),
         (["--exp-id", "1"], "leave out --folder and --exp-id"),

@@ -162,5 +162,12 @@ def test_a_login_is_asked_for(logs, tmp_path, monkeypatch, capsys):
     assert "needs a login" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("flags", [["load", "-f"], ["push", *WHICH, "--to"]])
+def test_folders_that_can_not_be_written(flags, logs, capsys, monkeypatch):
+    monkeypatch.chdir(logs.parent)
+    assert hub.main([*flags, "/dev/null/x", "-orga", "me"]) == 2
+    assert f"{flags[-1].replace('-f', '--folder')}: can't write to" in capsys.readouterr().err
+
+
 def test_names_are_rl_zoos():
     assert zoo_hub.model_name("cpo", "ALE/Pong-v5") == "cpo-ALE-Pong-v5"

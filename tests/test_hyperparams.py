@@ -12,9 +12,8 @@ from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.envs import env_ids
 from sb3_guard.zoo.algos import baselines
 from sb3_guard.zoo.hyperparams import (
-    PAPER,
     PRESETS,
-    arguments,
+    annotations,
     build,
     check,
     hyperparams_folder,
@@ -115,7 +114,7 @@ def checked(**values):
 
 
 def test_arguments_are_the_leafs_and_the_bases():
-    names = arguments(CPO)
+    names = annotations(CPO)
     assert {"cost_reduction", "target_kl", "n_steps", "policy_kwargs"} <= names.keys()
     assert (
         not {"env", "seed", "device", "verbose", "self", "kwargs", "_init_setup_model"}
@@ -277,6 +276,7 @@ def test_values_on_the_command_line(text, value):
 
 
 # The paper's table of hyper-parameters, row by row; ... stands for "not used".
+PAPER = "paper"
 COLUMNS = "trpo trpo_lag trpo_sl trpo_usl trpo_ipo trpo_fac cpo pcpo".split()
 TABLE = {
     "gamma": [0.99] * 8,
@@ -439,6 +439,6 @@ def test_the_omnisafe_preset_is_the_published_table(algo):
 def test_every_algorithm_has_a_file_and_every_file_an_algorithm():
     files = {path.stem for path in hyperparams_folder().glob("*.yml")} - {*PRESETS}
     assert set(ALGORITHMS) <= files <= {*ALGORITHMS, *baselines()}
-    assert read_file(hyperparams_folder() / f"{PAPER}.yml").keys() == {*COLUMNS}
+    assert read_file(hyperparams_folder() / "paper.yml").keys() == {*COLUMNS}
     for file in files:
         assert "default" in read_file(hyperparams_folder() / f"{file}.yml")

@@ -14,20 +14,20 @@ import threading
 import time
 import traceback
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_guard import __version__
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.algos import algorithm
-from sb3_guard.zoo.hyperparams import NOISE_KEYS, RUN_KEYS, arguments
+from sb3_guard.zoo.hyperparams import annotations
 from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
-from sb3_guard.zoo.run_folder import RunFolder, RunInUse, is_disk_error, is_run, run_path
-from sb3_guard.zoo.start import complete, prepare, refuse_another
+from sb3_guard.zoo.run_folder import RunInUse, is_disk_error
+from sb3_guard.zoo.start import complete, path_of, prepare, standing
 from sb3_guard.zoo.usage import UsageError, explained, interrupts, one_line
 
 if TYPE_CHECKING:
@@ -44,28 +44,24 @@ class Run:
     """
     One run of a grid.
 
-    :param args: all flags, as its folder states them
+    :param flags: all flags, as its folder states them
     :param values: all hyper-parameters, likewise
+    :param ignored: those given for the grid that its algorithm does not have
     """
 
-    args: dict[str, Any]
+    flags: RunFlags
     values: dict[str, Any]
+    ignored: list[str]
     #: done · resume · new (planned); waiting · running · in use · done · failed · stopped (later)
     state: str = "new"
     attempts: int = 0
     #: what went wrong last, in a line
     error: str = ""
-    ignored: list[str] = field(default_factory=list)
-
-    @property
-    def number(self) -> int:
-        """Of its folder."""
-        return int(self.args["seed"]) + 1
 
     @property
     def path(self) -> Path:
         """Its folder."""
-        return run_path(self.args["log_folder"], self.args["algo"], self.args["env"], self.number)
+        return path_of(self.flags)
 
     @property
     def steps(self) -> int:
@@ -73,13 +69,13 @@ class Run:
         return int(self.values["n_timesteps"])
 
     def __str__(self) -> str:
-        return f"{self.args['algo']} on {self.args['env']}, seed {self.args['seed']}"
+        return f"{self.flags.algo} on {self.flags.env}, seed {self.flags.seed}"
 
 
 def expand(
     pairs: Sequence[tuple[str, str]],
     seeds: Sequence[int],
-    args: Mapping[str, Any],
+    flags: RunFlags,
     scale: float = 1.0,
 ) -> list[Run]:
     """
@@ -89,37 +85,31 @@ def expand(
 
     :param pairs: environments and algorithms
     :param seeds: at least 0
-    :param args: all flags of training, with their defaults
+    :param flags: what all runs share
     :param scale: factor of every run's length
     :raises UsageError: a name or value is wrong for any of the runs
     """
-    given = dict(args["hyperparams"] or {})
-    known = {algo: _hyperparams(algo) for algo in dict.fromkeys(algo for _, algo in pairs)}
-    every = set[str]().union(*known.values())
+    given = flags.hyperparams or {}
+    known = {
+        algo: annotations(algorithm(algo)) for algo in dict.fromkeys(algo for _, algo in pairs)
+    }
+    every = sorted(set[str]().union(*known.values()))
     for name in given.keys() - every:
-        hint = did_you_mean(name, sorted(every))
+        hint = did_you_mean(name, every)
         raise UsageError(f"none of the algorithms has a hyper-parameter {name!r}; {hint}")
-    prepared = {}
-    args = {**args, "progress": False, "num_threads": max(args["num_threads"], 1)}
+    first = {}
+    flags = replace(flags, progress=False, num_threads=max(flags.num_threads, 1))
     for env_id, algo in pairs:
         own = {name: value for name, value in given.items() if name in known[algo]}
-        mine = {"env": env_id, "algo": algo, "seed": 0, "hyperparams": own or None}
-        flags, values = prepare(RunFlags.of({**args, **mine}))
-        one = flags.values()
-        values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
-        one["n_timesteps"] = values["n_timesteps"]
-        prepared[one["env"], algo] = one, values, sorted(given.keys() - own.keys())
+        mine = replace(flags, env=env_id, algo=algo, seed=0, hyperparams=own or None)
+        one, values = prepare(mine)
+        one.n_timesteps = values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
+        first[one.env, algo] = Run(one, values, sorted(given.keys() - own.keys()))
     return [
-        Run({**one, "seed": seed}, dict(values), ignored=ignored)
+        replace(run, flags=replace(run.flags, seed=seed))
         for seed in dict.fromkeys(seeds)
-        for one, values, ignored in prepared.values()
+        for run in first.values()
     ]
-
-
-def _hyperparams(algo: str) -> set[str]:
-    """The names of the hyper-parameters that an algorithm's runs may have."""
-    names = {*arguments(algorithm(algo)), *RUN_KEYS}
-    return names | NOISE_KEYS.keys() if "action_noise" in names else names
 
 
 def plan(runs: Sequence[Run]) -> None:
@@ -129,15 +119,7 @@ def plan(runs: Sequence[Run]) -> None:
     :raises UsageError: a folder holds another run than the one that belongs there
     """
     for run in runs:
-        run.state = "new"
-        if not is_run(run.path):
-            continue
-        folder = RunFolder(run.path)
-        refuse_another(folder, RunFlags.of(run.args), run.values)
-        if folder.read_result() is not None:
-            run.state = "done"
-        elif folder.checkpoint.exists():
-            run.state = "resume"
+        run.state = standing(run.flags, run.values)
 
 
 def try_out(runs: Sequence[Run]) -> None:
@@ -150,20 +132,20 @@ def try_out(runs: Sequence[Run]) -> None:
     import torch as th
 
     seen: set[str] = set()
-    here = {"device": "cpu", "num_threads": 1, "tensorboard_log": "", "track": False}
     for run in runs:
-        if run.state == "done" or {run.args["env"], run.args["algo"]} <= seen:
+        flags = run.flags
+        if run.state == "done" or {flags.env, flags.algo} <= seen:
             continue
-        seen |= {run.args["env"], run.args["algo"]}
-        args = {**run.args, **here}
-        if args["vec_env"] == "subproc":
-            args["vec_env"] = "dummy"
+        seen |= {flags.env, flags.algo}
+        here = replace(flags, device="cpu", num_threads=1, tensorboard_log="", track=False)
+        if flags.vec_env == "subproc":
+            here.vec_env = "dummy"
         try:
-            if run.args["device"] != "auto":
-                th.device(run.args["device"])
-            Experiment(RunFlags.of(args), run.values).close()
+            if flags.device != "auto":
+                th.device(flags.device)
+            Experiment(here, run.values).close()
         except (UsageError, RuntimeError) as error:
-            raise UsageError(f"{args['algo']} on {args['env']}: {one_line(error)}") from error
+            raise UsageError(f"{flags.algo} on {flags.env}: {one_line(error)}") from error
 
 
 # In a worker
@@ -186,7 +168,7 @@ def carry_out(run: Run, command: str, grid: str) -> tuple[str, str]:
             if grid in _stopped:
                 return "stopped", ""
             asked = lambda: grid in _stopped  # noqa: E731
-            status = complete(RunFlags.of(run.args), run.values, run.number, command, asked)
+            status = complete(run.flags, run.values, command, asked)
         except RunInUse as error:
             time.sleep(POLL)
             return "in use", one_line(error)
@@ -415,7 +397,7 @@ def run_grid(
             f"{len(runs)} runs in {folder}: {states.count('done')} done, "
             f"{states.count('resume')} to resume, {states.count('new')} new"
         )
-        for algo, names in {run.args["algo"]: run.ignored for run in runs if run.ignored}.items():
+        for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
             board.say(f"{algo} has no {', '.join(names)}: left out there")
         if states.count("done") < len(runs):
             with workers(jobs, scheduler, folder) as client:

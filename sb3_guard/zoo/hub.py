@@ -14,7 +14,7 @@ import yaml
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
 from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
-from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data
+from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data, require_writable
 from sb3_guard.zoo.usage import UsageError, explained
 
 # Said before an agent is downloaded.
@@ -62,6 +62,7 @@ def model_name(algo: str, env_id: str) -> str:
 
 def push(flags: HubFlags) -> int:
     """Evaluate an agent, write its card, film it, and upload all to the hub."""
+    require_writable(Path(flags.to or tempfile.gettempdir()), "--to")
     agent = open_agent(flags, None if flags.no_video else "rgb_array")
     with closing(agent.env):
         name = flags.repo_name or model_name(flags.algo, agent.env_id)
@@ -182,6 +183,7 @@ def load(flags: HubFlags) -> int:
     """Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it."""
     name = model_name(flags.algo, flags.env)
     repo_id = flags.repo_id or f"{flags.organization}/{flags.repo_name or name}"
+    require_writable(Path(flags.folder), "--folder")
     from huggingface_hub import snapshot_download
 
     print(TRUST)

@@ -30,7 +30,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.trust import entries, evaluate, import_class, wrapper
+from sb3_guard.zoo.trust import PRESETS, entries, evaluate, import_class, wrapper
 from sb3_guard.zoo.usage import UsageError, explained, read_mapping
 from sb3_guard.zoo.values import kind_of
 
@@ -55,9 +55,6 @@ NOISE_KEYS: dict[str, Any] = {
 }
 # Arguments of an algorithm that are flags of the command.
 FLAGS = {"env": "--env", "seed": "--seed", "device": "--device", "verbose": "--verbose"}
-# Presets are files of what differs from an algorithm's own file; `-conf NAME` reads them.
-PAPER = "paper"
-PRESETS = {PAPER: "the paper", "omnisafe": "the settings that OmniSafe has published"}
 NOT_HYPERPARAMETERS = {*FLAGS, "self", "tensorboard_log", "_init_setup_model", "policy_base"}
 
 
@@ -83,7 +80,7 @@ def read_file(path: str | Path) -> dict[str, Any]:
     if name.endswith((".yml", ".yaml")):
         content = read_mapping(name, "hyper-parameter file", form)
     else:
-        fix = f"give a .yml file, a Python file or module, or {PAPER!r}"
+        fix = f"give a .yml file, a Python file or module, or {' or '.join(map(repr, PRESETS))}"
         with explained(f"can't read hyper-parameters from {name}", fix=fix):
             python = name.endswith(".py")
             module = runpy.run_path(name) if python else vars(importlib.import_module(name))
@@ -165,12 +162,13 @@ def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
     return {name: one for name, one in found.items() if name not in NOT_HYPERPARAMETERS}
 
 
-def arguments(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
-    """The hyper-parameters an algorithm takes: name to type annotation."""
-    return {
+def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
+    """The hyper-parameters that runs of an algorithm may have: name to type annotation."""
+    known = {
         name: Any if one.annotation is one.empty else one.annotation
         for name, one in parameters(algorithm).items()
     }
+    return {**known, **RUN_KEYS, **(NOISE_KEYS if "action_noise" in known else {})}
 
 
 def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -180,9 +178,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, a
         NaN, a missing ``n_timesteps``, or a count below 1
     """
-    known = {**arguments(algorithm), **RUN_KEYS}
-    if "action_noise" in known:
-        known |= NOISE_KEYS
+    known = annotations(algorithm)
     checked = {}
     for name, value in values.items():
         if name in FLAGS:

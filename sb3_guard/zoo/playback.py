@@ -3,7 +3,7 @@
 import itertools
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from sb3_guard.zoo.run_folder import (
     is_run,
     latest_run,
     require_writable,
-    run_path,
 )
 from sb3_guard.zoo.trust import require_trust
 from sb3_guard.zoo.usage import UsageError, explained, import_packages
@@ -42,25 +41,29 @@ VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said oth
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
 
 
-def find_run(folder: str, algo: str, env_id: str, number: int = 0) -> RunFolder:
+def find_run(folder: str | Path, algo: str, env_id: str, number: int = 0) -> RunFolder:
     """
     The folder of a run.
 
     :param folder: log folder
+    :param env_id: the version may be left out if it is 0
     :param number: of the run; 0: the latest, -1: ``<folder>/<algo>`` itself, as in RL-Zoo
-    :raises UsageError: there is none
+    :raises UsageError: there is none; the message lists those that there are
     """
     parent, name = Path(folder) / algo, folder_name(env_id)
-    if number == 0:
-        number = latest_run(parent, name)
-        if number == 0:
-            ships = run_path(str(PRETRAINED), algo, env_id, 1).is_dir()
-            raise UsageError(
-                f"there is no run of {algo} on {env_id} in {folder!r}; train one with: "
-                f"python -m sb3_guard.train --algo {algo} --env {env_id} -f {folder}"
-                + (", or play the package's own with --pretrained" if ships else "")
-            )
-    return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
+    name = name if latest_run(parent, name) else f"{name.removesuffix('-v0')}-v0"
+    number = number or latest_run(parent, name)
+    if number:
+        return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
+    algorithm(algo), canonical_id(env_id)  # a misspelt name has a message of its own
+    where = "" if folder == PRETRAINED else f" -f {folder}"
+    runs = [one for one in sorted(Path(folder).glob("*/*_*")) if is_run(one)]
+    there = dict.fromkeys(f"{one.parent.name} on {one.name.rpartition('_')[0]}" for one in runs)
+    raise UsageError(
+        f"there is no run of {algo} on {env_id} in {str(folder)!r}; train one with: "
+        f"python -m sb3_guard.train --algo {algo} --env {env_id}{where}; or play one of those "
+        f"there: {', '.join(there) or 'none'}; or of those in the package, with --pretrained"
+    )
 
 
 def find_pretrained(algo: str, env_id: str) -> RunFolder:
@@ -69,17 +72,7 @@ def find_pretrained(algo: str, env_id: str) -> RunFolder:
 
     :raises UsageError: it ships none of that kind; the message lists what there is
     """
-    path = run_path(str(PRETRAINED), algo, env_id, 1)
-    if not path.is_dir():
-        shipped = ", ".join(
-            f"{one.parent.name} on {one.name.removesuffix('_1')}"
-            for one in sorted(PRETRAINED.glob("*/*_1"))
-        )
-        raise UsageError(
-            f"no trained agent of {algo} on {env_id} comes with the package; there are: "
-            f"{shipped}; train one with: python -m sb3_guard.train --algo {algo} --env {env_id}"
-        )
-    return RunFolder.open(path)
+    return find_run(PRETRAINED, algo, env_id)
 
 
 def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
@@ -128,19 +121,6 @@ class Agent:
     env: VecEnv
 
 
-def _packages_of_training(flags: AgentFlags) -> list[str]:
-    """The modules that registered the environment when the run was trained, if there is one."""
-    parent = Path(flags.folder) / flags.algo
-    for env_id in (flags.env, f"{flags.env}-v0"):
-        number = flags.exp_id or latest_run(parent, folder_name(env_id))
-        path = run_path(flags.folder, flags.algo, env_id, number)
-        if is_run(path):
-            packages = list(RunFolder.open(path).args()["gym_packages"])
-            require_trust(path, flags.trust, {"gym_packages": packages}, {})
-            return packages
-    return []
-
-
 def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
     """
     Load an agent and make one environment for it, wrapped as in training.
@@ -149,16 +129,16 @@ def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
     :param render_mode: None, ``"human"``, or ``"rgb_array"``
     :raises UsageError: there is no such agent, or it does not fit the environment
     """
-    import_packages(flags.gym_packages or _packages_of_training(flags))
+    import_packages(flags.gym_packages)
+    folder = PRETRAINED if flags.pretrained else flags.folder
+    run = find_run(folder, flags.algo, flags.env, flags.exp_id)
+    path, normalizer = find_model(run, flags)
+    packages = [] if flags.gym_packages else run.args().get("gym_packages") or []
+    values = {**run.hyperparams(), "callback": None}  # nobody calls one here
+    require_trust(run.path, flags.trust, {"gym_packages": packages}, values)
+    import_packages(packages)
     cls = algorithm(flags.algo)
     env_id, ours = canonical_id(flags.env)
-    if flags.pretrained:
-        run = find_pretrained(flags.algo, env_id)
-    else:
-        run = find_run(flags.folder, flags.algo, env_id, flags.exp_id)
-    path, normalizer = find_model(run, flags)
-    values = {**run.hyperparams(), "callback": None}  # nobody calls one here
-    require_trust(run.path, flags.trust, {}, values)
     setup = build(check(flags.algo, cls, values))
     if flags.num_threads > 0:
         import torch as th
@@ -352,12 +332,11 @@ def camera(env: VecEnv, video: Path | None, render_mode: str | None) -> Iterator
     fps = _frames_per_second(env)
     every = max(1, int(fps / 25))  # 25 pictures a second are enough
     video.parent.mkdir(parents=True, exist_ok=True)
-    partial = video.with_name(f".{video.name}.part.mp4")
-    with ExitStack() as last, explained(f"can't write {video}", OSError):
-        last.callback(partial.unlink, missing_ok=True)
+    with explained(f"can't write {video}", OSError), replacing(video) as file:
         writer = imageio_ffmpeg.write_frames(
-            str(partial), (width, height), fps=fps / every, macro_block_size=2
-        )
+            file.name, (width, height), fps=fps / every, macro_block_size=2,
+            output_params=["-f", "mp4"],
+        )  # fmt: skip
         writer.send(None)
         steps = itertools.count()
 
@@ -368,7 +347,6 @@ def camera(env: VecEnv, video: Path | None, render_mode: str | None) -> Iterator
 
         with closing(writer):
             yield shoot
-        partial.replace(video)
 
 
 def _render(env: VecEnv) -> np.ndarray | None:

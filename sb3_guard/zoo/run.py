@@ -78,7 +78,6 @@ class Experiment:
         #: the checkpoint to continue from
         self.state = None if folder is None else read_checkpoint(folder.checkpoint)
         self._saved = None if folder is None else folder.checkpoint
-        self.tracker = Tracker(flags, hyperparams) if flags.track else None
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
         _check_device(flags.device)
         if self._tensorboard_folder is not None:
@@ -98,6 +97,7 @@ class Experiment:
             seed_rows(self.env, flags.seed)
             self.model.verbose = max(flags.verbose - 1, 0)
             self.evaluation = self._make_evaluation() if flags.eval_freq > 0 else None
+            self.tracker = Tracker(flags, hyperparams, folder) if flags.track else None
         except BaseException:
             self.env.close()
             raise
@@ -292,7 +292,7 @@ class Experiment:
         if verbose:
             print(f"Run folder: {folder.path} (seed {self.flags.seed})")
         if self.tracker is not None:
-            self.tracker.begin(folder, resumed=state is not None)
+            self.tracker.remember(folder)
         with explained(f"can't write to {folder.path}", OSError):
             find_monitor(self.env).log_to(folder.monitor)
             logger = RunLogger(

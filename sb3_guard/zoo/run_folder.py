@@ -155,16 +155,15 @@ class RunFolder:
         flags: RunFlags,
         hyperparams: Mapping[str, Any],
         command: str,
-        number: int | None = None,
+        path: Path | None = None,
     ) -> "RunFolder":
         """
-        Take a number and write down what the run is.
+        Take a folder and write down what the run is.
 
         :param flags: all flags
         :param hyperparams: all hyper-parameters, plain data
         :param command: the command line
-        :param number: the number to take, by a caller that has :func:`lock` on the folder, which
-            may exist but is not a run yet; None: the next free one
+        :param path: its folder, on which the caller has :func:`lock`; None: the next free number
         :raises UsageError: the folder can't be written to, or there is more than plain data
         """
         name = folder_name(flags.env)
@@ -174,10 +173,7 @@ class RunFolder:
         what = f"can't write to log folder {flags.log_folder!r}"
         with explained(what, OSError, fix="choose another with -f"):
             parent.mkdir(parents=True, exist_ok=True)
-            if number is None:
-                path = claim(parent, name, suffix)
-            else:
-                path = run_path(flags.log_folder, flags.algo, flags.env, number)
+            path = path or claim(parent, name, suffix)
             params = path / name
             params.mkdir(parents=True, exist_ok=True)
             (params / "command.txt").write_text(command, encoding="utf-8")

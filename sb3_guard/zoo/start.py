@@ -3,7 +3,7 @@
 import dataclasses
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +58,6 @@ def start(flags: RunFlags) -> int:
     flags, values = prepare(flags)
     experiment = Experiment(flags, values)
     try:
-        if experiment.tracker is not None:
-            experiment.tracker.begin()
         folder = RunFolder.create(flags, values, shlex.join(sys.orig_argv))
     except UsageError:
         experiment.close()
@@ -68,19 +66,43 @@ def start(flags: RunFlags) -> int:
         return experiment.train(folder)
 
 
-def complete(
-    flags: RunFlags,
-    values: Mapping[str, Any],
-    number: int,
-    command: str,
-    asked_to_stop: Callable[[], bool],
-) -> int:
+def path_of(flags: RunFlags) -> Path:
+    """The folder of a run of a grid, whose number is its seed's."""
+    return run_path(flags.log_folder, flags.algo, flags.env, flags.seed + 1)
+
+
+def standing(flags: RunFlags, values: Mapping[str, Any]) -> str:
     """
-    Bring a run of a given number to its end: start it, or continue it from where it was cut.
+    How far a run of a grid is: ``new``, ``done``, or to ``resume``.
 
     :param flags: as :func:`prepare` returns them
     :param values: its hyper-parameters, likewise
-    :param number: of its folder
+    :raises UsageError: its folder holds another run, or is damaged
+    """
+    path = path_of(flags)
+    if not is_run(path):
+        return "new"
+    folder = RunFolder(path)
+    found = differences(folder.what(), plain({**flags.values(IDENTITY), **values}))
+    if found:
+        said = [f"{name}: {a} there, {b} here" for name, a, b in found[:3]]
+        raise UsageError(
+            f"{path} holds another run ({'; '.join(said)}); choose another folder with -f"
+        )
+    if folder.read_result() is not None:
+        return "done"
+    # Without a checkpoint nothing of it is worth keeping, and it restarts in its place.
+    return "resume" if folder.checkpoint.exists() else "new"
+
+
+def complete(
+    flags: RunFlags, values: Mapping[str, Any], command: str, asked_to_stop: Callable[[], bool]
+) -> int:
+    """
+    Bring a run of a grid to its end: start it, or continue it from where it was cut.
+
+    :param flags: as :func:`prepare` returns them
+    :param values: its hyper-parameters, likewise
     :param command: the command line it is part of
     :param asked_to_stop: when it says so, training ends after the rollout under way
     :return: exit status, 0 if it is complete, now or already before
@@ -88,35 +110,18 @@ def complete(
     :raises UsageError: it can't be trained, or the folder holds another run
     """
     import_packages(flags.gym_packages)
-    path = run_path(flags.log_folder, flags.algo, flags.env, number)
+    path = path_of(flags)
     with explained(f"can't make folder {path}", OSError):
         path.mkdir(parents=True, exist_ok=True)
     with lock(path):
-        if is_run(path):
-            folder = RunFolder(path)
-            refuse_another(folder, flags, values)
-        else:
-            folder = RunFolder.create(flags, values, command, number=number)
-        if folder.read_result() is not None:
+        state = standing(flags, values)
+        if state == "done":
             return 0
-        # Without a checkpoint nothing of it is worth keeping, and it restarts in its place.
-        begun = folder.checkpoint.exists()
+        made = is_run(path)
+        folder = RunFolder(path) if made else RunFolder.create(flags, values, command, path)
         quiet = dataclasses.replace(flags, progress=False, verbose=0)
-        return Experiment(quiet, values, folder if begun else None).train(folder, asked_to_stop)
-
-
-def refuse_another(folder: RunFolder, flags: RunFlags, values: Mapping[str, Any]) -> None:
-    """
-    Make sure that a folder holds the run that is asked for.
-
-    :raises UsageError: it holds another, or is damaged
-    """
-    found = differences(folder.what(), plain({**flags.values(IDENTITY), **values}))
-    if found:
-        said = [f"{name}: {a} there, {b} here" for name, a, b in found[:3]]
-        raise UsageError(
-            f"{folder.path} holds another run ({'; '.join(said)}); choose another folder with -f"
-        )
+        begun = folder if state == "resume" else None
+        return Experiment(quiet, values, begun).train(folder, asked_to_stop)
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -161,11 +166,12 @@ def resume(given: RunFlags, trusted: bool = False) -> int:
         named = {name: getattr(flags, name) for name in ("env", "gym_packages")}
         require_trust(folder.path, trusted, named, values)
         import_packages(flags.gym_packages)
-        _refuse_contradictions(given, flags, values, folder)
+        _refuse(differences(*_compared(given, flags, values, folder)), f"when {folder.path} began")
         for name in {*(given.given & RunFlags.names(HOST)), "progress"}:
             setattr(flags, name, getattr(given, name))
         state = read_checkpoint(folder.checkpoint)
-        _refuse_edited(folder, state)
+        ours, its = ({**one, "n_timesteps": None} for one in (folder.what(), state["what"]))
+        _refuse(differences(its, ours), f"when it was trained, but not in {folder.params}")
         done, wanted = state["num_timesteps"], given.n_timesteps
         if 0 < wanted < done:
             raise UsageError(
@@ -183,39 +189,27 @@ def resume(given: RunFlags, trusted: bool = False) -> int:
         return Experiment(flags, values, folder).train(folder, restate=True)
 
 
-def _refuse_edited(folder: RunFolder, state: Mapping[str, Any]) -> None:
-    """Raise if the files say something other than what the checkpoint was trained with."""
-    ours, its = ({**one, "n_timesteps": None} for one in (folder.what(), state["what"]))
-    found = differences(its, ours)
-    if found:
-        name, trained, stated = found[0]
-        raise UsageError(
-            f"{name} = {stated} in {folder.params} was {trained} when the run was trained; put it "
-            "back, or start a new run with it, without -i"
-        )
-
-
-def _refuse_contradictions(
+def _compared(
     given: RunFlags, saved: RunFlags, values: Mapping[str, Any], folder: RunFolder
-) -> None:
-    """Raise if a flag asks for something other than what the run is."""
-    pairs = []
-    hosted = {*RunFlags.names(HOST), "trained_agent", "n_timesteps"}
-    for name in given.given & (RunFlags.names() - hosted):
-        value, own = getattr(given, name), getattr(saved, name)
-        flag = "--" + name.replace("_", "-") + " "
-        if name == "hyperparams":
-            asked = check(saved.algo, algorithm(saved.algo), {**values, **value})
-            pairs += [(f"-params {key}:", asked[key], values.get(key)) for key in value]
-        elif name == "log_folder":
-            pairs.append((flag, Path(value).resolve(), folder.path.parent.parent.resolve()))
-        elif name == "env":
-            pairs.append((flag, canonical_id(value)[0], own))
-        else:
-            pairs.append((flag, plain(value), plain(own)))
-    for flag, value, own in pairs:
-        if value != own:
-            raise UsageError(
-                f"{flag}{value} contradicts {flag}{own} of {folder.path}; "
-                "leave it out, or start a new run without -i"
-            )
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What the run was begun with, and what is given now instead, as far as it may not change."""
+    hosted = {*RunFlags.names(HOST), "trained_agent", "n_timesteps", "hyperparams"}
+    now = {name: getattr(given, name) for name in given.given & RunFlags.names() - hosted}
+    if "env" in now:
+        now["env"] = canonical_id(given.env)[0]
+    if "log_folder" in now:
+        now["log_folder"] = str(Path(given.log_folder).resolve())
+    if given.hyperparams:
+        asked = check(saved.algo, algorithm(saved.algo), {**values, **given.hyperparams})
+        now |= {name: asked[name] for name in given.hyperparams}
+    own = {**saved.values(), **values, "log_folder": str(folder.path.parent.parent.resolve())}
+    return {name: plain(own.get(name)) for name in now}, plain(now)
+
+
+def _refuse(found: Sequence[tuple[str, Any, Any]], when: str) -> None:
+    """Raise if something is not what it was."""
+    for name, was, now in found:
+        raise UsageError(
+            f"{name} = {now} contradicts {was} {when}; put it back or leave it out, or start a new "
+            "run with it, without -i"
+        )

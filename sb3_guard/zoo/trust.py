@@ -18,6 +18,8 @@ from sb3_guard.zoo.usage import UsageError, explained
 from sb3_guard.zoo.values import read_expression
 
 KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
+# Files of what differs from an algorithm's own file, which `-conf NAME` reads; not code.
+PRESETS = {"paper": "the paper", "omnisafe": "the settings that OmniSafe has published"}
 # Hyper-parameters that name classes, one or several, perhaps with arguments.
 LISTS = ("env_wrapper", "vec_env_wrapper", "callback")
 
@@ -102,7 +104,7 @@ def _foreign(args: Mapping[str, Any], values: Mapping[str, Any]) -> Iterator[str
         if colon and _in_current_folder(module):
             yield f"env: {env_id}"
     file = args.get("conf_file")
-    if file and file != "paper" and not str(file).endswith((".yml", ".yaml")):
+    if file and file not in PRESETS and not str(file).endswith((".yml", ".yaml")):
         yield f"conf_file: {file}"
     for name, value in values.items():
         paths = []

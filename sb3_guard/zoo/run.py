@@ -43,8 +43,6 @@ from sb3_guard.zoo.make_envs import (
     BAD_ARGUMENTS,
     ERRORS_OF_OURS,
     PROCESS_DIED,
-    canonical_id,
-    choose_vec_env,
     evaluation_seed,
     make_envs,
     seed_rows,
@@ -82,9 +80,7 @@ class Experiment:
         _check_device(flags.device)
         if self._tensorboard_folder is not None:
             require_writable(self._tensorboard_folder, "--tensorboard-log")
-        self.vec_env = choose_vec_env(
-            flags.vec_env, canonical_id(flags.env)[1], self.setup.env_wrapper is not None
-        )
+        self.vec_env = str(flags.vec_env)
         if flags.num_threads > 0:
             th.set_num_threads(flags.num_threads)
         set_random_seed(flags.seed)

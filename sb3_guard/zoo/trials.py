@@ -9,7 +9,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -152,12 +152,14 @@ class Objective:
     What Optuna optimises: a trial's hyper-parameters to its return, or return and costs.
 
     :param flags: of the command
+    :param training: of each training but for its seed
     :param settings: of the study
     :param search: where hyper-parameters come from
     """
 
-    def __init__(self, flags: TuneFlags, settings: Settings, search: Search):
-        self.flags, self.settings, self.search = flags, settings, search
+    def __init__(self, flags: TuneFlags, training: RunFlags, settings: Settings, search: Search):
+        self.flags, self.training = flags, training
+        self.settings, self.search = settings, search
         self.stop = False
         self.failures = 0  # in a row
         self._said = 0.0
@@ -256,7 +258,7 @@ class Objective:
             algorithm(settings.algo),
             {**values, "n_timesteps": settings.n_timesteps},
         )
-        experiment = Experiment(run_flags(self.flags, settings.env, seed), checked)
+        experiment = Experiment(replace(self.training, seed=seed), checked)
 
         def on_step(steps: int) -> None:
             if self.stopped():
@@ -284,9 +286,3 @@ class Objective:
         finally:
             experiment.close()
         return evaluations.history, not evaluations.ended
-
-
-def run_flags(flags: TuneFlags, env_id: str, seed: int) -> RunFlags:
-    """The flags of a trial's training."""
-    own = {"env": env_id, "seed": seed, "env_kwargs": None, "verbose": 0, "progress": False}
-    return RunFlags.shared(flags, **own)

@@ -12,7 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -23,10 +23,11 @@ from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvin
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial
 
+from sb3_guard.zoo import start
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.hyperparams import check, read_hyperparams
-from sb3_guard.zoo.make_envs import canonical_id
 from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import folder_name, is_disk_error, require_writable
 from sb3_guard.zoo.spaces import SAMPLERS, Search, read_space
 from sb3_guard.zoo.studies import (
@@ -38,37 +39,36 @@ from sb3_guard.zoo.studies import (
     Study,
     open_storage,
 )
-from sb3_guard.zoo.trials import GIVEN, Objective, Settings, Stopped, run_flags
+from sb3_guard.zoo.trials import GIVEN, Objective, Settings, Stopped
 from sb3_guard.zoo.tune_flags import TuneFlags
 from sb3_guard.zoo.tuning_report import Report, short
-from sb3_guard.zoo.usage import UsageError, import_packages, interrupts, interrupts_ignored, run
+from sb3_guard.zoo.usage import UsageError, interrupts, interrupts_ignored, run
 
 MOST_FAILURES = 3  # in a row, until it is not the hyper-parameters' fault
 POLL = 1.0  # seconds between two looks at what other workers do
 SETTINGS = "settings"
 
 
-def prepare(flags: TuneFlags) -> tuple[Settings, Search]:
+def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     """
     Check everything before anything is written.
 
+    :return: the flags of a training, and what the study is
     :raises UsageError: something is wrong with the flags
     """
-    import_packages(flags.gym_packages)
-    cls = algorithm(flags.algo)
-    env_id, _ = canonical_id(flags.env)
     fixed = dict(flags.hyperparams or {})
-    values = read_hyperparams(flags.algo, env_id, flags.conf_file, fixed)
-    if flags.n_timesteps > 0:
-        values.setdefault("n_timesteps", flags.n_timesteps)
+    own = dict(fixed)
     if flags.cost_limit is not None:
         # Beside the trials: training with the result keeps the best model by the same limit.
         limit = flags.cost_limit
-        values["selection_limit"] = limit[0] if len(limit) == 1 else limit
-    base = check(flags.algo, cls, values)
-    if flags.env_kwargs:
-        base["env_kwargs"] = {**(base.get("env_kwargs") or {}), **flags.env_kwargs}
-    n_timesteps = flags.n_timesteps if flags.n_timesteps > 0 else base["n_timesteps"]
+        own["selection_limit"] = limit[0] if len(limit) == 1 else limit
+    how = {"hyperparams": own, "seed": flags.seeds[0], "verbose": 0, "progress": False}
+    run, values = start.prepare(RunFlags.shared(flags, **how))
+    n_timesteps = values["n_timesteps"]
+    # Training with the result is as long as the file says, whatever the trials are.
+    filed = read_hyperparams(run.algo, run.env, run.conf_file, own)
+    cls, length = algorithm(run.algo), filed.get("n_timesteps", n_timesteps)
+    base = check(run.algo, cls, {**values, "n_timesteps": length})
     n_evaluations = flags.n_evaluations or max(n_timesteps // 100_000, 4)
     if n_evaluations > n_timesteps:
         raise UsageError(
@@ -77,18 +77,13 @@ def prepare(flags: TuneFlags) -> tuple[Settings, Search]:
     space = read_space(flags.search_space) if flags.search_space else None
     search = Search(flags.algo, base, space, fixed)
     for corner in search.corners():
-        check(flags.algo, cls, corner)
-    experiment = Experiment(
-        run_flags(flags, env_id, flags.seeds[0]), {**base, "n_timesteps": n_timesteps}
-    )
-    try:
+        check(run.algo, cls, corner)
+    with closing(Experiment(run, values)) as experiment:
         assert experiment.evaluation is not None
         limits = experiment.evaluation.limits().tolist()
-    finally:
-        experiment.close()
-    return Settings(
-        algo=flags.algo,
-        env=env_id,
+    settings = Settings(
+        algo=run.algo,
+        env=run.env,
         hyperparams=base,
         space=search.description(),
         n_timesteps=n_timesteps,
@@ -98,7 +93,8 @@ def prepare(flags: TuneFlags) -> tuple[Settings, Search]:
         cost_keys=list(experiment.cost_keys),
         cost_limit=limits if np.isfinite(limits).all() else None,
         pareto=flags.pareto,
-    ), search
+    )
+    return run, settings, search
 
 
 def _pruner(flags: TuneFlags, settings: Settings) -> BasePruner:
@@ -236,7 +232,7 @@ def tune(flags: TuneFlags, main: bool = True) -> int:
 
 
 def _tune(flags: TuneFlags, main: bool) -> int:
-    settings, search = prepare(flags)
+    training, settings, search = prepare(flags)
     suffix = f"_{folder_name(flags.study_name)}" if flags.study_name else ""
     folder = Path(flags.log_folder) / settings.algo / f"{folder_name(settings.env)}_tune{suffix}"
     require_writable(folder, "-f")
@@ -246,7 +242,7 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     )
     try:
         study = open_study(flags, settings, search, name, storage)
-        objective = Objective(flags, settings, search)
+        objective = Objective(flags, training, settings, search)
         report = Report(folder, asdict(settings), flags.gym_packages)
         loud = main and flags.verbose > 0
         if loud:

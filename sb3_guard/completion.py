@@ -30,9 +30,9 @@ def whole() -> argparse.ArgumentParser:
     """One parser of all commands, which knows the values of ``--algo`` and ``--env``."""
     from sb3_guard.cli import COMMANDS
     from sb3_guard.envs import env_ids
-    from sb3_guard.zoo.algos import baselines, safe_algorithms
+    from sb3_guard.zoo.algos import ALGORITHMS, baselines
 
-    algos = [*safe_algorithms(), *baselines()]
+    algos = [*ALGORITHMS, *baselines()]
     known = {"algo": algos, "algos": algos, "env": env_ids(), "suites": env_ids()}
     result = argparse.ArgumentParser(prog="sb3-guard")
     commands = result.add_subparsers()

@@ -139,7 +139,7 @@ def export(run: RunFolder, agent: Agent) -> RunFolder:
     where = (str(PRETRAINED), agent.algo, agent.id)
     shutil.rmtree(run_path(*where, 1), ignore_errors=True)
     flags = RunFlags.of({**run.args(), "log_folder": str(PRETRAINED)})
-    copy = RunFolder.create(flags, run.hyperparams(), agent.command, number=1)
+    copy = RunFolder.create(flags, run.hyperparams(), agent.command, run_path(*where, 1))
     for file in copy.path.rglob("args.yml"):  # where the package is installed is nobody's business
         file.write_text(file.read_text().replace(str(PRETRAINED), "logs"))
     cls = algorithm(agent.algo)

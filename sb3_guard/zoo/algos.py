@@ -2,6 +2,7 @@
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_guard.algorithms import ALGORITHMS
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import UsageError
 
@@ -10,18 +11,10 @@ NOT_HERE = {"ars": "its costs can't be counted; RL-Zoo's own rl_zoo3.train runs 
 
 
 def baselines() -> dict[str, type[BaseAlgorithm]]:
-    """RL-Zoo's algorithms by key: unconstrained, with their costs logged."""
+    """RL-Zoo's algorithms by key: unconstrained, with their costs logged; ``trpo`` is ours."""
     from rl_zoo3.utils import ALGOS
 
-    ours = safe_algorithms()
-    return {key: cls for key, cls in ALGOS.items() if key not in ours and key not in NOT_HERE}
-
-
-def safe_algorithms() -> dict[str, type[BaseAlgorithm]]:
-    """This package's algorithms by key; ``trpo`` is one of them, RL-Zoo's is not used."""
-    from sb3_guard.algorithms import ALGORITHMS
-
-    return dict(ALGORITHMS)
+    return {key: ALGOS[key] for key in ALGOS if key not in ALGORITHMS and key not in NOT_HERE}
 
 
 def algorithm(key: str) -> type[BaseAlgorithm]:
@@ -30,11 +23,10 @@ def algorithm(key: str) -> type[BaseAlgorithm]:
 
     :raises UsageError: there is none of that name
     """
-    table = safe_algorithms()
-    if key not in table:
-        if key in NOT_HERE:
-            raise UsageError(f"algorithm {key!r} is not available here: {NOT_HERE[key]}")
-        table |= baselines()
+    if key in NOT_HERE:
+        raise UsageError(f"algorithm {key!r} is not available here: {NOT_HERE[key]}")
+    # RL-Zoo, which takes a while to import, is asked only where it must be.
+    table = ALGORITHMS if key in ALGORITHMS else {**ALGORITHMS, **baselines()}
     if key not in table:
         raise UsageError(f"unknown algorithm {key!r}; {did_you_mean(key, table)}")
     return table[key]

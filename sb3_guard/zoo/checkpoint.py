@@ -181,9 +181,6 @@ class Checkpoints(BaseCallback):
         self.rollouts = state["rollouts"]
         self._elapsed = state["elapsed"]
         self._start = state["start"]
-        names = [name for name, _, _ in state["callbacks"]]
-        if names != [type(one).__name__ for one in self.others]:
-            raise UsageError(f"{self.path} was written with other callbacks: {', '.join(names)}")
         for one, (_, n_calls, own) in zip(self.others, state["callbacks"], strict=True):
             one.n_calls = n_calls
             if own is not None:

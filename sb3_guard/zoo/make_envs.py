@@ -86,18 +86,6 @@ def canonical_id(env_id: str) -> tuple[str, bool]:
     return env_id, ours
 
 
-def choose_vec_env(wanted: str | None, ours: bool, wrapped: bool) -> str:
-    """
-    The kind of vectorised environment: native where it is possible, unless asked otherwise.
-
-    :param wanted: what the flag says, None if it says nothing; :func:`make_envs` refuses native
-        where it is not possible
-    :param ours: the environment is one of ours
-    :param wrapped: single environments get a wrapper, which native ones can't
-    """
-    return wanted or ("native" if ours and not wrapped else "dummy")
-
-
 def make_envs(
     env_id: str,
     setup: Setup,
@@ -119,7 +107,7 @@ def make_envs(
     :param setup: the run's hyper-parameters
     :param n_envs: how many
     :param seed: the environments get seed, seed + 1, …
-    :param vec_env: native, dummy or subproc
+    :param vec_env: native, dummy or subproc; native is refused where it is not possible
     :param env_kwargs: arguments of the environment
     :param cost_keys: entries of info that are costs
     :param num_threads: threads of the native engine; None: its own choice

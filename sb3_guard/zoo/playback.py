@@ -23,7 +23,6 @@ from sb3_guard.zoo.hyperparams import build, check
 from sb3_guard.zoo.make_envs import (
     ERRORS_OF_OURS,
     canonical_id,
-    choose_vec_env,
     make_envs,
 )
 from sb3_guard.zoo.run_folder import (
@@ -145,15 +144,14 @@ def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
 
         th.set_num_threads(flags.num_threads)
     model = load_model(cls, path, None, flags.device)
+    # A batch has no window, and no wrappers of single environments.
+    native = ours and setup.env_wrapper is None and render_mode != "human"
     env = make_envs(
         env_id,
         setup,
         n_envs=1,
         seed=flags.seed,
-        # A batch has no window; a single environment has.
-        vec_env="dummy"
-        if render_mode == "human"
-        else choose_vec_env(None, ours, setup.env_wrapper is not None),
+        vec_env="native" if native else "dummy",
         env_kwargs={
             **(VIDEO if ours and render_mode else {}),
             **setup.env_kwargs,

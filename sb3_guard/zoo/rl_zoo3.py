@@ -20,9 +20,9 @@ from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from sb3_guard.algorithms import ALGORITHMS
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.monitor import CostMonitor
-from sb3_guard.zoo.algos import safe_algorithms
 from sb3_guard.zoo.hyperparams import entry, read_file, shipped_file
 from sb3_guard.zoo.spaces import SPACES, rl_zoo_sampler, space_of
 from sb3_guard.zoo.trust import entries, evaluate, import_class
@@ -50,9 +50,9 @@ def register() -> None:
 
     import sb3_guard  # noqa: F401  registers the environments
 
-    for algo, cls in safe_algorithms().items():
+    for algo, cls in ALGORITHMS.items():
         rl_zoo3.ALGOS[key_in_rl_zoo(algo)] = cls
-    for algo in {**safe_algorithms(), **SPACES}:
+    for algo in {**ALGORITHMS, **SPACES}:
         path = shipped_file(algo)
         if space_of(algo):
             base = read_file(path)["default"] if path.is_file() else {}
@@ -105,7 +105,7 @@ def train(argv: Sequence[str]) -> int:
 
     register()
     arguments = list(argv)
-    ours = {key_in_rl_zoo(algo): algo for algo in safe_algorithms()}
+    ours = {key_in_rl_zoo(algo): algo for algo in ALGORITHMS}
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo")
     parser.add_argument("-conf", "--conf-file")

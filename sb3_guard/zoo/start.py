@@ -13,7 +13,7 @@ from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import is_checkpoint, read_checkpoint
 from sb3_guard.zoo.flags import HOST, IDENTITY
 from sb3_guard.zoo.hyperparams import check, read_hyperparams
-from sb3_guard.zoo.make_envs import canonical_id, choose_vec_env
+from sb3_guard.zoo.make_envs import canonical_id
 from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder, is_run, lock, plain, run_path
@@ -42,9 +42,8 @@ def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
     )
     if flags.env_kwargs:
         values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
-    wrapped = values.get("env_wrapper") is not None
-    chosen: Any = choose_vec_env(flags.vec_env, ours, wrapped)
-    flags.vec_env = chosen
+    native = ours and values.get("env_wrapper") is None  # what wraps single ones needs single ones
+    flags.vec_env = flags.vec_env or ("native" if native else "dummy")
     return flags, values
 
 

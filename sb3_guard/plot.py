@@ -4,13 +4,19 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
+from sb3_guard.zoo import runs as reading
+from sb3_guard.zoo.figures import FORMATS, Data, save
 from sb3_guard.zoo.flags import Command, command, flag
-from sb3_guard.zoo.usage import Parser, UsageError, positive
+from sb3_guard.zoo.paper import FIGURES, draw
+from sb3_guard.zoo.report import report
+from sb3_guard.zoo.run_folder import require_writable
+from sb3_guard.zoo.statistics import with_safety
+from sb3_guard.zoo.tables import check_table, tables, terminal, write_table, written
+from sb3_guard.zoo.usage import UsageError, positive
 
-if TYPE_CHECKING:
-    from sb3_guard.zoo.figures import Data
+TITLES = "\n".join(f"  {name:<10} {one.__doc__}" for name, one in FIGURES.items())
 
 
 @dataclass
@@ -31,7 +37,8 @@ class Flags(Command):
     """
 
     prog: ClassVar[str] = "sb3-guard plot"
-    examples: ClassVar[str] = """examples:
+    examples: ClassVar[str] = (
+        """examples:
   sb3-guard plot logs                                   learning curves, tables on the terminal
   sb3-guard plot logs --figure q3 q4 pareto -o figures --format png pdf
   sb3-guard plot logs --figure all --table results.md results.csv --report report.html
@@ -39,53 +46,18 @@ class Flags(Command):
 
 figures:
 """
+        + TITLES
+    )
 
     folders: list[str] = flag(default=["logs"], positional=True, nargs="*", metavar="DIR")
-    figure: list[str] = flag(default=[], metavar="NAME")
+    figure: list[str] = flag(default=[], choices=[*FIGURES, "all"], metavar="NAME")
     output: str = flag("-o", default="figures", metavar="DIR")
-    format: list[str] = flag(default=["png"], choices=["png", "svg", "pdf"])
+    format: list[str] = flag(default=["png"], choices=FORMATS)
     table: list[str] = flag(default=[], metavar="FILE")
     report: str | None = flag(metavar="FILE.html")
     env: list[str] | None = flag(metavar="ID")
     cost_limit: list[float] | None = flag(metavar="D")
     steps: int | None = flag(kind=positive, metavar="N")
-
-    @classmethod
-    def parser(cls) -> Parser:
-        """The flags; the figures are listed below them."""
-        from sb3_guard.zoo.paper import FIGURES
-
-        result = super().parser()
-        titles = {name: (function.__doc__ or "").strip() for name, function in FIGURES.items()}
-        result.epilog = cls.examples + "\n".join(f"  {k:<10} {v}" for k, v in titles.items())
-        return result
-
-
-def _check(flags: Flags) -> tuple[list[Path], list[str]]:
-    """The tables and the kinds of figures that are asked for, once all is known to be writable."""
-    from sb3_guard.spelling import did_you_mean
-    from sb3_guard.zoo.paper import FIGURES
-    from sb3_guard.zoo.run_folder import require_writable
-    from sb3_guard.zoo.tables import check_table
-
-    for kind in flags.figure:
-        if kind not in (*FIGURES, "all"):
-            hint = did_you_mean(kind, [*FIGURES, "all"])
-            raise UsageError(f"--figure: there is no figure {kind!r}; {hint}")
-    files = [Path(name) for name in flags.table]
-    for file in files:
-        check_table(file)
-        require_writable(file.parent, "--table")
-    if flags.report:
-        if Path(flags.report).suffix not in (".html", ".htm"):
-            raise UsageError(f"--report {flags.report!r} is not an .html file; name it so")
-        require_writable(Path(flags.report).parent, "--report")
-    kinds = list(FIGURES) if "all" in flags.figure else flags.figure
-    if not (kinds or files or flags.report):
-        kinds = ["curves"]
-    if kinds:
-        require_writable(Path(flags.output), "-o")
-    return files, kinds
 
 
 def plot(flags: Flags) -> int:
@@ -94,12 +66,20 @@ def plot(flags: Flags) -> int:
 
     :return: exit status, 1 if a figure lacks all its runs
     """
-    from sb3_guard.zoo import runs as reading
-    from sb3_guard.zoo.figures import Data
-    from sb3_guard.zoo.statistics import with_safety
-    from sb3_guard.zoo.tables import tables, terminal, write_table, written
+    files = [Path(name) for name in flags.table]
+    for file in files:
+        check_table(file)
+        require_writable(file.parent, "--table")
+    if flags.report:
+        if Path(flags.report).suffix not in (".html", ".htm"):
+            raise UsageError(f"--report {flags.report!r} is not an .html file; name it so")
+        require_writable(Path(flags.report).parent, "--report")
+    kinds = [*FIGURES] if "all" in flags.figure else flags.figure
+    by_default = not (kinds or files or flags.report)
+    kinds = ["curves"] if by_default else kinds
+    if kinds:
+        require_writable(Path(flags.output), "-o")
 
-    files, kinds = _check(flags)
     found = reading.read_results(flags.folders)
     for path, why in found.left_out.items():
         print(f"left out: {path}: {why}", file=sys.stderr)
@@ -123,8 +103,6 @@ def plot(flags: Flags) -> int:
     data = Data(runs)
     status = _draw(data, kinds, flags)
     if flags.report:
-        from sb3_guard.zoo.report import report
-
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
         page = report(data, title, found.left_out, notes)
         with written(Path(flags.report)) as handle:
@@ -132,29 +110,26 @@ def plot(flags: Flags) -> int:
         print(f"wrote {flags.report}")
     for why in data.unread.values():
         print(f"left out of the curves: {why}", file=sys.stderr)
-    if not (flags.figure or files or flags.report):
+    if by_default:
         for title, table in tables(runs).items():
             print(f"\n{title}\n\n{terminal(table)}")
     return status
 
 
-def _draw(data: "Data", kinds: Sequence[str], flags: Flags) -> int:
+def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
     """Draw figures; 1 if one that was asked for by name could not be drawn."""
-    from sb3_guard.zoo.figures import save
-    from sb3_guard.zoo.paper import draw
-
     status = 0
     for drawing in (drawing for kind in kinds for drawing in draw(kind, data)):
+        if drawing.missing:
+            lost = "" if drawing.figure else " is not drawn;"
+            print(f"{drawing.name}:{lost} missing: {drawing.missing}", file=sys.stderr)
         if drawing.figure is None:
-            print(f"{drawing.name} is not drawn; missing: {drawing.missing}", file=sys.stderr)
             status = status if "all" in flags.figure else 1
             continue
         for form in dict.fromkeys(flags.format):
             path = Path(flags.output) / f"{drawing.name}.{form}"
             save(drawing.figure, path)
             print(f"wrote {path}")
-        if drawing.missing:
-            print(f"{drawing.name}: missing: {drawing.missing}", file=sys.stderr)
     return status
 
 

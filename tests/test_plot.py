@@ -299,7 +299,7 @@ def test_all_of_it(small, tmp_path, capsys):
     made = {path.stem for path in (tmp_path / "f").iterdir()}
     assert made == {f"curves_{POINT}", f"pareto_{POINT}", "profiles", "iqm", "q1", "q2", "q3", "q4",
                     "q6", "q8"}  # fmt: skip
-    assert f"q7 is not drawn; missing: TRPO-USL, TRPO-SL on {POINT}" in err
+    assert f"q7: is not drawn; missing: TRPO-USL, TRPO-SL on {POINT}" in err
     # One asked for by name that can't be drawn is a failure.
     assert plot.main([str(small), "--figure", "q7", "-o", str(tmp_path / "g")]) == 1
     assert not (tmp_path / "g").exists()
@@ -340,7 +340,7 @@ def test_suites_may_have_limits_of_their_own(small, tmp_path):
     [
         (["absent"], "there is no folder 'absent'"),
         (["."], "there is no run below '.'"),
-        (["LOGS", "--figure", "q9"], "no figure 'q9'"),
+        (["LOGS", "--figure", "q9"], "invalid choice: 'q9' (choose from"),
         (["LOGS", "--format", "gif"], "invalid choice: 'gif'"),
         (["LOGS", "--table", "r.xls"], "unknown format '.xls'"),
         (["LOGS", "--report", "r.pdf"], "--report 'r.pdf' is not an .html file"),

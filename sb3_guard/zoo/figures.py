@@ -114,13 +114,10 @@ class Data:
 
     @cached_property
     def scores(self) -> pd.DataFrame:
-        """Means with scores, index suite and algorithm."""
-        return normalize(self.means, self.means).set_index(["suite", "algo"])
-
-    @cached_property
-    def by_family(self) -> pd.DataFrame:
-        """Scores of the families, index suite and family."""
-        return by_family(self.scores.reset_index()).set_index(["suite", "family"])
+        """Means with scores, of algorithms and of families; index suite and either's key."""
+        scores = normalize(self.means, self.means)
+        families = by_family(scores).rename(columns={"family": "algo"})
+        return pd.concat([scores, families]).set_index(["suite", "algo"])
 
     @cached_property
     def looks(self) -> dict[str, Look]:
@@ -146,7 +143,7 @@ class Data:
     @property
     def families(self) -> list[str]:
         """The families of constrained algorithms."""
-        return list(dict.fromkeys(self.by_family.index.get_level_values("family")))
+        return [key for key in self.looks if key not in {*self.runs["algo"]}]
 
     @property
     def suites(self) -> list[str]:
@@ -171,8 +168,7 @@ class Data:
 
     def score(self, suite: str, algo: str, name: str) -> float:
         """A score of an algorithm or a family, NaN if there is none."""
-        table = self.by_family if algo in self.families else self.scores
-        return float(table[name].get((suite, algo), np.nan))
+        return float(self.scores[name].get((suite, algo), np.nan))
 
     def _label(self, algo: str) -> str:
         return self.looks[algo].label if algo in self.looks else described(algo)["label"]

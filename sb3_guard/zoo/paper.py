@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -81,19 +80,18 @@ def mark_trpo(axis: Axes) -> None:
 
 def q3(data: Data) -> Figure | None:
     """Families of algorithms: reward, cost and cost rate on four suites, a polygon per family."""
-    have = data.by_family.index.get_level_values("suite")
-    shown = [s for s in RADAR4 if s in have and not np.isnan(data.score(s, REFERENCE, "cost"))]
-    if not shown:
-        return None
     spiders = {
         suite: {
             family: [data.score(suite, family, score) for score in SCORES.values()]
             for family in data.families
+            if (suite, family) in data.scores.index
         }
-        for suite in shown
+        for suite in RADAR4
+        if not np.isnan(data.score(suite, REFERENCE, "cost"))
     }
-    spokes = {suite: [*SPOKES.values()] for suite in shown}
-    return draw_spiders(spiders, spokes, data.looks)
+    spiders = {suite: polygons for suite, polygons in spiders.items() if polygons}
+    spokes = {suite: [*SPOKES.values()] for suite in spiders}
+    return draw_spiders(spiders, spokes, data.looks) if spiders else None
 
 
 def draw_spiders(
@@ -181,24 +179,21 @@ def q7(data: Data) -> Figure | None:
 
 def q8(data: Data) -> Figure | None:
     """Every algorithm, every task: five task options, each a mean over the robots there are."""
-    suites = {o: [name.format(robot) for robot in ROBOTS] for o, name in OPTIONS.items()}
+    options = {name.format(robot): o for o, name in OPTIONS.items() for robot in ROBOTS}
+    scores = [*SCORES.values()]
+    table = data.scores[scores].dropna().reset_index()  # of robots that have them all
+    table["option"] = table.pop("suite").map(options)
     spiders: dict[str, dict[str, list[float]]] = {}
     spokes: dict[str, list[str]] = {}
-    for algo in (a for a in data.looks if a != REFERENCE and a not in data.families):
-        # option, robot, score; a mean is over the robots that have all scores
-        values: Any = np.array(
-            [[[data.score(suite, algo, score) for score in SCORES.values()] for suite in row]
-             for row in suites.values()]
-        )  # fmt: skip
-        if not np.isfinite(values).any():
+    for algo, look in data.looks.items():
+        own = table[table["algo"] == algo].groupby("option")[scores].agg(["mean", "size"])
+        if algo == REFERENCE or algo in data.families or not len(own):
             continue
-        number = np.isfinite(values).all(axis=2).sum(axis=1)
-        means = np.ma.masked_invalid(values).mean(axis=1).filled(np.nan)
-        title = data.looks[algo].label
-        spiders[title] = dict(zip(SCORES.values(), means.T.tolist(), strict=True))
-        spokes[title] = [
-            option if n == len(ROBOTS) else f"{option}\n({n}/{len(ROBOTS)})"
-            for option, n in zip(suites, number, strict=True)
+        own = own.reindex([*OPTIONS])
+        spiders[look.label] = {score: own[score, "mean"].tolist() for score in scores}
+        spokes[look.label] = [
+            str(option) if number == len(ROBOTS) else f"{option}\n({number:.0f}/{len(ROBOTS)})"
+            for option, number in own["cost", "size"].fillna(0).items()
         ]
     return draw_spiders(spiders, spokes, POLYGONS) if spiders else None
 

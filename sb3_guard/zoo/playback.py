@@ -50,7 +50,8 @@ def find_run(folder: str | Path, algo: str, env_id: str, number: int = 0) -> Run
     :raises UsageError: there is none; the message lists those that there are
     """
     parent, name = Path(folder) / algo, folder_name(env_id)
-    name = name if latest_run(parent, name) else f"{name.removesuffix('-v0')}-v0"
+    if not latest_run(parent, name) and not name.rpartition("-v")[2].isdigit():
+        name = f"{name}-v0"
     number = number or latest_run(parent, name)
     if number:
         return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")

@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms import CRPO, TRPOFAC, TRPOIPO, FirstOrder
+from sb3_guard.algorithms import CRPO, CUP, P3O, TRPOFAC, TRPOIPO, FirstOrder
 
 
 class World:
@@ -384,20 +384,21 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
 
 
 def budget(cls: type, problem: Problem) -> Problem:
-    """The problem with as many steps as an algorithm's defaults need.
+    """The problem with as many steps as an algorithm's defaults need: twice its updates.
 
-    SB3's rate of 3e-4 moves a log standard deviation by no more than that in a gradient step, so
-    first-order algorithms get four times the updates of trust regions. So does CRPO: at the limit
-    every other step undoes what the last one did to the cost, and little of a step is left to
-    narrow the policy; TRPO-IPO, whose steps are cut where they would cross the limit; and TRPO-FAC,
-    whose multipliers are networks that have to be learnt.
-    Off-policy ones get a gradient step for each of 10,000 steps of one environment.
+    First-order algorithms get four times, since SB3's rate of 3e-4 moves a log standard deviation
+    by no more than that in a gradient step. So does CRPO: at the limit every other step undoes what
+    the last one did to the cost, and little of a step is left to narrow the policy; TRPO-IPO, whose
+    steps are cut where they would cross the limit; and TRPO-FAC, whose multipliers are networks
+    that have to be learnt. CUP and P3O, first-order ones whose updates go to and fro as CRPO's do,
+    get eight times. Off-policy ones take 10,000 steps of one environment, each with a gradient
+    step.
     """
-    if issubclass(cls, FirstOrder | CRPO | TRPOIPO | TRPOFAC):
-        return replace(problem, updates=4 * problem.updates)
-    if not issubclass(cls, OnPolicyAlgorithm):
-        return replace(problem, n_envs=1, n_steps=1, updates=10_000)
-    return problem
+    if issubclass(cls, OnPolicyAlgorithm):
+        slow = issubclass(cls, FirstOrder | CRPO | TRPOIPO | TRPOFAC)
+        times = 8 if issubclass(cls, CUP | P3O) else 4 if slow else 2
+        return replace(problem, updates=times * problem.updates)
+    return replace(problem, n_envs=1, n_steps=1, updates=10_000)
 
 
 def _table(

@@ -378,8 +378,7 @@ def test_a_known_optimum(key: str, kwargs: dict[str, Any]) -> None:
 
     The networks learn faster than by default, which takes seconds in place of minutes.
     """
-    # FOCOPS and CUP are still on their way after 60 updates
-    updates = 100 if key in ("focops", "cup") else 40
+    updates = {"focops": 100, "cup": 160}.get(key, 40)
     problem = replace(problems()["table"], updates=updates)
     assert isinstance(problem.world().cmdp, TabularCMDP)
     fast: dict[str, Any] = {"learning_rate": 3e-3, "batch_size": problem.n_envs * problem.n_steps}

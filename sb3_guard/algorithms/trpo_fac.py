@@ -38,7 +38,7 @@ class StateMultiplier(nn.Module):
         n_costs: int,
         rate: float,
         init: float | None = None,
-        ascent: Literal["output", "value"] = "value",
+        ascent: Literal["output", "value"] = "output",
     ) -> None:
         super().__init__()
         self.ascent = ascent
@@ -129,7 +129,7 @@ class TRPOFAC(TrustRegion):
     lambda_init: float | None = hyperparameter(None, ends="()")
     mode: Literal["statewise", "expected"] = hyperparameter("statewise")
     units: Literal["relative", "cost"] = hyperparameter("relative")
-    lambda_ascent: Literal["output", "value"] = hyperparameter("value")
+    lambda_ascent: Literal["output", "value"] = hyperparameter("output")
     proportional_gain: float = hyperparameter(5.0)
     trace: bool = hyperparameter(True)
 

@@ -1,4 +1,4 @@
-"""RCPO: natural gradient steps on the penalised reward, the penalty learnt slowly."""
+"""RCPO: natural gradient steps on the penalised advantage, without a line search."""
 
 import numpy as np
 import torch as th
@@ -18,8 +18,9 @@ class RCPO(PenalizedTrustRegion):
 
         max_π min_{λ ≥ 0}   J(π) - Σ λ_i (J_Ci(π) - d_i)
 
-    on two time scales: the policy takes a natural step of length √(2δ), without a line search, on
-    ``A - Σ λ_i A_Ci``, and the multipliers follow the violation more slowly.
+    The policy takes a natural step of length √(2δ), without a line search, on ``A - Σ λ_i A_Ci``,
+    and the multipliers follow the violation as :class:`~sb3_guard.TRPOLag`'s do; the paper has them
+    follow more slowly.
 
     :param penalized_reward: put the penalty into the reward, as the paper does: one critic learns
         r - Σ λ_i c_i, and there is none of the costs. Relative multipliers are then in units of the

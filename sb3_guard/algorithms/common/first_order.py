@@ -10,7 +10,6 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.utils import explained_variance
@@ -186,12 +185,6 @@ class FirstOrder(CostRollouts, PPO):
             and self.target_kl is not None
             and self._mean_kl(start) > self.target_kl
         )
-
-    def _taken(self, batch: CostRolloutBufferSamples) -> th.Tensor:
-        """The actions as the policy's distribution takes them."""
-        if isinstance(self.action_space, spaces.Discrete):
-            return batch.actions.long().flatten()
-        return batch.actions
 
     def _evaluate(self, batch: CostRolloutBufferSamples) -> tuple[th.Tensor, ...]:
         """Values, log-probabilities and entropies; the distribution is ``policy.action_dist``."""

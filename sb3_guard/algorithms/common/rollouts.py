@@ -23,7 +23,11 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecE
 from sb3_guard.algorithms.common.advantage import discounted_returns
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import rows
-from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
+from sb3_guard.algorithms.common.buffers import (
+    CostDictRolloutBuffer,
+    CostRolloutBuffer,
+    CostRolloutBufferSamples,
+)
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.fast.threads import one_thread
@@ -242,6 +246,12 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         return one if self.cost_units is None else np.where(self.cost_units, self.cost_units, one)
 
     # Learning
+
+    def _taken(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """The actions as the policy's distribution takes them."""
+        if isinstance(self.action_space, spaces.Discrete):
+            return batch.actions.long().flatten()
+        return batch.actions
 
     def fit_cost_critic(self, n_epochs: int | None = None, batch_size: int | None = None) -> None:
         """Fit the cost critic to the rollout's cost returns, with the algorithm's learning rate.

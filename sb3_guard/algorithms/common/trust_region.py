@@ -254,11 +254,8 @@ class TrustRegion(CostRollouts):
         advantages, cost_advantages = batch.advantages, batch.cost_advantages
         if self.normalize_advantage:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        actions = batch.actions
-        if isinstance(self.action_space, spaces.Discrete):
-            actions = actions.long().flatten()
         return batch._replace(
-            actions=actions,
+            actions=self._taken(batch),
             advantages=advantages,
             cost_advantages=cost_advantages - cost_advantages.mean(dim=0),
         )

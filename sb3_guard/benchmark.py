@@ -130,11 +130,11 @@ def with_file(flags: Flags) -> Flags:
 
 def show_plan(runs: Sequence["Run"]) -> None:
     """Print the runs and how far they are."""
+    from sb3_guard.zoo.live import summary
+
     for one in runs:
         print(f"{one.state:<7} {one.path}  {one.steps:,} steps")
-    states = [one.state for one in runs]
-    counts = ", ".join(f"{states.count(state)} {state}" for state in ("done", "resume", "new"))
-    print(f"{len(runs)} runs ({counts}), {sum(one.steps for one in runs):,} steps in all")
+    print(f"{summary(runs)}; {sum(one.steps for one in runs):,} steps in all")
 
 
 def benchmark(flags: Flags) -> int:

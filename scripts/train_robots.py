@@ -13,27 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from untrained import EPISODES, episodes
 
 from sb3_guard import TRPO, evaluate_policy, make_vec_env
 from sb3_guard.envs.registry import ROBOTS, guard
 from sb3_guard.zoo.hyperparams import build, check, read_hyperparams
 
-EPISODES = 20
 SLOW = {"Doggo", "Ant", "Walker", "Humanoid"}  # twice the steps
-
-
-def random_returns(env_id: str, seed: int) -> np.ndarray:
-    """Returns of EPISODES episodes of uniformly random actions."""
-    env = make_vec_env(env_id, EPISODES, seed=seed)
-    env.action_space.seed(seed)
-    env.reset()
-    returns: list[float] = []
-    while len(returns) < EPISODES:
-        actions = np.stack([env.action_space.sample() for _ in range(EPISODES)])
-        *_, infos = env.step(actions)
-        returns += [info["episode"]["r"] for info in infos if "episode" in info]
-    env.close()
-    return np.array(returns)
 
 
 def main() -> None:
@@ -64,16 +50,16 @@ def main() -> None:
             model = TRPO(env=env, seed=args.seed, **setup.model).learn(steps)
             env.close()
             model.save(agent)
-        before = random_returns(env_id, args.seed + 10_000)
+        before = episodes(env_id, "random")
         test = make_vec_env(env_id, EPISODES, seed=args.seed + 20_000, num_threads=args.threads)
         result = evaluate_policy(model, test, n_eval_episodes=EPISODES, deterministic=False)
         fixed = evaluate_policy(model, test, n_eval_episodes=EPISODES)
-        errors = [x.std(ddof=1) / np.sqrt(len(x)) for x in (before, result.returns)]
-        apart = (result.returns.mean() - before.mean()) / np.hypot(*errors)
+        error = result.returns.std(ddof=1) / np.sqrt(EPISODES)
+        apart = (result.returns.mean() - before["random"]) / np.hypot(error, before["random_se"])
         print(
-            f"| {robot} | {model.num_timesteps:,} | {before.mean():.2f} ± {errors[0]:.2f} "
-            f"| {result.returns.mean():.2f} ± {errors[1]:.2f} | {apart:.1f} "
-            f"| {result.costs.mean():.2f} | {fixed.returns.mean():.2f} |",
+            f"| {robot} | {model.num_timesteps:,} | {before['random']:.2f} "
+            f"± {before['random_se']:.2f} | {result.returns.mean():.2f} ± {error:.2f} "
+            f"| {apart:.1f} | {result.costs.mean():.2f} | {fixed.returns.mean():.2f} |",
             flush=True,
         )
         test.close()

@@ -131,7 +131,7 @@ def test_scale_shortens_every_run_alike(tmp_path, capsys):
     out = capsys.readouterr().out.splitlines()
     assert [line.split()[2] for line in out[:4]] == ["60,000"] * 2 + ["300,000"] * 2
     assert out[0].split()[:2] == ["new", str(tmp_path / "a" / "cpo" / "Goal_Point_8Hazards-v0_4")]
-    assert out[4] == "4 runs (0 done, 0 resume, 4 new), 720,000 steps in all"
+    assert out[4] == "0 of 4 done, 4 new; 720,000 steps in all"
     assert list(tmp_path.iterdir()) == []
     (run,) = grid.expand([("Goal_Point_8Hazards", "trpo_sl")], [0], RunFlags(), scale=0.5)
     assert run.values["warmup"] == pytest.approx(1 / 3)  # a ratio of whatever the length is
@@ -270,7 +270,7 @@ def test_done_is_skipped_and_half_written_made_whole(tmp_path, here, capsys):
         path.unlink()
     assert benchmark.main(arguments) == 0
     assert len(here.runs) == 4
-    assert "0 done, 1 to resume, 1 new" in capsys.readouterr().out
+    assert "0 of 2 done, 1 resume, 1 new" in capsys.readouterr().out
     after = results(tmp_path)
     assert {k: without_clock(v) for k, v in whole.items()} == {
         k: without_clock(v) for k, v in after.items()
@@ -396,7 +396,7 @@ def test_asked_to_stop(tmp_path, here, monkeypatch, capsys):
     assert len(here.runs) == 1 and results(tmp_path) == {}
     monkeypatch.setattr(grid, "complete", complete)
     assert benchmark.main(["-f", str(tmp_path)]) == 0 and len(results(tmp_path)) == 2
-    assert "1 to resume, 1 new" in capsys.readouterr().out
+    assert "1 resume, 1 new" in capsys.readouterr().out
 
 
 def test_the_scheduler_dies(tmp_path, here, monkeypatch, capsys):
@@ -454,7 +454,7 @@ def test_seeds_of_train(tmp_path, here, capsys):
     assert capsys.readouterr() == ("", "")
     assert list(results(tmp_path)) == ["cpo/CostPoint-v0_1", "cpo/CostPoint-v0_5"]
     assert train.main([*one, "--seeds", "0", "4", "5"]) == 0
-    assert len(here.runs) == 3 and "2 done, 0 to resume, 1 new" in capsys.readouterr().out
+    assert len(here.runs) == 3 and "2 of 3 done, 1 new" in capsys.readouterr().out
     assert not (tmp_path / "grid.yml").exists()
 
 

@@ -387,19 +387,15 @@ def run_grid(
     :return: exit status, see :meth:`Execution.carry_out`
     :raises UsageError: the workers are gone, or can't do the work
     """
-    from sb3_guard.zoo.live import Board
+    from sb3_guard.zoo.live import Board, summary
 
     status, no_disk = 0, ""
-    states = [run.state for run in runs]
     board = Board(str(folder), verbose)
     with board.bars:
-        board.say(
-            f"{len(runs)} runs in {folder}: {states.count('done')} done, "
-            f"{states.count('resume')} to resume, {states.count('new')} new"
-        )
+        board.say(f"{folder}: {summary(runs)}")
         for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
             board.say(f"{algo} has no {', '.join(names)}: left out there")
-        if states.count("done") < len(runs):
+        if any(run.state != "done" for run in runs):
             with workers(jobs, scheduler, folder) as client:
                 execution = Execution(runs, client, board)
                 try:
@@ -407,9 +403,8 @@ def run_grid(
                 except UsageError as error:
                     raise UsageError(f"{one_line(error)}; {again}") from error
                 no_disk = execution.no_disk
-    done = sum(run.state == "done" for run in runs)
-    board.say(f"{done} of {len(runs)} runs are done in {folder}")
-    if done < len(runs):
+    board.say(f"{folder}: {summary(runs)}")
+    if any(run.state != "done" for run in runs):
         board.say(again[0].upper() + again[1:])
     for run in runs:
         if run.state == "failed":

@@ -16,10 +16,8 @@ from tqdm import tqdm
 
 import sb3_guard
 from sb3_guard.common.monitor import find_monitor
-from sb3_guard.zoo.run_folder import limit_words
+from sb3_guard.zoo.run_folder import EPOCH, limit_words
 
-# The epoch of algorithms whose rollouts are a few steps long: the paper's, in steps
-EPOCH = 30_000
 PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")
 
 

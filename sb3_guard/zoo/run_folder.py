@@ -27,6 +27,7 @@ CHECKPOINT = "checkpoint.zip"
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 # What a result measures: return, episode cost and cost rate; null where no episode has ended.
 MEASURES = ("return", "cost", "cost_rate")
+EPOCH = 30_000  # steps, the paper's; of algorithms whose rollouts are a few steps long
 SILENCE = 120.0  # seconds without a sign of life after which another host takes a lock over
 
 WAIT = 1.2 * SILENCE  # seconds in which such a silence is certainly seen

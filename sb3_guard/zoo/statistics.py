@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import trim_mean
 
+from sb3_guard.zoo.run_folder import EPOCH
 from sb3_guard.zoo.runs import METRICS, REFERENCE, compared, read_episodes
 from sb3_guard.zoo.usage import UsageError
 
@@ -24,7 +25,6 @@ SAFETY = (
     "return_last", "cost_last", "above_limit", "cost_p95", "cost_max", "cost_total", "feasible_iqm",
 )  # fmt: skip
 RESAMPLES = 2000
-OFF_POLICY_EPOCH = 30_000  # steps, where a rollout is a few steps long
 
 
 def iqm(values: Any, axis: int = 0) -> Any:
@@ -75,7 +75,7 @@ def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, floa
         within the limit (NaN: none is)
     """
     total = episodes["step"].iloc[-1]
-    size = epoch if epoch > 0 else min(OFF_POLICY_EPOCH, total / 20)
+    size = epoch if epoch > 0 else min(EPOCH, total / 20)
     number: Any = np.ceil(episodes["step"] / size)
     last = episodes[number > number.iloc[-1] - EPOCHS]
     means = last.groupby(number)[["J_r", "M_c"]].mean().mean()

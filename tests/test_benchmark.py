@@ -260,7 +260,7 @@ def test_done_is_skipped_and_half_written_made_whole(tmp_path, here, capsys):
 
     assert benchmark.main(arguments) == 0
     assert len(here.runs) == 2
-    assert "2 runs in" in capsys.readouterr().out
+    assert "2 of 2 done" in capsys.readouterr().out
 
     cpo, trpo = tmp_path / "cpo" / "CostPoint-v0_1", tmp_path / "trpo" / "CostPoint-v0_1"
     # A corrupt result: the checkpoint of its end is still there.

@@ -214,7 +214,7 @@ def test_objects_are_made():
     assert setup.model["policy_kwargs"] == {"activation_fn": nn.ReLU}
     assert setup.model["policy"].__name__ == "ActorCriticPolicy"
     assert setup.normalize == {"gamma": 0.9}
-    assert isinstance(setup.env_wrapper(gym.make("CartPole-v1")), gym.wrappers.FlattenObservation)
+    assert setup.env_wrapper == [(gym.wrappers.FlattenObservation, {})]
     assert setup.env_kwargs == {"a": 1}
     assert (setup.n_envs, setup.n_timesteps, setup.callbacks()) == (1, 100, [])
     assert "env_kwargs" not in setup.model and "n_envs" not in setup.model

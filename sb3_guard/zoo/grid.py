@@ -392,10 +392,10 @@ def run_grid(
     status, no_disk = 0, ""
     board = Board(str(folder), verbose)
     with board.bars:
-        board.say(f"{folder}: {summary(runs)}")
         for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
             board.say(f"{algo} has no {', '.join(names)}: left out there")
         if any(run.state != "done" for run in runs):
+            board.say(f"{folder}: {summary(runs)}")
             with workers(jobs, scheduler, folder) as client:
                 execution = Execution(runs, client, board)
                 try:

@@ -15,7 +15,6 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
@@ -26,11 +25,10 @@ from stable_baselines3.common.noise import (
     OrnsteinUhlenbeckActionNoise,
 )
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.trust import PRESETS, entries, evaluate, import_class, wrapper
+from sb3_guard.zoo.trust import PRESETS, classes, evaluate, import_class
 from sb3_guard.zoo.usage import UsageError, explained, read_mapping
 from sb3_guard.zoo.values import kind_of
 
@@ -226,8 +224,8 @@ class Setup:
     :param normalize: arguments of VecNormalize; None: not used
     :param frame_stack: number of stacked observations; None: not used
     :param env_kwargs: arguments of the environment
-    :param env_wrapper: wraps each single environment; None: not used
-    :param vec_env_wrapper: wraps the vectorised environment; None: not used
+    :param env_wrapper: classes that wrap each single environment, and their arguments
+    :param vec_env_wrapper: those that wrap the vectorised environment
     :param monitor_kwargs: arguments of the monitor
     :param callback: names of callbacks; :meth:`callbacks` makes them
     :param selection_limit: see CostEvalCallback
@@ -241,8 +239,8 @@ class Setup:
     normalize: dict[str, Any] | None = None
     frame_stack: int | None = None
     env_kwargs: dict[str, Any] = field(default_factory=dict)
-    env_wrapper: Callable[[gym.Env], gym.Env] | None = None
-    vec_env_wrapper: Callable[[VecEnv], VecEnv] | None = None
+    env_wrapper: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
+    vec_env_wrapper: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
     monitor_kwargs: dict[str, Any] = field(default_factory=dict)
     callback: Any = None
     selection_limit: float | list[float] | None = None
@@ -255,10 +253,9 @@ class Setup:
 
         :raises UsageError: one is not there, not a callback, or refuses its arguments
         """
-        found = entries("callback", self.callback)
-        classes = [import_class("callback", path, BaseCallback) for path, _ in found]
+        found = classes("callback", self.callback)
         with explained("a callback can't be made"):
-            return [cls(**kwargs) for cls, (_, kwargs) in zip(classes, found, strict=True)]
+            return [cls(**kwargs) for cls, kwargs in found]
 
     def action_noise(self, actions: int) -> ActionNoise | None:
         """
@@ -302,8 +299,8 @@ def build(values: Mapping[str, Any]) -> Setup:
         run["normalize"] = {**learned, **({} if run["normalize"] is True else run["normalize"])}
     else:
         run["normalize"] = None
-    for name, base in (("env_wrapper", gym.Wrapper), ("vec_env_wrapper", VecEnvWrapper)):
-        run[name] = wrapper(name, run.get(name), base)
+    for name in ("env_wrapper", "vec_env_wrapper"):
+        run[name] = classes(name, run.get(name))
     return Setup(model, **run)
 
 

@@ -118,7 +118,9 @@ def make_envs(
     """
 
     def wrap(env: gym.Env) -> gym.Env:
-        return ResumableEnv(env if setup.env_wrapper is None else setup.env_wrapper(env))
+        for cls, arguments in setup.env_wrapper:
+            env = cls(env, **arguments)
+        return ResumableEnv(env)
 
     with (
         explained(f"can't make {env_id}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
@@ -143,8 +145,8 @@ def make_envs(
 
 
 def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: VecNormalize | None) -> VecEnv:
-    if setup.vec_env_wrapper is not None:
-        env = setup.vec_env_wrapper(env)
+    for cls, arguments in setup.vec_env_wrapper:
+        env = cls(env, **arguments)
     if normalizer is not None:
         normalizer.set_venv(env)
         env = normalizer

@@ -146,7 +146,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
         th.set_num_threads(flags.num_threads)
     model = load_model(cls, path, None, flags.device)
     # A batch has no window, and no wrappers of single environments.
-    native = ours and setup.env_wrapper is None and render_mode != "human"
+    native = ours and not setup.env_wrapper and render_mode != "human"
     env = make_envs(
         env_id,
         setup,

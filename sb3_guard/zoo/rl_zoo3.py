@@ -14,25 +14,22 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import gymnasium as gym
 import yaml
 from stable_baselines3 import HerReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms import ALGORITHMS
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.zoo.hyperparams import entry, read_file, shipped_file
 from sb3_guard.zoo.spaces import SPACES, rl_zoo_sampler, space_of
-from sb3_guard.zoo.trust import entries, evaluate, import_class
+from sb3_guard.zoo.trust import BASES, classes, evaluate
 from sb3_guard.zoo.usage import KeyValues, UsageError, run
 
 # Hyper-parameters that RL-Zoo evaluates where they are text, and the class it knows by a bare name.
 TEXT = ("normalize", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
         "monitor_kwargs")  # fmt: skip
 BUFFERS = {"HerReplayBuffer": HerReplayBuffer}
-CLASSES = {"env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback}
 
 
 def key_in_rl_zoo(algo: str) -> str:
@@ -87,9 +84,8 @@ def typed(values: dict[str, Any]) -> dict[str, Any]:
         value = values.get(name)
         if isinstance(value, str):
             read[name] = BUFFERS.get(value) or evaluate(name, value)
-    for name, base in CLASSES.items():
-        for path, _ in entries(name, values.get(name)):
-            import_class(name, path, base)
+    for name in BASES:
+        classes(name, values.get(name))
     return read
 
 

@@ -9,10 +9,14 @@ RL-Zoo, Stable-Baselines3 and what they stand on are used; any other needs ``--t
 import importlib
 import operator
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_guard.zoo.usage import UsageError, explained
 from sb3_guard.zoo.values import read_expression
@@ -20,8 +24,10 @@ from sb3_guard.zoo.values import read_expression
 KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
 # Files of what differs from an algorithm's own file, which `-conf NAME` reads; not code.
 PRESETS = {"paper": "the paper", "omnisafe": "the settings that OmniSafe has published"}
-# Hyper-parameters that name classes, one or several, perhaps with arguments.
-LISTS = ("env_wrapper", "vec_env_wrapper", "callback")
+# Hyper-parameters that name classes, one or several, perhaps with arguments; and of what kind.
+BASES: dict[str, type] = {
+    "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
+}  # fmt: skip
 
 
 def entries(name: str, value: Any) -> list[tuple[str, dict[str, Any]]]:
@@ -60,6 +66,15 @@ def import_class(name: str, path: str, base: type) -> Any:
     if not (isinstance(found, type) and issubclass(found, base)):
         raise UsageError(f"{name}: {path!r} is not allowed; it must be a {base.__name__}")
     return found
+
+
+def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:
+    """
+    What ``env_wrapper``, ``vec_env_wrapper`` or ``callback`` names: classes and their arguments.
+
+    :raises UsageError: one is not there, or not of its kind
+    """
+    return [(import_class(name, path, BASES[name]), own) for path, own in entries(name, value)]
 
 
 def torch_class(path: str) -> Any:
@@ -108,7 +123,7 @@ def _foreign(args: Mapping[str, Any], values: Mapping[str, Any]) -> Iterator[str
         yield f"conf_file: {file}"
     for name, value in values.items():
         paths = []
-        if name in LISTS:
+        if name in BASES:
             paths = [path for path, _ in entries(name, value)]
         elif isinstance(value, str) and (name == "policy" or name.endswith("_class")):
             paths = [value] if "." in value else []
@@ -140,21 +155,3 @@ def require_trust(
         raise UsageError(
             f"{where} names code to run ({'; '.join(found[:3])}); look at it, then add --trust"
         )
-
-
-def wrapper(name: str, value: Any, base: type) -> Callable[[Any], Any] | None:
-    """
-    What applies the wrappers that ``env_wrapper`` or ``vec_env_wrapper`` names.
-
-    :param base: the class they must have: a Gymnasium or a vectorised wrapper
-    :return: None if there are none
-    :raises UsageError: one is not there, or not a wrapper
-    """
-    found = [(import_class(name, path, base), kwargs) for path, kwargs in entries(name, value)]
-
-    def wrap(env: Any) -> Any:
-        for cls, kwargs in found:
-            env = cls(env, **kwargs)
-        return env
-
-    return wrap if found else None

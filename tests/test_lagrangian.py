@@ -196,11 +196,17 @@ def test_ascent_is_the_gradient_of_the_mean() -> None:
 
 
 def test_limits_of_discounted_costs() -> None:
-    """25 per episode of 1000 steps is a cost of 0.025 a step: 2.5 at γ = 0.99, all of it at 1."""
+    """25 per episode of 1000 steps is a cost of 0.025 a step: 2.5 at γ = 0.99, all of it at 1.
+
+    Of 30 steps that a time limit cuts, it is what a critic says that values what comes after them.
+    """
     limits = np.array([25.0, 0.0])
-    found = discounted_limit(limits, 1000.0, 0.99)
+    found = discounted_limit(limits, 1000.0, 0.99, cut=False)
     np.testing.assert_allclose(found, [0.025 * sum(0.99**k for k in range(1000)), 0.0])
-    np.testing.assert_allclose(discounted_limit(limits, 1000.0, 1.0), limits)
+    for cut in (False, True):
+        np.testing.assert_allclose(discounted_limit(limits, 1000.0, 1.0, cut), limits)
+    found = discounted_limit(limits, 30.0, 0.99, cut=True)
+    np.testing.assert_allclose(found, [25.0 / 30.0 * 100.0, 0.0])
 
 
 @pytest.mark.parametrize("mode", ["statewise", "expected"])

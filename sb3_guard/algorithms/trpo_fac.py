@@ -13,7 +13,6 @@ from torch.nn import functional as F
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.costs import discounted_limit
 from sb3_guard.algorithms.common.critics import StateNetwork
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
@@ -93,7 +92,8 @@ class TRPOFAC(TrustRegion):
         max_π min_ξ   E_s[ V(s) - Σ λ_i(s; ξ) (V_Ci(s) - d_γi) ],   λ_i(s; ξ) ≥ 0
 
     a limit at every state: the cost-to-go from s, discounted, is to stay below
-    ``d_γ = (d/T) (1 - γᵀ)/(1 - γ)``. The policy takes a TRPO step on
+    ``d_γ = (d/T) (1 - γᵀ)/(1 - γ)``, or ``(d/T) / (1 - γ)`` where a time limit cuts episodes, whose
+    cost is bootstrapped. The policy takes a TRPO step on
     ``E[ratio · (A - Σ p_i A_Ci)]``; then Adam raises λ(s) where the returns of the batch exceed
     d_γ and lowers it elsewhere. The price p of an action begins with
     ``λ(s) + K_P (V_C(s) - d_γ) / d_γ``, at least 0, the fraction between -1 and 1, which keeps λ
@@ -192,8 +192,7 @@ class TRPOFAC(TrustRegion):
         :param to_come: each step's discounted cost to come, [N, m]
         """
         if self.mode == "statewise":
-            gamma = self.rollout_buffer.cost_gamma
-            bound = discounted_limit(self.cost_limits, self.costs.horizon, gamma)
+            bound = self.discounted_limits()
         else:
             bound = self.cost_limits
             to_come = th.as_tensor(self.costs.episode_cost).to(to_come).expand_as(to_come)

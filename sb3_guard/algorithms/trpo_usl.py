@@ -11,7 +11,6 @@ from sb3_guard.algorithms.common.action_filters import UnrolledSafetyLayer
 from sb3_guard.algorithms.common.advantage import gae
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.costs import discounted_limit
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 
 
@@ -37,7 +36,8 @@ class TRPOUSL(FilteredTrustRegion):
     :param warmup: share of the first ``learn`` before the layer is switched on; an integer is a
         number of steps
     :param threshold: highest discounted cost to come that is not corrected; one number or one per
-        cost key; None: the larger of ``tolerance`` and ``(d/T) (1 - γᵀ)/(1 - γ)``
+        cost key; None: the larger of ``tolerance`` and ``(d/T) (1 - γᵀ)/(1 - γ)``, or
+        ``(d/T) / (1 - γ)`` where a time limit cuts episodes, whose cost is bootstrapped
     :param tolerance: what the Q-critic may say of a state where nothing costs: a softplus never
         is zero. On Goal_Point_8Hazards, after 8 updates, a twentieth of the states without any
         later cost is below 0.05
@@ -85,8 +85,7 @@ class TRPOUSL(FilteredTrustRegion):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
-        gamma = self.rollout_buffer.cost_gamma
-        limit = discounted_limit(self.cost_limits, self.costs.horizon, gamma)
+        gamma, limit = self.rollout_buffer.cost_gamma, self.discounted_limits()
         if bool((batch.costs < 0.0).any()):
             self._warn_once(
                 "TRPOUSL met costs below zero: to its critic no cost to come is less than 0; add a "

@@ -19,15 +19,18 @@ class CostEstimate(NamedTuple):
     violation: np.ndarray
 
 
-def discounted_limit(limits: np.ndarray, horizon: float, gamma: float) -> np.ndarray:
+def discounted_limit(limits: np.ndarray, horizon: float, gamma: float, cut: bool) -> np.ndarray:
     """The limits d of an episode's cost as limits of a discounted cost-to-go.
 
-    A constant cost of d/T per step has the discounted sum ``d_γ = (d/T) (1 - γᵀ)/(1 - γ)``.
+    A constant cost of d/T per step has the discounted sum ``d_γ = (d/T) (1 - γᵀ)/(1 - γ)``, and
+    ``(d/T) / (1 - γ)`` where the time limit of an episode is bootstrapped as if it went on.
 
     :param limits: d, shape (m,)
     :param horizon: T, steps
     :param gamma: discount factor of the costs
+    :param cut: whether episodes are cut by a time limit, which is bootstrapped where γ < 1
     :return: d_γ, shape (m,); d itself where γ is 1
     """
-    steps = horizon if gamma == 1.0 else (1.0 - gamma**horizon) / (1.0 - gamma)
-    return limits / horizon * steps
+    if gamma == 1.0:
+        return limits
+    return limits / horizon * (1.0 if cut else 1.0 - gamma**horizon) / (1.0 - gamma)

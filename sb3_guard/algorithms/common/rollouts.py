@@ -29,6 +29,7 @@ from sb3_guard.algorithms.common.buffers import (
     CostRolloutBufferSamples,
 )
 from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.costs import discounted_limit
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.fast.threads import one_thread
 
@@ -186,6 +187,13 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             self._count_last_step(callback)
         self.timing["collect"] = time.perf_counter() - started
         return full
+
+    def discounted_limits(self) -> np.ndarray:
+        """The limits as those of the discounted costs-to-go of the last rollout, shape (m,)."""
+        gamma = self.rollout_buffer.cost_gamma
+        return discounted_limit(
+            self.cost_limits, self.costs.horizon, gamma, cut=bool(self._timeouts)
+        )
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None

@@ -32,9 +32,11 @@ from stable_baselines3.common.vec_env import (
 from sb3_guard.algorithms import (
     ALGORITHMS,
     CPO,
+    P3O,
     RCPO,
     TRPO,
     TRPOFAC,
+    TRPOIPO,
     TRPOSL,
     TRPOUSL,
     PPOLag,
@@ -848,6 +850,19 @@ def test_logs(cls: type[TrustRegion]) -> None:
     assert found == expected | {key for key in SB3_KEYS if key.startswith("train/")}
     assert dump["rollout/ep_cost_mean"] == pytest.approx(np.mean(model.ep_cost_buffer))
     assert dump["rollout/cost_rate"] == pytest.approx(model.total_cost / model.num_timesteps)
+
+
+@pytest.mark.parametrize("cls", [TRPOIPO, P3O])
+def test_until_something_costs_the_reward_alone_is_learnt(cls: Any) -> None:
+    """At a limit of 0 too: a cost critic that has met no cost says nothing."""
+    settings = {"n_steps": 40, "seed": 0, "device": "cpu"}
+    plain = PPO if cls is P3O else TRPO
+    base = {"batch_size": 40} if cls is P3O else {"n_critic_updates": 3}
+    weights = []
+    for one, limit in ((plain, {}), (cls, {"cost_limit": 0.0})):
+        model = one("MlpPolicy", points(cost_scale=0.0), **settings, **base, **limit).learn(240)
+        weights.append(th.cat([value.flatten() for value in model.policy.parameters()]))
+    th.testing.assert_close(*weights, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("cls", some())

@@ -73,7 +73,8 @@ class TRPOIPO(TrustRegion):
         excess = horizon * (th.as_tensor(self.costs.violation).to(change) + change) / unit
         scale = unit / horizon
         if self.units == "relative":
-            scale = scale / (batch.cost_advantages.std(dim=0) + TINY)
+            deviation = batch.cost_advantages.std(dim=0)
+            scale = th.where(deviation > 0.0, scale / deviation, 0.0)
         penalty = (scale * barrier(excess, self.t, self.max_multiplier)).sum()
         return (ratio * batch.advantages).mean() + penalty
 

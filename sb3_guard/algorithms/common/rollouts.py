@@ -90,7 +90,8 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         # Shuffles the cost critic's batches: it takes no numbers from anybody else's stream.
         self.cost_rng: np.random.Generator = None  # type: ignore[assignment]
-        # What the cost critic measures costs in, [m]; 0 until a rollout has any.
+        # What the cost critic measures costs in, [m]; 0 until a rollout has any: before it
+        # has met a cost, what it says is noise, which is not to move the policy.
         self.cost_units: np.ndarray | None = None
         # (step, env, observation) of every episode cut by a time limit
         self._timeouts: list[tuple[int, int, Any]] = []
@@ -247,11 +248,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             size = np.sqrt(np.mean(np.square(ahead, dtype=np.float64), axis=(0, 1)))
             unknown = self.cost_units == 0.0
             self.cost_units[unknown] = size[unknown]
-        return self._units()
-
-    def _units(self) -> np.ndarray:
-        one = np.ones(len(self.cost_keys), np.float32)
-        return one if self.cost_units is None else np.where(self.cost_units, self.cost_units, one)
+        return self.cost_units
 
     # Learning
 
@@ -275,11 +272,13 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             self.cost_critic.optimizer, self.lr_schedule(self._current_progress_remaining)
         )
         batch = self.rollout_buffer.whole()
-        units = th.as_tensor(self._units()).to(batch.cost_returns)
+        assert self.cost_units is not None
+        units = np.where(self.cost_units, self.cost_units, np.float32(1.0))
+        targets = batch.cost_returns / th.as_tensor(units).to(batch.cost_returns)
         learnt = self.critic_rows(batch.cost_returns)
         loss = Regression.of_network(self.cost_critic).fit(
             rows(batch.observations, learnt),
-            (batch.cost_returns / units)[learnt],
+            targets[learnt],
             getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,
             getattr(self, "batch_size", None) if batch_size is None else batch_size,
             self.cost_rng,

@@ -86,6 +86,17 @@ def test_weight_of_the_cost_in_its_own_unit() -> None:
     np.testing.assert_allclose(weights, 0.5 * np.array([1 / 10, 1 / 2, 3.0, 3.0]), rtol=0.1)
 
 
+def test_several_barriers_are_sharper() -> None:
+    """1 / (m t) of each limit, so that m barriers together cost what one does."""
+    model = make(2, cost_limit=[5.0, 9.0], t=2.0, max_multiplier=3.0)
+    _estimate(model, [0.0, 8.0], 40.0)
+    model.set_logger(Logger(None, []))
+    model.fit(None)
+    logged = model.logger.name_to_value
+    weights = [logged[f"train/multiplier/{key}"] for key in model.cost_keys]
+    assert weights == pytest.approx([1 / 4, 9 / 4])
+
+
 def test_several_barriers_add_up() -> None:
     model = make(2, cost_limit=[5.0, 9.0], t=2.0, max_multiplier=3.0, units="cost")
     _estimate(model, [4.0, 80.0], 40.0)

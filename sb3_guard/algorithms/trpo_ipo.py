@@ -36,18 +36,19 @@ class TRPOIPO(TrustRegion):
     ::
 
         maximise   E[ratio · A] + Σ s_i φ((J_Ci + T E[ratio · A_Ci] - d_i) / d_i)
-                   φ(x) = log(-x) / t,   s_i = d_i / (T σ(A_Ci))
+                   φ(x) = log(-x) / (m t),   s_i = d_i / (T σ(A_Ci))
 
-    so that in the gradient the standardised cost advantage weighs ``d / (t (d - J_C))`` beside the
-    standardised reward advantage: 1 / t far inside the limit, more near it, and ``max_multiplier``
-    at most. φ continues as a straight line there, which also leads back where the limit is broken.
-    The unit of the costs does not matter. While a limit is kept strictly, the line search accepts
-    no policy whose estimated cost reaches it.
+    so that in the gradient the standardised cost advantage weighs ``d / (m t (d - J_C))`` beside
+    the standardised reward advantage: 1 / (m t) far inside the limit, more near it, and
+    ``max_multiplier`` at most. With m costs each barrier is m times as sharp, so that all of them
+    together cost as much return as one. Where it would be steeper, φ continues as a straight line,
+    which also leads back where the limit is broken. The unit of the costs does not matter. While a
+    limit is kept strictly, the line search accepts no policy whose estimated cost reaches it.
 
     :param t: sharpness of the barrier: the greater, the closer to the limit it lets the policy go
     :param max_multiplier: the most that cost may weigh against reward
     :param units: ``"relative"`` as above; ``"cost"`` for the raw form of the paper, the barrier
-        ``log(d - J_C) / (t T)`` in units of an episode's cost
+        ``log(d - J_C) / (t T)`` in units of an episode's cost, whatever their number
     """
 
     label, family, paper = "TRPO-IPO", "Lagrangian", "Liu et al. 2020"
@@ -67,6 +68,10 @@ class TRPOIPO(TrustRegion):
         limits = self.cost_limits
         return np.where(limits > 0.0, limits, np.maximum(self.costs.episode_cost, TINY))
 
+    @property
+    def _sharpness(self) -> float:
+        return self.t * (len(self.cost_limits) if self.units == "relative" else 1.0)
+
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
         change = (ratio - 1.0) @ batch.cost_advantages / len(ratio)  # [m]
         horizon, unit = self.costs.horizon, th.as_tensor(self._unit()).to(change)
@@ -75,7 +80,7 @@ class TRPOIPO(TrustRegion):
         if self.units == "relative":
             deviation = batch.cost_advantages.std(dim=0)
             scale = th.where(deviation > 0.0, scale / deviation, 0.0)
-        penalty = (scale * barrier(excess, self.t, self.max_multiplier)).sum()
+        penalty = (scale * barrier(excess, self._sharpness, self.max_multiplier)).sum()
         return (ratio * batch.advantages).mean() + penalty
 
     def accept(self, trial: Trial) -> bool:
@@ -85,5 +90,5 @@ class TRPOIPO(TrustRegion):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         slack = -self.costs.violation * self.costs.horizon / self._unit()
-        steepest = 1.0 / (self.t * self.max_multiplier)
-        self._record_per_cost("train/multiplier", 1.0 / (self.t * np.maximum(slack, steepest)))
+        t, most = self._sharpness, self.max_multiplier
+        self._record_per_cost("train/multiplier", 1.0 / (t * np.maximum(slack, 1.0 / (t * most))))

@@ -89,6 +89,7 @@ def test_time_outs_bootstrap_costs_on_a_copy(terminate: bool) -> None:
     """A truncated episode adds γ V_c(terminal observation), a terminated one nothing."""
     env = make_vec_env(lambda: CostPoint(episode_length=7, terminate=terminate), 2, seed=0)
     model = CPO("MlpPolicy", env, n_steps=16, n_critic_updates=1, cost_gamma=0.8, seed=0)
+    model.cost_units = np.ones(1, np.float32)  # as after a cost
     terminals: list[tuple[int, np.ndarray]] = []
 
     def record(local: dict, _: dict) -> bool:

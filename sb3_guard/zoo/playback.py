@@ -57,12 +57,14 @@ def find_run(folder: str | Path, algo: str, env_id: str, number: int = 0) -> Run
         return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
     algorithm(algo), canonical_id(env_id)  # a misspelt name has a message of its own
     where = "" if folder == PRETRAINED else f" -f {folder}"
+    ships = where and latest_run(PRETRAINED / algo, name)
     runs = [one for one in sorted(Path(folder).glob("*/*_*")) if is_run(one)]
     there = dict.fromkeys(f"{one.parent.name} on {one.name.rpartition('_')[0]}" for one in runs)
     raise UsageError(
         f"there is no run of {algo} on {env_id} in {str(folder)!r}; train one with: "
-        f"python -m sb3_guard.train --algo {algo} --env {env_id}{where}; or play one of those "
-        f"there: {', '.join(there) or 'none'}; or of those in the package, with --pretrained"
+        f"python -m sb3_guard.train --algo {algo} --env {env_id}{where}"
+        + (f"; or play one of those there: {', '.join(there)}" if there else "")
+        + ("; or play the package's own with --pretrained" if ships else "")
     )
 
 

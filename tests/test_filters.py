@@ -304,16 +304,16 @@ def test_targets_of_the_cost_critic_by_hand(lam: float, terminate: bool) -> None
     """
     env = make_vec_env(lambda: Corridor(terminate), 2, seed=0)
     model = make(TRPOUSL, env, n_steps=7, gamma=0.9, cost_gae_lambda=lam, warmup=10**9)
-    # A critic that says 0.5 everywhere.
+    # A critic that says half a unit everywhere.
     with th.no_grad():
         last = model._layer.network.network[-1]
         last.weight.zero_()
         last.bias.fill_(float(np.log(np.expm1(0.5))))
-    seen: list[Any] = []
-    targets = model._targets
-    model._targets = lambda *args: seen.append(targets(*args)) or seen[-1]
     model.learn(14)
-    ahead = 0.9 * 0.5
+    paid = [1 + 0.9 * (2 + 0.9 * 4), 2 + 0.9 * 4, 4] * 2 + [1]
+    unit = float(np.sqrt(np.mean(np.square(paid))))
+    assert float(model._layer.unit) == pytest.approx(unit)
+    ahead = 0.9 * 0.5 * unit
     end = 0.0 if terminate else ahead
     if lam == 0.0:
         expected = [1 + ahead, 2 + ahead, 4 + end] * 2 + [1 + ahead]
@@ -321,22 +321,35 @@ def test_targets_of_the_cost_critic_by_hand(lam: float, terminate: bool) -> None
         last_step = 4 + end
         episode = [1 + 0.9 * (2 + 0.9 * last_step), 2 + 0.9 * last_step, last_step]
         expected = episode * 2 + [1 + ahead]
-    np.testing.assert_allclose(seen[0].numpy().reshape(2, 7), [expected] * 2, rtol=1e-5)
+    found = model.rollout_buffer.cost_returns.reshape(2, 7)
+    np.testing.assert_allclose(found, [expected] * 2, rtol=1e-5)
 
 
 def test_targets_use_the_action_executed_next() -> None:
-    model = make(TRPOUSL, points(2), threshold=0.0, rate=0.5, cost_gae_lambda=0.0)
-    model.learn(240)
+    settings = {"rate": 0.5, "cost_gae_lambda": 0.0, "learning_rate": 1e-9}
+    model = make(TRPOUSL, points(2), threshold=0.0, **settings).learn(240)
     batch = model._batch()
     actions = model._executed(batch)
     assert not th.equal(actions, model._sampled(batch))
     values = model._layer.values(batch.observations, actions)[:, 0].reshape(2, 40)
-    found = model._targets(batch, actions, 0.99)[:, 0].reshape(2, 40)
+    found = batch.cost_returns[:, 0].reshape(2, 40)
     costs = batch.costs[:, 0].reshape(2, 40)
     starts = th.as_tensor(model.rollout_buffer.episode_starts.T[:, 1:])
     inner = costs[:, :-1] + 0.99 * values[:, 1:]
     within = starts == 0.0
     th.testing.assert_close(found[:, :-1][within], inner[within])
+
+
+def test_what_is_ahead_is_valued_before_the_policy_moves() -> None:
+    """An action that was not taken is one of the policy that took the others."""
+    model = make(TRPOUSL, points(2))
+    order: list[str] = []
+    ahead, update = model._value_ahead, model._update_actor
+    model._value_ahead = lambda *args: order.append("ahead") or ahead(*args)
+    model._update_actor = lambda *args: order.append("update") or update(*args)
+    model.learn(160)
+    # Each environment meets a time-out in a rollout, and both have a last observation.
+    assert order == ["ahead", "ahead", "ahead", "update"] * 2
 
 
 def test_what_is_ahead_is_the_cost_of_the_corrected_action() -> None:
@@ -517,7 +530,8 @@ def test_thresholds_default_to_the_limit() -> None:
     expected = 0.1 / 0.01  # a time limit cuts the episodes
     assert model.policy.action_filter.threshold.item() == pytest.approx(expected)
     model = make(TRPOUSL, points(2), tolerance=0.07).learn(80)
-    assert model.policy.action_filter.threshold.item() == pytest.approx(0.07)
+    expected = 0.07 * model.policy.action_filter.unit.item()
+    assert model.policy.action_filter.threshold.item() == pytest.approx(expected)
     keys = ("cost", "cost_1")
     model = make(TRPOSL, points(2, cost_keys=keys), cost_keys=keys, threshold=[0.1, 0.3]).learn(80)
     np.testing.assert_allclose(model.policy.action_filter.threshold.numpy(), [0.1, 0.3])
@@ -614,7 +628,7 @@ def test_the_exact_penalty_lowers_the_expected_excess() -> None:
     ratio = th.ones(80, requires_grad=True)
     (found,) = th.autograd.grad(model.surrogate(batch, ratio), ratio)
     values = model._layer.values(batch.observations, model._sampled(batch))
-    penalty = (values - 0.1).clamp(min=0.0)[:, 0]
+    penalty = (values - 0.1).clamp(min=0.0)[:, 0] / model._layer.unit
     expected = (batch.advantages - 2.0 * (penalty - penalty.mean())) / 80
     assert penalty.std() > 0.0
     th.testing.assert_close(found, expected)
@@ -639,7 +653,7 @@ def test_what_is_below_the_models_error_is_not_corrected(
 ) -> None:
     """ĉ = 0.2 + slope · a at a = 1, threshold 0.3: 0.5 and 0.7 are above it, by less than 0.4."""
     layer = make(TRPOSL, points(2)).policy.action_filter
-    outputs = th.tensor([[slope, 0.0, 0.0, 0.0]])  # g, h and drift
+    outputs = th.tensor([[slope, 0.0, 0.0, 0.0]])  # g, h and drift, in units of 1
     layer.network.forward = lambda observations: outputs
     layer.threshold.fill_(0.3)
     layer.noise.fill_(noise)
@@ -656,7 +670,7 @@ def test_the_models_error_is_that_of_its_predictions() -> None:
     layer, batch = model.policy.action_filter, model._batch()
     with th.no_grad():
         outputs = layer.network(batch.observations)
-    slopes, drift = outputs[:, :2], outputs[:, 3]
+    slopes, drift = layer.unit * outputs[:, :2], layer.unit * outputs[:, 3]
     actions = th.as_tensor(model.policy.to_unit(batch.executed_actions.numpy()))
     predicted = batch.previous_costs[:, 0] + (slopes * actions).sum(dim=1) + drift
     expected = 3.0 * float((predicted - batch.costs[:, 0]).square().mean().sqrt())

@@ -58,25 +58,35 @@ class TRPOSL(FilteredTrustRegion):
         # What is derived from the limit is known once an episode has ended.
         self._set_threshold(np.zeros(len(self.cost_keys)))
 
+    def _cost_size(self) -> np.ndarray:
+        """The root mean square of those costs of a step that are not zero, shape (m,)."""
+        costs = self.rollout_buffer.costs.astype(np.float64)
+        met = np.maximum(np.count_nonzero(costs, axis=(0, 1)), 1)
+        return np.sqrt(np.square(costs).sum(axis=(0, 1)) / met)
+
+    def _estimate_advantages(self) -> None:
+        self._choose_cost_units()
+
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
-        assert isinstance(self.policy.action_filter, SafetyLayer)
+        layer = self.policy.action_filter
+        assert isinstance(layer, SafetyLayer)
         self._set_threshold(self.cost_limits / self.costs.horizon)
         costly = (batch.costs != 0.0).any(dim=1)
         some, none = costly.nonzero().flatten(), (~costly).nonzero().flatten()
         if not len(some):
             return
-        regression = self.policy.action_filter.regression()
-        data = (batch.observations, self._executed(batch), batch.previous_costs)
-        targets = th.cat([batch.costs, batch.previous_costs], dim=1)
+        regression = layer.regression()
+        actions, previous = self._executed(batch), batch.previous_costs / layer.unit
+        data = (batch.observations, actions, previous)
+        targets = th.cat([batch.costs / layer.unit, previous], dim=1)
         loss = 0.0
         for _ in range(self.n_critic_updates):
             drawn = th.randperm(len(none))[: len(some)].to(none.device)
             index = th.cat([some, none[drawn]])
             loss = regression.fit(rows(data, index), targets[index], 1, self.batch_size)
         self._check_finite("cost_model_loss", loss)
-        layer = self.policy.action_filter
-        error = layer.error(*data, batch.costs)
+        error = layer.error(batch.observations, actions, batch.previous_costs, batch.costs)
         layer.noise.copy_(self.tolerance * error)
         self._record_per_cost("train/cost_model_error", error.cpu().numpy())
         self.logger.record("train/cost_model_loss", loss)

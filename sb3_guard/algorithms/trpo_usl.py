@@ -8,7 +8,6 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.action_filters import UnrolledSafetyLayer
-from sb3_guard.algorithms.common.advantage import gae
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
@@ -20,11 +19,12 @@ class TRPOUSL(FilteredTrustRegion):
     ::
 
         execute   a after at most K steps   a ← clip(a - η ∇_a h / |∇_a h|_∞),   while h > 0
-                  where   h(s, a) = Σ max(0, Q_i(s, a) - threshold_i)
+                  where   h(s, a) = Σ max(0, Q_i(s, a) - threshold_i) / unit_i
 
     starting from the sampled action, clipped to the box of the action space. Q_i is the discounted
     cost to come of the executed actions, a network with a softplus output fitted to λ-returns with
-    λ = ``cost_gae_lambda``; it can't learn costs below zero. With λ = 0 the target is
+    λ = ``cost_gae_lambda``, and unit_i the root mean square of the costs to come in the first
+    rollout that has any. It can't learn costs below zero. With λ = 0 the target is
     ``c + γ Q(s', a')``, a' the action executed next, as in GUARD; fitted once per update, such a
     critic needs hundreds of updates to forget where it started. ``kappa`` adds the paper's exact
     penalty: the policy then ascends ``E[ratio · (A - κ h(s, a))]``, whose gradient is that of the
@@ -36,11 +36,10 @@ class TRPOUSL(FilteredTrustRegion):
     :param warmup: share of the first ``learn`` before the layer is switched on; an integer is a
         number of steps
     :param threshold: highest discounted cost to come that is not corrected; one number or one per
-        cost key; None: the larger of ``tolerance`` and ``(d/T) (1 - γᵀ)/(1 - γ)``, or
+        cost key; None: the larger of ``tolerance`` · unit and ``(d/T) (1 - γᵀ)/(1 - γ)``, or
         ``(d/T) / (1 - γ)`` where a time limit cuts episodes, whose cost is bootstrapped
-    :param tolerance: what the Q-critic may say of a state where nothing costs: a softplus never
-        is zero. On Goal_Point_8Hazards, after 8 updates, a twentieth of the states without any
-        later cost is below 0.05
+    :param tolerance: what the Q-critic may say of a state where nothing costs, in its units: a
+        softplus never is zero
     :param steps: K
     :param rate: η, in units of the action space, which runs from -1 to 1
     :param kappa: weight of the exact penalty; 0 for none, as in GUARD
@@ -79,58 +78,44 @@ class TRPOUSL(FilteredTrustRegion):
         objective = super().surrogate(batch, ratio)
         if self.kappa == 0.0:
             return objective
-        values = self._layer.values(batch.observations, self._sampled(batch))
-        penalty = (values - self._layer.threshold.to(values)).clamp(min=0.0).sum(dim=1)
+        penalty = self._layer.excess(batch.observations, self._sampled(batch))
         return objective - self.kappa * (ratio * (penalty - penalty.mean())).mean()
+
+    def _estimate_advantages(self) -> None:
+        """Value the executed actions, those after the last step by the policy that took them."""
+        buffer = self.rollout_buffer
+        self._choose_cost_units()
+        observations = buffer.observations_by_time(self.device)
+        executed = self._unit(buffer.executed_actions.reshape(-1, buffer.action_dim))
+        values = self._layer.values(observations, executed)
+        buffer.cost_values = values.cpu().numpy().reshape(buffer.costs.shape)
+        for step, i, observation in self._timeouts if buffer.cost_gamma < 1.0 else ():
+            terminal, _ = self.policy.obs_to_tensor(observation)
+            buffer.cost_bootstraps[step, i] = buffer.cost_gamma * self._value_ahead(terminal)[0]
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        last = self._value_ahead(obs_as_tensor(self._last_obs, self.device))
+        buffer.compute_cost_returns_and_advantage(last, self._last_episode_starts)
+        buffer.cost_returns = buffer.cost_advantages + buffer.cost_values  # of λ, in any case
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
-        gamma, limit = self.rollout_buffer.cost_gamma, self.discounted_limits()
+        unit = self._layer.unit
         if bool((batch.costs < 0.0).any()):
             self._warn_once(
                 "TRPOUSL met costs below zero: to its critic no cost to come is less than 0; add a "
                 "constant to the cost of every step, and its sum over an episode to cost_limit, "
                 "or use TRPOSL"
             )
-        actions = self._executed(batch)
-        targets = self._targets(batch, actions, gamma)
         loss = self._layer.regression().fit(
-            (batch.observations, actions), targets, self.n_critic_updates, self.batch_size
+            (batch.observations, self._executed(batch)),
+            batch.cost_returns / unit,
+            self.n_critic_updates,
+            self.batch_size,
         )
         self._check_finite("cost_model_loss", loss)
         self.logger.record("train/cost_model_loss", loss)
-        self._set_threshold(np.maximum(limit, self.tolerance))
-
-    def _targets(
-        self, batch: CostRolloutBufferSamples, actions: th.Tensor, gamma: float
-    ) -> th.Tensor:
-        """λ-returns of the costs along the executed actions, shape [N, m]."""
-        assert self._last_obs is not None and self._last_episode_starts is not None
-        buffer = self.rollout_buffer
-        shape = (buffer.n_envs, buffer.buffer_size, len(self.cost_keys))
-
-        def by_time(rows: th.Tensor) -> np.ndarray:
-            """The batch's rows, one environment after the other, as [T, n, m]."""
-            return rows.cpu().numpy().reshape(shape).swapaxes(0, 1)
-
-        values = by_time(self._layer.values(batch.observations, actions))
-        costs = by_time(batch.costs).copy()
-        for step, i, observation in self._timeouts if gamma < 1.0 else ():
-            tensor, _ = self.policy.obs_to_tensor(observation)
-            costs[step, i] += gamma * self._value_ahead(tensor)[0]
-        last = self._value_ahead(obs_as_tensor(self._last_obs, self.device))
-        # An advantage plus the value it was measured from is the return it was estimated from.
-        advantages = gae(
-            costs,
-            values,
-            buffer.episode_starts,
-            last,
-            self._last_episode_starts,
-            gamma,
-            buffer.cost_gae_lambda,
-        )
-        targets = (values + advantages).swapaxes(0, 1).reshape(-1, shape[2])
-        return th.as_tensor(targets, device=self.device)
+        tolerance = self.tolerance * unit.cpu().numpy()
+        self._set_threshold(np.maximum(self.discounted_limits(), tolerance))
 
     @th.no_grad()
     def _value_ahead(self, observations: PyTorchObs) -> np.ndarray:

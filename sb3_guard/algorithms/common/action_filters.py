@@ -1,8 +1,8 @@
 """Filters that replace an action by a near one whose learned cost is below a threshold.
 
 A filter sees actions in units of the action space: each runs from -1 to 1. It owns its network,
-the network's optimizer, its thresholds and whether it is switched on, so a policy that carries it
-acts the same wherever it is loaded.
+the network's optimizer, its thresholds, the units that the network measures costs in, and whether
+it is switched on, so a policy that carries it acts the same wherever it is loaded.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from sb3_guard.algorithms.common.natural_gradient import shortest
 
 
 class ActionFilter(nn.Module):
-    """What the filters share: a network, thresholds, a switch.
+    """What the filters share: a network, thresholds and units of cost, a switch.
 
     :param network: what is learned
     :param n_costs: number m of constraints
@@ -35,10 +35,12 @@ class ActionFilter(nn.Module):
         super().__init__()
         self.network = network
         self.register_buffer("threshold", th.zeros(n_costs, dtype=th.float64))
+        self.register_buffer("unit", th.ones(n_costs))
         # 0 or 1: a number, since SB3's tools draw, average and compare whole state dictionaries.
         self.register_buffer("active", th.zeros(()))
 
     threshold: th.Tensor
+    unit: th.Tensor
     active: th.Tensor
 
     @property
@@ -145,7 +147,7 @@ class SafetyLayer(ActionFilter):
     noise: th.Tensor
 
     def _split(self, outputs: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """Slopes g [B, m, k], last costs h [B, m], drifts b [B, m]."""
+        """Slopes g [B, m, k], last costs h [B, m], drifts b [B, m], in the units of ``outputs``."""
         pieces = outputs.unflatten(1, (len(self.threshold), -1))
         slopes = pieces[..., : self.n_actions]
         drifts = pieces[..., -1] if self.drift else th.zeros_like(pieces[..., 0])
@@ -163,11 +165,15 @@ class SafetyLayer(ActionFilter):
         :param costs: what these steps cost, shape [B, m]
         """
         slopes, _, drifts = self._split(self.network.predict(observations))
-        predicted = last + (slopes * actions[:, None]).sum(dim=2) + drifts
+        change = (slopes * actions[:, None]).sum(dim=2) + drifts
+        predicted = last + self.unit * change
         return (predicted - costs).square().mean(dim=0).sqrt()
 
     def regression(self) -> Regression:
-        """Fits batches (observations, executed actions, last costs) to (costs, last costs)."""
+        """Fits batches (observations, executed actions, last costs) to (costs, last costs).
+
+        Both costs are in units of ``unit``.
+        """
 
         def readout(outputs: th.Tensor, batch: Any) -> th.Tensor:
             _, actions, costs = batch
@@ -187,6 +193,8 @@ class SafetyLayer(ActionFilter):
             each.cpu().numpy().astype(np.float64)
             for each in self._split(self.network(observations))
         )
+        unit = self.unit.cpu().numpy().astype(np.float64)
+        slopes, last, drifts = unit[:, None] * slopes, unit * last, unit * drifts
         clipped = np.clip(actions.astype(np.float64), -1.0, 1.0)
         noise = self.noise.cpu().numpy()
         limits = self.threshold.cpu().numpy() - (last if costs is None else costs) - drifts
@@ -206,7 +214,7 @@ class UnrolledSafetyLayer(ActionFilter):
 
     ``Q_i(s, a) > 0`` are the discounted costs to come. Where one exceeds its threshold, the action
     takes up to ``steps`` steps of length ``rate`` (in its fastest coordinate) down
-    ``Σ max(0, Q_i - threshold_i)``.
+    ``Σ max(0, Q_i - threshold_i) / unit_i``.
 
     :param policy: the policy that carries the filter
     :param n_costs: number m of constraints
@@ -223,7 +231,7 @@ class UnrolledSafetyLayer(ActionFilter):
         super().__init__(StateNetwork(policy, n_costs, self.n_actions), n_costs)
 
     def regression(self) -> Regression:
-        """Fits batches (observations, actions) to costs to come."""
+        """Fits batches (observations, actions) to costs to come in units of ``unit``."""
 
         def inputs(batch: Any) -> th.Tensor:
             observations, actions = batch
@@ -238,7 +246,16 @@ class UnrolledSafetyLayer(ActionFilter):
         :param observations: batch of B observations
         :param actions: in units of the action space, shape [B, k]
         """
-        return F.softplus(self.network.predict(observations, actions))
+        return self.unit * F.softplus(self.network.predict(observations, actions))
+
+    def excess(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """What the layer descends, ``Σ max(0, Q_i - threshold_i) / unit_i``, shape [B].
+
+        :param observations: batch of B observations
+        :param actions: in units of the action space, shape [B, k]
+        """
+        above = self.values(observations, actions) - self.threshold.to(self.unit)
+        return (above.clamp(min=0.0) / self.unit).sum(dim=1)
 
     def correct(
         self, observations: PyTorchObs, actions: np.ndarray, costs: np.ndarray | None
@@ -256,9 +273,9 @@ class UnrolledSafetyLayer(ActionFilter):
         return a
 
     def _slope(self, features: th.Tensor) -> Callable[[np.ndarray], np.ndarray]:
-        """Gradient of ``Σ max(0, Q_i - threshold_i)`` in the actions, each [B, k]."""
+        """Gradient of ``Σ max(0, Q_i - threshold_i) / unit_i`` in the actions, each [B, k]."""
         layers = TanhMlp.layers([*self.network.network])
-        threshold = self.threshold.to(features)
+        threshold = (self.threshold / self.unit).to(features)
         if layers is not None and features.device.type == "cpu":
             return softplus_slope(TanhMlp(layers), features, self.n_actions, threshold.numpy())
 

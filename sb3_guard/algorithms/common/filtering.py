@@ -149,6 +149,12 @@ class FilteredTrustRegion(TrustRegion):
             return objective
         return objective - self.correction_penalty * (ratio * (lengths - lengths.mean())).mean()
 
+    def _choose_cost_units(self) -> np.ndarray:
+        units = super()._choose_cost_units()
+        known = th.as_tensor(np.where(units, units, np.float32(1.0)))
+        self.policy.action_filter.unit.copy_(known)
+        return units
+
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         """Log what was corrected; leaves then fit their model."""
         lengths = self._corrections(batch)

@@ -182,8 +182,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             )
         if full:
             self._estimate_costs(self.rollout_buffer.costs.mean(axis=(0, 1)))
-            if self.uses_cost_critic:
-                self._estimate_advantages()
+            self._estimate_advantages()
         else:
             self._count_last_step(callback)
         self.timing["collect"] = time.perf_counter() - started
@@ -213,6 +212,8 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     @th.no_grad()
     def _estimate_advantages(self) -> None:
         """Value the rollout's states and finish the cost half of the buffer."""
+        if not self.uses_cost_critic:
+            return
         buffer, units = self.rollout_buffer, self._choose_cost_units()
         values = self.cost_critic.predict(buffer.observations_by_time(self.device))
         buffer.cost_values = units * values.cpu().numpy().reshape(buffer.costs.shape)
@@ -228,27 +229,30 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         buffer.compute_cost_returns_and_advantage(units * last, self._last_episode_starts)
 
     def _choose_cost_units(self) -> np.ndarray:
-        """What the cost critic measures costs in, shape (m,), float32, from a rollout just filled.
+        """What networks measure costs in, shape (m,), float32, from a rollout just filled.
 
-        The root mean square of the discounted costs-to-go in the first rollout that has any, so
-        that what it learns does not depend on the unit of cost.
+        The size of what they learn in the first rollout that has any cost, so that it does not
+        depend on the unit of cost.
         """
-        buffer = self.rollout_buffer
         if self.cost_units is None:
-            self.cost_units = np.zeros(buffer.n_costs, np.float32)
+            self.cost_units = np.zeros(self.rollout_buffer.n_costs, np.float32)
         if not self.cost_units.all():
-            assert self._last_episode_starts is not None
-            ahead = discounted_returns(
-                buffer.costs,
-                buffer.episode_starts,
-                np.zeros_like(buffer.costs[0]),
-                self._last_episode_starts,
-                buffer.cost_gamma,
-            )
-            size = np.sqrt(np.mean(np.square(ahead, dtype=np.float64), axis=(0, 1)))
             unknown = self.cost_units == 0.0
-            self.cost_units[unknown] = size[unknown]
+            self.cost_units[unknown] = self._cost_size()[unknown]
         return self.cost_units
+
+    def _cost_size(self) -> np.ndarray:
+        """The root mean square of the rollout's discounted costs-to-go, shape (m,)."""
+        buffer = self.rollout_buffer
+        assert self._last_episode_starts is not None
+        ahead = discounted_returns(
+            buffer.costs,
+            buffer.episode_starts,
+            np.zeros_like(buffer.costs[0]),
+            self._last_episode_starts,
+            buffer.cost_gamma,
+        )
+        return np.sqrt(np.mean(np.square(ahead, dtype=np.float64), axis=(0, 1)))
 
     # Learning
 

@@ -28,10 +28,13 @@ from sb3_guard.algorithms import (
     RCPO,
     TRPOFAC,
     TRPOIPO,
+    TRPOSL,
+    TRPOUSL,
     PPOLag,
     TrustRegion,
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
+from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, Multiplier
 
 KEYS = ("ppo_lag", "cppo_pid", "focops", "cup", "p3o", "crpo", "rcpo")
@@ -126,16 +129,19 @@ def test_a_broken_limit_raises_the_multiplier_and_a_kept_one_lowers_it(cls: Any)
     assert 0.0 < seen[0] < seen[1] > seen[2]
 
 
-@pytest.mark.parametrize("cls", [*LAGRANGIAN, CPO, PCPO, TRPOFAC, TRPOIPO])
+@pytest.mark.parametrize("cls", [*LAGRANGIAN, CPO, PCPO, TRPOFAC, TRPOIPO, TRPOSL, TRPOUSL])
 def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
     """Costs and limit × 100 and × 0.01: the same multipliers, the same policy to rounding."""
     runs = []
+    settings = {"warmup": 128} if issubclass(cls, FilteredTrustRegion) else {}
     for scale in (1.0, 100.0, 0.01):
         env = make_vec_env(
             lambda scale=scale: CostPoint(30, cost_scale=scale, hazard=(-1.0, 0.0)), 4, seed=0
         )
-        model = cls("MlpPolicy", env, n_steps=32, seed=0, device="cpu", cost_limit=2.0 * scale)
-        model.learn(256)
+        settings |= {"n_steps": 32, "seed": 0, "device": "cpu", "cost_limit": 2.0 * scale}
+        model = cls("MlpPolicy", env, **settings).learn(256)
+        if "warmup" in settings:
+            assert model.logger.name_to_value["train/corrected_fraction"] > 0.1
         runs.append(model)
     first, *others = runs
     for other in others:

@@ -316,6 +316,21 @@ def test_another_optimizer_of_the_multiplier_begins_afresh(
         assert float(again.multiplier.value[0]) > float(model.multiplier.value[0]) > 0.0
 
 
+@pytest.mark.parametrize("delay", [1, 3, 4])
+def test_another_delay_keeps_the_latest_averages(delay: int, tmp_path: Path) -> None:
+    """Those of 1, 5 and 4, the latest first; the file's delay is 3."""
+    settings = {**RAW, "lambda_lr": 0.0, "lambda_smoothing": 0.0, "derivative_gain": 2.0}
+    model = make(TRPOLag, lambda_delay=3, **settings)
+    follow(model.multiplier, [1.0, 5.0, 4.0], 10.0)
+    model.save(tmp_path / "model")
+    again: Any = TRPOLag.load(tmp_path / "model", device="cpu", lambda_delay=delay)
+    expected = [4.0, 5.0, 1.0, np.inf][:delay]
+    assert again.multiplier.last_costs[:, 0].tolist() == expected
+    # J_C = 7: the rise since 4, since 1, or since what is unknown
+    rise = {1: 3.0, 3: 6.0, 4: 0.0}[delay]
+    assert follow(again.multiplier, [7.0], 10.0) == [2.0 * rise]
+
+
 @pytest.mark.parametrize(
     ("cls", "kwargs", "message"),
     [

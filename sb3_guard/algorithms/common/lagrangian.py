@@ -1,5 +1,6 @@
 """Lagrange multipliers that follow the violation, for on- and off-policy algorithms."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -85,6 +86,13 @@ class Multiplier(nn.Module):
     slow_cost: th.Tensor
     violation: th.Tensor
     last_costs: th.Tensor
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
+        """Also that of another ``delay``: the latest averages are kept, earlier ones unknown."""
+        saved, delay = state_dict["last_costs"], len(self.last_costs)
+        unknown = saved.new_full((delay, *saved.shape[1:]), np.inf)
+        last_costs = th.cat([saved, unknown])[:delay]
+        return super().load_state_dict({**state_dict, "last_costs": last_costs}, *args, **kwargs)
 
     @th.no_grad()
     def update(self, cost: np.ndarray, limit: np.ndarray) -> None:

@@ -133,14 +133,15 @@ def test_a_broken_limit_raises_the_multiplier_and_a_kept_one_lowers_it(cls: Any)
 def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
     """Costs and limit × 100 and × 0.01: the same multipliers, the same policy to rounding."""
     runs = []
-    settings = {"warmup": 128} if issubclass(cls, FilteredTrustRegion) else {}
+    filtered = issubclass(cls, FilteredTrustRegion)
+    settings: dict[str, Any] = {"n_steps": 32, "seed": 0, "device": "cpu"}
+    settings |= {"warmup": 128, "threshold": 0.0} if filtered else {}
     for scale in (1.0, 100.0, 0.01):
         env = make_vec_env(
             lambda scale=scale: CostPoint(30, cost_scale=scale, hazard=(-1.0, 0.0)), 4, seed=0
         )
-        settings |= {"n_steps": 32, "seed": 0, "device": "cpu", "cost_limit": 2.0 * scale}
-        model = cls("MlpPolicy", env, **settings).learn(256)
-        if "warmup" in settings:
+        model = cls("MlpPolicy", env, cost_limit=2.0 * scale, **settings).learn(256)
+        if filtered:
             assert model.logger.name_to_value["train/corrected_fraction"] > 0.1
         runs.append(model)
     first, *others = runs

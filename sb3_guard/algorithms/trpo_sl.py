@@ -58,12 +58,6 @@ class TRPOSL(FilteredTrustRegion):
         # What is derived from the limit is known once an episode has ended.
         self._set_threshold(np.zeros(len(self.cost_keys)))
 
-    def _cost_size(self) -> np.ndarray:
-        """The root mean square of those costs of a step that are not zero, shape (m,)."""
-        costs = self.rollout_buffer.costs.astype(np.float64)
-        met = np.maximum(np.count_nonzero(costs, axis=(0, 1)), 1)
-        return np.sqrt(np.square(costs).sum(axis=(0, 1)) / met)
-
     def _estimate_advantages(self) -> None:
         self._choose_cost_units()
 

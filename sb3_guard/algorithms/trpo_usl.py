@@ -23,8 +23,8 @@ class TRPOUSL(FilteredTrustRegion):
 
     starting from the sampled action, clipped to the box of the action space. Q_i is the discounted
     cost to come of the executed actions, a network with a softplus output fitted to λ-returns with
-    λ = ``cost_gae_lambda``, and unit_i the root mean square of the costs to come in the first
-    rollout that has any. It can't learn costs below zero. With λ = 0 the target is
+    λ = ``cost_gae_lambda``, and unit_i the largest root mean square yet of a rollout's costs of a
+    step that are not zero. It can't learn costs below zero. With λ = 0 the target is
     ``c + γ Q(s', a')``, a' the action executed next, as in GUARD; fitted once per update, such a
     critic needs hundreds of updates to forget where it started. ``kappa`` adds the paper's exact
     penalty: the policy then ascends ``E[ratio · (A - κ h(s, a))]``, whose gradient is that of the

@@ -149,8 +149,16 @@ class FilteredTrustRegion(TrustRegion):
             return objective
         return objective - self.correction_penalty * (ratio * (lengths - lengths.mean())).mean()
 
+    def _cost_size(self) -> np.ndarray:
+        """The root mean square of those costs of a step that are not zero, shape (m,)."""
+        costs = self.rollout_buffer.costs.astype(np.float64)
+        met = np.maximum(np.count_nonzero(costs, axis=(0, 1)), 1)
+        return np.sqrt(np.square(costs).sum(axis=(0, 1)) / met)
+
     def _choose_cost_units(self) -> np.ndarray:
-        units = super()._choose_cost_units()
+        # The largest so far: the first rollout may only have touched what costs.
+        sizes = self._cost_size().astype(np.float32)
+        units = self.cost_units = np.maximum(super()._choose_cost_units(), sizes)
         known = th.as_tensor(np.where(units, units, np.float32(1.0)))
         self.policy.action_filter.unit.copy_(known)
         return units

@@ -31,6 +31,7 @@ from sb3_guard.algorithms import (
     TRPOSL,
     TRPOUSL,
     PPOLag,
+    TRPOLag,
     TrustRegion,
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
@@ -151,6 +152,36 @@ def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
             assert value == pytest.approx(float(first.multiplier.value), rel=1e-3) and value > 0.0
         for a, b in zip(first.policy.parameters(), other.policy.parameters(), strict=True):
             th.testing.assert_close(a, b, rtol=1e-2, atol=2e-3)
+
+
+@pytest.mark.parametrize("cls", [FOCOPS, P3O, PPOLag, TRPOLag, TRPOFAC, TRPOIPO, TRPOSL])
+def test_the_weight_of_a_cost_does_not_know_the_unit_of_reward(cls: Any) -> None:
+    """Advantages × 100, which are not standardised: the same gradient × 100."""
+    name = "surrogate" if issubclass(cls, TrustRegion) else "loss"
+    gradients = []
+    for scale in (1.0, 100.0):
+        model = make(cls, cost_limit=0.01, normalize_advantage=False)
+        buffer, train, loss = model.rollout_buffer, model.train, getattr(model, name)
+        model._corrections = lambda rows: rows.observations[:, 0]  # of TRPO-SL
+
+        def scaled(buffer: Any = buffer, train: Any = train, scale: float = scale) -> None:
+            buffer.advantages *= scale
+            train()
+
+        def spy(rows: Any, ratio: th.Tensor, *new: Any, loss: Any = loss) -> th.Tensor:
+            free = ratio.detach().requires_grad_()
+            gradients.append(th.autograd.grad(loss(rows, free, *new), free)[0])
+            raise StopIteration
+
+        model.train = scaled
+        setattr(model, name, spy)
+        with pytest.raises(StopIteration):
+            model.learn(128)
+        if cls in (FOCOPS, P3O):
+            weight = model._unit if cls is P3O else model._price / model.multiplier.value
+            expected = buffer.advantages.std() / buffer.cost_advantages.std()
+            assert float(weight) == pytest.approx(expected, rel=1e-4)
+    th.testing.assert_close(100.0 * gradients[0], gradients[1], rtol=1e-3, atol=1e-5)
 
 
 # Losses by hand

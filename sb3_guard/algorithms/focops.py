@@ -46,7 +46,8 @@ class FOCOPS(Lagrangian, FirstOrder):
     trust_region: float = hyperparameter(0.02, ends="()")
 
     def train(self) -> None:
-        self._price = th.as_tensor(self.price(self.centre_costs()), device=self.device)
+        price = self.price(self.advantage_unit() * self.centre_costs())
+        self._price = th.as_tensor(price, device=self.device)
         self._old = self.snapshot()
         super().train()
 

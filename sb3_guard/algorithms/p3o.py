@@ -25,7 +25,8 @@ class P3O(FirstOrder):
 
     :param penalty: κ, in standard deviations of A per standard deviation of A_C
     :param penalty_units: ``"relative"`` divides A_C and the violation by the standard deviation of
-        A_C, so that the unit of cost does not matter; ``"cost"`` leaves them as they are
+        A_C, and multiplies them by that of A unless ``normalize_advantage`` makes it 1, so that
+        the units of cost and reward do not matter; ``"cost"`` leaves them as they are
     """
 
     label, family, paper = "P3O", "First-order", "Zhang et al. 2022"
@@ -37,7 +38,7 @@ class P3O(FirstOrder):
     penalty_units: Literal["relative", "cost"] = hyperparameter("relative")
 
     def train(self) -> None:
-        unit = self.centre_costs()
+        unit = self.advantage_unit() * self.centre_costs()
         if self.penalty_units == "cost":
             unit = np.ones_like(unit)
         self._unit = th.as_tensor(unit, dtype=th.float32, device=self.device)

@@ -160,7 +160,8 @@ class TRPOFAC(TrustRegion):
         if self.trace:
             price = self._trace(price)
         if self.units == "relative":
-            price = price / (batch.cost_advantages.std(dim=0) + TINY)
+            deviation = batch.cost_advantages.std(dim=0)
+            price = self.advantage_unit() * price / (deviation + TINY)
         return price
 
     def _excess(self, batch: CostRolloutBufferSamples) -> th.Tensor:

@@ -79,7 +79,7 @@ class TRPOIPO(TrustRegion):
         scale = unit / horizon
         if self.units == "relative":
             deviation = batch.cost_advantages.std(dim=0)
-            scale = th.where(deviation > 0.0, scale / deviation, 0.0)
+            scale = th.where(deviation > 0.0, self.advantage_unit() * scale / deviation, 0.0)
         penalty = (scale * barrier(excess, self._sharpness, self.max_multiplier)).sum()
         return (ratio * batch.advantages).mean() + penalty
 

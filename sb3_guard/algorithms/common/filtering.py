@@ -147,7 +147,8 @@ class FilteredTrustRegion(TrustRegion):
         lengths = self._corrections(batch)
         if self.correction_penalty == 0.0 or not lengths.any():
             return objective
-        return objective - self.correction_penalty * (ratio * (lengths - lengths.mean())).mean()
+        penalty = self.correction_penalty * self.advantage_unit()
+        return objective - penalty * (ratio * (lengths - lengths.mean())).mean()
 
     def _cost_size(self) -> np.ndarray:
         """The root mean square of those costs of a step that are not zero, shape (m,)."""

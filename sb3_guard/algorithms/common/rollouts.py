@@ -256,6 +256,15 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
 
     # Learning
 
+    def advantage_unit(self) -> float:
+        """One standard deviation of the reward advantages as the policy learns from them.
+
+        1 with ``normalize_advantage``, or where they are all alike.
+        """
+        if getattr(self, "normalize_advantage", False):
+            return 1.0
+        return float(self.rollout_buffer.advantages.std()) or 1.0
+
     def _taken(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         """The actions as the policy's distribution takes them."""
         if isinstance(self.action_space, spaces.Discrete):

@@ -245,6 +245,7 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
         ({"lambda_starts": -1}, "lambda_starts=-1"),
         ({"cost_limit": [1.0, 2.0]}, "cost_limit=.*one for each of the 1 cost keys"),
         ({"lambda_init": 2.0, "lambda_max": 1.0}, "lambda_max=1.0"),
+        ({"env": "CartPole-v1"}, r"^\w+ needs continuous actions \(Box\), not Discrete"),
         ({"env": gymnasium.make("CartPole-v1")}, r"needs continuous actions \(Box\), not Discrete"),
     ],
 )

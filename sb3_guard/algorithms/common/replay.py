@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -136,6 +137,8 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
     def __init__(
         self, policy: str | type[BasePolicy], env: GymEnv | str, *args: Any, **kwargs: Any
     ) -> None:
+        if isinstance(env, str):  # made here already, to look at its actions
+            env = maybe_make_env(env, kwargs.get("verbose", 0))
         space = getattr(env, "action_space", None)
         if space is not None and not isinstance(space, spaces.Box):
             raise ValueError(

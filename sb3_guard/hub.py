@@ -11,10 +11,7 @@ def hub(flags: Flags) -> int:
     flags.check()
 
     from sb3_guard.zoo import hub
-    from sb3_guard.zoo.make_envs import canonical_id
 
-    if not flags.gym_packages:
-        flags.env = canonical_id(flags.env)[0]
     return hub.push(flags) if flags.direction == "push" else hub.load(flags)
 
 

@@ -503,12 +503,14 @@ def test_bad_values_are_named(kwargs: dict[str, Any], message: str) -> None:
 
 
 def test_without_a_limit_it_says_what_that_means(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="PPOLag without cost_limit: it is 0") as record:
+    with pytest.warns(UserWarning, match="(PPOLag|CPO) without cost_limit: it is 0") as record:
         PPOLag("MlpPolicy", points(), n_steps=40, batch_size=80).save(tmp_path / "model")
         PPOLag.load(tmp_path / "model")
         PPOLag("MlpPolicy", points(), n_steps=40, batch_size=80, cost_limit=0.0)
         TRPO("MlpPolicy", points(), n_steps=40)
-    assert len(record) == 1
+        CPO("MlpPolicy", points(), n_steps=40)
+    assert len(record) == 2
+    assert [one.filename for one in record] == [__file__] * 2, "the line of the call"
 
 
 def test_a_limit_set_later_is_the_limit() -> None:

@@ -108,8 +108,7 @@ TRAIN = [
       "selection_limit:[1]"], ["selection_limit=[1.0]", "heat"]),
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
-    (["--algo", "ppo", "-params", "n_steps:1e12"], ["ppo can't be made", "allocate", "10000000"]),
-    ([*TOY, "-params", "n_envs:1e12"], ["can't make CostPoint-v0", "MemoryError"]),
+    (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
     (["--gym-packages", "../x"], ["'../x' is not a module's name"]),
     (["--gym-packages", ""], ["'' is not a module's name"]),
     (["-conf", "absent.yml"], ["can't read hyper-parameter file absent.yml", "No such file"]),
@@ -170,6 +169,14 @@ def test_constructor_of_an_environment(error, capsys, empty, monkeypatch):
     for flag in ("--env-kwargs", "--eval-env-kwargs"):
         arguments = ["-n", "60", *TOY, flag, "kind:odd"]
         refused(train.main, arguments, capsys, "can't make CostPoint-v0", "odd is allowed nowhere")
+
+
+def test_more_environments_than_memory_holds(capsys, empty, monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("sb3_guard.zoo.make_envs.make_vec_env", refuse)
+    refused(train.main, [*TOY, *SMALL], capsys, "can't make CostPoint-v0: MemoryError")
 
 
 def test_track_without_wandb(capsys, empty, monkeypatch):

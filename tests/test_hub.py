@@ -2,7 +2,9 @@
 
 import json
 import shlex
+import sys
 
+import gymnasium
 import pytest
 import yaml
 from test_commands import PLAY, trained
@@ -117,6 +119,32 @@ def test_there_and_back(logs, tmp_path, monkeypatch, capsys):
         assert enjoy.main(play) == 0
         outputs.append(capsys.readouterr().out)
     assert outputs[0] == outputs[1]
+
+
+def test_an_environment_that_only_the_runs_package_knows(tmp_path, monkeypatch, capsys):
+    """To push, the package that the run names is imported if trusted; to load, none is needed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "stranger.py").write_text(
+        "import gymnasium\n"
+        "gymnasium.register('Stranger-v0', entry_point='registered_envs:Filmed')\n"
+    )
+    trained(tmp_path / "logs", "--gym-packages", "stranger", "--eval-freq", "-1", env="Stranger-v0")
+
+    def hub_in_a_new_process(direction, *flags):
+        sys.modules.pop("stranger", None)
+        gymnasium.registry.pop("Stranger-v0", None)
+        return hub.main([direction, "--env", "Stranger-v0", "-orga", "me", *flags])
+
+    push = ["push", "--n-episodes", "2", "--to", "card", "--dry-run", "--no-video"]
+    assert hub_in_a_new_process(*push) == 2
+    assert "names code to run (gym_packages: stranger)" in capsys.readouterr().err
+    assert hub_in_a_new_process(*push, "--trust") == 0
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "card"))
+    assert hub_in_a_new_process("load", "--repo-id", "me/it", "-f", "downloaded") == 0
+    assert hub_in_a_new_process("load", "-f", "other") == 2
+    assert "unknown environment 'Stranger-v0'" in capsys.readouterr().err
+    assert (tmp_path / "downloaded" / "cpo" / "Stranger-v0_1").is_dir()
 
 
 @pytest.mark.parametrize("error", [ConnectionError("no route to host"), TimeoutError()])

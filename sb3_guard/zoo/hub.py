@@ -13,6 +13,7 @@ import yaml
 
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
+from sb3_guard.zoo.make_envs import canonical_id
 from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
 from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data, require_writable
 from sb3_guard.zoo.usage import UsageError, explained
@@ -181,6 +182,12 @@ def command(run: RunFolder) -> str:
 
 def load(flags: HubFlags) -> int:
     """Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it."""
+    try:
+        flags.env = canonical_id(flags.env)[0]
+    except UsageError:
+        # A stranger's environment need not be known here: the repository says which it is.
+        if not (flags.repo_id or flags.gym_packages):
+            raise
     name = model_name(flags.algo, flags.env)
     repo_id = flags.repo_id or f"{flags.organization}/{flags.repo_name or name}"
     require_writable(Path(flags.folder), "--folder")

@@ -29,6 +29,8 @@ from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.checks import check_per_cost, is_number
 from sb3_guard.costs import read_costs
 
+_LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
+
 
 class Constrained(BaseAlgorithm):
     """Cost keys, limits and episode costs beside an algorithm of Stable-Baselines3.
@@ -330,7 +332,12 @@ class Constrained(BaseAlgorithm):
         topic = message.split(":")[0]
         if topic not in self._warned:
             self._warned.add(topic)
-            warnings.warn(message, UserWarning, stacklevel=3)
+            # The line to show is the user's, however many constructors are between (from Python
+            # 3.12 on, skip_file_prefixes does this).
+            frame, level = inspect.currentframe(), 1
+            while frame and frame.f_globals.get("__name__", "").split(".")[0] in _LIBRARIES:
+                frame, level = frame.f_back, level + 1
+            warnings.warn(message, UserWarning, stacklevel=level)
 
     # Logging
 

@@ -44,19 +44,27 @@ def action_table(env: GuardVectorEnv) -> str:
 
 
 def unsteady(env: GuardVectorEnv) -> str | None:
-    """What is wrong with a robot that is left alone for a second: it falls, or explodes."""
-    engine = env.engine
+    """What is wrong with a robot after a second alone, or of random actions: it falls, explodes."""
+    return _watch(env, "left alone") or _watch(env, "given random actions")
+
+
+def _watch(env: GuardVectorEnv, how: str) -> str | None:
+    engine, rng = env.engine, np.random.default_rng(0)
     low, high = engine.robot.action_range
-    rest = np.broadcast_to((np.asarray(low) + high) / 2, (env.num_envs, engine.robot.action_size))
+    alone = how == "left alone"
+    shape = env.num_envs, engine.robot.action_size
+    rest = np.broadcast_to((np.asarray(low) + high) / 2, shape)
+    env.reset(seed=0)
     for step in range(1, round(1 / engine.control_step) + 1):
-        outcome = engine.step(rest)
+        outcome = engine.step(rest if alone else rng.uniform(low, high, shape))
         seconds = f"{step * engine.control_step:.2g} s"
         if exploded(engine, outcome):
             return (
-                f"the robot, left alone, explodes within {seconds}: make its timestep "
-                f"({engine.model.opt.timestep:g} s) smaller, or stiffness, gears and overlaps"
+                f"the robot, {how}, explodes within {seconds}: reduce its timestep (now "
+                f"{engine.model.opt.timestep:g} s), or the stiffness of its joints and the gears "
+                "and gains of its actuators, or move apart geoms that overlap"
             )
-        if engine.robot.position[0, 2] < -0.1:
+        if alone and engine.robot.position[0, 2] < -0.1:
             return (
                 f"the robot, left alone, falls through the floor within {seconds}: its geoms need "
                 "contype and conaffinity of 1, and its class floor=True"

@@ -138,6 +138,12 @@ def test_show_warns_of_robots_that_fall_or_explode(cart, joint, attributes, word
     assert found is None if words is None else words in found
 
 
+def test_show_warns_of_actuators_that_are_too_strong(cart):
+    """At rest such a robot stands still."""
+    env = GuardVectorEnv(1, cart(lambda text: text.replace("<actuator>", BLAST)))
+    assert "given random actions, explodes within" in str(unsteady(env))
+
+
 def test_a_robot_that_explodes_is_not_told_to_mend_its_state(cart):
     cart(lambda text: text.replace("<actuator>", BLAST)).build()
 

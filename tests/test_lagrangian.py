@@ -348,3 +348,10 @@ def test_another_delay_keeps_the_latest_averages(delay: int, tmp_path: Path) -> 
 def test_bad_values_are_named(cls: type[TrustRegion], kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(cls, **kwargs)
+
+
+def test_part_of_the_state_can_be_set() -> None:
+    """As SB3's ``set_parameters(..., exact_match=False)`` does."""
+    multiplier = Multiplier(1, 0.5)
+    multiplier.load_state_dict({"value": th.full((1,), 3.0)}, strict=False)
+    assert float(multiplier.value) == 3.0

@@ -89,10 +89,11 @@ class Multiplier(nn.Module):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
         """Also that of another ``delay``: the latest averages are kept, earlier ones unknown."""
-        saved, delay = state_dict["last_costs"], len(self.last_costs)
-        unknown = saved.new_full((delay, *saved.shape[1:]), np.inf)
-        last_costs = th.cat([saved, unknown])[:delay]
-        return super().load_state_dict({**state_dict, "last_costs": last_costs}, *args, **kwargs)
+        saved, delay = state_dict.get("last_costs"), len(self.last_costs)
+        if saved is not None:
+            unknown = saved.new_full((delay, *saved.shape[1:]), np.inf)
+            state_dict = {**state_dict, "last_costs": th.cat([saved, unknown])[:delay]}
+        return super().load_state_dict(state_dict, *args, **kwargs)
 
     @th.no_grad()
     def update(self, cost: np.ndarray, limit: np.ndarray) -> None:

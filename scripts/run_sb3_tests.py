@@ -74,6 +74,8 @@ DOES_NOT_APPLY: dict[str, str] = {
     "costs as well, and says so when it is given another",
     "sb3/test_gae::test_gae_computation[*-0.9-*": "its advantages agree; as critic targets it "
     "expects λ-returns, ours are discounted returns",
+    "sb3/test_gae::test_gae_computation[*-1.0-1.0-PPO] with CUP": "CUP weighs costs by what has no "
+    "bound at a discount factor of 1; it says so",
     "sb3/test_identity::test_continuous[PPO]": "wants the task solved in 4 updates, of KL <= 0.02 "
     "here and with costs that are noise: some get there, some do not",
     "sb3/test_logger::test_fps_logger[A2C]": "asks for 100 steps a second, updates included, which "
@@ -105,6 +107,9 @@ def stand_in(cls: type, name: str, defaults: dict[str, Any]) -> type:
     taken = inspect.signature(cls).parameters
 
     class StandIn(cls):  # type: ignore[misc, valid-type]
+        def __new__(own, *args: Any, **kwargs: Any) -> Any:  # theirs are taken out below
+            return object.__new__(own)
+
         def __init__(self, policy: Any, env: Any, *args: Any, **kwargs: Any) -> None:
             global _made
             _made = True
@@ -124,6 +129,9 @@ def stand_in(cls: type, name: str, defaults: dict[str, Any]) -> type:
                 if filtered and "corrects actions of a Box" in str(error):
                     pytest.skip(str(error))
                 raise
+
+        def learn(self, *args: Any, **kwargs: Any) -> Any:
+            return super().learn(*args, **{"tb_log_name": name, **kwargs})
 
         def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
             costs = [float((self.num_timesteps + i) % 3 == 0) for i in range(self.n_envs)]

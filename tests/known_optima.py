@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms import CRPO, CUP, P3O, TRPOFAC, TRPOIPO, FirstOrder
+from sb3_guard.algorithms import CRPO, CUP, P3O, TRPOFAC, TRPOIPO, FirstOrder, SACLag
 
 
 class World:
@@ -391,14 +391,14 @@ def budget(cls: type, problem: Problem) -> Problem:
     the last one did to the cost, and little of a step is left to narrow the policy; TRPO-IPO, whose
     steps are cut where they would cross the limit; and TRPO-FAC, whose multipliers are networks
     that have to be learnt. CUP and P3O, first-order ones whose updates go to and fro as CRPO's do,
-    get eight times. Off-policy ones take 10,000 steps of one environment, each with a gradient
-    step.
+    get eight times. Off-policy ones take 8,000 steps of one environment, each with a gradient step,
+    SAC-Lagrangian 15,000: its temperature falls slowly at SB3's rate.
     """
     if issubclass(cls, OnPolicyAlgorithm):
         slow = issubclass(cls, FirstOrder | CRPO | TRPOIPO | TRPOFAC)
         times = 8 if issubclass(cls, CUP | P3O) else 4 if slow else 2
         return replace(problem, updates=times * problem.updates)
-    return replace(problem, n_envs=1, n_steps=1, updates=10_000)
+    return replace(problem, n_envs=1, n_steps=1, updates=15_000 if cls is SACLag else 8_000)
 
 
 def _table(

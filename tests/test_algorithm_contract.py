@@ -768,7 +768,7 @@ def test_a_leaf_is_its_problem_and_its_hooks(cls: type[TrustRegion]) -> None:
     first, _, rest = doc.partition("\n\n")
     assert re.search(r"\bet al\., \d{4}.*\d{4}\.\d{5}\)", first)
     assert rest.startswith("::\n")
-    hooks = {"surrogate", "step", "accept", "correct", "fit", "critic_rows"}
+    hooks = {"surrogate", "step", "accept", "correct", "fit", "critic_rows", "value_rollout"}
     set_up = {"__init__", "_check_hyperparameters", "_setup_model", "_get_torch_save_params"}
     base = {name for layer in cls.__mro__[1:] for name in vars(layer)}
     replaced = {name for name, value in vars(cls).items() if callable(value) and name in base}

@@ -58,9 +58,6 @@ class TRPOSL(FilteredTrustRegion):
         # What is derived from the limit is known once an episode has ended.
         self._set_threshold(np.zeros(len(self.cost_keys)))
 
-    def _estimate_advantages(self) -> None:
-        self._choose_cost_units()
-
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
         layer = self.policy.action_filter

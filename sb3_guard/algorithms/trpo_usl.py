@@ -81,10 +81,10 @@ class TRPOUSL(FilteredTrustRegion):
         penalty = self._layer.excess(batch.observations, self._sampled(batch))
         return objective - self.kappa * (ratio * (penalty - penalty.mean())).mean()
 
-    def _estimate_advantages(self) -> None:
+    def value_rollout(self) -> None:
         """Value the executed actions, those after the last step by the policy that took them."""
+        super().value_rollout()
         buffer = self.rollout_buffer
-        self._choose_cost_units()
         observations = buffer.observations_by_time(self.device)
         executed = self._unit(buffer.executed_actions.reshape(-1, buffer.action_dim))
         values = self._layer.values(observations, executed)

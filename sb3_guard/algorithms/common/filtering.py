@@ -164,6 +164,10 @@ class FilteredTrustRegion(TrustRegion):
         self.policy.action_filter.unit.copy_(known)
         return units
 
+    def value_rollout(self) -> None:
+        """Renew the units that the filter's network measures costs in."""
+        self._choose_cost_units()
+
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         """Log what was corrected; leaves then fit their model."""
         lengths = self._corrections(batch)

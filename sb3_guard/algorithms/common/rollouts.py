@@ -182,7 +182,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             )
         if full:
             self._estimate_costs(self.rollout_buffer.costs.mean(axis=(0, 1)))
-            self._estimate_advantages()
+            self.value_rollout()
         else:
             self._count_last_step(callback)
         self.timing["collect"] = time.perf_counter() - started
@@ -210,7 +210,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
                 self._timeouts.append((step, i, info["terminal_observation"]))
 
     @th.no_grad()
-    def _estimate_advantages(self) -> None:
+    def value_rollout(self) -> None:
         """Value the rollout's states and finish the cost half of the buffer."""
         if not self.uses_cost_critic:
             return

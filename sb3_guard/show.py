@@ -45,13 +45,13 @@ def action_table(env: GuardVectorEnv) -> str:
 
 def unsteady(env: GuardVectorEnv) -> str | None:
     """What is wrong with a robot after a second alone, or of random actions: it falls, explodes."""
-    return _watch(env, "left alone") or _watch(env, "given random actions")
+    return _watch(env, alone=True) or _watch(env, alone=False)
 
 
-def _watch(env: GuardVectorEnv, how: str) -> str | None:
+def _watch(env: GuardVectorEnv, alone: bool) -> str | None:
     engine, rng = env.engine, np.random.default_rng(0)
+    how = "left alone" if alone else "given random actions"
     low, high = engine.robot.action_range
-    alone = how == "left alone"
     shape = env.num_envs, engine.robot.action_size
     rest = np.broadcast_to((np.asarray(low) + high) / 2, shape)
     env.reset(seed=0)

@@ -136,6 +136,11 @@ class Renderer:
                 )
             from mujoco import viewer
 
+            # Forces of contacts (F) are seen: an arrow of 1 m is the weight of all there is.
+            model, shown = engine.model, engine.model.vis
+            shown.map.force = model.stat.meanmass / (9.81 * model.body_mass.sum())
+            shown.rgba.contactforce = [0.8, 0.1, 0.4, 1.0]
+            shown.scale.forcewidth = 0.03 / model.stat.meansize
             self._paused, self._pace = False, (0.0, 0.0)
             others = set(threading.enumerate())
             self._viewer = viewer.launch_passive(

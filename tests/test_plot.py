@@ -153,6 +153,18 @@ def test_pareto_marks_front_and_limit(small):
     assert "cost limit, 0" in lines(axis)
 
 
+def test_pareto_shows_an_outlier_at_the_edge(small):
+    fake_run(small, "pcpo", cost=1000.0, returns=7.0)
+    (drawing,) = draw("pareto", read(small))
+    (axis,) = drawing.figure.axes
+    highest = max(cost for cost in read(small).means["M_c"] if cost < 1000)
+    end = axis.get_xlim()[1]
+    assert highest < end <= 1.5 * highest
+    ((cost, value),) = axis.collections[-1].get_offsets()
+    assert 0.9 * end < cost < end and value == 7.0
+    assert "1e+03 →" in texts(drawing.figure)
+
+
 def test_profiles_rise_and_fall(data):
     (drawing,) = draw("profiles", data)
     reward, cost, _ = map(lines, drawing.figure.axes)
@@ -163,7 +175,7 @@ def test_profiles_rise_and_fall(data):
 
 @pytest.mark.parametrize(
     ("values", "end", "text"),
-    [([1.0, 2, 3, 4], None, ""), ([*np.ones(20), 1000.0], 5.25, "↑ up to 1e+03")],
+    [([1.0, 2, 3, 4], None, ""), ([*np.ones(20), 1000.0], 1.5, "↑ up to 1e+03")],
 )
 def test_one_outlier_does_not_squash_a_cost_axis(values, end, text):
     axis = figures.Figure().subplots()

@@ -207,9 +207,10 @@ def fit_costs(axis: Axes, values: Iterable[Any], way: str = "y") -> None:
     highest, enough = finite.max(), 5 * np.quantile(finite, 0.75)
     set_limits(0, min(end, 1.5 * highest))
     if 0 < enough < highest:
-        set_limits(0, 1.05 * enough)
-        text = f"{'↑' if way == 'y' else '→'} up to {highest:.3g}"
-        axis.annotate(text, (0.99, 0.98), xycoords="axes fraction", ha="right", va="top")
+        set_limits(0, min(1.5 * finite[finite <= enough].max(), 1.05 * enough))
+        if way == "y":
+            text = f"↑ up to {highest:.3g}"
+            axis.annotate(text, (0.99, 0.98), xycoords="axes fraction", ha="right", va="top")
 
 
 def draw_limit(line: Callable[..., Any], data: Data, suite: str) -> float:
@@ -264,7 +265,16 @@ def draw_pareto(axis: Axes, data: Data, suite: str) -> None:
     axis.set(xlabel="episode cost $M_c$", ylabel="return $J_r$", title=suite)
     axis.margins(0.08)
     fit_costs(axis, [means["M_c"], limit], "x")
-    axis.set_xlim(left=-0.03 * axis.get_xlim()[1])
+    end = axis.get_xlim()[1]
+    for row in means[means["M_c"] > end].to_dict("records"):
+        look = data.looks[row["algo"]]
+        at = 0.97 * end, row["J_r"]
+        axis.scatter(*at, s=80, color=look.color, marker=look.marker, zorder=3)
+        axis.annotate(
+            f"{row['M_c']:.3g} →", at, (-8, 0), textcoords="offset points", color=look.color,
+            ha="right", va="center",
+        )  # fmt: skip
+    axis.set_xlim(left=-0.03 * end)
 
 
 def pareto_front(costs: np.ndarray, returns: np.ndarray) -> np.ndarray:

@@ -65,6 +65,16 @@ def test_pid_by_hand() -> None:
     )
 
 
+@pytest.mark.parametrize("limit", [1.0, 0.1, 1e-6])
+def test_a_rise_far_above_a_small_limit_is_no_more_than_it_is(limit: float) -> None:
+    """J_C of 50 ± 5, whose rises are a tenth of it and many limits."""
+    costs = 50.0 + 5.0 * np.random.default_rng(0).standard_normal(12)
+    gains = {"proportional": 2.0, "smoothing": 0.5, "relative": True}
+    without = follow(Multiplier(1, 0.5, **gains), costs, limit)
+    values = follow(Multiplier(1, 0.5, derivative=2.0, **gains), costs, limit)
+    assert 0.0 < np.max(np.subtract(values, without)) < 0.4
+
+
 def test_adam_first_moves_by_its_rate() -> None:
     values = follow(Multiplier(1, 0.1, adam=True), [500.0, 500.0], 5.0)
     np.testing.assert_allclose(values, [0.1, 0.2], rtol=1e-6)

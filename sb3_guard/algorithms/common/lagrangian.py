@@ -21,6 +21,8 @@ def _only_of_its_kind(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> d
 
 # Gains that keep positive limits whatever the unit of cost, for policies that learn from rollouts.
 RELATIVE = {"lambda_lr": 0.5, "proportional_gain": 2.0, "lambda_units": "relative"}
+# A limit that nothing keeps raises λ as long as it may; where limits are kept it ends below this.
+HIGHEST = 5.0  # in standard deviations of the advantages
 
 SLOW = 0.95  # what the slow average of J_C keeps in an update
 
@@ -48,7 +50,7 @@ class Multiplier(nn.Module):
     :param delay: number of updates over which the rise of J_C is measured
     :param relative: measure costs in units of the limit (of a slow average of J_C where that is 0)
         and count violations of more than one unit as one, so that neither the unit of cost nor how
-        far away training begins matters
+        far away training begins matters; J̄_C is in units of the slow average where that is larger
     """
 
     def __init__(
@@ -108,8 +110,8 @@ class Multiplier(nn.Module):
         if self.relative:
             unit = th.where(bound == 0.0, self.slow_cost, bound).abs()
             unit[unit == 0.0] = 1.0  # neither cost nor limit: nothing is violated
-            now = now / unit
             violation = (violation / unit).clamp_(-1.0, 1.0)
+            now = now / unit.maximum(self.slow_cost.abs())  # far from a limit, its own size
         self.integral.grad = -violation
         self.optimizer.step()
         self.integral.clamp_(0.0, self.maximum)
@@ -141,7 +143,7 @@ class Lagrangian(Constrained):
 
     :param lambda_lr: η, what the multipliers gain per unit of violation and update
     :param lambda_init: multipliers before the first update
-    :param lambda_max: bound on the multipliers; None for none
+    :param lambda_max: bound on the multipliers; None for 5 in relative units, none in those of cost
     :param lambda_optimizer: ``"sgd"`` for plain ascent, ``"adam"`` lets Adam choose the steps
     :param lambda_update: whether the multipliers follow a rollout ``"before"`` the policy learns
         from it or ``"after"``
@@ -183,17 +185,21 @@ class Lagrangian(Constrained):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        relative = self.lambda_units == "relative"
+        highest = self.lambda_max
+        if relative and highest is None:
+            highest = max(HIGHEST, self.lambda_init)
         self.multiplier = Multiplier(
             len(self.cost_keys),
             self.lambda_lr,
             self.lambda_init,
-            self.lambda_max,
+            highest,
             self.lambda_optimizer == "adam",
             self.proportional_gain,
             self.derivative_gain,
             self.lambda_smoothing,
             self.lambda_delay,
-            self.lambda_units == "relative",
+            relative,
         )
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -227,6 +227,13 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         assert self._last_obs is not None and self._last_episode_starts is not None
         last = self.cost_critic(obs_as_tensor(self._last_obs, self.device)).cpu().numpy()
         buffer.compute_cost_returns_and_advantage(units * last, self._last_episode_starts)
+        # Where every step costs the same, in episodes that only time has ended, no action matters:
+        # what is left are the critic's errors, all that a policy would follow at a high price.
+        ended = buffer.episode_starts[1:].sum() + self._last_episode_starts.sum()
+        if ended == len(self._timeouts):
+            first = buffer.costs[0, 0]
+            alike = (first != 0.0) & (buffer.costs == first).all(axis=(0, 1))
+            buffer.cost_advantages[..., alike] = 0.0
 
     def _choose_cost_units(self) -> np.ndarray:
         """What networks measure costs in, shape (m,), float32, from a rollout just filled.

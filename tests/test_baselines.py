@@ -28,10 +28,12 @@ PARAMS = {
     "tqc": OFF_POLICY,
     "crossq": OFF_POLICY,
 }
+# Within the hazard, far above the limit: multipliers and cost critics matter.
+COSTLY = ["cost_limit:0.01", "env_kwargs:{'hazard': (-1.0, 0.0)}"]
 
 
-def arguments(algo: str, folder: Path) -> list[str]:
-    params = ["-params", *PARAMS[algo]]
+def arguments(algo: str, folder: Path, *more: str) -> list[str]:
+    params = ["-params", *PARAMS.get(algo, OFF_POLICY), *more]
     return [*TOY, *SMALL, "--algo", algo, "-n", "180", *params, "-f", str(folder)]
 
 
@@ -56,12 +58,22 @@ def test_trains_with_costs_logged(algo, tmp_path):
     assert enjoy.main([*TOY[:4], "--algo", algo, "-f", str(tmp_path), "--n-episodes", "1"]) == 0
 
 
-@pytest.mark.parametrize("algo", ["ppo", "sac", pytest.param("td3", marks=pytest.mark.slow)])
-def test_killed_and_resumed(algo, tmp_path, monkeypatch):
-    assert train.main([*arguments(algo, tmp_path / "whole"), "--eval-freq", "50"]) == 0
-    crash(monkeypatch, [*arguments(algo, tmp_path / "cut"), "--eval-freq", "50"], 101)
-    assert train.main(["-i", str(runs_of(tmp_path / "cut"))]) == 0
-    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+@pytest.mark.parametrize(
+    ("algo", "more"),
+    [
+        ("ppo", []),
+        ("sac", ["use_sde:True"]),
+        pytest.param("td3", [], marks=pytest.mark.slow),
+        ("sac_lag", ["use_sde:True", *COSTLY]),
+        ("td3_lag", ["gradient_steps:2", *COSTLY]),
+    ],
+)
+def test_killed_and_resumed(algo, more, tmp_path, monkeypatch):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert train.main([*arguments(algo, whole, *more), "--eval-freq", "50"]) == 0
+    crash(monkeypatch, [*arguments(algo, cut, *more), "--eval-freq", "50"], 101)
+    assert train.main(["-i", str(runs_of(cut))]) == 0
+    assert_same_run(whole, cut)
 
 
 def test_discrete_actions_with_rl_zoos_own_file(tmp_path):

@@ -206,7 +206,7 @@ def test_saved_and_loaded(cls: Any, tmp_path: Path) -> None:
     again.learn(40, reset_num_timesteps=False)
     assert again.num_timesteps == 190
     result = evaluate_policy(again, points(1), n_eval_episodes=2)
-    assert result is not None
+    assert result.lengths.tolist() == [30, 30] and (result.costs > 0.0).all()
 
 
 def test_dict_observations() -> None:

@@ -3,6 +3,7 @@
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard.algorithms import ALGORITHMS
+from sb3_guard.algorithms.common.generators import KeepsGenerators
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import UsageError
 
@@ -14,7 +15,9 @@ def baselines() -> dict[str, type[BaseAlgorithm]]:
     """RL-Zoo's algorithms by key: unconstrained, with their costs logged; ``trpo`` is ours."""
     from rl_zoo3.utils import ALGOS
 
-    return {key: ALGOS[key] for key in ALGOS if key not in ALGORITHMS and key not in NOT_HERE}
+    others = {key: ALGOS[key] for key in ALGOS if key not in ALGORITHMS and key not in NOT_HERE}
+    # Of the same name, which logs and tables show.
+    return {key: type(cls.__name__, (KeepsGenerators, cls), {}) for key, cls in others.items()}
 
 
 def algorithm(key: str) -> type[BaseAlgorithm]:

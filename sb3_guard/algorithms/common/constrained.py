@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv
@@ -26,13 +25,14 @@ from sb3_guard.algorithms.common.arguments import (
     with_defaults,
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
+from sb3_guard.algorithms.common.generators import KeepsGenerators
 from sb3_guard.checks import check_per_cost, is_number
 from sb3_guard.costs import read_costs
 
 _LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
 
 
-class Constrained(BaseAlgorithm):
+class Constrained(KeepsGenerators):
     """Cost keys, limits and episode costs beside an algorithm of Stable-Baselines3.
 
     Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. A subclass states its

@@ -5,7 +5,6 @@ cost critic values its states, cost advantages are estimated, and so are J_C, th
 episode and the violations of the limits.
 """
 
-import random
 import time
 from contextlib import nullcontext
 from typing import Any, ClassVar, Literal
@@ -95,8 +94,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         self.cost_units: np.ndarray | None = None
         # (step, env, observation) of every episode cut by a time limit
         self._timeouts: list[tuple[int, int, Any]] = []
-        self._rng_at_rollout: tuple[Any, Any, th.Tensor] | None = None
-        self._cuda_at_rollout: list[th.Tensor] = []  # one per device
         super().__init__(*args, **kwargs)
 
     # Construction and saving
@@ -136,8 +133,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
                 self.cost_critic = CostCritic(self.policy, len(self.cost_keys))
 
     def _excluded_save_params(self) -> list[str]:
-        mine = ["_timeouts", "_rng_at_rollout", "_cuda_at_rollout"]
-        return [*super()._excluded_save_params(), *mine]
+        return [*super()._excluded_save_params(), "_timeouts"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
@@ -162,11 +158,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         rollout_buffer: RolloutBuffer,
         n_rollout_steps: int,
     ) -> bool:
-        # Taken before anything is drawn: a checkpoint written at the start of a rollout restores
-        # these to continue as if it had never been written.
-        legacy = np.random.get_state()  # noqa: NPY002 (the generator SB3 draws from)
-        self._rng_at_rollout = (random.getstate(), legacy, th.get_rng_state())
-        self._cuda_at_rollout = th.cuda.get_rng_state_all() if self.device.type == "cuda" else []
         started = time.perf_counter()
         self._begin_statistics()
         self._timeouts = []

@@ -35,6 +35,14 @@ def check_number(
         )
 
 
+def check_learning_rate(rate: Any) -> None:
+    """
+    :raises ValueError: ``rate`` is neither a positive number nor a schedule
+    """
+    if not callable(rate) and not (is_number(rate) and rate > 0.0):
+        raise ValueError(f"learning_rate={rate!r}: must be a positive number or a schedule")
+
+
 def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
     """
     :raises ValueError: ``value`` is not one finite number, or one for each cost key

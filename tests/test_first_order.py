@@ -119,7 +119,7 @@ def test_smoothing_and_delay_by_hand() -> None:
 
 @pytest.mark.parametrize("cls", LAGRANGIAN)
 def test_a_broken_limit_raises_the_multiplier_and_a_kept_one_lowers_it(cls: Any) -> None:
-    """And J_C is that of this rollout, not of a window of episodes."""
+    """By the estimate of each update, not by a mean over those before."""
     model = make(cls, cost_limit=10.0)
     seen = []
     for cost in (20.0, 20.0, 1.0):
@@ -383,6 +383,8 @@ def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
         (P3O, {"penalty_units": "x"}, "penalty_units='x'"),
         (CRPO, {"tolerance": -0.1}, "tolerance=-0.1"),
         (P3O, {"n_epochs": 0}, "n_epochs=0: must be an integer of at least 1"),
+        (RCPO, {"penalized_reward": True, "cost_gamma": 0.9}, "cost_gamma=0.9: .*; set gamma"),
+        (RCPO, {"penalized_reward": True, "cost_gae_lambda": 0.9}, "cost_gae_.*; set gae_lambda"),
     ],
 )
 def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) -> None:

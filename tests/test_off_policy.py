@@ -242,6 +242,12 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
     [
         ({"n_steps": 3}, "n_steps=3: must be 1"),
         ({"cost_gamma": 1.0}, r"cost_gamma=1.0: must be a number in \[0, 1\)"),
+        ({"gamma": 1.0}, "gamma=1.0: .* must be below 1, .*; give cost_gamma=0.99 too"),
+        ({"gamma": 2.0, "cost_gamma": 0.9}, r"gamma=2.0: must be a number in \[0, 1\]"),
+        ({"batch_size": 0}, "batch_size=0: must be an integer of at least 1"),
+        ({"buffer_size": 0}, "buffer_size=0: must be an integer of at least 1"),
+        ({"tau": 2.0}, r"tau=2.0: must be a number in \(0, 1\]"),
+        ({"learning_rate": 0.0}, "learning_rate=0.0: must be a positive number or a schedule"),
         ({"lambda_starts": -1}, "lambda_starts=-1"),
         ({"cost_limit": [1.0, 2.0]}, "cost_limit=.*one for each of the 1 cost keys"),
         ({"lambda_init": 2.0, "lambda_max": 1.0}, "lambda_max=1.0"),

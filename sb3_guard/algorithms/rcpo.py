@@ -31,6 +31,16 @@ class RCPO(PenalizedTrustRegion):
 
     penalized_reward: bool = hyperparameter(False)
 
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        for name in ("gamma", "gae_lambda") if self.penalized_reward else ():
+            value = getattr(self, f"cost_{name}")
+            if value is not None:
+                raise ValueError(
+                    f"cost_{name}={value!r}: must be None with penalized_reward, where one critic "
+                    f"learns rewards and costs; set {name}"
+                )
+
     def _setup_model(self) -> None:
         self.uses_cost_critic = not self.penalized_reward
         super()._setup_model()

@@ -27,7 +27,7 @@ from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
-from sb3_guard.checks import check_number
+from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
 
 class CostReplayBufferSamples(NamedTuple):
@@ -152,8 +152,16 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        if self.cost_gamma is None:
-            check_number("gamma", self.gamma, 0.0, 1.0)
+        for name in ("batch_size", "buffer_size"):
+            check_integer(name, getattr(self, name))
+        check_number("gamma", self.gamma, 0.0, 1.0, "[]")
+        check_number("tau", self.tau, 0.0, 1.0, "(]")
+        check_learning_rate(self.learning_rate)
+        if self.cost_gamma is None and self.gamma == 1.0:
+            raise ValueError(
+                f"gamma={self.gamma!r}: cost_gamma, which is gamma unless it is given, must be "
+                "below 1, as undiscounted costs add up without end; give cost_gamma=0.99 too"
+            )
         if self.n_steps != 1:
             raise ValueError(f"n_steps={self.n_steps!r}: must be 1, costs are replayed by step")
         buffer_class = self.replay_buffer_class

@@ -31,7 +31,7 @@ from sb3_guard.algorithms.common.fast.actor import actor_of
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
 from sb3_guard.algorithms.common.rollouts import CostRollouts
-from sb3_guard.checks import check_integer, check_number, is_number
+from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
 
 class Trial(NamedTuple):
@@ -187,9 +187,7 @@ class TrustRegion(CostRollouts):
             check_integer("batch_size", self.batch_size)
         for name in ("gamma", "gae_lambda"):
             check_number(name, getattr(self, name), 0.0, 1.0, "[]")
-        rate = self.learning_rate
-        if not callable(rate) and not (is_number(rate) and rate > 0.0):
-            raise ValueError(f"learning_rate={rate!r}: must be a positive number or a schedule")
+        check_learning_rate(self.learning_rate)
         if self.env is not None and self.normalize_advantage and self.n_steps * self.n_envs < 2:
             raise ValueError(
                 f"n_steps={self.n_steps} with {self.n_envs} environment: standardising advantages "

@@ -339,6 +339,16 @@ class Constrained(KeepsGenerators):
                 frame, level = frame.f_back, level + 1
             warnings.warn(message, UserWarning, stacklevel=level)
 
+    def _check_finite(self, name: str, loss: float) -> None:
+        """
+        :raises FloatingPointError: a loss is not finite, and so is what it learns from
+        """
+        if not np.isfinite(loss):
+            raise FloatingPointError(
+                f"{name} is {loss} after {self._n_updates} updates: a reward or observation of "
+                f"the environment is not finite, or learning_rate={self.learning_rate!r} too high"
+            )
+
     # Logging
 
     def _record_per_cost(self, name: str, values: np.ndarray) -> None:

@@ -172,7 +172,8 @@ class FirstOrder(CostRollouts, PPO):
                 total = total + self.vf_coef * losses["value_loss"]
             divergence = self._divergence(batch, log_prob.detach(), start)
             for name, value in {**losses, kl_name: divergence}.items():
-                history.setdefault(name, []).append(value.item())
+                history.setdefault(name, []).append(number := value.item())
+                self._check_finite(name, number)
             too_far = self.target_kl is not None and float(divergence) > 1.5 * self.target_kl
             if self.kl_stop == "minibatch" and too_far:
                 return True

@@ -231,6 +231,7 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
             self._n_updates += 1
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             for name, value in self.learn_from(batch, step).items():  # type: ignore[arg-type]
+                self._check_finite(name, value)
                 history.setdefault(name, []).append(value)
         self.cost_critic.online.train(False)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

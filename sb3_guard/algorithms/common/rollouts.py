@@ -305,13 +305,3 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         :return: an index of rows
         """
         return slice(None)
-
-    def _check_finite(self, name: str, loss: float) -> None:
-        """
-        :raises FloatingPointError: a critic's loss is not finite, and so is what it learnt from
-        """
-        if not np.isfinite(loss):
-            raise FloatingPointError(
-                f"{name} is {loss} after update {self._n_updates + 1}: a reward or observation of "
-                f"the environment is not finite, or learning_rate={self.learning_rate!r} too high"
-            )

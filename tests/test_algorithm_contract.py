@@ -49,13 +49,14 @@ from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.costs import read_costs
 
-# Those off policy have a file of their own, test_off_policy.py.
 CLASSES = [cls for cls in ALGORITHMS.values() if issubclass(cls, OnPolicyAlgorithm)]
+# They take part where rollouts don't matter; more of them is in test_off_policy.py.
+OFF_POLICY = [cls for cls in ALGORITHMS.values() if cls not in CLASSES]
 TRUST_REGION = [cls for cls in CLASSES if issubclass(cls, TrustRegion)]
 
 
 # One of each base and kind of cost; what no class has of its own is shown by these.
-SOME = ("CPO", "SCPO", "TRPOFAC", "TRPOSL", "PPOLag")
+SOME = ("CPO", "SCPO", "TRPOFAC", "TRPOSL", "PPOLag", "SACLag", "TD3Lag")
 
 
 def each(*values: Any, classes: list[Any] = CLASSES) -> list[Any]:
@@ -84,11 +85,16 @@ IMAGE = spaces.Box(0, 255, (36, 36, 1), np.uint8)
 
 
 def small(cls: type[TrustRegion], env: Any, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
-    defaults: dict[str, Any] = {"n_steps": 40, "seed": 0, "device": "cpu", "cost_limit": 0.0}
+    defaults: dict[str, Any] = {"seed": 0, "device": "cpu", "cost_limit": 0.0}
+    if cls in OFF_POLICY:
+        defaults |= {"learning_starts": 20, "buffer_size": 300, "batch_size": 8}
+        kwargs.pop("n_critic_updates", None)
+    else:
+        defaults["n_steps"] = 40
     if issubclass(cls, FirstOrder):
         # Whole rollouts: none here is larger than this.
         defaults |= {"n_epochs": kwargs.pop("n_critic_updates", 3), "batch_size": 10_000}
-    else:
+    elif cls not in OFF_POLICY:
         defaults["n_critic_updates"] = 3
     if cls in FILTERED:
         # Switched on after the first rollout, whatever its length: by then it has learnt something.
@@ -295,7 +301,7 @@ def test_episodes_and_rollouts_of_any_length(
     assert len(model.ep_cost_buffer) == min(100, n_envs * (steps // episode_length))
 
 
-@pytest.mark.parametrize("cls", some())
+@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
 def test_episode_costs_are_sums_of_raw_costs_across_rollouts(cls: type[TrustRegion]) -> None:
     model = small(cls, points(2, episode_length=40))
     steps: list[list[float]] = []
@@ -591,7 +597,7 @@ def test_parameters_travel(cls: type[TrustRegion]) -> None:
         b.set_parameters({"policy": parameters(a)["policy"]})
 
 
-@pytest.mark.parametrize("cls", some())
+@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
 def test_load_with_another_number_of_envs(cls: type[TrustRegion], tmp_path: Path) -> None:
     small(cls, points(2), n_critic_updates=1).learn(80).save(tmp_path / "model")
     model = cls.load(tmp_path / "model", env=points(3), device="cpu")
@@ -625,7 +631,7 @@ def test_a_copy_learns_on_its_own() -> None:
         assert all(moved), name
 
 
-@pytest.mark.parametrize("cls", some())
+@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
 def test_set_env_starts_new_episodes(cls: type[TrustRegion]) -> None:
     model = small(cls, points(2, episode_length=1000), n_critic_updates=1)
     model._warned = {"no episode has ended yet and the environment states no max_episode_steps"}
@@ -694,7 +700,7 @@ def test_resumed_equals_uninterrupted(
             assert resumed.logger.name_to_value[key] == value, key
 
 
-@pytest.mark.parametrize("cls", some())
+@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
 def test_same_seed_same_training(cls: type[TrustRegion]) -> None:
     runs = [parameters(small(cls, points(), seed=seed).learn(160)) for seed in (3, 3, 4)]
     assert_equal(runs[0], runs[1])
@@ -890,7 +896,7 @@ def test_learning_rate_schedules_reach_every_critic(cls: type[TrustRegion]) -> N
         assert critic.optimizer.param_groups[0]["lr"] == 0.0
 
 
-@pytest.mark.parametrize("cls", some())
+@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
 def test_a_callback_may_stop_and_training_go_on(cls: type[TrustRegion]) -> None:
     model = small(cls, points())
     model.learn(400, callback=lambda local, _: local["self"].num_timesteps < 120)

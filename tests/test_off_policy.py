@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint
+from cost_envs import CostPoint, RandomCostEnv
 from gymnasium import spaces
 from known_optima import Outcomes, problems
 from stable_baselines3 import SAC, TD3
@@ -19,6 +19,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_guard import SACLag, TD3Lag, evaluate_policy
 from sb3_guard.algorithms.common.replay import CostReplayBuffer, CostReplayBufferSamples
+from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
+from sb3_guard.common.monitor import CostMonitor
 
 
 def settings() -> dict[str, Any]:
@@ -207,6 +209,25 @@ def test_saved_and_loaded(cls: Any, tmp_path: Path) -> None:
     assert again.num_timesteps == 190
     result = evaluate_policy(again, points(1), n_eval_episodes=2)
     assert result.lengths.tolist() == [30, 30] and (result.costs > 0.0).all()
+
+
+@both
+def test_evaluated_and_logged_while_training(cls: Any) -> None:
+    judge = CostEvalCallback(points(1), n_eval_episodes=2, eval_freq=50, verbose=0)
+    train = CostMonitor(points())
+    model = cls("MlpPolicy", train, cost_limit=0.1, **settings())
+    model.learn(150, [judge, LogCosts()])
+    assert judge.evaluations_timesteps == [100] and np.min(judge.evaluations_costs) > 0.0
+    rate = model.logger.name_to_value["rollout/cost_rate"]
+    assert rate == pytest.approx(train.total_cost / 150)
+
+
+@both
+def test_images(cls: Any) -> None:
+    image, move = spaces.Box(0, 255, (36, 36, 1), np.uint8), spaces.Box(-1.0, 1.0, (2,))
+    env = make_vec_env(lambda: RandomCostEnv(image, move), 2)
+    model = cls("CnnPolicy", env, **settings() | {"buffer_size": 200}).learn(70)
+    assert model.cost_critic.optimizer.state and len(model.predict(env.reset())[0]) == 2
 
 
 def test_dict_observations() -> None:

@@ -324,8 +324,9 @@ def test_fac_keeps_two_limits_in_every_context(seed: int) -> None:
 def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) -> None:
     """The paper's setting, which no policy of the point can satisfy exactly.
 
-    TRPO ends at a return of 1.9 and an episode cost of 3.5; the hazard can be walked around. All
-    cost half of that or less, but TRPO-USL: its policy learns to push against the correction.
+    TRPO ends at a return of 1.9 and an episode cost of 3.5, and who keeps away from the hazard and
+    does nothing at -0.2; it can be walked around. All cost half of TRPO or less, but TRPO-USL: its
+    policy learns to push against the correction.
     """
     settings: dict[str, dict[str, Any]] = {
         "trpo_fac": {**SLOW, "lambda_lr": 1e-2},
@@ -343,12 +344,12 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
             policy_kwargs={"log_std_init": -0.5, "net_arch": [32, 32]},
             seed=seed,
             **settings.get(key, {}),
-        ).learn(800 * 60)
+        ).learn(800 * 120)
 
     model = train(key)
     most = 0.9 * np.mean(train("trpo").ep_cost_buffer) if key == "trpo_usl" else 1.75
     assert np.mean(model.ep_cost_buffer) < most
-    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.2
+    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.1
     assert all(th.isfinite(each).all() for each in model.policy.parameters())
 
 

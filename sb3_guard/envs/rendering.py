@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 CAMERAS = ("fixed", "track", "top")
-ELEVATION = {"fixed": 50.0, "track": 55.0, "top": 90.0}  # degrees
+ELEVATION = {"fixed": 58.0, "track": 55.0, "top": 90.0}  # degrees
 
 
 class RenderingError(RuntimeError):
@@ -260,7 +260,7 @@ class Renderer:
             self._middle + self._half * side for side in ((-1, -1), (-1, 1), (1, -1), (1, 1))
         ]
         near = np.clip([low, high], [*(self._middle - wide), 0.0], [*(self._middle + wide), wide])
-        tall = 0.5 if self._engine.robot.workspace == "planar" else 1.5  # m
+        tall = 0.3 if self._engine.robot.workspace == "planar" else 1.5  # m
         points = [[*corner, z] for corner in corners for z in (0.0, tall)]
         fovy = float(self._engine.model.vis.global_.fovy)
         elevation = -float(camera.elevation)

@@ -94,8 +94,11 @@ class ScenePainter:
         """The shadow on the floor of every body that is in the scene so far.
 
         A flat copy of each geom, cast along the light: soft enough, and without the marks of
-        shadow maps, in which zones would throw shadows too.
+        shadow maps, in which zones would throw shadows too. A world that a robot brings has lights
+        of its own.
         """
+        if getattr(self._engine.robot, "complete", False):
+            return
         flat = np.array([[1.0, 0.0, _SLANT[0]], [0.0, 1.0, _SLANT[1]], [0.0, 0.0, 0.0]])
         plane = int(mujoco.mjtGeom.mjGEOM_PLANE)
         bodies = [g for g in self._scene.geoms[: self._scene.ngeom] if g.type != plane]
@@ -116,9 +119,11 @@ class ScenePainter:
         :param half: half its sides, [2] m
         """
         width = 0.008 * float(max(half))
+        floors = self._engine.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        height = min(self._data.geom_xpos[floors, 2], default=0.0)
         for axis in (0, 1):
             for side in (-1.0, 1.0):
-                at, size = np.array([*middle, 0.0]), [half[0] + width, half[1] + width, 0.003]
+                at, size = np.array([*middle, height]), [half[0] + width, half[1] + width, 0.003]
                 at[axis] += side * half[axis]
                 size[axis] = width
                 self._add(_BOX, tuple(size), at, (*color, 1.0))

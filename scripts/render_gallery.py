@@ -24,12 +24,12 @@ from sb3_guard.zoo.playback import find_pretrained, find_run
 from sb3_guard.zoo.usage import UsageError
 
 TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
-PERIOD = 4  # control steps, of 0.02 s, from frame to frame
-FRAMES = 120
-DELAY = 60  # ms that a frame is shown: a third faster than it happens
+PERIOD = 2  # control steps, of 0.02 s, from frame to frame
+FRAMES = 240
+DELAY = 40  # ms that a frame is shown: as fast as it happens
 TRAINING = "--algo trpo -n 5e5 --seed 0 --eval-freq -1 --verbose 0".split()  # of what is filmed
-CLIP = 50  # frames of a clip
-CLIP_FPS = 12.5  # as fast as it happens
+CLIP = 100  # frames of a clip
+CLIP_FPS = 25  # as fast as it happens
 # More pictures of a part, as it is elsewhere or can be made: <kind>_<part>_<how>
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "constraint_ghosts_spatial": ("Goal_Drone_8Ghosts", {}),
@@ -91,11 +91,12 @@ def film(key: str, seed: int) -> list[Image.Image]:
     for step in range(FRAMES * PERIOD):
         if step % PERIOD == 0:
             (pixels,) = env.get_images()
-            frame = Image.fromarray(pixels).resize((400, 278))  # drawn large: smooth edges
+            frame = Image.new("RGB", (400, 304), "white")
+            frame.paste(Image.fromarray(pixels).resize((400, 278)), (0, 26))  # drawn large: smooth
             draw = ImageDraw.Draw(frame)
             color = (200, 0, 0) if cost > 0 else (40, 40, 40)
-            draw.text((10, 6), f"{key.upper()}   return {reward:z.1f}", (40, 40, 40), font)
-            draw.text((390, 6), f"cost {cost:.2f}", color, font, anchor="ra")
+            draw.text((2, 3), f"{key.upper()}   return {reward:z.1f}", (40, 40, 40), font)
+            draw.text((398, 3), f"cost {cost:.2f}", color, font, anchor="ra")
             frames.append(frame)
         obs, rewards, _, infos = env.step(model.predict(obs, deterministic=True)[0])
         reward, cost = reward + rewards[0], cost + infos[0]["cost"]
@@ -105,7 +106,7 @@ def film(key: str, seed: int) -> list[Image.Image]:
 
 def animation(path: Path, seed: int) -> None:
     """Write a small film of two of the package's agents in the same place: TRPO, and CPO."""
-    frames = [Image.new("RGB", (808, 278), "white") for _ in range(FRAMES)]
+    frames = [Image.new("RGB", (808, 304), "white") for _ in range(FRAMES)]
     for left, key in ((0, "trpo"), (408, "cpo")):
         for frame, half in zip(frames, film(key, seed), strict=True):
             frame.paste(half, (left, 0))

@@ -149,7 +149,8 @@ def test_continues_from_its_state(tmp_path):
     second = CostMonitor(
         DummyVecEnv([lambda: envs[0], lambda: envs[1]]), cost_keys=("cost", "heat")
     )
-    second.log_to(path)
+    path.write_bytes(state["table"].encode())
+    second.log_to(path, append=True)
     second.restore(state)
     after = play(second, 11)
     second.close()

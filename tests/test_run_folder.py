@@ -11,6 +11,8 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
 
 from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import KEPT
+from sb3_guard.zoo.checkpoint import restore_logs
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, RunInUse, folder_name, latest_run, lock, owner
@@ -147,6 +149,12 @@ def rows(path) -> list[str]:
     return (path / "progress.csv").read_text().splitlines()
 
 
+def resumed(folder, state) -> RunLogger:
+    environments = [{"episodes": 3}, {**dict.fromkeys(KEPT), "table": "#{}\nr,l,t,c\n"}, None]
+    restore_logs(folder, {"logger": state, "environments": environments}, drop_later=True)
+    return RunLogger(folder, state=state)
+
+
 def test_progress_goes_on_where_it_was(tmp_path):
     logger = RunLogger(tmp_path)
     for k in range(3):
@@ -158,7 +166,7 @@ def test_progress_goes_on_where_it_was(tmp_path):
     logger.dump(4)  # dropped
     logger.close()
 
-    again = RunLogger(tmp_path, state=state)
+    again = resumed(tmp_path, state)
     again.record("a", 10)
     again.record("time/iterations", 1)
     again.dump(5)
@@ -176,7 +184,7 @@ def test_progress_of_no_rows_begins_anew(tmp_path):
     logger.record("a", 1)
     logger.dump()
     logger.close()
-    again = RunLogger(tmp_path, state=state)
+    again = resumed(tmp_path, state)
     again.record("b", 2)
     again.dump()
     again.close()
@@ -200,7 +208,7 @@ def test_a_sleeper_whose_run_was_taken_over_ends(tmp_path):
 
 
 @pytest.mark.parametrize("content", [None, "", "a\n0\n1\n", "a,b\n0\n1\n2,", "a\n0\n\0\n\xff"])
-def test_a_kill_or_a_full_disk_loses_no_row(content, tmp_path):
+def test_a_kill_or_a_full_disk_loses_no_row(content, tmp_path, capsys):
     """Whatever it left of the log, the checkpoint has all of it."""
     logger = RunLogger(tmp_path)
     for k in range(3):
@@ -210,5 +218,11 @@ def test_a_kill_or_a_full_disk_loses_no_row(content, tmp_path):
     logger.close()
     path = tmp_path / "progress.csv"
     path.unlink() if content is None else path.write_bytes(content.encode("latin-1"))
-    RunLogger(tmp_path, state=state).close()
+    resumed(tmp_path, state).close()
     assert rows(tmp_path) == ["a", "0", "1", "2"]
+    said = capsys.readouterr().out
+    assert f"{path} was damaged or absent" in said and "monitor.csv was damaged or absent" in said
+    with open(path, "a") as file:
+        file.write("3\n")
+    resumed(tmp_path, state).close()
+    assert (rows(tmp_path), capsys.readouterr().out) == (["a", "0", "1", "2"], "")

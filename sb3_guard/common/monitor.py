@@ -136,11 +136,12 @@ class CostMonitor(VecMonitor):
             self.results_writer.write_row(episode)
         return episode
 
-    def log_to(self, filename: str | os.PathLike[str]) -> None:
+    def log_to(self, filename: str | os.PathLike[str], append: bool = False) -> None:
         """
-        Write episodes to a new csv from now on.
+        Write episodes to a csv from now on.
 
         :param filename: the csv; its name ends in ``monitor.csv`` (else that is appended)
+        :param append: write after the rows that it has; False: begin a new one
         """
         if self.results_writer is not None:
             self.results_writer.close()
@@ -149,24 +150,19 @@ class CostMonitor(VecMonitor):
             os.fspath(filename),
             header={"t_start": self.t_start, "env_id": str(spec.id if spec else None)},
             extra_keys=("c", *self._columns, *self.info_keywords),
+            override_existing=not append,
         )
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs to continue counting: sums under way, totals, the csv."""
+        """What :meth:`restore` needs to continue counting, and the csv as ``"table"``."""
         writer = self.results_writer
         table = None if writer is None else Path(writer.file_handler.name).read_bytes().decode()
         return {**{name: copy.copy(getattr(self, name)) for name in KEPT}, "table": table}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue counting from :meth:`state`; the csv that is written to gets its rows."""
+        """Continue counting from :meth:`state`; the csv is left as it is."""
         for name in KEPT:
             setattr(self, name, copy.copy(state[name]))
-        if self.results_writer is not None and state["table"] is not None:
-            file = self.results_writer.file_handler
-            file.truncate(0)
-            file.seek(0)
-            file.write(state["table"])
-            file.flush()
 
 
 def find_monitor(env: VecEnv) -> CostMonitor:

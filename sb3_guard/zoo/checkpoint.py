@@ -21,6 +21,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import KEPT
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.make_envs import seed_rows
 from sb3_guard.zoo.resumable import capture, restore
@@ -212,6 +213,33 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if version != FORMAT:
         raise UsageError(f"{path} has format {version}; this version reads format {FORMAT} only")
     return state
+
+
+def restore_logs(folder: Path, state: Mapping[str, Any], drop_later: bool) -> None:
+    """
+    Put a run's csv files back as its checkpoint has them, each in one step.
+
+    :param folder: the run folder
+    :param state: as :func:`read_checkpoint` returns it
+    :param drop_later: also drop what was written after the checkpoint
+    :raises UsageError: they can't be written
+    """
+    kept = {*KEPT, "table"}
+    (monitor,) = (one["table"] for one in state["environments"] if kept <= {*(one or ())})
+    for path, table in (
+        (folder / "progress.csv", state["logger"]["table"]),
+        (folder / "0.monitor.csv", monitor),
+    ):
+        with explained(f"can't write to {folder}", OSError):
+            there = path.read_bytes().decode(errors="replace") if path.exists() else ""
+            lines, rows = there.split("\n"), table.split("\n")
+            # A column that came later is at the end of each line.
+            whole = len(lines) >= len(rows) and all(map(str.startswith, lines, rows))
+            if not whole:
+                print(f"{path} was damaged or absent: its rows are back, from the checkpoint.")
+            if not whole or (drop_later and there != table):
+                with replacing(path) as file:
+                    file.write(table.encode())
 
 
 def is_checkpoint(path: Path) -> bool:

@@ -21,7 +21,8 @@ class RunLogger(Logger):
     :param folder: the run folder
     :param stdout: print each row as a table
     :param tensorboard: folder of the TensorBoard events; None: none
-    :param state: continue from what :meth:`state` said; None: a new run
+    :param state: continue from what :meth:`state` said, after the rows that the file has; None: a
+        new run
     """
 
     def __init__(
@@ -31,7 +32,11 @@ class RunLogger(Logger):
         tensorboard: str | os.PathLike[str] | None = None,
         state: Mapping[str, Any] | None = None,
     ):
-        self._csv = CSVOutputFormat(os.path.join(folder, "progress.csv"))
+        self._csv = CSVOutputFormat(os.devnull)  # which empties the file it opens
+        self._csv.close()
+        path = os.path.join(folder, "progress.csv")
+        self._csv.file = open(path, "w+" if state is None else "r+", encoding="utf-8", newline="\n")
+        self._csv.file.seek(0, os.SEEK_END)
         formats: list[KVWriter] = [self._csv]
         if stdout:
             formats.append(HumanOutputFormat(sys.stdout))
@@ -40,9 +45,6 @@ class RunLogger(Logger):
         super().__init__(os.fspath(folder), formats)
         self._iterations_before = 0
         if state is not None:
-            # Later rows are dropped, and a file that a kill or a full disk cut is whole again.
-            self._csv.file.write(state["table"])
-            self._csv.file.flush()
             self._csv.keys = list(state["columns"])
             # What training logged after the last row is written with the next one.
             self.name_to_value.update(state["values"])

@@ -35,6 +35,7 @@ from sb3_guard.zoo.checkpoint import (
     load_model,
     read_checkpoint,
     read_normalizer,
+    restore_logs,
     restore_run,
 )
 from sb3_guard.zoo.hyperparams import Setup, build
@@ -290,7 +291,9 @@ class Experiment:
         if self.tracker is not None:
             self.tracker.remember(folder)
         with explained(f"can't write to {folder.path}", OSError):
-            find_monitor(self.env).log_to(folder.monitor)
+            if state is not None:
+                restore_logs(folder.path, state, drop_later=True)
+            find_monitor(self.env).log_to(folder.monitor, append=state is not None)
             logger = RunLogger(
                 folder.path,
                 stdout=self._prints_tables,

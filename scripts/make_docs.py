@@ -34,10 +34,10 @@ GROUPS: dict[str, dict[str, type[Part]]] = {
 CAPTIONS = {
     "robot": "Each in `Goal_<Robot>_8Hazards`. The ring of beads is its lidar: the more opaque a "
     "bead, the closer the object in that direction. The dart on the floor shows where the robot "
-    "faces. Point is the package's CPO agent; the others are TRPO after 200,000 to 500,000 steps, "
+    "faces. Point is the package's CPO agent; the others are TRPO after 500,000 steps, "
     "with noise.",
     "task": "Each with Point among eight hazards: in Goal the package's CPO agent, elsewhere TRPO, "
-    "which ignores cost, after 200,000 to 500,000 steps.",
+    "which ignores cost, after 500,000 steps.",
     "constraint": "Each with Point and the task Goal: among hazards and ghosts the package's CPO "
     "agents, elsewhere TRPO, which ignores cost, after 200,000 steps. While a robot incurs a cost, "
     "it and the border of the arena turn red.",

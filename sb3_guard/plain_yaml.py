@@ -5,6 +5,7 @@ from typing import Any
 import yaml
 
 LARGEST = 1_000_000  # values in a file, those that aliases repeat included
+DEEPEST = 100  # values within values; PyYAML recurses, and in C that ends the process
 
 
 class DoubleKeyError(yaml.YAMLError):
@@ -67,5 +68,13 @@ def load_yaml(text: str) -> Any:
     """The plain data of a YAML text.
 
     :raises yaml.YAMLError: it is no YAML, a mapping has a key twice, or something contains itself
+        or is nested too deeply
     """
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > DEEPEST:
+            line = event.start_mark.line + 1
+            raise yaml.YAMLError(f"line {line} is nested more than {DEEPEST} levels deep")
     return yaml.load(text, _Loader)

@@ -17,6 +17,7 @@ from registered_envs import Broken, Filmed
 
 from sb3_guard import CPO, enjoy, train
 from sb3_guard.envs.rendering import RenderingError
+from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.zoo import playback
 from sb3_guard.zoo.checkpoint import MEMBER
 from sb3_guard.zoo.run_folder import read_data
@@ -210,6 +211,14 @@ def test_a_yaml_bomb(capsys, tmp_path):
     refused(train.main, ["-conf", str(tmp_path / "bomb.yml")], capsys, "e+10 values")
     with pytest.raises(UsageError, match="values"):
         read_data(tmp_path / "bomb.yml")
+
+
+def test_a_yaml_file_that_is_nested_too_deeply(capsys, tmp_path):
+    path = tmp_path / "deep.yml"
+    path.write_text("a: " + "[" * 100_000 + "]" * 100_000)
+    refused(train.main, ["-conf", str(path)], capsys, "line 1", "100 levels")
+    deep = "[" * 99 + "]" * 99
+    assert load_yaml(deep) == yaml.safe_load(deep)
 
 
 @pytest.mark.parametrize(

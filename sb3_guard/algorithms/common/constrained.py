@@ -7,11 +7,16 @@ saved. What is done about them is the business of the classes that stand on it.
 import inspect
 import warnings
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    EvalCallback,
+    EventCallback,
+)
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
@@ -30,6 +35,16 @@ from sb3_guard.checks import check_per_cost, is_number
 from sb3_guard.costs import read_costs
 
 _LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
+
+
+def _within(callback: BaseCallback) -> Iterator[BaseCallback]:
+    """A callback and those that it calls, however deep."""
+    yield callback
+    below = callback.callbacks if isinstance(callback, CallbackList) else []
+    if isinstance(callback, EventCallback) and callback.callback is not None:
+        below = [callback.callback]
+    for one in below:
+        yield from _within(one)
 
 
 class Constrained(KeepsGenerators):
@@ -232,8 +247,7 @@ class Constrained(KeepsGenerators):
         steps, callbacks = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, *args, **kwargs
         )
-        among = callbacks.callbacks if isinstance(callbacks, CallbackList) else [callbacks]
-        if self.constrained and any(type(one) is EvalCallback for one in among):
+        if self.constrained and any(type(one) is EvalCallback for one in _within(callbacks)):
             self._warn_once(
                 "EvalCallback keeps the model of the highest reward, whatever it costs: "
                 "sb3_guard.CostEvalCallback keeps the best safe one"

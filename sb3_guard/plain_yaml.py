@@ -75,6 +75,5 @@ def load_yaml(text: str) -> Any:
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
-            line = event.start_mark.line + 1
-            raise yaml.YAMLError(f"line {line} is nested more than {DEEPEST} levels deep")
+            raise yaml.YAMLError(f"it is nested more than {DEEPEST} levels deep")
     return yaml.load(text, _Loader)

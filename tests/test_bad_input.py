@@ -216,7 +216,7 @@ def test_a_yaml_bomb(capsys, tmp_path):
 def test_a_yaml_file_that_is_nested_too_deeply(capsys, tmp_path):
     path = tmp_path / "deep.yml"
     path.write_text("a: " + "[" * 100_000 + "]" * 100_000)
-    refused(train.main, ["-conf", str(path)], capsys, "line 1", "100 levels")
+    refused(train.main, ["-conf", str(path)], capsys, "100 levels")
     deep = "[" * 99 + "]" * 99
     assert load_yaml(deep) == yaml.safe_load(deep)
 

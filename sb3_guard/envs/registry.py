@@ -7,6 +7,7 @@ Adding one to its table here, or with :func:`register_robot`, :func:`register_ta
 import dataclasses
 import inspect
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -256,7 +257,7 @@ def _check_class(name: str, part: Any, kind: type, verb: str = "") -> None:
 
 
 def _check_contract(name: str, part: type[Part]) -> None:
-    """Run a part with its defaults in a small world, if it can be in one.
+    """Run a part with its defaults in a small world, and warn if it can't be in one.
 
     :raises PartError: it does not keep its contract
     """
@@ -274,8 +275,11 @@ def _check_contract(name: str, part: type[Part]) -> None:
         check_part(make, name)
     except PartError:
         raise
-    except Exception:  # it may need other company: where it is used, its own error will say
-        return
+    except Exception as error:  # it may need other company
+        warnings.warn(
+            f"{name} was not tried: a small world with it raised {type(error).__name__}: {error}",
+            stacklevel=4,
+        )
 
 
 def _add(table: dict[str, Any], name: str, part: type[Part]) -> None:

@@ -160,7 +160,7 @@ class Report:
         trials = study.get_trials(deepcopy=False)
         done, top = complete(trials), best(trials)
         pruned = sum(one.state == TrialState.PRUNED for one in trials)
-        lines = [f"{len(done) + pruned} trials are finished, {pruned} of them pruned"]
+        lines = [f"finished trials: {len(done) + pruned}, of them pruned: {pruned}"]
         if self.limits is not None:
             feasible = sum(rank(one)[0] for one in done)
             lines[0] += f"; {feasible} of {len(done)} kept the cost limit"

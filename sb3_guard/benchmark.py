@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import yaml
+from filelock import FileLock
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.flags import HOST, IDENTITY, command, flag
@@ -169,7 +170,8 @@ def benchmark(flags: Flags) -> int:
     with explained(f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"):
         # What was asked for, so that the folder is enough to continue.
         folder.mkdir(parents=True, exist_ok=True)
-        with replacing(folder / RECORD) as file:
+        # Several may begin in one folder.
+        with FileLock(folder / ".grid.lock"), replacing(folder / RECORD) as file:
             file.write(yaml.safe_dump(flags.asked_for(), sort_keys=False).encode())
     how = {name: getattr(flags, name) for name in ("jobs", "scheduler") if name in flags.given}
     again = f"continue with: sb3-guard benchmark -f {folder}"

@@ -496,7 +496,7 @@ def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch)
     monkeypatch.setitem(animation.__globals__, "FRAMES", 2)
     animation(tmp_path / "film.gif", 0)
     with Image.open(tmp_path / "film.gif") as film:
-        assert (film.n_frames, film.size) == (2, (808, 278))
+        assert (film.n_frames, film.size) == (2, (808, 304))
     clip = script["clip"]
     monkeypatch.setitem(clip.__globals__, "CLIP", 2)
     clip("Goal_Point_8Hazards-v0", tmp_path / "clip.webp", "fixed", "no runs", 0)

@@ -80,7 +80,7 @@ def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
     assert train.main(go_on) == 2
     assert "callback: subprocess.Popen" in capsys.readouterr().err
     assert train.main([*go_on, "--trust"]) == 2  # trusted, but not what was trained
-    assert "contradicts none when it was trained" in capsys.readouterr().err
+    assert "contradicts none of the training so far" in capsys.readouterr().err
     enter(run, "config.yml", callback=None, env_wrapper="hostile.Wrapper")
     assert (enjoy.main(play), train.main(go_on)) == (2, 2)
     enter(run, "config.yml", env_wrapper=None)

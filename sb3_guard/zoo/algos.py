@@ -16,8 +16,14 @@ def baselines() -> dict[str, type[BaseAlgorithm]]:
     from rl_zoo3.utils import ALGOS
 
     others = {key: ALGOS[key] for key in ALGOS if key not in ALGORITHMS and key not in NOT_HERE}
-    # Of the same name, which logs and tables show.
-    return {key: type(cls.__name__, (KeepsGenerators, cls), {}) for key, cls in others.items()}
+    return {key: _keeping(cls) for key, cls in others.items()}
+
+
+def _keeping(cls: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
+    """The class, with its generators kept, under its name, which logs and tables show."""
+    if issubclass(cls, KeepsGenerators):  # a user's, that RL-Zoo has been told of
+        return cls
+    return type(cls.__name__, (KeepsGenerators, cls), {})
 
 
 def algorithm(key: str) -> type[BaseAlgorithm]:

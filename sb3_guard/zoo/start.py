@@ -170,9 +170,7 @@ def resume(given: RunFlags, trusted: bool = False) -> int:
             setattr(flags, name, getattr(given, name))
         state = read_checkpoint(folder.checkpoint)
         ours, its = ({**one, "n_timesteps": None} for one in (folder.what(), state["what"]))
-        _refuse(
-            differences(its, ours), f"with which the run was trained (its files: {folder.params})"
-        )
+        _refuse(differences(its, ours), f"of the training so far, in {folder.params}")
         done, wanted = state["num_timesteps"], given.n_timesteps
         if 0 < wanted < done:
             raise UsageError(

@@ -464,7 +464,7 @@ def test_a_run_whose_files_were_edited(run, capsys):
     path = run / "CostPoint-v0" / "config.yml"
     values = yaml.safe_load(path.read_text())
     path.write_text(yaml.safe_dump({**values, "gamma": 0.5}))
-    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "gamma = 0.5", "was")
+    refused(train.main, ["-i", str(run), "-n", "120"], capsys, "gamma = 0.5", "0.99")
     path.write_text(yaml.safe_dump(values))
 
 

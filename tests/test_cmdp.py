@@ -349,7 +349,7 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
     model = train(key)
     most = 0.9 * np.mean(train("trpo").ep_cost_buffer) if key == "trpo_usl" else 1.75
     assert np.mean(model.ep_cost_buffer) < most
-    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.1
+    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.2
     assert all(th.isfinite(each).all() for each in model.policy.parameters())
 
 

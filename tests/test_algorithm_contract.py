@@ -14,7 +14,7 @@ import pytest
 import torch as th
 from cost_envs import CostPoint, RandomCostEnv
 from gymnasium import spaces
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -52,6 +52,7 @@ from sb3_guard.costs import read_costs
 CLASSES = [cls for cls in ALGORITHMS.values() if issubclass(cls, OnPolicyAlgorithm)]
 # They take part where rollouts don't matter; more of them is in test_off_policy.py.
 OFF_POLICY = [cls for cls in ALGORITHMS.values() if cls not in CLASSES]
+EVERY = [*CLASSES, *OFF_POLICY]
 TRUST_REGION = [cls for cls in CLASSES if issubclass(cls, TrustRegion)]
 
 
@@ -151,10 +152,11 @@ ACTIONS: dict[str, spaces.Space] = {
     each(
         *((space, MOVES) for space in reversed(OBSERVATIONS.values())),
         *((BOX, space) for space in ACTIONS.values()),
+        classes=EVERY,
     ),
 )
 def test_spaces(
-    cls: type[TrustRegion],
+    cls: Any,
     observation_space: spaces.Space,
     action_space: spaces.Space,
     tmp_path: Path,
@@ -164,6 +166,10 @@ def test_spaces(
     env = make_vec_env(lambda: RandomCostEnv(observation_space, action_space), 2, seed=0)
     if cls in FILTERED and not isinstance(action_space, spaces.Box):
         with pytest.raises(ValueError, match=f"{cls.__name__} corrects actions of a Box, not of"):
+            small(cls, env, policy)
+        return
+    if cls in OFF_POLICY and not isinstance(action_space, spaces.Box):
+        with pytest.raises(ValueError, match=f"{cls.__name__} needs continuous actions"):
             small(cls, env, policy)
         return
     model = small(cls, env, policy).learn(160)
@@ -301,7 +307,7 @@ def test_episodes_and_rollouts_of_any_length(
     assert len(model.ep_cost_buffer) == min(100, n_envs * (steps // episode_length))
 
 
-@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
+@pytest.mark.parametrize("cls", some(classes=EVERY))
 def test_episode_costs_are_sums_of_raw_costs_across_rollouts(cls: type[TrustRegion]) -> None:
     model = small(cls, points(2, episode_length=40))
     steps: list[list[float]] = []
@@ -582,12 +588,12 @@ def test_save_and_load_keep_everything(cls: type[TrustRegion], tmp_path: Path) -
     assert again.num_timesteps == model.num_timesteps + 80
 
 
-@pytest.mark.parametrize("cls", CLASSES)
-def test_parameters_travel(cls: type[TrustRegion]) -> None:
+@pytest.mark.parametrize("cls", EVERY)
+def test_parameters_travel(cls: Any) -> None:
     a, b = small(cls, points()).learn(80), small(cls, points(), seed=1)
     b.set_parameters(parameters(a))
     assert_equal(parameters(a), parameters(b))
-    assert ("cost_critic" in parameters(a)) is cls.uses_cost_critic
+    assert ("cost_critic" in parameters(a)) is (cls in OFF_POLICY or cls.uses_cost_critic)
     assert ("multiplier" in parameters(a)) is (issubclass(cls, Lagrangian) or cls is TRPOFAC)
     assert ("policy.action_filter.optimizer" in parameters(a)) is (cls in FILTERED)
     # SB3's tools draw, average and compare whole state dictionaries: no booleans, no integers.
@@ -597,7 +603,7 @@ def test_parameters_travel(cls: type[TrustRegion]) -> None:
         b.set_parameters({"policy": parameters(a)["policy"]})
 
 
-@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
+@pytest.mark.parametrize("cls", some(classes=EVERY))
 def test_load_with_another_number_of_envs(cls: type[TrustRegion], tmp_path: Path) -> None:
     small(cls, points(2), n_critic_updates=1).learn(80).save(tmp_path / "model")
     model = cls.load(tmp_path / "model", env=points(3), device="cpu")
@@ -631,7 +637,7 @@ def test_a_copy_learns_on_its_own() -> None:
         assert all(moved), name
 
 
-@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
+@pytest.mark.parametrize("cls", some(classes=EVERY))
 def test_set_env_starts_new_episodes(cls: type[TrustRegion]) -> None:
     model = small(cls, points(2, episode_length=1000), n_critic_updates=1)
     model._warned = {"no episode has ended yet and the environment states no max_episode_steps"}
@@ -700,7 +706,7 @@ def test_resumed_equals_uninterrupted(
             assert resumed.logger.name_to_value[key] == value, key
 
 
-@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
+@pytest.mark.parametrize("cls", some(classes=EVERY))
 def test_same_seed_same_training(cls: type[TrustRegion]) -> None:
     runs = [parameters(small(cls, points(), seed=seed).learn(160)) for seed in (3, 3, 4)]
     assert_equal(runs[0], runs[1])
@@ -731,14 +737,15 @@ class _Dumps(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("cls", some())
-def test_callbacks_see_the_locals_of_sb3(cls: type[TrustRegion]) -> None:
+@pytest.mark.parametrize("cls", some(classes=EVERY))
+def test_callbacks_see_the_locals_of_sb3(cls: Any) -> None:
     seen: dict[type, tuple[dict[str, Any], dict[str, Any]]] = {}
-    for kind in (PPO, cls):
+    off = cls in OFF_POLICY
+    theirs: Any = SAC if off else PPO
+    settings = {} if off else {"n_steps": 40, "batch_size": 40}
+    for kind in (theirs, cls):
         model = (
-            PPO("MlpPolicy", points(), n_steps=40, batch_size=40, device="cpu")
-            if kind is PPO
-            else small(cls, points())
+            theirs("MlpPolicy", points(), **settings) if kind is theirs else small(cls, points())
         )
 
         def keep(local: dict[str, Any], glob: dict[str, Any], kind: type = kind) -> bool:
@@ -747,10 +754,11 @@ def test_callbacks_see_the_locals_of_sb3(cls: type[TrustRegion]) -> None:
 
         model.learn(160, callback=keep)
     local = seen[cls][0]
-    assert seen[PPO][0].keys() <= local.keys()
-    assert seen[PPO][1].keys() <= seen[cls][1].keys()
+    assert seen[theirs][0].keys() <= local.keys()
+    assert seen[theirs][1].keys() <= seen[cls][1].keys()
     assert local["self"] is not None and isinstance(local["env"], VecEnv)
-    assert local["actions"].shape == local["clipped_actions"].shape == (2, 2)
+    for name in ["actions"] if off else ["actions", "clipped_actions"]:
+        assert local[name].shape == (2, 2)
     assert local["infos"][0]["cost"] >= 0.0
 
 
@@ -896,7 +904,7 @@ def test_learning_rate_schedules_reach_every_critic(cls: type[TrustRegion]) -> N
         assert critic.optimizer.param_groups[0]["lr"] == 0.0
 
 
-@pytest.mark.parametrize("cls", some(classes=[*CLASSES, *OFF_POLICY]))
+@pytest.mark.parametrize("cls", some(classes=EVERY))
 def test_a_callback_may_stop_and_training_go_on(cls: type[TrustRegion]) -> None:
     model = small(cls, points())
     model.learn(400, callback=lambda local, _: local["self"].num_timesteps < 120)

@@ -5,8 +5,8 @@ models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and 
 a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``.
 Instead of ``runs`` there are ``learnt: NAME``, what the agents earned in the end beside the
 untrained ones of ``docs/data/untrained.csv``, ``sweep: NAME SUITE``, what was earned and paid at
-each limit N of ``NAME_limitN.tar.xz``, and, within a line, ``ppo: NAME SUITE``, what PPO earned and
-paid. ``--pack FOLDER NAME`` packs the logs of a folder.
+each limit N of ``NAME_limitN.tar.xz``, and, within a line, ``beside: NAME SUITE ALGO``, what an
+algorithm earned and paid. ``--pack FOLDER NAME`` packs the logs of a folder.
 """
 
 import argparse
@@ -28,7 +28,8 @@ from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
 BLOCK = re.compile(
-    r"(<!-- (runs|learnt|sweep|ppo): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)", re.DOTALL
+    r"(<!-- (runs|learnt|sweep|beside): (\S+)(?: (\S+))?(?: (\S+))? -->\n?).*?(<!-- end -->)",
+    re.DOTALL,
 )
 PUBLISHED_STEPS = 1_000_000
 LAST = 90  # episodes: three rollouts of 30 environments
@@ -130,11 +131,11 @@ def sweep(name: str, suite: str) -> str:
     return markdown(spelled(rows, {"limit": whole("limit"), **columns}))
 
 
-def beside(name: str, suite: str) -> str:
-    """PPO's return and cost on a suite of a grid, beside the published ones."""
+def beside(name: str, suite: str, algo: str) -> str:
+    """An algorithm's return and cost on a suite of a grid, beside the published ones."""
     rows = aggregate(runs(name)).set_index(["suite", "algo"])
     known = pd.read_csv(DATA / "published.csv", index_col=["suite", "algo"])
-    ours, theirs = rows.loc[(suite, "ppo")], known.loc[(suite, "ppo")]
+    ours, theirs = rows.loc[(suite, algo)], known.loc[(suite, algo)]
     return (
         f"{ours['return_last']:.1f} at a cost of {ours['cost_last']:.0f}, published "
         f"{theirs['return']:.1f} at {theirs['cost']:.0f}"
@@ -153,9 +154,9 @@ def filled(page: str) -> str:
     """A page with its tables remade."""
 
     def table(match: re.Match[str]) -> str:
-        begin, kind, name, only, end = match.groups()
-        if kind == "ppo":
-            return f"{begin}{beside(name, only)}{end}"
+        begin, kind, name, only, algo, end = match.groups()
+        if kind == "beside":
+            return f"{begin}{beside(name, only, algo)}{end}"
         if kind == "sweep":
             text = sweep(name, only)
         else:
@@ -195,7 +196,7 @@ def main() -> None:
     for path, text in pages().items():
         path.write_text(text)
         print(path)
-        for _, kind, name, only, _ in BLOCK.findall(text):
+        for _, kind, name, only, *_ in BLOCK.findall(text):
             if only or kind != "runs":
                 continue
             # Drawn is what the tables have: the last ten epochs, not the last one.

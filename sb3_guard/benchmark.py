@@ -159,10 +159,9 @@ def benchmark(flags: Flags) -> int:
     of_a_run = RunFlags.shared(flags, log_folder=str(folder), verbose=flags.verbose)
     of_a_run.check()
 
-    from sb3_guard.zoo.grid import expand, plan, run_grid, try_out
+    from sb3_guard.zoo.grid import expand, run_grid, try_out
 
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
-    plan(runs)
     if flags.dry_run:
         show_plan(runs)
         return 0

@@ -61,10 +61,9 @@ def train(flags: Flags) -> int:
         if value:
             raise UsageError(f"{name} is for a single run; leave it out, or --seeds")
 
-    from sb3_guard.zoo.grid import expand, plan, run_grid, try_out
+    from sb3_guard.zoo.grid import expand, run_grid, try_out
 
     runs = expand([(run.env, run.algo)], flags.seeds, run)
-    plan(runs)
     try_out(runs)
     again = "continue with the same command"
     return run_grid(runs, Path(run.log_folder), again, flags.jobs, None, flags.verbose)

@@ -52,8 +52,8 @@ class Run:
     flags: RunFlags
     values: dict[str, Any]
     ignored: list[str]
-    #: done · resume · new (planned); waiting · running · in use · done · failed · stopped (later)
-    state: str = "new"
+    #: at first done · resume · new; later waiting · running · in use · done · failed · stopped
+    state: str
     attempts: int = 0
     #: what went wrong last, in a line
     error: str = ""
@@ -79,7 +79,7 @@ def expand(
     scale: float = 1.0,
 ) -> list[Run]:
     """
-    The runs of a grid, checked; those of the first seed come first.
+    The runs of a grid, checked, and how far they are; those of the first seed come first.
 
     A hyper-parameter given for the whole grid is passed to the algorithms that have it.
 
@@ -87,7 +87,8 @@ def expand(
     :param seeds: at least 0
     :param flags: what all runs share
     :param scale: factor of every run's length
-    :raises UsageError: a name or value is wrong for any of the runs
+    :raises UsageError: a name or value is wrong for any of the runs, or a folder holds another run
+        than the one that belongs there
     """
     given = flags.hyperparams or {}
     known = {
@@ -104,22 +105,13 @@ def expand(
         mine = replace(flags, env=env_id, algo=algo, seed=0, hyperparams=own or None)
         one, values = prepare(mine)
         one.n_timesteps = values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
-        first[one.env, algo] = Run(one, values, sorted(given.keys() - own.keys()))
-    return [
-        replace(run, flags=replace(run.flags, seed=seed))
-        for seed in dict.fromkeys(seeds)
-        for run in first.values()
-    ]
-
-
-def plan(runs: Sequence[Run]) -> None:
-    """
-    Find out how far each run is: done, to be resumed, or new.
-
-    :raises UsageError: a folder holds another run than the one that belongs there
-    """
-    for run in runs:
-        run.state = standing(run.flags, run.values)
+        first[one.env, algo] = one, values, sorted(given.keys() - own.keys())
+    runs = []
+    for seed in dict.fromkeys(seeds):
+        for one, values, ignored in first.values():
+            mine = replace(one, seed=seed)
+            runs.append(Run(mine, values, ignored, standing(mine, values)))
+    return runs
 
 
 def try_out(runs: Sequence[Run]) -> None:
@@ -284,7 +276,7 @@ class Execution:
     """
     The runs of a grid being carried out.
 
-    :param runs: planned
+    :param runs: as :func:`expand` returns them
     :param client: of the workers, which see the runs' folders
     :param board: shows how it goes
     """
@@ -378,7 +370,7 @@ def run_grid(
     """
     Carry out what is not done, and say what has become of it.
 
-    :param runs: expanded, planned and tried out
+    :param runs: expanded and tried out
     :param folder: where they are
     :param again: how to continue when interrupted, for the message
     :param jobs: see :func:`workers`

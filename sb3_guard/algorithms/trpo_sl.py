@@ -27,19 +27,13 @@ class TRPOSL(FilteredTrustRegion):
     last rollout. Steps without cost are so many that as many of them are drawn again for each step
     of the optimizer, as there are steps with a cost.
 
-    :param policy: policy class or its alias; a class of one's own derives from ``FilteredPolicy``
-    :param env: environment or its id; its actions are a Box
     :param learning_rate: of the critic and the cost model
-    :param warmup: share of the first ``learn`` before the layer is switched on; an integer is a
-        number of steps
     :param threshold: highest predicted cost of a step that is not corrected; one number or one per
         cost key; None: d/T
     :param tolerance: ε in units of the model's error; 0 for none, as in the paper
     :param drift: let the model add b_i(s), for cost that changes whatever the agent does, as when
         it coasts or a hazard moves. Off by default: before the tests' wall it is afraid of every
         action, and stops at 0.77 of the best return instead of 0.99
-    :param correction_penalty: weight of the length of a correction in the policy's objective, in
-        standard deviations of the advantage; 0 for none, as in the paper
     """
 
     label, family, paper = "TRPO-SL", "hierarchical", "Dalal et al. 2018"

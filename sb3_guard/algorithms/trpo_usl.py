@@ -30,11 +30,7 @@ class TRPOUSL(FilteredTrustRegion):
     penalty: the policy then ascends ``E[ratio · (A - κ h(s, a))]``, whose gradient is that of the
     expected penalty of the sampled actions.
 
-    :param policy: policy class or its alias; a class of one's own derives from ``FilteredPolicy``
-    :param env: environment or its id; its actions are a Box
     :param learning_rate: of the critic and the cost Q-critic
-    :param warmup: share of the first ``learn`` before the layer is switched on; an integer is a
-        number of steps
     :param threshold: highest discounted cost to come that is not corrected; one number or one per
         cost key; None: the larger of ``tolerance`` · unit and ``(d/T) (1 - γᵀ)/(1 - γ)``, or
         ``(d/T) / (1 - γ)`` where a time limit cuts episodes, whose cost is bootstrapped
@@ -43,8 +39,6 @@ class TRPOUSL(FilteredTrustRegion):
     :param steps: K
     :param rate: η, in units of the action space, which runs from -1 to 1
     :param kappa: weight of the exact penalty; 0 for none, as in GUARD
-    :param correction_penalty: weight of the length of a correction in the policy's objective, in
-        standard deviations of the advantage; 0 for none, as in the paper
     """
 
     label, family, paper = "TRPO-USL", "hierarchical", "Zhang et al. 2022"

@@ -36,9 +36,9 @@ class FilteredTrustRegion(TrustRegion):
         number of steps
     :param threshold: cost, in the units of the filter's model, that is not corrected; one number or
         one per cost key; None derives it from ``cost_limit``
-    :param correction_penalty: κ: the policy ascends ``E[ratio · (A - κ |x - a|)]``, x the executed
-        and a the sampled action in units of the action space, or it learns to push against the
-        filter; 0 for none, as in the papers
+    :param correction_penalty: κ, in standard deviations of A: the policy ascends
+        ``E[ratio · (A - κ |x - a|)]``, x the executed and a the sampled action in units of the
+        action space, or it learns to push against the filter; 0 for none, as in the papers
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

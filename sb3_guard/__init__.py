@@ -9,57 +9,36 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# public name -> the module that has it
+# module -> the public names that it has
 _EXPORTS = {
-    "CPO": "sb3_guard.algorithms",
-    "PCPO": "sb3_guard.algorithms",
-    "TRPO": "sb3_guard.algorithms",
-    "TRPOFAC": "sb3_guard.algorithms",
-    "TRPOIPO": "sb3_guard.algorithms",
-    "TRPOLag": "sb3_guard.algorithms",
-    "TRPOSL": "sb3_guard.algorithms",
-    "TRPOUSL": "sb3_guard.algorithms",
-    "PPOLag": "sb3_guard.algorithms",
-    "CPPOPID": "sb3_guard.algorithms",
-    "FOCOPS": "sb3_guard.algorithms",
-    "CUP": "sb3_guard.algorithms",
-    "P3O": "sb3_guard.algorithms",
-    "CRPO": "sb3_guard.algorithms",
-    "RCPO": "sb3_guard.algorithms",
-    "SCPO": "sb3_guard.algorithms",
-    "SACLag": "sb3_guard.algorithms",
-    "TD3Lag": "sb3_guard.algorithms",
-    "ALGORITHMS": "sb3_guard.algorithms",
-    "register_algorithm": "sb3_guard.algorithms",
-    "CostEvalCallback": "sb3_guard.common.callbacks",
-    "LogCosts": "sb3_guard.common.callbacks",
-    "CostMonitor": "sb3_guard.common.monitor",
-    "GuardVecEnv": "sb3_guard.common.vec_env",
-    "evaluate_policy": "sb3_guard.common.evaluation",
-    "make_vec_env": "sb3_guard.common.vec_env",
-    "GuardEnv": "sb3_guard.envs",
-    "GuardVectorEnv": "sb3_guard.envs",
-    "Scenario": "sb3_guard.envs",
-    "env_ids": "sb3_guard.envs",
-    "make": "sb3_guard.envs",
-    "register": "sb3_guard.envs",
-    "register_constraint": "sb3_guard.envs",
-    "register_robot": "sb3_guard.envs",
-    "register_task": "sb3_guard.envs",
-}
-__all__ = ["__version__", *_EXPORTS]
+    "sb3_guard.algorithms": (
+        "CPO", "PCPO", "TRPO", "TRPOFAC", "TRPOIPO", "TRPOLag", "TRPOSL", "TRPOUSL",
+        "PPOLag", "CPPOPID", "FOCOPS", "CUP", "P3O", "CRPO", "RCPO", "SCPO", "SACLag", "TD3Lag",
+        "ALGORITHMS", "register_algorithm",
+    ),
+    "sb3_guard.common.callbacks": ("CostEvalCallback", "LogCosts"),
+    "sb3_guard.common.evaluation": ("evaluate_policy",),
+    "sb3_guard.common.monitor": ("CostMonitor",),
+    "sb3_guard.common.vec_env": ("GuardVecEnv", "make_vec_env"),
+    "sb3_guard.envs": (
+        "GuardEnv", "GuardVectorEnv", "Scenario", "env_ids", "make", "register",
+        "register_constraint", "register_robot", "register_task",
+    ),
+}  # fmt: skip
+_MODULES = {name: module for module, names in _EXPORTS.items() for name in names}
+__all__ = ["__version__", *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _EXPORTS:
+    if name not in _MODULES:
         raise AttributeError(f"module 'sb3_guard' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_EXPORTS[name]), name)
+    value = getattr(importlib.import_module(_MODULES[name]), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_EXPORTS})
+    return sorted({*globals(), *_MODULES})
 
 
 try:

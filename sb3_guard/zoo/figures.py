@@ -9,6 +9,7 @@ import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -124,16 +125,15 @@ class Data:
         """By key of an algorithm, the reference first and family by family, then by family."""
         table = self.runs.drop_duplicates("algo").fillna({"family": ""})
         table = table.assign(first=table["algo"] != REFERENCE)
-        looks, colors, markers = {}, 0, 0
+        looks, colors, markers = {}, cycle(COLORS), cycle(MARKERS)
         families = [one for one in sorted({*table["family"]}) if one]
-        dashes = {f: DASHES[i % len(DASHES)] for i, f in enumerate(families)} | {"": LOOSE}
+        dashes = dict(zip(families, cycle(DASHES), strict=False)) | {"": LOOSE}
         for row in table.sort_values(["first", "family", "label"]).to_dict("records"):
             if row["algo"] == REFERENCE:
                 looks[REFERENCE] = Look(row["label"], INK, "-", "o")
                 continue
-            style = COLORS[colors % len(COLORS)], dashes[row["family"]]
-            looks[row["algo"]] = Look(row["label"], *style, MARKERS[markers % len(MARKERS)])
-            colors, markers = colors + 1, markers + 1
+            style = next(colors), dashes[row["family"]], next(markers)
+            looks[row["algo"]] = Look(row["label"], *style)
         for family in families:
             own = table.loc[(table["family"] == family) & table["first"], "algo"].sort_values()
             if len(own):

@@ -79,8 +79,10 @@ class Experiment:
         self._saved = None if folder is None else folder.checkpoint
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
         _check_device(flags.device)
-        if self._tensorboard_folder is not None:
-            require_writable(self._tensorboard_folder, "--tensorboard-log")
+        events = flags.tensorboard_log or ("runs" if flags.track else "")
+        self._events = Path(events) if events else None
+        if self._events is not None:
+            require_writable(self._events, "--tensorboard-log")
         self.vec_env = str(flags.vec_env)
         if flags.num_threads > 0:
             th.set_num_threads(flags.num_threads)
@@ -290,6 +292,8 @@ class Experiment:
             print(f"Run folder: {folder.path} (seed {self.flags.seed})")
         if self.tracker is not None:
             self.tracker.remember(folder)
+        # TensorBoard's events have the run's own number, so that a resumed run finds them again.
+        own = f"{self.flags.algo}{folder.path.name[len(folder.name) :]}"
         with explained(f"can't write to {folder.path}", OSError):
             if state is not None:
                 restore_logs(folder.path, state, drop_later=True)
@@ -297,7 +301,7 @@ class Experiment:
             logger = RunLogger(
                 folder.path,
                 stdout=self._prints_tables,
-                tensorboard=self._tensorboard(folder),
+                tensorboard=self._events and self._events / folder.name / own,
                 state=None if state is None else state["logger"],
             )
         self.model.set_logger(logger)
@@ -337,18 +341,6 @@ class Experiment:
             result["interval"] = estimate(epochs.last[:, 1])
             print(summary(folder, self.flags, result, time.monotonic() - began, finished))
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
-
-    @property
-    def _tensorboard_folder(self) -> Path | None:
-        name = self.flags.tensorboard_log or ("runs" if self.flags.track else None)
-        return Path(name) if name else None
-
-    def _tensorboard(self, folder: RunFolder) -> Path | None:
-        parent = self._tensorboard_folder
-        if parent is None:
-            return None
-        # Of the run's own number, so that a resumed run finds it again.
-        return parent / folder.name / f"{self.flags.algo}{folder.path.name[len(folder.name) :]}"
 
     def _learn(self, callbacks: list[BaseCallback], received: list[int]) -> bool:
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)

@@ -65,13 +65,14 @@ def test_trains_with_costs_logged(algo, tmp_path):
         ("sac", ["use_sde:True"]),
         pytest.param("td3", [], marks=pytest.mark.slow),
         ("sac_lag", ["use_sde:True", *COSTLY]),
-        ("td3_lag", ["gradient_steps:2", *COSTLY]),
+        ("td3_lag", ["gradient_steps:2", "noise_type:ornstein-uhlenbeck", *COSTLY]),
     ],
 )
 def test_killed_and_resumed(algo, more, tmp_path, monkeypatch):
+    """In the middle of an episode, where Ornstein-Uhlenbeck noise has a state."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert train.main([*arguments(algo, whole, *more), "--eval-freq", "50"]) == 0
-    crash(monkeypatch, [*arguments(algo, cut, *more), "--eval-freq", "50"], 101)
+    crash(monkeypatch, [*arguments(algo, cut, *more), "--eval-freq", "50"], 115)
     assert train.main(["-i", str(runs_of(cut))]) == 0
     assert_same_run(whole, cut)
 

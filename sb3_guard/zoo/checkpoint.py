@@ -5,6 +5,7 @@ training depends on is in few places: model, random generators, environments, lo
 file is a model file of SB3's with one more member, so ``CPO.load("checkpoint.zip")`` works on it.
 """
 
+import copy
 import pickle
 import random
 import time
@@ -17,6 +18,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -86,6 +88,7 @@ class Checkpoints(BaseCallback):
         self.rollouts = 0  # all of the run's
         self._elapsed = 0.0  # seconds of training before this process
         self._start = 0  # steps at which the run, not this process, began
+        self._noise: ActionNoise | None = None  # as a checkpoint found it
         self._last = -np.inf
         self._took = 0.0  # seconds to write the last one
         self._between = True
@@ -95,6 +98,8 @@ class Checkpoints(BaseCallback):
         # SB3 measures time and speed since `learn` was called; here they are the whole run's.
         self.model.start_time -= int(self._elapsed * 1e9)
         self.model._num_timesteps_at_start = self._start
+        if self._noise is not None:
+            self.model.action_noise = self._noise
 
     def _on_rollout_start(self) -> None:
         pause = max(self.every, self._took / LARGEST_SHARE if self.every > 0 else 0.0)
@@ -177,8 +182,13 @@ class Checkpoints(BaseCallback):
     def _evaluation_envs(self) -> list[VecEnv]:
         return [one.eval_env for one in self.others if isinstance(one, EvalCallback)]
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continue the counts of a checkpoint, here and in the other callbacks."""
+    def restore(self, state: dict[str, Any], noise: ActionNoise | None) -> None:
+        """
+        Continue the counts of a checkpoint, here and in the other callbacks.
+
+        :param noise: the loaded model's exploration noise, which `learn` resets
+        """
+        self._noise = copy.deepcopy(noise)
         self.rollouts = state["rollouts"]
         self._elapsed = state["elapsed"]
         self._start = state["start"]

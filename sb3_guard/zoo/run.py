@@ -308,7 +308,7 @@ class Experiment:
         checkpoints, epochs, callbacks = self._make_callbacks(folder)
         checkpoints.asked = asked
         if state is not None:
-            checkpoints.restore(state)
+            checkpoints.restore(state, self.model.action_noise)
             # In this order, and only now: a result in the folder is always that of its config.
             folder.result.unlink(missing_ok=True)
             if restate:

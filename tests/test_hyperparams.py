@@ -9,7 +9,7 @@ import torch
 import yaml
 from torch import nn
 
-from sb3_guard.algorithms import ALGORITHMS, CPO
+from sb3_guard.algorithms import ALGORITHMS, CPO, SACLag
 from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.envs import env_ids
 from sb3_guard.zoo.algos import baselines
@@ -188,6 +188,17 @@ def test_unknown_name_suggests_the_nearest(name, near):
         UsageError, match=f"cpo has no hyper-parameter '{name}'; did you mean '{near}'"
     ):
         checked(**{name: 1})
+
+
+@pytest.mark.parametrize("value", [[1, "episode"], (1, "episode")])
+def test_how_often_to_train_in_episodes(value):
+    """As in RL-Zoo's own files, e.g. that of DDPG."""
+    values = check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": value})
+    assert values["train_freq"] == [1, "episode"]  # as a file holds it
+    assert build(values).model["train_freq"] == (1, "episode")
+    for bad in ([1], ["episode", 1], [1, 2], "episode"):
+        with pytest.raises(UsageError, match="a whole number or a list of a whole number and text"):
+            check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": bad})
 
 
 def test_names_that_are_flags():

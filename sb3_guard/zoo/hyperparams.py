@@ -287,6 +287,8 @@ def build(values: Mapping[str, Any]) -> Setup:
             model[name] = _schedule(name, value)
         elif isinstance(value, str) and value.startswith("dict("):
             model[name] = evaluate(name, value)
+        elif name == "train_freq" and isinstance(value, list):
+            model[name] = tuple(value)
         elif isinstance(value, str) and name.endswith("_class"):
             model[name] = import_class(name, value, BaseBuffer)
     run = {n: value for n, value in values.items() if n in not_models and value is not None}

@@ -81,6 +81,11 @@ def kind_of(hint: Any) -> tuple[str, Callable[[Any], Any]]:
         return _any_of({arm: kind_of(arm) for arm in args})
     if kind in (int, float):
         return "a whole number" if kind is int else "a number", partial(_number, kind=kind)
+    if kind is tuple and args and args[-1] is not ...:
+        words, makes = zip(*map(kind_of, args), strict=True)
+        is_tuple = _only(lambda value: isinstance(value, list | tuple) and len(value) == len(args))
+        made = lambda value: [make(v) for make, v in zip(makes, is_tuple(value), strict=True)]  # noqa: E731
+        return f"a list of {' and '.join(words)}", made
     if kind in (list, tuple, Sequence):
         words, make = kind_of(args[0] if args else Any)
         each = f" ({words} each)" if args and args[0] is not ... else ""

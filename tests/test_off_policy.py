@@ -267,6 +267,8 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
         ({"gamma": 2.0, "cost_gamma": 0.9}, r"gamma=2.0: must be a number in \[0, 1\]"),
         ({"batch_size": 0}, "batch_size=0: must be an integer of at least 1"),
         ({"buffer_size": 0}, "buffer_size=0: must be an integer of at least 1"),
+        ({"train_freq": 0}, "train_freq=0: must be an integer of at least 1"),
+        ({"train_freq": (0, "episode")}, "train_freq=0: must be an integer of at least 1"),
         ({"tau": 2.0}, r"tau=2.0: must be a number in \(0, 1\]"),
         ({"learning_rate": 0.0}, "learning_rate=0.0: must be a positive number or a schedule"),
         ({"lambda_starts": -1}, "lambda_starts=-1"),
@@ -279,6 +281,14 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
 def test_bad_input(cls: Any, more: Any, error: str) -> None:
     with pytest.raises(ValueError, match=error):
         cls("MlpPolicy", **{"env": points(1), **settings(), **more})
+
+
+@pytest.mark.parametrize(
+    ("cls", "name"), [(SACLag, "target_update_interval"), (TD3Lag, "policy_delay")]
+)
+def test_an_interval_of_zero_is_refused_before_training(cls: Any, name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name}=0: must be an integer of at least 1"):
+        cls("MlpPolicy", points(1), **settings(), **{name: 0})
 
 
 @both

@@ -152,8 +152,10 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        for name in ("batch_size", "buffer_size"):
-            check_integer(name, getattr(self, name))
+        for name in ("batch_size", "buffer_size", "policy_delay", "target_update_interval"):
+            check_integer(name, getattr(self, name, 1))  # the last two are TD3's and SAC's
+        self._convert_train_freq()
+        check_integer("train_freq", self.train_freq.frequency)  # type: ignore[union-attr]
         check_number("gamma", self.gamma, 0.0, 1.0, "[]")
         check_number("tau", self.tau, 0.0, 1.0, "(]")
         check_learning_rate(self.learning_rate)

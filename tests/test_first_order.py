@@ -154,6 +154,30 @@ def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
             th.testing.assert_close(a, b, rtol=1e-2, atol=2e-3)
 
 
+def test_prices_in_units_of_cost_weigh_costs_against_standardised_advantages() -> None:
+    """As Ray et al. and OmniSafe do: A standardised over the rollout, A_C only centred."""
+    fixed = {"lambda_init": 0.5, "lambda_lr": 0.0, "proportional_gain": 0.0}
+    model = make(PPOLag, lambda_units="cost", **fixed)
+    buffer, descend = model.rollout_buffer, model.descend
+
+    def before(*args: Any) -> None:
+        raw, costs = seen
+        expected = raw - 0.5 * raw.std() * (costs - costs.mean())
+        np.testing.assert_allclose(buffer.advantages, expected, rtol=1e-4, atol=1e-5)
+        descend(*args)
+        seen.clear()
+
+    seen: list[np.ndarray] = []
+    train = model.train
+    model.train = lambda: (
+        seen.extend([buffer.advantages.copy(), buffer.cost_advantages[..., 0].copy()]),
+        train(),
+    )
+    model.descend = before
+    model.learn(128)
+    assert not seen
+
+
 @pytest.mark.parametrize("cls", [FOCOPS, P3O, PPOLag, TRPOLag, TRPOFAC, TRPOIPO, TRPOSL])
 def test_the_weight_of_a_cost_does_not_know_the_unit_of_reward(cls: Any) -> None:
     """Advantages × 100, which are not standardised: the same gradient × 100."""

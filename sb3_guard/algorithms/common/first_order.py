@@ -231,7 +231,10 @@ class PenalizedPPO(Lagrangian, FirstOrder):
     def train(self) -> None:
         buffer = self.rollout_buffer
         # where the reward's advantages are all alike, their unit is 1
-        price = self.price((float(buffer.advantages.std()) or 1.0) * self.centre_costs())
+        spread = float(buffer.advantages.std()) or 1.0
+        price = self.price(spread * self.centre_costs())
+        if self.lambda_units == "cost" and self.normalize_advantage:
+            price *= np.float32(spread)  # as published: λ weighs A_C against the standardised A
         buffer.advantages = buffer.advantages - buffer.cost_advantages @ price
         super().train()
 

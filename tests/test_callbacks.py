@@ -69,6 +69,15 @@ def test_safe_first_then_good(limit, candidates, best):
     assert scores.index(max(scores)) == best
 
 
+@pytest.mark.parametrize(("limit", "score"), [(6.2, (True, 3.0)), (6.0, (False, -0.1455))])
+def test_safe_is_what_keeps_the_limit_by_a_standard_error(limit, score):
+    """Costs of 4, 5, 6 and 7: 5.5 on the average, with a standard error of 0.6455."""
+    costs = np.array([[4.0], [5.0], [6.0], [7.0]])
+    seen = Evaluation(np.full(4, 3.0), costs[:, 0], np.full(4, 10), costs)
+    safe, value = callback(limit).score(seen)
+    assert safe == score[0] and value == pytest.approx(score[1], abs=1e-4)
+
+
 def test_several_costs_each_have_their_limit():
     judge = callback(cost_limit=[0.0, 20.0], cost_keys=("a", "b"))
     assert judge.limits().tolist() == [1.0, 20.0]
@@ -126,6 +135,23 @@ def test_sb3s_stopping_callbacks_follow_the_best_model(monkeypatch, stop, evalua
     model.learn(90, callback=watcher)
     assert len(watcher.evaluations_costs) == evaluations
     assert watcher.best_score == (True, 9.0) and watcher.best_mean_reward == 9.0
+
+
+@pytest.mark.parametrize(
+    ("mean", "noisy", "best"),
+    [(1.0, 9.0, (False, -4.0)), (9.0, 1.0, (False, -4.0)), (1.0, 2.0, (True, 7.0))],
+)
+def test_the_policy_must_keep_the_limit_with_its_noise_and_without(monkeypatch, mean, noisy, best):
+    """Costs of its mean and of its samples, under a limit of 5; the return is that of the mean."""
+
+    def play(*_, deterministic, **__):
+        return evaluation(7.0, mean) if deterministic else evaluation(3.0, noisy)
+
+    monkeypatch.setattr(callbacks, "evaluate_policy", play)
+    model = CPO("MlpPolicy", envs(), n_steps=20, n_critic_updates=1, cost_limit=5.0)
+    watcher = CostEvalCallback(envs(), eval_freq=20, verbose=0)
+    model.learn(40, callback=watcher)
+    assert watcher.best_score == best
 
 
 def learn(tmp_path, algorithm=CPO, evaluate=True, env=None, steps=120, **kwargs):

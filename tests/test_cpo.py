@@ -15,7 +15,7 @@ from sb3_guard.algorithms import CPO, PCPO, TRPO, TRPOFAC, TRPOIPO, PPOLag, TRPO
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.natural_gradient import Case
 from sb3_guard.algorithms.common.rollouts import CostRollouts
-from sb3_guard.algorithms.common.trust_region import Trial
+from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
 
 KEYS = ("cost", "cost_1")
 
@@ -276,11 +276,10 @@ class Lottery(Toll):
         return *others, {"cost": info["cost"] * self.np_random.integers(2)}
 
 
-@pytest.mark.slow  # a minute
-def test_nor_does_one_that_only_chance_changes() -> None:
-    model = TRPOLag(
-        "MlpPolicy", make_vec_env(Lottery, 8, seed=0), n_steps=100, cost_limit=5.0, seed=0
-    )
+@pytest.mark.slow  # a minute each
+@pytest.mark.parametrize("cls", [TRPOLag, TRPOFAC])
+def test_nor_does_one_that_only_chance_changes(cls: type[TrustRegion]) -> None:
+    model = cls("MlpPolicy", make_vec_env(Lottery, 8, seed=0), n_steps=100, cost_limit=5.0, seed=0)
     model.learn(100_000)
     assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.5
 

@@ -194,6 +194,30 @@ def test_multipliers_that_have_fallen_rise_again(ascent: Any) -> None:
     assert risen > 1.0 if ascent == "output" else risen < 0.1
 
 
+@pytest.mark.parametrize("ascent", ["output", "value"])
+def test_multipliers_of_states_have_a_bound_and_come_down_from_it(ascent: Any) -> None:
+    """Nothing winds up beyond the bound, to be taken back before a price falls."""
+    multiplier, observations = network(ascent=ascent, maximum=2.0), th.randn(100, 4)
+    for _ in range(400):
+        multiplier.ascend(observations, th.ones(100, 1))
+    highest = float(multiplier.predict(observations).mean())
+    for _ in range(60):
+        multiplier.ascend(observations, -th.ones(100, 1))
+    assert highest == pytest.approx(2.0, rel=0.1)
+    assert float(multiplier.predict(observations).mean()) < 1.0
+
+
+@pytest.mark.parametrize(("units", "highest"), [("relative", 5.0), ("cost", 9.0)])
+def test_the_price_of_a_state_has_the_bound_of_other_prices(units: str, highest: float) -> None:
+    """λ = 4 and K_P = 5 at a violation of a limit or more; in units of cost there is no bound."""
+    model = make(TRPOFAC, units=units, trace=False)
+    model.multiplier.predict = lambda observations: th.tensor([[4.0], [0.5]])
+    model._excess = lambda batch: th.tensor([[1.0], [-1.0]])
+    price = model.price(_batch(th.zeros(2, 4), [0.0, 0.0], [[1.0], [-1.0]]))
+    deviation = 2.0**0.5 if units == "relative" else 1.0
+    th.testing.assert_close(price * deviation, th.tensor([[highest], [0.0]]))
+
+
 def test_ascent_is_the_gradient_of_the_mean() -> None:
     """Batches longer than a slice give the gradient of the whole, by plain autograd."""
     multiplier = network(2, ascent="value")

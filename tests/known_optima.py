@@ -18,7 +18,7 @@ from gymnasium import spaces
 from scipy.optimize import minimize
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.algorithms import CRPO, CUP, P3O, TRPOFAC, TRPOIPO, FirstOrder, SACLag
 
@@ -339,6 +339,11 @@ class Outcomes(BaseCallback):
         return True
 
 
+#: From here on rewards are normalised for SB3's PPO and its kin: they clip the gradients of policy
+#: and critic together, and the critic's grow with the square of the rewards.
+LARGE = 50.0
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Return as a share of the constrained optimum, and costs as shares of their limits, (m,)."""
@@ -370,9 +375,12 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
         bound = limits * env.world.horizon
     outcomes = Outcomes(problem.total_timesteps)
     settings = {"seed": seed, "device": "cpu", **kwargs}
+    made: VecEnv = env
+    if issubclass(cls, FirstOrder) and problem.unconstrained >= LARGE:
+        made = VecNormalize(env, norm_obs=False)
     if issubclass(cls, OnPolicyAlgorithm):
         settings.setdefault("n_steps", problem.n_steps)
-    cls("MlpPolicy", env, cost_limit=bound.tolist(), cost_keys=env.cost_keys, **settings).learn(
+    cls("MlpPolicy", made, cost_limit=bound.tolist(), cost_keys=env.cost_keys, **settings).learn(
         problem.total_timesteps, callback=outcomes
     )
     each = np.array(outcomes.worst if problem.statewise else outcomes.costs)  # [episodes, m]

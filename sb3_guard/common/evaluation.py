@@ -184,7 +184,6 @@ def evaluate_policy(
         lone = env
         env = DummyVecEnv([lambda: lone])
     keys = tuple(getattr(model, "cost_keys", ("cost",)) if cost_keys is None else cost_keys)
-    monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
@@ -198,24 +197,16 @@ def evaluate_policy(
     if isinstance(model, Constrained) and model.env is not None:
         model.begin_anew |= share_environment(model.env, env)
 
-    n = env.num_envs
-    left = np.array([(n_eval_episodes + i) // n for i in range(n)])
-    returns, lengths = np.zeros(n), np.zeros(n, dtype=np.int64)
-    costs = np.zeros((n, len(keys)))  # [n, m], episodes under way
-    highest = np.zeros((n, len(keys)))
-    totals = np.zeros(n)
-    ended: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
-    successes: list[bool] = []
-
+    tally = _Tally(env, n_eval_episodes, keys, on_episode)
     with _own_random_numbers(seed):
         if seed is not None:
             env.seed(seed)
         observations = env.reset()
-        starts = np.ones(n, dtype=bool)
+        starts = np.ones(env.num_envs, dtype=bool)
         state: tuple[np.ndarray, ...] | None = None
-        last_costs = np.zeros((n, len(keys)))
+        last_costs = np.zeros((env.num_envs, len(keys)))
         steps = 0
-        while left.any() and (max_steps is None or steps < max_steps):
+        while tally.left.any() and (max_steps is None or steps < max_steps):
             actions, state = model.predict(
                 observations,  # type: ignore[arg-type]
                 state=(last_costs,) if acts_on_cost else state,
@@ -225,47 +216,88 @@ def evaluate_policy(
             observations, rewards, starts, infos = env.step(actions)
             steps += 1
             last_costs, _ = read_costs(infos, keys, zero_if_missing)
-            returns += rewards
-            lengths += 1
-            costs += last_costs
-            highest = np.maximum(highest, last_costs)
-            if len(keys) == 1:
-                totals += last_costs[:, 0]
-            else:
-                totals += [total_cost(info, keys) for info in infos]
+            tally.add(rewards, last_costs, infos)
             if on_step is not None:
                 on_step()
             for i in np.flatnonzero(starts):
                 last_costs[i] = 0.0
-                episode = infos[i].get("episode")
-                if monitored and episode is None and "budget_exceeded" not in infos[i]:
-                    # A wrapper outside the monitor cut the episode (a life lost, in Atari): its
-                    # true end is still to come. Only what EarlyTermination ends is over.
-                    continue
-                if left[i]:
-                    left[i] -= 1
-                    outcome = (float(returns[i]), int(lengths[i]))
-                    if episode is not None:
-                        outcome = (float(episode["r"]), int(episode["l"]))
-                    sums = costs[i].copy(), highest[i].copy()
-                    ended.append((outcome[0], float(totals[i]), outcome[1], *sums))
-                    if "is_success" in infos[i]:
-                        successes.append(bool(infos[i]["is_success"]))
-                    if on_episode is not None:
-                        on_episode(outcome[0], float(totals[i]), outcome[1])
-                returns[i] = totals[i] = lengths[i] = 0
-                costs[i] = highest[i] = 0.0
-
-    return Evaluation(
-        returns=np.array([episode[0] for episode in ended]),
-        costs=np.array([episode[1] for episode in ended]),
-        lengths=np.array([episode[2] for episode in ended], dtype=np.int64),
-        key_costs=np.array([episode[3] for episode in ended]).reshape(len(ended), len(keys)),
-        successes=np.array(successes, dtype=bool),
-        unfinished=np.stack([returns, totals, lengths], axis=1)[(left > 0) & (lengths > 0)],
-        max_costs=np.array([episode[4] for episode in ended]).reshape(len(ended), len(keys)),
+                tally.end(int(i), infos[i])
+    return tally.evaluation(
         limit_on=getattr(model, "limit_on", "sum"),
         limits=tuple(model.cost_limits.tolist())
         if isinstance(model, Constrained) and model.constrained and keys == tuple(model.cost_keys)
         else (),
     )
+
+
+class _Tally:
+    """
+    Return, costs and steps of the episodes of vectorised environments, under way and ended.
+
+    :param left: episodes that each environment has still to play, shape [n]
+    """
+
+    def __init__(
+        self,
+        env: VecEnv,
+        n_eval_episodes: int,
+        keys: tuple[str, ...],
+        on_episode: Callable[[float, float, int], Any] | None,
+    ) -> None:
+        n = env.num_envs
+        self.keys, self.on_episode = keys, on_episode
+        self.monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
+        self.left = np.array([(n_eval_episodes + i) // n for i in range(n)])
+        self.returns, self.lengths = np.zeros(n), np.zeros(n, dtype=np.int64)
+        self.costs, self.highest = np.zeros((n, len(keys))), np.zeros((n, len(keys)))  # [n, m]
+        self.totals = np.zeros(n)
+        self.ended: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
+        self.successes: list[bool] = []
+
+    def add(self, rewards: np.ndarray, costs: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """One step of every environment."""
+        self.returns += rewards
+        self.lengths += 1
+        self.costs += costs
+        self.highest = np.maximum(self.highest, costs)
+        if len(self.keys) == 1:
+            self.totals += costs[:, 0]
+        else:
+            self.totals += [total_cost(info, self.keys) for info in infos]
+
+    def end(self, i: int, info: dict[str, Any]) -> None:
+        """The episode of environment ``i`` is over; it counts if one is still to be played."""
+        episode = info.get("episode")
+        if self.monitored and episode is None and "budget_exceeded" not in info:
+            # A wrapper outside the monitor cut the episode (a life lost, in Atari): its
+            # true end is still to come. Only what EarlyTermination ends is over.
+            return
+        if self.left[i]:
+            self.left[i] -= 1
+            earned, steps = float(self.returns[i]), int(self.lengths[i])
+            if episode is not None:
+                earned, steps = float(episode["r"]), int(episode["l"])
+            total = float(self.totals[i])
+            self.ended.append((earned, total, steps, self.costs[i].copy(), self.highest[i].copy()))
+            if "is_success" in info:
+                self.successes.append(bool(info["is_success"]))
+            if self.on_episode is not None:
+                self.on_episode(earned, total, steps)
+        self.returns[i] = self.totals[i] = self.lengths[i] = 0
+        self.costs[i] = self.highest[i] = 0.0
+
+    def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
+        """What was seen."""
+        shape = len(self.ended), len(self.keys)
+        under_way = np.stack([self.returns, self.totals, self.lengths], axis=1)
+        return Evaluation(
+            returns=np.array([episode[0] for episode in self.ended]),
+            costs=np.array([episode[1] for episode in self.ended]),
+            lengths=np.array([episode[2] for episode in self.ended], dtype=np.int64),
+            key_costs=np.array([episode[3] for episode in self.ended]).reshape(shape),
+            successes=np.array(self.successes, dtype=bool),
+            unfinished=under_way[(self.left > 0) & (self.lengths > 0)],
+            max_costs=np.array([episode[4] for episode in self.ended]).reshape(shape),
+            limit_on=limit_on,
+            limits=limits,
+        )

@@ -78,6 +78,7 @@ class Agent(NamedTuple):
 AGENTS = (
     Agent("cpo", "Goal_Point_8Hazards", 1, trained_at=3, limit=5),
     Agent("cpo", "Goal_Point_8Ghosts", 0, trained_at=4, limit=5),
+    Agent("trpo_lag", "SafetyPointGoal1-v0", 0, trained_at=15, limit=25),
     # without its noise the robot is faster, and speed costs
     Agent("cpo", "SafetyHalfCheetahVelocity-v1", 0, trained_at=8, limit=25),
     Agent("trpo", "Goal_Point_8Hazards", 0),

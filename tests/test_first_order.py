@@ -132,8 +132,11 @@ def test_a_broken_limit_raises_the_multiplier_and_a_kept_one_lowers_it(cls: Any)
 
 @pytest.mark.parametrize("cls", [*LAGRANGIAN, CPO, PCPO, TRPOFAC, TRPOIPO, TRPOSL, TRPOUSL])
 def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
-    """Costs and limit × 100 and × 0.01: the same multipliers, the same policy to rounding."""
-    runs = []
+    """Costs and limit × 100 and × 0.01: the same multipliers, the same policy to rounding.
+
+    Prices, in return per cost, are divided by as much.
+    """
+    runs, prices = [], []
     filtered = issubclass(cls, FilteredTrustRegion)
     settings: dict[str, Any] = {"n_steps": 32, "seed": 0, "device": "cpu"}
     settings |= {"warmup": 128, "threshold": 0.0} if filtered else {}
@@ -142,9 +145,14 @@ def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
             lambda scale=scale: CostPoint(30, cost_scale=scale, hazard=(-1.0, 0.0)), 4, seed=0
         )
         model = cls("MlpPolicy", env, cost_limit=2.0 * scale, **settings).learn(256)
+        logged = model.logger.name_to_value
         if filtered:
-            assert model.logger.name_to_value["train/corrected_fraction"] > 0.1
+            assert logged["train/corrected_fraction"] > 0.1
+        if cls in (*LAGRANGIAN, TRPOFAC, TRPOIPO):
+            prices.append(scale * logged["train/price"])
         runs.append(model)
+    assert prices == pytest.approx(prices[:1] * len(prices), rel=1e-2)
+    assert np.all(np.array(prices) > 0.0)
     first, *others = runs
     for other in others:
         if cls in LAGRANGIAN:

@@ -65,6 +65,8 @@ def _weight(model: Any, cost: float, scale: float = 1.0) -> float:
     th.testing.assert_close(found, -weight * shape / 200)
     model.set_logger(Logger(None, []))
     model.fit(Batch)
+    price = model.logger.name_to_value["train/price"]
+    assert price * float(deviation) == pytest.approx(weight, rel=1e-4), "per unit of the advantage"
     return weight
 
 
@@ -91,10 +93,16 @@ def test_several_barriers_are_sharper() -> None:
     model = make(2, cost_limit=[5.0, 9.0], t=2.0, max_multiplier=3.0)
     _estimate(model, [0.0, 8.0], 40.0)
     model.set_logger(Logger(None, []))
-    model.fit(None)
+
+    class Batch:
+        cost_advantages = th.tensor([[1.0, 10.0], [-1.0, -10.0], [0.0, 0.0]])
+
+    model.fit(Batch)
     logged = model.logger.name_to_value
     weights = [logged[f"train/multiplier/{key}"] for key in model.cost_keys]
     assert weights == pytest.approx([1 / 4, 9 / 4])
+    prices = [logged[f"train/price/{key}"] for key in model.cost_keys]
+    assert prices == pytest.approx([1 / 4, 9 / 40])
 
 
 def test_several_barriers_add_up() -> None:

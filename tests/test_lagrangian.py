@@ -265,10 +265,13 @@ def test_what_the_multipliers_ascend_on(mode: Any) -> None:
 
 def test_the_state_wise_lagrangian_by_hand() -> None:
     model = make(TRPOFAC, n_costs=2, proportional_gain=0.0, trace=False)
+    model.set_logger(Logger(None, []))
     model.multiplier.predict = lambda observations: th.tensor([[0.5, 0.0], [2.0, 1.0], [0.0, 3.0]])
     batch = _batch(th.zeros(3, 4), [1.0, -1.0, 2.0], [[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]])
     # (1 - 0.5, -1 - 1, 2 + 3) times (1, 2, 0.5), mean of (0.5, -4, 2.5)
     assert float(model.surrogate(batch, th.tensor([1.0, 2.0, 0.5]))) == pytest.approx(-1 / 3)
+    prices = [model.logger.name_to_value[f"train/price/{key}"] for key in model.cost_keys]
+    assert prices == pytest.approx([2.5 / 3, 4.0 / 3]), "their means over the states"
 
 
 def test_states_price_the_actions_after_them() -> None:

@@ -157,6 +157,7 @@ class TRPOFAC(TrustRegion):
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
         price = self.price(batch)
+        self._record_per_cost("train/price", price.mean(dim=0).cpu().numpy())
         return (ratio * (batch.advantages - (price * batch.cost_advantages).sum(dim=1))).mean()
 
     def price(self, batch: CostRolloutBufferSamples) -> th.Tensor:

@@ -72,14 +72,18 @@ class TRPOIPO(TrustRegion):
     def _sharpness(self) -> float:
         return self.t * (len(self.cost_limits) if self.units == "relative" else 1.0)
 
+    def _spread(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """What one standard deviation of a cost's advantages is in the reward's, shape (m,)."""
+        if self.units == "cost":
+            return th.ones_like(batch.cost_advantages[0])
+        deviation = batch.cost_advantages.std(dim=0)
+        return th.where(deviation > 0.0, self.advantage_unit() / deviation, 0.0)
+
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
         change = (ratio - 1.0) @ batch.cost_advantages / len(ratio)  # [m]
         horizon, unit = self.costs.horizon, th.as_tensor(self._unit()).to(change)
         excess = horizon * (th.as_tensor(self.costs.violation).to(change) + change) / unit
-        scale = unit / horizon
-        if self.units == "relative":
-            deviation = batch.cost_advantages.std(dim=0)
-            scale = th.where(deviation > 0.0, self.advantage_unit() * scale / deviation, 0.0)
+        scale = self._spread(batch) * unit / horizon
         penalty = (scale * barrier(excess, self._sharpness, self.max_multiplier)).sum()
         return (ratio * batch.advantages).mean() + penalty
 
@@ -91,4 +95,6 @@ class TRPOIPO(TrustRegion):
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         slack = -self.costs.violation * self.costs.horizon / self._unit()
         t, most = self._sharpness, self.max_multiplier
-        self._record_per_cost("train/multiplier", 1.0 / (t * np.maximum(slack, 1.0 / (t * most))))
+        weight = 1.0 / (t * np.maximum(slack, 1.0 / (t * most)))
+        self._record_per_cost("train/multiplier", weight)
+        self._record_per_cost("train/price", weight * self._spread(batch).cpu().numpy())

@@ -71,6 +71,13 @@ def test_spaces_hold_what_algorithms_accept(algo):
     algorithm(algo)(env=CostPoint(), **build(check(algo, algorithm(algo), values)).model)
 
 
+def test_the_decay_of_cost_advantages_is_searched_where_it_matters():
+    """With the values of the files, and not where nothing depends on it."""
+    for algo in set(OURS) - {"trpo", "trpo_sl", "rcpo", *OFF_POLICY}:
+        assert {0.5, 0.97, shipped(algo).get("cost_gae_lambda")} <= {*space_of(algo)["cost_gae_lambda"]}, algo
+    assert not any("cost_gae_lambda" in space_of(algo) for algo in ("trpo", "trpo_sl", "rcpo"))
+
+
 @pytest.mark.parametrize("algo", OURS)
 def test_the_first_trial_is_the_shipped_one(algo):
     base = shipped(algo)

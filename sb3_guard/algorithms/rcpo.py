@@ -1,5 +1,7 @@
 """RCPO: natural gradient steps on the penalised advantage, without a line search."""
 
+from typing import Any, ClassVar
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.utils import obs_as_tensor
@@ -28,6 +30,9 @@ class RCPO(PenalizedTrustRegion):
     """
 
     label, family, paper = "RCPO", "Lagrangian", "Tessler et al. 2019"
+
+    # penalized_reward refuses it
+    search_space: ClassVar[dict[str, Any]] = {"cost_gae_lambda": None}
 
     penalized_reward: bool = hyperparameter(False)
 

@@ -21,4 +21,5 @@ class TRPO(TrustRegion):
     label, family, paper = "TRPO", "unconstrained", "Schulman et al. 2015"
 
     constrained, uses_cost_critic = False, False
+    search_space: ClassVar[dict[str, Any]] = {"cost_gae_lambda": None}
     defaults: ClassVar[dict[str, Any]] = {"missing_cost": "zero"}

@@ -38,6 +38,7 @@ class TRPOSL(FilteredTrustRegion):
 
     label, family, paper = "TRPO-SL", "hierarchical", "Dalal et al. 2018"
     search_space: ClassVar[dict[str, Any]] = {
+        "cost_gae_lambda": None,
         "warmup": {"low": 0.0, "high": 0.5},
         "drift": [False, True],
         "tolerance": {"low": 0.0, "high": 4.0},

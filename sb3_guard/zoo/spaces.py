@@ -44,13 +44,16 @@ def space_of(algo: str) -> dict[str, Any]:
     """
     The space of an algorithm: what its class and the bases of that say; empty if nobody does.
 
+    What a class says None of is left out.
+
     :param algo: key of the algorithm
     :raises UsageError: there is no such algorithm, or one of the entries is wrong
     """
     found = dict(SPACES.get(algo, {}))
     for cls in reversed(algorithm(algo).__mro__):
         found |= vars(cls).get("search_space", {})
-    return {name: _checked(name, entry, algo) for name, entry in found.items()}
+    searched = {name: entry for name, entry in found.items() if entry is not None}
+    return {name: _checked(name, entry, algo) for name, entry in searched.items()}
 
 
 def read_space(path: str) -> dict[str, Any]:
@@ -239,7 +242,7 @@ class Search:
         for name, entry in self.space.items():
             own = get_dotted(self.base, name)
             own = defaults.get(name) if own is None else own
-            if own is not None and _contains(entry, own):
+            if _contains(entry, own):
                 known[name] = _label(own)
         return known
 

@@ -67,11 +67,13 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     :param cost_gae_lambda: likewise for ``gae_lambda``
     """
 
-    #: What tuning searches, as in a file for ``tune --search-space``; subclasses add theirs.
+    #: What tuning searches, as in a file for ``tune --search-space``; subclasses add theirs, or
+    #: None for what it is not to search.
     search_space: ClassVar[dict[str, Any]] = {
         "n_envs": [10, 20, 30],
         "gamma": [0.95, 0.97, 0.98, 0.99, 0.995, 0.999],
         "gae_lambda": {"low": 0.9, "high": 0.99},
+        "cost_gae_lambda": [None, 0.0, 0.5, 0.9, 0.97],  # None: that of the reward
         "learning_rate": {"low": 3e-5, "high": 3e-3, "log": True},
         "policy_kwargs.net_arch": [{"pi": [n, n], "vf": [n, n]} for n in (64, 256)],
         "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},

@@ -1,14 +1,20 @@
 """Draw the curve of each algorithm's page, from the logs: ``python scripts/draw_curves.py``.
 
 Return, episode cost and cost rate against steps, beside an unconstrained algorithm, from the first
-of ``GRIDS`` in ``docs/data`` that has the algorithm, as ``docs/images/curve_<algo>.png``.
+of ``GRIDS`` in ``docs/data`` that has the algorithm, as ``docs/images/curve_<algo>.png``; and a
+good run of docs/healthy.md beside a bad one, as ``docs/images/healthy_<algo>.png``.
 """
 
 import tarfile
 import tempfile
 from pathlib import Path
 
-from sb3_guard.zoo.figures import Data, save
+import matplotlib as mpl
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from sb3_guard.zoo.figures import COLORS, INK, STYLE, WIDTH, Data, finish, save
 from sb3_guard.zoo.paper import draw
 from sb3_guard.zoo.runs import read_results
 
@@ -19,6 +25,55 @@ GRIDS = (
     (("guard_limit2",), "Goal_Point_8Hazards", "trpo"),
     (("off_policy",), "SafetyPointGoal1-v0", None),
 )
+
+HAZARDS = "Goal_Point_8Hazards-v0"
+# Of docs/healthy.md, a good run and a bad one: label, limit, archive and folder.
+HEALTHY = {
+    "pcpo": (
+        ("seed 23", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_24"),
+        ("seed 22", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_23"),
+    ),
+    "trpo_lag": (
+        ("default", 2.0, "guard_limit2", f"guard_limit2/trpo_lag/{HAZARDS}_23"),
+        ("-conf paper", 0.0, "goal_point_1m_limit0", f"goal_point_1m/d0/trpo_lag/{HAZARDS}_1"),
+    ),
+}
+
+
+def draw_healthy(algo: str) -> Figure:
+    """A good and a bad run: return, J_C beside its limit, and what is to keep the limit."""
+    rows, columns = (2, 2) if algo == "pcpo" else (1, 3)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 0.7 + 2.1 * rows), layout="constrained")
+        axes = figure.subplots(rows, columns).ravel()
+        for (name, limit, archive, folder), color in zip(HEALTHY[algo], COLORS, strict=False):
+            with tarfile.open(DOCS / "data" / f"{archive}.tar.xz") as packed:
+                file = packed.extractfile(f"{folder}/progress.csv")
+                assert file is not None
+                log = pd.read_csv(file, index_col="time/total_timesteps")
+            log.columns = log.columns.str.rpartition("/").get_level_values(-1)
+            means = log.rolling(10, min_periods=3).mean()
+            lines = {"return": log["ep_rew_mean"]}
+            lines["episode cost"] = means["constraint_violation"] + limit
+            if algo == "pcpo":
+                lines["cost_margin"] = log["cost_margin"]
+                lines["cost_change"] = means["cost_change"]
+                axes[3].plot(
+                    means["cost_change_promised"], color=color, linestyle=(0, (5, 1.5)),
+                    label=f"{name}, promised",
+                )  # fmt: skip
+            else:
+                # In units of cost, as the paper has them, λ is the price.
+                lines["price"] = log["price" if "price" in log else "multiplier"]
+            for axis, (label, line) in zip(axes, lines.items(), strict=True):
+                axis.plot(line, color=color, linewidth=1.5, label=name)
+                axis.set(xlabel="steps", ylabel=label, xlim=(0, line.index[-1]))
+                axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes[1].axhline(limit, color=INK, linestyle=(0, (1, 2)), label=f"limit, {limit:g}")
+        for axis in axes[1:3]:
+            axis.set_ylim(bottom=0)
+        finish(figure, "")
+    return figure
 
 
 def main() -> None:
@@ -38,6 +93,8 @@ def main() -> None:
                 left.remove(algo)
                 print(f"{algo}: {suite}")
     print("without logs:", *sorted(left))
+    for algo in HEALTHY:
+        save(draw_healthy(algo), DOCS / "images" / f"healthy_{algo}.png")
 
 
 if __name__ == "__main__":

@@ -74,7 +74,9 @@ def test_spaces_hold_what_algorithms_accept(algo):
 def test_the_decay_of_cost_advantages_is_searched_where_it_matters():
     """With the values of the files, and not where nothing depends on it."""
     for algo in set(OURS) - {"trpo", "trpo_sl", "rcpo", *OFF_POLICY}:
-        assert {0.5, 0.97, shipped(algo).get("cost_gae_lambda")} <= {*space_of(algo)["cost_gae_lambda"]}, algo
+        assert {0.5, 0.97, shipped(algo).get("cost_gae_lambda")} <= {
+            *space_of(algo)["cost_gae_lambda"]
+        }, algo
     assert not any("cost_gae_lambda" in space_of(algo) for algo in ("trpo", "trpo_sl", "rcpo"))
 
 

@@ -29,7 +29,7 @@ from sb3_guard.algorithms.common.arguments import (
     taking_defaults,
     with_defaults,
 )
-from sb3_guard.algorithms.common.costs import CostEstimate, weights
+from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.generators import KeepsGenerators
 from sb3_guard.checks import check_per_cost, is_number
 from sb3_guard.costs import read_costs
@@ -258,8 +258,6 @@ class Constrained(KeepsGenerators):
         """Forget the episodes that have ended: the next estimate is about others."""
         self._ended_costs: list[np.ndarray] = []
         self._ended_lengths: list[int] = []
-        self._ended_within: list[int] = []  # how much of them came after the last estimate
-        self._steps_since = 0
         self._cost_seen_lately = False
 
     def _update_info_buffer(
@@ -280,12 +278,10 @@ class Constrained(KeepsGenerators):
         self.running_costs += costs
         self.running_charges += self.step_costs
         self.running_lengths += 1
-        self._steps_since += 1
         self.last_costs = np.where(dones[:, None], 0.0, costs)
         for i in np.flatnonzero(dones):
             self._ended_costs.append(self.running_charges[i].copy())
             self._ended_lengths.append(int(self.running_lengths[i]))
-            self._ended_within.append(min(self._ended_lengths[-1], self._steps_since))
             self.ep_cost_buffer.append(self.running_costs[i].copy())
             self.running_costs[i] = self.running_charges[i] = 0.0
             self.running_lengths[i] = 0
@@ -297,17 +293,14 @@ class Constrained(KeepsGenerators):
     def _estimate_costs(self, rate: np.ndarray | None = None) -> bool:
         """Renew ``costs`` from the episodes that ended since the last time.
 
-        :param rate: of a rollout of so many steps, the mean costs of one, shape (m,), which tell
-            what an episode would cost where none has ended; None keeps the last estimate then
+        :param rate: mean costs of a step, shape (m,), which tell what an episode would cost where
+            none has ended; None keeps the last estimate then
         :return: whether there is a new estimate
         """
         self.cost_seen |= self._cost_seen_lately
         if self._ended_costs:
             self.horizon = horizon = float(np.mean(self._ended_lengths))
-            costs = np.array(self._ended_costs)
-            if rate is not None:  # off-policy, an estimate comes when episodes end
-                costs *= weights(self._ended_lengths, self._ended_within)[:, None]
-            episode_cost = costs.mean(axis=0)
+            episode_cost = np.mean(self._ended_costs, axis=0)
         elif rate is not None:
             horizon = self.horizon or self._horizon_before_any_episode()
             episode_cost = rate * horizon

@@ -269,7 +269,7 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
         ({"buffer_size": 0}, "buffer_size=0: must be an integer of at least 1"),
         ({"train_freq": 0}, "train_freq=0: must be an integer of at least 1"),
         ({"train_freq": (0, "episode")}, "train_freq=0: must be an integer of at least 1"),
-        ({"tau": 2.0}, r"tau=2.0: must be a number in \(0, 1\]"),
+        ({"tau": 2.0}, r"tau=2.0: must be a number in \[0, 1\]"),
         ({"learning_rate": 0.0}, "learning_rate=0.0: must be a positive number or a schedule"),
         ({"lambda_starts": -1}, "lambda_starts=-1"),
         ({"cost_limit": [1.0, 2.0]}, "cost_limit=.*one for each of the 1 cost keys"),

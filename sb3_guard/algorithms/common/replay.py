@@ -161,7 +161,7 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         self._convert_train_freq()
         check_integer("train_freq", self.train_freq.frequency)  # type: ignore[union-attr]
         check_number("gamma", self.gamma, 0.0, 1.0, "[]")
-        check_number("tau", self.tau, 0.0, 1.0, "(]")
+        check_number("tau", self.tau, 0.0, 1.0, "[]")
         check_learning_rate(self.learning_rate)
         if self.cost_gamma is None and self.gamma == 1.0:
             raise ValueError(

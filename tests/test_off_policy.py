@@ -269,6 +269,10 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
         ({"buffer_size": 0}, "buffer_size=0: must be an integer of at least 1"),
         ({"train_freq": 0}, "train_freq=0: must be an integer of at least 1"),
         ({"train_freq": (0, "episode")}, "train_freq=0: must be an integer of at least 1"),
+        (
+            {"train_freq": (1, "episode"), "env": points(2)},
+            "train_freq=.*of a single environment, and there are 2; give a number of steps",
+        ),
         ({"tau": 2.0}, r"tau=2.0: must be a number in \[0, 1\]"),
         ({"learning_rate": 0.0}, "learning_rate=0.0: must be a positive number or a schedule"),
         ({"lambda_starts": -1}, "lambda_starts=-1"),

@@ -17,7 +17,12 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, RolloutReturn
+from stable_baselines3.common.type_aliases import (
+    GymEnv,
+    PyTorchObs,
+    RolloutReturn,
+    TrainFrequencyUnit,
+)
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
@@ -159,7 +164,13 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         for name in ("batch_size", "buffer_size", "policy_delay", "target_update_interval"):
             check_integer(name, getattr(self, name, 1))  # the last two are TD3's and SAC's
         self._convert_train_freq()
-        check_integer("train_freq", self.train_freq.frequency)  # type: ignore[union-attr]
+        frequency, unit = self.train_freq  # type: ignore[misc]
+        check_integer("train_freq", frequency)
+        if unit is TrainFrequencyUnit.EPISODE and self.n_envs > 1:
+            raise ValueError(
+                f"train_freq=({frequency}, 'episode'): counts episodes of a single environment, "
+                f"and there are {self.n_envs}; give a number of steps, or n_envs=1"
+            )
         check_number("gamma", self.gamma, 0.0, 1.0, "[]")
         check_number("tau", self.tau, 0.0, 1.0, "[]")
         check_learning_rate(self.learning_rate)

@@ -4,9 +4,10 @@
 models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
 a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``.
 Instead of ``runs`` there are ``learnt: NAME``, what the agents earned in the end beside the
-untrained ones of ``docs/data/untrained.csv``, ``sweep: NAME SUITE``, what was earned and paid at
-each limit N of ``NAME_limitN.tar.xz``, and, within a line, ``beside: NAME SUITE ALGO``, what an
-algorithm earned and paid. ``--pack FOLDER NAME`` packs the logs of a folder.
+untrained ones of ``docs/data/untrained.csv``, ``scores: NAME``, returns and costs as parts of
+TRPO's, ``sweep: NAME SUITE``, what was earned and paid at each limit N of ``NAME_limitN.tar.xz``,
+and, within a line, ``beside: NAME SUITE ALGO``, what an algorithm earned and paid. ``--pack FOLDER
+NAME`` packs the logs of a folder.
 """
 
 import argparse
@@ -22,13 +23,14 @@ import pandas as pd
 from sb3_guard.zoo.figures import Data, save
 from sb3_guard.zoo.paper import draw
 from sb3_guard.zoo.runs import read_episodes, read_results
-from sb3_guard.zoo.statistics import aggregate, with_safety
+from sb3_guard.zoo.statistics import aggregate, normalize, with_safety
 from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
 BLOCK = re.compile(
-    r"(<!-- (runs|learnt|sweep|beside): (\S+)(?: (\S+))?(?: (\S+))? -->\n?).*?(<!-- end -->)",
+    r"(<!-- (runs|learnt|scores|sweep|beside): (\S+)(?: (\S+))?(?: (\S+))? -->\n?).*?"
+    r"(<!-- end -->)",
     re.DOTALL,
 )
 PUBLISHED_STEPS = 1_000_000
@@ -110,6 +112,23 @@ def learnt(name: str) -> str:
     return markdown(spelled(rows, columns))
 
 
+def scores(name: str) -> str:
+    """A table of the algorithms' returns and costs as parts of TRPO's, a column per suite."""
+    found = runs(name)
+    means = aggregate(found.assign(J_r=found["return_last"], M_c=found["cost_last"]))
+    rows = normalize(means, means).set_index(["suite", "label"])
+    labels = pd.DataFrame({"label": means["label"].unique()})
+
+    def cell(row: Any, suite: str) -> str:
+        if (suite, row["label"]) not in rows.index:
+            return "–"
+        of = rows.loc[(suite, row["label"])]
+        return f"{number(of['reward'])}; {number(of['cost'])}"
+
+    suites = {suite: lambda row, of=suite: cell(row, of) for suite in means["suite"].unique()}
+    return markdown(spelled(labels, {"algorithm": "label", **suites}))
+
+
 def sweep(name: str, suite: str) -> str:
     """A table of return and cost at each limit that a suite was run with, over all seeds."""
     found = {}
@@ -157,10 +176,11 @@ def filled(page: str) -> str:
         begin, kind, name, only, algo, end = match.groups()
         if kind == "beside":
             return f"{begin}{beside(name, only, algo)}{end}"
+        made = {"learnt": learnt, "scores": scores}
         if kind == "sweep":
             text = sweep(name, only)
         else:
-            text = learnt(name) if kind == "learnt" else tables(name, only)
+            text = made[kind](name) if kind in made else tables(name, only)
         return f"{begin}\n{text}\n\n{end}"
 
     return BLOCK.sub(table, page)

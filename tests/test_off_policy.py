@@ -172,6 +172,17 @@ def test_multipliers_follow_ended_episodes_once_and_not_before_their_time(cls: A
     assert [seen[n] for n in (101, 121, 125, 151)] == pytest.approx([0.1, 0.2, 0.2, 0.3])
 
 
+@both
+def test_many_environments_move_multipliers_as_far_as_one(cls: Any) -> None:
+    """Six episodes above the limit, one after the other or three at a time."""
+    more = {"cost_limit": 0.01, "lambda_lr": 0.1, "proportional_gain": 0.0}
+    ends = []
+    for n_envs in (1, 3):
+        model = cls("MlpPolicy", points(n_envs), **more, **settings()).learn(180)
+        ends.append(float(model.multiplier.value))
+    assert ends == pytest.approx([0.6, 0.6])
+
+
 def test_a_callback_that_stops_loses_no_cost() -> None:
     """Stopped at the last step of an episode, which SB3 does not store: the episode has ended."""
 

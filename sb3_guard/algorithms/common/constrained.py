@@ -311,9 +311,8 @@ class Constrained(KeepsGenerators):
                 f"no info had a cost key of {tuple(self.cost_keys)} during a whole rollout: "
                 "training continues as if nothing cost anything (missing_cost='zero')"
             )
-        self.costs = CostEstimate(
-            episode_cost, horizon, (episode_cost - self.cost_limits) / horizon
-        )
+        violation = (episode_cost - self.cost_limits) / horizon
+        self.costs = CostEstimate(episode_cost, horizon, violation, len(self._ended_costs))
         self.costs_are_new = True
         self._begin_statistics()
         return True

@@ -12,11 +12,13 @@ class CostEstimate(NamedTuple):
     :param horizon: T, the length of an episode, steps
     :param violation: (J_C - d) / T, in the per-step units of mean(ratio · cost advantage),
         shape (m,)
+    :param episodes: how many ended
     """
 
     episode_cost: np.ndarray
     horizon: float
     violation: np.ndarray
+    episodes: int = 1
 
 
 def discounted_limit(limits: np.ndarray, horizon: float, gamma: float, cut: bool) -> np.ndarray:

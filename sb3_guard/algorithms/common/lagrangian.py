@@ -163,6 +163,8 @@ class Lagrangian(Constrained):
     }
 
     signed_limits = True
+    #: Whether an estimate of J_C counts as often as there are episodes in it.
+    follows_episodes = False
 
     lambda_lr: float = hyperparameter(0.005)
     lambda_init: float = hyperparameter(0.0)
@@ -227,7 +229,8 @@ class Lagrangian(Constrained):
         self.costs_are_new = False
         # As with the critics' rate: what the attribute says, not what a file has restored.
         update_learning_rate(self.multiplier.optimizer, self.lambda_lr)
-        self.multiplier.update(self.costs.episode_cost, self.cost_limits)
+        for _ in range(self.costs.episodes if self.follows_episodes else 1):
+            self.multiplier.update(self.costs.episode_cost, self.cost_limits)
         self._record_per_cost("train/multiplier", self.multiplier.value.numpy())
 
     def train(self, *args: Any, **kwargs: Any) -> None:

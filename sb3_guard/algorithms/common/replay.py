@@ -306,6 +306,9 @@ class LagrangianReplay(Lagrangian, CostReplay):
     that of Q_C, both of the transitions in the batch: replayed actions vary after the policy has
     ceased to.
 
+    The multipliers follow every episode, so that they move as far with many environments as with
+    one: where several have ended since the last update, their mean cost counts as often.
+
     :param lambda_starts: steps before which the multipliers stay where they begin
     """
 
@@ -320,6 +323,8 @@ class LagrangianReplay(Lagrangian, CostReplay):
         "lambda_smoothing": 0.9,
         "lambda_units": "relative",
     }
+
+    follows_episodes = True
 
     lambda_starts: int = hyperparameter(0, low=0)
 

@@ -1,12 +1,15 @@
 """Draw the curve of each algorithm's page, from the logs: ``python scripts/draw_curves.py``.
 
 Return, episode cost and cost rate against steps, beside an unconstrained algorithm, from the first
-of ``GRIDS`` in ``docs/data`` that has the algorithm, as ``docs/images/curve_<algo>.png``; and a
-good run of docs/healthy.md beside a bad one, as ``docs/images/healthy_<algo>.png``.
+of ``GRIDS`` in ``docs/data`` that has the algorithm, as ``docs/images/curve_<algo>.png``; those of
+all algorithms of ``PAPER``, as ``docs/images/curves_<suite>.png``; and a good run of
+docs/healthy.md beside a bad one, as ``docs/images/healthy_<algo>.png``.
 """
 
 import tarfile
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import matplotlib as mpl
@@ -26,6 +29,11 @@ GRIDS = (
     (("off_policy",), "SafetyPointGoal1-v0", None),
 )
 
+# Of docs/benchmark.md, with the paper's settings: archive and suite.
+PAPER = (
+    ("guard_paper", "Goal_Point_8Hazards"),
+    ("goal_point_1m_limit0", "Goal_Point_8Ghosts"),
+)
 HAZARDS = "Goal_Point_8Hazards-v0"
 # Of docs/healthy.md, a good run and a bad one: label, limit, archive and folder.
 HEALTHY = {
@@ -35,7 +43,7 @@ HEALTHY = {
     ),
     "trpo_lag": (
         ("default", 2.0, "guard_limit2", f"guard_limit2/trpo_lag/{HAZARDS}_23"),
-        ("-conf paper", 0.0, "goal_point_1m_limit0", f"goal_point_1m/d0/trpo_lag/{HAZARDS}_1"),
+        ("-conf paper", 0.0, "guard_paper", f"guard_paper/trpo_lag/{HAZARDS}_1"),
     ),
 }
 
@@ -76,23 +84,36 @@ def draw_healthy(algo: str) -> Figure:
     return figure
 
 
+@contextmanager
+def unpacked(*names: str) -> Iterator[pd.DataFrame]:
+    """The runs of packed grids, whose logs are there within the block."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            with tarfile.open(DOCS / "data" / f"{name}.tar.xz") as archive:
+                archive.extractall(folder, filter="data")
+        yield read_results([folder]).runs
+
+
+def draw_curves(runs: pd.DataFrame, name: str) -> None:
+    """Save the curves of runs of a suite as an image."""
+    (drawing,) = draw("curves", Data(runs))
+    assert drawing.figure is not None, drawing.missing
+    save(drawing.figure, DOCS / "images" / f"{name}.png")
+    print(name)
+
+
 def main() -> None:
     left = {page.stem for page in DOCS.glob("algorithms/*.md")}
     for names, suite, reference in GRIDS:
-        with tempfile.TemporaryDirectory() as folder:
-            for name in names:
-                with tarfile.open(DOCS / "data" / f"{name}.tar.xz") as archive:
-                    archive.extractall(folder, filter="data")
-            runs = read_results([folder]).runs
+        with unpacked(*names) as runs:
             runs = runs[runs["suite"] == suite]
             for algo in sorted(left & {*runs["algo"]}):
-                shown = runs[runs["algo"].isin([algo, reference])]
-                (drawing,) = draw("curves", Data(shown))
-                assert drawing.figure is not None, drawing.missing
-                save(drawing.figure, DOCS / "images" / f"curve_{algo}.png")
+                draw_curves(runs[runs["algo"].isin([algo, reference])], f"curve_{algo}")
                 left.remove(algo)
-                print(f"{algo}: {suite}")
     print("without logs:", *sorted(left))
+    for name, suite in PAPER:
+        with unpacked(name) as runs:
+            draw_curves(runs[runs["suite"] == suite], f"curves_{suite}")
     for algo in HEALTHY:
         save(draw_healthy(algo), DOCS / "images" / f"healthy_{algo}.png")
 

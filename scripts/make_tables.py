@@ -15,6 +15,7 @@ import re
 import tarfile
 import tempfile
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -195,17 +196,18 @@ def pages() -> dict[Path, str]:
 
 
 def pack(folder: Path, name: str) -> None:
-    """Pack the logs of finished runs, the same bytes for the same logs."""
-
-    def plain(info: tarfile.TarInfo) -> tarfile.TarInfo:
-        info.mtime, info.uid, info.gid, info.uname, info.gname = 0, 0, 0, "", ""
-        return info
-
+    """Pack the logs of finished runs, the same bytes for the same logs wherever they were."""
     done = sorted(path.parent for path in folder.rglob("result.json"))
     with tarfile.open(DATA / f"{name}.tar.xz", "w:xz", preset=9) as archive:
         for path in (path for run in done for path in sorted(run.rglob("*"))):
-            if path.name in LOGS:
-                archive.add(path, Path(name) / path.relative_to(folder), filter=plain)
+            if path.name not in LOGS:
+                continue
+            text = path.read_bytes()
+            if path.name == "args.yml":
+                text = re.sub(rb"(?m)^log_folder: .*", f"log_folder: logs/{name}".encode(), text)
+            info = tarfile.TarInfo(str(Path(name) / path.relative_to(folder)))
+            info.size = len(text)
+            archive.addfile(info, BytesIO(text))
 
 
 def main() -> None:

@@ -1,5 +1,7 @@
 """SAC- and TD3-Lagrangian: SB3's own while the limit holds, and what costs add to them."""
 
+import itertools
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -168,19 +170,66 @@ def test_multipliers_follow_ended_episodes_once_and_not_before_their_time(cls: A
         return True
 
     model.learn(180, callback=look)
-    assert seen[100] == 0.0  # the episodes until then broke the limit as well
-    assert [seen[n] for n in (101, 121, 125, 151)] == pytest.approx([0.1, 0.2, 0.2, 0.3])
+    assert seen[101] == 0.0  # the episodes until then broke the limit as well
+    assert [seen[n] for n in (119, 121, 125, 151)] == pytest.approx([0.0, 0.1, 0.1, 0.2])
+
+
+def given(costs: Iterable[float], n_envs: int, length: int) -> Any:
+    """Environments whose episodes, in the order in which they begin, cost what is given."""
+    to_come = iter(costs)
+
+    class Given(Clock):
+        def reset(self, **kwargs: Any) -> Any:
+            self.cost = next(to_come) / length
+            return super().reset(**kwargs)
+
+        def step(self, action: Any) -> Any:
+            *others, info = super().step(action)
+            return *others, {**info, "cost": self.cost}
+
+    return make_vec_env(lambda: Given(length, cut=True), n_envs)
 
 
 @both
-def test_many_environments_move_multipliers_as_far_as_one(cls: Any) -> None:
-    """Six episodes above the limit, one after the other or three at a time."""
-    more = {"cost_limit": 0.01, "lambda_lr": 0.1, "proportional_gain": 0.0}
-    ends = []
-    for n_envs in (1, 3):
-        model = cls("MlpPolicy", points(n_envs), **more, **settings()).learn(180)
-        ends.append(float(model.multiplier.value))
-    assert ends == pytest.approx([0.6, 0.6])
+def test_many_environments_move_multipliers_as_one_does(cls: Any) -> None:
+    """Sixty episodes, one after the other or six at a time, which end together."""
+    costs, ends = np.random.default_rng(0).gamma(0.2, 10.0, 70), []
+    gains = {"cost_limit": 2.0, "proportional_gain": 0.5, "derivative_gain": 0.5}
+    for n_envs in (1, 6):
+        env = given(costs, n_envs, length=10)
+        model = cls("MlpPolicy", env, **gains, **settings() | {"learning_starts": 0}).learn(600)
+        ends.append([float(model.multiplier.value), float(model.multiplier.integral)])
+    assert ends[0] == pytest.approx(ends[1]) and min(ends[0]) > 0.0
+
+
+@both
+def test_multipliers_follow_the_mean_of_episodes(cls: Any) -> None:
+    """Most episodes cost nothing, each tenth 60: 6 on average, which is what the limit is about."""
+    values = []
+    for limit in (5.0, 7.0):
+        env = given(itertools.cycle([0.0] * 9 + [60.0]), 1, length=3)
+        model = cls("MlpPolicy", env, cost_limit=limit, **settings()).learn(600)
+        values.append(float(model.multiplier.integral))
+    assert values[0] > 0.3 and values[1] == 0.0
+
+
+@both
+def test_multipliers_do_not_run_ahead_of_the_actor(cls: Any) -> None:
+    """Eight episodes for each gradient step count once; those of random actions do not count."""
+    gains = {"cost_limit": 5.0, "lambda_lr": 0.1, "proportional_gain": 0.0}
+    env = given(itertools.repeat(100.0), 8, length=1)
+    model = cls("MlpPolicy", env, **gains, **settings() | {"learning_starts": 80}).learn(160)
+    assert model._n_updates == 10 and float(model.multiplier.value) == pytest.approx(1.0)
+
+
+def test_a_loaded_model_counts_the_episodes_that_have_ended(tmp_path: Path) -> None:
+    waiting = {"train_freq": 100, "learning_starts": 0}
+    model = SACLag("MlpPolicy", given(itertools.count(), 1, 10), **settings() | waiting)
+    model.learn(100, callback=lambda names, _: names["self"].num_timesteps < 25)
+    model.save(tmp_path / "model")
+    again = SACLag.load(tmp_path / "model", env=given(itertools.count(5), 1, 10))
+    again.learn(1, reset_num_timesteps=False)
+    np.testing.assert_allclose(np.ravel(again.costs.ended), [0, 1, *range(5, 15)])
 
 
 def test_a_callback_that_stops_loses_no_cost() -> None:

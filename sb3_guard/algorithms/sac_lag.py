@@ -16,9 +16,8 @@ class SACLag(LagrangianReplay, SAC):
         max_π min_{λ ≥ 0}   J(π) + α H(π) - Σ λ_i (J_Ci(π) - d_i)
 
     Each cost has critics of its own, of which the larger value counts. The actor descends
-    ``(α log π - min Q + Σ λ_i Q_Ci) / (1 + Σ λ_i)``; the multipliers follow the cost of the
-    episodes that have ended since the last update. While no limit is exceeded the run equals SB3's
-    SAC, bit for bit.
+    ``(α log π - min Q + Σ λ_i Q_Ci) / (1 + Σ λ_i)``; the multipliers follow the mean
+    cost of the latest episodes. While no limit is exceeded the run equals SB3's SAC, bit for bit.
     """
 
     label, family, paper = "SAC-Lagrangian", "Lagrangian", "Ha et al. 2020"

@@ -16,9 +16,9 @@ class TD3Lag(LagrangianReplay, TD3):
         max_π min_{λ ≥ 0}   J(π) - Σ λ_i (J_Ci(π) - d_i)
 
     Each cost has critics of its own, of which the larger value counts. Every ``policy_delay`` steps
-    the actor descends ``(-Q + Σ λ_i Q_Ci) / (1 + Σ λ_i)``; the multipliers follow the cost of the
-    episodes that have ended since the last update, exploration noise included. While no limit is
-    exceeded the run equals SB3's TD3, bit for bit.
+    the actor descends ``(-Q + Σ λ_i Q_Ci) / (1 + Σ λ_i)``; the multipliers follow the mean
+    cost of the latest episodes, exploration noise included. While no limit is exceeded the run
+    equals SB3's TD3, bit for bit.
     """
 
     label, family, paper = "TD3-Lagrangian", "Lagrangian", "Ray et al. 2019"

@@ -34,7 +34,7 @@ NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
 # Checkpoints take at most this share of the time: those with a replay buffer are large.
 LARGEST_SHARE = 0.05
-FORMAT = 4  # increased when the content changes so that older files can't be continued
+FORMAT = 5  # increased when the content changes so that older files can't be continued
 
 
 class Interrupted(Exception):
@@ -152,6 +152,8 @@ class Checkpoints(BaseCallback):
             "what": self.what,
             "num_timesteps": self.model.num_timesteps,
             "generators": generators,
+            # Off-policy algorithms fill their buffers with random actions from here.
+            "action_space": self.model.action_space.np_random,
             "cuda": cuda or [],
             "environments": environments,
             # Seeded again for each evaluation, but a wrapper may remember more than its episode.
@@ -312,5 +314,6 @@ def restore_run(model: BaseAlgorithm, state: dict[str, Any]) -> None:
         model._last_obs = None
         seed_rows(env, model.seed or 0, 0, state["num_timesteps"])
     set_random_state(state["generators"])
+    model.action_space._np_random = state["action_space"]
     if state["cuda"] and th.cuda.is_available():
         th.cuda.set_rng_state_all(state["cuda"])

@@ -243,6 +243,7 @@ class Constrained(KeepsGenerators):
             self.running_charges = np.zeros((self.n_envs, n_costs))
             self.running_lengths = np.zeros(self.n_envs, dtype=np.int64)
             self.last_costs = np.zeros((self.n_envs, n_costs))
+        if reset_num_timesteps:
             self._begin_statistics()
         steps, callbacks = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, *args, **kwargs
@@ -312,7 +313,7 @@ class Constrained(KeepsGenerators):
                 "training continues as if nothing cost anything (missing_cost='zero')"
             )
         violation = (episode_cost - self.cost_limits) / horizon
-        self.costs = CostEstimate(episode_cost, horizon, violation, len(self._ended_costs))
+        self.costs = CostEstimate(episode_cost, horizon, violation, self._ended_costs)
         self.costs_are_new = True
         self._begin_statistics()
         return True

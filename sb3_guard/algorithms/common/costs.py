@@ -1,24 +1,25 @@
 """The costs of a rollout, compared with their limits."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 
 class CostEstimate(NamedTuple):
-    """What a rollout says about the costs, m of them.
+    """What the episodes since the last update say about the costs, m of them.
 
     :param episode_cost: J_C, mean undiscounted cost of the episodes that ended, shape (m,)
     :param horizon: T, the length of an episode, steps
     :param violation: (J_C - d) / T, in the per-step units of mean(ratio · cost advantage),
         shape (m,)
-    :param episodes: how many ended
+    :param ended: cost of each of them, shape (episodes, m)
     """
 
     episode_cost: np.ndarray
     horizon: float
     violation: np.ndarray
-    episodes: int = 1
+    ended: Sequence[np.ndarray] = ()
 
 
 def discounted_limit(limits: np.ndarray, horizon: float, gamma: float, cut: bool) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Lagrange multipliers that follow the violation, for on- and off-policy algorithms."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -137,11 +137,11 @@ def inverse(deviation: np.ndarray) -> np.ndarray:
 class Lagrangian(Constrained):
     """Prices of the costs that follow the violations, for any algorithm that takes them.
 
-    The prices of an update come from :meth:`price`. They follow J_C once for each new estimate of
-    it, before the policy learns (in :meth:`price`) or after (in :meth:`ascend`, which ``train``
-    calls at its end).
+    The prices of an update come from :meth:`price`. The multipliers take their step, or steps, once
+    for each new estimate of J_C (:meth:`costs_to_follow`), before the policy learns (in
+    :meth:`price`) or after (in :meth:`ascend`, which ``train`` calls at its end).
 
-    :param lambda_lr: η, what the multipliers gain per unit of violation and update
+    :param lambda_lr: η, what the multipliers gain per unit of violation and step
     :param lambda_init: multipliers before the first update
     :param lambda_max: bound on the multipliers; None for 5 in relative units, none in those of cost
     :param lambda_optimizer: ``"sgd"`` for plain ascent, ``"adam"`` lets Adam choose the steps
@@ -150,8 +150,8 @@ class Lagrangian(Constrained):
     :param proportional_gain: with ``derivative_gain``, turns the ascent into a PID controller
         (Stooke et al., 2020, arXiv 2007.03964) whose integral gain is ``lambda_lr``
     :param derivative_gain: of the rise of J_C
-    :param lambda_smoothing: share that the averages behind those two gains keep in an update
-    :param lambda_delay: updates over which the rise of J_C is taken
+    :param lambda_smoothing: share that the averages behind those two gains keep in a step
+    :param lambda_delay: steps over which the rise of J_C is taken
     :param lambda_units: ``"relative"`` measures violations in units of the limit and λ in standard
         deviations of the advantages, so that a run with all costs and limits multiplied by a number
         is the same run; ``"cost"`` takes both as they are
@@ -163,8 +163,6 @@ class Lagrangian(Constrained):
     }
 
     signed_limits = True
-    #: Whether an estimate of J_C counts as often as there are episodes in it.
-    follows_episodes = False
 
     lambda_lr: float = hyperparameter(0.005)
     lambda_init: float = hyperparameter(0.0)
@@ -229,9 +227,13 @@ class Lagrangian(Constrained):
         self.costs_are_new = False
         # As with the critics' rate: what the attribute says, not what a file has restored.
         update_learning_rate(self.multiplier.optimizer, self.lambda_lr)
-        for _ in range(self.costs.episodes if self.follows_episodes else 1):
-            self.multiplier.update(self.costs.episode_cost, self.cost_limits)
+        for cost in self.costs_to_follow():
+            self.multiplier.update(cost, self.cost_limits)
         self._record_per_cost("train/multiplier", self.multiplier.value.numpy())
+
+    def costs_to_follow(self) -> Iterable[np.ndarray]:
+        """J_C in each step of the multipliers, shape (m,); a rollout is one step."""
+        return [self.costs.episode_cost]
 
     def train(self, *args: Any, **kwargs: Any) -> None:
         super().train(*args, **kwargs)  # type: ignore[misc]

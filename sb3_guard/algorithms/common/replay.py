@@ -218,6 +218,9 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
     ) -> None:
         super()._update_info_buffer(infos, dones)
+        if self.num_timesteps <= self.learning_starts:  # they are those of random actions
+            self._ended_costs.clear()
+            self._ended_lengths.clear()
         self.replay_buffer.costs[self.replay_buffer.pos] = self.step_costs
         if self.first_costs is None or self.unmovable is None:
             self.first_costs = self.step_costs[0].copy()
@@ -306,10 +309,13 @@ class LagrangianReplay(Lagrangian, CostReplay):
     that of Q_C, both of the transitions in the batch: replayed actions vary after the policy has
     ceased to.
 
-    The multipliers follow every episode, so that they move as far with many environments as with
-    one: where several have ended since the last update, their mean cost counts as often.
+    A single episode is a poor estimate of J_C, so each that ends moves the multipliers by the mean
+    cost of the latest ones: the same way whether one environment or many have brought them, but
+    not more often than the actor has learnt. Episodes of the random actions that fill the buffer
+    do not count.
 
     :param lambda_starts: steps before which the multipliers stay where they begin
+    :param lambda_window: number of episodes in that mean
     """
 
     search_space: ClassVar[dict[str, Any]] = {
@@ -320,17 +326,29 @@ class LagrangianReplay(Lagrangian, CostReplay):
     defaults: ClassVar[dict[str, Any]] = {
         "lambda_lr": 0.02,
         "proportional_gain": 1.0,
-        "lambda_smoothing": 0.9,
         "lambda_units": "relative",
     }
 
-    follows_episodes = True
-
     lambda_starts: int = hyperparameter(0, low=0)
+    lambda_window: int = hyperparameter(20)
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
+        self.followed_at = 0  # the gradient step
+        super().__init__(*args, **kwargs)
 
     def ascend(self) -> None:
-        if self.num_timesteps >= self.lambda_starts:
-            super().ascend()
+        if self.num_timesteps < self.lambda_starts:
+            self.costs_are_new = False  # nor are these episodes followed later
+        super().ascend()
+
+    def costs_to_follow(self) -> list[np.ndarray]:
+        means = []
+        for cost in self.costs.ended:
+            self.latest_costs = [*self.latest_costs, cost][-self.lambda_window :]
+            means.append(np.mean(self.latest_costs, axis=0))
+        steps, self.followed_at = self._n_updates - self.followed_at, self._n_updates
+        return means[-steps:]
 
     def penalized(
         self,

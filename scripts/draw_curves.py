@@ -32,6 +32,9 @@ GRIDS = (
 # Of docs/benchmark.md, with the paper's settings: archive and suite.
 PAPER = (
     ("guard_paper", "Goal_Point_8Hazards"),
+    ("guard_paper", "Goal_Drone_8Hazards"),
+    ("guard_paper", "Goal_Arm3_8Hazards"),
+    ("guard_paper", "Goal_Walker_8Hazards"),
     ("goal_point_1m_limit0", "Goal_Point_8Ghosts"),
 )
 HAZARDS = "Goal_Point_8Hazards-v0"

@@ -214,22 +214,33 @@ def test_multipliers_follow_the_mean_of_episodes(cls: Any) -> None:
 
 
 @both
-def test_multipliers_do_not_run_ahead_of_the_actor(cls: Any) -> None:
-    """Eight episodes for each gradient step count once; those of random actions do not count."""
-    gains = {"cost_limit": 5.0, "lambda_lr": 0.1, "proportional_gain": 0.0}
+def test_multipliers_do_not_run_ahead_of_the_policy(cls: Any) -> None:
+    """Eight episodes for each gradient step; TD3's actor learns, and pays, in every other one."""
+    gains = {"cost_limit": 5.0, "lambda_lr": 0.1, "proportional_gain": 0.0, "lambda_starts": 80}
     env = given(itertools.repeat(100.0), 8, length=1)
-    model = cls("MlpPolicy", env, **gains, **settings() | {"learning_starts": 80}).learn(160)
-    assert model._n_updates == 10 and float(model.multiplier.value) == pytest.approx(1.0)
+    model = cls("MlpPolicy", env, **gains, **settings() | {"learning_starts": 0}).learn(232)
+    assert model._n_updates == 29 and float(model.multiplier.value) == pytest.approx(2.0)
+
+
+@both
+def test_random_actions_do_not_move_multipliers(cls: Any) -> None:
+    """11 steps of 8 environments, whose first action after 81 steps is the policy's."""
+    env = given([100.0] * 88 + [0.0] * 40, 8, length=1)
+    more = {"cost_limit": 5.0, "gradient_steps": -1}
+    model = cls("MlpPolicy", env, **more, **settings() | {"learning_starts": 81}).learn(96)
+    assert model._n_updates == 16 and float(model.multiplier.value) == 0.0
+    assert np.ravel(model.latest_costs).tolist() == [0.0] * 8
 
 
 def test_a_loaded_model_counts_the_episodes_that_have_ended(tmp_path: Path) -> None:
-    waiting = {"train_freq": 100, "learning_starts": 0}
+    waiting = {"train_freq": 100, "learning_starts": 0, "cost_limit": 1.0}
     model = SACLag("MlpPolicy", given(itertools.count(), 1, 10), **settings() | waiting)
     model.learn(100, callback=lambda names, _: names["self"].num_timesteps < 25)
     model.save(tmp_path / "model")
     again = SACLag.load(tmp_path / "model", env=given(itertools.count(5), 1, 10))
     again.learn(1, reset_num_timesteps=False)
-    np.testing.assert_allclose(np.ravel(again.costs.ended), [0, 1, *range(5, 15)])
+    np.testing.assert_allclose(np.ravel(again.latest_costs), [0, 1, *range(5, 15)])
+    assert float(again.costs.episode_cost[0]) == pytest.approx(np.mean([0, 1, *range(5, 15)]))
 
 
 def test_a_callback_that_stops_loses_no_cost() -> None:

@@ -181,7 +181,13 @@ def test_killed_and_resumed(variant, tmp_path, monkeypatch):
 def test_killed_and_resumed_off_policy(at, tmp_path, monkeypatch):
     """While random actions fill the buffer, and after."""
     off = ["--algo", "sac_lag", "--save-freq", "-1", "--checkpoint-every", "0", "--eval-freq", "-1"]
-    small = ["n_envs:1", "learning_starts:80", "batch_size:8", "policy_kwargs:{'net_arch':[8]}"]
+    small = [
+        "n_envs:1",
+        "learning_starts:80",
+        "batch_size:8",
+        "buffer_size:500",
+        "policy_kwargs:{'net_arch':[8]}",
+    ]
     more = ["--seed", "3", "--verbose", "0", "-n", "150", "-params", *small, "cost_limit:0.1"]
     arguments = [*TOY, *SHORT, *off, *more]
     assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0

@@ -313,7 +313,7 @@ class Constrained(KeepsGenerators):
                 "training continues as if nothing cost anything (missing_cost='zero')"
             )
         violation = (episode_cost - self.cost_limits) / horizon
-        self.costs = CostEstimate(episode_cost, horizon, violation, self._ended_costs)
+        self.costs = CostEstimate(episode_cost, horizon, violation)
         self.costs_are_new = True
         self._begin_statistics()
         return True

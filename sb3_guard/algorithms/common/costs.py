@@ -1,6 +1,5 @@
 """The costs of a rollout, compared with their limits."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,13 +12,11 @@ class CostEstimate(NamedTuple):
     :param horizon: T, the length of an episode, steps
     :param violation: (J_C - d) / T, in the per-step units of mean(ratio · cost advantage),
         shape (m,)
-    :param ended: cost of each of them, shape (episodes, m)
     """
 
     episode_cost: np.ndarray
     horizon: float
     violation: np.ndarray
-    ended: Sequence[np.ndarray] = ()
 
 
 def discounted_limit(limits: np.ndarray, horizon: float, gamma: float, cut: bool) -> np.ndarray:

@@ -30,6 +30,7 @@ from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.checks import check_integer, check_learning_rate, check_number
@@ -218,9 +219,8 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
     ) -> None:
         super()._update_info_buffer(infos, dones)
-        if self.num_timesteps <= self.learning_starts:  # they are those of random actions
-            self._ended_costs.clear()
-            self._ended_lengths.clear()
+        if self.num_timesteps - self.n_envs < self.learning_starts:  # the actions were random
+            self._begin_statistics()
         self.replay_buffer.costs[self.replay_buffer.pos] = self.step_costs
         if self.first_costs is None or self.unmovable is None:
             self.first_costs = self.step_costs[0].copy()
@@ -311,8 +311,8 @@ class LagrangianReplay(Lagrangian, CostReplay):
 
     A single episode is a poor estimate of J_C, so each that ends moves the multipliers by the mean
     cost of the latest ones: the same way whether one environment or many have brought them, but
-    not more often than the actor has learnt. Episodes of the random actions that fill the buffer
-    do not count.
+    not more often than there were gradient steps. Episodes that end while random actions fill the
+    buffer do not count.
 
     :param lambda_starts: steps before which the multipliers stay where they begin
     :param lambda_window: number of episodes in that mean
@@ -334,20 +334,30 @@ class LagrangianReplay(Lagrangian, CostReplay):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
-        self.followed_at = 0  # the gradient step
+        # Since the multipliers' last step: the mean after each episode, and which update that was.
+        self.unfollowed: list[np.ndarray] = []
+        self.followed_at = 0
         super().__init__(*args, **kwargs)
+
+    def _estimate_costs(self, rate: np.ndarray | None = None) -> bool:
+        for cost in self._ended_costs:
+            self.latest_costs = [*self.latest_costs, cost][-self.lambda_window :]
+            self.unfollowed.append(np.mean(self.latest_costs, axis=0))
+        if not super()._estimate_costs(rate):
+            return False
+        mean, horizon = self.unfollowed[-1], self.costs.horizon
+        self.costs = CostEstimate(mean, horizon, (mean - self.cost_limits) / horizon)
+        return True
 
     def ascend(self) -> None:
         if self.num_timesteps < self.lambda_starts:
-            self.costs_are_new = False  # nor are these episodes followed later
-        super().ascend()
+            self.unfollowed, self.followed_at = [], self._n_updates
+        elif self._n_updates > self.followed_at:
+            super().ascend()
 
     def costs_to_follow(self) -> list[np.ndarray]:
-        means = []
-        for cost in self.costs.ended:
-            self.latest_costs = [*self.latest_costs, cost][-self.lambda_window :]
-            means.append(np.mean(self.latest_costs, axis=0))
-        steps, self.followed_at = self._n_updates - self.followed_at, self._n_updates
+        means, steps = self.unfollowed, self._n_updates - self.followed_at
+        self.unfollowed, self.followed_at = [], self._n_updates
         return means[-steps:]
 
     def penalized(

@@ -29,14 +29,11 @@ GRIDS = (
     (("off_policy",), "SafetyPointGoal1-v0", None),
 )
 
-# Of docs/benchmark.md, with the paper's settings: archive and suite.
-PAPER = (
-    ("guard_paper", "Goal_Point_8Hazards"),
-    ("guard_paper", "Goal_Drone_8Hazards"),
-    ("guard_paper", "Goal_Arm3_8Hazards"),
-    ("guard_paper", "Goal_Walker_8Hazards"),
-    ("goal_point_1m_limit0", "Goal_Point_8Ghosts"),
-)
+# Of docs/benchmark.md, with the paper's settings: archive and suites.
+PAPER = {
+    "guard_paper": [f"Goal_{robot}_8Hazards" for robot in ("Point", "Drone", "Arm3", "Walker")],
+    "goal_point_1m_limit0": ["Goal_Point_8Ghosts"],
+}
 HAZARDS = "Goal_Point_8Hazards-v0"
 # Of docs/healthy.md, a good run and a bad one: label, limit, archive and folder.
 HEALTHY = {
@@ -114,9 +111,10 @@ def main() -> None:
                 draw_curves(runs[runs["algo"].isin([algo, reference])], f"curve_{algo}")
                 left.remove(algo)
     print("without logs:", *sorted(left))
-    for name, suite in PAPER:
+    for name, suites in PAPER.items():
         with unpacked(name) as runs:
-            draw_curves(runs[runs["suite"] == suite], f"curves_{suite}")
+            for suite in suites:
+                draw_curves(runs[runs["suite"] == suite], f"curves_{suite}")
     for algo in HEALTHY:
         save(draw_healthy(algo), DOCS / "images" / f"healthy_{algo}.png")
 

@@ -6,7 +6,7 @@ import numpy as np
 
 
 class CostEstimate(NamedTuple):
-    """What the episodes since the last update say about the costs, m of them.
+    """What the latest episodes say about the costs, m of them.
 
     :param episode_cost: J_C, mean undiscounted cost of the episodes that ended, shape (m,)
     :param horizon: T, the length of an episode, steps

@@ -1,7 +1,7 @@
 """Replay with costs, for any off-policy algorithm of Stable-Baselines3 with continuous actions.
 
 The costs of each step go into the replay buffer. Beside the policy, two networks per cost learn
-Q_C(s, a) = c + γ_C Q_C(s', a'); the episodes that ended since the last update tell J_C.
+Q_C(s, a) = c + γ_C Q_C(s', a'); the latest episodes tell J_C.
 """
 
 import copy

@@ -1,8 +1,16 @@
-"""What every test has in common: one thread for torch, and nothing left behind in /tmp."""
+"""What every test has in common: an empty working folder, one thread for torch, a clean /tmp."""
 
 from collections.abc import Iterator
 
 import pytest
+
+
+@pytest.fixture(autouse=True)
+def _working_folder(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever runs the tests may have runs in ``logs/``: a test neither reads nor adds to them."""
+    monkeypatch.chdir(tmp_path_factory.mktemp("cwd"))
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -147,3 +147,7 @@ def test_every_public_name_exists():
         assert getattr(sb3_guard, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'PPO'"):
         _ = sb3_guard.PPO
+
+
+def test_a_test_has_an_empty_working_folder_of_its_own():
+    assert list(Path.cwd().iterdir()) == []

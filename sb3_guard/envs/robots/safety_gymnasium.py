@@ -36,10 +36,14 @@ class SafetyPoint(SafetyRobot):
 
 @dataclass
 class SafetyCar(SafetyRobot):
-    """Safety-Gymnasium's Car: two driven wheels, and a ball that rolls along."""
+    """Safety-Gymnasium's Car: two driven wheels, and a ball that rolls along.
+
+    Positive actions drive it along its body's -y axis, which is where it looks.
+    """
 
     asset = "safety_car.xml"
     timestep = 0.004
+    eye = (SafetyRobot.root, (0.0, 0.0, 0.1), (0.0, -1.0, 0.0))
     components = (*_SENSORS, "ballangvel_rear", "ballquat_rear")
 
 
@@ -53,6 +57,7 @@ class SafetyAnt(SafetyRobot):
     asset = "safety_ant.xml"
     timestep = 0.01
     integrator = "RK4"
+    eye = (SafetyRobot.root, (0.0, 0.0, 0.1), (0.0, 1.0, 0.0))
     components = (
         *_SENSORS,
         *(f"jointvel_{joint}" for joint in _ANT),

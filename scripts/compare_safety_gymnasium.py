@@ -1,12 +1,14 @@
 """How far our tasks are from Safety-Gymnasium 1.0.0's, over all that was recorded of it.
 
-``python scripts/compare_safety_gymnasium.py`` prints two tables, of all 52 ids
+``python scripts/compare_safety_gymnasium.py`` prints two tables, of all 52 navigation ids
 (``tests/data/safety_gymnasium``), with a column or two rows for each robot. What is observed and
 rewarded in a recorded state: the largest differences, relative to the value or to 0.01 if that is
 more; observations in the files have 21 bits, 4.8e-7. And one control step from a recorded state, by
 the physics of another MuJoCo, while the robot and everything else touch nothing but the floor, and
 while something touches an object; places in the files have 20 bits after the point, so that half of
 that, 4.8e-7 m, is not a difference. The causes are in docs/fidelity.md.
+
+``--velocity`` prints the second for the robots of the velocity tasks, whose files have 24 bits.
 
 ``--distributions`` compares 400 recorded layouts with 1,000 of ours, and 200 random episodes with
 as many: by chance, 5 % of single comparisons are beyond 0.080 and 0.136.
@@ -22,8 +24,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from safety_distributions import episode_gaps, layout_gaps
-from safety_traces import Trace, load
+from safety_traces import Trace, load, velocity_steps
 
+from sb3_guard.envs.suites import velocity
 from sb3_guard.envs.suites.safety_gymnasium import LEVELS, NAMES
 from sb3_guard.zoo.tables import table
 
@@ -82,6 +85,20 @@ def moved(t: Trace) -> tuple[np.ndarray, np.ndarray]:
     return np.abs(ours - t["qpos"][t.after, :robot]).max(axis=1), met
 
 
+def print_velocity() -> None:
+    """One control step of the velocity tasks' robots, in contact and in the air."""
+    steps = []
+    for robot in velocity.TABLE:
+        recorded, qpos, _ = velocity_steps(robot)
+        off = np.abs(qpos - recorded["next_qpos"]).max(axis=1)
+        touching = recorded["contacts"] > 0
+        for state, rows in (("touching", touching), ("free", ~touching)):
+            if rows.any():
+                values = [f"{np.quantile(off[rows], q):.1e}" for q in (0.5, 0.95, 1.0)]
+                steps.append([robot, state, f"{int(rows.sum()):,}", *values])
+    print(table(["robot", "", "steps", "median, m or rad", "95 %", "largest"], steps))
+
+
 def print_distributions() -> None:
     """The largest Kolmogorov-Smirnov distances of layouts, and those of random episodes."""
     recorded = load("distributions")
@@ -103,7 +120,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--match", default="", help="only names that contain this")
     parser.add_argument("--distributions", action="store_true", help="layouts and returns instead")
+    parser.add_argument("--velocity", action="store_true", help="steps of the velocity tasks")
     args = parser.parse_args()
+    if args.velocity:
+        return print_velocity()
     if args.distributions:
         return print_distributions()
     worst: dict[str, dict[str, float]] = {}

@@ -1,6 +1,6 @@
 """Traces of Safety-Gymnasium 1.0.0, and our simulations in the states that they hold.
 
-``scripts/record_safety_gymnasium.py`` says what is recorded.
+``scripts/record_safety_gymnasium.py`` and ``scripts/record_velocity.py`` say what is recorded.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs import Scenario
+from sb3_guard.envs.outcome import Outcome
 
 FOLDER = Path(__file__).parent / "data" / "safety_gymnasium"
 GEOM = mujoco.mjtGeom
@@ -141,3 +142,27 @@ class Trace:
         now = engine.task.measure()
         met = engine.task.succeeded(now)[:n]
         return engine.task.reward(before, now)[:n] + engine.task.bonus * met, met
+
+
+def velocity_steps(name: str) -> tuple[dict[str, Any], Any, Outcome]:
+    """One step of ours from each recorded state of ``Safety<name>Velocity-v1``.
+
+    :return: what was recorded (``scripts/record_velocity.py``), our qpos after the step, [n, nq],
+        and our outcomes
+    """
+    recorded = {
+        key.removeprefix(f"{name}_"): values
+        for key, values in load("velocity").items()
+        if key.startswith(f"{name}_")
+    }
+    rows = np.arange(len(recorded["qpos"]))
+    engine = Scenario.parse(f"Safety{name}Velocity-v1").build(len(rows), num_threads=1)
+    engine.reset(rows)
+    engine.batch.clear(rows)
+    for field in ("qpos", "qvel"):
+        engine.batch.bind(field)[:] = recorded[field]
+    engine.batch.begin(rows)
+    engine.batch.bind("qacc_warmstart")[:] = 0.0
+    engine._before[:] = engine.task.measure()
+    outcome = engine.step(recorded["action"])
+    return recorded, engine.batch.bind("qpos").copy(), outcome

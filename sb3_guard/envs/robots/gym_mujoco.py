@@ -4,6 +4,10 @@ Their files come with the gymnasium package. Starts, observations and deaths are
 ``gymnasium.make("Ant-v4")`` and its sisters, bit for bit, with the same random numbers: a row with
 seed s begins as that environment does. Derived quantities, such as the place of Ant's torso, are
 read as ``mj_step`` leaves them there: of the last physics step's beginning.
+
+Two things are as with the MuJoCo that the files were written for. It took the larger margin of two
+geoms, and today's adds the two, so margins are half of those in the files. And it kept quaternions
+at length 1, also where an episode begins.
 """
 
 import importlib.resources
@@ -16,6 +20,7 @@ import numpy as np
 
 from sb3_guard.envs.observation import Observations, Values
 from sb3_guard.envs.part import Array, Generators, Simulation
+from sb3_guard.envs.robots import mjcf
 from sb3_guard.envs.robots.robot import MJCFRobot
 
 
@@ -50,6 +55,13 @@ class GymRobot(MJCFRobot):
         folder = importlib.resources.files("gymnasium.envs.mujoco") / "assets"
         return Path(str(folder / cls.asset))
 
+    def world(self) -> mujoco.MjSpec:
+        """The file's world, in which the margins of two geoms add up to the larger in the file."""
+        spec = mjcf.read(self.path(), self.root, True)
+        for geom in spec.geoms:  # within a file, all have the same margin
+            geom.margin /= 2
+        return spec
+
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self._qvel = sim.batch.bind("qvel")
@@ -63,6 +75,8 @@ class GymRobot(MJCFRobot):
                 self._qvel[i] = self.noise * rngs[i].standard_normal(n)
             else:
                 self._qvel[i] = rngs[i].uniform(-self.noise, self.noise, n)
+            # MuJoCo 2.3.3 normalises quaternions in place whenever it computes positions
+            mujoco.mj_normalizeQuat(self.sim.model, self._qpos[i])
 
     @property
     def position(self) -> Array:

@@ -1,5 +1,6 @@
 """Train a grid, suites × algorithms × seeds: ``python -m sb3_guard.benchmark --preset main8``."""
 
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 # The file that says what a grid is, in its folder; `--grid` reads such a file.
 RECORD = "grid.yml"
 # Flags that no such file states; "jobs", which it may, are not of the record either.
-HOW = ("grid", "log_folder", "trust", "dry_run", "scheduler", "verbose")
+HOW = ("grid", "log_folder", "dry_run", "scheduler", "verbose")
 
 
 @dataclass
@@ -48,7 +49,6 @@ class Flags(EvaluationFlags, TrainingFlags):
 
     Running:
 
-    :param trust: let files of a run or grid name code that is not this package's, RL-Zoo's or SB3's
     :param dry_run: list the runs and do nothing
     :param jobs: runs at once, a process with one thread each (default: as many as there are cores)
     :param scheduler: of a Dask cluster, e.g. tcp://node1:8786 (default: run on this machine)
@@ -72,7 +72,6 @@ class Flags(EvaluationFlags, TrainingFlags):
     scale: float = flag(default=1.0, kind=factor, metavar="X", role=IDENTITY)
     grid: str | None = flag(metavar="FILE", role=HOST)
     log_folder: str = flag("-f", default="logs/benchmark", metavar="DIR", role=HOST)
-    trust: bool = flag(default=False, role=HOST)
     dry_run: bool = flag(default=False, role=HOST)
     jobs: int | None = flag(kind=positive, metavar="N", role=HOST)
     scheduler: str | None = flag(metavar="ADDRESS", role=HOST)
@@ -111,9 +110,10 @@ def with_file(flags: Flags) -> Flags:
 
     What the command line says wins; of hyper-parameters and the like, entry by entry.
 
-    :raises UsageError: the file can't be read, has an unknown entry, or names code of strangers
+    :raises UsageError: the file can't be read, has an unknown entry, or names modules that the
+        command line does not name
     """
-    from sb3_guard.zoo.trust import require_trust
+    from sb3_guard.zoo.names import is_program, require_named
 
     path = Path(flags.grid or Path(flags.log_folder) / RECORD)
     if not flags.grid and (flags.given & {"suites", "preset"} or not path.is_file()):
@@ -122,7 +122,12 @@ def with_file(flags: Flags) -> Flags:
     content = read_mapping(path, "grid file", form)
     filed = Flags.read(content, path, HOW)
     given = {name: getattr(filed, name) for name in filed.given}
-    require_trust(path, flags.trust, given, given.get("hyperparams") or {})
+    require_named(path, flags.gym_packages, filed.gym_packages)
+    if not flags.conf_file and is_program(filed.conf_file):
+        raise UsageError(
+            f"{path} has conf_file: {filed.conf_file}, a program, which only the command line may "
+            f"name; look at it, then add -conf {filed.conf_file}"
+        )
     for name in flags.given:
         value, old = getattr(flags, name), given.get(name)
         given[name] = {**old, **value} if isinstance(old, dict) else value
@@ -160,6 +165,7 @@ def benchmark(flags: Flags) -> int:
     of_a_run.check()
 
     from sb3_guard.zoo.grid import expand, run_grid, try_out
+    from sb3_guard.zoo.names import is_program, packages_flag
 
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
     if flags.dry_run:
@@ -173,8 +179,10 @@ def benchmark(flags: Flags) -> int:
         with FileLock(folder / ".grid.lock"), replacing(folder / RECORD) as file:
             file.write(yaml.safe_dump(flags.asked_for(), sort_keys=False).encode())
     how = {name: getattr(flags, name) for name in ("jobs", "scheduler") if name in flags.given}
-    again = f"continue with: sb3-guard benchmark -f {folder}"
+    again = f"continue with: sb3-guard benchmark -f {shlex.quote(str(folder))}"
     again += "".join(f" --{name} {value}" for name, value in how.items())
+    again += packages_flag(flags.gym_packages)
+    again += f" -conf {flags.conf_file}" if is_program(flags.conf_file) else ""
     return run_grid(runs, folder, again, flags.jobs, flags.scheduler, flags.verbose)
 
 

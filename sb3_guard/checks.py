@@ -5,6 +5,10 @@ from typing import Any
 import numpy as np
 
 
+class NotFiniteError(FloatingPointError, ValueError):
+    """A reward, cost, observation, action or loss is not a finite number."""
+
+
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number; booleans are not."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)

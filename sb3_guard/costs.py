@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_guard.checks import NotFiniteError
 from sb3_guard.spelling import nearest
 
 
@@ -14,7 +15,7 @@ def number(value: Any, name: str) -> float:
     """One cost as a float: an int, bool, NumPy scalar or array of one number will do.
 
     :param name: what the message calls it
-    :raises ValueError: it is something else, or not finite
+    :raises NotFiniteError: it is something else, or not finite
     """
     try:
         one = value.item() if isinstance(value, np.ndarray) else value
@@ -22,7 +23,7 @@ def number(value: Any, name: str) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{name} is {value!r}: a cost must be a finite number")
+        raise NotFiniteError(f"{name} is {value!r}: a cost must be a finite number")
     return number
 
 
@@ -51,7 +52,8 @@ def read_costs(
     :param keys: the m entries that hold costs
     :param zero_if_missing: whether an absent entry means that nothing was charged
     :return: costs, shape (n_envs, m), and whether any of the entries was there
-    :raises ValueError: an entry is missing and may not be, or is not a finite number
+    :raises ValueError: an entry is missing and may not be
+    :raises NotFiniteError: one is not a finite number
     """
     shape, seen = (len(infos), len(keys)), True
     try:

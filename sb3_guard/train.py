@@ -19,7 +19,6 @@ class Flags(RunFlags):
 
     :param seeds: a run for each of these seeds, <env>_<seed + 1>, several at once; the same command
         continues with what is not done
-    :param trust: let files of a run or grid name code that is not this package's, RL-Zoo's or SB3's
 
     Running:
 
@@ -36,7 +35,6 @@ class Flags(RunFlags):
   python -m sb3_guard.train -i logs/cpo/Goal_Point_8Hazards-v0_1 -n 2e6      and for longer
 """
     seeds: list[int] | None = flag(kind=seed_number, metavar="K", exclusive="seeds")
-    trust: bool = flag(default=False)
     jobs: int | None = flag(kind=positive, metavar="N")
 
 
@@ -55,7 +53,7 @@ def train(flags: Flags) -> int:
         from sb3_guard.zoo.start import continues_run, resume, start
 
         if run.trained_agent and continues_run(run.trained_agent):
-            return resume(run, flags.trust)
+            return resume(run)
         return start(run)
     for name, value in (("-i", run.trained_agent), ("--uuid", run.uuid)):
         if value:

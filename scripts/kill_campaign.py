@@ -60,6 +60,9 @@ class Campaign:
         flags = [*self.flags, "-f", str(self.folder)]
         if self.what == "train" and begun:  # a single run is continued, not begun again
             flags = ["-i", str(begun[0])]
+            if "--gym-packages" in self.flags:
+                named = self.flags.index("--gym-packages")
+                flags += self.flags[named : named + 2]
         elif self.what == "train":
             shutil.rmtree(self.folder, ignore_errors=True)
         return psutil.Popen(

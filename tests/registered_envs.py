@@ -56,6 +56,24 @@ class Wordy(CostPoint):
         return *rest, {"cost": "high"}
 
 
+class Undefined(CostPoint):
+    """Gives a reward or an observation that is not a number after a while."""
+
+    def __init__(self, what: str, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.what = what
+        self.taken = 0
+
+    def step(self, action: np.ndarray) -> Any:
+        obs, reward, *rest = super().step(action)
+        self.taken += 1
+        if self.taken > 30 and self.what == "reward":
+            reward = float("nan")
+        elif self.taken > 30:
+            obs = np.full_like(obs, np.nan)
+        return obs, reward, *rest
+
+
 class Broken(CostPoint):
     """Fails after a while."""
 
@@ -87,6 +105,7 @@ for name, cls in {
     "Flickering": Flickering,
     "Wordy": Wordy,
     "Broken": Broken,
+    "Undefined": Undefined,
 }.items():
     if f"{name}-v0" not in gym.registry:
         gym.register(f"{name}-v0", entry_point=f"{cls.__module__}:{name}")

@@ -73,7 +73,7 @@ def test_killed_and_resumed(algo, more, tmp_path, monkeypatch):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert train.main([*arguments(algo, whole, *more), "--eval-freq", "50"]) == 0
     crash(monkeypatch, [*arguments(algo, cut, *more), "--eval-freq", "50"], 115)
-    assert train.main(["-i", str(runs_of(cut))]) == 0
+    assert train.main(["-i", str(runs_of(cut)), *TOY[:2]]) == 0
     assert_same_run(whole, cut)
 
 

@@ -223,7 +223,7 @@ def test_bad_grid_file(content, part, capsys, tmp_path):
     assert not folder.exists()
 
 
-def test_a_preset_in_a_grid_file_needs_no_trust(capsys, tmp_path):
+def test_a_preset_in_a_grid_file_is_no_program(capsys, tmp_path):
     grid = "suites: [Goal_Point_8Hazards]\nalgos: [cpo]\nconf_file: omnisafe"
     (tmp_path / "g.yml").write_text(grid)
     assert benchmark.main(["--grid", str(tmp_path / "g.yml"), "--dry-run"]) == 0

@@ -66,7 +66,7 @@ def test_track_sends_what_tensorboard_gets_and_goes_on(tmp_path, monkeypatch, ca
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
     run = trained(logs, "--track", "-tb", str(tmp_path / "tb"))
     assert "did not get everything: OSError: no network" in capsys.readouterr().err
-    assert train.main(["-i", str(run), "-n", "180", "--verbose", "0"]) == 0
+    assert train.main(["-i", str(run), *TOY[:2], "-n", "180", "--verbose", "0"]) == 0
     assert json.loads((run / "result.json").read_text())["n_timesteps"] == 180
     (first, *before), (second, *after) = calls
     assert (before, after) == ([0, False], [1, True])
@@ -154,7 +154,16 @@ def test_our_environments(tmp_path, vec_env, capsys):
     config = yaml.safe_load((run / "Goal_Point_3Hazards-v0" / "config.yml").read_text())
     assert config["env_kwargs"]["goal"] == {"size": 0.5}
     capsys.readouterr()
-    play = ["--env", "Goal_Point_3Hazards", "-f", str(tmp_path), "--no-render", "-n", "20"]
+    play = [
+        *TOY[:2],
+        "--env",
+        "Goal_Point_3Hazards",
+        "-f",
+        str(tmp_path),
+        "--no-render",
+        "-n",
+        "20",
+    ]
     assert enjoy.main(play) == 0
     assert "No episode ended" in capsys.readouterr().out
 
@@ -351,20 +360,19 @@ def test_record_our_environment(tmp_path):
     require_rendering()
     trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
     video = tmp_path / "film.mp4"
-    play = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3", "--record", str(video)]
+    play = [
+        *TOY[:2],
+        "--env",
+        "Goal_Point_2Hazards",
+        "-f",
+        str(tmp_path),
+        "-n",
+        "3",
+        "--record",
+        str(video),
+    ]
     assert enjoy.main(play) == 0
     assert video.stat().st_size > 1000
-
-
-def test_enjoy_imports_what_training_imported(tmp_path, monkeypatch):
-    """Before it looks the id up, which only that module may know."""
-    trained(tmp_path)
-    asked = []
-    monkeypatch.setattr("sb3_guard.zoo.playback.import_packages", asked.append)
-    play = ["--algo", "cpo", "--env", "CostPoint-v0", "-f", str(tmp_path), "--no-render"]
-    assert enjoy.main([*play, "--n-episodes", "1"]) == 0
-    assert enjoy.main([*play, "--n-episodes", "1", "--exp-id", "1"]) == 0
-    assert [one for one in asked if one] == [["registered_envs"]] * 2
 
 
 def test_packages_are_found_in_the_current_folder(tmp_path, monkeypatch):
@@ -407,7 +415,7 @@ def test_our_environment_has_a_window(tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_guard.envs.GuardEnv.render", lambda self: frames.append(self))
     monkeypatch.setenv("DISPLAY", ":0")
     trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
-    play = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3"]
+    play = [*TOY[:2], "--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3"]
     assert enjoy.main(play) == 0
     assert len(frames) >= 3 and {env.render_mode for env in frames} == {"human"}
 
@@ -421,7 +429,17 @@ def test_no_backend_no_video(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(rendering, "gl_backend", nothing)
     trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
     video = tmp_path / "film.mp4"
-    play = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3", "--record", str(video)]
+    play = [
+        *TOY[:2],
+        "--env",
+        "Goal_Point_2Hazards",
+        "-f",
+        str(tmp_path),
+        "-n",
+        "3",
+        "--record",
+        str(video),
+    ]
     assert enjoy.main(play) == 2
     assert "error: can't render: RenderingError: no OpenGL backend" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))

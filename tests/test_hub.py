@@ -122,7 +122,7 @@ def test_there_and_back(logs, tmp_path, monkeypatch, capsys):
 
 
 def test_an_environment_that_only_the_runs_package_knows(tmp_path, monkeypatch, capsys):
-    """To push, the package that the run names is imported if trusted; to load, none is needed."""
+    """To push, the command line names the package that the run does; to load, none is needed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "stranger.py").write_text(
@@ -138,8 +138,10 @@ def test_an_environment_that_only_the_runs_package_knows(tmp_path, monkeypatch, 
 
     push = ["push", "--n-episodes", "2", "--to", "card", "--dry-run", "--no-video"]
     assert hub_in_a_new_process(*push) == 2
-    assert "names code to run (gym_packages: stranger)" in capsys.readouterr().err
-    assert hub_in_a_new_process(*push, "--trust") == 0
+    assert "then add --gym-packages stranger" in capsys.readouterr().err
+    assert hub_in_a_new_process(*push, "--gym-packages", "stranger") == 0
+    page = (tmp_path / "card" / "README.md").read_text()
+    assert "sb3-guard enjoy --algo cpo --env Stranger-v0 -f logs --gym-packages stranger\n" in page
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "card"))
     assert hub_in_a_new_process("load", "--repo-id", "me/it", "-f", "downloaded") == 0
     assert hub_in_a_new_process("load", "-f", "other") == 2

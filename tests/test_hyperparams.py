@@ -259,8 +259,8 @@ def test_expressions_are_data_and_classes_of_torch(text, value):
         ("normalize", "dict(**{'a': 1})", "can't be evaluated"),
         ("normalize", "{'a': exit()}", r"exit\(\) is not allowed"),
         ("learning_rate", "lin_fast", "not a schedule"),
-        ("policy", "no.such.Policy", "there is no class 'no.such.Policy'"),
-        ("env_wrapper", "no.such.Wrapper", "there is no class 'no.such.Wrapper'"),
+        ("policy", "no.such.Policy", "add --gym-packages no.such"),
+        ("env_wrapper", "no.such.Wrapper", "add --gym-packages no.such"),
     ],
 )
 def test_text_that_names_nothing(name, value, message):

@@ -47,7 +47,7 @@ def test_seconds_go_on_in_a_resumed_run(tmp_path, monkeypatch):
     assert train.main(start) == 0
     (run,) = tmp_path.glob("cpo/*_1")
     before = json.loads((run / "result.json").read_text())["seconds"]
-    again = ["-i", str(run), "-n", "120", "--verbose", "0"]
+    again = ["-i", str(run), *RUN[:2], "-n", "120", "--verbose", "0"]
     assert train.main(again) == 0
     assert json.loads((run / "result.json").read_text())["seconds"] > before
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_guard.checks import NotFiniteError
 from sb3_guard.common.vec_budgets import end_rows
 from sb3_guard.costs import number, read_costs
 
@@ -90,13 +91,25 @@ class CostMonitor(VecMonitor):
         self._key_costs = np.zeros((len(self._columns), self.num_envs))
 
     def reset(self) -> VecEnvObs:
-        """Begin new episodes everywhere; those under way are not reported."""
+        """
+        Begin new episodes everywhere; those under way are not reported.
+
+        :raises NotFiniteError: an observation is not finite
+        """
         self._clear()
-        return self.venv.reset()
+        obs = self.venv.reset()
+        _require_finite("observation", obs)
+        return obs
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Pass a step on; the infos of rows that ended an episode gain ``"episode"``."""
+        """
+        Pass a step on; the infos of rows that ended an episode gain ``"episode"``.
+
+        :raises NotFiniteError: a reward, cost or observation is not finite
+        """
         obs, rewards, dones, infos = self.venv.step_wait()
+        _require_finite("reward", rewards)
+        _require_finite("observation", obs)
         costs = [total_cost(info, self.cost_keys) for info in infos]
         self.episode_returns += rewards
         self.episode_lengths += 1
@@ -163,6 +176,25 @@ class CostMonitor(VecMonitor):
         """Continue counting from :meth:`state`; the csv is left as it is."""
         for name in KEPT:
             setattr(self, name, copy.copy(state[name]))
+
+
+def _require_finite(name: str, values: VecEnvObs) -> None:
+    """
+    Refuse what networks would turn into NaN everywhere.
+
+    :param values: shape (n_envs, ...), or a dictionary or tuple of such
+    :raises NotFiniteError: one is not finite; the message names the environments
+    """
+    if not isinstance(values, np.ndarray):
+        entries = values.items() if isinstance(values, Mapping) else enumerate(values)
+        for key, value in entries:
+            _require_finite(f"{name} {key!r}", value)
+    elif values.dtype.kind == "f" and not np.isfinite(values).all():
+        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
+        rows = np.flatnonzero(bad).tolist()
+        raise NotFiniteError(
+            f"the {name} of environment {rows[0]} is {values[rows[0]].tolist()}: it must be finite"
+        )
 
 
 def find_monitor(env: VecEnv) -> CostMonitor:

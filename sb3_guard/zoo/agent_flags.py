@@ -29,8 +29,7 @@ class AgentFlags(Command):
     :param stochastic: sampled actions
     :param seed: seed of the episodes (default: 0)
     :param env_kwargs: arguments of the environment, over those of training
-    :param gym_packages: modules to import first (default: those of training)
-    :param trust: let files of a run or grid name code that is not this package's, RL-Zoo's or SB3's
+    :param gym_packages: modules to import first, such as those that training imported
 
     Output:
 
@@ -51,7 +50,6 @@ class AgentFlags(Command):
     seed: int = flag(default=0, kind=seed_number)
     env_kwargs: dict[str, Any] | None = flag()
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
-    trust: bool = flag(default=False)
     device: str = flag(default="auto")
     num_threads: int = flag(default=-1, metavar="N")
 

@@ -14,6 +14,7 @@ import yaml
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
 from sb3_guard.zoo.make_envs import canonical_id
+from sb3_guard.zoo.names import packages_flag
 from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
 from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data, require_writable
 from sb3_guard.zoo.usage import UsageError, explained
@@ -42,7 +43,7 @@ Cost is the undiscounted sum of `info["cost"]` over an episode{limit}.
 ```bash
 pip install sb3-guard   # or, in a clone of its repository: pip install .
 sb3-guard hub load --repo-id {repo_id} --algo {algo} --env {env} -f logs
-sb3-guard enjoy --algo {algo} --env {env} -f logs
+sb3-guard enjoy --algo {algo} --env {env} -f logs{packages}
 ```
 
 ## Train it again
@@ -155,6 +156,7 @@ def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]
         name=name,
         env=agent.env_id,
         algo=flags.algo,
+        packages=packages_flag(agent.run.args().get("gym_packages") or []),
         repo_id=repo_id,
         episodes=results["episodes"],
         actions="sampled" if flags.stochastic else "most likely",

@@ -28,7 +28,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.trust import PRESETS, classes, evaluate, import_class
+from sb3_guard.zoo.names import PRESETS, classes, evaluate, import_class
 from sb3_guard.zoo.usage import UsageError, explained, read_mapping
 from sb3_guard.zoo.values import kind_of
 

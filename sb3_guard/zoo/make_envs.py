@@ -16,17 +16,20 @@ from sb3_guard.zoo.resumable import ResumableEnv
 from sb3_guard.zoo.usage import UsageError, explained, interrupts_ignored
 
 
-def _errors_of_ours() -> tuple[type[Exception], type[Exception]]:
+def _errors_of_ours() -> tuple[type[Exception], type[Exception], type[Exception]]:
     """What our environments raise, also where MuJoCo is absent or too old for them."""
     try:
         from sb3_guard.envs.layout import LayoutError
+        from sb3_guard.envs.parameters import PartError
         from sb3_guard.envs.rendering import RenderingError
     except ImportError:
-        return gym.error.DependencyNotInstalled, gym.error.DependencyNotInstalled
-    return LayoutError, RenderingError
+        return (gym.error.DependencyNotInstalled,) * 3
+    return LayoutError, RenderingError, PartError
 
 
 ERRORS_OF_OURS = _errors_of_ours()
+# What ends a training in a line: the message says all that a traceback would, and the remedy.
+BAD_NUMBERS = (FloatingPointError, *ERRORS_OF_OURS)
 # What constructors of environments and models raise when their arguments are wrong.
 BAD_ARGUMENTS = (
     ValueError,
@@ -79,7 +82,10 @@ def canonical_id(env_id: str) -> tuple[str, bool]:
         )
     with explained("--env", ValueError, gym.error.Error):
         ours = find_scenario(env_id) is not None
-        if not ours and not is_safety_gymnasium(env_id) and ":" not in env_id:
+        if not ours and not is_safety_gymnasium(env_id):
+            module, colon, name = env_id.rpartition(":")
+            if colon:
+                raise UsageError(f"--env {env_id}: write --gym-packages {module} --env {name}")
             gym.spec(env_id)
     if ours and not env_id.rpartition("-v")[2].isdigit():
         env_id = f"{env_id}-v0"

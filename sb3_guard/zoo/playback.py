@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +25,7 @@ from sb3_guard.zoo.make_envs import (
     canonical_id,
     make_envs,
 )
+from sb3_guard.zoo.names import packages_flag, require_named
 from sb3_guard.zoo.run_folder import (
     RunFolder,
     folder_name,
@@ -32,7 +33,6 @@ from sb3_guard.zoo.run_folder import (
     latest_run,
     require_writable,
 )
-from sb3_guard.zoo.trust import require_trust
 from sb3_guard.zoo.usage import UsageError, explained, import_packages
 
 VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
@@ -40,13 +40,16 @@ VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said oth
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
 
 
-def find_run(folder: str | Path, algo: str, env_id: str, number: int = 0) -> RunFolder:
+def find_run(
+    folder: str | Path, algo: str, env_id: str, number: int = 0, packages: Sequence[str] = ()
+) -> RunFolder:
     """
     The folder of a run.
 
     :param folder: log folder
     :param env_id: the version may be left out if it is 0
     :param number: of the run; 0: the latest, -1: ``<folder>/<algo>`` itself, as in RL-Zoo
+    :param packages: modules that the environment needs, for the command in the message
     :raises UsageError: there is none; the message lists those that there are
     """
     parent, name = Path(folder) / algo, folder_name(env_id)
@@ -62,7 +65,7 @@ def find_run(folder: str | Path, algo: str, env_id: str, number: int = 0) -> Run
     there = dict.fromkeys(f"{one.parent.name} on {one.name.rpartition('_')[0]}" for one in runs)
     raise UsageError(
         f"there is no run of {algo} on {env_id} in {str(folder)!r}; train one with: "
-        f"python -m sb3_guard.train --algo {algo} --env {env_id}{where}"
+        f"python -m sb3_guard.train --algo {algo} --env {env_id}{where}{packages_flag(packages)}"
         + (f"; or play one of those there: {', '.join(there)}" if there else "")
         + ("; or play the package's own with --pretrained" if ships else "")
     )
@@ -133,12 +136,10 @@ def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
     """
     import_packages(flags.gym_packages)
     folder = PRETRAINED if flags.pretrained else flags.folder
-    run = find_run(folder, flags.algo, flags.env, flags.exp_id)
+    run = find_run(folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
     path, normalizer = find_model(run, flags)
-    packages = [] if flags.gym_packages else run.args().get("gym_packages") or []
+    require_named(run.path, flags.gym_packages, run.args().get("gym_packages") or [])
     values = {**run.hyperparams(), "callback": None}  # nobody calls one here
-    require_trust(run.path, flags.trust, {"gym_packages": packages}, values)
-    import_packages(packages)
     cls = algorithm(flags.algo)
     env_id, ours = canonical_id(flags.env)
     setup = build(check(flags.algo, cls, values))

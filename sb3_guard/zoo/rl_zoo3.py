@@ -22,8 +22,8 @@ from sb3_guard.algorithms import ALGORITHMS
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.zoo.hyperparams import entry, read_file, shipped_file
+from sb3_guard.zoo.names import BASES, classes, evaluate
 from sb3_guard.zoo.spaces import SPACES, rl_zoo_sampler, space_of
-from sb3_guard.zoo.trust import BASES, classes, evaluate
 from sb3_guard.zoo.usage import KeyValues, UsageError, run
 
 # Hyper-parameters that RL-Zoo evaluates where they are text, and the class it knows by a bare name.

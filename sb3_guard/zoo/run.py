@@ -21,13 +21,13 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
 from sb3_guard.common.evaluation import estimate
 from sb3_guard.common.files import replacing
-from sb3_guard.common.monitor import CostMonitor, find_monitor
+from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import (
     Checkpoints,
@@ -42,17 +42,18 @@ from sb3_guard.zoo.hyperparams import Setup, build
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.make_envs import (
     BAD_ARGUMENTS,
-    ERRORS_OF_OURS,
+    BAD_NUMBERS,
     PROCESS_DIED,
     evaluation_seed,
     make_envs,
     seed_rows,
 )
+from sb3_guard.zoo.names import packages_flag
 from sb3_guard.zoo.progress import Epochs
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, is_disk_error, require_writable
 from sb3_guard.zoo.tracking import Tracker
-from sb3_guard.zoo.usage import ForeignError, UsageError, explained, interrupts, one_line
+from sb3_guard.zoo.usage import TrainingStopped, UsageError, explained, interrupts, one_line
 
 
 class Experiment:
@@ -119,14 +120,10 @@ class Experiment:
         vec_env = "dummy" if self.vec_env == "subproc" else self.vec_env
         env = self._make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
         try:
-            with explained(f"{self.flags.env} fails at its first step", *ERRORS_OF_OURS):
+            with explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
                 env.reset()
                 env.action_space.seed(self.flags.seed)
                 info = env.step(np.array([env.action_space.sample()]))[3][0]
-        except Exception as error:
-            self._blame(error, "its first step")
-            with explained(f"{self.flags.env} fails at its first step", ValueError):
-                raise
         finally:
             env.close()
         if not getattr(self.algorithm, "constrained", False):
@@ -242,41 +239,26 @@ class Experiment:
         try:
             return self._train(folder, asked_to_stop, restate)
         except PROCESS_DIED as error:
-            if not self._lost_a_process():
-                raise  # the pipe of somebody else, such as that of standard output
+            print(flush=True)  # fails again if it is the reader of our output that is gone
+            if self.vec_env != "subproc":
+                raise
             raise UsageError(
                 "a process of --vec-env subproc has died, because of an error printed above or for "
-                f"lack of memory; continue with -i {folder.path}"
+                f"lack of memory; continue with {folder.again(self.flags)}"
             ) from error
-        except Exception as error:
-            self._blame(error, f"{self.model.num_timesteps} steps")
-            if isinstance(error, OSError) and is_disk_error(error):
-                what = "standard output" if _stdout_is_full() else str(folder.path)
-                raise UsageError(
-                    f"can't write to {what}: {error.strerror}; what was written before is "
-                    f"intact: make room, then continue with -i {folder.path}"
-                ) from error
-            raise
+        except OSError as error:
+            if not is_disk_error(error):
+                raise
+            raise UsageError(
+                f"can't write to {folder.path}: {error.strerror}; what was written before is "
+                f"intact: make room, then continue with {folder.again(self.flags)}"
+            ) from error
         finally:
             self.close()
-
-    def _blame(self, error: Exception, when: str) -> None:
-        """Raise a :class:`ForeignError` if the environment raised the exception."""
-        if not isinstance(error, UsageError) and from_environment(error):
-            what = f"{self.flags.env} raised {one_line(error)} at {when}; its traceback:"
-            raise ForeignError(what) from error
 
     @property
     def _envs(self) -> list[VecEnv]:
         return [self.env, *([] if self.evaluation is None else [self.evaluation.eval_env])]
-
-    def _lost_a_process(self) -> bool:
-        """Whether a process of the environments has died; a dying one is waited for."""
-        envs = [env.unwrapped for env in self._envs]
-        processes = [one for env in envs if isinstance(env, SubprocVecEnv) for one in env.processes]
-        for one in processes:
-            one.join(timeout=0.2)
-        return any(not one.is_alive() for one in processes)
 
     def close(self) -> None:
         """Release the environments, and let Weights & Biases have what it has not yet."""
@@ -327,7 +309,7 @@ class Experiment:
         began = time.monotonic()
         with interrupts(stop) as received, ExitStack() as last:
             last.callback(epochs.on_training_end)  # leaves the terminal tidy
-            finished = self._learn(callbacks, received)
+            finished = self._learn(callbacks)
         with replacing(folder.model) as file:
             self.model.save(file)
         normalizer = self.model.get_vec_normalize_env()
@@ -342,7 +324,7 @@ class Experiment:
             print(summary(folder, self.flags, result, time.monotonic() - began, finished))
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
-    def _learn(self, callbacks: list[BaseCallback], received: list[int]) -> bool:
+    def _learn(self, callbacks: list[BaseCallback]) -> bool:
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
         interval = self.flags.log_interval
         kwargs: dict[str, Any] = {}
@@ -354,19 +336,11 @@ class Experiment:
             )
         except Interrupted:
             return False
-        except PROCESS_DIED:
-            # SIGTERM to all processes at once, as batch systems send it, ends the environments'
-            # own before the rollout is done; this one may get it last.
-            time.sleep(0.2)
-            if not received:
+        except BAD_NUMBERS as error:
+            if self.flags.verbose > 1:
                 raise
-            return False
-        except (ValueError, FloatingPointError, *ERRORS_OF_OURS) as error:
-            # What an environment or algorithm refuses, e.g. a NaN: its message says it all.
-            if self.flags.verbose > 1 or (self.vec_env != "native" and from_environment(error)):
-                raise
-            raise UsageError(
-                f"training stopped at {self.model.num_timesteps} steps: {one_line(error)[:600]} "
+            raise TrainingStopped(
+                f"training stopped at {self.model.num_timesteps} steps: {one_line(error)} "
                 "(--verbose 2 shows where)"
             ) from error
         return True
@@ -384,27 +358,6 @@ def _check_device(name: str) -> None:
         raise UsageError(
             f"--device {name!r}: torch sees {th.cuda.device_count()} GPUs here; use auto or cpu"
         )
-
-
-def from_environment(error: BaseException) -> bool:
-    """Whether an exception was raised below the monitor: by an environment or its wrappers."""
-    within = {CostMonitor.step_wait.__code__, CostMonitor.reset.__code__}
-    own = CostMonitor.step_wait.__code__.co_filename
-    trace, below = error.__traceback__, False
-    while trace is not None:
-        if below and trace.tb_frame.f_code.co_filename != own:
-            return True
-        below = trace.tb_frame.f_code in within
-        trace = trace.tb_next
-    return False
-
-
-def _stdout_is_full() -> bool:
-    try:
-        print(flush=True)
-    except OSError:
-        return True
-    return False
 
 
 def summary(
@@ -429,11 +382,12 @@ def summary(
         f"  episode cost M_c   {number(result['cost'], 3)}{interval}",
         f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
     ]
+    packages = packages_flag(flags.gym_packages)
     if not finished:
-        lines.append(f"  continue with      -i {folder.path}")
+        lines.append(f"  continue with      {folder.again(flags)}")
     elif (own := folder.path.name[len(folder.name) + 1 :]).isdigit():
         lines.append(
             f"  see the agent      sb3-guard enjoy --algo {flags.algo} --env {flags.env} "
-            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {own}"
+            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {own}{packages}"
         )
     return "\n".join(lines)

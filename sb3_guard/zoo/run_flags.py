@@ -38,7 +38,7 @@ class TrainingFlags(Command):
     env_kwargs: dict[str, Any] | None = flag()
     vec_env: Literal["native", "dummy", "subproc"] | None = flag(role=IDENTITY)
     device: str = flag(default="auto", role=IDENTITY)
-    gym_packages: list[str] = flag(default=[], metavar="MODULE")
+    gym_packages: list[str] = flag(default=[], metavar="MODULE", role=HOST)
 
 
 @dataclass

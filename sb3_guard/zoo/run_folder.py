@@ -5,6 +5,7 @@ import glob
 import json
 import math
 import os
+import shlex
 import socket
 import sys
 import tempfile
@@ -19,6 +20,7 @@ from filelock import SoftFileLease, Timeout
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.flags import IDENTITY
+from sb3_guard.zoo.names import packages_flag
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.usage import UsageError, explained, one_line, read_mapping
 
@@ -223,6 +225,10 @@ class RunFolder:
     def hyperparams(self) -> dict[str, Any]:
         """The hyper-parameters the run was started with."""
         return read_data(self.params / "config.yml")
+
+    def again(self, flags: RunFlags) -> str:
+        """The flags of ``train`` that continue the run, for messages."""
+        return f"-i {shlex.quote(str(self.path))}{packages_flag(flags.gym_packages)}"
 
     def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
         """Replace what :meth:`create` wrote, e.g. to make a finished run longer."""

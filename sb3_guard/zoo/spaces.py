@@ -23,7 +23,7 @@ from optuna.samplers import BaseSampler, GPSampler, NSGAIISampler, RandomSampler
 
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.hyperparams import NOISE_KEYS, RUN_KEYS, parameters
-from sb3_guard.zoo.trust import evaluate
+from sb3_guard.zoo.names import evaluate
 from sb3_guard.zoo.usage import UsageError, explained, read_mapping
 
 Space = Mapping[str, Any]

@@ -14,10 +14,10 @@ from sb3_guard.zoo.checkpoint import is_checkpoint, read_checkpoint, restore_log
 from sb3_guard.zoo.flags import HOST, IDENTITY
 from sb3_guard.zoo.hyperparams import check, read_hyperparams
 from sb3_guard.zoo.make_envs import canonical_id
+from sb3_guard.zoo.names import require_named
 from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder, is_run, lock, plain, run_path
-from sb3_guard.zoo.trust import require_trust
 from sb3_guard.zoo.usage import UsageError, explained, import_packages
 
 
@@ -150,21 +150,19 @@ def continues_run(agent: str) -> bool:
     return False
 
 
-def resume(given: RunFlags, trusted: bool = False) -> int:
+def resume(given: RunFlags) -> int:
     """
     Continue a run in its folder.
 
     :param given: the flags given now; ``trained_agent`` is the run's folder or checkpoint
-    :param trusted: code that the folder names may run, whoever wrote it
     :return: exit status
     :raises UsageError: the run can't be continued, or a flag contradicts what it is
     """
     folder = RunFolder.open(given.trained_agent)
     with lock(folder.path):
         flags, values = folder.flags(), folder.hyperparams()
-        named = {name: getattr(flags, name) for name in ("env", "gym_packages")}
-        require_trust(folder.path, trusted, named, values)
-        import_packages(flags.gym_packages)
+        require_named(folder.path, given.gym_packages, flags.gym_packages)
+        import_packages(given.gym_packages)
         _refuse(differences(*_compared(given, flags, values, folder)), f"when {folder.path} began")
         for name in {*(given.given & RunFlags.names(HOST)), "progress"}:
             setattr(flags, name, getattr(given, name))

@@ -9,7 +9,6 @@ import re
 import signal
 import sys
 import threading
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,9 +26,13 @@ LONGEST = 500  # characters of an error that are printed
 class UsageError(Exception):
     """Something the user can put right; the message names the value, what is allowed, the fix."""
 
+    status = 2  # the exit status of the command
 
-class ForeignError(UsageError):
-    """Code of the user's raised its cause, whose traceback is printed below the message."""
+
+class TrainingStopped(UsageError):
+    """A reward, cost, observation or loss is not a number, or an episode can't begin."""
+
+    status = 1
 
 
 def one_line(error: BaseException) -> str:
@@ -121,7 +124,7 @@ def run(command: Callable[[], int]) -> int:
     Run a command and turn what the user can put right into one line on stderr.
 
     :return: the exit status: the command's own, 130 for Ctrl-C, 141 if nobody reads its output any
-        longer (``| head``), 2 for a :class:`UsageError` or a package that does not import
+        longer (``| head``), that of a :class:`UsageError`, 2 for a package that does not import
     """
     # OpenMP's idle threads spin by default: on a machine shared with other work, torch's threads
     # then wait for one another's time slices and training is ten times slower. Read when torch is
@@ -135,6 +138,12 @@ def run(command: Callable[[], int]) -> int:
         sys.stdout.flush()
         return status
     except BrokenPipeError:
+        try:
+            print(flush=True)
+        except BrokenPipeError:
+            pass
+        else:
+            raise  # some other pipe, such as one of an environment
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         return 141
     except (UsageError, ImportError, OSError) as error:
@@ -143,9 +152,7 @@ def run(command: Callable[[], int]) -> int:
             raise
         text = one_line(error)
         print(f"error: {text if len(text) <= LONGEST else text[:LONGEST] + ' …'}", file=sys.stderr)
-        if isinstance(error, ForeignError):
-            traceback.print_exception(error.__cause__)
-        return 2
+        return getattr(error, "status", 2)
     except KeyboardInterrupt:
         return 130
 

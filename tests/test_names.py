@@ -1,15 +1,17 @@
 """Data never runs: hostile files and values try to write a file, and none appears."""
 
+import shlex
 import sys
 from pathlib import Path
 
 import pytest
 import yaml
 from cost_envs import CostPoint
-from test_commands import TOY, trained
+from test_bad_input import refused
+from test_commands import SMALL, TOY, trained
 
 from sb3_guard import CPO, benchmark, enjoy, train
-from sb3_guard.zoo import rl_zoo3
+from sb3_guard.zoo import grid, rl_zoo3
 from sb3_guard.zoo.hyperparams import build
 from sb3_guard.zoo.usage import UsageError
 from sb3_guard.zoo.values import parse_value
@@ -31,7 +33,8 @@ def trap(tmp_path, monkeypatch):
         f"open({str(path)!r}, 'w')\nhyperparams = {{'default': {{}}}}\n"
     )
     yield path
-    sys.modules.pop("hostile", None)
+    for name in ("hostile", "unittest.__main__"):
+        sys.modules.pop(name, None)
 
 
 def test_values_are_read_not_evaluated(trap):
@@ -41,23 +44,38 @@ def test_values_are_read_not_evaluated(trap):
 
 
 @pytest.mark.parametrize(
-    "entry",
+    ("entry", "message"),
     [
-        {"hyperparams": [f"policy_kwargs:{ESCAPE}"]},
-        {"env_kwargs": {"a": ESCAPE}},
-        {"gym_packages": ["hostile"]},
-        {"conf_file": "hostile.py"},
-        {"conf_file": "hostile"},
-        {"suites": ["hostile:X-v0"]},
-        {"hyperparams": {"env_wrapper": "hostile.Wrapper"}},
-        {"hyperparams": {"policy": "hostile.Policy"}},
+        ({"hyperparams": [f"policy_kwargs:{ESCAPE}"]}, "can't be evaluated"),
+        ({"env_kwargs": {"a": ESCAPE}}, "unknown"),
+        ({"gym_packages": ["hostile"]}, "then add --gym-packages hostile"),
+        ({"gym_packages": ["unittest.__main__"]}, "then add --gym-packages unittest.__main__"),
+        ({"conf_file": "hostile.py"}, "then add -conf hostile.py"),
+        ({"conf_file": "hostile"}, "then add -conf hostile"),
+        ({"suites": ["hostile:X-v0"]}, "write --gym-packages hostile --env X-v0"),
+        ({"hyperparams": {"env_wrapper": "hostile.Wrapper"}}, "add --gym-packages hostile"),
+        ({"hyperparams": {"policy": "hostile.Policy"}}, "add --gym-packages hostile"),
     ],
 )
-def test_a_grid_file_runs_nothing(tmp_path, trap, entry):
+def test_a_grid_file_runs_nothing(tmp_path, trap, entry, message, capsys):
     text = yaml.safe_dump({"suites": ["Goal_Point_8Hazards"], "algos": ["cpo"], **entry})
     (tmp_path / "grid.yml").write_text(text.replace("{}", str(trap)))
-    benchmark.main(["--grid", str(tmp_path / "grid.yml"), "--dry-run", "-f", str(tmp_path / "g")])
-    assert not trap.exists()
+    refused(benchmark.main, ["--grid", "grid.yml", "-f", "grid"], capsys, message)
+    assert not trap.exists() and "unittest.__main__" not in sys.modules
+
+
+def test_a_grid_goes_on_by_the_command_it_prints(tmp_path, capsys, monkeypatch):
+    """Its environment and its -conf file are programs, which the folder's record only names."""
+    (tmp_path / "mine.py").write_text("hyperparams = {'default': {'n_timesteps': 100}}\n")
+    monkeypatch.chdir(tmp_path)
+    said = []
+    monkeypatch.setattr(grid, "run_grid", lambda runs, folder, again, *_: said.append(again) or 0)
+    start = ["--suites", "CostPoint-v0", "--algos", "cpo", "-f", "a grid", "-conf", "mine.py"]
+    assert benchmark.main([*start, "--gym-packages", "registered_envs"]) == 0
+    command = shlex.split(said[0])
+    assert command[:5] == ["continue", "with:", "sb3-guard", "benchmark", "-f"]
+    assert benchmark.main([*command[4:], "--dry-run"]) == 0
+    assert "0 of 2 done" in capsys.readouterr().out
 
 
 @pytest.fixture
@@ -73,24 +91,35 @@ def enter(run, file, **entries):
 
 def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
     play = ["--algo", "cpo", *TOY, "-f", str(tmp_path / "logs"), "--no-render", "--n-episodes", "1"]
-    go_on = ["-i", str(run), "-n", "240", "--verbose", "0"]
+    go_on = ["-i", str(run), *TOY[:2], "-n", "240", "--verbose", "0"]
     popen = {"subprocess.Popen": {"args": f"touch {trap}", "shell": True}}
     enter(run, "config.yml", callback=[popen])
     assert enjoy.main(play) == 0  # nobody calls a callback there
-    assert train.main(go_on) == 2
-    assert "callback: subprocess.Popen" in capsys.readouterr().err
-    assert train.main([*go_on, "--trust"]) == 2  # trusted, but not what was trained
-    assert "contradicts none of the training so far" in capsys.readouterr().err
+    refused(train.main, go_on, capsys, "contradicts none of the training so far")
     enter(run, "config.yml", callback=None, env_wrapper="hostile.Wrapper")
-    assert (enjoy.main(play), train.main(go_on)) == (2, 2)
+    refused(enjoy.main, play, capsys, "add --gym-packages hostile")
+    refused(train.main, go_on, capsys, "contradicts none of the training so far")
     enter(run, "config.yml", env_wrapper=None)
     enter(run, "args.yml", gym_packages=["hostile"])
     without = [word for word in play if word not in TOY[:2]]
-    assert (enjoy.main(without), train.main(go_on)) == (2, 2)
-    assert capsys.readouterr().err.count("--trust") == 4
+    refused(enjoy.main, without, capsys, f"{run} needs modules", "add --gym-packages hostile")
+    refused(train.main, [*go_on[:2], "-n", "240"], capsys, "then add --gym-packages hostile")
     assert not trap.exists()
-    enjoy.main([*without, "--trust"])
+    enjoy.main([*without, "--gym-packages", "hostile"])
     assert trap.exists()
+
+
+def test_printed_commands_name_the_modules(tmp_path, capsys):
+    assert train.main([*TOY, *SMALL, "-n", "120", "-f", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in lines if "see the agent" in line]
+    command = shlex.split(line.partition("see the agent")[2])
+    assert command[:2] == ["sb3-guard", "enjoy"]
+    assert command[-2:] == ["--gym-packages", "registered_envs"]
+    assert enjoy.main([*command[2:], "--no-render", "--n-episodes", "1"]) == 0
+    (run,) = (tmp_path / "cpo").iterdir()
+    refused(train.main, ["-i", str(run), "-n", "180"], capsys, "add --gym-packages registered_envs")
+    assert train.main(["-i", str(run), "-n", "180", *command[-2:]]) == 0
 
 
 @pytest.mark.parametrize(

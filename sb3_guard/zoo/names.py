@@ -1,16 +1,15 @@
-"""Code that data names: classes are checked before they are called, strangers need ``--trust``.
+"""The classes that data names: looked up, and checked before anyone calls them.
 
-Hyper-parameters and flags are data that name code: wrappers, callbacks, policies, modules that
-register environments. On a command line, and in a file that it names, that is what the user asks
-for. In the files of a run or a grid, which may come from anybody, only classes of this package,
-RL-Zoo, Stable-Baselines3 and what they stand on are used; any other needs ``--trust``.
+Hyper-parameters name wrappers, callbacks and policies. A module runs code when it is imported, so a
+file may name classes of :data:`KNOWN` packages only, and of modules that the command line names
+(``--gym-packages``), which are imported by then.
 """
 
 import importlib
 import operator
-import os
-from collections.abc import Iterator, Mapping
-from importlib.machinery import PathFinder
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,9 +57,15 @@ def import_class(name: str, path: str, base: type) -> Any:
 
     :param name: the hyper-parameter, for the message
     :param base: what it must be a subclass of
-    :raises UsageError: there is no such class, or it is another kind of thing
+    :raises UsageError: there is no such class, it is another kind of thing, or its module is not
+        imported yet and of none of the :data:`KNOWN` packages
     """
     module, _, attribute = path.rpartition(".")
+    if module and module.partition(".")[0] not in KNOWN and module not in sys.modules:
+        raise UsageError(
+            f"{name}: {path!r} is not of {', '.join(sorted(KNOWN))}, nor of a module that the "
+            f"command line names; add --gym-packages {module}"
+        )
     with explained(f"{name}: there is no class {path!r}"):
         found = getattr(importlib.import_module(module), attribute)
     if not (isinstance(found, type) and issubclass(found, base)):
@@ -109,49 +114,29 @@ def evaluate(name: str, text: str) -> Any:
         return read_expression(text, torch_class)
 
 
-def _foreign(args: Mapping[str, Any], values: Mapping[str, Any]) -> Iterator[str]:
-    for module in args.get("gym_packages") or []:
-        if _in_current_folder(str(module)):
-            yield f"gym_packages: {module}"
-    envs = args.get("suites") or [args.get("env")]
-    for env_id in envs if isinstance(envs, list) else [envs]:
-        module, colon, _ = str(env_id or "").partition(":")
-        if colon and _in_current_folder(module):
-            yield f"env: {env_id}"
-    file = args.get("conf_file")
-    if file and file not in PRESETS and not str(file).endswith((".yml", ".yaml")):
-        yield f"conf_file: {file}"
-    for name, value in values.items():
-        paths = []
-        if name in BASES:
-            paths = [path for path, _ in entries(name, value)]
-        elif isinstance(value, str) and (name == "policy" or name.endswith("_class")):
-            paths = [value] if "." in value else []
-        yield from (f"{name}: {one}" for one in paths if one.split(".")[0] not in KNOWN)
-
-
-def _in_current_folder(module: str) -> bool:
-    """Whether a module comes from the current folder; found without importing anything."""
-    root = module.split(".")[0]
-    return root not in KNOWN and PathFinder.find_spec(root, [os.getcwd()]) is not None
-
-
-def require_trust(
-    where: Path, trusted: bool, args: Mapping[str, Any], values: Mapping[str, Any]
-) -> None:
+def require_named(where: Path, named: Sequence[str], modules: Sequence[str]) -> None:
     """
-    Refuse files that name code of strangers, before any of it is imported.
+    Refuse modules that only a file names, before any of them is imported.
 
-    :param where: the folder or file they were read from
-    :param trusted: ``--trust`` is given
-    :param args: flags that were read there
-    :param values: hyper-parameters that were read there
-    :raises UsageError: they name other code than that of :data:`KNOWN` packages
+    :param where: the folder or file
+    :param named: the modules that the command line names, which replace the file's
+    :param modules: those that the file names
+    :raises UsageError: the command line names none of them
     """
-    if trusted:
-        return
-    found = list(_foreign(args, values))
-    if found:
+    if modules and not named:
         raise UsageError(
-            f"{where} names code to run ({'; '.join(found[:3])}); look at it, then add --trust"
+            f"{where} needs modules, which only the command line may name; look at them, then add"
+            + packages_flag(modules)
         )
+
+
+def is_program(conf_file: str | None) -> bool:
+    """Whether ``-conf`` has a Python file or module run, rather than a YAML file read."""
+    return bool(conf_file) and not (
+        conf_file in PRESETS or str(conf_file).endswith((".yml", ".yaml"))
+    )
+
+
+def packages_flag(modules: Sequence[str]) -> str:
+    """The flag that names modules, for a command that is printed; empty: there are none."""
+    return f" --gym-packages {shlex.join(map(str, modules))}" if modules else ""

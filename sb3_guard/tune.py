@@ -8,9 +8,10 @@ from sb3_guard.zoo.tune_flags import TuneFlags
 
 
 def _tune(flags: TuneFlags) -> int:
+    flags = flags.completed()
     flags.check()
-    if flags.n_jobs > 1:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported, below
+    # Read when torch is imported, below.
+    os.environ.setdefault("OMP_NUM_THREADS", str(flags.num_threads))
 
     from sb3_guard.zoo.tuning import tune
 

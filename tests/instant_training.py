@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_guard.algorithms import TRPOLag
+from sb3_guard.zoo import studies
 
 STEPS = 10
 
@@ -43,6 +44,7 @@ def learn(self: TRPOLag, total_timesteps: int, callback: Any = None, **_: Any) -
     return self
 
 
+studies.HEARTBEAT, studies.GRACE = 1, 3  # seconds: a silence is soon a long one
 TRPOLag.learn = learn  # type: ignore[method-assign, assignment]
 if "Still-v0" not in gym.registry:
     gym.register("Still-v0", entry_point="instant_training:Still")

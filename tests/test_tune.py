@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections import Counter
@@ -463,7 +464,7 @@ def test_a_seeded_search_is_the_same_again(tmp_path, monkeypatch):
 def test_no_trial_is_lost_whatever_is_killed(tmp_path):
     """`python scripts/kill_tuner.py` does the same for longer."""
     study = campaign(str(tmp_path / "journal"), tmp_path, n_trials=12, n_workers=3, kills=6)
-    assert faults(study, 12) == []
+    assert faults(study, 12, n_workers=3) == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -480,12 +481,13 @@ def test_an_interrupted_trial_is_done_later(tmp_path, folder, monkeypatch, capsy
     command = ["--n-trials", "2", "--seeds", "0", "1"]
     assert run(tmp_path, *command) == 128 + number
     out, err = capsys.readouterr()
-    assert "The same command continues the study." in out and "Stopping" in err
+    again = out.split("continue with python -m sb3_guard.tune ")[1].splitlines()[0].split()
+    assert "Stopping" in err
     assert "Traceback" not in out + err
-    assert states(folder) == {"FAIL": 1}
+    assert states(folder) == {"FAIL": 1, "WAITING": 1}
     trained = []
     pretend(monkeypatch, lambda values, seed: trained.append(seed) or (1.0, 0.0))
-    assert run(tmp_path, *command) == 0
+    assert tune.main(again) == 0
     assert states(folder) == {"FAIL": 1, "COMPLETE": 2}
     before, again, _ = study_in(folder).trials
     assert again.params == before.params
@@ -521,52 +523,57 @@ def test_a_killed_workers_trial_is_done_at_the_next_start(tmp_path, folder, monk
     assert run(tmp_path, *command) == 0
     assert states(folder) == {"FAIL": 1, "COMPLETE": 1}
     assert study_in(folder).trials[1].params["target_kl"] == SHIPPED_KL
-    left = {path.name for path in (folder / "study.journal.locks").iterdir()}
-    assert left == {"claim", "journal"}  # none of trials
 
 
-def shared(path: Path, n_trials: int = 1) -> studies.Study:
-    storage = studies.Journal(path)
-    optuna.create_study(study_name="x", storage=storage, load_if_exists=True)
-    return studies.Study("x", storage, n_trials)
+def begun(tmp_path, worker: str | None, **attributes) -> optuna.Study:
+    """A study of which a worker has begun a trial, whose hyperparameters are drawn."""
+    storage, _ = studies.open_storage(None, tmp_path / "study.journal")
+    study = optuna.create_study(storage=storage)
+    trial = study.ask()
+    trial.suggest_float("x", 0.0, 1.0)
+    for name, value in attributes.items():
+        trial.set_user_attr(name, value)
+    if worker:
+        trial.set_user_attr("worker", worker)
+    studies.repeat_lost_trials(study, storage)
+    return study
 
 
-def lose(study: studies.Study) -> None:
-    """Take a trial, as a worker that dies does."""
-    study._thread_local.in_optimize_loop = True
-    study.ask()
-    study.shared.close()  # the operating system would
-    optuna.storages.fail_stale_trials(study)
+def gone() -> int:
+    """The number of a process that has ended."""
+    process = subprocess.Popen(["true"])
+    process.wait()
+    return process.pid
+
+
+def test_the_trial_of_a_dead_worker_is_queued_with_what_is_done(tmp_path):
+    study = begun(tmp_path, f"{socket.gethostname()}-{gone()}", seed_0=[1.0])
+    lost, again = study.trials
+    assert (lost.state, again.state) == (TrialState.FAIL, TrialState.WAITING)
+    assert again.params == lost.params and again.user_attrs == {"seed_0": [1.0]}
+
+
+def test_other_trials_are_left_to_their_workers(tmp_path):
+    alive = f"{socket.gethostname()}-{os.getppid()}"
+    for number, worker in enumerate([alive, f"elsewhere-{gone()}", None]):
+        (trial,) = begun(tmp_path / str(number), worker).trials
+        assert trial.state == TrialState.RUNNING
+
+
+def test_a_worker_that_never_said_who_it_is_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "GRACE", -1)
+    assert [trial.state.name for trial in begun(tmp_path, None).trials] == ["FAIL", "WAITING"]
 
 
 def test_trials_that_kill_their_workers_are_given_up(tmp_path):
-    study = shared(tmp_path / "study.journal")
+    study, worker = None, f"{socket.gethostname()}-{gone()}"
+    storage, _ = studies.open_storage(None, tmp_path / "study.journal")
+    study = optuna.create_study(storage=storage)
     for _ in range(studies.MOST_REPEATS + 2):
-        lose(study)
-    histories = [one.system_attrs.get("retry_history", []) for one in study.trials]
-    assert histories == [[], [0], [0, 1], [0, 1, 2], []]
-
-
-def test_a_trial_is_not_lost_between_failing_and_queueing(tmp_path):
-    """Whoever found that its worker is gone dies before it queues the trial again."""
-    study = shared(tmp_path / "study.journal")
-    lose(study)
-    assert [one.state.name for one in study.trials] == ["FAIL"]
-    for _ in range(2):
-        study._repeat_lost_trials()
-    assert [one.state.name for one in study.trials] == ["FAIL", "WAITING"]
-
-
-def test_a_trial_is_taken_once(tmp_path):
-    """Another worker finds nothing to take, and nothing lost, while one works on the last."""
-    one, other = (shared(tmp_path / "study.journal", 1) for _ in range(2))
-    one._thread_local.in_optimize_loop = True
-    one.ask()
-    optuna.storages.fail_stale_trials(other)
-    with pytest.raises(studies.NoneLeft) as none:
-        other.ask()
-    assert none.value.running == 1
-    assert [t.state for t in one.trials] == [TrialState.RUNNING]
+        study.ask().set_user_attr("worker", worker)
+        studies.repeat_lost_trials(study, storage)
+    histories = [trial.system_attrs.get("retry_history", []) for trial in study.trials]
+    assert histories == [[], [0], [0, 1], [0, 1, 2], [], [4]]
 
 
 def test_a_cut_line_of_the_journal_is_mended(tmp_path, folder, monkeypatch):
@@ -609,8 +616,11 @@ def test_a_trial_given_to_another_is_left_to_it(tmp_path, folder, monkeypatch, c
         return by_kl(values, seed)
 
     pretend(monkeypatch, outcome)
+    refused(
+        lambda argv: run(tmp_path, *argv), ["--n-trials", "2"], capsys,
+        "was given to another; the same command joins the study again",
+    )  # fmt: skip
     assert run(tmp_path, "--n-trials", "2") == 0
-    assert "taken for lost" in capsys.readouterr().out
     assert states(folder) == {"FAIL": 1, "COMPLETE": 2}
 
 
@@ -662,7 +672,7 @@ WRONG = [
     (["--seeds", "1", "--n-seeds", "2"], ["--n-seeds", "--seeds"]),
     (["--n-evaluations", "500"], ["--n-evaluations 500", "240 steps"]),
     (["--storage", "redis://here"], ["--storage redis://here", "must be postgresql://"]),
-    (["--storage-timeout", "-1"], ["--storage-timeout", "-1", "at least 0"]),
+    (["--num-threads", "0"], ["--num-threads", "at least 1"]),
     (["--search-space", "absent.yml"], ["--search-space", "absent.yml"]),
     (["--trials", "3"], ["unknown flag --trials", "did you mean"]),
     (["-f", "/proc/nowhere"], ["-f", "'/proc/nowhere"]),
@@ -696,6 +706,20 @@ def test_a_study_is_continued_as_it_was_begun(tmp_path, folder, monkeypatch, cap
     assert states(folder) == {"COMPLETE": 1}
 
 
+def test_a_study_is_continued_from_its_folder(tmp_path, folder, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--n-trials", "1", "--seeds", "2", "5", "--cost-limit", "1") == 0
+    moved = (tmp_path / "logs").mkdir() or (tmp_path / "trpo_lag").rename(
+        tmp_path / "logs/trpo_lag"
+    )
+    more = ["--gym-packages", "registered_envs", "--n-trials", "3"]
+    assert tune.main(["-i", str(moved / folder.name), *more]) == 0
+    assert states(moved / folder.name) == {"COMPLETE": 3}
+    for trial in study_in(moved / folder.name).trials:
+        assert {"seed 2", "seed 5"} <= trial.user_attrs.keys()
+    refused(tune.main, ["-i", str(tmp_path)], capsys, "no study.yml", str(tmp_path))
+
+
 JOURNAL = b'{"op_code":0,"worker_id":"a","study_name":"x","directions":[2]}\n'
 
 
@@ -705,15 +729,14 @@ JOURNAL = b'{"op_code":0,"worker_id":"a","study_name":"x","directions":[2]}\n'
         b"PK\x03\x04 a model\nthat ends without a line break",
         b"one line of text",
         b"{}\n",
-        JOURNAL + b"text",
-        JOURNAL + b'{"op_code":4,\n' + JOURNAL + b'{"op_code":8,"wor',
+        JOURNAL + b'{"op_code":4,\n' + JOURNAL,
     ],
 )
 def test_files_that_are_no_studies_are_left_alone(tmp_path, content):
     path = tmp_path / "file"
     path.write_bytes(content)
     with pytest.raises(UsageError, match="not a study"):
-        studies.Journal(path)
+        studies.open_storage(str(path), tmp_path)
     assert path.read_bytes() == content
     assert list(tmp_path.iterdir()) == [path]
 
@@ -779,4 +802,4 @@ def test_several_processes_stop_together(tmp_path, folder, number):
         assert first.returncode == -number
     else:
         assert first.returncode == 128 + number
-        assert states(folder) == {"FAIL": 2}
+        assert states(folder) == {"FAIL": 2, "WAITING": 2}

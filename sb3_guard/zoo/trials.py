@@ -26,7 +26,7 @@ from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.spaces import Search
 from sb3_guard.zoo.start import differences
-from sb3_guard.zoo.studies import STOPPED
+from sb3_guard.zoo.studies import WORKER, repeat
 from sb3_guard.zoo.tune_flags import TuneFlags
 from sb3_guard.zoo.tuning_report import short
 from sb3_guard.zoo.usage import UsageError, one_line
@@ -161,6 +161,7 @@ class Objective:
         self.flags, self.training = flags, training
         self.settings, self.search = settings, search
         self.stop = False
+        self.taken = False  # the trial under way was given to another worker
         self.failures = 0  # in a row
         self._said = 0.0
 
@@ -178,13 +179,16 @@ class Objective:
         :raises Stopped: it is to be done again
         """
         self._said = time.monotonic()
-        trial.set_user_attr("worker", f"{socket.gethostname()}-{os.getpid()}")
+        trial.set_user_attr(WORKER, f"{socket.gethostname()}-{os.getpid()}")
         try:
             mean = self._train_seeds(trial)
-        except (TrialPruned, UpdateFinishedTrialError):
+        except TrialPruned:
             raise
-        except Stopped:
-            trial.set_user_attr(STOPPED, trial.user_attrs.get(STOPPED, 0) + 1)
+        except UpdateFinishedTrialError:
+            self.taken = True
+            raise
+        except (Stopped, KeyboardInterrupt):
+            repeat(trial.study, trial.study.trials[trial.number], most=None)
             raise
         except FAILURES as error:
             if self.flags.verbose > 1:

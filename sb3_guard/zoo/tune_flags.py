@@ -1,11 +1,20 @@
-"""The flags of tuning."""
+"""The flags of tuning, and those that a study's folder remembers."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 from sb3_guard.zoo.flags import flag
 from sb3_guard.zoo.run_flags import TrainingFlags
-from sb3_guard.zoo.usage import UsageError, amount, count, positive, seed_number, seed_or_random
+from sb3_guard.zoo.usage import (
+    UsageError,
+    amount,
+    count,
+    positive,
+    read_mapping,
+    seed_number,
+    seed_or_random,
+)
 
 EXAMPLES = """examples:
   python -m sb3_guard.tune --algo trpo_lag --env Goal_Point_8Hazards --n-trials 50 -n 1e6
@@ -15,8 +24,13 @@ EXAMPLES = """examples:
   python -m sb3_guard.tune ... --storage postgresql://me:secret@server/studies
 
 The same command continues a study that was stopped, and joins one that runs: --n-trials counts the
-trials of the study, not of the process.
+trials of the study, not of the process. So does its folder:
+
+  python -m sb3_guard.tune -i logs/cpo/Goal_Point_8Hazards-v0_tune --n-trials 100
 """
+# The file of a study's folder that `-i` reads; flags that it does not state.
+RECORD = "study.yml"
+HOW = ("resume", "log_folder", "gym_packages", "verbose")
 
 
 @dataclass
@@ -47,16 +61,13 @@ class TuneFlags(TrainingFlags):
 
     Storage and workers:
 
+    :param resume: folder of a study to continue or to join, with the flags that it was begun with
     :param log_folder: where studies go (default: logs)
     :param study_name: to have several studies (default: <algo>_<env>)
     :param storage: postgresql://… for workers on many machines, or a journal file (default: a
         journal file in the study's folder, for one machine)
-    :param heartbeat: seconds between signs of life in PostgreSQL; a worker silent for three times
-        as long loses its trial to another (default: 60)
-    :param storage_timeout: seconds to wait for a PostgreSQL server that is down (default: 300)
     :param n_jobs: processes that work on it (default: 1)
-    :param num_threads: threads of torch and of the native engine (default: their own choice, or 1
-        if there are several processes)
+    :param num_threads: threads of torch and of the native engine in each process (default: 1)
     :param verbose: 0 nothing, 1 progress, 2 with tracebacks (default: 1)
     """
 
@@ -79,13 +90,12 @@ class TuneFlags(TrainingFlags):
     n_evaluations: int | None = flag(kind=positive, metavar="N")
     eval_episodes: int = flag(default=5, kind=positive, metavar="N")
 
+    resume: str | None = flag("-i", metavar="FOLDER")
     log_folder: str = flag("-f", default="logs", metavar="DIR")
     study_name: str | None = flag(metavar="NAME")
     storage: str | None = flag(metavar="URL")
-    heartbeat: int = flag(default=60, kind=positive, metavar="S")
-    storage_timeout: float = flag(default=300.0, kind=amount, metavar="S")
     n_jobs: int = flag(default=1, kind=positive, metavar="N")
-    num_threads: int = flag(default=-1, metavar="N")
+    num_threads: int = flag(default=1, kind=positive, metavar="N")
     verbose: Literal[0, 1, 2] = flag(default=1)
 
     def check(self) -> None:
@@ -100,5 +110,29 @@ class TuneFlags(TrainingFlags):
             raise UsageError(f"--seeds {' '.join(map(str, self.seeds))}: a seed is given twice")
         if self.pareto and self.pruner != "none" and "pruner" in self.given:
             raise UsageError("--pruner: there is no pruning with --pareto; leave it out")
-        if self.n_jobs > 1 and self.num_threads < 0:
-            self.num_threads = 1
+
+    def recorded(self) -> dict[str, Any] | None:
+        """The flags for the study's folder; None for a database, whose address has a password."""
+        if self.storage is not None and "://" in self.storage:
+            return None
+        return {name: getattr(self, name) for name in sorted(self.given - {*HOW})}
+
+    def completed(self) -> "TuneFlags":
+        """
+        The flags completed by those that the study to continue was begun with.
+
+        :raises UsageError: there is no such study
+        """
+        if self.resume is None:
+            return self
+        folder = Path(self.resume).absolute()
+        path = folder / RECORD
+        if not path.is_file():
+            raise UsageError(
+                f"-i: {self.resume} has no {RECORD}, so it is not the folder of a study in a "
+                "journal file; the command that began a study continues it"
+            )
+        filed = TuneFlags.read(read_mapping(path, "the study's file", "flags to values"), path, HOW)
+        given = {name: getattr(filed, name) for name in filed.given}
+        given |= {name: getattr(self, name) for name in self.given - {"resume"}}
+        return TuneFlags.of({**given, "log_folder": str(folder.parent.parent)})

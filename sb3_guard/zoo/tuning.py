@@ -1,51 +1,43 @@
-"""Tuning: the hyper-parameters with the highest return whose agents keep the cost limit.
+"""Tuning: the hyperparameters with the highest return whose agents keep the cost limit.
 
 Between two trials the feasible one is better, then the higher return, then the smaller violation.
-What is ours is the objective (:mod:`sb3_guard.zoo.trials`), the search space and the report;
-samplers, pruners and storages are Optuna's (:mod:`sb3_guard.zoo.studies` adds what that leaves
-open).
+The package adds the objective (:mod:`sb3_guard.zoo.trials`), the search space and the report;
+``study.optimize``, samplers, pruners and storages are Optuna's.
 """
 
 import multiprocessing
-import signal
 import sys
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
 import optuna
+import yaml
 from optuna.exceptions import ExperimentalWarning, UpdateFinishedTrialError
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
-from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial
+from optuna.storages import RDBStorage
+from optuna.study import MaxTrialsCallback, StudyDirection
+from optuna.trial import FrozenTrial, TrialState
 
-from sb3_guard.zoo import start
+from sb3_guard.zoo import start, studies
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.hyperparams import check, read_hyperparams
 from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import folder_name, is_disk_error, require_writable
 from sb3_guard.zoo.spaces import SAMPLERS, Search, read_space
-from sb3_guard.zoo.studies import (
-    FINISHED,
-    NoneLeft,
-    Outage,
-    Storage,
-    StorageLost,
-    Study,
-    open_storage,
-)
+from sb3_guard.zoo.studies import Storage, open_storage, repeat_lost_trials
 from sb3_guard.zoo.trials import GIVEN, Objective, Settings, Stopped
-from sb3_guard.zoo.tune_flags import TuneFlags
-from sb3_guard.zoo.tuning_report import Report, short
+from sb3_guard.zoo.tune_flags import RECORD, TuneFlags
+from sb3_guard.zoo.tuning_report import FINISHED, Report, short
 from sb3_guard.zoo.usage import UsageError, interrupts, interrupts_ignored, run
 
-MOST_FAILURES = 3  # in a row, until it is not the hyper-parameters' fault
-POLL = 1.0  # seconds between two looks at what other workers do
+MOST_FAILURES = 3  # in a row, until it is not the hyperparameters' fault
 SETTINGS = "settings"
 
 
@@ -106,101 +98,114 @@ def _pruner(flags: TuneFlags, settings: Settings) -> BasePruner:
     return MedianPruner(n_startup_trials=flags.n_startup_trials, n_warmup_steps=warmup)
 
 
-def _begin(
-    study: Study, settings: Settings, search: Search, directions: list[StudyDirection]
-) -> bool:
-    """Write down what the study is, and its first trial, if nobody has; whether somebody had."""
-    saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
-    if saved is not None:
-        settings.refuse_others(saved, study.study_name)
-    elif begun or study.directions != directions:
-        raise UsageError(
-            f"{study.shared.shown} has a study {study.study_name!r} that is not one of "
-            "sb3_guard's; choose another --study-name"
-        )
-    else:
-        # First of all: a worker may die after any of these lines, and the next one continues.
-        study.set_user_attr(SETTINGS, asdict(settings))
-    if not begun:
-        # So that the best is never worse than where one came from.
-        first = search.first()
-        study.enqueue_trial(first, user_attrs={GIVEN: bool(first)})
-    return begun
-
-
 def open_study(
-    flags: TuneFlags, settings: Settings, search: Search, name: str, storage: Storage
-) -> Study:
+    flags: TuneFlags, settings: Settings, search: Search, name: str, storage: Storage, shown: str
+) -> optuna.Study:
     """
     Begin the study, or join it.
 
+    :param shown: address of the storage, for the message
     :raises UsageError: it was begun with other settings
     """
     directions = [StudyDirection.MAXIMIZE]
     if settings.pareto:
         directions += [StudyDirection.MINIMIZE] * len(settings.cost_keys)
-    optuna.create_study(
-        storage=storage, study_name=name, directions=directions, load_if_exists=True
+    study = optuna.create_study(
+        storage=storage,
+        study_name=name,
+        directions=directions,
+        load_if_exists=True,
+        pruner=_pruner(flags, settings),
     )
-    study = Study(name, storage, flags.n_trials)
-    try:
-        with storage.exclusive():
-            begun = _begin(study, settings, search, directions)
-    except Outage:
-        time.sleep(POLL)
-        return open_study(flags, settings, search, name, storage)
-    study.pruner = _pruner(flags, settings)
+    saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
+    if saved is not None:
+        settings.refuse_others(saved, name)
+    elif begun or study.directions != directions:
+        raise UsageError(
+            f"{shown} has a study {name!r} that is not one of sb3_guard's; "
+            "choose another --study-name"
+        )
+    else:
+        # First of all: a worker may die after any of these lines, and the next one continues.
+        study.set_user_attr(SETTINGS, asdict(settings))
+    if not begun:
+        # So that the best is never worse than the starting point.
+        first = search.first()
+        study.enqueue_trial(first, user_attrs={GIVEN: bool(first)}, skip_if_exists=True)
     # Workers that drew the same numbers would try the same things: only the first has the seed.
     seed = flags.seed if not begun and flags.seed >= 0 else None
     study.sampler = SAMPLERS[flags.sampler](seed, flags.n_startup_trials)
     return study
 
 
-def work(study: Study, objective: Objective, report: Report) -> None:
+class Work:
     """
-    Work until the study has all its trials, or until stopped.
+    One process's work on a study.
 
-    :raises UsageError: trial after trial fails
-    :raises StorageLost: the storage is lost
+    :param study: which may be shared with other processes
+    :param storage: of the study
+    :param objective: of its trials
+    :param report: rewritten after each of them
     """
 
-    def after(_: optuna.Study, trial: FrozenTrial) -> None:
+    def __init__(self, study: optuna.Study, storage: Storage, objective: Objective, report: Report):
+        self.study, self.storage = study, storage
+        self.objective, self.report = objective, report
+        self.flags = objective.flags
+
+    def _after(self, study: optuna.Study, trial: FrozenTrial) -> None:
         trials = study.get_trials(deepcopy=False)
-        report.write(study)
-        if objective.flags.verbose:
-            print(report.line(trials, trial), flush=True)
-        if objective.failures >= MOST_FAILURES:
+        self.report.write(study)
+        if self.flags.verbose:
+            print(self.report.line(trials, trial), flush=True)
+        failures = self.objective.failures
+        if failures >= MOST_FAILURES:
             raise UsageError(
-                f"{objective.failures} trials in a row failed, the last one: "
-                f"{trial.user_attrs['error']}"
+                f"{failures} trials in a row failed, the last one: {trial.user_attrs['error']}"
             )
-        if objective.stopped():
+        if self.objective.stopped():
             study.stop()
 
-    said = False
-    while not objective.stopped():
+    def _optimize(self, n_trials: int | None = None) -> None:
+        enough = [] if n_trials else [MaxTrialsCallback(self.flags.n_trials, states=FINISHED)]
         try:
-            study.optimize(objective, callbacks=[after])
+            self.study.optimize(self.objective, n_trials, callbacks=[self._after, *enough])
         except Stopped:
-            return
-        except Outage:
-            time.sleep(POLL)
-        except NoneLeft as none:
-            if not none.running:
-                return
-            # If one of them is lost, its trial is for us.
-            if not said and objective.flags.verbose:
-                print(f"Waiting for {none.running} trial(s) of other workers", flush=True)
-            said = True
-            time.sleep(POLL)
-        except Exception as error:
-            if study.shared.lost is not None:
-                raise study.shared.lost from error
-            # Optuna refuses to tell what somebody else has told.
-            refused = str(error).startswith("Cannot tell a")
-            if not refused and not isinstance(error, UpdateFinishedTrialError):
+            pass
+        except (ValueError, UpdateFinishedTrialError) as error:
+            if isinstance(error, ValueError) and not self.objective.taken:
                 raise
-            print("A trial was taken for lost and given to another worker")
+            raise UsageError(
+                f"this process gave no sign of life for {studies.GRACE} s, and its trial was "
+                "given to another; the same command joins the study again"
+            ) from error
+
+    def _count(self, *states: TrialState) -> int:
+        return len(self.study.get_trials(deepcopy=False, states=states))
+
+    def do(self) -> None:
+        """
+        Work until the study has all its trials, or until stopped.
+
+        :raises UsageError: trial after trial fails
+        """
+        repeat_lost_trials(self.study, self.storage)
+        if self._count(*FINISHED) < self.flags.n_trials:
+            self._optimize()
+
+    def finish(self) -> None:
+        """Do the trials again whose workers died meanwhile; on a database, their silence tells."""
+        wait = isinstance(self.storage, RDBStorage) and self._count(TrialState.RUNNING)
+        if wait and self.flags.verbose:
+            print(f"Waiting up to {studies.GRACE} s in case a worker is gone", flush=True)
+        end = time.monotonic() + studies.GRACE + 1.0 if wait else 0.0
+        while time.monotonic() < end and not self.objective.stopped():
+            time.sleep(0.5)
+            if not self._count(TrialState.RUNNING):
+                break
+        repeat_lost_trials(self.study, self.storage)
+        while self._count(TrialState.WAITING) and not self.objective.stopped():
+            self._optimize(n_trials=1)
 
 
 def tune(flags: TuneFlags, main: bool = True) -> int:
@@ -209,26 +214,22 @@ def tune(flags: TuneFlags, main: bool = True) -> int:
 
     :param main: this is the process that the user started, not one of ``--n-jobs``
     :return: exit status: 0, or 128 + the signal's number when interrupted
-    :raises UsageError: something is wrong with the flags, or the storage is lost
+    :raises UsageError: something is wrong with the flags, or the study can't be written
     """
     optuna.logging.set_verbosity(optuna.logging.CRITICAL)
+    again = "its trials are kept, and the same command continues the study"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
-            # What is reported again by a trial that is done again, or after an outage.
-            warnings.filterwarnings("ignore", message="The (reported|constraint) value is ignored")
             warnings.filterwarnings("ignore", message="The number of trials is too small")
             warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes")
             return _tune(flags, main)
-    except StorageLost as error:
-        raise UsageError(str(error)) from error
-    except OSError as error:
-        if not is_disk_error(error):
+    except Exception as error:
+        if isinstance(error, OSError) and is_disk_error(error):
+            raise UsageError(f"can't write the study: {error.strerror}; {again}") from error
+        if (text := studies.database_error(error)) is None:
             raise
-        raise UsageError(
-            f"can't write the study: {error.strerror}; what is in it is intact: the same command "
-            "continues it"
-        ) from error
+        raise UsageError(f"the study's database fails: {text}; {again}") from error
 
 
 def _tune(flags: TuneFlags, main: bool) -> int:
@@ -237,67 +238,71 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     folder = Path(flags.log_folder) / settings.algo / f"{folder_name(settings.env)}_tune{suffix}"
     require_writable(folder, "-f")
     name = flags.study_name or f"{settings.algo}_{settings.env}"
-    storage = open_storage(
-        flags.storage, folder / "study.journal", flags.heartbeat, flags.storage_timeout
-    )
-    try:
-        study = open_study(flags, settings, search, name, storage)
-        objective = Objective(flags, training, settings, search)
-        report = Report(folder, asdict(settings), flags.gym_packages)
-        loud = main and flags.verbose > 0
+    storage, shown = open_storage(flags.storage, folder / "study.journal")
+    study = open_study(flags, settings, search, name, storage, shown)
+    objective = Objective(flags, training, settings, search)
+    record = flags.recorded()
+    report = Report(folder, asdict(settings), flags.gym_packages, resumable=record is not None)
+    if main and record is not None:
+        report.save({RECORD: yaml.safe_dump(record, sort_keys=False).encode()})
+    work = Work(study, storage, objective, report)
+    loud = main and flags.verbose > 0
+    if loud:
+        print(_header(flags, settings, study, folder, shown), flush=True)
+
+    def stop(number: int) -> None:
+        objective.stop = True
         if loud:
-            print(_header(flags, settings, study, folder), flush=True)
+            print("\nStopping; Ctrl-C again stops immediately.", file=sys.stderr)
 
-        def stop(number: int) -> None:
-            objective.stop = True
-            if loud:
-                print("\nStopping; Ctrl-C again stops immediately.", file=sys.stderr)
-
-        with interrupts(stop) as received:
-            if not main:
-                signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process passes it on
-            with _other_workers(flags, flags.n_jobs - 1 if main else 0):
-                work(study, objective, report)
+    with interrupts(stop) as received:
+        with _other_workers(flags, flags.n_jobs - 1 if main else 0) as others:
+            work.do()
+            while not objective.stopped() and any(process.is_alive() for process in others):
+                time.sleep(0.2)
         if main:
-            report.write(study)
-            report.plot(study)
-            if loud:
-                print(report.summary(study, interrupted=bool(received)))
-        return 128 + received[0] if received else 0
-    finally:
-        storage.close()
+            work.finish()
+    if main:
+        report.write(study)
+        report.plot(study)
+        if loud:
+            print(report.summary(study, interrupted=bool(received)))
+    return 128 + received[0] if received else 0
 
 
 @contextmanager
-def _other_workers(flags: TuneFlags, n: int) -> Iterator[None]:
-    """Let more processes work on the study; they stop when this one does."""
+def _other_workers(flags: TuneFlags, n: int) -> Iterator[list[BaseProcess]]:
+    """Let more processes work on the study; those left at the end of the block are stopped."""
     context = multiprocessing.get_context("spawn")
-    others = [context.Process(target=_work_beside, args=(flags,)) for _ in range(n)]
+    others: list[BaseProcess] = [
+        context.Process(target=_work_beside, args=(flags,)) for _ in range(n)
+    ]
     with interrupts_ignored():  # by those that inherit it; Ctrl-C reaches this process
-        for one in others:
-            one.start()
+        for process in others:
+            process.start()
     try:
-        yield
+        yield others
     finally:
-        for one in others:
-            one.terminate()
-        for one in others:
-            one.join()
+        for process in others:
+            process.terminate()
+        for process in others:
+            process.join()
 
 
 def _work_beside(flags: TuneFlags) -> None:
     sys.exit(run(lambda: tune(flags, main=False)))
 
 
-def _header(flags: TuneFlags, settings: Settings, study: Study, folder: Path) -> str:
-    trials = study.get_trials(deepcopy=False)
-    finished = sum(one.state in FINISHED for one in trials)
+def _header(
+    flags: TuneFlags, settings: Settings, study: optuna.Study, folder: Path, shown: str
+) -> str:
+    finished = len(study.get_trials(deepcopy=False, states=FINISHED))
     if settings.pareto:
         goal = "the trade-off of return and episode cost"
     elif settings.cost_limit is None:
         goal = f"the highest return ({settings.algo} has no cost limit; --cost-limit sets one)"
     else:
-        limits = ", ".join(short(one) for one in settings.cost_limit)
+        limits = ", ".join(short(limit) for limit in settings.cost_limit)
         goal = f"the highest return with an episode cost of at most {limits}"
     seeds = f" × {len(settings.seeds)} seeds" if len(settings.seeds) > 1 else ""
     pruner = "none" if settings.pareto else flags.pruner
@@ -308,6 +313,6 @@ def _header(flags: TuneFlags, settings: Settings, study: Study, folder: Path) ->
             f"  each trial   {settings.n_timesteps:,} steps{seeds}, sampler {flags.sampler}, "
             f"pruner {pruner}",
             f"  folder       {folder}",
-            f"  watch with   optuna-dashboard {study.shared.shown}",
+            f"  watch with   optuna-dashboard {shown}",
         ]
     )

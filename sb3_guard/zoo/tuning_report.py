@@ -16,6 +16,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 from sb3_guard.common.files import replacing
 
+FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+
 
 def short(value: Any) -> str:
     """A number as short as it may be."""
@@ -50,10 +52,18 @@ class Report:
     :param folder: where they go; several processes may write them
     :param settings: of the study, as data
     :param packages: modules that register the environment
+    :param resumable: the folder is enough to continue the study
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], packages: Sequence[str] = ()):
+    def __init__(
+        self,
+        folder: Path,
+        settings: Mapping[str, Any],
+        packages: Sequence[str] = (),
+        resumable: bool = False,
+    ):
         self.folder, self.settings, self.packages = folder, settings, packages
+        self.resumable = resumable
         self.keys: list[str] = settings["cost_keys"]
         self.limits: list[float] | None = settings["cost_limit"]
 
@@ -67,9 +77,10 @@ class Report:
         for name, trial in chosen.items():
             if trial is not None:
                 files[name] = self.hyperparams(trial, name).encode()
-        self._save(files)
+        self.save(files)
 
-    def _save(self, files: Mapping[str, bytes]) -> None:
+    def save(self, files: Mapping[str, bytes]) -> None:
+        """Write files, each in one step."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with FileLock(self.folder / ".report.lock"):
             for name, content in files.items():
@@ -130,10 +141,19 @@ class Report:
     def command(self, name: str) -> str:
         """The command line that trains with one of the files."""
         settings, packages = self.settings, self.packages
-        what = ["--algo", settings["algo"], "--env", settings["env"]]
-        what += ["--gym-packages", *packages] if packages else []
+        flags = ["--algo", settings["algo"], "--env", settings["env"]]
+        flags += ["--gym-packages", *packages] if packages else []
         conf = str(self.folder / name)
-        return shlex.join(["python", "-m", "sb3_guard.train", *what, "-conf", conf])
+        return shlex.join(["python", "-m", "sb3_guard.train", *flags, "-conf", conf])
+
+    @property
+    def _again(self) -> str:
+        """How to continue the study."""
+        if not self.resumable:
+            return "  The same command continues the study."
+        flags = ["--gym-packages", *self.packages] if self.packages else []
+        command = ["python", "-m", "sb3_guard.tune", "-i", str(self.folder), *flags]
+        return f"  continue with {shlex.join(command)}"
 
     def length(self, trial: FrozenTrial) -> str:
         """How long that command trains, and how to train as long as the trials."""
@@ -165,7 +185,7 @@ class Report:
             feasible = sum(rank(one)[0] for one in done)
             lines[0] += f"; {feasible} of {len(done)} kept the cost limit"
         if interrupted:
-            lines.append("  The same command continues the study.")
+            lines.append(self._again)
         if top is None:
             return "\n".join([*lines, "  No trial went to its end: there is no best one."])
         if self.limits is not None and not rank(top)[0]:
@@ -224,7 +244,7 @@ class Report:
                     pyplot.gcf().savefig(buffer, format="png", dpi=150, bbox_inches="tight")
                     files[name] = buffer.getvalue()
             pyplot.close("all")
-        self._save(files)
+        self.save(files)
 
     def _scatter(self, pyplot: Any, done: Sequence[FrozenTrial]) -> Any:
         """Return against each cost: trials within the limit filled, others hollow."""

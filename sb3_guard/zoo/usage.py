@@ -162,6 +162,8 @@ def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
     """
     Let Ctrl-C and SIGTERM ask for an end in good order; a second one ends immediately.
 
+    A signal that the process ignores, as workers ignore Ctrl-C, is left alone.
+
     :param stop: called with the number of the first signal, between two steps of whatever runs
     :return: the numbers of the signals received
     """
@@ -176,12 +178,16 @@ def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
             raise KeyboardInterrupt
         stop(number)
 
-    before = {one: signal.signal(one, handle) for one in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, handle)
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
     try:
         yield received
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from sb3_guard.common.evaluation import Estimate
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import read_normalizer
 from sb3_guard.zoo.hyperparams import build, check
-from sb3_guard.zoo.make_envs import canonical_id, make_envs
+from sb3_guard.zoo.make_envs import full_id, make_envs
 from sb3_guard.zoo.playback import PRETRAINED
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, run_path
@@ -49,7 +49,7 @@ class Agent(NamedTuple):
     @property
     def id(self) -> str:
         """Full id of the environment."""
-        return canonical_id(self.env)[0]
+        return full_id(self.env)
 
     @property
     def settings(self) -> dict[str, float]:

@@ -8,6 +8,9 @@ import numpy as np
 from gymnasium import spaces
 from scipy.optimize import linprog
 
+#: SB3's first policy, which moves more than ours and so meets costs sooner.
+SB3_POLICY = {"log_std_init": 0.0, "ortho_init": True}
+
 
 class LinearCostBandit(gym.Env):
     """One continuous decision: a quadratic reward under a linear cost, solved by projection.

@@ -32,7 +32,7 @@ from sb3_guard.common.adapters import (
     make_safety_gymnasium,
 )
 from sb3_guard.common.budgets import EarlyTermination, RemainingBudget
-from sb3_guard.zoo.make_envs import canonical_id
+from sb3_guard.zoo.make_envs import source_of
 from sb3_guard.zoo.resumable import ResumableEnv
 from sb3_guard.zoo.usage import UsageError
 
@@ -197,8 +197,8 @@ def test_five_values_are_refused():
 )
 def test_its_ids_are_accepted(package, env_id):
     assert is_safety_gymnasium(env_id)
-    full, ours = canonical_id(env_id)
-    assert not ours and full == env_id  # the prefix tells it from ours of that name
+    full, _, batch = source_of(env_id)
+    assert batch is None and full == env_id  # the prefix tells it from ours of that name
     for name in (env_id, full):
         env = make_vec_env(name, 2, seed=0)
         env.reset()
@@ -209,7 +209,12 @@ def test_its_ids_are_accepted(package, env_id):
 
 def test_its_environments_train(package):
     env = make_vec_env("SafetyPointGoal9-v0", 2, seed=0, max_episode_steps=20)
-    model = CPO("MlpPolicy", env, cost_limit=0.5, cost_keys=("cost_hazards",), **SMALL).learn(128)
+    settings = {
+        **SMALL,
+        "policy_kwargs": {"net_arch": [8], "ortho_init": True, "log_std_init": 0.0},
+    }
+    costs = {"cost_limit": 0.5, "cost_keys": ("cost_hazards",)}
+    model = CPO("MlpPolicy", env, **costs, **settings).learn(128)
     assert [one["l"] for one in model.ep_info_buffer] == [20] * 6
     evaluation = evaluate_policy(model, env, n_eval_episodes=3, seed=0)
     assert evaluation.costs.sum() > 0
@@ -227,7 +232,7 @@ def test_absent_package_says_where_to_get_it(monkeypatch):
     with pytest.raises(
         UsageError, match=r"'safety_gymnasium:SafetyPointGoal9-v0' needs .*safety-gymnasium"
     ):
-        canonical_id("safety_gymnasium:SafetyPointGoal9-v0")
+        source_of("safety_gymnasium:SafetyPointGoal9-v0")
 
 
 def test_broken_package_says_why(monkeypatch, tmp_path):

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint, RandomCostEnv
+from cost_envs import SB3_POLICY, CostPoint, RandomCostEnv
 from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
@@ -873,7 +873,9 @@ def test_until_something_costs_the_reward_alone_is_learnt(cls: Any) -> None:
     """At a limit of 0 too: a cost critic that has met no cost says nothing."""
     settings = {"n_steps": 40, "seed": 0, "device": "cpu"}
     plain = PPO if cls is P3O else TRPO
-    base = {"batch_size": 40} if cls is P3O else {"n_critic_updates": 3}
+    base: dict[str, Any] = {"n_critic_updates": 3}
+    if cls is P3O:
+        base = {"batch_size": 40, "gae_lambda": 0.9, "target_kl": None, "policy_kwargs": SB3_POLICY}
     weights = []
     for one, limit in ((plain, {}), (cls, {"cost_limit": 0.0})):
         model = one("MlpPolicy", points(cost_scale=0.0), **settings, **base, **limit).learn(240)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint, LinearCostBandit
+from cost_envs import SB3_POLICY, CostPoint, LinearCostBandit
 from ppo_lagrangian import PPOLagrangian
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
@@ -53,8 +53,10 @@ def test_without_a_price_it_is_sb3s_ppo_bit_for_bit(batch_size: int) -> None:
 
 def test_first_order_with_ppos_loss_is_ppo_bit_for_bit() -> None:
     kwargs: dict[str, Any] = {"n_steps": 32, "batch_size": 48, "seed": 0, "device": "cpu"}
-    kwargs |= {"target_kl": 0.005, "clip_range_vf": 0.1, "ent_coef": 0.01}
-    models = [PPO("MlpPolicy", points(), **kwargs), FirstOrder("MlpPolicy", points(), **kwargs)]
+    kwargs |= {"target_kl": 0.005, "clip_range_vf": 0.1, "ent_coef": 0.01, "gae_lambda": 0.9}
+    kwargs["policy_kwargs"] = SB3_POLICY
+    model = FirstOrder("MlpPolicy", points(), kl_stop="minibatch", cost_limit=1.0, **kwargs)
+    models = [PPO("MlpPolicy", points(), **kwargs), model]
     states = []
     for model in models:
         model.set_random_seed(0)
@@ -147,6 +149,16 @@ def state_of_off_policy(model: Any) -> list[Any]:
     return [*(tensor.tolist() for tensor in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
 
 
+def test_policies_begin_calm_unless_told_otherwise() -> None:
+    """Key by key: what a user says of the networks leaves the first σ as it is."""
+    for cls in (CPO, PPOLag):
+        model = cls("MlpPolicy", points(2), n_steps=32, policy_kwargs={"net_arch": [8]})
+        assert model.policy_kwargs == {"log_std_init": -0.5, "ortho_init": False, "net_arch": [8]}
+        assert (model.policy.log_std == -0.5).all() and not model.policy.ortho_init
+        loud = cls("MlpPolicy", points(2), n_steps=32, policy_kwargs={"log_std_init": 0.0})
+        assert (loud.policy.log_std == 0.0).all() and not loud.policy.ortho_init
+
+
 def test_defaults_are_stated_where_only_they_differ() -> None:
     """The signature shows them, a call overrides them, and so does a class further down."""
 
@@ -156,14 +168,14 @@ def test_defaults_are_stated_where_only_they_differ() -> None:
     class Hastier(Hasty):
         defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.9}
 
-    for cls, rate in ((PPOLag, 0.5), (Hasty, 0.7), (Hastier, 0.9)):
+    for cls, rate in ((PPOLag, 0.1), (Hasty, 0.7), (Hastier, 0.9)):
         taken = inspect.signature(cls).parameters
         assert taken["lambda_lr"].default == rate and taken["lambda_units"].default == "relative"
         assert list(taken)[:3] == ["policy", "env", "learning_rate"]
         model = cls("MlpPolicy", points(2), batch_size=16)
         assert model.lambda_lr == rate and model.lambda_units == "relative"
         assert model.n_steps == taken["n_steps"].default == (2048 if cls is PPOLag else 32)
-        assert cls("MlpPolicy", points(2), batch_size=16, lambda_lr=0.1).lambda_lr == 0.1
+        assert cls("MlpPolicy", points(2), batch_size=16, lambda_lr=0.3).lambda_lr == 0.3
 
 
 # Algorithms from outside the package

@@ -250,7 +250,15 @@ def test_fac_keeps_the_limit_in_every_context(seed: int) -> None:
         return LinearCostBandit(offset=[1.0, -1.0])
 
     bandit, limit = make(), 1.0
-    modes = solve_bandit(TRPOFAC, make, seed, updates=120, cost_limit=limit, n_critic_updates=15)
+    modes = solve_bandit(
+        TRPOFAC,
+        make,
+        seed,
+        updates=120,
+        cost_limit=limit,
+        n_critic_updates=15,
+        policy_kwargs={"net_arch": [8], "log_std_init": -1.0, "ortho_init": True},
+    )
     turn = slice(20, 120)
     actions = np.array(modes.actions)[turn]  # [100, 2, 2]
     costs = (actions @ bandit.normal + bandit.offset).mean(axis=0)

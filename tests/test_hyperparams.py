@@ -19,6 +19,7 @@ from sb3_guard.zoo.hyperparams import (
     build,
     check,
     hyperparams_folder,
+    parameters,
     read_file,
     read_hyperparams,
 )
@@ -206,9 +207,10 @@ def test_names_that_are_flags():
         checked(seed=3)
 
 
-def test_n_timesteps_must_be_known():
-    with pytest.raises(UsageError, match="use the flag -n"):
-        check("cpo", CPO, {})
+def test_training_takes_a_million_steps_unless_somebody_says_otherwise():
+    assert check("cpo", CPO, {})["n_timesteps"] == 1_000_000
+    for algo in ALGORITHMS:
+        assert read_hyperparams(algo, "Goal_Ant_8Hazards-v0")["n_timesteps"] == 1e6
 
 
 def test_objects_are_made():
@@ -309,25 +311,20 @@ TABLE = {
     "cost_reduction": [..., ..., ..., ..., ..., ..., 0.0, ...],
 }
 # Where the default is another one: (the paper's, ours).
-LIMIT = {"cost_limit": (0.0, 2.0)}
+ALL = {"n_timesteps": (3e7, 1e6)}
+LIMIT = {**ALL, "cost_limit": (0.0, 2.0)}
 LAMBDA = {"cost_gae_lambda": (0.97, 0.5)}
-MARGIN = {"margin_lr": (0.0, None)}
+MARGIN = {"margin_lr": (0.0, 0.1)}
 DIFFERENT = {
-    "trpo_sl": {
-        **LIMIT,
-        "tolerance": (0.0, None),
-        "correction_penalty": (0.0, None),
-    },
-    "trpo_usl": {**LIMIT, "correction_penalty": (0.0, None)},
-    "trpo": {},
-    "cpo": {**LIMIT, **LAMBDA, **MARGIN, "recovery": (1.0, None)},
+    "trpo": ALL,
+    "cpo": {**LIMIT, **LAMBDA, **MARGIN, "recovery": (1.0, 0.98)},
     "pcpo": {**LIMIT, **LAMBDA, **MARGIN, "line_search": (False, True)},
     "trpo_lag": {
         **LIMIT,
         **LAMBDA,
         "lambda_lr": (0.005, 0.2),
-        "lambda_update": ("after", None),
-        "lambda_units": ("cost", None),
+        "lambda_update": ("after", "before"),
+        "lambda_units": ("cost", "relative"),
         "proportional_gain": (0.0, 1.0),
         "derivative_gain": (0.0, 0.5),
     },
@@ -338,15 +335,17 @@ DIFFERENT = {
         "lambda_lr": (0.0001, 0.0005),
         "lambda_init": (None, 0.3),
         "proportional_gain": (0.0, 1.0),
-        "units": ("cost", None),
+        "units": ("cost", "relative"),
     },
     "trpo_ipo": {
         **LIMIT,
         **LAMBDA,
-        "t": (0.01, None),
-        "max_multiplier": (0.5, None),
-        "units": ("cost", None),
+        "t": (0.01, 20.0),
+        "max_multiplier": (0.5, 2.0),
+        "units": ("cost", "relative"),
     },
+    "trpo_sl": {**LIMIT, "tolerance": (0.0, 1.0), "correction_penalty": (0.0, 1.0)},
+    "trpo_usl": {**LIMIT, "correction_penalty": (0.0, 1.0)},
 }
 
 
@@ -369,13 +368,22 @@ def test_the_papers_preset_is_its_table(algo):
         assert read_hyperparams(algo, env_id, PAPER) == {**values, "n_timesteps": steps}
 
 
+def in_full(algo: str, env_id: str, conf: str | None = None) -> dict[str, Any]:
+    """What trains: the defaults of the class, and what the file has beside or instead of them."""
+    cls = ALGORITHMS[algo]
+    values = {name: parameter.default for name, parameter in parameters(cls).items()}
+    values |= read_hyperparams(algo, env_id, conf)
+    values["policy_kwargs"] = {**cls.policy_defaults, **(values["policy_kwargs"] or {})}
+    values["policy_kwargs"].setdefault("net_arch", {"pi": [64, 64], "vf": [64, 64]})  # SB3's
+    return values
+
+
 @pytest.mark.parametrize("algo", COLUMNS)
 def test_the_default_is_the_papers_but_where_it_says_so(algo):
     env_id = "Goal_Ant_8Hazards-v0"
-    default, paper = (read_hyperparams(algo, env_id, conf) for conf in (None, PAPER))
-    names = {*default, *paper}
-    both = {n: (paper.get(n), default.get(n)) for n in names}
-    assert {n: pair for n, pair in both.items() if pair[0] != pair[1]} == DIFFERENT.get(algo, LIMIT)
+    default, paper = (in_full(algo, env_id, conf) for conf in (None, PAPER))
+    both = {n: (paper.get(n), default.get(n)) for n in {*default, *paper}}
+    assert {n: pair for n, pair in both.items() if pair[0] != pair[1]} == DIFFERENT[algo]
 
 
 @pytest.mark.parametrize("algo", COLUMNS)
@@ -431,6 +439,6 @@ def test_the_omnisafe_preset_makes_a_model(algo):
 def test_every_algorithm_has_a_file_and_every_file_an_algorithm():
     files = {path.stem for path in hyperparams_folder().glob("*.yml")} - {*PRESETS}
     assert set(ALGORITHMS) <= files <= {*ALGORITHMS, *baselines()}
-    assert read_file(hyperparams_folder() / "paper.yml").keys() == {*COLUMNS}
+    assert read_file(hyperparams_folder() / "paper.yml").keys() == {"all", *COLUMNS}
     for file in files:
         assert "default" in read_file(hyperparams_folder() / f"{file}.yml")

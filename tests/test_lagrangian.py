@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint
+from cost_envs import SB3_POLICY, CostPoint
 from known_optima import problems, solve
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
@@ -17,13 +17,15 @@ from sb3_guard.algorithms.common.lagrangian import Multiplier
 from sb3_guard.algorithms.trpo_fac import StateMultiplier
 
 KEYS = ("cost", "cost_1")
-RAW = {"lambda_units": "cost", "proportional_gain": 0.0}  # plain ascent, as published
+# Plain ascent, as published.
+RAW = {"lambda_units": "cost", "proportional_gain": 0.0, "derivative_gain": 0.0}
 
 
 def make(cls: type[TrustRegion], n_costs: int = 1, **kwargs: Any) -> Any:
     keys = KEYS[:n_costs]
     env = make_vec_env(lambda: CostPoint(cost_keys=keys, hazard=(-1.0, 0.0)), 4, seed=0)
     defaults: dict[str, Any] = {"n_steps": 100, "n_critic_updates": 5, "seed": 0, "device": "cpu"}
+    defaults["policy_kwargs"] = SB3_POLICY
     return cls("MlpPolicy", env, cost_keys=keys, **{**defaults, **kwargs})
 
 
@@ -305,7 +307,9 @@ def test_at_a_limit_of_zero(cls: type[TrustRegion], cost_scale: float) -> None:
     """Multipliers never fall there; without any cost TRPO-Lagrangian's stays zero."""
     env = make_vec_env(lambda: CostPoint(cost_scale=cost_scale, hazard=(-1.0, 0.0)), 4, seed=0)
     raw = RAW if cls is TRPOLag else {}
-    model: Any = cls("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0, **raw)
+    model: Any = cls(
+        "MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0, policy_kwargs=SB3_POLICY, **raw
+    )
     logged = []
     train = model.train
     model.train = lambda: (train(), logged.append(dict(model.logger.name_to_value)))

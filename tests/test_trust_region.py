@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sb3_contrib
 import torch as th
-from cost_envs import CostPoint
+from cost_envs import SB3_POLICY, CostPoint
 from gymnasium import spaces
 from sb3_contrib.common.utils import conjugate_gradient_solver
 from stable_baselines3.common.callbacks import BaseCallback
@@ -325,7 +325,15 @@ def _reference(cls: type, **kwargs: Any) -> Any:
     """A model with its first rollout collected; the global generators are its own until then."""
     env = make_vec_env(lambda: CostPoint(episode_length=30), 4, seed=3)
     model = cls(
-        "MlpPolicy", env, n_steps=64, gamma=0.98, gae_lambda=0.9, seed=3, device="cpu", **kwargs
+        "MlpPolicy",
+        env,
+        n_steps=64,
+        gamma=0.98,
+        gae_lambda=0.9,
+        seed=3,
+        device="cpu",
+        policy_kwargs=SB3_POLICY,
+        **kwargs,
     )
     _collect(model, 256)
     return model
@@ -480,7 +488,7 @@ def test_an_error_during_the_search_leaves_the_old_policy() -> None:
 
 def test_a_trial_says_what_the_candidate_changes() -> None:
     """Improvement and change of the cost surrogate, from the probabilities before and after."""
-    model = _toy(CPO)
+    model = _toy(CPO, policy_kwargs=SB3_POLICY)
     changes: list[tuple[Any, float, float]] = []
     search = model._line_search
 

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import warnings
 import weakref
 
 import cloudpickle
@@ -12,7 +13,11 @@ from cost_envs import CostPoint
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard import CostMonitor, Scenario, make_vec_env
-from sb3_guard.common.vec_env import GuardVecEnv, find_scenario
+from sb3_guard.common.sources import find
+from sb3_guard.common.vec_env import GuardVecEnv
+from sb3_guard.zoo.make_envs import full_id
+from sb3_guard.zoo.run_flags import RunFlags
+from sb3_guard.zoo.start import prepare
 
 
 @pytest.mark.parametrize(
@@ -71,8 +76,29 @@ def test_foreign_environments_go_through_gymnasium():
     assert env.reset().shape == (2, 4)
     *_, infos = env.step(np.zeros(2, dtype=int))
     assert "cost" not in infos[0]
-    assert find_scenario("CartPole-v1") is None
-    assert find_scenario("Goal_Point_2Hazards") == Scenario.parse("Goal_Point_2Hazards")
+    assert find("CartPole-v1").batch is None
+    assert find("Goal_Point_2Hazards").batch is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "full"),
+    [
+        ("SafetyHopperVelocity", "SafetyHopperVelocity-v1"),
+        ("SafetyHopperVelocity-v0", "SafetyHopperVelocity-v0"),
+        ("SafetyPointGoal1", "SafetyPointGoal1-v0"),
+        ("Goal_Ant_3Ghosts", "Goal_Ant_3Ghosts-v0"),
+        ("CartPole", "CartPole-v1"),
+        ("Humanoid", "Humanoid-v5"),
+    ],
+)
+def test_a_missing_version_is_the_latest_everywhere(name, full):
+    """In Python, in Gymnasium, in commands and in the entries of hyperparameter files."""
+    assert find(name).env_id == full_id(name) == full
+    assert prepare(RunFlags(algo="ppo", env=name))[0].env == full
+    if name in gymnasium.registry or full in gymnasium.registry:
+        assert make_vec_env(name).get_attr("spec")[0].id == full
+        with warnings.catch_warnings(action="ignore"):
+            assert gymnasium.make(name).spec.id == full
 
 
 @pytest.mark.parametrize("make", [CostPoint, lambda **arguments: CostPoint(**arguments)])

@@ -24,3 +24,5 @@ class CPO(LinearisedLimits):
         "margin_lr": [0.0, 0.05, 0.1, 0.2],
         "cost_reduction": {"low": 0.0, "high": 0.02},
     }
+    # Costs far ahead are noisy in a rollout, so they are left to the cost critic.
+    defaults: ClassVar[dict[str, Any]] = {"cost_gae_lambda": 0.5}

@@ -28,6 +28,6 @@ class CPPOPID(PenalizedPPO):
     }
     defaults: ClassVar[dict[str, Any]] = {
         **RELATIVE,
-        "derivative_gain": 2.0,
+        "derivative_gain": 0.5,
         "lambda_smoothing": 0.5,
     }

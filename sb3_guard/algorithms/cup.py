@@ -38,9 +38,9 @@ class CUP(Lagrangian, FirstOrder):
     # is much noise in both. Gains are a sixth of others': at γ = 0.99 and λ = 0.95 the factor above
     # is six.
     defaults: ClassVar[dict[str, Any]] = {
-        "n_epochs": 5,
-        "lambda_lr": 0.08,
-        "proportional_gain": 0.33,
+        "n_epochs": 10,
+        "lambda_lr": 0.016,
+        "proportional_gain": 0.08,
         "lambda_units": "relative",
     }
 

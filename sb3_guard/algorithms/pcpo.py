@@ -35,6 +35,9 @@ class PCPO(Margin):
         "projection": ["kl", "l2"],
         "margin_lr": [0.0, 0.05, 0.1, 0.2],
     }
+    # Costs far ahead are noisy in a rollout, so they are left to the cost critic. A step always has
+    # the reward's part, so the projection may go as far as the limit asks.
+    defaults: ClassVar[dict[str, Any]] = {"cost_gae_lambda": 0.5, "recovery": 1.0}
 
     projection: Literal["kl", "l2"] = hyperparameter("kl")
     line_search: bool = hyperparameter(True)

@@ -30,6 +30,7 @@ class RCPO(PenalizedTrustRegion):
     """
 
     label, family, paper = "RCPO", "Lagrangian", "Tessler et al. 2019"
+    defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.1, "proportional_gain": 0.5}
 
     # penalized_reward refuses it
     search_space: ClassVar[dict[str, Any]] = {"cost_gae_lambda": None}

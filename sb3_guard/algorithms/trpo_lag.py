@@ -1,5 +1,7 @@
 """TRPO-Lagrangian: the cost joins the objective at a price that follows the violation."""
 
+from typing import Any, ClassVar
+
 from sb3_guard.algorithms.common.trust_region import PenalizedTrustRegion
 
 
@@ -19,3 +21,5 @@ class TRPOLag(PenalizedTrustRegion):
     """
 
     label, family, paper = "TRPO-Lagrangian", "Lagrangian", "Ray et al. 2019"
+    # Costs far ahead are noisy in a rollout, so they are left to the cost critic.
+    defaults: ClassVar[dict[str, Any]] = {"cost_gae_lambda": 0.5, "derivative_gain": 0.5}

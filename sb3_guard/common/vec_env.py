@@ -2,7 +2,6 @@
 
 :func:`make_vec_env` is what training, evaluation and notebooks call. For an environment of ours it
 makes a :class:`GuardVecEnv`, which steps all environments in one call on one batch of simulations.
-Ours are imported where they are used: environments of others work where MuJoCo is older than 4.
 """
 
 from __future__ import annotations
@@ -15,76 +14,20 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
 from sb3_guard.common.monitor import CostMonitor
+from sb3_guard.common.sources import Source, find
 from sb3_guard.spelling import did_you_mean
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from sb3_guard.envs.scenario import Scenario
 
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {
     "dummy": DummyVecEnv,
     "subproc": SubprocVecEnv,
 }
-_OURS = "sb3_guard.envs.gym_env:GuardEnv"
-
-
-def _our_envs(env_id: Any) -> ModuleType:
-    """``sb3_guard.envs``, or an error that says why ``env_id`` can't be looked up in it."""
-    try:
-        import sb3_guard.envs
-    except ImportError as error:
-        raise DependencyNotInstalled(
-            f"unknown environment {env_id!r}: it is not registered with Gymnasium, and sb3_guard's "
-            f"own environments need MuJoCo 4 or newer ({error})"
-        ) from error
-    return sb3_guard.envs
-
-
-def find_scenario(env_id: str | Path | Mapping[str, Any] | Scenario) -> Scenario | None:
-    """The scenario that an id stands for, or None for an environment that is not ours.
-
-    :param env_id: a registered id, one of Safety-Gymnasium, an id of ours with or without ``-v0``,
-        a scenario, its plain data or its YAML file
-    :raises ValueError: nothing of that name is known, with the nearest match
-    :raises gymnasium.error.DependencyNotInstalled: the package that has it is absent or too old
-    """
-    if not isinstance(env_id, str) or env_id.endswith((".yml", ".yaml")):
-        one: Scenario = _our_envs(env_id).as_scenario(env_id)
-        return one
-    for name in (env_id, f"{env_id}-v1", f"{env_id}-v0"):
-        spec = gymnasium.registry.get(name)
-        if spec is not None:
-            if spec.entry_point != _OURS:
-                return None
-            scenario: type[Scenario] = _our_envs(env_id).Scenario
-            what = spec.kwargs["scenario"]
-            return scenario.parse(what) if isinstance(what, str) else scenario(**what)
-    try:
-        if ":" in env_id or is_safety_gymnasium(env_id):
-            return None  # of "module:Env-v0" gymnasium imports the module first
-    except DependencyNotInstalled:
-        _our_envs(env_id).Scenario.parse(env_id)  # says what there is without the package
-        raise
-    envs = _our_envs(env_id)
-    try:
-        return envs.Scenario.parse(env_id)
-    except ValueError as error:
-        if "is not an id of the form" not in str(error):
-            raise
-        known = [*envs.env_ids(), *gymnasium.registry]
-        hint = did_you_mean(env_id, known).split("allowed:")[0]
-        raise ValueError(
-            f"unknown environment {env_id!r}: {hint}allowed: ids of the form "
-            "Task_Robot_NConstraint-v0, such as 'Goal_Point_8Hazards-v0', and ids registered with "
-            "Gymnasium"
-        ) from None
 
 
 class GuardVecEnv(VecEnv):
@@ -200,7 +143,7 @@ class GuardVecEnv(VecEnv):
 
 
 def make_vec_env(
-    env_id: str | Path | Mapping[str, Any] | Scenario | Callable[..., gymnasium.Env],
+    env_id: str | Path | Mapping[str, Any] | Scenario | Callable[..., gymnasium.Env] | Source,
     n_envs: int = 1,
     seed: int | None = None,
     *,
@@ -217,7 +160,8 @@ def make_vec_env(
 
     :param env_id: an id of ours (the version may be left out), a scenario, its plain data or its
         YAML file, any id registered with Gymnasium, one of Safety-Gymnasium where that package is
-        installed, or a class or function that makes an environment
+        installed, a class or function that makes an environment, or what
+        :func:`~sb3_guard.common.sources.find` returns
     :param n_envs: how many; 30 is a good number for training
     :param seed: the environments get seed, seed + 1, …
     :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"``
@@ -240,52 +184,33 @@ def make_vec_env(
         kwargs["render_mode"] = render_mode
     if max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
-    scenario = None if callable(env_id) else find_scenario(env_id)
-    spec = None if scenario is None or callable(env_id) else _our_envs(env_id).env_spec(env_id)
-    wrapped = wrapper_class is not None or (spec is not None and spec.additional_wrappers)
-    vec_env = vec_env or ("dummy" if scenario is None or wrapped else "native")
-    if vec_env not in ("native", *VEC_ENVS):
-        hint = did_you_mean(vec_env, ["native", *VEC_ENVS])
-        raise ValueError(f"unknown vec_env {vec_env!r}: {hint}")
+    source = env_id if isinstance(env_id, Source) else find(env_id)
+    batched = source.batch is not None and wrapper_class is None
+    vec_env = vec_env or ("native" if batched else "dummy")
     venv: VecEnv
     if vec_env == "native":
-        if scenario is None:
+        if source.batch is None:
             raise ValueError(
-                f"{env_id!r} is not an sb3_guard environment: use vec_env 'dummy' or 'subproc'"
+                f"{source.env_id or env_id!r} is not an sb3_guard environment, or has wrappers of "
+                "its own: use vec_env 'dummy' or 'subproc'"
             )
-        if wrapped:
+        if wrapper_class is not None:
             raise ValueError(
                 "wrapper_class, or env_wrapper of a run, needs vec_env 'dummy' or 'subproc': "
                 "native envs share one batch"
             )
-        assert spec is not None
-        registered = {k: v for k, v in spec.kwargs.items() if k != "scenario"}
-        if spec.max_episode_steps is not None:
-            registered["max_episode_steps"] = spec.max_episode_steps
-        kwargs = {**registered, **kwargs}
-        venv = GuardVecEnv(scenario, n_envs, spec, num_threads=num_threads, **kwargs)
-    else:
-        make: Callable[..., gymnasium.Env] = gymnasium.make
-        what: Any = env_id
-        if callable(env_id):
-            cut = kwargs.pop("max_episode_steps", None)
+        venv = source.batch(n_envs, num_threads=num_threads, **kwargs)
+    elif vec_env in VEC_ENVS:
 
-            def make(_: Any, **arguments: Any) -> gymnasium.Env:
-                env = env_id(**arguments)
-                return env if cut is None else gymnasium.wrappers.TimeLimit(env, cut)
-
-            what = None
-        elif is_safety_gymnasium(str(env_id)):
-            make = make_safety_gymnasium
-        else:
-            # a spec, not an id: other processes may not have registered it
-            what = spec or gymnasium.spec(str(env_id))
-
-        def one() -> gymnasium.Env:
-            env = make(what, **kwargs)
+        def make_one() -> gymnasium.Env:
+            env = source.make(**kwargs)
             return env if wrapper_class is None else wrapper_class(env)
 
-        venv = VEC_ENVS[vec_env]([one] * int(n_envs))
+        venv = VEC_ENVS[vec_env]([make_one] * int(n_envs))
+    else:
+        raise ValueError(
+            f"unknown vec_env {vec_env!r}: {did_you_mean(vec_env, ['native', *VEC_ENVS])}"
+        )
     if seed is not None:
         venv.seed(seed)
     return CostMonitor(venv, monitor_path, **(monitor_kwargs or {}))

@@ -30,8 +30,9 @@ from sb3_guard.envs.registry import (
     register_task,
 )
 from sb3_guard.envs.scenario import Scenario
-from sb3_guard.envs.suites import env_ids, episode_steps, with_version
+from sb3_guard.envs.suites import env_ids, episode_steps
 from sb3_guard.envs.vector_env import GuardVectorEnv
+from sb3_guard.ids import with_version
 
 __all__ = [
     "GuardEnv",

@@ -13,7 +13,7 @@ import yaml
 
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
-from sb3_guard.zoo.make_envs import canonical_id
+from sb3_guard.zoo.make_envs import full_id
 from sb3_guard.zoo.names import packages_flag
 from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
 from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data, require_writable
@@ -185,7 +185,7 @@ def command(run: RunFolder) -> str:
 def load(flags: HubFlags) -> int:
     """Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it."""
     try:
-        flags.env = canonical_id(flags.env)[0]
+        flags.env = full_id(flags.env)
     except UsageError:
         # A stranger's environment need not be known here: the repository says which it is.
         if not (flags.repo_id or flags.gym_packages):

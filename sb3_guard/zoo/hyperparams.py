@@ -46,6 +46,7 @@ RUN_KEYS: dict[str, Any] = {
     "monitor_kwargs": dict | str,
     "selection_limit": float | list[float] | None,
 }
+N_TIMESTEPS = 1_000_000  # the length of training where neither a file nor a flag says
 # RL-Zoo's two for the exploration noise of off-policy algorithms.
 NOISE_KEYS: dict[str, Any] = {
     "noise_type": Literal["normal", "ornstein-uhlenbeck"] | None,
@@ -103,19 +104,21 @@ def shipped_file(algo: str) -> Path:
     return theirs if theirs.is_file() else ours
 
 
-def preset(name: str, algo: str) -> dict[str, Any]:
+def preset(name: str, algo: str, env_id: str) -> dict[str, Any]:
     """
-    What a preset has otherwise than the shipped file of an algorithm.
+    The hyperparameters in which a preset differs from the shipped file of an algorithm.
 
-    :param name: one of ``PRESETS``
+    :param name: one of ``PRESETS``; below ``all``, its file has entries like those of a
+        hyperparameter file, and below the key of an algorithm what is different for that one
     :raises UsageError: the algorithm is not in it
     """
     content = read_file(hyperparams_folder() / f"{name}.yml")
+    common = entry(content.pop("all", {}), env_id) or {}
     if algo not in content:
         raise UsageError(
             f"-conf {name}: {algo!r} is not in {PRESETS[name]}; {did_you_mean(algo, content)}"
         )
-    return content[algo]
+    return {**common, **content[algo]}
 
 
 def read_hyperparams(
@@ -132,7 +135,7 @@ def read_hyperparams(
     :param overrides: what the command line says
     :raises UsageError: the file can't be read, or has no entry that fits
     """
-    changes = preset(conf_file, algo) if conf_file in PRESETS else {}
+    changes = preset(conf_file, algo, env_id) if conf_file in PRESETS else {}
     path = shipped_file(algo) if conf_file is None or conf_file in PRESETS else conf_file
     # An algorithm of a user has no shipped file; its own defaults serve.
     own = conf_file is None and not Path(path).is_file()
@@ -147,6 +150,7 @@ def read_hyperparams(
 
 def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] | None:
     """The entry of a file that an environment takes; None: there is none."""
+    env_id = env_id.rpartition(":")[2]  # without the module that registers it
     patterns = (name for name in content if "*" in name and fnmatchcase(env_id, name))
     for name in (env_id, env_id.rsplit("-v", 1)[0], *patterns, "default"):
         if name in content:
@@ -174,7 +178,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     The same hyper-parameters with numbers in their proper type, or an error that says what to mend.
 
     :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, a
-        NaN, a missing ``n_timesteps``, or a count below 1
+        NaN, or a count below 1
     """
     known = annotations(algorithm)
     checked = {}
@@ -195,6 +199,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     if isinstance(checked.get("env_kwargs"), str):
         checked["env_kwargs"] = evaluate("env_kwargs", checked["env_kwargs"])
     checked.setdefault("n_envs", 1)
+    checked.setdefault("n_timesteps", N_TIMESTEPS)
     aliases = algorithm.policy_aliases
     policy = checked.setdefault("policy", next(iter(aliases)))  # MlpPolicy, or its recurrent twin
     if isinstance(policy, str) and "." not in policy and policy not in aliases:
@@ -202,8 +207,6 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
             f"{algo} has no policy {policy!r}; {did_you_mean(policy, aliases)}, "
             "or the dotted name of a class"
         )
-    if "n_timesteps" not in checked:
-        raise UsageError(f"n_timesteps of {algo} is not given; use the flag -n, e.g. -n 1e6")
     for name in ("n_envs", "n_timesteps", "n_steps", "batch_size", "frame_stack"):
         value = checked.get(name)
         if isinstance(value, int) and value < 1:

@@ -9,8 +9,8 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
-from sb3_guard.common.adapters import is_safety_gymnasium
-from sb3_guard.common.vec_env import find_scenario, make_vec_env
+from sb3_guard.common.sources import Source, find
+from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.zoo.hyperparams import Setup
 from sb3_guard.zoo.resumable import ResumableEnv
 from sb3_guard.zoo.usage import UsageError, explained, interrupts_ignored
@@ -67,11 +67,11 @@ def evaluation_seed(seed: int) -> int:
     return row_seeds(seed, 1, 1)[0] // 2
 
 
-def canonical_id(env_id: str) -> tuple[str, bool]:
+def source_of(env_id: str) -> Source:
     """
-    The full id of an environment, and whether it is one of ours.
+    The environments of ``--env``.
 
-    :param env_id: an id, whose version may be left out if the environment is ours
+    :param env_id: an id, whose version may be left out
     :raises UsageError: it is unknown
     """
     if env_id.endswith((".yml", ".yaml")):
@@ -81,15 +81,20 @@ def canonical_id(env_id: str) -> tuple[str, bool]:
             f"sb3_guard.Scenario.load({env_id!r})), then --gym-packages my_module --env Mine-v0"
         )
     with explained("--env", ValueError, gym.error.Error):
-        ours = find_scenario(env_id) is not None
-        if not ours and not is_safety_gymnasium(env_id):
-            module, colon, name = env_id.rpartition(":")
-            if colon:
-                raise UsageError(f"--env {env_id}: write --gym-packages {module} --env {name}")
-            gym.spec(env_id)
-    if ours and not env_id.rpartition("-v")[2].isdigit():
-        env_id = f"{env_id}-v0"
-    return env_id, ours
+        source = find(env_id)
+    module, colon, name = env_id.rpartition(":")
+    if colon and module not in ("sb3_guard", "safety_gymnasium"):
+        raise UsageError(f"--env {env_id}: write --gym-packages {module} --env {name}")
+    return source
+
+
+def full_id(env_id: str) -> str:
+    """
+    The id with its version.
+
+    :raises UsageError: it is unknown
+    """
+    return str(source_of(env_id).env_id)
 
 
 def make_envs(

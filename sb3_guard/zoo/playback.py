@@ -22,8 +22,9 @@ from sb3_guard.zoo.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.hyperparams import build, check
 from sb3_guard.zoo.make_envs import (
     ERRORS_OF_OURS,
-    canonical_id,
+    full_id,
     make_envs,
+    source_of,
 )
 from sb3_guard.zoo.names import packages_flag, require_named
 from sb3_guard.zoo.run_folder import (
@@ -58,7 +59,7 @@ def find_run(
     number = number or latest_run(parent, name)
     if number:
         return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
-    algorithm(algo), canonical_id(env_id)  # a misspelt name has a message of its own
+    algorithm(algo), full_id(env_id)  # a misspelt name has a message of its own
     where = "" if folder == PRETRAINED else f" -f {folder}"
     ships = where and latest_run(PRETRAINED / algo, name)
     runs = [one for one in sorted(Path(folder).glob("*/*_*")) if is_run(one)]
@@ -141,7 +142,8 @@ def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
     require_named(run.path, flags.gym_packages, run.args().get("gym_packages") or [])
     values = {**run.hyperparams(), "callback": None}  # nobody calls one here
     cls = algorithm(flags.algo)
-    env_id, ours = canonical_id(flags.env)
+    source = source_of(flags.env)
+    env_id, ours = str(source.env_id), source.batch is not None
     setup = build(check(flags.algo, cls, values))
     if flags.num_threads > 0:
         import torch as th

@@ -13,7 +13,7 @@ from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import is_checkpoint, read_checkpoint, restore_logs
 from sb3_guard.zoo.flags import HOST, IDENTITY
 from sb3_guard.zoo.hyperparams import check, read_hyperparams
-from sb3_guard.zoo.make_envs import canonical_id
+from sb3_guard.zoo.make_envs import full_id, source_of
 from sb3_guard.zoo.names import require_named
 from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
@@ -31,7 +31,8 @@ def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
     flags = dataclasses.replace(flags)
     import_packages(flags.gym_packages)  # which may register algorithms, too
     cls = algorithm(flags.algo)
-    flags.env, ours = canonical_id(flags.env)
+    source = source_of(flags.env)
+    flags.env = str(source.env_id)
     if flags.seed < 0:
         flags.seed = int(np.random.default_rng().integers(2**31))
     overrides = dict(flags.hyperparams or {})
@@ -42,7 +43,8 @@ def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
     )
     if flags.env_kwargs:
         values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
-    native = ours and values.get("env_wrapper") is None  # what wraps single ones needs single ones
+    # What wraps single environments needs single ones.
+    native = source.batch is not None and values.get("env_wrapper") is None
     flags.vec_env = flags.vec_env or ("native" if native else "dummy")
     return flags, values
 
@@ -194,7 +196,7 @@ def _compared(
     hosted = {*RunFlags.names(HOST), "trained_agent", "n_timesteps", "hyperparams"}
     now = {name: getattr(given, name) for name in given.given & RunFlags.names() - hosted}
     if "env" in now:
-        now["env"] = canonical_id(given.env)[0]
+        now["env"] = full_id(given.env)
     if "log_folder" in now:
         now["log_folder"] = str(Path(given.log_folder).resolve())
     if given.hyperparams:

@@ -22,7 +22,7 @@ from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.fast.actor import distribution_of
 from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
-from sb3_guard.algorithms.common.rollouts import CostRollouts
+from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 from sb3_guard.checks import check_integer, check_number
 
 #: ``loss(batch, ratio, distribution)``, see :meth:`FirstOrder.loss`
@@ -49,7 +49,11 @@ class FirstOrder(CostRollouts, PPO):
         "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},
     }
 
-    kl_stop: Literal["minibatch", "epoch"] = hyperparameter("minibatch")
+    # λ = 0.97 and the stop by the KL of the rollout: what robots with episodes of 1,000 steps need.
+    defaults: ClassVar[dict[str, Any]] = {"gae_lambda": 0.97, "target_kl": 0.02}
+    policy_defaults: ClassVar[dict[str, Any]] = CALM
+
+    kl_stop: Literal["minibatch", "epoch"] = hyperparameter("epoch")
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

@@ -30,7 +30,7 @@ from sb3_guard.algorithms.common.critics import Regression
 from sb3_guard.algorithms.common.fast.actor import actor_of
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
-from sb3_guard.algorithms.common.rollouts import CostRollouts
+from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
 
@@ -127,6 +127,7 @@ class TrustRegion(CostRollouts):
         "CnnPolicy": ActorCriticCnnPolicy,
         "MultiInputPolicy": MultiInputActorCriticPolicy,
     }
+    policy_defaults: ClassVar[dict[str, Any]] = CALM
     returns: ClassVar[Literal["lambda", "discounted"]] = "discounted"
     # SB3's weights of losses: nothing here mixes those of actor and critic.
     fixed_arguments: ClassVar[frozenset[str]] = frozenset({"ent_coef", "vf_coef", "max_grad_norm"})
@@ -376,8 +377,8 @@ class PenalizedTrustRegion(Lagrangian, TrustRegion):
     }
 
     defaults: ClassVar[dict[str, Any]] = {
-        "lambda_lr": 0.3,
-        "proportional_gain": 10.0,
+        "lambda_lr": 0.2,
+        "proportional_gain": 1.0,
         "lambda_smoothing": 0.5,
         "lambda_units": "relative",
     }

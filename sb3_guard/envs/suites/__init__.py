@@ -5,13 +5,12 @@ A family is a :class:`~sb3_guard.envs.suites.suite.Suite` in a module of its own
 the commands, with the keywords that change parameters.
 """
 
-import re
-
 from sb3_guard.envs.suites import guard, safety_gymnasium, velocity
 from sb3_guard.envs.suites.suite import EPISODE_STEPS, Fields, Suite
+from sb3_guard.ids import UnknownId, with_version
 from sb3_guard.spelling import did_you_mean, nearest
 
-__all__ = ["EPISODE_STEPS", "SUITES", "Suite", "env_ids", "episode_steps", "fields", "with_version"]
+__all__ = ["EPISODE_STEPS", "SUITES", "Suite", "env_ids", "episode_steps", "fields"]
 
 SUITES: dict[str, Suite] = {
     "guard": guard.SUITE,
@@ -32,14 +31,6 @@ def env_ids(suite: str | None = None) -> list[str]:
     return [env_id for one in chosen for env_id in one.scenarios]
 
 
-def with_version(name: str) -> str:
-    """An id in full: without a version the latest that is in a table, else v0."""
-    if re.search(r"-v\d+$", name):
-        return name
-    versions = [i for i in env_ids() if i.rpartition("-v")[0] == name]
-    return max(versions, key=lambda i: int(i.rpartition("-v")[2]), default=f"{name}-v0")
-
-
 def episode_steps(name: str) -> int:
     """Control steps after which an episode of this id is cut."""
     env_id = with_version(name)
@@ -49,7 +40,7 @@ def episode_steps(name: str) -> int:
 def fields(name: str) -> Fields:
     """The fields of the scenario that an id stands for; its version may be left out.
 
-    :raises ValueError: no family knows it
+    :raises UnknownId: no family knows it
     """
     env_id = with_version(name)
     for suite in SUITES.values():
@@ -60,7 +51,7 @@ def fields(name: str) -> Fields:
             return found
     meant = nearest(name, env_ids())
     hint = "" if meant is None else f"; did you mean {meant!r}?"
-    raise ValueError(
+    raise UnknownId(
         f"{name!r} is not an id of the form Task_Robot_NConstraint-v0, such as "
         f"'Goal_Point_8Hazards-v0'{hint}"
     )

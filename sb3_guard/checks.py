@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 
-class NotFiniteError(FloatingPointError, ValueError):
-    """A reward, cost, observation, action or loss is not a finite number."""
+class NumberError(FloatingPointError, ValueError):
+    """A reward, cost, observation, action or loss is a number that nothing can be learnt from."""
 
 
 def is_number(value: Any) -> bool:

@@ -15,7 +15,6 @@ COMMANDS = {
     "hub": "upload a trained agent to the Hugging Face hub, or download one",
     "list": "print suites, robots, tasks and constraints",
     "show": "print an environment's scenario, observations and actions, write a picture",
-    "completion": "print what completes the commands' flags in a shell",
 }
 
 

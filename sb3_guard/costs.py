@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_guard.checks import NotFiniteError
+from sb3_guard.checks import NumberError
 from sb3_guard.spelling import nearest
 
 
@@ -15,7 +15,7 @@ def number(value: Any, name: str) -> float:
     """One cost as a float: an int, bool, NumPy scalar or array of one number will do.
 
     :param name: what the message calls it
-    :raises NotFiniteError: it is something else, or not finite
+    :raises NumberError: it is something else, or not finite
     """
     try:
         one = value.item() if isinstance(value, np.ndarray) else value
@@ -23,7 +23,7 @@ def number(value: Any, name: str) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        raise NotFiniteError(f"{name} is {value!r}: a cost must be a finite number")
+        raise NumberError(f"{name} is {value!r}: a cost must be a finite number")
     return number
 
 
@@ -53,7 +53,7 @@ def read_costs(
     :param zero_if_missing: whether an absent entry means that nothing was charged
     :return: costs, shape (n_envs, m), and whether any of the entries was there
     :raises ValueError: an entry is missing and may not be
-    :raises NotFiniteError: one is not a finite number
+    :raises NumberError: one is not a finite number
     """
     shape, seen = (len(infos), len(keys)), True
     try:

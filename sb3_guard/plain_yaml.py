@@ -1,11 +1,8 @@
-"""YAML as people write it: plain data, no key twice, and nothing that contains itself."""
+"""YAML as people write it: plain data, and no key twice."""
 
 from typing import Any
 
 import yaml
-
-LARGEST = 1_000_000  # values in a file, those that aliases repeat included
-DEEPEST = 100  # values within values; PyYAML recurses, and in C that ends the process
 
 
 class DoubleKeyError(yaml.YAMLError):
@@ -14,40 +11,25 @@ class DoubleKeyError(yaml.YAMLError):
 
 # In C where libyaml is there, ten times as fast: a large grid reads a thousand files.
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    def __init__(self, stream: Any) -> None:
-        super().__init__(stream)
-        self.deep_construct = True  # PyYAML then refuses an alias within what it stands for
-
     def get_single_node(self) -> Any:
         """
-        The text's root.
+        The text's root. Constructing it writes merges, ``<<: *other``, into the mappings' nodes.
 
-        :raises yaml.YAMLError: a mapping has a key twice, or a few lines of nested aliases stand
-            for more than a million values
+        :raises DoubleKeyError: a mapping has a key twice
         """
         root = super().get_single_node()
-        sizes: dict[int, float] = {}
-
-        def size(node: Any) -> float:
-            if id(node) not in sizes:
-                sizes[id(node)] = 0.0  # within itself
-                below = node.value if isinstance(node, yaml.CollectionNode) else ()
-                if isinstance(node, yaml.MappingNode):
-                    _refuse_double_keys(node)
-                    below = [one for pair in below for one in pair]
-                sizes[id(node)] = 1.0 + sum(size(one) for one in below)
-            return sizes[id(node)]
-
-        if size(root) > LARGEST:
-            raise yaml.YAMLError(f"its aliases stand for {size(root):.1g} values")
+        nodes, seen = [root], set()
+        while nodes:
+            node = nodes.pop()
+            if id(node) in seen or not isinstance(node, yaml.CollectionNode):
+                continue
+            seen.add(id(node))
+            if isinstance(node, yaml.MappingNode):
+                _refuse_double_keys(node)
+                nodes += [item for pair in node.value for item in pair]
+            else:
+                nodes += node.value
         return root
-
-
-# The ordered mappings that RL-Zoo writes
-_Loader.add_constructor(
-    "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
-    lambda loader, node: dict(loader.construct_sequence(node, deep=True)[0]),
-)
 
 
 def _refuse_double_keys(node: yaml.MappingNode) -> None:
@@ -64,16 +46,23 @@ def _refuse_double_keys(node: yaml.MappingNode) -> None:
             lines[key.value] = line
 
 
-def load_yaml(text: str) -> Any:
-    """The plain data of a YAML text.
+def _ordered(loader: Any, node: Any) -> dict[Any, Any]:
+    """The ordered mapping that RL-Zoo writes: a list of one list of pairs."""
+    try:
+        return dict(*loader.construct_sequence(node, deep=True))
+    except (TypeError, ValueError) as error:
+        raise yaml.constructor.ConstructorError(
+            None, None, f"an OrderedDict must hold a list of pairs: {error}", node.start_mark
+        ) from error
 
-    :raises yaml.YAMLError: it is no YAML, a mapping has a key twice, or something contains itself
-        or is nested too deeply
+
+_Loader.add_constructor("tag:yaml.org,2002:python/object/apply:collections.OrderedDict", _ordered)
+
+
+def load_yaml(text: str) -> Any:
     """
-    depth = 0
-    for event in yaml.parse(text, _Loader):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            raise yaml.YAMLError(f"it is nested more than {DEEPEST} levels deep")
+    The plain data of a YAML text.
+
+    :raises yaml.YAMLError: it is no YAML, or a mapping has a key twice
+    """
     return yaml.load(text, _Loader)

@@ -28,7 +28,7 @@ class Flags(Command):
     :param figure: figures to draw, see below; all: all that there are runs for
     :param output: for figures (default: figures)
     :param format: of figures (default: png)
-    :param table: tables to write: .csv and .parquet a row per run, .md and .tex means and scores
+    :param table: tables to write: .csv a row per run, .md and .tex means and scores
     :param report: one page with everything
     :param env: only these suites
     :param cost_limit: only runs of this limit (several costs: of these limits), and unconstrained
@@ -86,7 +86,7 @@ def plot(flags: Flags) -> int:
     if not len(found.runs):
         raise UsageError(f"there is no finished run below {', '.join(flags.folders)}")
     chosen = with_safety(reading.choose(found.runs, flags.env, flags.cost_limit, flags.steps))
-    per_run = [file for file in files if file.suffix in (".csv", ".parquet")]
+    per_run = [file for file in files if file.suffix == ".csv"]
     for file in per_run:
         write_table(file, chosen)
         print(f"wrote {file}")

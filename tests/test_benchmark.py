@@ -153,7 +153,8 @@ def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
     )
     folder = tmp_path / "grid"
     # What is given now wins; hyper-parameters are merged.
-    arguments = ["--grid", str(file), "-f", str(folder), "--algos", "trpo", "-params", "n_envs:1"]
+    arguments = [*PACKAGE, "--grid", str(file), "-f", str(folder)]
+    arguments += ["--algos", "trpo", "-params", "n_envs:1"]
     assert benchmark.main(arguments) == 0
     (run,) = folder.glob("*/*_*")
     assert run == folder / "trpo" / "CostPoint-v0_2"
@@ -162,7 +163,7 @@ def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
     # The folder's record is such a file: it is enough to go on.
     assert yaml.safe_load((folder / "grid.yml").read_text())["algos"] == ["trpo"]
     capsys.readouterr()
-    assert benchmark.main(["-f", str(folder), "--dry-run"]) == 0
+    assert benchmark.main([*PACKAGE, "-f", str(folder), "--dry-run"]) == 0
     assert capsys.readouterr().out.startswith(f"done    {run}  60 steps")
 
 
@@ -330,7 +331,7 @@ def test_failures_are_retried_twice(failures, tmp_path, here, monkeypatch, capsy
         assert "failed: cpo on CostPoint-v0, seed 0: no luck" in err
         assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in out
         # Once more: the failed one is tried again, the other is not.
-        assert benchmark.main(["-f", str(tmp_path)]) == 0
+        assert benchmark.main([*PACKAGE, "-f", str(tmp_path)]) == 0
         assert here.runs[-1].flags.algo == "cpo" and len(here.runs) == 5
 
 
@@ -376,7 +377,7 @@ def test_a_full_disk_stops_the_grid(tmp_path, here, capsys):
     assert before.items() <= results(tmp_path).items()
     assert [run.flags.algo for run in here.runs] == ["trpo", "cpo"]  # no retries, nothing new
     (run / "0.monitor.csv").unlink()  # room is made
-    assert benchmark.main(["-f", str(tmp_path)]) == 0
+    assert benchmark.main([*PACKAGE, "-f", str(tmp_path)]) == 0
     assert len(results(tmp_path)) == 3
 
 
@@ -395,7 +396,7 @@ def test_asked_to_stop(tmp_path, here, monkeypatch, capsys):
     assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in capsys.readouterr().out
     assert len(here.runs) == 1 and results(tmp_path) == {}
     monkeypatch.setattr(grid, "complete", complete)
-    assert benchmark.main(["-f", str(tmp_path)]) == 0 and len(results(tmp_path)) == 2
+    assert benchmark.main([*PACKAGE, "-f", str(tmp_path)]) == 0 and len(results(tmp_path)) == 2
     assert "1 resume, 1 new" in capsys.readouterr().out
 
 
@@ -532,7 +533,7 @@ def test_interrupted_once_and_twice(number, tmp_path):
     assert process.returncode == 128 + number and "Traceback" not in out + err
     assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in out
     before = episodes(tmp_path)
-    with start(["-f", str(tmp_path)]) as process:
+    with start([*PACKAGE, "-f", str(tmp_path)]) as process:
         wait_for(lambda: episodes(tmp_path) > before + 10, process, 180)
         process.send_signal(number)
         time.sleep(0.1)

@@ -670,23 +670,6 @@ def test_help_shows_an_example(command, capsys):
     assert f"sb3_guard.{command} " in examples or f"sb3-guard {command}" in examples
 
 
-def test_completion_in_bash(tmp_path, capsys):
-    assert cli.main(["completion", "bash"]) == 0
-    script = capsys.readouterr().out
-    asked = ("sb3-guard tr", "sb3-guard train --algo ", "sb3-guard enjoy --env Goal_Arm6_8G",
-             "sb3-guard enjoy --re")  # fmt: skip
-    for line in asked:
-        words = line.split(" ")
-        script += (
-            f"\nCOMP_WORDS=({' '.join(words[:-1])} '{words[-1]}'); COMP_CWORD={len(words) - 1}\n"
-            "COMPREPLY=(); _shtab_sb3_guard; echo ${COMPREPLY[@]}"
-        )
-    done = subprocess.run(["bash"], input=script, capture_output=True, text=True, check=True)
-    first, algos, envs, flags = (set(line.split()) for line in done.stdout.splitlines())
-    assert first == {"train"} and envs == {"Goal_Arm6_8Ghosts-v0"} and "--record" in flags
-    assert {"cpo", "pcpo", "trpo_lag", "ppo"} <= algos
-
-
 @pytest.mark.parametrize("command", ["train", "enjoy"])
 def test_help_is_quick_and_loads_nothing_heavy(command):
     script = (

@@ -11,7 +11,7 @@ from test_bad_input import refused
 from test_commands import SMALL, TOY, trained
 
 from sb3_guard import CPO, benchmark, enjoy, train
-from sb3_guard.zoo import grid, rl_zoo3
+from sb3_guard.zoo import grid
 from sb3_guard.zoo.hyperparams import build
 from sb3_guard.zoo.usage import UsageError
 from sb3_guard.zoo.values import parse_value
@@ -138,28 +138,6 @@ def test_printed_commands_name_the_modules(tmp_path, capsys):
 def test_only_classes_of_their_kind(name, value):
     with pytest.raises(UsageError, match=name):
         build({"n_envs": 1, "n_timesteps": 1, name: value}).callbacks()
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"policy_kwargs": "dict(a=exit())"},
-        {"normalize": "exit()"},
-        {"monitor_kwargs": "exit()"},
-        {"callback": "subprocess.Popen"},
-    ],
-)
-def test_rl_zoo_evaluates_nothing_of_ours(values):
-    with pytest.raises(UsageError, match=next(iter(values))):
-        rl_zoo3.typed(values)
-
-
-def test_rl_zoos_command_reads_values_without_eval(trap):
-    command = f"train --algo cpo --env CostPoint-v0 {' '.join(TOY[:2])} -n 1 -f {trap.parent}"
-    escape = f"open({str(trap)!r},'w')"
-    with pytest.raises((UsageError, TypeError)):
-        rl_zoo3.main([*command.split(), "-params", f"n_envs:{escape}"])
-    assert not trap.exists()
 
 
 class Hostile:

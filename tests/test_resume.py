@@ -276,28 +276,6 @@ def test_a_result_is_always_that_of_its_configuration(
     assert run.checked_result()["n_timesteps"] == 120
 
 
-@pytest.mark.parametrize("name", ["progress.csv", "0.monitor.csv"])
-def test_a_damaged_log_of_a_finished_run_is_restored(name, tmp_path, monkeypatch, capsys):
-    assert train.main([*TOY, *SHORT, *SMALL, "-n", "60", "-f", str(tmp_path)]) == 0
-    run = runs_of(tmp_path)
-    whole = (run / name).read_bytes()
-    later = whole + b"1,2,3,4\n"  # which no checkpoint has
-    for content, restored in ((whole[:-9], whole), (b"", whole), (later, later)):
-        (run / name).write_bytes(content)
-        assert train.main(["-i", str(run), *TOY[:2]]) == 0
-        out = capsys.readouterr().out
-        assert "is finished" in out and ("damaged or absent" in out) == (content != restored)
-        assert (run / name).read_bytes() == restored
-
-    def die(*_: object) -> None:
-        raise Killed
-
-    monkeypatch.setattr("sb3_guard.common.files.os.replace", die)
-    with pytest.raises(Killed):
-        train.main(["-i", str(run), *TOY[:2], "-n", "120"])
-    assert (run / name).read_bytes() == later
-
-
 def test_time_goes_on(tmp_path, monkeypatch):
     arguments = [*TOY, *SHORT, *SMALL, "-n", "180", "-f", str(tmp_path)]
     crash(monkeypatch, arguments, 100)

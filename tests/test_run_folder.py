@@ -12,7 +12,7 @@ from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
 
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import KEPT
-from sb3_guard.zoo.checkpoint import restore_logs
+from sb3_guard.zoo.checkpoint import cut_logs
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, RunInUse, folder_name, latest_run, lock, owner
@@ -149,9 +149,12 @@ def rows(path) -> list[str]:
     return (path / "progress.csv").read_text().splitlines()
 
 
+MONITOR = b"#{}\nr,l,t,c\n"
+
+
 def resumed(folder, state) -> RunLogger:
-    environments = [{"episodes": 3}, {**dict.fromkeys(KEPT), "table": "#{}\nr,l,t,c\n"}, None]
-    restore_logs(folder, {"logger": state, "environments": environments}, drop_later=True)
+    environments = [{"episodes": 3}, {**dict.fromkeys(KEPT), "length": len(MONITOR)}, None]
+    cut_logs(folder, {"logger": state, "environments": environments})
     return RunLogger(folder, state=state)
 
 
@@ -207,22 +210,38 @@ def test_a_sleeper_whose_run_was_taken_over_ends(tmp_path):
     assert "was taken over while this process gave no sign of life" in done.stderr
 
 
-@pytest.mark.parametrize("content", [None, "", "a\n0\n1\n", "a,b\n0\n1\n2,", "a\n0\n\0\n\xff"])
-def test_a_kill_or_a_full_disk_loses_no_row(content, tmp_path, capsys):
-    """Whatever it left of the log, the checkpoint has all of it."""
+@pytest.mark.parametrize("older", [False, True])
+def test_what_came_after_the_checkpoint_is_cut(older, tmp_path):
+    """New columns too, which extend the rows before; and as checkpoints of format 5 have it."""
     logger = RunLogger(tmp_path)
     for k in range(3):
         logger.record("a", k)
         logger.dump(k)
     state = logger.state(iterations=3)
+    before = (tmp_path / "progress.csv").read_bytes()
+    if older:
+        state = {**state, "table": before.decode()}
+        del state["length"]
+    for k in range(3):
+        logger.record("b", k)
+        logger.record("c" * k, k)
+        logger.dump(k)
     logger.close()
-    path = tmp_path / "progress.csv"
-    path.unlink() if content is None else path.write_bytes(content.encode("latin-1"))
+    (tmp_path / "0.monitor.csv").write_bytes(MONITOR + b"1,1,1,1\n")
     resumed(tmp_path, state).close()
-    assert rows(tmp_path) == ["a", "0", "1", "2"]
-    said = capsys.readouterr().out
-    assert f"{path} was damaged or absent" in said and "monitor.csv was damaged or absent" in said
-    with open(path, "a") as file:
-        file.write("3\n")
-    resumed(tmp_path, state).close()
-    assert (rows(tmp_path), capsys.readouterr().out) == (["a", "0", "1", "2"], "")
+    assert (tmp_path / "progress.csv").read_bytes() == before
+    assert (tmp_path / "0.monitor.csv").read_bytes() == MONITOR
+
+
+def test_a_deleted_log_begins_anew(tmp_path):
+    logger = RunLogger(tmp_path)
+    logger.record("a", 1)
+    logger.dump()
+    state = logger.state(iterations=1)
+    logger.close()
+    (tmp_path / "progress.csv").unlink()
+    again = resumed(tmp_path, state)
+    again.record("b", 2)
+    again.dump()
+    again.close()
+    assert rows(tmp_path) == ["b", "2"]

@@ -21,7 +21,7 @@ from sb3_guard.zoo.statistics import (
     safety,
     with_safety,
 )
-from sb3_guard.zoo.tables import check_table, latex, markdown, tables, terminal, write_table
+from sb3_guard.zoo.tables import latex, markdown, tables, terminal, write_table
 from sb3_guard.zoo.usage import UsageError
 
 HAZARDS, GHOSTS = "Goal_Point_8Hazards", "Goal_Point_8Ghosts"
@@ -183,16 +183,12 @@ def runs(tmp_path):
     return with_safety(read_results([tmp_path / "logs"]).runs)
 
 
-def test_csv_and_parquet_are_the_table(tmp_path, runs):
+def test_csv_is_the_table(tmp_path, runs):
     write_table(tmp_path / "a" / "runs.csv", runs)
     again = pd.read_csv(tmp_path / "a" / "runs.csv")
     same = ["algo", "seed", "J_r"]
     pd.testing.assert_frame_equal(again[same], runs[same], check_dtype=False)
     assert list(again.columns) == [*COLUMNS, *SAFETY]
-    pytest.importorskip("pyarrow")
-    write_table(tmp_path / "runs.parquet", runs)
-    again = pd.read_parquet(tmp_path / "runs.parquet")
-    pd.testing.assert_frame_equal(again, runs, check_dtype=False)
 
 
 def test_markdown_and_latex(tmp_path, runs):
@@ -225,14 +221,11 @@ def test_markdown_shows_cells_as_they_are(text, page):
     assert "|" in text or escaped(text) == page
 
 
-def test_formats(tmp_path, runs, monkeypatch):
+def test_formats(tmp_path, runs):
     for name in ("r.xlsx", "r", "r.cvs"):
-        with pytest.raises(UsageError, match=r"unknown format .*.md, .tex, .csv, .parquet"):
+        with pytest.raises(UsageError, match=r"unknown format .*.md, .tex, .csv"):
             write_table(tmp_path / name, runs)
         assert not (tmp_path / name).exists()
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match=r"can't write to"):
         write_table(tmp_path / "file" / "r.csv", runs)
-    monkeypatch.setattr("sb3_guard.zoo.tables.find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"pip install pyarrow"):
-        check_table(tmp_path / "runs.parquet")

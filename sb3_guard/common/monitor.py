@@ -5,7 +5,6 @@ import inspect
 import os
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.checks import NotFiniteError
+from sb3_guard.checks import NumberError
 from sb3_guard.common.vec_budgets import end_rows
 from sb3_guard.costs import number, read_costs
 
@@ -94,7 +93,7 @@ class CostMonitor(VecMonitor):
         """
         Begin new episodes everywhere; those under way are not reported.
 
-        :raises NotFiniteError: an observation is not finite
+        :raises NumberError: an observation is not finite
         """
         self._clear()
         obs = self.venv.reset()
@@ -105,7 +104,7 @@ class CostMonitor(VecMonitor):
         """
         Pass a step on; the infos of rows that ended an episode gain ``"episode"``.
 
-        :raises NotFiniteError: a reward, cost or observation is not finite
+        :raises NumberError: a reward, cost or observation is not finite
         """
         obs, rewards, dones, infos = self.venv.step_wait()
         _require_finite("reward", rewards)
@@ -167,10 +166,10 @@ class CostMonitor(VecMonitor):
         )
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs to continue counting, and the csv as ``"table"``."""
+        """What :meth:`restore` needs to continue counting, and ``"length"``, the csv's bytes."""
         writer = self.results_writer
-        table = None if writer is None else Path(writer.file_handler.name).read_bytes().decode()
-        return {**{name: copy.copy(getattr(self, name)) for name in KEPT}, "table": table}
+        length = 0 if writer is None else os.path.getsize(writer.file_handler.name)
+        return {**{name: copy.copy(getattr(self, name)) for name in KEPT}, "length": length}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue counting from :meth:`state`; the csv is left as it is."""
@@ -183,7 +182,7 @@ def _require_finite(name: str, values: VecEnvObs) -> None:
     Refuse what networks would turn into NaN everywhere.
 
     :param values: shape (n_envs, ...), or a dictionary or tuple of such
-    :raises NotFiniteError: one is not finite; the message names the environments
+    :raises NumberError: one is not finite; the message names the environments
     """
     if not isinstance(values, np.ndarray):
         entries = values.items() if isinstance(values, Mapping) else enumerate(values)
@@ -192,7 +191,7 @@ def _require_finite(name: str, values: VecEnvObs) -> None:
     elif values.dtype.kind == "f" and not np.isfinite(values).all():
         bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
         rows = np.flatnonzero(bad).tolist()
-        raise NotFiniteError(
+        raise NumberError(
             f"the {name} of environment {rows[0]} is {values[rows[0]].tolist()}: it must be finite"
         )
 

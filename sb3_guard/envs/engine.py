@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import DTypeLike
 
-from sb3_guard.checks import NotFiniteError
+from sb3_guard.checks import NumberError
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.check_part import check_moving, per_row
 from sb3_guard.envs.extras import Extras
@@ -350,7 +350,7 @@ class Engine:
         """The actions, [N, action_size].
 
         :raises ValueError: they have another shape
-        :raises NotFiniteError: they are not finite
+        :raises NumberError: they are not finite
         """
         actions = np.asarray(actions, dtype=float)
         shape = (self.num_envs, self.robot.action_size)
@@ -358,7 +358,7 @@ class Engine:
             raise ValueError(f"actions have shape {actions.shape}, expected {shape}")
         if np.count_nonzero(np.isfinite(actions)) < actions.size:  # all() takes longer
             rows = np.flatnonzero(~np.isfinite(actions).all(axis=1)).tolist()
-            raise NotFiniteError(
+            raise NumberError(
                 f"actions of rows {rows} are not finite: {actions[rows[0]].tolist()}; allowed: "
                 "numbers, which are clipped to the action space"
             )

@@ -6,6 +6,7 @@ file is a model file of SB3's with one more member, so ``CPO.load("checkpoint.zi
 """
 
 import copy
+import os
 import pickle
 import random
 import time
@@ -34,7 +35,8 @@ NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
 # Checkpoints take at most this share of the time: those with a replay buffer are large.
 LARGEST_SHARE = 0.05
-FORMAT = 5  # increased when the content changes so that older files can't be continued
+# Increased when the content changes, and the formats that can be continued.
+FORMAT, FORMATS = 6, (5, 6)
 
 
 class Interrupted(Exception):
@@ -222,36 +224,38 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         whole = state is None and "data" in members
         raise UsageError(f"{path} is {'a model, not a checkpoint' if whole else 'damaged'}")
     version = state["format"]
-    if version != FORMAT:
-        raise UsageError(f"{path} has format {version}; this version reads format {FORMAT} only")
+    if version not in FORMATS:
+        raise UsageError(
+            f"{path} has format {version}; this version continues formats "
+            f"{' and '.join(map(str, FORMATS))} only"
+        )
     return state
 
 
-def restore_logs(folder: Path, state: Mapping[str, Any], drop_later: bool) -> None:
+def cut_logs(folder: Path, state: Mapping[str, Any]) -> None:
     """
-    Put a run's csv files back as its checkpoint has them, each in one step.
+    Drop what a run wrote to its csv files after a checkpoint.
 
     :param folder: the run folder
     :param state: as :func:`read_checkpoint` returns it
-    :param drop_later: also drop what was written after the checkpoint
     :raises UsageError: they can't be written
     """
-    kept = {*KEPT, "table"}
-    (monitor,) = (one["table"] for one in state["environments"] if kept <= {*(one or ())})
-    for path, table in (
-        (folder / "progress.csv", state["logger"]["table"]),
-        (folder / "0.monitor.csv", monitor),
-    ):
-        with explained(f"can't write to {folder}", OSError):
-            there = path.read_bytes().decode(errors="replace") if path.exists() else ""
-            lines, rows = there.split("\n"), table.split("\n")
-            # A column that came later is at the end of each line.
-            whole = len(lines) >= len(rows) and all(map(str.startswith, lines, rows))
-            if not whole:
-                print(f"{path} was damaged or absent: its rows are back, from the checkpoint.")
-            if not whole or (drop_later and there != table):
-                with replacing(path) as file:
-                    file.write(table.encode())
+    logger = state["logger"]
+    (monitor,) = (part for part in state["environments"] if {*KEPT} <= {*(part or ())})
+    with explained(f"can't write to {folder}", OSError):
+        table = folder / "progress.csv"
+        header, *rows = table.read_bytes().split(b"\n") if table.is_file() else [b""]
+        later = header.count(b",") + 1 - len(logger["columns"])
+        if rows and later > 0:
+            # Each column that came after the checkpoint put a comma behind every row before it.
+            with replacing(table) as file:
+                header = header.rsplit(b",", later)[0]
+                file.write(b"\n".join([header, *(row[:-later] for row in rows)]))
+        for path, written in ((table, logger), (folder / "0.monitor.csv", monitor)):
+            # Checkpoints of format 5 have the table itself.
+            length = written["length"] if "length" in written else len(written["table"].encode())
+            if path.is_file() and path.stat().st_size > length:
+                os.truncate(path, length)
 
 
 def is_checkpoint(path: Path) -> bool:

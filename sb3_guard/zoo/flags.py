@@ -210,7 +210,6 @@ def command(flags: type[Any], function: Callable[[Any], int]) -> Callable[..., i
         """
         return run(lambda: function(flags.parse(sys.argv[1:] if argv is None else argv)))
 
-    main.flags = flags  # type: ignore[attr-defined]  # for what completes or documents them
     return main
 
 

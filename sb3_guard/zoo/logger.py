@@ -1,4 +1,4 @@
-"""A logger whose table is part of a checkpoint, and is continued from there."""
+"""A logger whose table is continued from a checkpoint."""
 
 import os
 import sys
@@ -35,8 +35,9 @@ class RunLogger(Logger):
         self._csv = CSVOutputFormat(os.devnull)  # which empties the file it opens
         self._csv.close()
         path = os.path.join(folder, "progress.csv")
-        self._csv.file = open(path, "w+" if state is None else "r+", encoding="utf-8", newline="\n")
-        self._csv.file.seek(0, os.SEEK_END)
+        goes_on = state is not None and os.path.exists(path)
+        self._csv.file = open(path, "r+" if goes_on else "w+", encoding="utf-8", newline="\n")
+        goes_on = self._csv.file.seek(0, os.SEEK_END) > 0
         formats: list[KVWriter] = [self._csv]
         if stdout:
             formats.append(HumanOutputFormat(sys.stdout))
@@ -45,7 +46,8 @@ class RunLogger(Logger):
         super().__init__(os.fspath(folder), formats)
         self._iterations_before = 0
         if state is not None:
-            self._csv.keys = list(state["columns"])
+            if goes_on:
+                self._csv.keys = list(state["columns"])
             # What training logged after the last row is written with the next one.
             self.name_to_value.update(state["values"])
             self.name_to_count.update(state["counts"])
@@ -64,9 +66,8 @@ class RunLogger(Logger):
 
         :param iterations: rollouts so far, those before a resume included
         """
-        self._csv.file.seek(0)
         return {
-            "table": self._csv.file.read(),
+            "length": self._csv.file.seek(0, os.SEEK_END),  # bytes
             "columns": list(self._csv.keys),
             "values": dict(self.name_to_value),
             "counts": dict(self.name_to_count),

@@ -32,10 +32,10 @@ from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import (
     Checkpoints,
     Interrupted,
+    cut_logs,
     load_model,
     read_checkpoint,
     read_normalizer,
-    restore_logs,
     restore_run,
 )
 from sb3_guard.zoo.hyperparams import Setup, build
@@ -278,8 +278,9 @@ class Experiment:
         own = f"{self.flags.algo}{folder.path.name[len(folder.name) :]}"
         with explained(f"can't write to {folder.path}", OSError):
             if state is not None:
-                restore_logs(folder.path, state, drop_later=True)
-            find_monitor(self.env).log_to(folder.monitor, append=state is not None)
+                cut_logs(folder.path, state)
+            goes_on = state is not None and folder.monitor.exists()
+            find_monitor(self.env).log_to(folder.monitor, append=goes_on)
             logger = RunLogger(
                 folder.path,
                 stdout=self._prints_tables,

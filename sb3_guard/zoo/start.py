@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_guard.zoo.algos import algorithm
-from sb3_guard.zoo.checkpoint import is_checkpoint, read_checkpoint, restore_logs
+from sb3_guard.zoo.checkpoint import is_checkpoint, read_checkpoint
 from sb3_guard.zoo.flags import HOST, IDENTITY
 from sb3_guard.zoo.hyperparams import check, read_hyperparams
 from sb3_guard.zoo.make_envs import full_id, source_of
@@ -180,7 +180,6 @@ def resume(given: RunFlags) -> int:
             values["n_timesteps"] = flags.n_timesteps = wanted
         values = check(flags.algo, algorithm(flags.algo), values)
         if folder.read_result() is not None and done >= values["n_timesteps"]:
-            restore_logs(folder.path, state, drop_later=False)
             print(
                 f"{folder.path} is finished: {done} of {values['n_timesteps']} steps; "
                 "a larger -n continues it"

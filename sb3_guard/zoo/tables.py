@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from io import BufferedRandom
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from sb3_guard.zoo.usage import UsageError, explained
 # A column's name, or a function of a row; by heading
 Cell = str | Callable[[Any], str]
 Columns = dict[str, Cell]
-FORMATS = (".md", ".tex", ".csv", ".parquet")
+FORMATS = (".md", ".tex", ".csv")
 DIGITS = {"rho_c": 5}
 HEADINGS = {"J_r": "return J_r", "M_c": "episode cost M_c", "rho_c": "cost rate ρ_c"}
 SCORE_HEADINGS = {"reward": "reward / TRPO", "cost": "cost / TRPO", "cost_rate": "rate / TRPO"}
@@ -180,16 +179,12 @@ def check_table(path: Path) -> None:
     """
     Find out before work is done whether a table can be written in the format its name asks for.
 
-    :raises UsageError: the format is unknown, or Parquet without pyarrow
+    :raises UsageError: the format is unknown
     """
     if path.suffix not in FORMATS:
         raise UsageError(
             f"--table {str(path)!r}: unknown format {path.suffix!r}; "
             f"{did_you_mean(path.suffix, FORMATS)}"
-        )
-    if path.suffix == ".parquet" and find_spec("pyarrow") is None:
-        raise UsageError(
-            f"--table {str(path)!r}: Parquet needs pyarrow; run pip install pyarrow, or write .csv"
         )
 
 
@@ -197,7 +192,7 @@ def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> No
     """
     Write a table in the format that the file's name says.
 
-    :param path: ``.csv`` and ``.parquet`` get a row per run; ``.md`` and ``.tex`` the means over
+    :param path: ``.csv`` gets a row per run; ``.md`` and ``.tex`` the means over
         seeds and the scores, see :func:`tables`
     :param runs: with the columns of :func:`~sb3_guard.zoo.statistics.with_safety`; for means, those
         that may be averaged
@@ -215,7 +210,5 @@ def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> No
     with written(path) as file:
         if path.suffix == ".csv":
             runs.to_csv(file, index=False)
-        elif path.suffix == ".parquet":
-            runs.to_parquet(file, index=False)
         else:
             file.write(("\n\n".join(parts) + "\n").encode())

@@ -815,6 +815,21 @@ def test_an_unknown_argument_is_answered_with_the_nearest(name: str, meant: str)
         CPO("MlpPolicy", points(1), ent_coef=0.1)
 
 
+@pytest.mark.parametrize("cls", ALGORITHMS.values())
+def test_the_signature_says_what_can_be_passed_by_position(cls: Any) -> None:
+    stated = inspect.signature(cls).parameters.values()
+    names = [one.name for one in stated if one.kind is one.POSITIONAL_OR_KEYWORD]
+    values = {name: inspect.signature(cls).parameters[name].default for name in names[2:]}
+    values |= {"learning_rate": 1.5e-4, "gamma": 0.91, "n_steps": 1 if "tau" in values else 40}
+    values |= {"batch_size": 16} if values["batch_size"] else {}
+    values.pop("_init_setup_model", None)
+    model = cls("MlpPolicy", points(1), *values.values())
+    for name in {"learning_rate", "gamma", "n_steps", "batch_size", "n_epochs"} & values.keys():
+        assert getattr(model, name) == values[name], name
+    with pytest.raises(TypeError, match="'learning_rate'"):
+        cls("MlpPolicy", points(1), 3e-4, learning_rate=1e-4)
+
+
 SB3_KEYS = {
     "rollout/ep_rew_mean",
     "rollout/ep_len_mean",

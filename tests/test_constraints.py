@@ -496,6 +496,7 @@ def test_constraints_state_the_papers_taxonomy():
         ("gremlins", {"travel": -0.1}, r"gremlins.travel = -0.1 must be at least 0"),
         ("buttons", {"weight": float("nan")}, r"buttons.weight = nan must be a number"),
         ("walls", {}, r"unknown constraint 'walls'"),
+        ("speed", {"limit": -1.0}, r"speed.limit = -1.0 must be at least 0"),
     ],
 )
 def test_bad_parameters_are_named(name, params, words):

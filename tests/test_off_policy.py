@@ -359,6 +359,15 @@ def test_bad_input(cls: Any, more: Any, error: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("cls", "name"),
+    [(SACLag, "ent_coef"), (TD3Lag, "target_policy_noise"), (TD3Lag, "target_noise_clip")],
+)
+def test_what_sb3_takes_silently_is_refused(cls: Any, name: str) -> None:
+    with pytest.raises(ValueError, match=rf"{name}=-1: must be a number in \[0, inf\)"):
+        cls("MlpPolicy", points(1), **settings(), **{name: -1})
+
+
+@pytest.mark.parametrize(
     ("cls", "name"), [(SACLag, "target_update_interval"), (TD3Lag, "policy_delay")]
 )
 def test_an_interval_of_zero_is_refused_before_training(cls: Any, name: str) -> None:

@@ -97,6 +97,14 @@ def test_a_robot_that_would_fall_forever_is_refused(cart):
         cart(change).build()
 
 
+@pytest.mark.parametrize("step", [0, -1, 0.051, 10])
+def test_a_physics_step_that_is_none_is_refused(step, cart):
+    with pytest.raises(
+        ValueError, match=rf"physics step of {step} s; allowed: above 0, at most 0.05"
+    ):
+        cart(options=f'<option timestep="{step}"/>').build()
+
+
 def test_a_floor_in_the_file_is_answered_or_kept(cart):
     ground = '<geom name="ground" type="plane" size="5 5 1"/>'
     with pytest.raises(ValueError, match=r"has a floor, geom 'ground', .* complete=True"):

@@ -11,6 +11,7 @@ from known_optima import Outcomes, problems, solve
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_guard import CPO, SCPO, CostEvalCallback, evaluate_policy
+from sb3_guard.checks import NumberError
 from sb3_guard.common.vec_budgets import VecMaxCost
 
 KEYS = ("cost", "cost_1")
@@ -96,3 +97,16 @@ def test_the_worst_step_keeps_its_limit_where_a_limited_sum_does_not() -> None:
     )
     assert np.mean(seen.costs) <= 1.05 * 10.0
     assert np.mean(seen.worst) >= 1.5 * problem.limits[0]
+
+
+def test_negative_costs_are_refused() -> None:
+    """The highest cost so far begins at 0, so that they would count as nothing."""
+
+    class Credit(CostPoint):
+        def step(self, action: np.ndarray) -> Any:
+            *rest, info = super().step(action)
+            return *rest, {**info, "cost": -0.5}
+
+    model = SCPO("MlpPolicy", make_vec_env(Credit, 2), cost_limit=1.0, n_steps=20)
+    with pytest.raises(NumberError, match=r"a cost is -0\.5: SCPO needs costs of at least 0"):
+        model.learn(40)

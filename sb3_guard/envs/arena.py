@@ -16,6 +16,7 @@ INTEGRATORS = {
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
+LONGEST = 0.05  # s of a physics step: contacts of robots are lost in longer ones
 STILL = 1e-8  # m/s: 2e-10 m in a control step, less than what any test tells from rest
 WALL = 0.3  # m, height of walls as they are drawn around robots in the plane
 
@@ -98,6 +99,12 @@ class Arena(Part):
         timestep, integrator = self.timestep or robot.timestep, self.integrator or robot.integrator
         if timestep is not None:
             spec.option.timestep = timestep  # attach() keeps the parent's options
+        timestep = float(spec.option.timestep)
+        if not 0.0 < timestep <= LONGEST:
+            raise ValueError(
+                f"robot {robot.name!r} has a physics step of {timestep:g} s; allowed: above 0, at "
+                f"most {LONGEST:g} s, as in <option timestep='0.002'/>"
+            )
         if integrator is not None:
             spec.option.integrator = INTEGRATORS[integrator]
         if self.sleep:

@@ -15,7 +15,8 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnvWrapper
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 from sb3_guard.zoo.usage import UsageError, explained
 from sb3_guard.zoo.values import read_expression
@@ -77,9 +78,18 @@ def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:
     """
     What ``env_wrapper``, ``vec_env_wrapper`` or ``callback`` names: classes and their arguments.
 
-    :raises UsageError: one is not there, or not of its kind
+    :raises UsageError: one is not there, not of its kind, or a monitor that writes a file
     """
-    return [(import_class(name, path, BASES[name]), own) for path, own in entries(name, value)]
+    result = []
+    for path, arguments in entries(name, value):
+        cls = import_class(name, path, BASES[name])
+        if issubclass(cls, Monitor | VecMonitor) and arguments.get("filename") is not None:
+            raise UsageError(
+                f"{name}: {path} would write to {arguments['filename']!r}, which may be another "
+                "run's; leave it out, since 0.monitor.csv of the run has all episodes"
+            )
+        result.append((cls, arguments))
+    return result
 
 
 def torch_class(path: str) -> Any:

@@ -274,8 +274,6 @@ class Experiment:
             print(f"Run folder: {folder.path} (seed {self.flags.seed})")
         if self.tracker is not None:
             self.tracker.remember(folder)
-        # TensorBoard's events have the run's own number, so that a resumed run finds them again.
-        own = f"{self.flags.algo}{folder.path.name[len(folder.name) :]}"
         with explained(f"can't write to {folder.path}", OSError):
             if state is not None:
                 cut_logs(folder.path, state)
@@ -284,7 +282,7 @@ class Experiment:
             logger = RunLogger(
                 folder.path,
                 stdout=self._prints_tables,
-                tensorboard=self._events and self._events / folder.name / own,
+                tensorboard=folder.events(self.flags) if self._events else None,
                 state=None if state is None else state["logger"],
             )
         self.model.set_logger(logger)

@@ -72,7 +72,7 @@ class EvaluationFlags(Command):
     eval_env_kwargs: dict[str, Any] | None = flag(role=IDENTITY)
     save_freq: int = flag(default=-1, kind=steps, metavar="N", role=IDENTITY)
     checkpoint_every: float = flag(default=10.0, kind=amount, metavar="S", role=HOST)
-    tensorboard_log: str = flag("-tb", default="", metavar="DIR")
+    tensorboard_log: str = flag("-tb", default="", metavar="DIR", role=HOST)
     track: bool = flag(default=False, role=HOST)
     wandb_project_name: str = flag(default="sb3_guard")
     wandb_entity: str | None = flag()

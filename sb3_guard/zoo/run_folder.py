@@ -226,6 +226,11 @@ class RunFolder:
         """The hyper-parameters the run was started with."""
         return read_data(self.params / "config.yml")
 
+    def events(self, flags: RunFlags) -> Path:
+        """The folder of its TensorBoard events, with its number: a resumed run finds it again."""
+        name = f"{flags.algo}{self.path.name[len(self.name) :]}"
+        return Path(flags.tensorboard_log or "runs") / self.name / name
+
     def again(self, flags: RunFlags) -> str:
         """The flags of ``train`` that continue the run, for messages."""
         return f"-i {shlex.quote(str(self.path))}{packages_flag(flags.gym_packages)}"

@@ -168,6 +168,11 @@ def resume(given: RunFlags) -> int:
         _refuse(differences(*_compared(given, flags, values, folder)), f"when {folder.path} began")
         for name in {*(given.given & RunFlags.names(HOST)), "progress"}:
             setattr(flags, name, getattr(given, name))
+        if flags.tensorboard_log and "tensorboard_log" not in given.given:
+            # A file may name any folder: it is followed to where the run has written before.
+            if not folder.events(flags).is_dir():
+                print(f"no events in {folder.events(flags)}; --tensorboard-log says where to write")
+                flags.tensorboard_log = ""
         state = read_checkpoint(folder.checkpoint)
         ours, its = ({**one, "n_timesteps": None} for one in (folder.what(), state["what"]))
         _refuse(differences(its, ours), f"of the training so far, in {folder.params}")

@@ -25,6 +25,12 @@ from sb3_guard.spelling import did_you_mean
 
 # Arguments that SB3's own base classes take from the algorithms, not from users.
 _INTERNAL = {"supported_action_spaces", "monitor_wrapper", "support_multi_env", "sde_support"}
+# The ends of the ranges, from 0 to infinity, of arguments that SB3 does not check.
+_THEIRS = {
+    "clip_range": "()", "clip_range_vf": "()", "ent_coef": "[)", "target_policy_noise": "[)",
+    "target_noise_clip": "[)",
+}  # fmt: skip
+_ONLY = inspect.Parameter.KEYWORD_ONLY
 _HANDS_ON = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
@@ -109,12 +115,27 @@ def defaults_of(cls: type) -> dict[str, Any]:
 
 
 def taking_defaults(cls: type) -> FunctionType:
-    """The constructor of a class, given what ``defaults`` states unless a call says otherwise."""
-    construct, defaults = cls.__init__, vars(cls)["defaults"]  # type: ignore[misc]
+    """
+    The constructor of a class, given what ``defaults`` states unless a call says otherwise.
+
+    It hands arguments on by name: the bases' positions include what the class fills in itself.
+    """
+    construct, defaults = cls.__init__, vars(cls).get("defaults", {})  # type: ignore[misc]
 
     @wraps(construct)
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
-        construct(self, *args, **{**defaults, **kwargs})
+        # The class that was called, or whose constructor a subclass calls.
+        called = next(c for c in type(self).__mro__ if getattr(c, "__init__", None) is __init__)
+        arguments = inspect.signature(called).parameters.values()
+        names = [argument.name for argument in arguments if argument.kind is not _ONLY]
+        if len(args) > len(names):
+            raise TypeError(
+                f"{called.__name__} takes {len(names)} arguments by position, not {len(args)}"
+            )
+        given = dict(zip(names, args, strict=False))
+        for name in given.keys() & kwargs.keys():
+            raise TypeError(f"{called.__name__} got two values for argument {name!r}")
+        construct(self, **{**defaults, **given, **kwargs})
 
     return __init__  # type: ignore[return-value]
 
@@ -127,18 +148,17 @@ def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signatu
     """
     found: dict[str, inspect.Parameter] = {}
     positional = True
-    only = inspect.Parameter.KEYWORD_ONLY
     for one in cls.__mro__:
         for name, value in vars(one).items():
             if isinstance(value, Hyperparameter) and name not in fixed:
                 hint = _annotations(one).get(name, inspect.Parameter.empty)
-                parameter = inspect.Parameter(name, only, default=value.default, annotation=hint)
+                parameter = inspect.Parameter(name, _ONLY, default=value.default, annotation=hint)
                 found.setdefault(name, parameter)
         own = own_arguments(one)
         for each in own:
             if each.kind in _HANDS_ON or each.name in fixed | _INTERNAL:
                 continue
-            kind = each.kind if positional else only
+            kind = each.kind if positional else _ONLY
             found.setdefault(each.name, each.replace(kind=kind))
         kinds = {each.kind for each in own}
         if own and inspect.Parameter.VAR_KEYWORD not in kinds:
@@ -184,6 +204,18 @@ def check_names(cls: type, given: Mapping[str, Any]) -> None:
             raise TypeError(
                 f"{cls.__name__} takes no argument {name!r}; {did_you_mean(name, public)}"
             )
+
+
+def check_theirs(algorithm: Any) -> None:
+    """
+    Refuse values of SB3's own arguments that it takes silently, or fails at later.
+
+    :raises ValueError: one is out of its range
+    """
+    for name, ends in _THEIRS.items():
+        value = getattr(algorithm, name, None)
+        if isinstance(value, int | float):  # else absent, a schedule, or "auto"
+            check_number(name, value, ends=ends)
 
 
 def with_defaults(function: FunctionType, **defaults: Any) -> FunctionType:

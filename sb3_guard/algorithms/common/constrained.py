@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard.algorithms.common.arguments import (
     check_names,
+    check_theirs,
     documentation,
     hyperparameter,
     signature,
@@ -31,7 +32,7 @@ from sb3_guard.algorithms.common.arguments import (
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.generators import KeepsGenerators
-from sb3_guard.checks import check_per_cost, is_number
+from sb3_guard.checks import NumberError, check_per_cost, is_number
 from sb3_guard.costs import read_costs
 
 _LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
@@ -90,7 +91,7 @@ class Constrained(KeepsGenerators):
         super().__init_subclass__(**kwargs)
         if "label" not in vars(cls):
             cls.label = cls.__name__
-        if "defaults" in vars(cls):
+        if {"defaults", "fixed_arguments"} & {*vars(cls)}:
             cls.__init__ = taking_defaults(cls)  # type: ignore[method-assign]
         composed = signature(cls, cls.fixed_arguments)
         cls.__signature__ = composed  # type: ignore[attr-defined]
@@ -160,6 +161,7 @@ class Constrained(KeepsGenerators):
                 f"cost_keys={self.cost_keys!r}: must be a sequence of one or more different names "
                 "of info entries, such as ('cost',)"
             )
+        check_theirs(self)
         self._check_cost_limit()
 
     def _check_cost_limit(self) -> None:
@@ -270,6 +272,8 @@ class Constrained(KeepsGenerators):
         # A vectorised environment without anything to say may leave infos out.
         infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
         costs, seen = read_costs(infos, self.cost_keys, self.missing_cost == "zero")
+        if self.limit_on == "max" and np.min(costs) < 0.0:  # the highest so far begins at 0
+            raise NumberError(f"a cost is {np.min(costs)}: {self.label} needs costs of at least 0")
         self._cost_seen_lately |= seen
         # [n_envs, m], for the buffer; of the highest cost so far, what the step adds to it
         self.step_costs = costs

@@ -21,7 +21,7 @@ class Speed(Constraint):
     movable = "no"
     color = (0.9, 0.2, 0.1)
 
-    limit: float = param(1.0, "highest speed that is free, m/s")
+    limit: float = param(1.0, "highest speed that is free, m/s", low=0)
     axes: str = param(
         "xy", "x: forwards along the x axis only; xy: in the plane", choices=("x", "xy")
     )

@@ -10,8 +10,9 @@ that, 4.8e-7 m, is not a difference. The causes are in docs/fidelity.md.
 
 ``--velocity`` prints the second for the robots of the velocity tasks, whose files have 24 bits.
 
-``--distributions`` compares 400 recorded layouts with 1,000 of ours, and 200 random episodes with
-as many: by chance, 5 % of single comparisons are beyond 0.080 and 0.136.
+``--distributions`` compares 400 recorded layouts, of Button1 and Button2 1,000, with 1,000 of ours,
+and 200 random episodes with as many: by chance, 5 % of single comparisons are beyond 0.080 and
+0.136.
 """
 
 from __future__ import annotations

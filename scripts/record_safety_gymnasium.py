@@ -389,6 +389,21 @@ def layouts(name: str, count: int) -> dict[str, Any]:
     }
 
 
+def button_layouts(name: str, count: int) -> dict[str, Any]:
+    """The same for Button, whose resets draw nothing more: without building each world."""
+    env = safety_gymnasium.make(f"Safety{name}-v0").unwrapped
+    env.reset(seed=0)
+    generator = env.task.random_generator
+    generator.set_random_seed(12345)
+    drawn = [generator.build_layout() for _ in range(count)]
+    things = sorted(drawn[0])
+    places = np.array([[layout[thing] for thing in things] for layout in drawn])
+    return {
+        f"layout_{name}": shorten(places, 10).astype(np.float32),
+        f"things_{name}": np.array(things),
+    }
+
+
 def episodes(name: str, count: int, steps: int) -> dict[str, Any]:
     """Returns, costs and lengths of random episodes of at most ``steps`` steps, [count, 3]."""
     env = safety_gymnasium.make(f"Safety{name}-v0").unwrapped
@@ -409,6 +424,8 @@ def record_distributions() -> None:
     arrays: dict[str, Any] = {}
     for name in ("CarPush1", *(f"Point{task}" for task in TASKS)):
         arrays.update(layouts(name, 400))
+    for name in ("PointButton1", "PointButton2"):  # 52 and more attempts each
+        arrays.update(button_layouts(name, 1000))
     for name in EPISODES:
         arrays.update(episodes(name, 200, 100))
         print(name, arrays[f"episodes_{name}"].mean(axis=0), flush=True)

@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
-from safety_distributions import episode_gaps, layout_gaps
+from safety_distributions import episode_gaps, gap, layout_gaps, layouts
 from safety_traces import Trace, load
 
 from sb3_guard.envs import Scenario, env_ids
@@ -177,6 +177,16 @@ def test_layouts_are_distributed_alike(name):
     """Coordinates, and distances of any two things, of 1,000 new episodes, against 400."""
     gaps = layout_gaps(name)
     assert max(gaps.values()) < 0.13, gaps  # chance passes one of them once in 10,000
+
+
+@pytest.mark.parametrize("name", ["PointButton1", "PointButton2"])
+def test_the_robot_of_button_begins_as_far_from_the_middle(name):
+    """Of 1,000 new episodes, against 1,000; it is drawn first, and few layouts succeed."""
+    *layouts_of_both, kinds = layouts(name, 1000)
+    robot = kinds.index("agent")
+    ours, theirs = (np.linalg.norm(places[:, robot], axis=1) for places in layouts_of_both)
+    assert len(theirs) == 1000
+    assert gap(ours, theirs) < 0.09  # chance passes it once in 2,000
 
 
 @pytest.mark.parametrize("name", ["PointGoal1", *REST])

@@ -9,6 +9,7 @@ limit: those belong to the gymnasium classes above it.
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from sb3_guard.envs.outcome import Outcome
 from sb3_guard.envs.parameters import PartError, check_count, misshapen
 from sb3_guard.envs.part import Array, Constraint, Part, Robot, Task
 from sb3_guard.envs.physics import Physics
+from sb3_guard.envs.restarts import Restarts
 from sb3_guard.spelling import did_you_mean
 
 CLEAN_STARTS = 100  # layouts drawn before a start with a cost is an error
@@ -130,6 +132,12 @@ class Engine:
                 )
                 self._owners[f.name] = part
                 self.array(f"places/{f.name}", (f.num, 3))
+        order = self._layout.order
+        self._ordered = sorted(  # stable: what is not named keeps its place in the order of parts
+            self.footprints.values(),
+            key=lambda f: order.index(f.name) if f.name in order else len(order),
+        )
+        self._restarts = Restarts(self._ordered, self._layout.restarts, self.array)
         check_locations(list(self.footprints.values()))
         if not self._layout.overlap:
             check_covers(list(self.footprints.values()))
@@ -208,6 +216,7 @@ class Engine:
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Give one row its generator; its layouts and its movers draw from nothing else."""
         self.rngs[row] = rng
+        self._restarts.forget(row)
         self._origins.pop(row, None)
 
     def reset(self, ids: Array) -> None:
@@ -219,6 +228,7 @@ class Engine:
         ids = np.asarray(ids, dtype=np.int32)
         self.steps[ids] = 0
         if not self._layout.randomize:
+            self._restarts.forget(ids)
             for row in ids.tolist():
                 bits = self.rngs[row].bit_generator
                 bits.state = self._origins.setdefault(row, bits.state)
@@ -244,13 +254,10 @@ class Engine:
     def _start(self, ids: Array) -> None:
         """Draw a layout for rows ``ids``, [n], and put everything there."""
         self.batch.clear(ids)
-        order = self._layout.order
-        footprints = sorted(  # stable: what is not named keeps its place in the order of parts
-            self.footprints.values(),
-            key=lambda f: order.index(f.name) if f.name in order else len(order),
-        )
         for row in ids.tolist():
-            for name, places in arrange(footprints, self.rngs[row]).items():
+            rng = self.rngs[row]
+            layout = arrange(self._ordered, rng, partial(self._restarts.draw, row, rng))
+            for name, places in layout.items():
                 self.places(name)[row] = places
         for part in self.parts:
             part.reset(ids, self.rngs)

@@ -4,14 +4,15 @@ The rule is GUARD's: two objects keep at least the sum of their keep-outs betwee
 and a centre keeps its own keep-out from the border of its rectangle. GUARD draws blindly and
 starts over whenever one object finds no room, which for ten wide objects in a small arena takes
 hundreds of restarts. Here an object that finds no room among 128 draws takes the place where it
-disturbs the fewest others, and those are drawn again.
+disturbs the fewest others, and those are drawn again. This is quick, but favours some layouts: with
+``restarts``, a layout starts over first.
 """
 
 import functools
 import itertools
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,7 @@ from sb3_guard.envs.parameters import Parameters, param
 
 Array = np.ndarray
 Rectangle = tuple[float, float, float, float]
+StartOver = Callable[[Array, Array, Array, bool], Array | None]
 
 DRAWS = 128
 PATIENCE = 4000  # placements, or 4 of each object, before a layout is called impossible
@@ -39,6 +41,11 @@ class Layout(Parameters):
     margin: float = param(0.0, "extra distance between any two objects, m", low=0)
     order: tuple[str, ...] = param(
         (), "what is placed first, such as [robot, goal]; the others follow: task, constraints"
+    )
+    restarts: int = param(
+        0,
+        "layouts begun anew where an object finds no room, before others make room for it",
+        low=0,
     )
     overlap: bool = param(False, "whether keep-outs may let solid objects begin inside each other")
     randomize: bool = param(True, "false: all episodes of a row are the same")
@@ -181,11 +188,17 @@ class Footprint:
         return dx**2 + dy**2 > self.reach**2 - self._lowest**2
 
 
-def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[str, Array]:
+def arrange(
+    footprints: Sequence[Footprint],
+    rng: np.random.Generator,
+    start_over: StartOver | None = None,
+) -> dict[str, Array]:
     """Draw a clear layout.
 
     :param footprints: what to place, in order
     :param rng: the only source of randomness
+    :param start_over: gives a whole layout, see :meth:`sb3_guard.envs.restarts.Restarts.draw`; if
+        it gives none, others make room for an object that finds no room
     :return: centres by footprint name, [num, 3] m
     :raises LayoutError: no layout was found, naming the part that found no room most often
     """
@@ -201,7 +214,11 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         for j, place in enumerate(f.locations):
             xy[:, k + j, 0], fixed[k + j] = place, True
         k += f.num
+    given = xy.copy()
     queue = deque(np.flatnonzero(~fixed).tolist())
+    layout = None if start_over is None else start_over(apart, given, fixed, False)
+    if layout is not None:
+        xy, queue = layout, deque()
     weight = np.where(fixed, 1.0 + len(owner), 1.0)  # what a clash with each is worth
     failures: dict[str, int] = {}
     for _ in range(max(PATIENCE, 4 * len(owner))):
@@ -210,12 +227,17 @@ def arrange(footprints: Sequence[Footprint], rng: np.random.Generator) -> dict[s
         k = queue.popleft()
         f = owner[k]
         draws = f.draw(rng, DRAWS)
-        clash = _square_distance(draws, xy) < apart[k]  # [K, DRAWS]
+        clash = square_distance(draws, xy) < apart[k]  # [K, DRAWS]
         trouble = weight @ clash
         if math.isfinite(f.reach):
             trouble += len(owner) ** 2 * f.out_of_reach(draws)
         best = int(trouble.argmin())  # the first clear draw, else the least disturbing one
         if trouble[best] > 0:
+            if start_over is not None and not failures:
+                layout = start_over(apart, given, fixed, True)
+                if layout is not None:
+                    xy, queue = layout, deque()
+                    break
             failures[f.name] = failures.get(f.name, 0) + 1
             if trouble[best] >= len(owner):
                 queue.append(k)
@@ -257,8 +279,8 @@ def farthest(one: Footprint, other: Footprint) -> float:
     return float(np.hypot(offset[..., 0], offset[..., 1]).max(initial=0.0))
 
 
-def _square_distance(draws: Array, xy: Array) -> Array:
-    """Squared distances, [K, n] m², of [2, n] draws to [2, K, 1] places."""
+def square_distance(draws: Array, xy: Array) -> Array:
+    """Squared distances, [K, ...] m², of [2, ...] draws to [2, K, ...] places."""
     offset = draws[:, None] - xy
     offset *= offset
     square: Array = offset[0]
@@ -323,7 +345,7 @@ def redraw(
         apart = np.array(gaps)[:, None] ** 2  # [K, 1] m²
         for _ in range(tries):
             draws = footprint.draw(rng, DRAWS)
-            clear = ~(_square_distance(draws, xy) < apart).any(axis=0)
+            clear = ~(square_distance(draws, xy) < apart).any(axis=0)
             if math.isfinite(footprint.reach):
                 clear &= ~footprint.out_of_reach(draws)
             if clear.any():

@@ -137,7 +137,7 @@ def _scenario(robot: str, level: str) -> dict[str, Any]:
         "constraints": constraints,
         "robot_params": STARTS.get(task, {}),
         "lidar": {"falloff": "linear", "range": 6.0 if task == "Circle" else 3.0},
-        "layout": {"order": ["robot", *ORDER], "overlap": True},
+        "layout": {"order": ["robot", *ORDER], "restarts": 1000, "overlap": True},
         "arena": {"size": size, "condim": 6, "sleep": sleep},
         "observe": {"components": [*body.components, *lidars]},
         "cost": "any",

@@ -82,7 +82,7 @@ class Flags(Command):
     :param env: an id of ours, or a scenario file (.yml)
     :param env_kwargs: change parameters
     :param output: picture to write (default: <env>.png)
-    :param camera: fixed, track or top (default: fixed)
+    :param camera: fixed, track or top (default: fixed, or track where the robot runs far away)
     :param window: watch the robot act at random in MuJoCo's viewer instead: Space pauses, Tab opens
         menus, F shows contact forces
     :param seed: of the episode in the picture
@@ -98,7 +98,7 @@ class Flags(Command):
     env: str = flag(positional=True)
     env_kwargs: dict[str, Any] | None = flag()
     output: str | None = flag("-o", metavar="FILE.png")
-    camera: str = flag(default="fixed", choices=CAMERAS)
+    camera: str | None = flag(choices=CAMERAS)
     window: bool = flag(default=False)
     seed: int = flag(default=0)
     gym_packages: list[str] = flag(default=[], metavar="MODULE")

@@ -8,6 +8,7 @@ import sb3_guard
 from sb3_guard.envs import GuardEnv, rendering
 from sb3_guard.envs import scene as scene_module
 from sb3_guard.envs.extras import EYE
+from sb3_guard.envs.suites.velocity import TABLE
 
 ROW = np.zeros(1, dtype=np.int32)
 
@@ -95,4 +96,94 @@ def test_safety_ant_looks_along_its_y_axis():
     y = env.unwrapped.engine.robot.frames[1][0, 0, :, 1]
     for direction in ahead(env):
         assert direction @ y > 0.99
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "limits"),
+    [("Circle1", (1.125, np.inf)), ("Circle2", (1.125, 1.125)), ("Run0", (0.5, np.inf))],
+)
+def test_walls_are_drawn_where_it_begins_to_cost(task, limits):
+    env = sb3_guard.make(f"SafetyPoint{task}-v0")
+    env.reset(seed=0)
+    engine = env.unwrapped.engine
+    scene = mujoco.MjvScene(engine.model, maxgeom=100)
+    painter = scene_module.ScenePainter(scene, engine, engine.batch.get_data(0), 0)
+    engine.constraints[0].draw(painter, 0)
+    walls = list(scene.geoms[: scene.ngeom])
+    ends = np.array(
+        [wall.pos + s * wall.size[0] * wall.mat[:, 0] for wall in walls for s in (-1, 1)]
+    )
+    middles = np.array([wall.pos for wall in walls])
+    assert len(walls) == 2 * np.isfinite(limits).sum()
+    for points in (ends, middles):
+        x, y = np.abs(points[:, :2]).T
+        on_x, on_y = np.isclose(x, limits[0], atol=1e-5), np.isclose(y, limits[1], atol=1e-5)
+        assert (on_x | on_y).all() and (x < limits[0] + 1e-5).all() and (y < limits[1] + 1e-5).all()
+    if not np.isfinite(limits[1]):  # as far as anybody sees, and as the robot runs
+        assert (
+            np.ptp(ends[:, 1]) > 90 and abs(middles[:, 1] - engine.robot.position[0, 1]).max() < 1
+        )
+
+
+@pytest.mark.parametrize("env_id", ["SafetyPointCircle1-v0", "SafetyCarRun0-v0"])
+def test_a_boundary_is_seen_in_pictures(env_id):
+    env = sb3_guard.make(env_id, render_mode="rgb_array", width=120, height=120)
+    env.reset(seed=0)
+    with_walls = env.render().astype(int)
+    env.unwrapped.engine.constraints[0].x = None
+    yellow = (with_walls - env.render())[..., 2] < -40  # it takes the blue out of the floor
+    env.close()
+    assert yellow.sum() > 100
+
+
+def runs():
+    """Ids of what runs away from where it starts."""
+    velocity = [f"Safety{name}Velocity-v1" for name in TABLE]
+    return ["SafetyPointRun0-v0", "SafetyCarRun0-v0", *velocity]
+
+
+@pytest.mark.parametrize("env_id", runs())
+def test_pictures_of_a_run_are_bright_near_and_without_a_border(env_id, monkeypatch):
+    monkeypatch.delattr(scene_module.ScenePainter, "border")
+    env = sb3_guard.make(env_id, render_mode="rgb_array", width=200, height=150)
+    env.reset(seed=0)
+    frame = env.render().astype(int)
+    assert frame.mean() > 150 and (frame.max(axis=2) < 60).mean() < 0.1
+    engine = env.unwrapped.engine
+    batch_x = engine.batch.bind("qpos" if engine.model.nmocap == 0 else "mocap_pos")
+    batch_x[0].flat[0] += 7.0  # it has run on by seven squares of the floor, and stays in sight
+    engine.batch.forward(ROW)
+    colored = np.ptp(env.render().astype(int), axis=2) > 40
+    env.close()
+    middle = colored[30:120, 50:150]
+    assert middle.sum() > 300
+
+
+def test_a_picture_says_the_speed_and_its_limit(monkeypatch):
+    env = sb3_guard.make("SafetyHopperVelocity-v1", render_mode="rgb_array", width=360, height=300)
+    env.reset(seed=0)
+    speed = env.unwrapped.engine.constraints[0]
+    assert speed.words(0) == {"speed": "0.00 m/s, limit 0.74"}
+    position, duration = env.unwrapped.engine.robot.position, 0.008
+    for _ in range(3):
+        before = position[0, 0]
+        env.step(np.ones(3))
+    fast = (position[0, 0] - before) / duration
+    assert abs(fast) > 0.01
+    assert speed.words(0) == {"speed": f"{fast:.2f} m/s, limit 0.74"}
+    said = env.render().astype(int)
+    monkeypatch.setattr(type(speed), "words", lambda *_: {})
+    rows, columns = np.nonzero(np.abs(env.render() - said).sum(axis=2) > 100)
+    env.close()
+    assert len(rows) > 300 and rows.max() < 40 and columns.max() < 300
+
+
+def test_the_robots_own_camera_reads_nothing(monkeypatch):
+    env = sb3_guard.make(
+        "SafetyAntVelocity-v1", flatten=False, observe={"components": None, "camera": [96, 64]}
+    )
+    seen = env.reset(seed=0)[0]["camera"].astype(int)
+    monkeypatch.setattr(type(env.unwrapped.engine.constraints[0]), "words", lambda *_: {})
+    np.testing.assert_allclose(env.unwrapped.look()[0], seen, atol=3)
     env.close()

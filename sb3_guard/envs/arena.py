@@ -88,10 +88,7 @@ class Arena(Part):
     def world(self, robot: Robot) -> WorldSpec:
         """A world without parts yet: the robot's own, or a floor under the sky."""
         spec = robot.world()
-        if spec is None:
-            file = importlib.resources.files("sb3_guard.envs") / "arena.xml"
-            spec = mujoco.MjSpec.from_string(file.read_text(encoding="utf-8"))
-        return WorldSpec(robot, spec)
+        return WorldSpec(robot, _empty() if spec is None else spec)
 
     def build(self, world: World) -> None:
         super().build(world)
@@ -135,6 +132,35 @@ class Arena(Part):
                         f"{name} may begin at {tuple(place.tolist())}, beyond the walls at "
                         f"±{self.size} m: set arena={{'size': ...}}, or placements within"
                     )
+
+
+def _empty() -> mujoco.MjSpec:
+    """The world of ``arena.xml``."""
+    file = importlib.resources.files("sb3_guard.envs") / "arena.xml"
+    return mujoco.MjSpec.from_string(file.read_text(encoding="utf-8"))
+
+
+def furnish(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Give a world that has a floor the arena's sky, light and look of the floor.
+
+    :param spec: changed, and returned; its physics stays
+    """
+    skies = [t for t in spec.textures if t.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]
+    for thing in (*spec.lights, *skies):
+        spec.delete(thing)
+    arena = _empty()
+    arena.delete(arena.geom("floor"))
+    # what the two state differently would be a warning
+    for name in ("integrator", "jacobian"):
+        setattr(arena.option, name, getattr(spec.option, name))
+    spec.visual.map.znear = arena.visual.map.znear
+    spec.visual.headlight.ambient = arena.visual.headlight.ambient
+    spec.visual.headlight.diffuse = arena.visual.headlight.diffuse
+    spec.attach(arena, prefix="arena/", frame=spec.worldbody.add_frame())
+    for geom in spec.worldbody.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            geom.material, geom.rgba, geom.size = "arena/floor", [1, 1, 1, 1], [0, 0, 1]
+    return spec
 
 
 def _add_wall(

@@ -97,7 +97,7 @@ class Simulated:
         flatten: bool,
         width: int,
         height: int,
-        camera: str,
+        camera: str | None,
     ) -> None:
         """Check the options and run the scenario.
 
@@ -107,7 +107,7 @@ class Simulated:
         if render_mode is not None and render_mode not in modes:
             hint = did_you_mean(render_mode, modes)
             raise ValueError(f"unknown render_mode {render_mode!r}: {hint}")
-        if camera not in CAMERAS:
+        if camera is not None and camera not in CAMERAS:
             raise ValueError(f"unknown camera {camera!r}: {did_you_mean(camera, CAMERAS)}")
         if not isinstance(flatten, bool):
             raise ValueError(f"flatten = {flatten!r} must be true or false")
@@ -116,8 +116,8 @@ class Simulated:
         self.scenario = as_scenario(scenario, params)
         self.render_mode, self.flatten = render_mode, flatten
         self._num_threads = num_threads
-        self._window = (width, height, camera)
         self.engine = self.scenario.build(num_envs, num_threads)
+        self._window = (width, height, camera or self.engine.task.camera)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.engine.control_step)}
 
     @property
@@ -229,7 +229,8 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
     :param flatten: False for a Dict observation with the components by name
     :param width: width of rendered frames, pixels
     :param height: height of rendered frames, pixels
-    :param camera: ``"fixed"``, ``"track"`` or ``"top"``
+    :param camera: ``"fixed"``, ``"track"`` or ``"top"``; None: the task's, which is fixed, or
+        track where the robot runs far away
     :param params: parameters of parts to change, such as ``hazards={"num": 4}``
     :raises ValueError: unknown names or bad values
     """
@@ -243,7 +244,7 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         flatten: bool = True,
         width: int = 480,
         height: int = 480,
-        camera: str = "fixed",
+        camera: str | None = None,
         **params: Any,
     ) -> None:
         self._simulate(scenario, params, 1, None, render_mode, flatten, width, height, camera)

@@ -103,6 +103,9 @@ class Painter(Protocol):
     ) -> None:
         """A see-through cylinder, or a sphere if ``half_height`` is 0, at ``center``, [3] m."""
 
+    def wall(self, start: Array, end: Array, color: tuple[float, ...]) -> None:
+        """A see-through wall, 20 cm high, on the floor between two places, [2] m."""
+
 
 class Part(Parameters):
     """A robot, a task or a constraint: see the module's text for the verbs."""
@@ -209,6 +212,10 @@ class Part(Parameters):
         for group in self.groups:
             group.draw(painter, row)
 
+    def words(self, row: int) -> dict[str, str]:
+        """What a row's picture says in its corner, by name."""
+        return {}
+
 
 class Robot(Part):
     """What a robot answers to the other parts, none of which may ask its name."""
@@ -280,6 +287,7 @@ class Task(Part):
     reward_limit: float | None = None  # dense rewards are cut off at ± this; None: they are not
     bonus: float = 0.0  # reward for success, added to the dense reward after that
     ends: bool = False  # whether success ends the episode instead of drawing a new goal
+    camera: ClassVar[str] = "fixed"  # of pictures that are not asked to have another one
     invalid_reason: ClassVar[str] = "its goal is reached immediately"  # why it is drawn again
 
     def measure(self) -> Array:

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 
-from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, geoms_below
+from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, geoms_below, has_arena
 
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 Array = np.ndarray
 CAMERAS = ("fixed", "track", "top")
 ELEVATION = {"fixed": 58.0, "track": 55.0, "top": 90.0}  # degrees
+RUNNING = 25.0  # degrees, elevation from which a robot is followed where there is no arena
+LINE = 24  # pixels, height of a line of text
 
 
 class RenderingError(RuntimeError):
@@ -119,11 +121,15 @@ class Renderer:
         self._explain = camera in CAMERAS
         self._follows = camera == "track"
         self._aspect = width / height
+        self._line = LINE / height
         self._middle, self._half = arena(engine)
+        self._has_arena = has_arena(engine)
         self._geoms = geoms_below(engine.model, engine.robot.root)
         if self._explain:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-            self._camera.azimuth, self._camera.elevation = 90.0, -ELEVATION[camera]
+            low = self._follows and not self._has_arena
+            self._camera.azimuth = 90.0
+            self._camera.elevation = -(RUNNING if low else ELEVATION[camera])
         else:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self._camera.fixedcamid = engine.model.camera(camera).id
@@ -171,7 +177,8 @@ class Renderer:
         """
         if not self._human:
             return self.frame(row)
-        viewer, words = self._viewer, words or {}
+        viewer = self._viewer
+        words = {**(words or {}), **self._words(row)}
         self._engine.batch.get_data(row, self._data)
         with viewer.lock():
             viewer.user_scn.ngeom = 0
@@ -259,7 +266,8 @@ class Renderer:
         low, high = body.min(axis=0), body.max(axis=0)
         if self._follows:
             camera.lookat[:] = (low + high) / 2
-            camera.distance = 2.0 + 1.2 * float(np.linalg.norm(high - low))
+            free = 2.0 if self._has_arena else 1.3  # m
+            camera.distance = free + 1.2 * float(np.linalg.norm(high - low))
             return
         wide = 2.0 * self._half.max()
         corners = [
@@ -290,7 +298,14 @@ class Renderer:
         pays = any(c.cost()[row] > 0 for c in engine.constraints)
         if pays:
             painter.glow(engine.robot.position[row] + shift)
-        painter.border(self._middle, self._half, COST_COLOR if pays else (0.45, 0.5, 0.56))
+        if self._has_arena:
+            painter.border(self._middle, self._half, COST_COLOR if pays else (0.45, 0.5, 0.56))
+        if not self._human:
+            painter.say(self._words(row), self._aspect, self._line)
+
+    def _words(self, row: int) -> dict[str, str]:
+        """What a picture says in its corner, by name."""
+        return {name: text for part in self._engine.parts for name, text in part.words(row).items()}
 
     def close(self) -> None:
         """Free the window or the OpenGL context."""

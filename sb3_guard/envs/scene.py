@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -20,11 +21,13 @@ COST_COLOR = (0.85, 0.1, 0.1)
 SHADOW = (0.58, 0.60, 0.63)
 RING, RING_STEP = 0.15, 0.06  # m, radius of the first lidar ring, and how much wider each next is
 BEAD = 0.02  # m, radius
+WALL = 0.2  # m, height of a wall that is drawn only
 # m along x and y for each m of height: a shadow falls away from the light
 _SLANT = np.array([0.25, 0.35])
 _SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 _CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
 _BOX = mujoco.mjtGeom.mjGEOM_BOX
+_LABEL = mujoco.mjtGeom.mjGEOM_LABEL
 
 
 class ScenePainter:
@@ -55,6 +58,21 @@ class ScenePainter:
         kind = _CYLINDER if half_height else _SPHERE
         height = half_height or radius
         self._add(kind, (radius, height, height), center, (*color, 0.35))
+
+    def wall(self, start: Array, end: Array, color: tuple[float, ...]) -> None:
+        """A see-through wall on the floor between two places, [2] m."""
+        along, high = (end - start) / 2, WALL / 2
+        middle = np.array([*(start + along), self.floor + high])
+        shape = self._add(_BOX, (float(np.hypot(*along)), 0.015, high), middle, (*color, 0.5))
+        if shape is not None:
+            x, y = along / np.hypot(*along)
+            shape.mat[:] = [[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]]
+
+    @functools.cached_property
+    def floor(self) -> float:
+        """Its height, m."""
+        planes = self._engine.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        return float(min(self._data.geom_xpos[planes, 2], default=0.0))
 
     @functools.cached_property
     def _first_ring(self) -> tuple[Array, Array, Array]:
@@ -94,18 +112,18 @@ class ScenePainter:
         """The shadow on the floor of every body that is in the scene so far.
 
         A flat copy of each geom, cast along the light: soft enough, and without the marks of
-        shadow maps, in which zones would throw shadows too. A world that a robot brings has lights
-        of its own.
+        shadow maps, in which zones would throw shadows too. A world with such lights has none.
         """
-        if getattr(self._engine.robot, "complete", False):
+        model = self._engine.model
+        if not model.nlight or model.light_castshadow.any():
             return
         flat = np.array([[1.0, 0.0, _SLANT[0]], [0.0, 1.0, _SLANT[1]], [0.0, 0.0, 0.0]])
         plane = int(mujoco.mjtGeom.mjGEOM_PLANE)
         bodies = [g for g in self._scene.geoms[: self._scene.ngeom] if g.type != plane]
         for body in bodies:
-            place = flat @ body.pos + [0.0, 0.0, 0.002]
+            place = flat @ (body.pos - [0.0, 0.0, self.floor]) + [0.0, 0.0, self.floor + 0.002]
             shape = self._add(_SPHERE, (1.0, 1.0, 1.0), place, (*SHADOW, 1.0))
-            if shape is None or body.pos[2] < 0:
+            if shape is None or body.pos[2] < self.floor:
                 return
             shape.type, shape.dataid, shape.size[:] = body.type, body.dataid, body.size
             # a copy thinner than it is far from the floor's depth steps
@@ -119,11 +137,9 @@ class ScenePainter:
         :param half: half its sides, [2] m
         """
         width = 0.008 * float(max(half))
-        floors = self._engine.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        height = min(self._data.geom_xpos[floors, 2], default=0.0)
         for axis in (0, 1):
             for side in (-1.0, 1.0):
-                at, size = np.array([*middle, height]), [half[0] + width, half[1] + width, 0.003]
+                at, size = np.array([*middle, self.floor]), [*(half + width), 0.003]
                 at[axis] += side * half[axis]
                 size[axis] = width
                 self._add(_BOX, tuple(size), at, (*color, 1.0))
@@ -140,7 +156,7 @@ class ScenePainter:
         ahead /= length
         reach = float(self._first_ring[2][0]) + 0.05
         start = origin[row, 0] + self._shift + reach * ahead
-        start[2] = 0.03
+        start[2] = self.floor + 0.03
         dart = self._add(_SPHERE, (1.0, 1.0, 1.0), start, (0.15, 0.15, 0.2, 1.0))
         if dart is not None:
             mujoco.mjv_connector(
@@ -150,6 +166,23 @@ class ScenePainter:
     def glow(self, center: Array) -> None:
         """The tint of a robot that pays a cost."""
         self._add(_SPHERE, (0.3,) * 3, center, (*COST_COLOR, 0.5))
+
+    def say(self, words: Mapping[str, str], aspect: float, line: float) -> None:
+        """Text in the upper left corner of a picture.
+
+        :param words: of each line, by name
+        :param aspect: width of the picture by its height
+        :param line: height of a line, by the picture's
+        """
+        eye = self._scene.camera[0]
+        right = np.cross(eye.forward, eye.up)
+        for i, (name, text) in enumerate(words.items(), start=1):
+            x, y = -0.9 * aspect, 1.0 - 2.0 * line * i  # from -1 to 1
+            slope = eye.frustum_top / eye.frustum_near
+            place = eye.pos + eye.forward + slope * (x * right + y * eye.up)  # 1 m away
+            label = self._add(_LABEL, (0.1,) * 3, place, (1.0, 1.0, 1.0, 1.0))
+            if label is not None:
+                label.label = f"{name} {text}"
 
     def _add(
         self, kind: mujoco.mjtGeom, size: tuple[float, ...], center: Array, rgba: tuple[float, ...]
@@ -219,14 +252,22 @@ def _thickness(
     return thick
 
 
+def has_arena(engine: Engine) -> bool:
+    """Whether anything but the robot is placed in the arena: else nothing happens at its edge."""
+    return any(f.num > 0 for name, f in engine.footprints.items() if name != "robot")
+
+
 def arena(engine: Engine) -> tuple[Array, Array]:
     """Middle and half sides, [2] m each, of what holds all placements and locations.
 
-    The arena belongs to it: movers and arms are at home at the origin.
+    The arena belongs to it: movers and arms are at home at the origin. Where there is nothing but
+    the robot, it is as large an area around its start.
     """
-    boxes = list(engine.arena.placements)
+    boxes = list(engine.arena.placements) if has_arena(engine) else []
     for footprint in engine.footprints.values():
         boxes += footprint.placements
         boxes += [(x, y, x, y) for x, y in footprint.locations]
+    boxes = boxes or list(engine.arena.placements)
     low, high = np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]
-    return (low + high) / 2, (high - low) / 2
+    half = (high - low) / 2
+    return (low + high) / 2, half if has_arena(engine) else np.maximum(half, engine.arena.size)

@@ -80,7 +80,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         flatten: bool = True,
         width: int = 480,
         height: int = 480,
-        camera: str = "fixed",
+        camera: str | None = None,
         **params: Any,
     ) -> None:
         if max_episode_steps is None:

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Constraint
+from sb3_guard.envs.part import Array, Constraint, Painter
+
+ENDLESS = 50.0  # m, how far a line is drawn that has no end
 
 
 @dataclass
@@ -31,3 +33,15 @@ class Boundary(Constraint):
             if limit is not None:
                 beyond |= np.abs(self.sim.robot.position[:, axis]) > limit
         return beyond.astype(float)
+
+    def draw(self, painter: Painter, row: int) -> None:
+        position = self.sim.robot.position[row, :2]
+        limits = np.array([np.nan if limit is None else limit for limit in (self.x, self.y)])
+        # a line without an end is drawn around the robot, which never comes to where it stops
+        low = np.where(np.isnan(limits), position - ENDLESS, -limits)
+        high = np.where(np.isnan(limits), position + ENDLESS, limits)
+        for axis in np.flatnonzero(~np.isnan(limits)):
+            for side in (low, high):
+                start, end = low.copy(), high.copy()
+                start[axis] = end[axis] = side[axis]
+                painter.wall(start, end, self.color)

@@ -36,9 +36,16 @@ class Speed(Constraint):
     def before_step(self) -> None:
         self._before[:] = self.sim.robot.position[:, :2]
 
-    def cost(self) -> Array:
+    def _speed(self) -> Array:
+        """Of the last control step, 0 before the first, [N] m/s."""
         velocity = (self.sim.robot.position[:, :2] - self._before) / self.sim.control_step
         speed = velocity[:, 0]
         if self.axes == "xy":
             speed = np.sqrt(velocity[:, 0] ** 2 + velocity[:, 1] ** 2)
-        return ((speed > self.limit) & (self.sim.steps > 0)).astype(float)
+        return np.where(self.sim.steps > 0, speed, 0.0)
+
+    def cost(self) -> Array:
+        return (self._speed() > self.limit).astype(float)
+
+    def words(self, row: int) -> dict[str, str]:
+        return {"speed": f"{self._speed()[row]:z.2f} m/s, limit {self.limit:.2f}"}

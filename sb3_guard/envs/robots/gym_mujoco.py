@@ -18,6 +18,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
+from sb3_guard.envs.arena import furnish
 from sb3_guard.envs.observation import Observations, Values
 from sb3_guard.envs.part import Array, Generators, Simulation
 from sb3_guard.envs.robots import mjcf
@@ -56,11 +57,14 @@ class GymRobot(MJCFRobot):
         return Path(str(folder / cls.asset))
 
     def world(self) -> mujoco.MjSpec:
-        """The file's world, in which the margins of two geoms add up to the larger in the file."""
+        """The file's world, in which the margins of two geoms add up to the larger in the file.
+
+        Floor, light and sky look like the arena's.
+        """
         spec = mjcf.read(self.path(), self.root, True)
         for geom in spec.geoms:  # within a file, all have the same margin
             geom.margin /= 2
-        return spec
+        return furnish(spec)
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)

@@ -22,6 +22,7 @@ class Forward(Task):
     contact = False
     targets = "one"
     color = (0.2, 0.7, 0.3)
+    camera = "track"
 
     speed: float = param(1.0, "reward per m/s along x")
     survival: float = param(0.0, "reward of a step")

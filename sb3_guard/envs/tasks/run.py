@@ -22,6 +22,7 @@ class Run(Task):
     contact = False
     targets = "one"
     spaces = ("planar",)
+    camera = "track"
 
     target: tuple[float, float] = param((0.0, -1000.0), "where to, (x, y) m")
     reward_distance: float = param(60.0, "reward per metre gained")

@@ -265,7 +265,7 @@ def test_sizes_that_spoil_every_start_are_refused(suite, params, words):
         (
             "Goal_Point_2Hazards",
             {"hazards": {"size": 4.2}},
-            "hazards: the robot pays for them immediately",
+            "hazards: a cost at the start",
         ),
         (
             "Chase_Arm3_0Hazards",
@@ -280,6 +280,16 @@ def test_starts_that_are_never_clean_name_only_what_spoils_them(suite, params, r
     engine.seed(0, np.random.default_rng(0))
     with pytest.raises(LayoutError, match=rf"none of 100 layouts .* clean \({reason}\): make size"):
         engine.reset(np.zeros(1, dtype=int))
+
+
+def test_a_boundary_that_no_start_is_within_says_how_to_begin_within():
+    base = Scenario.parse("Goal_Point_2Hazards").override(boundary={"x": 1e-3})
+    words = r"boundary: a cost at the start\): make its x or y larger, .* robot={'locations': \[\[0"
+    engine = base.build()
+    engine.seed(0, np.random.default_rng(0))
+    with pytest.raises(LayoutError, match=words):
+        engine.reset(np.zeros(1, dtype=int))
+    base.override(robot={"locations": [[0, 0]]}).build().reset(np.zeros(1, dtype=int))
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,19 @@ def test_bad_ids_say_what_is_wrong(name, message):
         ({"hazards": {"keepout": 3}}, "keepout 3 does not fit the placement"),
         ({"hazards": {"space": "flat"}}, "hazards.space = 'flat': "),
         ({"hazards": 4}, "hazards = 4 must be a mapping of parameters"),
+        (
+            {"hazards": {"speed": 1}},
+            r"'speed': it moves nothing; ghosts={'speed': 0.5} and gremlins",
+        ),
+        ({"hazards": {"ends": True}}, "'ends': .* sb3_guard.common.budgets.EarlyTermination"),
+        ({"gremlins": {"speed": 1}}, "gremlins has no parameter 'speed': set rate, .* rad/s"),
+        ({"speed": {"speed": 1}}, "speed has no parameter 'speed': set limit, .* m/s"),
+        ({"goal": {"speed": 1}}, "'speed': it moves nothing; .* tasks Chase and Defense"),
+        ({"walls": "solid"}, r"unknown parameter 'walls': write arena={'walls': \.\.\.}$"),
+        ({"frame_skip": 5}, r"unknown parameter 'frame_skip': write arena={'frame_skip': \.\.\.}$"),
+        ({"reward_clip": 10}, r"'reward_clip': write goal={'reward_limit': \.\.\.}$"),
+        ({"indicator": True}, "'indicator': write cost='any' for costs of 0 or 1$"),
+        ({"size": 3}, r"write arena={'size': \.\.\.} or goal={'size': \.\.\.}$"),
         ({"hazzards": {"num": 4}}, "unknown parameter 'hazzards': did you mean 'hazards'"),
         ({"goal": {"size": 0}}, "goal.size = 0 must be greater than 0"),
         ({"lidar": {"bins": 0}}, "lidar.bins = 0 must be at least 1"),
@@ -677,3 +690,20 @@ def test_bad_robot_files_say_what_is_wrong(tmp_path, old, new, message):
         with pytest.raises(ValueError, match=message) as caught:
             Scenario.parse("Goal_Sled_2Hazards").build()
         assert "\n" not in str(caught.value)
+
+
+def test_a_falloff_and_a_range_that_disagree_say_how_to_have_either():
+    message = r"lidar.range = 3.0 .* or lidar={'falloff': 'exponential', 'range': None}$"
+    base = Scenario.parse("SafetyPointGoal1-v0")
+    with pytest.raises(ValueError, match=message):
+        base.override(lidar={"falloff": "exponential"})
+    base.override(lidar={"falloff": "exponential", "range": None}).build()
+
+
+@pytest.mark.parametrize("id_", ["Chase_Point_2Hazards", "SafetyPointCircle1-v0"])
+def test_a_task_without_an_end_says_which_have_one(id_):
+    base = Scenario.parse(id_)
+    with pytest.raises(
+        ValueError, match=r"'ends': it is never completed; .* Goal, Push and Button"
+    ):
+        base.override(**{base.task.lower(): {"ends": True}})

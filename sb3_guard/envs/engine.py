@@ -233,7 +233,7 @@ class Engine:
                 bits = self.rngs[row].bit_generator
                 bits.state = self._origins.setdefault(row, bits.state)
         pending = ids
-        refusals: dict[str, int] = {}  # starts that are not used, by the reason
+        refusals: dict[tuple[str, str], int] = {}  # starts not used, by reason and remedy
         for _ in range(CLEAN_STARTS):
             self._start(pending)
             faults = self._faults()
@@ -244,9 +244,10 @@ class Engine:
                 refusals[reason] = refusals.get(reason, 0) + int(rows[pending].sum())
         else:
             found = [r for r, count in sorted(refusals.items(), key=lambda i: -i[1]) if count]
+            reasons, remedies = (dict.fromkeys(words) for words in zip(*found, strict=True))
             raise LayoutError(
-                f"none of {CLEAN_STARTS} layouts lets an episode begin clean ({'; '.join(found)}): "
-                "make size or num smaller, or keepout or placements larger"
+                f"none of {CLEAN_STARTS} layouts lets an episode begin clean "
+                f"({'; '.join(reasons)}): {'; '.join(remedies)}"
             )
         self._before[ids] = self.task.measure()[ids]
         self._begun = self._begun or bool((self.steps >= 0).all())
@@ -263,17 +264,17 @@ class Engine:
             part.reset(ids, self.rngs)
         self.batch.begin(ids)
 
-    def _faults(self) -> dict[str, Array]:
-        """Why no episode is to begin as everything is now: the reason, and the rows [N] bool."""
+    def _faults(self) -> dict[tuple[str, str], Array]:
+        """Why no episode is to begin as everything is now: reason and remedy, and rows [N] bool."""
         task, n = self.task, self.num_envs
         invalid = per_row(task, "invalid_start()", task.invalid_start(), n, bool)
-        faults = {f"{task.name}: {task.invalid_reason}": invalid}
+        faults = {(f"{task.name}: {task.invalid_reason}", task.remedy): invalid}
         for c in self.constraints:
             pays = per_row(c, "cost()", c.cost(), n) > 0
-            faults[f"{c.name}: the robot pays for them immediately"] = pays
+            faults[f"{c.name}: a cost at the start", c.remedy] = pays
         for p in self._enders:
             ends = per_row(p, "terminated()", p.terminated(), n, bool)
-            faults[f"{p.name}: it ends the episode immediately"] = ends
+            faults[f"{p.name}: it ends the episode immediately", p.remedy] = ends
         return faults
 
     def step(self, actions: Array) -> Outcome:

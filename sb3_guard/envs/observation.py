@@ -139,7 +139,8 @@ class Lidar(Parameters):
         if self.falloff == "exponential" and self.range is not None:
             raise ValueError(
                 f"lidar.range = {self.range!r} needs a linear falloff: set lidar={{'falloff': "
-                f"'linear', 'range': {self.range!r}}}, or leave it out"
+                f"'linear', 'range': {self.range!r}}}, or "
+                "lidar={'falloff': 'exponential', 'range': None}"
             )
 
     def size(self, planar: bool) -> int:

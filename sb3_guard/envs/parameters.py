@@ -11,7 +11,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -125,6 +125,8 @@ class Parameters:
     """
 
     name: str = ""  # what messages call it, and users the keyword that sets its parameters
+    # what to write instead of parameters that it does not have, though others have them
+    instead: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
@@ -162,7 +164,8 @@ class Parameters:
         known = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
         for key in params:
             if key not in known:
-                raise ValueError(f"{label} has no parameter {key!r}: {did_you_mean(key, known)}")
+                hint = cls.instead.get(key) or did_you_mean(key, known)
+                raise ValueError(f"{label} has no parameter {key!r}: {hint}")
         made = cls.__new__(cls)
         if name is not None:
             made.name = name  # before the values are checked: it is in the messages

@@ -116,6 +116,8 @@ class Part(Parameters):
     planar: bool
     height: tuple[float, float] = (0.5, 1.5)  # m, range of z in space
     size: float  # m, radius of its objects
+    # how to let episodes begin clean, where it spoils every start
+    remedy: ClassVar[str] = "make size or num smaller, or keepout or placements larger"
     if TYPE_CHECKING:
         groups: tuple[Group, ...]
         group: Group  # where it has one
@@ -289,6 +291,10 @@ class Task(Part):
     ends: bool = False  # whether success ends the episode instead of drawing a new goal
     camera: ClassVar[str] = "fixed"  # of pictures that are not asked to have another one
     invalid_reason: ClassVar[str] = "its goal is reached immediately"  # why it is drawn again
+    instead: ClassVar[Mapping[str, str]] = {
+        "speed": "it moves nothing; targets move in the tasks Chase and Defense",
+        "ends": "it is never completed; episodes of the tasks Goal, Push and Button can end",
+    }
 
     def measure(self) -> Array:
         """The distances that the reward is made of, [N, M] m."""
@@ -320,6 +326,11 @@ class Constraint(Part):
 
     trespassable: bool  # the taxonomy of the paper's constraint table
     movable: str  # "no", "passive" or "active"
+    instead: ClassVar[Mapping[str, str]] = {
+        "speed": "it moves nothing; ghosts={'speed': 0.5} and gremlins={'rate': 1.0} move",
+        "ends": "to end episodes by cost, wrap the environment in "
+        "sb3_guard.common.budgets.EarlyTermination",
+    }
 
     def cost(self) -> Array:
         """The cost of this step, [N], at least 0."""

@@ -182,8 +182,11 @@ class Scenario:
             known = {*own, *kinds, *changes["constraints"], *tasks}
             new = isinstance(value, Mapping) and "type" in value
             if key not in known and not new:
-                hint = did_you_mean(key, [*own, *sorted(kinds), *OPTIONS])
-                raise ValueError(f"unknown parameter {key!r}: {hint}; {_OWN_NAME}")
+                hint = self._instead(key)
+                if hint is None:
+                    allowed = did_you_mean(key, [*own, *sorted(kinds), *OPTIONS])
+                    hint = f"{allowed}; {_OWN_NAME}"
+                raise ValueError(f"unknown parameter {key!r}: {hint}")
             if value is not None and not isinstance(value, Mapping):
                 such = "{'size': 0.3}"
                 if key == "robot":
@@ -210,6 +213,22 @@ class Scenario:
             components = self._components(changes["constraints"])
             changes["observe"] = {**changes.get("observe", self.observe), "components": components}
         return replace(self, **changes)
+
+    def _instead(self, key: str) -> str | None:
+        """What to write for a parameter that belongs to a part, or None: it belongs to none."""
+        if key == "indicator":
+            return "write cost='any' for costs of 0 or 1"
+        key = {"reward_clip": "reward_limit"}.get(key, key)
+        parts: dict[str, Any] = {
+            "arena": Arena,
+            self.task.lower(): TASKS[self.task],
+            "robot": ROBOTS[self.robot],
+            "layout": Layout,
+            "lidar": Lidar,
+            "observe": Extras,
+        }
+        owners = [name for name, cls in parts.items() if key in {f.name for f in fields(cls)}]
+        return f"write {' or '.join(f'{n}={{{key!r}: ...}}' for n in owners)}" if owners else None
 
     def _components(self, constraints: Mapping[str, Params]) -> list[str]:
         """What is observed with these constraints: not those that go, and the objects that come."""

@@ -10,7 +10,8 @@ from sb3_guard.algorithms.common.advantage import discounted_returns
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.lagrangian import inverse
-from sb3_guard.algorithms.common.trust_region import PenalizedTrustRegion, Trial, TrustRegion
+from sb3_guard.algorithms.common.penalized import PenalizedTrustRegion
+from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
 
 
 class RCPO(PenalizedTrustRegion):

@@ -2,7 +2,7 @@
 
 from typing import Any, ClassVar
 
-from sb3_guard.algorithms.common.trust_region import PenalizedTrustRegion
+from sb3_guard.algorithms.common.penalized import PenalizedTrustRegion
 
 
 class TRPOLag(PenalizedTrustRegion):

@@ -23,6 +23,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
+from sb3_guard.algorithms.common.reuse import Reuse, Rollout
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import KEPT
 from sb3_guard.zoo.logger import RunLogger
@@ -33,6 +34,7 @@ from sb3_guard.zoo.usage import UsageError, explained
 MEMBER = "run_state.pkl"
 NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
+EARLIER = "earlier"  # folder beside the checkpoint: earlier rollouts, each written once
 # Checkpoints take at most this share of the time: those with a replay buffer are large.
 LARGEST_SHARE = 0.05
 # Increased when the content changes, and the formats that can be continued.
@@ -141,6 +143,7 @@ class Checkpoints(BaseCallback):
         assert isinstance(self.logger, RunLogger)
         began = time.monotonic()
         environments = capture(self.training_env)
+        earlier = _write_earlier(self.model, self.path.parent / EARLIER)
         if environments[-1] is None and not self._warned:
             self._warned = True
             print(
@@ -168,6 +171,7 @@ class Checkpoints(BaseCallback):
             "rollouts": self.rollouts,
             "elapsed": (time.time_ns() - self.model.start_time) / 1e9,
             "start": self.model._num_timesteps_at_start,
+            "earlier": earlier,
         }
         with replacing(self.path) as file:
             self.model.save(file)
@@ -180,6 +184,7 @@ class Checkpoints(BaseCallback):
                 if isinstance(self.model, OffPolicyAlgorithm):
                     with archive.open(REPLAY_BUFFER, "w", force_zip64=True) as member:
                         pickle.dump(self.model.replay_buffer, member, pickle.HIGHEST_PROTOCOL)
+        _keep_only(self.path.parent / EARLIER, earlier)
         self._last = time.monotonic()
         self._took = self._last - began
 
@@ -203,6 +208,35 @@ class Checkpoints(BaseCallback):
         for env, parts in zip(self._evaluation_envs(), state["evaluation"], strict=True):
             env.reset()
             restore(env, parts)
+
+
+def _write_earlier(model: BaseAlgorithm, folder: Path) -> list[str]:
+    """Write what is not yet there of the rollouts that an update uses beside its own.
+
+    :return: the names of the files, the latest last
+    """
+    rollouts = model.earlier if isinstance(model, Reuse) else []
+    for rollout in rollouts:
+        folder.mkdir(exist_ok=True)
+        path = folder / f"{rollout.number}.pkl"
+        if not path.exists():
+            with replacing(path) as file:
+                pickle.dump(tuple(rollout), file, pickle.HIGHEST_PROTOCOL)
+    return [f"{rollout.number}.pkl" for rollout in rollouts]
+
+
+def _keep_only(folder: Path, names: Sequence[str]) -> None:
+    for file in folder.glob("*"):
+        if file.name not in names:
+            file.unlink()
+
+
+def _read_earlier(folder: Path, names: Sequence[str]) -> list[Rollout]:
+    """
+    :raises UsageError: a file is absent or damaged
+    """
+    with explained(f"can't read the earlier rollouts in {folder}"):
+        return [Rollout(*pickle.loads((folder / name).read_bytes())) for name in names]
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -302,12 +336,18 @@ def load_model(
         return model
 
 
-def restore_run(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+def restore_run(model: BaseAlgorithm, state: dict[str, Any], folder: Path) -> None:
     """
     Put environments and generators where the checkpoint found them; the last thing before `learn`.
 
     :param model: as loaded from the same checkpoint, with its environment
+    :param folder: the run's
+    :raises UsageError: a file that the checkpoint names is absent or damaged
     """
+    if isinstance(model, Reuse):
+        names = state.get("earlier", ())
+        model.earlier = _read_earlier(folder / EARLIER, names)
+        _keep_only(folder / EARLIER, names)
     env = model.get_env()
     assert env is not None
     env.reset()

@@ -295,7 +295,7 @@ class Experiment:
             if restate:
                 folder.write_config(self.flags.values(), self.hyperparams)
                 checkpoints.what = folder.what()
-            restore_run(self.model, state)
+            restore_run(self.model, state, folder.path)
 
         def stop(number: int) -> None:
             checkpoints.stop = True

@@ -34,3 +34,12 @@ def discounted_limit(limits: np.ndarray, horizon: float, gamma: float, cut: bool
     if gamma == 1.0:
         return limits
     return limits / horizon * (1.0 if cut else 1.0 - gamma**horizon) / (1.0 - gamma)
+
+
+def same_at_every_step(costs: np.ndarray) -> np.ndarray:
+    """Which of m costs are the same, and not 0, at each step of a rollout, shape (m,) bool.
+
+    :param costs: shape (T, n, m)
+    """
+    first = costs[0, 0]
+    return (first != 0.0) & (costs == first).all(axis=(0, 1))

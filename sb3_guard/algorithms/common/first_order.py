@@ -113,7 +113,7 @@ class FirstOrder(CostRollouts, PPO):
     def snapshot(self) -> Before:
         """The policy as it is now on the rollout, to measure distances from while it learns."""
         batch = self.rollout_buffer.whole()
-        return Before(self.policy, batch.observations, self._taken(batch))
+        return Before(self.policy, batch.observations, self._taken(batch.actions))
 
     def descend(
         self,
@@ -161,7 +161,7 @@ class FirstOrder(CostRollouts, PPO):
                 distribution = self.policy.action_dist
             else:
                 distribution = policy(batch.observations)
-                log_prob = distribution.log_prob(self._taken(batch))
+                log_prob = distribution.log_prob(self._taken(batch.actions))
             advantages = batch.advantages
             if self.normalize_advantage and len(advantages) > 1:
                 advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -193,7 +193,7 @@ class FirstOrder(CostRollouts, PPO):
 
     def _evaluate(self, batch: CostRolloutBufferSamples) -> tuple[th.Tensor, ...]:
         """Values, log-probabilities and entropies; the distribution is ``policy.action_dist``."""
-        return self.policy.evaluate_actions(batch.observations, self._taken(batch))  # type: ignore
+        return self.policy.evaluate_actions(batch.observations, self._taken(batch.actions))  # type: ignore
 
     def _value_loss(self, batch: CostRolloutBufferSamples, values: th.Tensor) -> th.Tensor:
         if self.clip_range_vf is not None:

@@ -6,10 +6,10 @@ import numpy as np
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.trust_region import TrustRegion
+from sb3_guard.algorithms.common.reuse import Reuse
 
 
-class Margin(TrustRegion):
+class Margin(Reuse):
     """Trust-region steps that aim below the limits by what they have missed them so far.
 
     ::

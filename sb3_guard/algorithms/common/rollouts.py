@@ -25,10 +25,9 @@ from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import (
     CostDictRolloutBuffer,
     CostRolloutBuffer,
-    CostRolloutBufferSamples,
 )
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.algorithms.common.costs import discounted_limit
+from sb3_guard.algorithms.common.costs import discounted_limit, same_at_every_step
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.fast.threads import one_thread
 
@@ -231,9 +230,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         # what is left are the critic's errors, all that a policy would follow at a high price.
         ended = buffer.episode_starts[1:].sum() + self._last_episode_starts.sum()
         if ended == len(self._timeouts):
-            first = buffer.costs[0, 0]
-            alike = (first != 0.0) & (buffer.costs == first).all(axis=(0, 1))
-            buffer.cost_advantages[..., alike] = 0.0
+            buffer.cost_advantages[..., same_at_every_step(buffer.costs)] = 0.0
 
     def _choose_cost_units(self) -> np.ndarray:
         """What networks measure costs in, shape (m,), float32, from a rollout just filled.
@@ -272,11 +269,11 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             return 1.0
         return float(self.rollout_buffer.advantages.std()) or 1.0
 
-    def _taken(self, batch: CostRolloutBufferSamples) -> th.Tensor:
-        """The actions as the policy's distribution takes them."""
-        if isinstance(self.action_space, spaces.Discrete):
-            return batch.actions.long().flatten()
-        return batch.actions
+    def _taken(self, actions: th.Tensor) -> th.Tensor:
+        """Actions of the buffer as the policy's distribution takes them."""
+        return (
+            actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else actions
+        )
 
     def fit_cost_critic(self, n_epochs: int | None = None, batch_size: int | None = None) -> None:
         """Fit the cost critic to the rollout's cost returns, with the algorithm's learning rate.

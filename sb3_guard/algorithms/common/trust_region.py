@@ -28,7 +28,6 @@ from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.critics import Regression
 from sb3_guard.algorithms.common.fast.actor import actor_of
-from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 from sb3_guard.checks import check_integer, check_learning_rate, check_number
@@ -47,12 +46,36 @@ class Trial(NamedTuple):
     cost_change: np.ndarray
 
 
+class CostSurrogates:
+    """mean(ratio · cost advantage) of each cost on the rollout, as functions of the policy.
+
+    :param actor: the policy on the rollout's N rows
+    :param advantages: centred cost advantages, shape (N, m)
+    """
+
+    def __init__(self, actor: Actor, advantages: th.Tensor) -> None:
+        self.actor, self.advantages = actor, advantages
+
+    def gradients(self) -> th.Tensor:
+        """At the old policy, shape (m, P)."""
+        weights = self.advantages / len(self.advantages)
+        return th.stack([self.actor.score(column) for column in weights.unbind(dim=1)])
+
+    def changes(self, ratio: th.Tensor) -> th.Tensor:
+        """From the old policy to the actor's present one, shape (m,).
+
+        :param ratio: its likelihood ratios on the rollout, shape (N,)
+        """
+        return ((ratio - 1.0) @ self.advantages) / len(ratio)
+
+
 @dataclass(eq=False)
 class Region:
     """The update's local picture: a linear surrogate inside a quadratic trust region.
 
     :param actor: the policy on the batch
     :param batch: the batch
+    :param costs: the cost surrogates
     :param gradient: of the surrogate at the old policy, shape (P,)
     :param violation: of the cost limits, in units of the cost surrogates, shape (m,)
     :param delta: bound on the mean KL
@@ -62,6 +85,7 @@ class Region:
 
     actor: Actor
     batch: CostRolloutBufferSamples
+    costs: CostSurrogates
     gradient: th.Tensor
     violation: np.ndarray
     delta: float
@@ -71,8 +95,7 @@ class Region:
     @cached_property
     def cost_gradients(self) -> th.Tensor:
         """Gradients of mean(ratio · cost advantage) at the old policy, shape (m, P)."""
-        weights = self.batch.cost_advantages / len(self.batch.cost_advantages)
-        return th.stack([self.actor.score(column) for column in weights.unbind(dim=1)])
+        return self.costs.gradients()
 
     def product(self, vector: th.Tensor) -> th.Tensor:
         """F · vector, damped, shape (P,)."""
@@ -254,7 +277,7 @@ class TrustRegion(CostRollouts):
         if self.normalize_advantage:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         return batch._replace(
-            actions=self._taken(batch),
+            actions=self._taken(batch.actions),
             advantages=advantages,
             cost_advantages=cost_advantages - cost_advantages.mean(dim=0),
         )
@@ -268,6 +291,7 @@ class TrustRegion(CostRollouts):
         region = Region(
             actor,
             batch,
+            self.cost_surrogates(actor, batch),
             actor.score(weights),
             self.violation(),
             self.target_kl,
@@ -314,7 +338,7 @@ class TrustRegion(CostRollouts):
                     # So far off that torch refuses the distribution: a scale of 0, a mean of nan.
                     fraction *= self.line_search_shrinking_factor
                     continue
-                change = ((ratio - 1.0) @ batch.cost_advantages) / len(ratio)
+                change = region.costs.changes(ratio)
                 improvement = float(self.surrogate(batch, ratio)) - before
                 trial = Trial(kl, improvement, change.cpu().numpy().astype(np.float64))
                 accepted = self.accept(trial)
@@ -334,6 +358,10 @@ class TrustRegion(CostRollouts):
         self.logger.record("train/value_loss", loss)
         if self.uses_cost_critic:
             self.fit_cost_critic(self.n_critic_updates)
+
+    def cost_surrogates(self, actor: Actor, batch: CostRolloutBufferSamples) -> CostSurrogates:
+        """What steps and line searches know of the costs: here, what this rollout says."""
+        return CostSurrogates(actor, batch.cost_advantages)
 
     # What an algorithm may replace
 
@@ -364,28 +392,3 @@ class TrustRegion(CostRollouts):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         """Learn what else the algorithm has to learn, after the policy has moved."""
-
-
-class PenalizedTrustRegion(Lagrangian, TrustRegion):
-    """Trust-region steps on (A - Σ λ_i A_Ci) / (1 + Σ λ_i)."""
-
-    search_space: ClassVar[dict[str, Any]] = {
-        "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
-        "proportional_gain": {"low": 0.1, "high": 20.0, "log": True},
-        "derivative_gain": {"low": 0.0, "high": 4.0},
-        "lambda_smoothing": {"low": 0.0, "high": 0.9},
-    }
-
-    defaults: ClassVar[dict[str, Any]] = {
-        "lambda_lr": 0.2,
-        "proportional_gain": 1.0,
-        "lambda_smoothing": 0.5,
-        "lambda_units": "relative",
-    }
-
-    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
-        deviation = batch.cost_advantages.std(dim=0, correction=0).double().cpu().numpy()
-        price = self.price(self.advantage_unit() * inverse(deviation))
-        priced = batch.cost_advantages @ th.as_tensor(price).to(batch.cost_advantages)
-        advantages = batch.advantages - priced
-        return (ratio * advantages).mean() / (1.0 + float(self.multiplier.value.sum()))

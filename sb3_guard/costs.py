@@ -27,6 +27,17 @@ def number(value: Any, name: str) -> float:
     return number
 
 
+def verdict(low: float, high: float, limit: float) -> str:
+    """Whether a cost keeps a limit, as far as the interval of its mean tells; empty: there is none.
+
+    :param low: lower end of the interval, NaN if there is none
+    :param high: upper end
+    """
+    if math.isnan(low):
+        return ""
+    return "kept" if high <= limit else "exceeded" if low > limit else "undecided"
+
+
 def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ValueError:
     """What to raise where a cost is not in ``info``.
 

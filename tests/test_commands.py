@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import runpy
 import subprocess
 import sys
@@ -142,7 +143,27 @@ def test_progress_bar_shows_return_and_cost(tmp_path, capsys):
     trained(tmp_path, "--progress", "--verbose", "1")
     err = capsys.readouterr().err
     assert "120/120" in err
-    assert all(word in err for word in ("return", "cost", "(limit 2)", "rate"))
+    assert "return" in err and "rate" in err and re.search(r", cost [\d.]+ [≤>] 2, ", err)
+
+
+def test_every_limit_has_a_verdict(tmp_path, capsys):
+    limits = ["cost_keys:['cost','heat']", "cost_limit:[1000.0, 0.0]"]
+    run = trained(
+        tmp_path, "--progress", "--verbose", "1", "-params", "n_critic_updates:1", *limits,
+        "--env-kwargs", "cost_keys:['cost','heat']", "hazard:[-1.0, 0.0]",
+    )  # fmt: skip
+    out, err = capsys.readouterr()
+    result = json.loads((run / "result.json").read_text())
+    cost, heat = result["costs"]["cost"], result["costs"]["heat"]
+    assert heat["mean"] == pytest.approx(2 * cost["mean"])  # as the environment has it
+    assert cost["mean"] == pytest.approx(result["cost"])
+    assert (cost["limit"], cost["verdict"]) == (1000, "kept")
+    assert (heat["limit"], heat["verdict"]) == (0, "exceeded")
+    assert cost["low"] <= cost["mean"] <= cost["high"]
+    assert f"cost {cost['mean']:.2f} ≤ 1000, heat {heat['mean']:.2f} > 0, rate" in err
+    shown = [line.split() for line in out.splitlines()]
+    for key, end in (("cost", ["1000:", "kept"]), ("heat", ["0:", "exceeded"])):
+        assert any(words[:1] == [key] and words[-2:] == end for words in shown), key
 
 
 @pytest.mark.parametrize("vec_env", ["native", "dummy"])

@@ -1,5 +1,7 @@
 """Whole episodes, counted fairly, with an honest interval."""
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -227,6 +229,20 @@ def test_an_evaluation_in_words():
     assert "limit" not in words
     model = CPO("MlpPolicy", CostPoint(10), n_steps=20, cost_limit=30.0, seed=0)
     assert str(evaluate_policy(model, CostPoint(10), 2)).endswith(", limit 30: kept")
+
+
+def test_each_of_several_costs_has_its_limit_in_words():
+    keys = ("cost", "heat")
+    model = CPO("MlpPolicy", CostPoint(10, cost_keys=keys), cost_keys=keys, cost_limit=[30, 0.0])
+    seen = evaluate_policy(model, CostPoint(10, hazard=(-1, 0), cost_keys=keys), 2)
+    heat, limit = seen.by_key()["heat"]
+    assert limit == 0.0 and heat == estimate(seen.key_costs[:, 1])
+    total, *words = str(seen).split("; ")
+    assert "limit" not in total
+    assert words[0].startswith("cost ") and words[0].endswith(", limit 30: kept")
+    assert words[1] == f"heat {heat}, limit 0: exceeded"
+    worst = dataclasses.replace(seen, limit_on="max")
+    assert f"; worst step of heat {estimate(seen.max_costs[:, 1])}, limit 0" in str(worst)
 
 
 @pytest.mark.parametrize(

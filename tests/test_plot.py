@@ -23,6 +23,7 @@ from sb3_guard.zoo.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.report import report
 from sb3_guard.zoo.runs import read_results, select
 from sb3_guard.zoo.statistics import with_safety
+from sb3_guard.zoo.tables import tables
 
 EFFECTS = dict(zip(ALGOS, (1.0, 0.5, 0.6, 0.4, 0.7, 0.9, 0.8, 1.5), strict=True))
 POINT = "Goal_Point_8Hazards"
@@ -296,10 +297,65 @@ def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys):
     assert cli.main(["plot", str(small), "-o", str(out)]) == 0
     assert [path.name for path in out.iterdir()] == [f"curves_{POINT}.png"]
     printed, err = capsys.readouterr()
-    for text in ("return J_r", "5.00\xa0±\xa00.00", "PPO", "above limit"):
+    assert max(map(len, printed.splitlines())) <= 120
+    for text in ("return J_r", "5.00\xa0±\xa00.00", "PPO", "0: exceeded"):
         assert text in printed
     assert "left out of the curves: can't use" in err and "v0_2/0.monitor.csv" in err
-    assert "| CPO       | 0     | 2 " in printed  # its result counts all the same
+    (row,) = (line.split() for line in printed.splitlines() if "CPO  " in line and "0:" in line)
+    assert row[:5] == [POINT, "CPO", "0:", "exceeded", "2"]  # its result counts all the same
+
+
+def test_without_folders_it_reads_logs(small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert plot.main(["--table", "r.md"]) == 0
+    assert "CPO" in (tmp_path / "r.md").read_text()
+
+
+def limited(folder, seed: int) -> None:
+    """A run with limits of 5 and 2 on two costs, whose episodes cost 4 and 3."""
+    path = fake_run(
+        folder, "cpo", seed=seed, cost=7.0, cost_limit=[5.0, 2.0],
+        costs={
+            "heat": {"mean": 4.0, "low": 3.5, "high": 4.5, "limit": 5.0, "verdict": "kept"},
+            "noise": {"mean": 3.0, "low": 1.5, "high": 4.5, "limit": 2.0, "verdict": "undecided"},
+        },
+    )  # fmt: skip
+    file = path / "0.monitor.csv"
+    first, head, *rows = file.read_text().splitlines()
+    rows = [f"{row},4,3" for row in rows]
+    file.write_text("\n".join([first, f"{head},c_heat,c_noise", *rows]) + "\n")
+
+
+def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
+    limited(tmp_path / "logs", 0)
+    found = read(tmp_path / "logs")
+    (row,) = found.runs.to_dict("records")
+    assert (row["M_c/heat"], row["cost_limit/noise"], row["verdict"]) == (4, 2, "undecided")
+    shown = tables(found.runs)
+    assert shown["Results"]["limit"].tolist() == ["5 2: undecided"]
+    assert shown["Limits"][["cost", "limit"]].to_numpy().tolist() == [
+        ["heat", "5: kept"], ["noise", "2: undecided"]
+    ]  # fmt: skip
+    limited(tmp_path / "logs", 1)  # with two seeds it is their mean that is judged
+    fake_run(tmp_path / "logs", "trpo")  # which knows the total only
+    found = read(tmp_path / "logs")
+    assert tables(found.runs)["Limits"]["limit"].tolist() == ["5: kept", "2: exceeded"]
+    for kind, panels in (("curves", 5), ("pareto", 3)):
+        (drawing,) = draw(kind, found)
+        assert len(drawing.figure.axes) == panels
+    (drawing,) = draw("curves", found)
+    heat = next(axis for axis in drawing.figure.axes if "heat" in axis.get_ylabel())
+    assert lines(heat)["CPO"] == pytest.approx([4.0] * 6)
+    assert lines(heat)["cost limit, 5"].tolist() == [5, 5] and "TRPO" not in lines(heat)
+    assert page_of(tmp_path / "logs").count("2: exceeded") == 1
+
+
+def test_what_older_versions_wrote_is_read(tmp_path):
+    fake_run(tmp_path, "cpo", cost_limit=[5.0, 2.0])  # without an entry for each cost
+    fake_run(tmp_path, "pcpo", cost_limit=25.0)
+    (_, several), (_, alone) = read_results([tmp_path]).runs.iterrows()
+    assert (several["limits"], alone["limits"]) == ("5 2", "25")
+    assert pd.isna(several["verdict"]) and pd.isna(alone["verdict"]) and alone["cost_limit"] == 25
 
 
 def test_all_of_it(small, tmp_path, capsys):
@@ -344,7 +400,7 @@ def test_suites_may_have_limits_of_their_own(small, tmp_path):
     fake_run(small, "cpo", "SafetyPointGoal1-v0", cost_limit=25.0)
     assert plot.main([str(small), "--table", str(tmp_path / "r.md")]) == 0
     text = (tmp_path / "r.md").read_text()
-    assert "| 25 " in text and "| 0 " in text
+    assert "| 25 " in text and "| 0: exceeded " in text
 
 
 @pytest.mark.parametrize(
@@ -411,7 +467,8 @@ def test_page_is_complete_and_by_itself(small):
     assert INK not in page  # dark pages have light ink
     for name in ("TRPO", "CPO", "PPO", "f" * 10, "PROFILES", "feasible IQM return"):
         assert name in page
-    assert page.count("<table") == 4 and page.count("<svg") > 8
+    assert page.index("Results</h2>") < page.index("page by sb3_guard")
+    assert page.count("<table") == 5 and page.count("<svg") > 8
     assert f"<td>{small / 'trpo' / POINT}-v0_1</td>" in page  # nothing is abbreviated
 
 

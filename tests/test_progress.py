@@ -15,7 +15,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import sb3_guard
-from sb3_guard import CPO, TRPO, CostMonitor, train
+from sb3_guard import CPO, SCPO, TRPO, CostMonitor, train
 from sb3_guard.zoo import progress
 from sb3_guard.zoo.progress import Epochs, commit, provenance
 from sb3_guard.zoo.runs import read_results
@@ -67,6 +67,18 @@ def test_only_constrained_algorithms_have_a_limit(algorithm, limit):
     model.learn(20, callback=epochs)
     assert epochs.result()["cost_limit"] == limit
     assert epochs.result()["episodes"] == 2
+
+
+def test_the_worst_step_is_judged_by_the_limit_on_it():
+    model = SCPO("MlpPolicy", envs(), n_steps=40, cost_limit=0.0, n_critic_updates=1)
+    epochs = Epochs(40)
+    model.learn(40, callback=epochs)
+    result = epochs.result()
+    (cost,) = result["costs"].values()
+    # What the algorithm itself has found the highest costs of these episodes to be, on average
+    assert cost["mean"] == pytest.approx(model.costs.episode_cost.item())
+    assert cost["limit"] == 0 and result["limit_on"] == "max"
+    assert cost["mean"] < result["cost"]
 
 
 def test_off_policy_epochs_are_of_the_papers_length(monkeypatch):

@@ -226,11 +226,10 @@ class CostEvalCallback(EvalCallback):
         if self.verbose >= 1:
             returns = evaluation.estimate(evaluation.returns)
             words = [f"return {returns.mean:.2f} ± {returns.std:.2f}"]
-            name = "worst step of {}" if evaluation.limit_on == "max" else "{}"
-            rows = zip(self.cost_keys, evaluation.limited.T, self.limits(), strict=True)
-            for key, costs, limit in rows:
-                beside = f" (limit {limit:g})" if np.isfinite(limit) else ""
-                words.append(f"{name.format(key)} {costs.mean():.2f} ± {costs.std():.2f}{beside}")
+            rows = zip(evaluation.by_key().items(), self.limits(), strict=True)
+            for (name, (cost, _)), limit in rows:
+                beside = f" ({cost.against(limit)})" if np.isfinite(limit) else ""
+                words.append(f"{name} {cost.mean:.2f} ± {cost.std:.2f}{beside}")
             words += [f"with noise {other.costs.mean():.2f}" for other in noisy]
             best = " (best so far)" if is_best else ""
             print(f"Evaluation after {self.num_timesteps} steps: {', '.join(words)}{best}")

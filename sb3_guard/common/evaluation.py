@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.monitor import total_cost
-from sb3_guard.costs import read_costs
+from sb3_guard.costs import read_costs, verdict
 
 
 class Estimate(NamedTuple):
@@ -37,10 +37,8 @@ class Estimate(NamedTuple):
 
     def against(self, limit: float) -> str:
         """Whether a cost keeps a limit, as far as the interval tells: ``limit 2: exceeded``."""
-        if np.isnan(self.low):
-            return f"limit {limit:g}"
-        kept = "kept" if self.high <= limit else "exceeded" if self.low > limit else "undecided"
-        return f"limit {limit:g}: {kept}"
+        words = verdict(self.low, self.high, limit)
+        return f"limit {limit:g}" + (f": {words}" if words else "")
 
 
 def estimate(values: np.ndarray, resamples: int = 2000) -> Estimate:
@@ -62,6 +60,11 @@ def estimate(values: np.ndarray, resamples: int = 2000) -> Estimate:
     return Estimate(float(np.mean(values)), float(np.std(values)), low, high)
 
 
+def bounded_name(key: str, limit_on: str) -> str:
+    """What the limit of a cost bounds, in words: its sum over an episode, or its worst step."""
+    return f"worst step of {key}" if limit_on == "max" else key
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """
@@ -78,6 +81,7 @@ class Evaluation:
     :param max_costs: highest cost of a step, by key, shape [E, m]; 0 where none is above it
     :param limit_on: what of the costs the model's limits bound, their ``"sum"`` or ``"max"``
     :param limits: the model's limits, one for each cost key; empty if it has none
+    :param cost_keys: the m entries of info that were read as costs
     """
 
     returns: np.ndarray
@@ -89,6 +93,7 @@ class Evaluation:
     max_costs: np.ndarray = field(default_factory=lambda: np.zeros((0, 1)))
     limit_on: str = "sum"
     limits: tuple[float, ...] = ()
+    cost_keys: tuple[str, ...] = ("cost",)
 
     def __len__(self) -> int:
         return len(self.returns)
@@ -96,10 +101,19 @@ class Evaluation:
     def __str__(self) -> str:
         returns, costs = self.estimate(self.returns), self.estimate(self.costs)
         text = f"{len(self)} episodes: return {returns}, cost {costs}"
-        if self.limit_on == "max":
-            costs = self.estimate(self.worst)
-            text += f", worst step {costs}"
-        return text + (f", {costs.against(self.limits[0])}" if len(self.limits) == 1 else "")
+        if self.limit_on == "sum" and len(self.cost_keys) == 1:
+            return text + "".join(f", {costs.against(limit)}" for limit in self.limits)
+        return text + "".join(
+            f"; {name} {cost}" + ("" if limit is None else f", {cost.against(limit)}")
+            for name, (cost, limit) in self.by_key().items()
+        )
+
+    def by_key(self) -> dict[str, tuple[Estimate, float | None]]:
+        """Of each cost key what a limit bounds, and the limit: None if the model has none."""
+        names = [bounded_name(key, self.limit_on) for key in self.cost_keys]
+        limits = self.limits or (None,) * len(names)
+        costs = map(estimate, self.limited.T)
+        return dict(zip(names, zip(costs, limits, strict=True), strict=True))
 
     @property
     def limited(self) -> np.ndarray:
@@ -300,4 +314,5 @@ class _Tally:
             max_costs=np.array([episode[4] for episode in self.ended]).reshape(shape),
             limit_on=limit_on,
             limits=limits,
+            cost_keys=self.keys,
         )

@@ -9,7 +9,7 @@ import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
-from itertools import cycle
+from itertools import cycle, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_guard.zoo.runs import METRICS, REFERENCE, described, read_curve
+from sb3_guard.zoo.runs import REFERENCE, described, read_curve
 from sb3_guard.zoo.statistics import (
     SCORES,
     aggregate,
@@ -166,6 +166,15 @@ class Data:
                     self.unread[path] = one_line(error)
         return [self._curves[path] for path in own["path"] if path in self._curves]
 
+    def costs(self, suite: str) -> list[str]:
+        """Columns of episode costs: the total, and those that have limits of their own."""
+        runs = self.runs[self.runs["suite"] == suite].dropna(axis=1, how="all")
+        return ["M_c", *runs.filter(regex="^M_c/")]
+
+    def panels(self, suite: str) -> list[str]:
+        """Columns that have a learning curve."""
+        return ["J_r", *self.costs(suite), "rho_c"]
+
     def score(self, suite: str, algo: str, name: str) -> float:
         """A score of an algorithm or a family, NaN if there is none."""
         return float(self.scores[name].get((suite, algo), np.nan))
@@ -213,9 +222,15 @@ def fit_costs(axis: Axes, values: Iterable[Any], way: str = "y") -> None:
             axis.annotate(text, (0.99, 0.98), xycoords="axes fraction", ha="right", va="top")
 
 
-def draw_limit(line: Callable[..., Any], data: Data, suite: str) -> float:
-    """Mark the cost limit of a suite's constrained runs with an axis's axhline or axvline."""
-    limits = data.runs.loc[data.runs["suite"] == suite, "cost_limit"].dropna()
+def cost_name(column: str) -> str:
+    """What an axis calls a column of :meth:`Data.costs`."""
+    return "episode cost" + (f", {column[4:]}" if column != "M_c" else "")
+
+
+def draw_limit(line: Callable[..., Any], data: Data, suite: str, cost: str) -> float:
+    """Mark a cost's limit of a suite's constrained runs with an axis's axhline or axvline."""
+    column = cost.replace("M_c", "cost_limit", 1)
+    limits = data.runs.loc[data.runs["suite"] == suite, column].dropna()
     if not len(limits):
         return np.nan
     name = f"cost limit, {limits.iloc[0]:g}"
@@ -227,7 +242,7 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
     """Draw one figure of merit against steps: means of the seeds, shaded ± their deviation."""
     drawn: list[Any] = []
     for algo in data.algos(suite):
-        curves = data.curves(suite, algo)
+        curves = [curve for curve in data.curves(suite, algo) if metric in curve]
         if not curves:
             continue
         table, look = mean_curve(curves, metric), data.looks[algo]
@@ -237,41 +252,41 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
         if len(curves) > 1:
             low, high = table["mean"] - table["std"], table["mean"] + table["std"]
             axis.fill_between(steps, low, high, color=look.color, alpha=0.15, linewidth=0)
-    if metric == "M_c":
-        drawn.append(draw_limit(axis.axhline, data, suite))
-    axis.set(xlabel="steps", ylabel=AXES[metric])
+    if metric.startswith("M_c"):
+        drawn.append(draw_limit(axis.axhline, data, suite, metric))
+    axis.set(xlabel="steps", ylabel=AXES.get(metric) or cost_name(metric))
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_xlim(left=0)
     if metric != "J_r" and drawn:
         fit_costs(axis, drawn)
 
 
-def draw_pareto(axis: Axes, data: Data, suite: str) -> None:
-    """Return against episode cost: means large, seeds small, and the front of the means."""
-    means = data.means[(data.means["suite"] == suite)].dropna(subset=["M_c", "J_r"])
+def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
+    """Return against an episode cost: means large, seeds small, and the front of the means."""
+    means = data.means[(data.means["suite"] == suite)].dropna(subset=[cost, "J_r"])
     runs = data.runs[data.runs["suite"] == suite]
-    front = means.iloc[pareto_front(means["M_c"].to_numpy(), means["J_r"].to_numpy())]
+    front = means.iloc[pareto_front(means[cost].to_numpy(), means["J_r"].to_numpy())]
     axis.plot(
-        front["M_c"], front["J_r"], color=INK, alpha=0.35, linewidth=5, solid_capstyle="round",
+        front[cost], front["J_r"], color=INK, alpha=0.35, linewidth=5, solid_capstyle="round",
         drawstyle="steps-post", label="Pareto front", zorder=1,
     )  # fmt: skip
-    limit = draw_limit(axis.axvline, data, suite)
+    limit = draw_limit(axis.axvline, data, suite, cost)
     for row in means.to_dict("records"):
         look = data.looks[row["algo"]]
         own = runs[runs["algo"] == row["algo"]]
         style: dict[str, Any] = {"color": look.color, "marker": look.marker}
-        axis.scatter(own["M_c"], own["J_r"], s=14, alpha=0.6, **style)
-        axis.scatter(row["M_c"], row["J_r"], s=80, label=look.label, zorder=3, **style)
-    axis.set(xlabel="episode cost $M_c$", ylabel="return $J_r$", title=suite)
+        axis.scatter(own[cost], own["J_r"], s=14, alpha=0.6, **style)
+        axis.scatter(row[cost], row["J_r"], s=80, label=look.label, zorder=3, **style)
+    axis.set(xlabel=cost_name(cost), ylabel="return", title=suite)
     axis.margins(0.08)
-    fit_costs(axis, [means["M_c"], limit], "x")
+    fit_costs(axis, [means[cost], limit], "x")
     end = axis.get_xlim()[1]
-    for row in means[means["M_c"] > end].to_dict("records"):
+    for row in means[means[cost] > end].to_dict("records"):
         look = data.looks[row["algo"]]
         at = 0.97 * end, row["J_r"]
         axis.scatter(*at, s=80, color=look.color, marker=look.marker, zorder=3)
         axis.annotate(
-            f"{row['M_c']:.3g} →", at, (-8, 0), textcoords="offset points", color=look.color,
+            f"{row[cost]:.3g} →", at, (-8, 0), textcoords="offset points", color=look.color,
             ha="right", va="center",
         )  # fmt: skip
     axis.set_xlim(left=-0.03 * end)
@@ -307,15 +322,20 @@ def finish(figure: Figure, missing: str) -> None:
 
 
 def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
-    """One row of three panels per suite that has runs."""
+    """One row of panels per suite that has runs: return, episode costs, cost rate."""
     drawn = [suite for suite in suites if any(data.curves(suite, a) for a in data.algos(suite))]
     if not drawn:
         return None
-    figure = Figure(figsize=(WIDTH, 0.8 + 2.2 * len(drawn)), layout="constrained")
-    grid = figure.subplots(len(drawn), 3, squeeze=False)
+    columns = max(len(data.panels(suite)) for suite in drawn)
+    size = WIDTH * columns / 3, 0.8 + 2.2 * len(drawn)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(len(drawn), columns, squeeze=False)
     for row, suite in zip(grid, drawn, strict=True):
-        for axis, metric in zip(row, METRICS, strict=True):
-            draw_curves(axis, data, suite, metric)
+        for axis, metric in zip_longest(row, data.panels(suite)):
+            if metric is None:
+                axis.set_axis_off()
+            else:
+                draw_curves(axis, data, suite, metric)
         row[1].set_title(suite, fontweight="bold")
     return figure
 
@@ -326,11 +346,14 @@ def curves(data: Data, suite: str) -> Figure | None:
 
 
 def pareto(data: Data, suite: str) -> Figure | None:
-    """Return against cost with the Pareto front and the cost limit, a figure per suite."""
+    """Return against each cost with the Pareto front and the limit, a figure per suite."""
     if not len(data.means[data.means["suite"] == suite].dropna(subset=["M_c", "J_r"])):
         return None
-    figure = Figure(figsize=(0.7 * WIDTH, 0.6 * WIDTH), layout="constrained")
-    draw_pareto(figure.subplots(), data, suite)
+    costs = data.costs(suite)
+    width = WIDTH * (0.7 if len(costs) == 1 else 0.5 * len(costs))
+    figure = Figure(figsize=(width, 0.6 * WIDTH), layout="constrained")
+    for axis, cost in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
+        draw_pareto(axis, data, suite, cost)
     return figure
 
 

@@ -110,7 +110,7 @@ class Command:
                 group = groups[name]
             options = {"help": help_, **_options(field, hint)}
             if meta["positional"]:
-                group.add_argument(field.name, **{"default": None, **options})
+                group.add_argument(field.name, **{"default": _default(field), **options})
             else:
                 group.add_argument(*_names(field), dest=field.name, **options)
         return result

@@ -11,7 +11,7 @@ import pandas as pd
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from sb3_guard.zoo.run_folder import RunFolder, limit_words
+from sb3_guard.zoo.run_folder import RunFolder, cost_words
 
 if TYPE_CHECKING:
     from sb3_guard.zoo.grid import Run
@@ -68,9 +68,8 @@ class Board:
         line = f"{time.strftime('%H:%M:%S')}  {what}: {run}"
         if what == "done":
             result = RunFolder(run.path).read_result() or {}
-            known = [name for name in ("return", "cost") if result.get(name) is not None]
-            line += "".join(f", {name} {result[name]:.2f}" for name in known)
-            line += limit_words(result)
+            if result.get("return") is not None:
+                line += f", return {result['return']:.2f}, {cost_words(result)}"
         elif what == "failed":
             line += f": {run.error}"
         self.say(line)

@@ -12,7 +12,6 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.common.vec_env import GuardVecEnv
@@ -212,7 +211,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
             on_step=shoot,
             on_episode=(lambda *one: print(_episode(*one))) if flags.verbose > 0 else None,
         )
-    print(_means(evaluation, agent))
+    print(_means(evaluation))
     if flags.verbose > 0:
         for one in evaluation.unfinished:
             print(_episode(*one), "so far: this episode did not end and is not counted")
@@ -271,40 +270,40 @@ def _episode(episode_return: float, cost: float, length: float) -> str:
     return f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length:.0f} steps"
 
 
-def _means(evaluation: Evaluation, agent: Agent) -> str:
+def _means(evaluation: Evaluation) -> str:
     count = len(evaluation)
     if count == 0:
         return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"
-    columns, limits = _columns(evaluation), {}
-    if isinstance(agent.model, Constrained) and agent.model.constrained:
-        keys = agent.model.cost_keys
-        if len(keys) > 1:  # each has its limit, their sum has none
-            columns |= dict(zip(keys, evaluation.limited.T, strict=True))
-        names = keys if len(keys) > 1 else ("worst" if evaluation.limit_on == "max" else "cost",)
-        limits = dict(zip(names, agent.model.cost_limits, strict=True))
-    rows = [f"Mean ± std of {count} episodes, 95 % interval of the mean:"]
-    if count == 1:
-        rows = ["One episode:"]
-    rows += [_row(name, evaluation.estimate(one), limits) for name, one in columns.items()]
-    return "\n".join(rows)
+    rows: dict[str, tuple[Estimate, float | None]] = {
+        name: (evaluation.estimate(values), None) for name, values in _columns(evaluation).items()
+    }
+    if len(evaluation.cost_keys) > 1:  # each has its limit, their sum has none
+        rows |= evaluation.by_key()
+    elif evaluation.limits:
+        name = "worst" if evaluation.limit_on == "max" else "cost"
+        rows[name] = rows[name][0], evaluation.limits[0]
+    title = f"Mean ± std of {count} episodes, 95 % interval of the mean:"
+    return "\n".join(["One episode:" if count == 1 else title, *_rows(rows)])
 
 
-def _row(name: str, estimate: Estimate, limits: Mapping[str, float]) -> str:
-    mean, std, low, high = estimate
-    interval = "" if np.isnan(low) else f" ± {std:.3f}   [{low:.3f}, {high:.3f}]"
-    end = f"   {estimate.against(limits[name])}" if name in limits else ""
-    return f"  {name:<7}{mean:9.3f}{interval}{end}"
+def _rows(rows: Mapping[str, tuple[Estimate, float | None]]) -> Iterator[str]:
+    width = max(map(len, rows))
+    for name, (estimate, limit) in rows.items():
+        mean, std, low, high = estimate
+        interval = "" if np.isnan(low) else f" ± {std:.3f}   [{low:.3f}, {high:.3f}]"
+        end = "" if limit is None else f"   {estimate.against(limit)}"
+        yield f"  {name:<{width}} {mean:9.3f}{interval}{end}"
 
 
 def _when_shipped(flags: EnjoyFlags, agent: Agent) -> Iterator[str]:
     """What the package says of its own agents, where they act as then: few episodes say little."""
     result = agent.run.read_result() or {}
     if flags.pretrained and not flags.env_kwargs and "played" in result:
-        limits = {"cost": result["cost_limit"]} if "cost_limit" in result else {}
+        limits = {"cost": result.get("cost_limit")}
         for mode in ("stochastic", "deterministic"):
             yield f"100 episodes of other seeds, when it was shipped (--{mode}):"
-            for name, one in result["played"][mode].items():
-                yield _row(name, Estimate(*one), limits)
+            played = result["played"][mode].items()
+            yield from _rows({name: (Estimate(*one), limits.get(name)) for name, one in played})
 
 
 @contextmanager

@@ -9,9 +9,18 @@ import jinja2
 import pandas as pd
 
 import sb3_guard
-from sb3_guard.zoo.figures import INK, Data, Look, draw_curves, draw_pareto, inline_svg, panel
+from sb3_guard.zoo.figures import (
+    INK,
+    Data,
+    Look,
+    cost_name,
+    draw_curves,
+    draw_pareto,
+    inline_svg,
+    panel,
+)
 from sb3_guard.zoo.paper import FIGURES, draw
-from sb3_guard.zoo.runs import METRICS, VERSIONS
+from sb3_guard.zoo.runs import VERSIONS
 from sb3_guard.zoo.tables import RUNS, spelled, tables
 
 # A video is part of the page up to this size; the page's videos together, up to the other.
@@ -69,13 +78,14 @@ def _panels(data: Data, suite: str) -> list[str]:
     """Learning curves and return against cost, as SVG."""
     name = suite.translate(dict.fromkeys(map(ord, '<>&"'), "_"))
     charts = [
-        inline_svg(panel(lambda axis, m=m: draw_curves(axis, data, suite, m)), f"{text}, {name}")  # type: ignore[misc]
-        for m, text in METRICS.items()
+        inline_svg(panel(lambda axis, m=m: draw_curves(axis, data, suite, m)), f"{m}, {name}")  # type: ignore[misc]
+        for m in data.panels(suite)
         if any(data.curves(suite, algo) for algo in data.algos(suite))
     ]
     if data.runs.loc[data.runs["suite"] == suite, "J_r"].notna().any():
-        chart = panel(lambda axis: draw_pareto(axis, data, suite))
-        charts.append(inline_svg(chart, f"return against episode cost, {name}"))
+        for cost in data.costs(suite):
+            chart = panel(lambda axis, c=cost: draw_pareto(axis, data, suite, c))  # type: ignore[misc]
+            charts.append(inline_svg(chart, f"return against {cost_name(cost)}, {name}"))
     return charts
 
 

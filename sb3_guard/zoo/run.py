@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
-from sb3_guard.common.evaluation import estimate
+from sb3_guard.common.evaluation import bounded_name
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.algos import algorithm
@@ -319,7 +319,6 @@ class Experiment:
         if finished:
             folder.write_result({"algo": self.flags.algo, "env": self.flags.env, **result})
         if verbose:
-            result["interval"] = estimate(epochs.last[:, 1])
             print(summary(folder, self.flags, result, time.monotonic() - began, finished))
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
@@ -367,18 +366,26 @@ def summary(
     def number(value: float | None, digits: int) -> str:
         return "– (no episode has ended)" if value is None else f"{value:.{digits}f}"
 
-    costs, limit = result["interval"], result["cost_limit"]
-    interval = "" if np.isnan(costs.low) else f"   [{costs.low:.3f}, {costs.high:.3f}]"
-    if result.get("limit_on") == "max":
-        interval += f"   limit on the worst step {limit}"
-    elif isinstance(limit, int | float):  # several limits are of parts of the cost
-        interval += f"   {costs.against(limit)}"
+    def bounded(cost: Mapping[str, Any]) -> str:
+        text = number(cost["mean"], 3)
+        if "low" in cost:
+            text += f"   [{cost['low']:.3f}, {cost['high']:.3f}]"
+        if cost["limit"] is not None:
+            text += f"   limit {cost['limit']:g}"
+        return text + (f": {cost['verdict']}" if "verdict" in cost else "")
+
+    costs, limit_on = result["costs"], result.get("limit_on", "sum")
+    alone = len(costs) == 1 and limit_on == "sum"
     lines = [
         f"{'Finished' if finished else 'Interrupted'} at {result['n_timesteps']:,} steps, "
         f"{seconds:.0f} s",
         f"  run folder         {folder.path}",
         f"  return       J_r   {number(result['return'], 3)}",
-        f"  episode cost M_c   {number(result['cost'], 3)}{interval}",
+        f"  episode cost M_c   {bounded(*costs.values()) if alone else number(result['cost'], 3)}",
+        *(
+            f"    {bounded_name(key, limit_on):<16} {bounded(cost)}"
+            for key, cost in ({} if alone else costs).items()
+        ),
         f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
     ]
     packages = packages_flag(flags.gym_packages)

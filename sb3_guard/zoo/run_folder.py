@@ -10,7 +10,7 @@ import socket
 import sys
 import tempfile
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -64,13 +64,14 @@ def read_data(path: Path) -> dict[str, Any]:
     return read_mapping(path, "the run's file", "names to values")
 
 
-def limit_words(result: Mapping[str, Any]) -> str:
-    """The limit of a run's episode cost in brackets, as of its ``result.json``; empty: none."""
-    limits = result.get("cost_limit")
-    if limits is None or "limit_on" in result:
-        return ""
-    limits = limits if isinstance(limits, Sequence) else [limits]
-    return f" (limit {', '.join(f'{one:g}' for one in limits)})"
+def cost_words(result: Mapping[str, Any]) -> str:
+    """The costs of a run as of its ``result.json``, each with its limit: ``cost 27.31 > 25``."""
+    words = []
+    for key, cost in result["costs"].items():
+        mean, limit = cost["mean"], cost["limit"]
+        if mean is not None and limit is not None:
+            words.append(f"{key} {mean:.2f} {'≤' if mean <= limit else '>'} {limit:g}")
+    return ", ".join(words) or f"cost {result['cost']:.2f}"
 
 
 def folder_name(env_id: str) -> str:
@@ -256,6 +257,11 @@ class RunFolder:
             for key, value in {key: result[key] for key in ("n_timesteps", *MEASURES)}.items():
                 if value is not None and not math.isfinite(value):
                     raise ValueError(f"{key} = {value!r} should be a number")
+        if "costs" not in result:  # as older versions wrote it: of several costs only the total
+            limit = result.get("cost_limit")
+            bounded = None if "limit_on" in result else result["cost"]
+            limit = None if isinstance(limit, list) else limit
+            result["costs"] = {"cost": {"mean": bounded, "limit": limit}}
         return result
 
     def read_result(self) -> dict[str, Any] | None:

@@ -28,7 +28,7 @@ NUMBERS = (
     "seed", "steps", *METRICS, "cost_limit", "episodes", "physics_errors", "seconds", "epoch",
 )  # fmt: skip
 TEXTS = (
-    "suite", "robot", "task", "constraint", "algo", "label", "family", "limits", "world",
+    "suite", "robot", "task", "constraint", "algo", "label", "family", "limits", "verdict", "world",
     "started_from", "settings", "config", *VERSIONS, "commit", "platform", "path",
 )  # fmt: skip
 COLUMNS = (*TEXTS[:7], *NUMBERS, *TEXTS[7:])
@@ -39,6 +39,7 @@ _SAME = ["suite", "world", "algo", "limits", "seed", "steps", "started_from", "c
 SETTINGS = (
     "n_envs", "n_steps", "gamma", "gae_lambda", "target_kl", "policy_kwargs", "normalize",
 )  # fmt: skip
+VERDICTS = ("exceeded", "undecided", "kept")  # the worst one first
 CURVE_POINTS = 200  # at most as many per run, of epochs taken together
 
 
@@ -78,8 +79,10 @@ def read_results(folders: Sequence[str | Path]) -> Results:
                 rows[path.resolve()] = read_run(path)
             except (UsageError, OSError, ValueError, TypeError) as error:
                 left_out[str(path)] = one_line(error)
-    runs = pd.DataFrame([*rows.values()], columns=list(COLUMNS))
-    runs = runs.astype(dict.fromkeys(TEXTS, "string"))
+    keys = sorted({name for row in rows.values() for name in row} - {*COLUMNS})
+    runs = pd.DataFrame([*rows.values()], columns=[*COLUMNS, *keys])
+    texts = [*TEXTS, *(name for name in keys if name.startswith("verdict"))]
+    runs = runs.astype(dict.fromkeys(texts, "string"))
     # The reference comes first, then family by family.
     order = ["suite", "_first", "family", "label", "algo", "cost_limit", "seed"]
     runs = runs.assign(_first=runs["algo"] != REFERENCE).sort_values(order, kind="stable")
@@ -106,10 +109,12 @@ def read_run(path: Path) -> dict[str, Any]:
         ``M_c`` (means over the episodes of the final epoch; NaN if none ended), ``rho_c``
         (cumulative cost ÷ steps),
         ``cost_limit`` (NaN: unconstrained, or several costs), ``limits`` (of all costs, "1 2";
-        missing: unconstrained), ``seconds`` of training, ``epoch`` (steps of a rollout), ``world``
-        (``env_kwargs``), ``started_from`` (the model that training started from), ``settings``
-        (:data:`SETTINGS`) and ``config`` (the same for the same hyper-parameters). What runs of
-        older versions did not write is missing
+        missing: unconstrained), ``verdict`` on them (of several the worst), ``seconds`` of
+        training, ``epoch`` (steps of a rollout), ``world`` (``env_kwargs``), ``started_from`` (the
+        model that training started from), ``settings`` (:data:`SETTINGS`) and ``config`` (the same
+        for the same hyper-parameters). If the limits are on other costs than the total, there are
+        ``M_c/<key>``, ``cost_limit/<key>`` and ``verdict/<key>`` of each. What runs of older
+        versions did not write is missing
     :raises UsageError: the run is not finished, or damaged
     """
     if not (path / "result.json").exists():
@@ -123,6 +128,7 @@ def read_run(path: Path) -> dict[str, Any]:
     limit = result.get("cost_limit", config.get("cost_limit"))
     limits = limit if isinstance(limit, list) else [] if limit is None else [limit]
     limits = [_number(one) for one in limits]
+    by_key, verdicts = _by_key(result)
     settings = {name: config.get(name) for name in SETTINGS}
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
     whole = all(isinstance(one, int) for one in rollout)
@@ -139,8 +145,10 @@ def read_run(path: Path) -> dict[str, Any]:
         "seed": seed,
         "steps": result["n_timesteps"],
         **{name: _number(result.get(key)) for name, key in numbers.items()},
-        "cost_limit": limits[0] if len(limits) == 1 else math.nan,
+        "cost_limit": math.nan if by_key or len(limits) != 1 else limits[0],
         "limits": _limits(limits) if limits else None,
+        "verdict": min(verdicts, key=VERDICTS.index, default=None),
+        **by_key,
         "epoch": math.prod(rollout) if whole else math.nan,
         "world": json.dumps(config["env_kwargs"], sort_keys=True, default=str)
         if config.get("env_kwargs")
@@ -153,6 +161,19 @@ def read_run(path: Path) -> dict[str, Any]:
         "platform": result.get("platform"),
         "path": str(path),
     }
+
+
+def _by_key(result: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """What a result says of its costs: columns of those that are not the total, and verdicts."""
+    costs = result["costs"]
+    verdicts = [cost["verdict"] for cost in costs.values() if cost.get("verdict")]
+    columns: dict[str, Any] = {}
+    total = [cost["mean"] for cost in costs.values()] == [result["cost"]]
+    for key, cost in {}.items() if total or "limit_on" in result else costs.items():
+        columns[f"M_c/{key}"] = _number(cost["mean"])
+        columns[f"cost_limit/{key}"] = _number(cost["limit"])
+        columns[f"verdict/{key}"] = cost.get("verdict")
+    return columns, verdicts
 
 
 @cache
@@ -356,19 +377,20 @@ def read_episodes(path: str | Path) -> pd.DataFrame:
     """
     All training episodes of a run.
 
-    :return: ``step`` at which the episode ended, ``J_r``, ``M_c`` and ``rho_c`` (cumulative cost ÷
-        steps until then)
+    :return: ``step`` at which the episode ended, ``J_r``, ``M_c``, of several costs also
+        ``M_c/<key>``, and ``rho_c`` (cumulative cost ÷ steps until then)
     :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
     """
     file = Path(path) / "0.monitor.csv"
     with explained(f"can't read {file}", OSError, ValueError, KeyError):
-        table = pd.read_csv(file, skiprows=1)[["r", "l", "c"]].astype(float)
+        table = pd.read_csv(file, skiprows=1).filter(regex="^([rlc]|c_.*)$").astype(float)
+        steps = table.pop("l").cumsum()
+        rate = table["c"].cumsum() / steps
     if not len(table) or table.isna().any(axis=None):
         raise UsageError(f"can't use {file}: it has no episodes, or is truncated")
-    steps = table["l"].cumsum()
-    return pd.DataFrame(
-        {"step": steps, "J_r": table["r"], "M_c": table["c"], "rho_c": table["c"].cumsum() / steps}
-    )
+    names = {"r": "J_r", "c": "M_c"}
+    table.columns = [names.get(name, f"M_c/{name[2:]}") for name in map(str, table)]
+    return table.assign(step=steps, rho_c=rate)
 
 
 def read_curve(path: str | Path, epoch: float = math.nan) -> pd.DataFrame:
@@ -377,8 +399,9 @@ def read_curve(path: str | Path, epoch: float = math.nan) -> pd.DataFrame:
 
     :param path: the run folder
     :param epoch: steps per point; NaN or too few: 1/200 of the run
-    :return: ``step`` (the end of an epoch), ``J_r`` and ``M_c`` (means over the episodes that ended
-        in it), and ``rho_c`` (cumulative cost ÷ steps of all episodes until then)
+    :return: ``step`` (the end of an epoch), ``J_r``, ``M_c`` and ``M_c/<key>`` (means over the
+        episodes that ended in it), and ``rho_c`` (cumulative cost ÷ steps of all episodes until
+        then)
     :raises UsageError: see :func:`read_episodes`
     """
     table = read_episodes(path)
@@ -386,4 +409,4 @@ def read_curve(path: str | Path, epoch: float = math.nan) -> pd.DataFrame:
     rollout = epoch if epoch > 0 else total / CURVE_POINTS
     size = rollout * max(1, math.ceil(total / rollout / CURVE_POINTS))
     epochs = table.groupby(np.ceil(table["step"] / size) * size)
-    return epochs.agg({"J_r": "mean", "M_c": "mean", "rho_c": "last"}).reset_index()
+    return epochs.mean().assign(rho_c=epochs["rho_c"].last()).drop(columns="step").reset_index()

@@ -121,16 +121,18 @@ def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
     Means over seeds, a row per suite and algorithm.
 
     :param runs: see :func:`~sb3_guard.zoo.runs.select`
-    :return: ``suite``, ``algo``, ``label``, ``family``, ``limits``, ``seeds``, ``steps``, and for
-        each of :data:`~sb3_guard.zoo.runs.METRICS` its mean, ``_std`` (of the sample; NaN for one
+    :return: ``suite``, ``algo``, ``label``, ``family``, limits, verdicts (of a single seed),
+        ``seeds``, ``steps``, and for each of :data:`~sb3_guard.zoo.runs.METRICS`, and ``M_c/<key>``
+        if the runs have it, its mean, ``_std`` (of the sample; NaN for one
         seed), ``_low`` and ``_high`` (95 % bootstrap interval of the mean). If the runs have
         :data:`SAFETY`: their means, ``_se`` (standard error: ``_std`` ÷ √seeds), and the greatest
         ``cost_max``
     """
     groups = runs.groupby(["suite", "algo"], sort=False)
-    parts = [groups[["label", "family", "limits"]].first(), groups["seed"].nunique()]
+    stated = runs.filter(regex="^(label|family|limits|cost_limit|verdict)").columns
+    parts = [groups[list(stated)].first(), groups["seed"].nunique()]
     parts.append(groups["steps"].max())
-    for name in METRICS:
+    for name in (*METRICS, *runs.filter(regex="^M_c/")):
         ends = [interval([group.to_numpy()]) for _, group in groups[name]]
         low, high = np.array(ends).reshape(-1, 2).T
         part = groups[name].agg(["mean", "std"]).assign(low=low, high=high)

@@ -1,5 +1,7 @@
 """Tables that read well in a terminal, in Markdown, in LaTeX and on a web page."""
 
+import io
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BufferedRandom
@@ -7,8 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from sb3_guard.common.files import replacing
+from sb3_guard.costs import verdict
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.markdown import escaped, table
 from sb3_guard.zoo.usage import UsageError, explained
@@ -24,13 +31,21 @@ _LATEX = {"±": r"$\pm$", "−": "$-$", "ρ": r"$\rho$", "–": "--", "\N{NO-BRE
 
 
 def terminal(data: pd.DataFrame) -> str:
-    """A table of text, its columns aligned."""
-    return table(list(data.columns), data.astype(str).to_numpy().tolist())
+    """A table of text that fits the terminal, or 120 columns; intervals have their own lines."""
+    console = Console(width=shutil.get_terminal_size((120, 0)).columns, file=io.StringIO())
+    grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in map(str, data):
+        grid.add_column(name, no_wrap=name in ("suite", "algorithm"))
+    for row in data.astype(str).to_numpy():
+        grid.add_row(*(Text(cell.replace(" [", "\n[")) for cell in row))
+    with console.capture() as captured:
+        console.print(grid)
+    return "\n".join(map(str.rstrip, captured.get().splitlines())).strip("\n")
 
 
 def markdown(data: pd.DataFrame) -> str:
     """A table of text for a Markdown page."""
-    return terminal(data.astype(str).map(escaped))
+    return table(list(data.columns), data.astype(str).map(escaped).to_numpy().tolist())
 
 
 def latex(data: pd.DataFrame) -> str:
@@ -97,14 +112,36 @@ def _with_interval(name: str, middle: str = "") -> Callable[[Any], str]:
     return cell
 
 
-def _limit(row: Any) -> str:
-    return "–" if pd.isna(row["limits"]) else row["limits"]
+def _limit(row: Any, end: str = "") -> str:
+    """A limit, and whether the mean over seeds keeps it; of one seed, the run's own verdict."""
+    limit, low = row[f"cost_limit{end}"], row.get(f"M_c{end}_low")
+    name = f"{limit:g}" if end else row["limits"]
+    if pd.isna(name):
+        return "–"
+    words = row[f"verdict{end}"]
+    if not pd.isna(low):
+        words = None if pd.isna(limit) else verdict(low, row[f"M_c{end}_high"], limit)
+    return name if pd.isna(words) else f"{name}: {words}"
+
+
+def _limits(means: pd.DataFrame) -> pd.DataFrame:
+    """Where limits are on other costs than the total: a row for each of them."""
+    parts = []
+    for name in map(str, means.filter(regex="^cost_limit/")):
+        end = name.removeprefix("cost_limit")
+        columns: Columns = {
+            "suite": "suite", "algorithm": "label", "cost": lambda row, end=end: end[1:],  # type: ignore[misc]
+            "mean of an episode": _with_interval(f"M_c{end}"),
+            "limit": lambda row, end=end: _limit(row, end),  # type: ignore[misc]
+        }  # fmt: skip
+        parts.append(spelled(means.dropna(subset=[name]), columns))
+    return pd.concat(parts).sort_values("suite", kind="stable") if parts else pd.DataFrame()
 
 
 SAFETY_HEADINGS: Columns = {
     "return, last epochs": lambda row: spread(row["return_last"], row["return_last_se"]),
     "cost, last epochs": lambda row: spread(row["cost_last"], row["cost_last_se"]),
-    "above limit": lambda row: number(100 * row["above_limit"], 1) + "\xa0%",
+    "above limit, %": lambda row: number(100 * row["above_limit"], 1),
     "95 % of costs": "cost_p95",
     "worst cost": "cost_max",
     "cost of training": whole("cost_total"),
@@ -123,19 +160,21 @@ def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
     means = aggregate(runs)
     scores = normalize(means, means)
-    who: dict[str, Any] = {"suite": "suite", "algorithm": "label", "limit": _limit}
+    who: Columns = {"suite": "suite", "algorithm": "label"}
     shown: Columns = {heading: score for score, heading in SCORE_HEADINGS.items()}
     result = {
         "Results": spelled(
-            scores,
-            {**who, "seeds": whole("seeds"), "steps": whole("steps")}
-            | {heading: _with_interval(name) for name, heading in HEADINGS.items()}
-            | shown,
+            means,
+            {**who, "limit": _limit, "seeds": whole("seeds"), "steps": whole("steps")}
+            | {heading: _with_interval(name) for name, heading in HEADINGS.items()},
         ),
+        "Limits": _limits(means),
         "Safety": spelled(means, {**who, **SAFETY_HEADINGS}),
     }
+    result = {title: table for title, table in result.items() if len(table)}
     if scores[["reward", "cost"]].isna().all(axis=None):
         return result
+    result["Relative to TRPO"] = spelled(scores, who | shown)
     families = by_family(scores)
     if len(families):
         columns: Columns = {"suite": "suite", "family": "family", "algorithms": whole("algorithms")}

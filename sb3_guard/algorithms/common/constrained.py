@@ -32,6 +32,7 @@ from sb3_guard.algorithms.common.arguments import (
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.generators import KeepsGenerators
+from sb3_guard.algorithms.common.loading import LoadsOthers
 from sb3_guard.checks import NumberError, check_per_cost, is_number
 from sb3_guard.costs import read_costs
 
@@ -48,7 +49,7 @@ def _within(callback: BaseCallback) -> Iterator[BaseCallback]:
         yield from _within(one)
 
 
-class Constrained(KeepsGenerators):
+class Constrained(LoadsOthers, KeepsGenerators):
     """Cost keys, limits and episode costs beside an algorithm of Stable-Baselines3.
 
     Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. A subclass states its

@@ -1,0 +1,132 @@
+"""Agents of other algorithms, such as SB3's PPO, loaded to be made safe.
+
+``PPOLag.load("ppo.zip", env=env, cost_limit=25.0)`` takes over what PPO has learnt, the actor and
+the critic of the reward. What only PPO-Lagrangian has, the cost critic and the multiplier, begins
+anew.
+"""
+
+import inspect
+import warnings
+from typing import Any, Self
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+
+from sb3_guard.algorithms.common.arguments import stated
+
+# SB3's buffers have no room for costs.
+_BUFFERS: dict[str, Any] = {
+    "rollout_buffer_class": None,
+    "rollout_buffer_kwargs": {},
+    "replay_buffer_class": None,
+    "replay_buffer_kwargs": {},
+}
+
+
+def replacements(cls: Any, data: dict[str, Any]) -> dict[str, Any]:
+    """
+    What takes the place of attributes in the file of an algorithm that knows no cost.
+
+    A hyper-parameter that the class states itself has the class's default, since the same name
+    may mean something else there: sb3-contrib's ``target_kl`` is a mean over the dimensions of an
+    action, ours a sum.
+
+    :param cls: the algorithm that loads the file
+    :param data: attributes in the file
+    :raises ValueError: the agent's policy is of a kind that the algorithm can't train
+    """
+    kind, kinds = data["policy_class"], [*cls.policy_aliases.values()]
+    if not any(issubclass(kind, ours) or issubclass(ours, kind) for ours in kinds):
+        names = ", ".join(ours.__name__ for ours in kinds)
+        raise ValueError(
+            f"{cls.__name__} can't take over an agent with a {kind.__name__}: allowed are {names} "
+            "and their subclasses"
+        )
+    policies = [ours for ours in kinds if issubclass(ours, kind)]
+    arguments = inspect.signature(cls).parameters
+    defaults = {name: arguments[name].default for name in stated(cls) if name in arguments}
+    return {
+        **_BUFFERS,
+        **defaults,
+        **dict.fromkeys(cls.fixed_arguments, 0.0),
+        **({"policy_class": policies[0]} if policies else {}),
+    }
+
+
+class LoadsOthers(BaseAlgorithm):
+    """Loads agents of algorithms that know no cost. Mixed in before an algorithm."""
+
+    @classmethod
+    def load(
+        cls,
+        path: Any,
+        env: Any = None,
+        device: Any = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """Load an agent as SB3's ``load`` does, also one that an algorithm without costs trained.
+
+        Then actor, critic of the reward, their optimizers and the hyper-parameters that both
+        algorithms take from SB3 are those of the file; a warning says what begins anew and what is
+        left behind.
+
+        :param path: the file
+        :param env: environment to train in; None: to predict only
+        :param device: torch device
+        :param custom_objects: what replaces attributes in the file
+        :param print_system_info: whether to print the versions that the file was written with
+        :param force_reset: whether the next ``learn`` begins new episodes
+        :param kwargs: attributes to change, such as ``cost_limit``
+        :return: the agent
+        :raises ValueError: the file does not fit the environment or the algorithm
+        """
+        data, parts, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
+        if hasattr(path, "seek"):
+            path.seek(0)
+        left: list[str] = []
+        if data is not None and "cost_keys" not in data:
+            custom_objects = {**replacements(cls, data), **(custom_objects or {})}
+            blank = cls(custom_objects["policy_class"], env=None, _init_setup_model=False)  # type: ignore[call-arg]
+            known = {*vars(blank), "lr_schedule", "n_envs"}
+            settings = {k: v for k, v in data.items() if callable(v) or isinstance(v, int | float)}
+            left = sorted(settings.keys() - known)
+        model = super().load(
+            path, env, device, custom_objects, print_system_info, force_reset, **kwargs
+        )
+        for name in left:
+            delattr(model, name)
+        new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
+        if new:
+            limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""  # type: ignore[attr-defined]
+            warnings.warn(
+                f"{cls.__name__} takes over an agent of another algorithm: policy and critic are "
+                f"carried over, {', '.join(new)} begin anew, "
+                f"{', '.join(left) or 'nothing'} is left behind{limit}",
+                UserWarning,
+                stacklevel=2,
+            )
+        return model
+
+    def set_parameters(
+        self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto"
+    ) -> None:
+        """Set networks and optimizers as SB3 does; those that SB3's algorithm lacks may be absent.
+
+        :param load_path_or_dict: a file, or states by name
+        :param exact_match: whether all that SB3's algorithm has must be there
+        :param device: torch device
+        """
+        given = load_path_or_dict
+        if not isinstance(given, dict):
+            _, given, _ = load_from_zip_file(given, load_data=False, device=device)
+        theirs = super()._get_torch_save_params()[0]
+        ours = {name: now for name, now in self.get_parameters().items() if name not in theirs}
+        given = {**ours, **given}
+        if "policy" in given:
+            weights = self.policy.state_dict()
+            action_filter = {k: v for k, v in weights.items() if k.startswith("action_filter.")}
+            given["policy"] = {**action_filter, **given["policy"]}
+        super().set_parameters(given, exact_match, device)

@@ -26,7 +26,7 @@ from sb3_guard import ALGORITHMS, CPO, cli, enjoy, make_vec_env, train
 from sb3_guard.envs import Scenario, register, register_constraint
 from sb3_guard.envs.part import Constraint
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
-from sb3_guard.zoo import usage
+from sb3_guard.zoo import playback, usage
 from sb3_guard.zoo.hyperparams import build, check
 from sb3_guard.zoo.make_envs import make_envs
 from sb3_guard.zoo.playback import PRETRAINED
@@ -143,15 +143,15 @@ def test_progress_bar_shows_return_and_cost(tmp_path, capsys):
     trained(tmp_path, "--progress", "--verbose", "1")
     err = capsys.readouterr().err
     assert "120/120" in err
-    assert "return" in err and "rate" in err and re.search(r", cost [\d.]+ [≤>] 2, ", err)
+    assert "return" in err and "rate" in err and re.search(r", cost [\d.]+ [≤>] 0, ", err)
 
 
 def test_every_limit_has_a_verdict(tmp_path, capsys):
     limits = ["cost_keys:['cost','heat']", "cost_limit:[1000.0, 0.0]"]
-    run = trained(
-        tmp_path, "--progress", "--verbose", "1", "-params", "n_critic_updates:1", *limits,
-        "--env-kwargs", "cost_keys:['cost','heat']", "hazard:[-1.0, 0.0]",
-    )  # fmt: skip
+    arguments = [*TOY, *SMALL, *LENGTH, "-n", "120", "-f", str(tmp_path), "--progress"]
+    world = ["cost_keys:['cost','heat']", "hazard:[-1.0, 0.0]"]
+    assert train.main([*arguments, "-params", *limits, "--env-kwargs", *world]) == 0
+    (run,) = tmp_path.glob("cpo/*_1")
     out, err = capsys.readouterr()
     result = json.loads((run / "result.json").read_text())
     cost, heat = result["costs"]["cost"], result["costs"]["heat"]
@@ -505,6 +505,25 @@ def test_a_shipped_agent_keeps_its_limit(env_id, noise, tmp_path):
     which = ["--pretrained", "--no-render", "--verbose", "0", "--env", env_id, *noise]
     assert enjoy.main([*which, "--n-episodes", "200", "--json", str(file)]) == 0
     assert 1 < json.loads(file.read_text())["cost"]["mean"] < 5.3
+
+
+def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):
+    made = []
+    monkeypatch.setattr(
+        playback,
+        "make_envs",
+        lambda *args, **kwargs: made.append(make_envs(*args, **kwargs)) or made[-1],
+    )
+    which = ["--pretrained", "--no-render", "--env-kwargs", "max_episode_steps:5"]
+    file = tmp_path / "played.json"
+    for flags, episodes, at_once in (
+        ([], 30, 30),
+        (["--n-episodes", "3"], 3, 3),
+        (["-n", "10"], 2, 1),
+    ):
+        assert enjoy.main([*which, *flags, "--json", str(file)]) == 0
+        assert json.loads(file.read_text())["episodes"] == episodes
+        assert made[-1].num_envs == at_once
 
 
 def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):

@@ -25,7 +25,8 @@ class AgentFlags(Command):
 
     What is played:
 
-    :param n_episodes: episodes (default: 5, or 1 to record; 10 for the hub)
+    :param n_episodes: episodes (default: 30 at once; 5 in a window or of an environment that is not
+        this package's, 1 to record, 10 for the hub)
     :param stochastic: sampled actions
     :param seed: seed of the episodes (default: 0)
     :param env_kwargs: arguments of the environment, over those of training

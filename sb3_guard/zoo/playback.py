@@ -35,6 +35,7 @@ from sb3_guard.zoo.run_folder import (
 )
 from sb3_guard.zoo.usage import UsageError, explained, import_packages
 
+BATCH = 30  # episodes at once: as many as tell whether a limit is kept
 VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
 #: The trained agents that the package ships: a log folder, written by ``scripts/pretrain.py``.
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
@@ -126,12 +127,13 @@ class Agent:
     env: VecEnv
 
 
-def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
+def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> Agent:
     """
-    Load an agent and make one environment for it, wrapped as in training.
+    Load an agent and make an environment for it, wrapped as in training.
 
     :param flags: of the command
     :param render_mode: None, ``"human"``, or ``"rgb_array"``
+    :param n_envs: environments of ours, which are one batch; of others there is one
     :raises UsageError: there is no such agent, or it does not fit the environment
     """
     import_packages(flags.gym_packages)
@@ -154,7 +156,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None) -> Agent:
     env = make_envs(
         env_id,
         setup,
-        n_envs=1,
+        n_envs=n_envs if native else 1,
         seed=flags.seed,
         vec_env="native" if native else "dummy",
         env_kwargs={
@@ -184,7 +186,8 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     for name in ("record", "json"):
         if getattr(flags, name):
             _require_file(Path(getattr(flags, name)), f"--{name}")
-    agent = open_agent(flags, render_mode)
+    alone = render_mode is not None or flags.n_timesteps is not None
+    agent = open_agent(flags, render_mode, 1 if alone else min(flags.n_episodes or BATCH, BATCH))
     video = None
     if flags.record is not None:
         beside = agent.path.with_suffix(".mp4")
@@ -193,7 +196,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         _require_file(video, "--record")
     episodes = flags.n_episodes
     if episodes is None and flags.n_timesteps is None:
-        episodes = 1 if flags.record is not None else 5
+        episodes = 1 if flags.record is not None else max(agent.env.num_envs, 5)
     if flags.verbose > 0:
         print(f"Playing {agent.path} on {agent.env_id}")
     with (

@@ -63,7 +63,7 @@ def state_of(model: Any) -> list[Any]:
 @pytest.mark.parametrize(
     ("ours", "theirs", "more"),
     [
-        (SACLag, SAC, {"gradient_steps": 2, "target_update_interval": 2}),
+        (SACLag, SAC, {"gradient_steps": 2, "target_update_interval": 2, "ent_coef": "auto"}),
         (SACLag, SAC, {"ent_coef": 0.1, "use_sde": True}),
         (TD3Lag, TD3, {"gradient_steps": 3}),
     ],
@@ -162,6 +162,7 @@ def test_the_actors_loss_by_hand() -> None:
 def test_multipliers_follow_ended_episodes_once_and_not_before_their_time(cls: Any) -> None:
     """Episodes of 30 steps: λ moves at their ends alone, by η and K_P, once ``lambda_starts``."""
     more = {"cost_limit": 0.01, "lambda_lr": 0.1, "proportional_gain": 0.0, "train_freq": 10}
+    more["lambda_lr_per"] = "episode"
     model = cls("MlpPolicy", points(1), lambda_starts=100, gradient_steps=3, **more, **settings())
     seen: dict[int, float] = {}
 
@@ -194,7 +195,8 @@ def given(costs: Iterable[float], n_envs: int, length: int) -> Any:
 def test_many_environments_move_multipliers_as_one_does(cls: Any) -> None:
     """Sixty episodes, one after the other or six at a time, which end together."""
     costs, ends = np.random.default_rng(0).gamma(0.2, 10.0, 70), []
-    gains = {"cost_limit": 2.0, "proportional_gain": 0.5, "derivative_gain": 0.5}
+    gains = {"cost_limit": 2.0, "lambda_lr": 0.02, "lambda_lr_per": "episode"}
+    gains |= {"proportional_gain": 0.5, "derivative_gain": 0.5}
     for n_envs in (1, 6):
         env = given(costs, n_envs, length=10)
         model = cls("MlpPolicy", env, **gains, **settings() | {"learning_starts": 0}).learn(600)
@@ -217,9 +219,74 @@ def test_multipliers_follow_the_mean_of_episodes(cls: Any) -> None:
 def test_multipliers_do_not_run_ahead_of_the_policy(cls: Any) -> None:
     """Eight episodes for each gradient step; TD3's actor learns, and pays, in every other one."""
     gains = {"cost_limit": 5.0, "lambda_lr": 0.1, "proportional_gain": 0.0, "lambda_starts": 80}
+    gains["lambda_lr_per"] = "episode"
     env = given(itertools.repeat(100.0), 8, length=1)
     model = cls("MlpPolicy", env, **gains, **settings() | {"learning_starts": 0}).learn(232)
     assert model._n_updates == 29 and float(model.multiplier.value) == pytest.approx(2.0)
+
+
+@both
+@pytest.mark.parametrize(("n_envs", "total"), [(1, 400), (8, 800), (8, 1600)])
+def test_a_training_moves_multipliers_as_far_however_many_episodes_it_has(
+    cls: Any, n_envs: int, total: int
+) -> None:
+    """From 40 % of it on: η Δ ∫ dt / t with η = 2 and half a limit's worth of violation."""
+    env = given(itertools.repeat(150.0), n_envs, length=4)
+    more = {"cost_limit": 100.0, "lambda_lr": 2.0, "proportional_gain": 0.0, "lambda_starts": 0.4}
+    model = cls("MlpPolicy", env, **more, **settings() | {"train_freq": 2}).learn(total)
+    assert float(model.multiplier.value) == pytest.approx(np.log(1.0 / 0.4), abs=0.1)
+
+
+def paid(size: float) -> Any:
+    """Two environments that pay ``size`` and its negative by turns."""
+
+    class Paid(Clock):
+        def step(self, action: Any) -> Any:
+            observation, _, *others = super().step(action)
+            return observation, size * (-1.0) ** self.t, *others
+
+    return make_vec_env(lambda: Paid(4, cut=True), 2)
+
+
+@pytest.mark.parametrize(
+    ("ent_coef", "size", "start"),
+    [
+        ("auto_reward", 0.02, 0.02),
+        ("auto_reward", 30.0, 30.0),
+        ("auto_reward", 0.0, 1.0),  # nothing to go by
+        ("auto", 0.02, 1.0),
+        ("auto_0.1", 0.02, 0.1),
+    ],
+)
+def test_the_entropy_coefficient_starts_where_it_is_told(
+    ent_coef: str, size: float, start: float
+) -> None:
+    """One action dimension, so that the mean absolute reward is the start; once, not at each."""
+    model = SACLag("MlpPolicy", paid(size), ent_coef=ent_coef, cost_limit=1e6, **settings())
+    model.learn(62)
+    assert model._n_updates == 1
+    rate = model.learning_rate  # Adam's first step of log α
+    assert abs(np.log(float(model.log_ent_coef.exp()) / start)) == pytest.approx(rate, rel=0.01)
+    assert model.ent_coef == ent_coef
+    model.set_env(paid(1000.0))
+    model.learn(4, reset_num_timesteps=False)
+    assert float(model.log_ent_coef.exp()) == pytest.approx(start, rel=0.01)
+
+
+def test_the_entropy_coefficient_fits_normalised_rewards_and_the_number_of_actions() -> None:
+    env = VecNormalize(points(), norm_obs=False)
+    model = SACLag("MlpPolicy", env, learning_rate=1e-9, cost_limit=1e6, **settings()).learn(62)
+    rewards = env.normalize_reward(model.replay_buffer.rewards[:31])
+    expected = np.abs(rewards).mean() / 2.0
+    assert float(model.log_ent_coef.exp()) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("value", ["auto_size", "car", -0.1, "auto_0.0", "auto_-1", float("nan")])
+def test_an_entropy_coefficient_of_another_kind_is_named(value: Any) -> None:
+    with pytest.raises(
+        ValueError, match=f"ent_coef={value!r}: must be a number of at least 0, 'au"
+    ):
+        SACLag("MlpPolicy", points(1), ent_coef=value, cost_limit=1.0, **settings())
 
 
 @both
@@ -403,8 +470,9 @@ def test_it_finds_a_known_optimum(cls: Any) -> None:
         "batch_size": 64,
         "seed": 0,
         "buffer_size": steps,
+        "gradient_steps": 2,
     }
-    # SAC's temperature would need longer to come down from 1.
+    # SAC's temperature would need longer to come down.
     fast |= {"action_noise": noise()} if cls is TD3Lag else {"ent_coef": 0.01}
     policy = {"net_arch": [32, 32]}
     cls("MlpPolicy", env, cost_limit=0.5, policy_kwargs=policy, **fast).learn(steps, outcomes)

@@ -6,9 +6,10 @@ from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.replay import CostReplayBufferSamples, LagrangianReplay
+from sb3_guard.algorithms.common.temperature import Temperature
 
 
-class SACLag(LagrangianReplay, SAC):
+class SACLag(Temperature, LagrangianReplay, SAC):
     """SAC on the Lagrangian (Ha et al., 2020, arXiv 2002.08550).
 
     ::
@@ -17,7 +18,8 @@ class SACLag(LagrangianReplay, SAC):
 
     Each cost has critics of its own, of which the larger value counts. The actor descends
     ``(α log π - min Q + Σ λ_i Q_Ci) / (1 + Σ λ_i)``; the multipliers follow the mean
-    cost of the latest episodes. While no limit is exceeded the run equals SB3's SAC, bit for bit.
+    cost of the latest episodes. With ``ent_coef="auto"`` and while no limit is exceeded the run
+    equals SB3's SAC, bit for bit.
     """
 
     label, family, paper = "SAC-Lagrangian", "Lagrangian", "Ha et al. 2020"
@@ -28,7 +30,7 @@ class SACLag(LagrangianReplay, SAC):
             self.actor.reset_noise()
         actions, log_prob = self.actor.action_log_prob(batch.observations)
         log_prob = log_prob.reshape(-1, 1)
-        logs, alpha = self._fit_temperature(log_prob.detach())
+        logs, alpha = self.fit_temperature(log_prob.detach())
 
         with th.no_grad():
             next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
@@ -57,14 +59,3 @@ class SACLag(LagrangianReplay, SAC):
             polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
             self.cost_critic.follow(self.tau)
         return logs
-
-    def _fit_temperature(self, log_prob: th.Tensor) -> tuple[dict[str, float], th.Tensor]:
-        """α as this step uses it, after which it learns if it is to."""
-        if self.ent_coef_optimizer is None or self.log_ent_coef is None:
-            return {"ent_coef": self.ent_coef_tensor.item()}, self.ent_coef_tensor
-        alpha = th.exp(self.log_ent_coef.detach())
-        loss = -(self.log_ent_coef * (log_prob + float(self.target_entropy))).mean()
-        self.ent_coef_optimizer.zero_grad()
-        loss.backward()
-        self.ent_coef_optimizer.step()
-        return {"ent_coef": alpha.item(), "ent_coef_loss": loss.item()}, alpha

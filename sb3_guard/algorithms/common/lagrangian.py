@@ -226,10 +226,14 @@ class Lagrangian(Constrained):
             return
         self.costs_are_new = False
         # As with the critics' rate: what the attribute says, not what a file has restored.
-        update_learning_rate(self.multiplier.optimizer, self.lambda_lr)
+        update_learning_rate(self.multiplier.optimizer, self.multiplier_rate())
         for cost in self.costs_to_follow():
             self.multiplier.update(cost, self.cost_limits)
         self._record_per_cost("train/multiplier", self.multiplier.value.numpy())
+
+    def multiplier_rate(self) -> float:
+        """η of each step that the multipliers take now."""
+        return self.lambda_lr
 
     def costs_to_follow(self) -> Iterable[np.ndarray]:
         """J_C in each step of the multipliers, shape (m,); a rollout is one step."""

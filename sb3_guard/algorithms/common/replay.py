@@ -7,7 +7,7 @@ Q_C(s, a) = c + γ_C Q_C(s', a'); the latest episodes tell J_C.
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch as th
@@ -314,23 +314,30 @@ class LagrangianReplay(Lagrangian, CostReplay):
     not more often than there were gradient steps. Episodes that end while random actions fill the
     buffer do not count.
 
-    :param lambda_starts: steps before which the multipliers stay where they begin
+    :param lambda_lr: η, what the multipliers gain per unit of violation
+    :param lambda_lr_per: ``"training"`` gives an episode that ends its share of the steps so far,
+        η T / t, so that the multipliers move as far in a short training as in a long one, and
+        settle; ``"episode"`` gives each episode η
+    :param lambda_starts: when the multipliers begin to move: after that many steps, or below 1
+        after that share of the training. Before it the policy learns its task at ``lambda_init``
     :param lambda_window: number of episodes in that mean
     """
 
     search_space: ClassVar[dict[str, Any]] = {
-        "lambda_lr": {"low": 1e-3, "high": 0.2, "log": True},
+        "lambda_lr": {"low": 0.2, "high": 10.0, "log": True},
         "lambda_init": {"low": 0.0, "high": 2.0},
-        "proportional_gain": {"low": 0.0, "high": 4.0},
+        "proportional_gain": {"low": 0.0, "high": 2.0},
+        "lambda_starts": {"low": 0.0, "high": 0.3},
     }
     defaults: ClassVar[dict[str, Any]] = {
-        "lambda_lr": 0.02,
-        "proportional_gain": 1.0,
+        "lambda_lr": 3.0,
+        "proportional_gain": 0.5,
         "lambda_units": "relative",
     }
 
-    lambda_starts: int = hyperparameter(0, low=0)
-    lambda_window: int = hyperparameter(20)
+    lambda_lr_per: Literal["training", "episode"] = hyperparameter("training")
+    lambda_starts: float = hyperparameter(0.15)
+    lambda_window: int = hyperparameter(50)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
@@ -350,15 +357,22 @@ class LagrangianReplay(Lagrangian, CostReplay):
         return True
 
     def ascend(self) -> None:
-        if self.num_timesteps < self.lambda_starts:
+        share = self.lambda_starts < 1.0
+        starts = self.lambda_starts * (self._total_timesteps if share else 1.0)
+        if self.num_timesteps < starts:
             self.unfollowed, self.followed_at = [], self._n_updates
         elif self._n_updates > self.followed_at:
             super().ascend()
 
+    def multiplier_rate(self) -> float:
+        if self.lambda_lr_per == "episode":
+            return self.lambda_lr
+        return self.lambda_lr * self.costs.horizon / self.num_timesteps
+
     def costs_to_follow(self) -> list[np.ndarray]:
         means, steps = self.unfollowed, self._n_updates - self.followed_at
         self.unfollowed, self.followed_at = [], self._n_updates
-        return means[-steps:]
+        return means[-steps:] if self.lambda_lr_per == "episode" else means
 
     def penalized(
         self,

@@ -51,7 +51,8 @@ class Flags(EvaluationFlags, TrainingFlags):
 
     :param dry_run: list the runs and do nothing
     :param jobs: runs at once, a process with one thread each (default: as many as there are cores)
-    :param scheduler: of a Dask cluster, e.g. tcp://node1:8786 (default: run on this machine)
+    :param scheduler: address of a Dask cluster, e.g. tcp://node1:8786 (default: run on this
+        machine); needs the extra sb3-guard[cluster]
     :param verbose: 0: errors only (default: 1)
     """
 
@@ -155,7 +156,7 @@ def benchmark(flags: Flags) -> int:
         if flags.jobs is not None:
             raise UsageError(
                 "--jobs is for this machine; on a Dask cluster, each worker carries out one run at "
-                "a time (dask worker --nworkers N --nthreads 1)"
+                "a time (dask worker ADDRESS --nworkers N --nthreads 1)"
             )
         # Workers have working folders of their own.
         folder = folder.absolute()
@@ -179,7 +180,7 @@ def benchmark(flags: Flags) -> int:
         with FileLock(folder / ".grid.lock"), replacing(folder / RECORD) as file:
             file.write(yaml.safe_dump(flags.asked_for(), sort_keys=False).encode())
     how = {name: getattr(flags, name) for name in ("jobs", "scheduler") if name in flags.given}
-    again = f"continue with: sb3-guard benchmark -f {shlex.quote(str(folder))}"
+    again = f"sb3-guard benchmark -f {shlex.quote(str(folder))}"
     again += "".join(f" --{name} {value}" for name, value in how.items())
     again += packages_flag(flags.gym_packages)
     again += f" -conf {flags.conf_file}" if is_program(flags.conf_file) else ""

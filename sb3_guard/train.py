@@ -60,11 +60,13 @@ def train(flags: Flags) -> int:
             raise UsageError(f"{name} is for a single run; leave it out, or --seeds")
 
     from sb3_guard.zoo.grid import expand, run_grid, try_out
+    from sb3_guard.zoo.run_folder import folder_name
 
     runs = expand([(run.env, run.algo)], flags.seeds, run)
     try_out(runs)
-    again = "continue with the same command"
-    return run_grid(runs, Path(run.log_folder), again, flags.jobs, None, flags.verbose)
+    stop = f".stop_{run.algo}_{folder_name(run.env)}"  # other grids may be in the same folder
+    again = "the same command"
+    return run_grid(runs, Path(run.log_folder), again, flags.jobs, verbose=flags.verbose, stop=stop)
 
 
 main = command(Flags, train)

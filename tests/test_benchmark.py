@@ -8,9 +8,12 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -25,7 +28,6 @@ from sb3_guard.zoo.live import Board, read_progress
 from sb3_guard.zoo.presets import PRESETS, preset
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunFolder, lock
-from sb3_guard.zoo.usage import UsageError
 
 PACKAGE = TOY[:2]
 SMALL = [
@@ -36,47 +38,31 @@ SMALL = [
 GRID = ["--suites", "CostPoint-v0", *SMALL, "-n", "120"]
 
 
-class Here:
-    """Stands for Dask's client: does the work at once, in this process."""
-
-    cluster, status = None, "running"
+class Here(Executor):
+    """Does the work at once, in this process."""
 
     def __init__(self) -> None:
         #: the runs carried out, in their order
         self.runs: list[grid.Run] = []
-        self.lost: Exception | None = None  # what becomes of the next run's worker
+        self.before: Callable[[grid.Run], object] = lambda run: None
 
-    def nthreads(self) -> dict[str, int]:
-        return {"here": 1}
-
-    def run(self, function, *args, on_error: str = "raise") -> None:
-        function(*args)
-
-    def submit(self, function, run, *args, pure: bool):
+    def submit(self, function, run, /, *args) -> Future:
         self.runs.append(run)
-        future = {"done": lambda: True, "status": "finished"}
-        if self.lost is not None:
-            future |= {"status": "error", "exception": lambda error=self.lost: error}
-            self.lost = None
-        else:
-            result = function(run, *args)
-            future |= {"result": lambda: result}
-        return type("Future", (), {k: v if k == "status" else staticmethod(v)
-                                   for k, v in future.items()})()  # fmt: skip
+        future: Future = Future()
+        try:
+            self.before(run)
+            future.set_result(function(run, *args))
+        except Exception as error:
+            future.set_exception(error)
+        return future
 
 
 @pytest.fixture
 def here(monkeypatch):
     """Carry out grids in this process."""
-    client = Here()
-
-    @contextmanager
-    def workers(jobs, scheduler, folder):
-        yield client
-
-    monkeypatch.setattr(grid, "workers", workers)
-    monkeypatch.setattr(grid, "POLL", 0.01)
-    return client
+    executor = Here()
+    monkeypatch.setattr(grid, "processes", lambda number: nullcontext(executor))
+    return executor
 
 
 def results(folder: Path) -> dict[str, dict]:
@@ -91,12 +77,6 @@ def without_clock(result: dict) -> dict:
 
 
 # what a grid is
-
-
-def test_workers_keep_the_memory_they_freed(tmp_path):
-    with grid.workers(1, None, tmp_path) as client:
-        (trim,) = client.run(os.environ.get, "MALLOC_TRIM_THRESHOLD_").values()
-    assert trim is None  # Dask sets it: every large array is a new mapping, half as slow again
 
 
 def test_presets_are_the_papers():
@@ -283,7 +263,7 @@ def test_another_run_in_the_folder_is_not_touched(tmp_path, here, capsys):
     assert benchmark.main(arguments) == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     for change, part in (
-        (["-params", "cost_limit:5"], "cost_limit: 2.0 there, 5.0 here"),
+        (["-params", "cost_limit:5"], "cost_limit: none there, 5.0 here"),
         (["-n", "240"], "n_timesteps: 120 there, 240 here"),
         (["--eval-freq", "60"], "eval_freq: -1 there, 60 here"),
     ):
@@ -306,107 +286,99 @@ def test_a_warm_start_is_another_run(tmp_path, here, capsys):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("failures", [1, 3])
-def test_failures_are_retried_twice(failures, tmp_path, here, monkeypatch, capsys):
-    complete, left = grid.complete, {"n": failures}
+def test_a_failure_leaves_the_others_alone(tmp_path, here, monkeypatch, capsys):
+    complete, left = grid.complete, [1]
 
     def failing(flags, *rest):
-        if flags.algo == "cpo" and left["n"]:
-            left["n"] -= 1
+        if flags.algo == "cpo" and left:
+            left.pop()
             raise ValueError("no luck")
         return complete(flags, *rest)
 
     monkeypatch.setattr(grid, "complete", failing)
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
     (tmp_path / "cpo" / "CostPoint-v0_1").mkdir(parents=True)
-    assert benchmark.main(arguments) == (0 if failures == 1 else 1)
-    assert sum(run.flags.algo == "cpo" for run in here.runs) == min(failures + 1, 3)
-    done = {"trpo/CostPoint-v0_1"} | ({"cpo/CostPoint-v0_1"} if failures == 1 else set())
-    assert results(tmp_path).keys() == done
+    assert benchmark.main(arguments) == 1
+    assert [run.flags.algo for run in here.runs] == ["cpo", "trpo"]
+    assert results(tmp_path).keys() == {"trpo/CostPoint-v0_1"}
     out, err = capsys.readouterr()
-    assert "failed: cpo on CostPoint-v0, seed 0: no luck" in out and "retrying: cpo" in out
+    assert "failed: cpo on CostPoint-v0, seed 0: no luck" in out and "no luck" in err
     text = (tmp_path / "cpo" / "CostPoint-v0_1" / "error.txt").read_text()
-    assert text.count("Traceback") == failures and "ValueError: no luck" in text
-    if failures == 3:
-        assert "failed: cpo on CostPoint-v0, seed 0: no luck" in err
-        assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in out
-        # Once more: the failed one is tried again, the other is not.
-        assert benchmark.main([*PACKAGE, "-f", str(tmp_path)]) == 0
-        assert here.runs[-1].flags.algo == "cpo" and len(here.runs) == 5
+    assert text.count("Traceback") == 1 and "ValueError: no luck" in text
+    again = out.split("Continue with: sb3-guard benchmark ")[1].split()
+    # Once more: the failed one is tried again, the other is not.
+    assert benchmark.main(again) == 0
+    assert here.runs[-1].flags.algo == "cpo" and len(here.runs) == 3
+    assert f"See the results with: sb3-guard plot {tmp_path}" in capsys.readouterr().out
 
 
-def test_a_dead_worker_is_a_failure_of_its_run(tmp_path, here, capsys):
-    here.lost = RuntimeError("KilledWorker")
-    (tmp_path / "cpo" / "CostPoint-v0_1").mkdir(parents=True)
-    assert benchmark.main([*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)]) == 0
-    assert len(here.runs) == 2 and len(results(tmp_path)) == 1
-    assert "its process died" in capsys.readouterr().out
-    assert "KilledWorker" in (tmp_path / "cpo" / "CostPoint-v0_1" / "error.txt").read_text()
+def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
+    def die(run):
+        raise BrokenProcessPool("terminated abruptly")
+
+    here.before = die
+    refused(
+        benchmark.main, [*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)], capsys,
+        "a worker is gone", "abruptly", f"continue with: sb3-guard benchmark -f {tmp_path}",
+    )  # fmt: skip
 
 
-def test_a_run_that_another_process_has_is_waited_for(tmp_path, here, monkeypatch, capsys):
+def test_a_run_that_another_process_has_is_left_to_it(tmp_path, here, capsys):
     run = tmp_path / "cpo" / "CostPoint-v0_1"
     run.mkdir(parents=True)
-    held = lock(run)
-    held.__enter__()
-    submit = here.submit
-
-    def release(function, run, *args, **kwargs):
-        if len(here.runs) == 2:
-            held.__exit__(None, None, None)
-        return submit(function, run, *args, **kwargs)
-
-    monkeypatch.setattr(here, "submit", release)
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
+    with lock(run):
+        assert benchmark.main(arguments) == 1
+    assert "1 of 2 done, 1 in use" in capsys.readouterr().out
     assert benchmark.main(arguments) == 0
-    assert [run.flags.algo for run in here.runs] == ["cpo", "trpo", "cpo"]
-    assert len(results(tmp_path)) == 2
-    assert {run.attempts for run in here.runs} == {0}  # to wait is not to fail
 
 
-def test_a_full_disk_stops_the_grid(tmp_path, here, capsys):
-    arguments = [*GRID, "--algos", "trpo", "cpo", "pcpo", "--seeds", "0", "-f", str(tmp_path)]
-    assert benchmark.main([*arguments, "--algos", "trpo"]) == 0
-    before = results(tmp_path)
+def test_a_full_disk_is_named(tmp_path, here, capsys):
+    arguments = [*GRID, "--algos", "trpo", "cpo", "--seeds", "0", "-f", str(tmp_path)]
     run = tmp_path / "cpo" / "CostPoint-v0_1"
     run.mkdir(parents=True)
     (run / "0.monitor.csv").symlink_to("/dev/full")
     assert benchmark.main(arguments) == 1
     err = capsys.readouterr().err
     assert f"can't write to {run}: No space left on device" in err and "Traceback" not in err
-    assert before.items() <= results(tmp_path).items()
-    assert [run.flags.algo for run in here.runs] == ["trpo", "cpo"]  # no retries, nothing new
     (run / "0.monitor.csv").unlink()  # room is made
-    assert benchmark.main([*PACKAGE, "-f", str(tmp_path)]) == 0
-    assert len(results(tmp_path)) == 3
+    assert benchmark.main(["-f", str(tmp_path), *PACKAGE]) == 0
+    assert len(results(tmp_path)) == 2
 
 
-def test_asked_to_stop(tmp_path, here, monkeypatch, capsys):
-    """What runs ends with a checkpoint, what waits does not begin."""
-    complete = grid.complete
-
-    def interrupted(args, values, command, asked):
-        os.kill(os.getpid(), signal.SIGINT)
-        grid.ask_to_stop(asked.__closure__[0].cell_contents)
-        return complete(args, values, command, asked)
-
-    monkeypatch.setattr(grid, "complete", interrupted)
+def test_asked_to_stop(tmp_path, here, capsys):
+    """What runs ends with a checkpoint, what waits does not begin, and all is done later."""
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
-    assert benchmark.main(arguments) == 130
+
+    def interrupt(run):
+        if run.flags.algo == "cpo":
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    here.before = interrupt
+    assert benchmark.main(arguments) == 143
+    assert len(here.runs) == 2
     assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in capsys.readouterr().out
-    assert len(here.runs) == 1 and results(tmp_path) == {}
-    monkeypatch.setattr(grid, "complete", complete)
-    assert benchmark.main([*PACKAGE, "-f", str(tmp_path)]) == 0 and len(results(tmp_path)) == 2
-    assert "1 resume, 1 new" in capsys.readouterr().out
+    assert results(tmp_path) == {} and not (tmp_path / "stop").exists()
+    here.before = lambda run: None
+    assert benchmark.main(arguments) == 0 and len(results(tmp_path)) == 2
 
 
-def test_the_scheduler_dies(tmp_path, here, monkeypatch, capsys):
-    future = type("Future", (), {"done": lambda self: True, "status": "cancelled"})()
-    monkeypatch.setattr(here, "submit", lambda *_, **__: future)
-    refused(
-        benchmark.main, [*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)], capsys,
-        "the Dask scheduler is gone", f"continue with: sb3-guard benchmark -f {tmp_path}",
-    )  # fmt: skip
+def test_a_run_looks_for_the_file_after_each_rollout(tmp_path, here):
+    stop, asked = tmp_path / "stop", []
+
+    class Appearing(type(stop)):
+        def exists(self, **kwargs):
+            asked.append(True)
+            return len(asked) > 3
+
+    flags = RunFlags(log_folder=str(tmp_path), gym_packages=["registered_envs"], eval_freq=-1)
+    flags.hyperparams = {"n_envs": 2, "n_steps": 30}
+    (run,) = grid.expand([("CostPoint-v0", "cpo")], [0], replace(flags, n_timesteps=600))
+    assert grid.carry_out(run, "", Appearing(stop)) == ("stopped", "")
+    assert len(asked) == 4 and (run.path / "checkpoint.zip").exists()
+    (run,) = grid.expand([("CostPoint-v0", "cpo")], [0], replace(flags, n_timesteps=600))
+    assert run.state == "resume"
+    assert grid.carry_out(run, "", tmp_path / "elsewhere" / "stop")[0] == "failed"
 
 
 # what is shown
@@ -425,9 +397,10 @@ def test_progress_is_read_from_the_folder(tmp_path):
 def test_bars_of_what_runs(tmp_path):
     args = RunFlags(log_folder=str(tmp_path))
     runs = grid.expand([("Goal_Point_8Hazards", a) for a in ("cpo", "trpo")], [0, 1], args)
-    for run, state in zip(runs, ("running", "failed", "done", "waiting"), strict=True):
+    for run, state in zip(runs, ("waiting", "failed", "done", "waiting"), strict=True):
         run.state = state
     runs[0].path.mkdir(parents=True)
+    (runs[0].path / ".lock").touch()  # it runs
     with open(runs[0].path / "progress.csv", "w", newline="") as file:
         rows = csv.DictWriter(file, ["time/total_timesteps", "rollout/ep_rew_mean"])
         rows.writeheader()
@@ -444,9 +417,24 @@ def test_bars_of_what_runs(tmp_path):
     ):  # fmt: skip
         assert part in text, text
     assert "trpo on Goal_Point" not in text
+    # The same without a terminal
+    console = Console(width=200, record=True, file=open(os.devnull, "w"))
+    Board("logs/x", console=console).update(runs, now=True)
+    assert "cpo on Goal_Point_8Hazards-v0, seed 0: 1,500,000 steps, return 12.35" in (
+        console.export_text()
+    )
 
 
 # train --seeds
+
+
+@pytest.mark.parametrize(("jobs", "number"), [("5", 2), ("1", 1)])
+def test_no_more_workers_than_runs(jobs, number, tmp_path, here, monkeypatch):
+    asked = []
+    monkeypatch.setattr(grid, "processes", lambda n: asked.append(n) or nullcontext(here))
+    flags = ["--algo", "cpo", "--env", "CostPoint-v0", *SMALL, "-n", "60", "-f", str(tmp_path)]
+    assert train.main([*flags, "--seeds", "0", "1", "--jobs", jobs]) == 0
+    assert asked == [number]
 
 
 def test_seeds_of_train(tmp_path, here, capsys):
@@ -542,25 +530,11 @@ def test_interrupted_once_and_twice(number, tmp_path):
     assert process.returncode in (130, 128 + number) and "Traceback" not in out + err
 
 
-@pytest.mark.slow
-def test_two_grids_on_one_folder(tmp_path):
-    """Nothing is done twice, and both end when everything is done."""
-    arguments = ["--suites", "CostPoint-v0", *SMALL, "--algos", "cpo", "trpo", "--seeds", "0"]
-    arguments += ["-n", "6000", "--jobs", "1", "-f", str(tmp_path)]
-    with start(arguments) as one, start(arguments) as other:
-        said = [process.communicate(timeout=400) for process in (one, other)]
-        assert (one.returncode, other.returncode) == (0, 0), said
-    assert len(results(tmp_path)) == 2 and not list(tmp_path.rglob("error.txt"))
-    for path in tmp_path.rglob("0.monitor.csv"):
-        assert lines(path) == 2 + 6000 // 25
-
-
 # a cluster
 
 
 def test_no_scheduler_there(tmp_path, monkeypatch, capsys):
-    import distributed
-
+    distributed = pytest.importorskip("distributed")
     whole = distributed.Client.__init__
     monkeypatch.setattr(
         distributed.Client, "__init__", lambda self, a, timeout, **k: whole(self, a, timeout=1, **k)
@@ -573,19 +547,9 @@ def test_no_scheduler_there(tmp_path, monkeypatch, capsys):
         )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("looks", "message"),
-    [(("0.0", True), "has sb3_guard 0.0"), ((grid.__version__, False), "does not see the folder")],
-)
-def test_workers_that_can_not_do_the_work(looks, message, tmp_path):
-    client = SimpleNamespace(run=lambda *_: {"tcp://node1:1": looks})
-    with pytest.raises(UsageError, match=f"tcp://node1:1 {message}"):
-        grid._check(client, tmp_path)
-
-
 @pytest.mark.slow
 def test_a_cluster_with_a_worker_killed(tmp_path):
-    """A real scheduler and two workers, one killed: nothing is lost, nothing done twice."""
+    """A scheduler and two workers started as commands, one killed: nothing is lost."""
     address = tmp_path / "scheduler.json"
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment()}
     place = ["--scheduler-file", str(address), "--no-dashboard"]

@@ -565,6 +565,20 @@ def test_a_worker_that_never_said_who_it_is_is_given_up(tmp_path, monkeypatch):
     assert [trial.state.name for trial in begun(tmp_path, None).trials] == ["FAIL", "WAITING"]
 
 
+def test_a_trial_is_not_lost_between_failing_and_queueing(tmp_path, monkeypatch):
+    """Whoever noticed that its worker is gone was killed before it queued the trial again."""
+    monkeypatch.setattr(studies, "repeat", lambda *_: None)
+    study = begun(tmp_path, f"{socket.gethostname()}-{gone()}")
+    monkeypatch.undo()
+    storage, _ = studies.open_storage(None, tmp_path / "study.journal")
+    studies.repeat_lost_trials(study, storage)
+    assert [trial.state.name for trial in study.trials] == ["FAIL"]  # somebody may be about to
+    monkeypatch.setattr(studies, "GRACE", -1)
+    for _ in range(2):
+        studies.repeat_lost_trials(study, storage)
+    assert [trial.state.name for trial in study.trials] == ["FAIL", "WAITING"]
+
+
 def test_trials_that_kill_their_workers_are_given_up(tmp_path):
     study, worker = None, f"{socket.gethostname()}-{gone()}"
     storage, _ = studies.open_storage(None, tmp_path / "study.journal")

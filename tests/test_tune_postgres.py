@@ -10,6 +10,8 @@ import optuna
 import pytest
 from kill_tuner import campaign, faults
 from postgres import Server, free_port, programs, running
+from sqlalchemy.exc import OperationalError
+from test_bad_input import refused
 
 from sb3_guard import tune
 from sb3_guard.zoo import studies, trials
@@ -105,6 +107,18 @@ def test_a_restart_between_two_calls_goes_unnoticed(server, tmp_path, monkeypatc
     assert "secret" not in out + err and "Traceback" not in out + err
     assert f"optuna-dashboard postgresql://tuner:***@127.0.0.1:{server.port}" in out
     assert states(server) == {"COMPLETE": 2}
+
+
+def test_a_trial_whose_connection_is_cut_is_done_again(server, tmp_path, monkeypatch, capsys):
+    """Within a call, when the database is back at once: Optuna can still say that it failed."""
+
+    def cut() -> None:
+        raise OperationalError("UPDATE …", {}, Exception("the connection was cut"))
+
+    interrupt_at(monkeypatch, 70, cut)
+    command = [*TOY, "--storage", server.url, "-f", str(tmp_path)]
+    refused(tune.main, command, capsys, "the connection was cut", "the same command continues")
+    assert states(server) == {"FAIL": 1, "WAITING": 1}
 
 
 def test_a_database_that_is_gone_ends_the_worker_with_a_line(server, tmp_path, monkeypatch, capsys):

@@ -163,7 +163,9 @@ class Physics(Batch):
             old: Array = field.copy()
             field[:] = new
             return old
-        options = [(self._copy or self._model_of(i)).opt for i in range(self.nsim)]
+        models = self._copy or self.models
+        several = models if isinstance(models, tuple) else [models] * self.nsim
+        options = [model.opt for model in several]
         old = np.array([option.sleep_tolerance for option in options])
         for option, value in zip(options, new, strict=True):
             option.sleep_tolerance = value

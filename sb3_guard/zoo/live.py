@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sb3_guard.zoo.grid import Run
 
 REFRESH = 1.0  # seconds between looks into the folders
-LINE_EVERY = 300.0  # seconds between plain lines of progress
+LINE_EVERY = 60.0  # seconds between plain lines of progress
 LOGGED = {
     "steps": "time/total_timesteps",
     "return": "rollout/ep_rew_mean",
@@ -63,14 +63,14 @@ class Board:
         """Print a line, above the bars if there are any."""
         self.console.print(text, markup=False, soft_wrap=True)
 
-    def note(self, what: str, run: "Run") -> None:
+    def note(self, run: "Run") -> None:
         """Say what has become of a run."""
-        line = f"{time.strftime('%H:%M:%S')}  {what}: {run}"
-        if what == "done":
+        line = f"{time.strftime('%H:%M:%S')}  {run.state}: {run}"
+        if run.state == "done":
             result = RunFolder(run.path).read_result() or {}
             if result.get("return") is not None:
                 line += f", return {result['return']:.2f}, {cost_words(result)}"
-        elif what == "failed":
+        elif run.error:
             line += f": {run.error}"
         self.say(line)
 
@@ -84,29 +84,40 @@ class Board:
         if clock - self._looked < REFRESH and not now:
             return
         self._looked = clock
-        if clock - self._line > LINE_EVERY and self.bars.disable:
-            self._line = clock
-            self.say(f"{time.strftime('%H:%M:%S')}  {summary(runs)}")
+        for run in runs:
+            if run.state in ("waiting", "running"):
+                run.state = "running" if (run.path / ".lock").exists() else "waiting"
         if not self.bars.disable:
             reached = sum(self._show(run) for run in runs)
             title = f"{self.title}: {summary(runs)}"
             total = sum(run.steps for run in runs)
             self.bars.update(self._total, completed=reached, total=total, description=title)
+        elif clock - self._line > LINE_EVERY or now:
+            self._line = clock
+            self.say(f"{time.strftime('%H:%M:%S')}  {summary(runs)}")
+            for run in runs:
+                if run.state == "running":
+                    last = read_progress(run.path)
+                    self.say(f"          {run}: {reached_words(last)}")
 
     def _show(self, run: "Run") -> float:
         """A bar for a run while it is under way; how many steps it has done."""
         last = {"steps": float(run.steps)} if run.state == "done" else read_progress(run.path)
-        shown = run.state in ("running", "in use")
+        shown = run.state == "running"
         if run not in self._tasks:
             self._tasks[run] = self.bars.add_task(
                 str(run), total=run.steps, visible=False, reached=""
             )
-        words = [f"{last['steps']:,.0f} steps"]
-        words += [f"{name} {last[name]:.2f}" for name in ("return", "cost") if name in last]
         self.bars.update(
-            self._tasks[run], completed=last["steps"], visible=shown, reached=", ".join(words)
+            self._tasks[run], completed=last["steps"], visible=shown, reached=reached_words(last)
         )
         return last["steps"]
+
+
+def reached_words(last: Mapping[str, float]) -> str:
+    """Steps, return and cost of a run that goes on, as :func:`read_progress` has them."""
+    words = [f"{last['steps']:,.0f} steps"]
+    return ", ".join(words + [f"{n} {last[n]:.2f}" for n in ("return", "cost") if n in last])
 
 
 def summary(runs: Sequence["Run"]) -> str:

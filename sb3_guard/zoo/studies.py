@@ -155,12 +155,23 @@ def repeat_lost_trials(study: optuna.Study, storage: Storage) -> None:
             with suppress(ValueError, UpdateFinishedTrialError):
                 study.tell(trial.number, state=TrialState.FAIL)
                 repeat(study, trial)
+    trials = study.get_trials()
+    histories = map(RetryHeartbeatStaleTrialCallback.retry_history, trials)
+    repeated = {number for history in histories for number in history}
+    for trial in trials:
+        # Whoever noticed that its worker is gone was killed before the trial was queued.
+        failed = trial.state == TrialState.FAIL and _is_old(trial.datetime_complete)
+        if failed and trial.number not in repeated:
+            repeat(study, trial)
+
+
+def _is_old(moment: datetime | None) -> bool:
+    return moment is not None and datetime.now() - moment > timedelta(seconds=GRACE)
 
 
 def _is_lost(trial: FrozenTrial, storage: Storage) -> bool:
     if WORKER not in trial.user_attrs:  # killed before its first sign of life
-        assert trial.datetime_start is not None
-        return datetime.now() - trial.datetime_start > timedelta(seconds=GRACE)
+        return _is_old(trial.datetime_start)
     host, _, process = trial.user_attrs[WORKER].rpartition("-")
     local = isinstance(storage, JournalStorage) and host == socket.gethostname()
     return local and not _is_alive(int(process))

@@ -9,6 +9,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -26,7 +27,7 @@ from sb3_guard.zoo.run import Experiment
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.spaces import Search
 from sb3_guard.zoo.start import differences
-from sb3_guard.zoo.studies import WORKER, repeat
+from sb3_guard.zoo.studies import DATABASE_ERRORS, WORKER, repeat
 from sb3_guard.zoo.tune_flags import TuneFlags
 from sb3_guard.zoo.tuning_report import short
 from sb3_guard.zoo.usage import UsageError, one_line
@@ -179,16 +180,13 @@ class Objective:
         :raises Stopped: it is to be done again
         """
         self._said = time.monotonic()
-        trial.set_user_attr(WORKER, f"{socket.gethostname()}-{os.getpid()}")
         try:
+            trial.set_user_attr(WORKER, f"{socket.gethostname()}-{os.getpid()}")
             mean = self._train_seeds(trial)
         except TrialPruned:
             raise
         except UpdateFinishedTrialError:
             self.taken = True
-            raise
-        except (Stopped, KeyboardInterrupt):
-            repeat(trial.study, trial.study.trials[trial.number], most=None)
             raise
         except FAILURES as error:
             if self.flags.verbose > 1:
@@ -197,6 +195,10 @@ class Objective:
             trial.set_user_attr("error", one_line(error)[:600])
             self._constrain(trial, None)
             raise TrialPruned from error
+        except BaseException:  # a signal, a lost connection: not the hyperparameters' fault
+            with suppress(*DATABASE_ERRORS):
+                repeat(trial.study, trial.study.trials[trial.number], most=None)
+            raise
         self.failures = 0
         return mean if self.settings.pareto else mean[0]
 

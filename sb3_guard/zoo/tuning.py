@@ -222,6 +222,7 @@ def tune(flags: TuneFlags, main: bool = True) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
             warnings.filterwarnings("ignore", message="The number of trials is too small")
+            warnings.filterwarnings("ignore", module="optuna.importance")
             warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes")
             return _tune(flags, main)
     except Exception as error:

@@ -184,7 +184,10 @@ def benchmark(flags: Flags) -> int:
     again += "".join(f" --{name} {value}" for name, value in how.items())
     again += packages_flag(flags.gym_packages)
     again += f" -conf {flags.conf_file}" if is_program(flags.conf_file) else ""
-    return run_grid(runs, folder, again, flags.jobs, flags.scheduler, flags.verbose)
+    status = run_grid(runs, folder, again, flags.jobs, flags.scheduler, flags.verbose)
+    if status == 0 and flags.verbose > 0:
+        print(f"tables and curves: sb3-guard plot {shlex.quote(str(folder))}")
+    return status
 
 
 main = command(Flags, benchmark)

@@ -1,4 +1,4 @@
-"""What there is: ``sb3-guard list`` prints suites, robots, tasks and constraints."""
+"""What there is: ``sb3-guard list`` prints suites, parts and pretrained agents."""
 
 import re
 import sys
@@ -82,13 +82,36 @@ def constraints() -> str:
     return table(["constraint", "trespassable", "moves", "spaces", "what it is"], rows)
 
 
-KINDS = {"suites": suites, "robots": robots, "tasks": tasks, "constraints": constraints}
+def agents() -> str:
+    """The agents that the package ships, for ``enjoy --pretrained``."""
+    from sb3_guard.zoo.playback import PRETRAINED
+    from sb3_guard.zoo.run_folder import RunFolder, is_run
+
+    rows = []
+    for path in sorted(PRETRAINED.glob("*/*_1")):
+        if is_run(path):
+            run = RunFolder(path)
+            result = run.checked_result()
+            played, limit = result["played"]["stochastic"], result.get("cost_limit")
+            words = [f"{played[name][0]:.1f}" for name in ("return", "cost")]
+            words.append("none" if limit is None else f"{limit:g}")
+            rows.append([path.parent.name, run.name, *words])
+    return table(["pretrained agent", "environment", "return", "cost", "limit"], rows)
+
+
+KINDS = {
+    "suites": suites,
+    "robots": robots,
+    "tasks": tasks,
+    "constraints": constraints,
+    "agents": agents,
+}
 
 
 @dataclass
 class Flags(Command):
     """
-    Print suites, robots, tasks and constraints.
+    Print suites, robots, tasks, constraints and pretrained agents.
 
     :param kind: only these
     :param ladder: ids of growing difficulty: more and more of a constraint
@@ -101,7 +124,7 @@ class Flags(Command):
   sb3-guard list robots
   sb3-guard list --ladder Goal_Point Hazards
 """
-    kind: Literal["suites", "robots", "tasks", "constraints"] | None = flag(
+    kind: Literal["suites", "robots", "tasks", "constraints", "agents"] | None = flag(
         positional=True, nargs="?"
     )
     ladder: list[str] | None = flag(nargs="*", metavar="TASK_ROBOT CONSTRAINT")

@@ -1,12 +1,16 @@
 """One environment in full: ``sb3-guard show Goal_Ant_8Ghosts`` prints it and writes a picture."""
 
+import inspect
+import re
 import sys
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium
+import mujoco
 import numpy as np
 import yaml
 
@@ -14,17 +18,55 @@ from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.check_part import exploded
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.zoo.flags import Command, command, flag
+from sb3_guard.zoo.hyperparams import entry, read_file, shipped_file
 from sb3_guard.zoo.markdown import table
 from sb3_guard.zoo.usage import UsageError, explained, import_packages
 
+# Names and units of what a free joint, a ball, a slide and a hinge add to qpos and to qvel
+_QUATERNION = [(f"q{axis}", "") for axis in "wxyz"]
+_COORDINATES: dict[str, list[list[tuple[str, str]]]] = {
+    "qpos": [
+        [*((axis, "m") for axis in "xyz"), *_QUATERNION], _QUATERNION, [("", "m")], [("", "rad")]
+    ],
+    "qvel": [
+        [*((axis, "m/s") for axis in "xyz"), *((f"ω{axis}", "rad/s") for axis in "xyz")],
+        [(f"ω{axis}", "rad/s") for axis in "xyz"], [("", "m/s")], [("", "rad/s")],
+    ],
+}  # fmt: skip
+# What Gymnasium's Humanoid observes beside its joints
+_UNITS = {
+    "cinert": "kg m², kg m, kg", "cvel": "rad/s, m/s", "qfrc_actuator": "N m", "cfrc_ext": "N m, N"
+}  # fmt: skip
+
+
+def joints(model: mujoco.MjModel, which: str, last: int) -> Iterator[tuple[str, str]]:
+    """
+    Names and units of the last numbers of ``qpos`` or ``qvel``.
+
+    :param which: ``"qpos"`` or ``"qvel"``
+    :param last: number of them
+    """
+    found = [
+        (f"{which} {model.joint(i).name.removeprefix('robot/')} {part}".strip(), unit)
+        for i in range(model.njnt)
+        for part, unit in _COORDINATES[which][model.jnt_type[i]]
+    ]
+    yield from found[len(found) - last :]
+
 
 def observation_table(env: GuardVectorEnv) -> str:
-    """Name, slice, bounds and unit of every component of the observation."""
+    """Name, slice, bounds and unit of every component of the observation; joints one by one."""
     rows = []
     for name, where in env.observation_layout.items():
         channel = env.engine.channels[name]
         bounds = f"[{channel.low:g}, {channel.high:g}]"
-        rows.append([name, f"{where.start}:{where.stop}", bounds, channel.unit])
+        if name in ("qpos", "qvel"):
+            parts = joints(env.engine.model, name, where.stop - where.start)
+            for i, (part, unit) in enumerate(parts, where.start):
+                rows.append([part, str(i), bounds, unit])
+            continue
+        unit = channel.unit or _UNITS.get(name, "")
+        rows.append([name, f"{where.start}:{where.stop}", bounds, unit])
     if env.engine.extras.camera is not None:
         width, height = env.engine.extras.camera
         rows.append(["camera", f"image {height} × {width} × 3", "[0, 255]", "red, green, blue"])
@@ -37,10 +79,33 @@ def action_table(env: GuardVectorEnv) -> str:
     rows = []
     for i in range(model.nu):
         low, high = model.actuator_ctrlrange[i]
-        name = model.actuator(i).name.removeprefix("robot/")
+        name = model.actuator(i).name or model.joint(model.actuator_trnid[i, 0]).name
+        name = name.removeprefix("robot/")
         least, most = (np.broadcast_to(b, model.nu)[i] for b in env.engine.robot.action_range)
         rows.append([str(i), name, f"[{least:g}, {most:g}]", f"[{low:g}, {high:g}]"])
     return table(["action", "actuator", "range", "control"], rows)
+
+
+def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
+    """In words what costs, up to which limit, and how long an episode is."""
+    parts = env.engine.constraints
+    for part in parts:
+        paragraph = " ".join(inspect.cleandoc(type(part).__doc__ or "").replace("``", "").split())
+        text = paragraph[max(paragraph.find("Cost"), 0) :]
+        words = {*re.findall(r"\w+", text)}
+        stated: Any = fields(part)  # type: ignore[arg-type]  # every part is a dataclass
+        changed = {f.name for f in stated if getattr(part, f.name) != f.default}
+        named = words | {"weight", "indicator"} & changed
+        values = ", ".join(f"{f.name} {getattr(part, f.name)}" for f in stated if f.name in named)
+        yield f"info['cost_{part.name}']: {text}" + (f" Here: {values}." if values else "")
+    how = "1 if any of these costs" if env.scenario.cost == "any" else "their sum"
+    if len(parts) > 1:
+        yield f"info['cost']: {how}."
+    limit = (entry(read_file(shipped_file("cpo")), env_id) or {}).get("cost_limit")
+    if limit is not None and parts:
+        yield f"Usual cost limit of an episode: {limit:g}."
+    steps = env.max_episode_steps
+    yield f"An episode has {steps} steps of {env.engine.control_step:g} s."
 
 
 def unsteady(env: GuardVectorEnv) -> str | None:
@@ -77,7 +142,7 @@ def _watch(env: GuardVectorEnv, alone: bool) -> str | None:
 @dataclass
 class Flags(Command):
     """
-    Print an environment's scenario, observations and actions; write a picture.
+    Print an environment's scenario, costs, observations and actions; write a picture.
 
     :param env: an id of ours, or a scenario file (.yml)
     :param env_kwargs: change parameters
@@ -147,6 +212,7 @@ def show(flags: Flags) -> int:
         env.begin([flags.seed])
     data = {key: value for key, value in env.scenario.to_dict().items() if value}
     print(yaml.safe_dump(data, sort_keys=False))
+    print(*costs(env, spec.id), "", sep="\n")
     print(observation_table(env), action_table(env), sep="\n\n")
     path = Path(flags.output) if flags.output else Path(f"{file.stem.removesuffix('-v0')}.png")
     with explained("no picture", RenderingError, OSError, ValueError):

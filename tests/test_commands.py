@@ -606,6 +606,28 @@ def test_list_prints_what_there_is(capsys):
     assert [row[0] for row in rows(capsys.readouterr().out)] == ["robot", *ROBOTS]
 
 
+def test_list_shows_the_pretrained_agents(capsys):
+    assert cli.main(["list", "agents"]) == 0
+    head, *cells = rows(capsys.readouterr().out)
+    assert head[:2] == ["pretrained agent", "environment"]
+    assert ["cpo", "trpo"] == [r[0] for r in cells if r[1] == "Goal_Point_8Hazards-v0"]
+    assert len(cells) == len([*PRETRAINED.glob("*/*_1")])
+
+
+def test_show_names_the_joints_of_a_velocity_task(tmp_path, capsys):
+    require_rendering()
+    assert cli.main(["show", "SafetyHopperVelocity", "-o", str(tmp_path / "hopper.png")]) == 0
+    text = capsys.readouterr().out
+    assert "faster than limit (Zhang" in text and "Here: limit 0.7402." in text
+    cells = rows(text)
+    # Gymnasium's own documentation of the observation: height, angle of the torso, ...
+    assert [row[::3] for row in cells[1:4]] == [
+        ["qpos rootz", "m"], ["qpos rooty", "rad"], ["qpos thigh_joint", "rad"]
+    ]  # fmt: skip
+    assert cells[6] == ["qvel rootx", "5", "[-inf, inf]", "m/s"]
+    assert cells[-1][:2] == ["2", "foot_joint"]
+
+
 def test_nobody_needs_to_read_to_the_end():
     done = subprocess.run(
         f"{sys.executable} -m sb3_guard.cli list robots | true; echo ${{PIPESTATUS[0]}}",
@@ -655,11 +677,17 @@ def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(["show", "Goal_Ant_8Ghosts"]) == 0
     text = capsys.readouterr().out
-    scenario = yaml.safe_load(text.partition("|")[0])
+    scenario = yaml.safe_load(text.partition("\n\n")[0])
     ghosts = {"ghosts": {"num": 8}}
     assert scenario == {"robot": "Ant", "task": "Goal", "constraints": ghosts, "cost": "sum"}
     cells = rows(text)
     assert ["accelerometer", "0:3", "[-inf, inf]", "m/s²"] in cells
+    costs = text.split("\n\n")[1].splitlines()
+    assert costs[0].startswith("info['cost_ghosts']: Cost: Σ max(0, size − distance)")
+    assert costs[0].endswith("Here: size 0.3, solid False.")
+    assert costs[1:] == [
+        "Usual cost limit of an episode: 2.", "An episode has 1000 steps of 0.2 s."
+    ]  # fmt: skip
     assert ["ghosts_lidar", "3:19", "[0, 1]", "closeness"] in cells
     assert cells[cells.index(["action", "actuator", "range", "control"]) - 1][1].endswith(":62")
     assert [row[1] for row in cells[-8:]] == [
@@ -688,6 +716,7 @@ def test_show_knows_an_observed_camera_and_lets_its_options_be_changed(tmp_path,
 def test_show_knows_what_users_registered(tmp_path, monkeypatch, capsys):
     require_rendering()
     monkeypatch.setitem(gymnasium.registry, "TwoPits-v0", None)  # to be forgotten afterwards
+    del gymnasium.registry["TwoPits-v0"]
     register("TwoPits-v0", Scenario(constraints={"pits": {"type": "hazards", "num": 2}}))
     assert cli.main(["show", "TwoPits-v0", "-o", str(tmp_path / "pits.png")]) == 0
     assert "pits_lidar" in capsys.readouterr().out

@@ -36,6 +36,7 @@ from sb3_guard.algorithms import (
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
+from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, Multiplier
 
 KEYS = ("ppo_lag", "cppo_pid", "focops", "cup", "p3o", "crpo", "rcpo")
@@ -489,3 +490,10 @@ def test_a_known_optimum(key: str, kwargs: dict[str, Any]) -> None:
         fast["lambda_lr"], fast["proportional_gain"] = gains
     outcome = solve(ALGORITHMS[key], problem, 0, **fast, **kwargs)
     assert outcome.good, outcome
+
+
+def test_minibatches_that_are_searched_divide_rollouts():
+    """Else SB3 warns of truncated minibatches in every trial, of what nobody has chosen."""
+    space = FirstOrder.search_space
+    for n_envs in space["n_envs"]:
+        assert not any(1000 * n_envs % size for size in space["batch_size"])

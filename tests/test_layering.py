@@ -145,6 +145,7 @@ def test_imports_stay_light(statement, absent):
 def test_every_public_name_exists():
     for name in sb3_guard.__all__:
         assert getattr(sb3_guard, name) is not None
+    assert dir(sb3_guard) == sorted(sb3_guard.__all__)
     with pytest.raises(AttributeError, match="no attribute 'PPO'"):
         _ = sb3_guard.PPO
 

@@ -43,7 +43,7 @@ class FirstOrder(CostRollouts, PPO):
         "gamma": [0.95, 0.98, 0.99, 0.995, 0.999],
         "gae_lambda": [0.9, 0.95, 0.97, 0.99],
         "learning_rate": {"low": 3e-5, "high": 3e-3, "log": True},
-        "batch_size": [64, 250, 1000],
+        "batch_size": [50, 250, 1000],
         "n_epochs": {"low": 3, "high": 40, "log": True},
         "policy_kwargs.net_arch": [{"pi": [n, n], "vf": [n, n]} for n in (64, 256)],
         "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},

@@ -362,7 +362,7 @@ def test_record_writes_a_video(logs, tmp_path):
     assert [path.name for path in video.parent.iterdir()] == ["film.mp4"]
     frames = imageio_ffmpeg.read_frames(str(video))
     meta = next(frames)
-    assert meta["size"] == (64, 64) and meta["fps"] == 10
+    assert meta["size"] == (64, 64 + 16) and meta["fps"] == 10  # below a line of text
     pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
     assert len(pictures) == 12
     assert pictures[0].max() > 200 and abs(int(np.median(pictures[0])) - 60) < 10

@@ -67,8 +67,8 @@ class EnjoyFlags(AgentFlags):
 
     Output:
 
-    :param record: write a video; no display is needed (default: beside the model; of a pretrained
-        agent in the current folder)
+    :param record: write a video, with return, cost and limit above the pictures; no display is
+        needed (default: beside the model; of a pretrained agent in the current folder)
     :param json: write the statistics there as JSON
     :param window: MuJoCo's viewer, the default where there is a display: Space pauses, Tab opens
         menus, F shows contact forces

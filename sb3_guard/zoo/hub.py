@@ -13,9 +13,10 @@ import yaml
 
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
+from sb3_guard.zoo.film import filming
 from sb3_guard.zoo.make_envs import full_id
 from sb3_guard.zoo.names import packages_flag
-from sb3_guard.zoo.playback import Agent, camera, open_agent, summary
+from sb3_guard.zoo.playback import Agent, open_agent, summary
 from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data, require_writable
 from sb3_guard.zoo.usage import UsageError, explained
 
@@ -113,8 +114,8 @@ def stage(agent: Agent, flags: HubFlags, repo_id: str, folder: Path) -> None:
     how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
     results = summary(evaluate_policy(agent.model, agent.env, flags.n_episodes or EPISODES, **how))
     if not flags.no_video:
-        with camera(agent.env, folder / "replay.mp4", "rgb_array") as shoot:
-            evaluate_policy(agent.model, agent.env, 1, on_step=shoot, **how)
+        with filming(agent.env, agent.model, folder / "replay.mp4") as env:
+            evaluate_policy(agent.model, env, 1, **how)
     results["is_deterministic"] = not flags.stochastic
     (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
     (folder / "README.md").write_text(card(agent, flags, repo_id, results), encoding="utf-8")

@@ -1,9 +1,8 @@
 """A trained agent found in its run folder, played, and filmed."""
 
-import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from sb3_guard.common.vec_env import GuardVecEnv
 from sb3_guard.zoo.agent_flags import AgentFlags, EnjoyFlags
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import load_model, read_normalizer
+from sb3_guard.zoo.film import filming, render
 from sb3_guard.zoo.hyperparams import build, check
 from sb3_guard.zoo.make_envs import (
     ERRORS_OF_OURS,
@@ -202,16 +202,16 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     with (
         closing(agent.env),
         explained(f"can't play {agent.env_id}", *ERRORS_OF_OURS),
-        camera(agent.env, video, render_mode) as shoot,
+        _stage(agent, video, flags, episodes) as env,
     ):
         evaluation = evaluate_policy(
             agent.model,
-            agent.env,
+            env,
             n_eval_episodes=episodes or flags.n_timesteps or 1,
             deterministic=not flags.stochastic,
             seed=flags.seed,
             max_steps=flags.n_timesteps,
-            on_step=shoot,
+            on_step=(lambda: render(env)) if render_mode == "human" else None,
             on_episode=(lambda *one: print(_episode(*one))) if flags.verbose > 0 else None,
         )
     print(_means(evaluation))
@@ -234,6 +234,18 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     if video is not None and flags.verbose > 0:
         print(f"Video: {video}")
     return 0
+
+
+def _stage(
+    agent: Agent, video: Path | None, flags: EnjoyFlags, episodes: int | None
+) -> AbstractContextManager[VecEnv]:
+    """The environment to play in, which is filmed if there is to be a video."""
+    if video is None:
+        return nullcontext(agent.env)
+    steps, native = flags.n_timesteps, agent.env.unwrapped
+    if steps is None and episodes is not None and isinstance(native, GuardVecEnv):
+        steps = episodes * native.envs.max_episode_steps
+    return filming(agent.env, agent.model, video, steps, bar=flags.verbose > 0)
 
 
 def _require_file(path: Path, flag: str) -> None:
@@ -307,72 +319,3 @@ def _when_shipped(flags: EnjoyFlags, agent: Agent) -> Iterator[str]:
             yield f"100 episodes of other seeds, when it was shipped (--{mode}):"
             played = result["played"][mode].items()
             yield from _rows({name: (Estimate(*one), limits.get(name)) for name, one in played})
-
-
-@contextmanager
-def camera(env: VecEnv, video: Path | None, render_mode: str | None) -> Iterator[Any]:
-    """
-    What to call after each step: write a frame, show one, or nothing.
-
-    The first frame is taken at once, so that a machine that can't render says so before anything
-    is played, and nothing is written then.
-
-    :param env: one environment
-    :param video: mp4 to write; None: no recording
-    :param render_mode: the environment's
-    :raises UsageError: no frame can be rendered, or the file can't be written
-    """
-    if render_mode is None:
-        yield None
-        return
-    if video is None:
-        yield lambda: _render(env)
-        return
-    import imageio_ffmpeg
-
-    env.reset()
-    first = _render(env)
-    if first is None:
-        raise UsageError("this environment renders no rgb_array frames; it can't be recorded")
-    height, width = first.shape[:2]
-    fps = _frames_per_second(env)
-    every = max(1, int(fps / 25))  # 25 pictures a second are enough
-    video.parent.mkdir(parents=True, exist_ok=True)
-    with explained(f"can't write {video}", OSError), replacing(video) as file:
-        writer = imageio_ffmpeg.write_frames(
-            file.name, (width, height), fps=fps / every, macro_block_size=2,
-            output_params=["-f", "mp4"],
-        )  # fmt: skip
-        writer.send(None)
-        steps = itertools.count()
-
-        def shoot() -> None:
-            if next(steps) % every == 0:
-                for picture in _film(env):
-                    writer.send(np.ascontiguousarray(picture))
-
-        with closing(writer):
-            yield shoot
-
-
-def _render(env: VecEnv) -> np.ndarray | None:
-    if env.render_mode == "human":
-        env.render()
-        return None
-    with explained("can't render", RuntimeError, ImportError, AttributeError):
-        return env.get_images()[0]
-
-
-def _film(env: VecEnv) -> list[np.ndarray]:
-    """The pictures of one step: several where a control step of ours is long."""
-    native = env.unwrapped
-    return native.film() if isinstance(native, GuardVecEnv) else [_render(env)]  # type: ignore[list-item]
-
-
-def _frames_per_second(env: VecEnv) -> float:
-    if isinstance(env.unwrapped, GuardVecEnv):
-        return env.unwrapped.envs.film_fps
-    try:
-        return float(env.get_attr("metadata")[0].get("render_fps", 30))
-    except AttributeError:
-        return 30.0

@@ -309,7 +309,7 @@ def test_flags_that_contradict_the_run(arguments, parts, capsys, run):
 
 
 def test_the_runs_own_flags_may_be_repeated(run):
-    arguments = ["-i", str(run), *TOY, "-params", "n_steps:3e1", "cost_limit:2", "-n", "120"]
+    arguments = ["-i", str(run), *TOY, "-params", "n_steps:3e1", "-n", "120"]
     assert train.main([*arguments, "--env-kwargs", "episode_length:20", "--seed", "1"]) == 0
 
 
@@ -470,8 +470,8 @@ def test_a_gpu_that_is_not_there(capsys, tmp_path):
 def test_a_run_whose_files_were_edited(run, capsys):
     path = run / "CostPoint-v0" / "config.yml"
     values = yaml.safe_load(path.read_text())
-    path.write_text(yaml.safe_dump({**values, "gamma": 0.5}))
-    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "gamma = 0.5", "0.99")
+    path.write_text(yaml.safe_dump({**values, "n_steps": 31}))
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "n_steps = 31 contradicts 30")
     path.write_text(yaml.safe_dump(values))
 
 

@@ -19,7 +19,9 @@ WHICH = ["--env", "Filmed-v0", "--gym-packages", "registered_envs", "--n-episode
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
-    trained(folder, "--eval-freq", "-1", "-params", "normalize:True", env="Filmed-v0")
+    trained(
+        folder, "--eval-freq", "-1", "-params", "normalize:True", "cost_limit:2", env="Filmed-v0"
+    )
     return folder
 
 

@@ -20,6 +20,7 @@ _EXPORTS = {
     "sb3_guard.common.evaluation": ("evaluate_policy",),
     "sb3_guard.common.monitor": ("CostMonitor",),
     "sb3_guard.common.vec_env": ("GuardVecEnv", "make_vec_env"),
+    "sb3_guard.zoo.make_model": ("make_model",),
     "sb3_guard.envs": (
         "GuardEnv", "GuardVectorEnv", "Scenario", "env_ids", "make", "register",
         "register_constraint", "register_robot", "register_task",

@@ -166,7 +166,8 @@ def benchmark(flags: Flags) -> int:
     of_a_run.check()
 
     from sb3_guard.zoo.grid import expand, run_grid, try_out
-    from sb3_guard.zoo.names import is_program, packages_flag
+    from sb3_guard.zoo.names import is_program
+    from sb3_guard.zoo.usage import packages_flag
 
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
     if flags.dry_run:

@@ -13,16 +13,18 @@ import yaml
 from cost_envs import CostPoint
 from registered_envs import Broken, Filmed
 
-from sb3_guard import CPO, enjoy, train
+from sb3_guard import ALGORITHMS, CPO, enjoy, train
 from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.zoo import playback
 from sb3_guard.zoo.checkpoint import MEMBER
 
 TOY = ["--gym-packages", "registered_envs", "--env", "CostPoint-v0"]
+LIMITED = [*TOY, "-params", "cost_limit:2"]
 GO_ON = [*TOY[:2], "-i"]
-SMALL = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3", "-n", "60", "--verbose", "0",
-         "--env-kwargs", "episode_length:20", "--eval-freq", "-1", "--seed", "1"]  # fmt: skip
+SMALL = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3", "cost_limit:2",
+         "-n", "60", "--verbose", "0", "--env-kwargs", "episode_length:20",
+         "--eval-freq", "-1", "--seed", "1"]  # fmt: skip
 
 
 def refused(main, arguments, capsys, *parts: str, status: int = 2) -> str:
@@ -67,17 +69,18 @@ TRAIN = [
     (["--env-kwargs", "speed:{limit:0.4}", "hazards:{sise:0.4}"], ["'sise'", "'size'"]),
     (["--env-kwargs", "max_steps:100"], ["'max_steps'", "'max_episode_steps'"]),
     (["--env-kwargs", "hazards"], ["'hazards' is not of the form key:value"]),
-    ([*TOY, "--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
+    ([*LIMITED, "--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
     (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError", "hazards"]),
     (["--eval-env-kwargs", "hazards:{'num':200}"], ["LayoutError", "hazards"]),
-    (["--env", "CostPoint-v0", "--gym-packages", "registered_envs", "--vec-env", "native"],
+    ([*LIMITED, "--vec-env", "native"],
      ["'CostPoint-v0' is not an sb3_guard environment", "'dummy' or 'subproc'"]),
     (["--vec-env", "fast"], ["--vec-env", "'fast'", "native"]),
     (["-params", "env_wrapper:gymnasium.wrappers.FlattenObservation", "--vec-env", "native"],
      ["env_wrapper of a run", "'dummy' or 'subproc'"]),
     # an environment without the cost key
-    ([*TOY, "--env", "NoCost-v0"], ["no cost 'cost'", "depth", "cost_keys", "missing_cost:zero"]),
-    ([*TOY, "-params", "cost_keys:['heat']"], ["no cost 'heat'"]),
+    ([*LIMITED, "--env", "NoCost-v0"],
+     ["no cost 'cost'", "depth", "cost_keys", "missing_cost:zero"]),
+    ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost 'heat'"]),
     # hyper-parameters
     (["-params", "n_step:10"], ["no hyper-parameter 'n_step'", "did you mean 'n_steps'?"]),
     (["-params", "n_steps:ten"], ["n_steps: 'ten'", "a whole number"]),
@@ -94,7 +97,7 @@ TRAIN = [
     (["--algo", "cup", "-params", "cost_limit:[1.0,2.0]"], ["one for each of the 1 cost keys"]),
     (["--algo", "focops", "-params", "lambda_init:2", "lambda_max:1"],
      ["lambda_max=1.0", "lambda_init=2.0"]),
-    (["--algo", "sac_lag", "--env", "CartPole-v1", "-params", "missing_cost:zero"],
+    (["--algo", "sac_lag", "--env", "CartPole-v1", "-params", "missing_cost:zero", "cost_limit:1"],
      ["continuous actions (Box)", "PPOLag"]),
     (["-params", "policy:MlpPolcy"], ["no policy 'MlpPolcy'", "did you mean 'MlpPolicy'?"]),
     (["-params", "policy:Foo"], ["no policy 'Foo'", "allowed: ", "MlpPolicy", "dotted name"]),
@@ -102,7 +105,7 @@ TRAIN = [
     (["-params", "selection_limit:[1,2]"],
      ["selection_limit=[1.0, 2.0]", "one number, or one for each of the 1 cost keys", "cost"]),
     (["-params", "selection_limit:[]"], ["selection_limit=[]", "one number"]),
-    ([*TOY, "--env-kwargs", "cost_keys:('cost','heat')", "-params", "cost_keys:['cost','heat']",
+    ([*LIMITED, "--env-kwargs", "cost_keys:('cost','heat')", "-params", "cost_keys:['cost','heat']",
       "selection_limit:[1]"], ["selection_limit=[1.0]", "heat"]),
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
@@ -125,8 +128,9 @@ TRAIN = [
     (["--log-interval", "0"], ["--log-interval: '0'"]),
     (["--device", "abacus"], ["abacus"]),
     (["-i", "absent"], ["no run folder or model 'absent'"]),
-    ([*TOY, "-tb", "/dev/null"], ["--tensorboard-log", "'/dev/null'", "choose another"]),
-    ([*TOY, "-tb", "/proc/foo/bar"], ["--tensorboard-log", "'/proc/foo/bar'", "choose another"]),
+    ([*LIMITED, "-tb", "/dev/null"], ["--tensorboard-log", "'/dev/null'", "choose another"]),
+    ([*LIMITED, "-tb", "/proc/foo/bar"],
+     ["--tensorboard-log", "'/proc/foo/bar'", "choose another"]),
 ]  # fmt: skip
 
 
@@ -165,7 +169,7 @@ def test_constructor_of_an_environment(error, capsys, empty, monkeypatch):
 
     monkeypatch.setattr(CostPoint, "__init__", refuse)
     for flag in ("--env-kwargs", "--eval-env-kwargs"):
-        arguments = ["-n", "60", *TOY, flag, "kind:odd"]
+        arguments = ["-n", "60", *LIMITED, flag, "kind:odd"]
         refused(train.main, arguments, capsys, "can't make CostPoint-v0", "odd is allowed nowhere")
 
 
@@ -229,7 +233,7 @@ def test_more_than_plain_data(capsys, tmp_path):
         "from torch import nn\n"
         "hyperparams = {'default': {'policy_kwargs': {'activation_fn': nn.ReLU}, 'n_steps': 30}}\n"
     )
-    arguments = [*TOY, "-n", "60", "-conf", str(conf), "-f", str(tmp_path / "logs")]
+    arguments = [*LIMITED, "-n", "60", "-conf", str(conf), "-f", str(tmp_path / "logs")]
     refused(train.main, arguments, capsys, "config.yml can hold plain data only", "nn.ReLU")
     assert not (tmp_path / "logs").exists()
 
@@ -454,9 +458,10 @@ def test_an_exception_of_the_users_keeps_its_traceback(error, after, tmp_path, m
 @pytest.mark.parametrize("what", ["reward", "observation"])
 @pytest.mark.parametrize("algo", ["sac", "td3", "ppo", "cpo", "sac_lag"])
 def test_what_is_not_a_number_ends_training_in_a_line(algo, what, capsys, tmp_path):
-    params = "learning_starts:10" if algo in ("sac", "td3", "sac_lag") else "n_steps:64"
+    params = ["learning_starts:10" if algo in ("sac", "td3", "sac_lag") else "n_steps:64"]
+    params += ["cost_limit:2"] if algo in ALGORITHMS else []
     arguments = f"--algo {algo} --env Undefined-v0 -n 64 --env-kwargs what:{what}".split()
-    arguments += [*TOY[:2], "--eval-freq", "-1", "-params", "n_envs:1", "batch_size:32", params]
+    arguments += [*TOY[:2], "--eval-freq", "-1", "-params", "n_envs:1", "batch_size:32", *params]
     assert train.main([*arguments, "-f", str(tmp_path)]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"error: training stopped at 30 steps: the {what} of environment 0 is ")

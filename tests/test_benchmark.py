@@ -32,7 +32,7 @@ from sb3_guard.zoo.run_folder import RunFolder, lock
 PACKAGE = TOY[:2]
 SMALL = [
     *PACKAGE,
-    *"-params n_envs:2 n_steps:30 n_critic_updates:3 --eval-freq -1".split(),
+    *"-params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:2 --eval-freq -1".split(),
     *"--env-kwargs episode_length:25 --device cpu --num-threads 1".split(),
 ]
 GRID = ["--suites", "CostPoint-v0", *SMALL, "-n", "120"]
@@ -96,7 +96,8 @@ def test_presets_are_the_papers():
 
 @pytest.mark.parametrize("name", ["q2", "ladder"])
 def test_every_run_of_a_preset_is_valid(name, tmp_path):
-    runs = grid.expand(preset(name), [0, 1], RunFlags(log_folder=str(tmp_path)))
+    flags = RunFlags(log_folder=str(tmp_path), conf_file="paper")
+    runs = grid.expand(preset(name), [0, 1], flags)
     assert len({run.path for run in runs}) == len(runs) == 2 * len(preset(name))
     assert [run.flags.seed + 1 for run in runs] == [1] * (len(runs) // 2) + [2] * (len(runs) // 2)
     for run in runs:  # the paper's lengths
@@ -107,13 +108,15 @@ def test_every_run_of_a_preset_is_valid(name, tmp_path):
 def test_scale_shortens_every_run_alike(tmp_path, capsys):
     arguments = ["--suites", "Goal_Point_8Hazards", "Goal_Ant_8Ghosts", "--algos", "cpo", "trpo_sl"]
     arguments += ["--seeds", "3", "--scale", "0.01", "-f", str(tmp_path / "a"), "--dry-run"]
+    arguments += ["-conf", "paper"]
     assert benchmark.main(arguments) == 0
     out = capsys.readouterr().out.splitlines()
     assert [line.split()[2] for line in out[:4]] == ["60,000"] * 2 + ["300,000"] * 2
     assert out[0].split()[:2] == ["new", str(tmp_path / "a" / "cpo" / "Goal_Point_8Hazards-v0_4")]
     assert out[4] == "0 of 4 done, 4 new; 720,000 steps in all"
     assert list(tmp_path.iterdir()) == []
-    (run,) = grid.expand([("Goal_Point_8Hazards", "trpo_sl")], [0], RunFlags(), scale=0.5)
+    flags = RunFlags(conf_file="paper")
+    (run,) = grid.expand([("Goal_Point_8Hazards", "trpo_sl")], [0], flags, scale=0.5)
     assert run.values["warmup"] == pytest.approx(1 / 3)  # a ratio of whatever the length is
 
 

@@ -33,7 +33,7 @@ from sb3_guard.zoo.playback import PRETRAINED
 
 TOY = "--gym-packages registered_envs --env CostPoint-v0".split()
 SMALL = (
-    "-params n_envs:2 n_steps:30 n_critic_updates:3 --seed 3 --device cpu "
+    "-params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:2 --seed 3 --device cpu "
     "--eval-freq 60 --eval-episodes 2"
 ).split()
 LENGTH = ["--env-kwargs", "episode_length:20"]
@@ -90,7 +90,7 @@ def test_run_folder_is_rl_zoos(tmp_path):
     args = yaml.safe_load((run / "CostPoint-v0" / "args.yml").read_text())
     config = yaml.safe_load((run / "CostPoint-v0" / "config.yml").read_text())
     assert (args["seed"], args["env"]) == (3, "CostPoint-v0")
-    assert (config["n_envs"], config["n_timesteps"], config["gamma"]) == (2, 120, 0.99)
+    assert (config["n_envs"], config["n_timesteps"], config["policy"]) == (2, 120, "MlpPolicy")
     assert (run / "CostPoint-v0" / "command.txt").read_text()
     assert CPO.load(run / "CostPoint-v0.zip").num_timesteps == 120
     assert trained(tmp_path).name == "CostPoint-v0_2"
@@ -143,7 +143,7 @@ def test_progress_bar_shows_return_and_cost(tmp_path, capsys):
     trained(tmp_path, "--progress", "--verbose", "1")
     err = capsys.readouterr().err
     assert "120/120" in err
-    assert "return" in err and "rate" in err and re.search(r", cost [\d.]+ [≤>] 0, ", err)
+    assert "return" in err and "rate" in err and re.search(r", cost [\d.]+ [≤>] 2, ", err)
 
 
 def test_every_limit_has_a_verdict(tmp_path, capsys):
@@ -215,7 +215,9 @@ def test_tensorboard_and_uuid(tmp_path):
 
 def test_schedules_and_other_conf_file(tmp_path):
     conf = tmp_path / "conf.yml"
-    conf.write_text("default: {n_timesteps: 60, n_envs: 1, n_steps: 60, learning_rate: lin_0.01}")
+    conf.write_text(
+        "default: {n_timesteps: 60, n_envs: 1, n_steps: 60, learning_rate: lin_0.01, cost_limit: 2}"
+    )
     arguments = [
         *TOY,
         "-conf",
@@ -713,10 +715,9 @@ def test_show_knows_an_observed_camera_and_lets_its_options_be_changed(tmp_path,
     assert "observe.camera = (32, 24) needs flatten=False" in capsys.readouterr().err
 
 
-def test_show_knows_what_users_registered(tmp_path, monkeypatch, capsys):
+def test_show_knows_what_users_registered(tmp_path, request, capsys):
     require_rendering()
-    monkeypatch.setitem(gymnasium.registry, "TwoPits-v0", None)  # to be forgotten afterwards
-    del gymnasium.registry["TwoPits-v0"]
+    request.addfinalizer(lambda: gymnasium.registry.pop("TwoPits-v0", None))
     register("TwoPits-v0", Scenario(constraints={"pits": {"type": "hazards", "num": 2}}))
     assert cli.main(["show", "TwoPits-v0", "-o", str(tmp_path / "pits.png")]) == 0
     assert "pits_lidar" in capsys.readouterr().out

@@ -374,7 +374,6 @@ def in_full(algo: str, env_id: str, conf: str | None = None) -> dict[str, Any]:
     values = {name: parameter.default for name, parameter in parameters(cls).items()}
     values |= read_hyperparams(algo, env_id, conf)
     values["policy_kwargs"] = {**cls.policy_defaults, **(values["policy_kwargs"] or {})}
-    values["policy_kwargs"].setdefault("net_arch", {"pi": [64, 64], "vf": [64, 64]})  # SB3's
     return values
 
 

@@ -29,8 +29,8 @@ from sb3_guard.zoo.run_folder import RunFolder
 TESTS = Path(__file__).parent
 # Checkpoints at every rollout; models kept and evaluations at steps that are no rollout's end.
 SMALL = (
-    "-params n_envs:2 n_steps:30 n_critic_updates:3 --seed 3 --save-freq 70 --checkpoint-every 0 "
-    "--eval-freq 50 --eval-episodes 3 --n-eval-envs 2 --verbose 0 --device cpu"
+    "-params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:2 --seed 3 --save-freq 70 "
+    "--checkpoint-every 0 --eval-freq 50 --eval-episodes 3 --n-eval-envs 2 --verbose 0 --device cpu"
 ).split()
 TOY = "--gym-packages registered_envs --env CostPoint-v0".split()
 SHORT = ["--env-kwargs", "episode_length:25"]  # no divisor of a rollout

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from registered_envs import CostPoint  # noqa: F401  registers the environments
 
+from sb3_guard.zoo.experiment import Experiment
 from sb3_guard.zoo.make_envs import evaluation_seed, row_seeds
-from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run import Training
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.start import prepare
 
@@ -30,12 +31,12 @@ def test_first_observations_of_seeds_0_and_1_differ(algo, vec_env):
             RunFlags(algo=algo, env=env, seed=seed, device="cpu", hyperparams=params, eval_freq=1,
                      n_eval_envs=4)
         )  # fmt: skip
-        experiment = Experiment(flags, values)
-        experiment.evaluation.eval_env.seed(evaluation_seed(seed))
-        firsts += [experiment.env.reset(), experiment.evaluation.eval_env.reset()]
-        again = Experiment(flags, values)
+        training = Training(Experiment(flags, values))
+        training.evaluation.eval_env.seed(evaluation_seed(seed))
+        firsts += [training.env.reset(), training.evaluation.eval_env.reset()]
+        again = Training(Experiment(flags, values))
         np.testing.assert_array_equal(again.env.reset(), firsts[-2])
         again.close()
-        experiment.close()
+        training.close()
     rows = np.concatenate(firsts)
     assert len(np.unique(rows, axis=0)) == len(rows) == 16

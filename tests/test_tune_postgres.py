@@ -24,8 +24,8 @@ pytestmark = [
 
 TOY = (
     "--algo trpo_lag --gym-packages registered_envs --env CostPoint-v0 --env-kwargs "
-    "episode_length:20 -params n_envs:2 n_steps:30 n_critic_updates:3 --eval-episodes 2 "
-    "--device cpu --num-threads 1 --pruner none -n 240 --n-trials 2"
+    "episode_length:20 -params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:2 "
+    "--eval-episodes 2 --device cpu --num-threads 1 --pruner none -n 240 --n-trials 2"
 ).split()
 
 

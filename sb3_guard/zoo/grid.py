@@ -25,9 +25,10 @@ from typing import Any
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.experiment import Experiment
 from sb3_guard.zoo.hyperparams import annotations
 from sb3_guard.zoo.live import REFRESH, Board, summary
-from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run import Training
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import RunInUse
 from sb3_guard.zoo.start import complete, path_of, prepare, standing
@@ -129,7 +130,7 @@ def try_out(runs: Sequence[Run]) -> None:
         try:
             if flags.device != "auto":
                 th.device(flags.device)
-            Experiment(here, run.values).close()
+            Training(Experiment(here, run.values)).close()
         except (UsageError, RuntimeError) as error:
             raise UsageError(f"{flags.algo} on {flags.env}: {one_line(error)}") from error
 

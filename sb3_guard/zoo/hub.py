@@ -15,10 +15,9 @@ from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
 from sb3_guard.zoo.film import filming
 from sb3_guard.zoo.make_envs import full_id
-from sb3_guard.zoo.names import packages_flag
 from sb3_guard.zoo.playback import Agent, open_agent, summary
 from sb3_guard.zoo.run_folder import RunFolder, claim, folder_name, read_data, require_writable
-from sb3_guard.zoo.usage import UsageError, explained
+from sb3_guard.zoo.usage import UsageError, explained, packages_flag
 
 # Said before an agent is downloaded.
 TRUST = "agents are programs: load only from people you trust"

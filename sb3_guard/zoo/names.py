@@ -7,7 +7,6 @@ file may name classes of :data:`KNOWN` packages only, and of modules that the co
 
 import importlib
 import operator
-import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
-from sb3_guard.zoo.usage import UsageError, explained
+from sb3_guard.zoo.usage import UsageError, explained, packages_flag
 from sb3_guard.zoo.values import read_expression
 
 KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
@@ -145,8 +144,3 @@ def is_program(conf_file: str | None) -> bool:
     return bool(conf_file) and not (
         conf_file in PRESETS or str(conf_file).endswith((".yml", ".yaml"))
     )
-
-
-def packages_flag(modules: Sequence[str]) -> str:
-    """The flag that names modules, for a command that is printed; empty: there are none."""
-    return f" --gym-packages {shlex.join(map(str, modules))}" if modules else ""

@@ -5,191 +5,77 @@ and resets counters, seeds and environments when it continues; so its pieces are
 (schedules, run numbers, file layout, flags) and its class is not.
 """
 
-import copy
 import shlex
 import signal
 import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
-from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
 from sb3_guard.common.evaluation import bounded_name
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
-from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import (
     Checkpoints,
     Interrupted,
     cut_logs,
-    load_model,
     read_checkpoint,
-    read_normalizer,
     restore_run,
 )
-from sb3_guard.zoo.hyperparams import Setup, build
+from sb3_guard.zoo.experiment import Experiment
 from sb3_guard.zoo.logger import RunLogger
 from sb3_guard.zoo.make_envs import (
-    BAD_ARGUMENTS,
     BAD_NUMBERS,
     PROCESS_DIED,
-    evaluation_seed,
-    make_envs,
-    seed_rows,
 )
-from sb3_guard.zoo.names import packages_flag
 from sb3_guard.zoo.progress import Epochs
 from sb3_guard.zoo.run_flags import RunFlags
-from sb3_guard.zoo.run_folder import RunFolder, is_disk_error, require_writable
+from sb3_guard.zoo.run_folder import RunFolder, is_disk_error
 from sb3_guard.zoo.tracking import Tracker
-from sb3_guard.zoo.usage import TrainingStopped, UsageError, explained, interrupts, one_line
+from sb3_guard.zoo.usage import (
+    TrainingStopped,
+    UsageError,
+    explained,
+    interrupts,
+    one_line,
+    packages_flag,
+)
 
 
-class Experiment:
+class Training:
     """
-    One training run, made and checked but not yet on disk.
+    A run whose environments and model are made; it is on disk once it has a folder.
 
-    :param flags: all flags of the run
-    :param hyperparams: hyper-parameters as data, checked
-    :param folder: the folder of the run to continue; None: a new run
-    :raises UsageError: the environment, the algorithm or a wrapper refuses a value, or TensorBoard
-        events can't be written
+    :param experiment: what is trained
+    :raises UsageError: something can't be made, or is not there
     """
 
-    def __init__(
-        self, flags: RunFlags, hyperparams: Mapping[str, Any], folder: RunFolder | None = None
-    ):
-        self.flags = flags
-        self.hyperparams = dict(hyperparams)
-        self.algorithm = algorithm(flags.algo)
-        self.setup: Setup = build(hyperparams)
+    def __init__(self, experiment: Experiment):
+        folder, flags = experiment.folder, experiment.flags
+        self.experiment, self.flags, self.setup = experiment, flags, experiment.setup
         self.callbacks = self.setup.callbacks()
         #: the checkpoint to continue from
         self.state = None if folder is None else read_checkpoint(folder.checkpoint)
-        self._saved = None if folder is None else folder.checkpoint
-        self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
-        _check_device(flags.device)
-        events = flags.tensorboard_log or ("runs" if flags.track else "")
-        self._events = Path(events) if events else None
-        if self._events is not None:
-            require_writable(self._events, "--tensorboard-log")
-        self.vec_env = str(flags.vec_env)
-        if flags.num_threads > 0:
-            th.set_num_threads(flags.num_threads)
-        set_random_seed(flags.seed)
-        self._try_environment(self.setup.env_kwargs)
-        if flags.eval_freq > 0 and flags.eval_env_kwargs is not None:
-            self._try_environment(flags.eval_env_kwargs)
-        self.env = self._make_envs(self.setup.n_envs, flags.seed)
+        experiment.try_out()
+        self.model = experiment.make_model()
+        self.env: VecEnv = self.model.get_env()  # type: ignore[assignment]
+        self.evaluation: CostEvalCallback | None = None
+        self.tracker: Tracker | None = None
         try:
-            self.model = self._make_model()
-            seed_rows(self.env, flags.seed)
             self.model.verbose = max(flags.verbose - 1, 0)
-            self.evaluation = self._make_evaluation() if flags.eval_freq > 0 else None
-            self.tracker = Tracker(flags, hyperparams, folder) if flags.track else None
+            if flags.eval_freq > 0:
+                self.evaluation = experiment.make_evaluation(self.model)
+            if flags.track:
+                self.tracker = Tracker(flags, experiment.hyperparams, folder)
         except BaseException:
-            self.env.close()
+            self.close()
             raise
-
-    def _make_envs(self, n_envs: int, seed: int, **kwargs: Any) -> VecEnv:
-        kwargs = {"vec_env": self.vec_env, "env_kwargs": self.setup.env_kwargs, **kwargs}
-        return make_envs(
-            self.flags.env,
-            self.setup,
-            n_envs=n_envs,
-            seed=seed,
-            cost_keys=self.cost_keys,
-            num_threads=self.flags.num_threads if self.flags.num_threads > 0 else None,
-            normalizer=self._warm_start_normalizer(),
-            **kwargs,
-        )
-
-    def _try_environment(self, env_kwargs: Mapping[str, Any]) -> None:
-        """Make one environment and take a step, so that nothing fails later for want of a cost."""
-        vec_env = "dummy" if self.vec_env == "subproc" else self.vec_env
-        env = self._make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
-        try:
-            with explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
-                env.reset()
-                env.action_space.seed(self.flags.seed)
-                info = env.step(np.array([env.action_space.sample()]))[3][0]
-        finally:
-            env.close()
-        if not getattr(self.algorithm, "constrained", False):
-            return
-        if self.setup.model.get("missing_cost", "error") == "zero":
-            return
-        for key in self.cost_keys:
-            if key not in info:
-                raise UsageError(
-                    f"{self.flags.env} reports no cost {key!r} in its info, which has "
-                    f"{', '.join(sorted(info)) or 'nothing'}; name its costs with "
-                    "-params cost_keys:\"['name']\", or count a missing cost as 0 with "
-                    "-params missing_cost:zero"
-                )
-
-    def _make_model(self) -> BaseAlgorithm:
-        flags = self.flags
-        if self._saved is not None:
-            return load_model(self.algorithm, self._saved, self.env, flags.device)
-        arguments = copy.deepcopy(self.setup.model)  # some algorithms add to their policy_kwargs
-        arguments["seed"] = flags.seed
-        if flags.trained_agent:
-            # What the networks are is for the saved agent to say.
-            for name in ("policy", "policy_kwargs"):
-                arguments.pop(name, None)
-            path = Path(flags.trained_agent)
-            return load_model(self.algorithm, path, self.env, flags.device, **arguments)
-        space = self.env.action_space
-        noise = self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
-        if noise is not None:
-            arguments["action_noise"] = noise
-        with explained(f"{flags.algo} can't be made", *BAD_ARGUMENTS, RuntimeError, MemoryError):
-            return self.algorithm(env=self.env, device=flags.device, **arguments)
-
-    def _warm_start_normalizer(self) -> VecNormalize | None:
-        """Observation statistics that belong to the agent given by ``-i model.zip``."""
-        agent = self.flags.trained_agent
-        if self.state is not None or not agent or self.setup.normalize is None:
-            return None
-        found = sorted(Path(agent).parent.glob("*/vecnormalize.pkl"))
-        return read_normalizer(found[0]) if found else None
-
-    def _make_evaluation(self) -> CostEvalCallback:
-        flags, number, kwargs = self.flags, self.flags.n_eval_envs, self.flags.eval_env_kwargs
-        if number is None:
-            # All episodes at once where that is cheap; a process each would not be.
-            number = flags.eval_episodes if self.vec_env == "native" else 1
-        seed = evaluation_seed(flags.seed)
-        env = self._make_envs(
-            number,
-            seed,
-            evaluation=True,
-            env_kwargs=self.setup.env_kwargs if kwargs is None else kwargs,
-        )
-        evaluation = CostEvalCallback(
-            env,
-            selection_limit=self.setup.selection_limit,
-            seed=seed,
-            n_eval_episodes=flags.eval_episodes,
-            eval_freq=max(flags.eval_freq // self.setup.n_envs, 1),
-            verbose=int(flags.verbose > 0 and self._prints_tables),
-        )
-        evaluation.model = self.model
-        with explained("hyper-parameter", ValueError):
-            evaluation.limits()
-        return evaluation
 
     def _make_callbacks(self, folder: RunFolder) -> tuple[Checkpoints, Epochs, list[BaseCallback]]:
         flags = self.flags
@@ -216,11 +102,6 @@ class Experiment:
         # The checkpoint comes first: it must see the others as the last rollout left them.
         return checkpoints, epochs, [checkpoints, *others]
 
-    @property
-    def _prints_tables(self) -> bool:
-        # The progress bar shows the same live; two displays would be one too many.
-        return self.flags.verbose > (1 if self.flags.progress else 0)
-
     def train(
         self,
         folder: RunFolder,
@@ -240,7 +121,7 @@ class Experiment:
             return self._train(folder, asked_to_stop, restate)
         except PROCESS_DIED as error:
             print(flush=True)  # fails again if it is the reader of our output that is gone
-            if self.vec_env != "subproc":
+            if self.flags.vec_env != "subproc":
                 raise
             raise UsageError(
                 "a process of --vec-env subproc has died, because of an error printed above or for "
@@ -281,8 +162,8 @@ class Experiment:
             find_monitor(self.env).log_to(folder.monitor, append=goes_on)
             logger = RunLogger(
                 folder.path,
-                stdout=self._prints_tables,
-                tensorboard=folder.events(self.flags) if self._events else None,
+                stdout=self.experiment.prints_tables,
+                tensorboard=folder.events(self.flags) if self.experiment.events else None,
                 state=None if state is None else state["logger"],
             )
         self.model.set_logger(logger)
@@ -293,7 +174,7 @@ class Experiment:
             # In this order, and only now: a result in the folder is always that of its config.
             folder.result.unlink(missing_ok=True)
             if restate:
-                folder.write_config(self.flags.values(), self.hyperparams)
+                folder.write_config(self.flags.values(), self.experiment.hyperparams)
                 checkpoints.what = folder.what()
             restore_run(self.model, state, folder.path)
 
@@ -342,20 +223,6 @@ class Experiment:
                 "(--verbose 2 shows where)"
             ) from error
         return True
-
-
-def _check_device(name: str) -> None:
-    """
-    Refuse a GPU that is not there; SB3 would train on the CPU instead.
-
-    :raises UsageError: torch has no such device
-    """
-    with explained(f"--device {name!r} is not allowed", RuntimeError):
-        device = th.device("cpu" if name == "auto" else name)
-    if device.type == "cuda" and (device.index or 0) >= th.cuda.device_count():
-        raise UsageError(
-            f"--device {name!r}: torch sees {th.cuda.device_count()} GPUs here; use auto or cpu"
-        )
 
 
 def summary(

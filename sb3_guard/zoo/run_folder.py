@@ -20,9 +20,8 @@ from filelock import SoftFileLease, Timeout
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.flags import IDENTITY
-from sb3_guard.zoo.names import packages_flag
 from sb3_guard.zoo.run_flags import RunFlags
-from sb3_guard.zoo.usage import UsageError, explained, one_line, read_mapping
+from sb3_guard.zoo.usage import UsageError, explained, one_line, packages_flag, read_mapping
 
 CHECKPOINT = "checkpoint.zip"
 # What the system says when a disk is full, read-only or broken.

@@ -238,10 +238,12 @@ class Search:
         the base says nothing; what lies outside is drawn.
         """
         known = {}
-        defaults = {name: one.default for name, one in parameters(algorithm(self.algo)).items()}
+        cls = algorithm(self.algo)
+        defaults = {name: parameter.default for name, parameter in parameters(cls).items()}
+        defaults["policy_kwargs"] = getattr(cls, "policy_defaults", {})
         for name, entry in self.space.items():
             own = get_dotted(self.base, name)
-            own = defaults.get(name) if own is None else own
+            own = get_dotted(defaults, name) if own is None else own
             if _contains(entry, own):
                 known[name] = _label(own)
         return known

@@ -11,14 +11,16 @@ import numpy as np
 
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import is_checkpoint, read_checkpoint
+from sb3_guard.zoo.experiment import Experiment
 from sb3_guard.zoo.flags import HOST, IDENTITY
-from sb3_guard.zoo.hyperparams import check, read_hyperparams
+from sb3_guard.zoo.hyperparams import check, parameters, read_hyperparams
 from sb3_guard.zoo.make_envs import full_id, source_of
 from sb3_guard.zoo.names import require_named
-from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run import Training
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import CHECKPOINT, RunFolder, is_run, lock, plain, run_path
 from sb3_guard.zoo.usage import UsageError, explained, import_packages
+from sb3_guard.zoo.values import is_data
 
 
 def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
@@ -41,6 +43,12 @@ def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
     values = check(
         flags.algo, cls, read_hyperparams(flags.algo, flags.env, flags.conf_file, overrides)
     )
+    if getattr(cls, "constrained", False) and "cost_limit" not in values:
+        raise UsageError(
+            f"no cost limit is known for {flags.env}: give cost_limit, the highest cost of an "
+            "episode that you accept, such as half of what an episode costs PPO "
+            "(-params cost_limit:25)"
+        )
     if flags.env_kwargs:
         values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
     # What wraps single environments needs single ones.
@@ -57,14 +65,14 @@ def start(flags: RunFlags) -> int:
     :raises UsageError: anything is wrong with the flags; nothing has been written then
     """
     flags, values = prepare(flags)
-    experiment = Experiment(flags, values)
+    training = Training(Experiment(flags, values))
     try:
         folder = RunFolder.create(flags, values, shlex.join(sys.orig_argv))
     except UsageError:
-        experiment.close()
+        training.close()
         raise
     with lock(folder.path):
-        return experiment.train(folder)
+        return training.train(folder)
 
 
 def path_of(flags: RunFlags) -> Path:
@@ -122,7 +130,7 @@ def complete(
         folder = RunFolder(path) if made else RunFolder.create(flags, values, command, path)
         quiet = dataclasses.replace(flags, progress=False, verbose=0)
         begun = folder if state == "resume" else None
-        return Experiment(quiet, values, begun).train(folder, asked_to_stop)
+        return Training(Experiment(quiet, values, begun)).train(folder, asked_to_stop)
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -174,7 +182,10 @@ def resume(given: RunFlags) -> int:
                 print(f"no events in {folder.events(flags)}; --tensorboard-log says where to write")
                 flags.tensorboard_log = ""
         state = read_checkpoint(folder.checkpoint)
-        ours, its = ({**one, "n_timesteps": None} for one in (folder.what(), state["what"]))
+        defaults = defaults_of(flags.algo)
+        ours, its = (
+            {**defaults, **what, "n_timesteps": None} for what in (folder.what(), state["what"])
+        )
         _refuse(differences(its, ours), f"of the training so far, in {folder.params}")
         done, wanted = state["num_timesteps"], given.n_timesteps
         if 0 < wanted < done:
@@ -190,7 +201,7 @@ def resume(given: RunFlags) -> int:
                 "a larger -n continues it"
             )
             return 0
-        return Experiment(flags, values, folder).train(folder, restate=True)
+        return Training(Experiment(flags, values, folder)).train(folder, restate=True)
 
 
 def _compared(
@@ -206,8 +217,15 @@ def _compared(
     if given.hyperparams:
         asked = check(saved.algo, algorithm(saved.algo), {**values, **given.hyperparams})
         now |= {name: asked[name] for name in given.hyperparams}
-    own = {**saved.values(), **values, "log_folder": str(folder.path.parent.parent.resolve())}
-    return {name: plain(own.get(name)) for name in now}, plain(now)
+    was = {**defaults_of(saved.algo), **saved.values(), **values}
+    was["log_folder"] = str(folder.path.parent.parent.resolve())
+    return {name: plain(was.get(name)) for name in now}, plain(now)
+
+
+def defaults_of(algo: str) -> dict[str, Any]:
+    """The hyperparameters that an algorithm has where a run does not say."""
+    defaults = {name: one.default for name, one in parameters(algorithm(algo)).items()}
+    return {name: plain(value) for name, value in defaults.items() if is_data(value)}
 
 
 def _refuse(found: Sequence[tuple[str, Any, Any]], when: str) -> None:

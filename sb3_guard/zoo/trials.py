@@ -21,9 +21,10 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_guard.envs.layout import LayoutError
 from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.experiment import Experiment
 from sb3_guard.zoo.hyperparams import check
 from sb3_guard.zoo.make_envs import PROCESS_DIED
-from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run import Training
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.spaces import Search
 from sb3_guard.zoo.start import differences
@@ -104,7 +105,7 @@ class Evaluations(BaseCallback):
     """
     Evaluate an agent evenly through its training.
 
-    :param experiment: what is trained
+    :param training: what is trained
     :param settings: of the study
     :param after: called with all evaluations so far, each a list of the mean return and the mean
         episode costs; False ends the training
@@ -113,13 +114,13 @@ class Evaluations(BaseCallback):
 
     def __init__(
         self,
-        experiment: Experiment,
+        training: Training,
         settings: Settings,
         after: Callable[[list[list[float]]], bool],
         on_step: Callable[[int], None],
     ):
         super().__init__()
-        self.experiment, self.settings = experiment, settings
+        self.training, self.settings = training, settings
         self.after, self.on_step_taken = after, on_step
         self.history: list[list[float]] = []
         self.ended = False
@@ -139,8 +140,8 @@ class Evaluations(BaseCallback):
             self.ended = not self._evaluate()
 
     def _evaluate(self) -> bool:
-        assert self.experiment.evaluation is not None
-        result = self.experiment.evaluation.evaluate()
+        assert self.training.evaluation is not None
+        result = self.training.evaluation.evaluate()
         row = [float(result.returns.mean()), *result.limited.mean(axis=0).tolist()]
         if not np.isfinite(row).all():
             raise FloatingPointError(f"an evaluation gave {row}")
@@ -264,7 +265,7 @@ class Objective:
             algorithm(settings.algo),
             {**values, "n_timesteps": settings.n_timesteps},
         )
-        experiment = Experiment(replace(self.training, seed=seed), checked)
+        training = Training(Experiment(replace(self.training, seed=seed), checked))
 
         def on_step(steps: int) -> None:
             if self.stopped():
@@ -278,17 +279,15 @@ class Objective:
                     text += f", cost {', '.join(map(short, evaluations.history[-1][1:]))}"
                 print(text, flush=True)
 
-        evaluations = Evaluations(experiment, settings, after, on_step)
+        evaluations = Evaluations(training, settings, after, on_step)
         try:
-            experiment.model.set_logger(Logger(folder=None, output_formats=[]))
-            experiment.model.learn(
-                settings.n_timesteps, callback=[evaluations, *experiment.callbacks]
-            )
+            training.model.set_logger(Logger(folder=None, output_formats=[]))
+            training.model.learn(settings.n_timesteps, callback=[evaluations, *training.callbacks])
             evaluations.finish()
         except PROCESS_DIED as error:
             if self.stopped():  # the signal was for all processes
                 raise Stopped from error
             raise UsageError("a process of --vec-env subproc has died") from error
         finally:
-            experiment.close()
+            training.close()
         return evaluations.history, not evaluations.ended

@@ -26,8 +26,9 @@ from optuna.trial import FrozenTrial, TrialState
 
 from sb3_guard.zoo import start, studies
 from sb3_guard.zoo.algos import algorithm
+from sb3_guard.zoo.experiment import Experiment
 from sb3_guard.zoo.hyperparams import check, read_hyperparams
-from sb3_guard.zoo.run import Experiment
+from sb3_guard.zoo.run import Training
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.run_folder import folder_name, is_disk_error, require_writable
 from sb3_guard.zoo.spaces import SAMPLERS, Search, read_space
@@ -70,9 +71,9 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     search = Search(flags.algo, base, space, fixed)
     for corner in search.corners():
         check(run.algo, cls, corner)
-    with closing(Experiment(run, values)) as experiment:
-        assert experiment.evaluation is not None
-        limits = experiment.evaluation.limits().tolist()
+    with closing(Training(Experiment(run, values))) as training:
+        assert training.evaluation is not None
+        limits = training.evaluation.limits().tolist()
     settings = Settings(
         algo=run.algo,
         env=run.env,
@@ -82,7 +83,7 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         seeds=flags.seeds,
         n_evaluations=n_evaluations,
         eval_episodes=flags.eval_episodes,
-        cost_keys=list(experiment.cost_keys),
+        cost_keys=list(training.experiment.cost_keys),
         cost_limit=limits if np.isfinite(limits).all() else None,
         pareto=flags.pareto,
     )

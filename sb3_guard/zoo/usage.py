@@ -6,6 +6,7 @@ import importlib
 import math
 import os
 import re
+import shlex
 import signal
 import sys
 import threading
@@ -95,6 +96,11 @@ def import_packages(names: Sequence[str]) -> None:
             )
         with explained(f"--gym-packages: can't import {name!r}", ImportError):
             importlib.import_module(name)
+
+
+def packages_flag(modules: Sequence[str]) -> str:
+    """The flag that names modules, for a command that is printed; empty: there are none."""
+    return f" --gym-packages {shlex.join(map(str, modules))}" if modules else ""
 
 
 class Parser(argparse.ArgumentParser):

@@ -140,3 +140,12 @@ def _number(value: Any, kind: type) -> int | float:
     if math.isnan(number) or (kind is int and not number.is_integer()):
         raise TypeError
     return int(number) if kind is int else number
+
+
+def is_data(value: Any) -> bool:
+    """Whether a YAML file can hold the value."""
+    if isinstance(value, Mapping):
+        return all(isinstance(key, str) and is_data(item) for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return all(map(is_data, value))
+    return value is None or isinstance(value, str | bool | int | float)

@@ -142,6 +142,7 @@ EVERYTHING = [
     *"-params frame_stack:3 normalize:True use_sde:True learning_rate:lin_0.01".split(),
     "env_wrapper:gymnasium.wrappers.NormalizeObservation",
     "cost_keys:['cost', 'heat']",
+    "cost_limit:['lin_3_1', 2.0]",
     *["--env-kwargs", "cost_keys:('cost', 'heat')"],
 ]
 VARIANTS = {

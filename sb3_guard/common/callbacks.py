@@ -12,6 +12,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_guard.algorithms.common.limits import limits_at
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy, share_environment
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
@@ -153,9 +154,9 @@ class CostEvalCallback(EvalCallback):
         """
         limit: Any = self.selection_limit
         if limit is None:
-            cost_limit: Any = getattr(self.model, "cost_limit", None)
-            constrained = cost_limit is not None and getattr(self.model, "constrained", True)
-            limit = np.where(np.equal(cost_limit, 0.0), 1.0, cost_limit) if constrained else np.inf
+            final: Any = limits_at(getattr(self.model, "cost_limit", None), 0.0)
+            constrained = final is not None and getattr(self.model, "constrained", True)
+            limit = np.where(np.equal(final, 0.0), 1.0, final) if constrained else np.inf
         limits = np.asarray(limit, dtype=np.float64)
         m = len(self.cost_keys)
         if limits.shape not in ((), (m,)) or np.isnan(limits).any():

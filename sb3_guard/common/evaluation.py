@@ -238,7 +238,7 @@ def evaluate_policy(
                 tally.end(int(i), infos[i])
     return tally.evaluation(
         limit_on=getattr(model, "limit_on", "sum"),
-        limits=tuple(model.cost_limits.tolist())
+        limits=tuple(model.final_cost_limits.tolist())
         if isinstance(model, Constrained) and model.constrained and keys == tuple(model.cost_keys)
         else (),
     )

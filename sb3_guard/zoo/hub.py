@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 
+from sb3_guard.algorithms.common.limits import limits_at
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agent_flags import HubFlags
 from sb3_guard.zoo.film import filming
@@ -149,7 +150,7 @@ def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]
         interval = "–" if one["low"] is None else f"{one['low']:.2f} to {one['high']:.2f}"
         spread = "–" if one["low"] is None else f"{one['std']:.2f}"
         rows.append(f"| {key} | {one['mean']:.2f} | {spread} | {interval} |")
-    limit = getattr(agent.model, "cost_limit", None)
+    limit = limits_at(getattr(agent.model, "cost_limit", None), 0.0)
     constrained = getattr(agent.model, "constrained", False) and limit is not None
     worst = " on the worst step" if "worst" in results else ""
     page = CARD.format(

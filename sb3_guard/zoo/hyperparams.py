@@ -286,7 +286,7 @@ def build(values: Mapping[str, Any]) -> Setup:
         if name == "policy":
             if "." in value:
                 model[name] = import_class(name, value, BasePolicy)
-        elif isinstance(value, str) and value.startswith("lin_"):
+        elif isinstance(value, str) and value.startswith("lin_") and name != "cost_limit":
             model[name] = _schedule(name, value)
         elif isinstance(value, str) and value.startswith("dict("):
             model[name] = evaluate(name, value)

@@ -15,6 +15,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import tqdm
 
 import sb3_guard
+from sb3_guard.algorithms.common.limits import limits_at
 from sb3_guard.common.evaluation import estimate
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.costs import read_costs, verdict
@@ -156,7 +157,7 @@ class Epochs(BaseCallback):
         """Mean of what its limit bounds, and limit, by cost key."""
         model: Any = self.model
         constrained = getattr(model, "constrained", False)
-        limits = model.cost_limits.tolist() if constrained else [None] * len(self._keys)
+        limits = model.final_cost_limits.tolist() if constrained else [None] * len(self._keys)
         means = self.last[:, 3:].mean(axis=0).tolist() if len(self.last) else [None] * len(limits)
         rows = zip(self._keys, means, limits, strict=True)
         return {key: {"mean": mean, "limit": limit} for key, mean, limit in rows}
@@ -192,7 +193,7 @@ class Epochs(BaseCallback):
         monitor = find_monitor(self.training_env)
         means = self.last[:, :3].mean(axis=0).tolist() if len(self.last) else [None] * 3
         constrained = getattr(self.model, "constrained", False)
-        limit = getattr(self.model, "cost_limit", None) if constrained else None
+        limit = limits_at(getattr(self.model, "cost_limit", None), 0.0) if constrained else None
         algorithm = type(self.model)
         return {
             "label": getattr(algorithm, "label", None),

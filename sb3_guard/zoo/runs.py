@@ -218,7 +218,9 @@ def _digest(config: Mapping[str, Any], learned: Any = None) -> str:
     """
     columns = ("n_timesteps", "cost_limit", "env_kwargs")
     own = {k: v for k, v in config.items() if k not in columns}
-    scheduled = any(isinstance(one, str) and one.startswith("lin_") for one in own.values())
+    limits = config.get("cost_limit")
+    texts = [*own.values(), *(limits if isinstance(limits, list) else [limits])]
+    scheduled = any(isinstance(text, str) and text.startswith("lin_") for text in texts)
     if learned and (scheduled or "warmup" in own):
         own["learned"] = learned
     text = json.dumps(own, sort_keys=True, default=str)

@@ -7,7 +7,7 @@ saved. What is done about them is the business of the classes that stand on it.
 import inspect
 import warnings
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -32,8 +32,9 @@ from sb3_guard.algorithms.common.arguments import (
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.generators import KeepsGenerators
+from sb3_guard.algorithms.common.limits import CostLimits
 from sb3_guard.algorithms.common.loading import LoadsOthers
-from sb3_guard.checks import NumberError, check_per_cost, is_number
+from sb3_guard.checks import NumberError, is_number
 from sb3_guard.costs import read_costs
 
 _LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
@@ -49,7 +50,7 @@ def _within(callback: BaseCallback) -> Iterator[BaseCallback]:
         yield from _within(one)
 
 
-class Constrained(LoadsOthers, KeepsGenerators):
+class Constrained(LoadsOthers, CostLimits, KeepsGenerators):
     """Cost keys, limits and episode costs beside an algorithm of Stable-Baselines3.
 
     Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. A subclass states its
@@ -58,9 +59,6 @@ class Constrained(LoadsOthers, KeepsGenerators):
     on: SB3 builds the model at the end of its own. The signature, the docstring and the name under
     which ``learn`` logs are composed for every subclass.
 
-    :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key.
-        The attribute may be set at any time, and holds from the next update on
-    :param cost_keys: entries of ``info`` that hold the costs of a step
     :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
         absent key means that nothing was charged
     :raises TypeError: an argument is not known; the message names the nearest one
@@ -77,15 +75,11 @@ class Constrained(LoadsOthers, KeepsGenerators):
     #: What of an episode's costs the limits bound: their sum, or the highest one of a step. Then
     #: the cost of a step is what it adds to the highest before it, which is 0 at first.
     limit_on: ClassVar[Literal["sum", "max"]] = "sum"
-    #: Whether costs and limits may be negative: "at least x" of what is reported as -cost.
-    signed_limits: ClassVar[bool] = False
     #: Default values of keyword arguments, where they differ from those of the bases.
     defaults: ClassVar[dict[str, Any]] = {}
     #: Arguments of SB3's constructors that the class fills in itself.
     fixed_arguments: ClassVar[frozenset[str]] = frozenset()
 
-    cost_limit: float | Sequence[float] = hyperparameter(0.0)
-    cost_keys: Sequence[str] = hyperparameter(("cost",))
     missing_cost: Literal["error", "zero"] = hyperparameter("error")
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -165,14 +159,6 @@ class Constrained(LoadsOthers, KeepsGenerators):
         check_theirs(self)
         self._check_cost_limit()
 
-    def _check_cost_limit(self) -> None:
-        check_per_cost("cost_limit", self.cost_limit, tuple(self.cost_keys))
-        if not self.signed_limits and np.min(self.cost_limit) < 0.0:
-            raise ValueError(
-                f"cost_limit={self.cost_limit!r}: must be at least 0; a negative limit (cost -x, "
-                "limit -5: at least 5 of x) is for CPO, PCPO and Lagrangian algorithms"
-            )
-
     def _setup_model(self) -> None:
         self._check_hyperparameters()
         self.cost_keys = tuple(self.cost_keys)  # loading turns tuples into lists
@@ -188,15 +174,12 @@ class Constrained(LoadsOthers, KeepsGenerators):
 
     # Costs
 
-    @property
-    def cost_limits(self) -> np.ndarray:
-        """d: what ``cost_limit`` says now, for each cost key, shape (m,).
-
-        :raises ValueError: ``cost_limit`` was set to something that is not a limit
-        """
-        self._check_cost_limit()
-        limits = np.asarray(self.cost_limit, np.float64)
-        return np.broadcast_to(limits, (len(self.cost_keys),))
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        """Called by SB3 before each update: a limit may be another one then."""
+        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        if self.costs is not None and self.limits_change:
+            cost, horizon, _ = self.costs
+            self.costs = CostEstimate(cost, horizon, (cost - self.cost_limits) / horizon)
 
     @property
     def total_cost(self) -> float:
@@ -380,6 +363,8 @@ class Constrained(LoadsOthers, KeepsGenerators):
         if self.constrained and self.costs is not None:
             excess = self.costs.violation * self.costs.horizon
             self._record_per_cost("train/constraint_violation", excess)
+            if self.limits_change:
+                self._record_per_cost("train/cost_limit", self.cost_limits)
 
     def dump_logs(self, *args: Any) -> None:
         if self.constrained or self.cost_seen:

@@ -1,0 +1,86 @@
+"""Limits that change over the training."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cost_envs import CostPoint
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_guard import CostEvalCallback, evaluate_policy, train
+from sb3_guard.algorithms import CPO, TRPOIPO, PPOLag, SACLag
+from sb3_guard.algorithms.common.limits import limits_at
+
+
+def points(n_envs: int = 2) -> Any:
+    return make_vec_env(lambda: CostPoint(episode_length=20, hazard=(-1.0, 0.0)), n_envs, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("limit", "start", "middle", "end"),
+    [
+        (3, 3, 3, 3),
+        ("lin_50_25", 50.0, 37.5, 25.0),
+        ("lin_-5_-10.5", -5.0, -7.75, -10.5),
+        ("lin_0_1e2", 0.0, 50.0, 100.0),
+        (lambda remaining: 1.0 + remaining**2, 2.0, 1.25, 1.0),
+        (["lin_4_2", 7.0], [4.0, 7.0], [3.0, 7.0], [2.0, 7.0]),
+    ],
+)
+def test_a_limit_at_a_time(limit: Any, start: Any, middle: Any, end: Any) -> None:
+    assert [limits_at(limit, remaining) for remaining in (1.0, 0.5, 0.0)] == [start, middle, end]
+
+
+def test_bad_schedules_are_named() -> None:
+    for limit, message in (
+        ("lin_50", r"cost_limit='lin_50': .*'lin_50_25', a line from 50 to 25"),
+        ("lin_5_-5", r"cost_limit=-5.0: must be at least 0"),
+        (lambda remaining: "low", "cost_limit='low': must be finite numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            TRPOIPO("MlpPolicy", points(), cost_limit=limit)
+
+
+@pytest.mark.parametrize("cls", [CPO, PPOLag, SACLag])
+@pytest.mark.parametrize("limit", ["lin_4_2", lambda remaining: 2.0 + 2.0 * remaining])
+def test_every_update_has_the_limit_of_its_time(cls: Any, limit: Any, tmp_path: Path) -> None:
+    arguments = {"learning_starts": 0} if cls is SACLag else {"n_steps": 40}
+    env = points(1)
+    model = cls("MlpPolicy", env, cost_limit=limit, seed=0, device="cpu", **arguments)
+    seen: list[tuple[int, float]] = []
+    train = model.train
+
+    def spy(*args: Any, **kwargs: Any) -> None:
+        expected = 4.0 - 2.0 * model.num_timesteps / 160
+        assert model.cost_limits.tolist() == pytest.approx([expected])
+        if model.costs is not None:
+            cost, horizon, violation = model.costs
+            np.testing.assert_allclose(violation, (cost - expected) / horizon)
+        train(*args, **kwargs)
+        if "train/cost_limit" in model.logger.name_to_value:
+            seen.append((model.num_timesteps, model.logger.name_to_value["train/cost_limit"]))
+
+    model.train = spy
+    model.learn(160)
+    assert seen and seen[-1][1] == pytest.approx(4.0 - 2.0 * seen[-1][0] / 160)
+    del model.train
+    model.save(tmp_path / "model")
+    again = cls.load(tmp_path / "model", env=env)
+    assert limits_at(again.cost_limit, 0.5) == 3.0
+    assert again.final_cost_limits.tolist() == [2.0]
+    assert evaluate_policy(again, env, n_eval_episodes=1).limits == (2.0,)
+
+
+def test_an_agent_is_judged_by_the_last_limit(tmp_path: Path) -> None:
+    model = CPO("MlpPolicy", points(), cost_limit="lin_4_2")
+    callback = CostEvalCallback(points(), n_eval_episodes=1)
+    callback.model = model
+    assert callback.limits().tolist() == [2.0]
+    arguments = "--gym-packages registered_envs --env CostPoint-v0 --algo cpo -n 120 --verbose 0"
+    hyperparams = "-params n_envs:2 n_steps:30 n_critic_updates:1 cost_limit:lin_4_2 --eval-freq -1"
+    folder = ["-f", str(tmp_path)]
+    assert train.main([*arguments.split(), *hyperparams.split(), *folder]) == 0
+    result = json.loads((tmp_path / "cpo" / "CostPoint-v0_1" / "result.json").read_text())
+    assert result["cost_limit"] == result["costs"]["cost"]["limit"] == 2.0

@@ -13,8 +13,8 @@ __version__ = "0.1.0"
 _EXPORTS = {
     "sb3_guard.algorithms": (
         "CPO", "PCPO", "TRPO", "TRPOFAC", "TRPOIPO", "TRPOLag", "TRPOSL", "TRPOUSL",
-        "PPOLag", "CPPOPID", "FOCOPS", "CUP", "P3O", "CRPO", "RCPO", "SCPO", "SACLag", "TD3Lag",
-        "ALGORITHMS", "register_algorithm",
+        "PPOLag", "CPPOPID", "FOCOPS", "CUP", "P3O", "CRPO", "RCPO", "SCPO",
+        "SACLag", "TD3Lag", "TQCLag", "ALGORITHMS", "register_algorithm",
     ),
     "sb3_guard.common.callbacks": ("CostEvalCallback", "LogCosts"),
     "sb3_guard.common.evaluation": ("evaluate_policy",),

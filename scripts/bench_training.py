@@ -4,7 +4,8 @@
 (30,000 steps an update; in trust regions 80 full-batch steps of each critic) beside a bare physics
 loop timed in the same run; the best of several updates counts. The safety layers are measured
 switched on. ``--beside-sb3`` compares first-order and off-policy algorithms with SB3's PPO, SAC and
-TD3 of the same settings instead: updates of the two by turns, the median of the ratios.
+TD3 and SB3-contrib's TQC of the same settings instead: updates of the two by turns, the median of
+the ratios.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the commands do; read 
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from sb3_contrib import TQC
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -37,6 +39,7 @@ BESIDE: dict[type[BaseAlgorithm], dict[str, float | None]] = {
     PPO: {"ppo_lag": 1.4, "cppo_pid": 1.4, "focops": 1.6, "cup": 1.6, "p3o": 1.6},
     SAC: {"sac_lag": 1.4},
     TD3: {"td3_lag": None},
+    TQC: {"tqc_lag": None},
 }
 ON_POLICY = [key for key, cls in ALGORITHMS.items() if issubclass(cls, OnPolicyAlgorithm)]
 # Seconds an update may take on two free cores.
@@ -127,7 +130,7 @@ def main() -> None:
     parser.add_argument("--env", default="Goal_Point_8Hazards-v0")
     parser.add_argument("--updates", type=int, default=6, help="updates per algorithm")
     parser.add_argument("--threads", type=int, default=None, help="torch and physics threads")
-    parser.add_argument("--beside-sb3", action="store_true", help="ratios to PPO, SAC and TD3")
+    parser.add_argument("--beside-sb3", action="store_true", help="ratios to PPO, SAC, TD3 and TQC")
     args = parser.parse_args()
     if args.threads:
         torch.set_num_threads(args.threads)

@@ -30,7 +30,7 @@ import torch
 from gymnasium import spaces
 from known_optima import Outcome, budget, problems, solve
 
-from sb3_guard.algorithms import ALGORITHMS, SACLag, TD3Lag
+from sb3_guard.algorithms import ALGORITHMS, CostReplay
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 
 Run = tuple[str, str, float, int]  # problem, algorithm, scale, seed
@@ -53,7 +53,7 @@ def fits(algo: str, name: str) -> bool:
         return algo in STATEWISE[name]
     if issubclass(cls, FilteredTrustRegion) or algo in ("trpo", "scpo"):
         return False
-    return box or not issubclass(cls, SACLag | TD3Lag)
+    return box or not issubclass(cls, CostReplay)
 
 
 def train(run: Run) -> tuple[Run, Outcome, float]:

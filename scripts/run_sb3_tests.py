@@ -3,7 +3,7 @@
 ``python scripts/run_sb3_tests.py`` fetches the two source distributions of the installed versions
 into a temporary folder and runs every test module that trains an algorithm like ours, once for each
 of our classes: trust regions stand where the module says ``A2C``, ``PPO`` or ``TRPO``, first-order
-ones for ``PPO``, off-policy ones for ``SAC`` or ``TD3``. It prints what
+ones for ``PPO``, off-policy ones for ``SAC``, ``TD3`` or ``TQC``. It prints what
 passed per module and class, and for every test that failed whether that is ours or does not apply,
 and why (``DOES_NOT_APPLY``); it fails if one is ours. ``--source DIR`` takes distributions that are
 unpacked there already.
@@ -44,7 +44,7 @@ import stable_baselines3
 from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard.algorithms import ALGORITHMS, FirstOrder, SACLag, TD3Lag, TrustRegion
+from sb3_guard.algorithms import ALGORITHMS, FirstOrder, SACLag, TD3Lag, TQCLag, TrustRegion
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 from sb3_guard.algorithms.common.policies import FilteredPolicy
 
@@ -57,6 +57,7 @@ REPLACED: dict[type, dict[str, dict[str, dict[str, Any]]]] = {
     FirstOrder: {"sb3": {"PPO": {}}, "contrib": {}},
     SACLag: {"sb3": {"SAC": {}}, "contrib": {}},
     TD3Lag: {"sb3": {"TD3": {}}, "contrib": {}},
+    TQCLag: {"sb3": {}, "contrib": {"TQC": {}}},
 }
 # What their classes take and ours have no use for, beside ``fixed_arguments``.
 THEIR_ARGUMENTS = {"n_epochs", "sub_sampling_factor"}

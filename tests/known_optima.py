@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_guard.algorithms import CRPO, CUP, P3O, TRPOFAC, TRPOIPO, FirstOrder, SACLag
+from sb3_guard.algorithms import CRPO, CUP, P3O, TRPOFAC, TRPOIPO, FirstOrder, TD3Lag
 
 
 class World:
@@ -400,13 +400,13 @@ def budget(cls: type, problem: Problem) -> Problem:
     steps are cut where they would cross the limit; and TRPO-FAC, whose multipliers are networks
     that have to be learnt. CUP and P3O, first-order ones whose updates go to and fro as CRPO's do,
     get eight times. Off-policy ones take 8,000 steps of one environment, each with a gradient step,
-    SAC-Lagrangian 15,000: its temperature falls slowly at SB3's rate.
+    SAC- and TQC-Lagrangian 15,000: their temperature falls slowly at SB3's rate.
     """
     if issubclass(cls, OnPolicyAlgorithm):
         slow = issubclass(cls, FirstOrder | CRPO | TRPOIPO | TRPOFAC)
         times = 8 if issubclass(cls, CUP | P3O) else 4 if slow else 2
         return replace(problem, updates=times * problem.updates)
-    return replace(problem, n_envs=1, n_steps=1, updates=15_000 if cls is SACLag else 8_000)
+    return replace(problem, n_envs=1, n_steps=1, updates=8_000 if cls is TD3Lag else 15_000)
 
 
 def _table(

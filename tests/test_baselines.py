@@ -66,6 +66,7 @@ def test_trains_with_costs_logged(algo, tmp_path):
         pytest.param("td3", [], marks=pytest.mark.slow),
         ("sac_lag", ["use_sde:True", *COSTLY]),
         ("td3_lag", ["gradient_steps:2", "noise_type:ornstein-uhlenbeck", *COSTLY]),
+        ("tqc_lag", COSTLY),
     ],
 )
 def test_killed_and_resumed(algo, more, tmp_path, monkeypatch):

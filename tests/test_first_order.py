@@ -444,7 +444,7 @@ def test_limits_and_bounds_that_contradict_are_named(key: str) -> None:
             make(cls, lambda_init=2.0, lambda_max=1.0)
 
 
-@pytest.mark.parametrize("key", [*KEYS, "sac_lag", "td3_lag"])
+@pytest.mark.parametrize("key", [*KEYS, "sac_lag", "td3_lag", "tqc_lag"])
 def test_a_reward_that_is_not_finite_is_named(key: str) -> None:
     """Before torch refuses the policy's parameters, and though TD3 would train on."""
 
@@ -455,7 +455,7 @@ def test_a_reward_that_is_not_finite_is_named(key: str) -> None:
 
     cls = ALGORITHMS[key]
     off_policy = {"learning_starts": 20, "batch_size": 8, "buffer_size": 200}
-    more = off_policy if key in ("sac_lag", "td3_lag") else {"n_steps": 40}
+    more = off_policy if key in ("sac_lag", "td3_lag", "tqc_lag") else {"n_steps": 40}
     more |= {"batch_size": 20} if issubclass(cls, PPO) else {}
     model = cls("MlpPolicy", Broken(30), cost_limit=1.0, device="cpu", **more)
     with pytest.raises(FloatingPointError, match=r"_loss is nan after .*: a reward"):

@@ -10,7 +10,7 @@ import torch as th
 from cost_envs import CostPoint
 
 import sb3_guard
-from sb3_guard import CPO, TRPOUSL, PPOLag, SACLag, TD3Lag, TRPOLag, train
+from sb3_guard import CPO, TRPOUSL, PPOLag, SACLag, TD3Lag, TQCLag, TRPOLag, train
 from sb3_guard.algorithms.common.arguments import stated
 
 SMALL = {"seed": 0, "gamma": 0.97}
@@ -26,6 +26,7 @@ PAIRS = [
     (sb3_guard.TRPO, CPO, ON),
     (sb3.SAC, SACLag, OFF),
     (sb3.TD3, TD3Lag, OFF),
+    (sb3_contrib.TQC, TQCLag, OFF),
 ]
 
 

@@ -38,7 +38,7 @@ TOY = (
 ).split()
 SMALL = "-params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:2".split()
 OURS = [*sorted(ALGORITHMS), "crossq"]
-OFF_POLICY = ("crossq", "sac_lag", "td3_lag")
+OFF_POLICY = ("crossq", "sac_lag", "td3_lag", "tqc_lag")
 SHIPPED_KL = 0.02
 
 

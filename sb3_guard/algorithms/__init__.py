@@ -23,6 +23,7 @@ from sb3_guard.algorithms.rcpo import RCPO
 from sb3_guard.algorithms.sac_lag import SACLag
 from sb3_guard.algorithms.scpo import SCPO
 from sb3_guard.algorithms.td3_lag import TD3Lag
+from sb3_guard.algorithms.tqc_lag import TQCLag
 from sb3_guard.algorithms.trpo import TRPO
 from sb3_guard.algorithms.trpo_fac import TRPOFAC
 from sb3_guard.algorithms.trpo_ipo import TRPOIPO
@@ -49,6 +50,7 @@ KEYS = (
     "scpo",
     "sac_lag",
     "td3_lag",
+    "tqc_lag",
 )
 
 #: The algorithms by the keys that commands and configurations use.
@@ -118,6 +120,7 @@ __all__ = [
     "PPOLag",
     "SACLag",
     "TD3Lag",
+    "TQCLag",
     "TRPOLag",
     "TrustRegion",
     "hyperparameter",

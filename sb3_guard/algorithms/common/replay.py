@@ -4,7 +4,6 @@ The costs of each step go into the replay buffer. Beside the policy, two network
 Q_C(s, a) = c + γ_C Q_C(s', a'); the latest episodes tell J_C.
 """
 
-import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -16,22 +15,18 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
     GymEnv,
-    PyTorchObs,
     RolloutReturn,
     TrainFrequencyUnit,
 )
-from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from stable_baselines3.common.vec_env import VecEnv
-from torch import nn
-from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.cost_critics import CostQ
 from sb3_guard.algorithms.common.costs import CostEstimate
-from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
@@ -74,49 +69,6 @@ class CostReplayBuffer(_CostColumns):
 
 class CostDictReplayBuffer(_CostColumns, DictReplayBuffer):
     """The same for Dict observations."""
-
-
-class CostQ(nn.Module):
-    """Expected discounted cost-to-go Q_C(s, a): per cost, the larger of two networks' values.
-
-    They are built like the policy's critic, learn with its kind of optimizer and share nothing
-    with it.
-
-    :param policy: a policy of SAC's or TD3's kind
-    :param n_costs: number m of costs
-    :param learning_rate: at the beginning
-    """
-
-    def __init__(self, policy: BasePolicy, n_costs: int, learning_rate: float) -> None:
-        super().__init__()
-        kwargs = policy._update_features_extractor(policy.critic_kwargs, None)  # type: ignore
-        kwargs |= {"n_critics": 2 * n_costs, "share_features_extractor": False}
-        self.online = ContinuousCritic(**kwargs).to(policy.device)
-        self.target = copy.deepcopy(self.online)
-        self.train(False)  # but the one that is learning, while it is
-        self.optimizer = policy.optimizer_class(
-            self.online.parameters(),
-            lr=learning_rate,  # type: ignore[call-arg]
-            **policy.optimizer_kwargs,
-        )
-        fuse(self.optimizer)
-
-    @staticmethod
-    def larger(values: tuple[th.Tensor, ...]) -> th.Tensor:
-        """The larger value of each pair, shape [B, m]."""
-        return th.cat(values, dim=1).unflatten(1, (-1, 2)).amax(dim=2)
-
-    def forward(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-        """Q_C of actions as the buffer has them, in [-1, 1], shape [B, m]."""
-        return self.larger(self.online(observations, actions))
-
-    def follow(self, tau: float) -> None:
-        """Move the target networks by a share of the way."""
-        polyak_update(self.online.parameters(), self.target.parameters(), tau)
-        ours, theirs = (
-            get_parameters_by_name(one, ["running_"]) for one in (self.online, self.target)
-        )
-        polyak_update(ours, theirs, 1.0)
 
 
 class CostReplay(Constrained, OffPolicyAlgorithm):
@@ -199,7 +151,11 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         super()._setup_model()
         # Its first weights take nothing from the stream that actions are sampled from.
         with th.random.fork_rng(devices=[]):
-            self.cost_critic = CostQ(self.policy, len(self.cost_keys), self.lr_schedule(1))
+            self.cost_critic = self.make_cost_critic()
+
+    def make_cost_critic(self) -> CostQ:
+        """The critics of the costs, before they have learnt."""
+        return CostQ(self.policy, len(self.cost_keys), self.lr_schedule(1))
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
@@ -275,14 +231,15 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         """
         critic, gamma = self.cost_critic, self.gamma if self.cost_gamma is None else self.cost_gamma
         with th.no_grad():
-            after = critic.larger(critic.target(batch.next_observations, next_actions))
-            target = batch.costs + (1 - batch.dones) * gamma * after  # [B, m]
-        each = critic.online(batch.observations, batch.actions)
-        self.cost_deviation = critic.larger(each).detach().std(dim=0, correction=0).cpu().numpy()
+            after = critic.predict(critic.target, batch.next_observations, next_actions)
+            after = (1 - batch.dones[:, None]) * gamma * critic.samples(after)
+            target = batch.costs[:, :, None] + after  # [B, m, K]
+        predicted = critic.predict(critic.online, batch.observations, batch.actions)
+        values = critic.value(predicted.detach())
+        self.cost_deviation = values.std(dim=0, correction=0).cpu().numpy()
         if self.unmovable is not None:
             self.cost_deviation[self.unmovable] = 0.0  # it is the critic's errors
-        values = th.cat(each, dim=1)
-        loss = F.mse_loss(values.unflatten(1, (-1, 2)), target[:, :, None].expand(-1, -1, 2))
+        loss = critic.loss(predicted, target)
         critic.optimizer.zero_grad()
         loss.backward()
         critic.optimizer.step()

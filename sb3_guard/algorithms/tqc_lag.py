@@ -1,0 +1,128 @@
+"""TQC-Lagrangian: critics of the distributions of costs join TQC's actor at a price."""
+
+from typing import Any
+
+import torch as th
+from sb3_contrib import TQC
+from sb3_contrib.common.utils import quantile_huber_loss
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.utils import polyak_update
+
+from sb3_guard.algorithms.common.arguments import hyperparameter
+from sb3_guard.algorithms.common.cost_critics import CostQ
+from sb3_guard.algorithms.common.replay import CostReplayBufferSamples, LagrangianReplay
+from sb3_guard.algorithms.common.temperature import Temperature
+
+
+class CostQuantiles(CostQ):
+    """Quantiles of the discounted cost-to-go, of networks like those of TQC's critic.
+
+    TQC drops the highest quantiles of the return-to-go from its targets, since an actor that
+    climbs a critic seeks out what the critic overrates. What it underrates of a cost is sought out
+    likewise, so that the lowest quantiles are dropped here.
+
+    :param policy: TQC's
+    :param n_costs: number m of costs
+    :param learning_rate: at the beginning
+    :param drop: quantiles to drop per network
+    :param quantile: which quantile a cost counts for; None for the mean
+    """
+
+    def __init__(
+        self,
+        policy: BasePolicy,
+        n_costs: int,
+        learning_rate: float,
+        drop: int,
+        quantile: float | None = None,
+    ) -> None:
+        kwargs: dict[str, Any] = policy.critic_kwargs  # type: ignore[assignment]
+        networks, outputs = kwargs["n_critics"], kwargs["n_quantiles"]
+        if not 0 <= drop < outputs:
+            raise ValueError(
+                f"top_quantiles_to_drop_per_net={drop!r}: must be at least 0 and below the number "
+                f"of quantiles, policy_kwargs={{'n_quantiles': {outputs}}}"
+            )
+        super().__init__(policy, n_costs, learning_rate, networks, outputs)
+        self.dropped = drop * networks
+        self.index = None if quantile is None else int(quantile * outputs)
+
+    def value(self, predicted: th.Tensor) -> th.Tensor:
+        """Mean over the networks of their means, or of their estimates of the quantile."""
+        if self.index is None:
+            return predicted.mean(dim=(2, 3))
+        return predicted[..., self.index].mean(dim=2)
+
+    def samples(self, predicted: th.Tensor) -> th.Tensor:
+        """The quantiles of all networks without the lowest ones."""
+        return predicted.flatten(2).sort(dim=2).values[:, :, self.dropped :]
+
+    def loss(self, predicted: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """TQC's, the mean over costs."""
+        return quantile_huber_loss(
+            predicted.flatten(0, 1), target.flatten(0, 1)[:, None], sum_over_quantiles=False
+        )
+
+
+class TQCLag(Temperature, LagrangianReplay, TQC):
+    """TQC on the Lagrangian (Kuznetsov et al., 2020, arXiv 2005.04269, with multipliers).
+
+    ::
+
+        max_π min_{λ ≥ 0}   J(π) + α H(π) - Σ λ_i (J_Ci(π) - d_i)
+
+    Returns-to-go and costs-to-go are learnt as distributions. The actor descends
+    ``(α log π - Q + Σ λ_i Q_Ci) / (1 + Σ λ_i)`` with the means of both, or an upper quantile of the
+    costs; the multipliers follow the mean cost of the latest episodes. With ``ent_coef="auto"`` and
+    while no limit is exceeded the run equals SB3-contrib's TQC, bit for bit.
+
+    :param cost_quantile: which quantile of the cost-to-go the actor avoids, above 0 and below 1,
+        such as 0.9, which avoids rare high costs; None for the mean, which is what the limit bounds
+    """
+
+    label, family, paper = "TQC-Lagrangian", "Lagrangian", "Kuznetsov et al. 2020"
+
+    cost_quantile: float | None = hyperparameter(None, high=1.0, ends="()")
+
+    def make_cost_critic(self) -> CostQ:
+        rate, drop = self.lr_schedule(1), self.top_quantiles_to_drop_per_net
+        return CostQuantiles(self.policy, len(self.cost_keys), rate, drop, self.cost_quantile)
+
+    def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
+        """TQC's step: temperature, critics, actor, targets."""
+        if self.use_sde:
+            self.actor.reset_noise()
+        actions, log_prob = self.actor.action_log_prob(batch.observations)
+        log_prob = log_prob.reshape(-1, 1)
+        logs, alpha = self.fit_temperature(log_prob.detach())
+
+        with th.no_grad():
+            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
+            after = self.critic_target(batch.next_observations, next_actions).flatten(1)
+            dropped = self.top_quantiles_to_drop_per_net * self.critic.n_critics
+            after = after.sort().values[:, : self.critic.quantiles_total - dropped]
+            after = after - alpha * next_log_prob.reshape(-1, 1)
+            target = batch.rewards + (1 - batch.dones) * self.gamma * after
+        values = self.critic(batch.observations, batch.actions)  # [B, networks, quantiles]
+        critic_loss = quantile_huber_loss(values, target[:, None], sum_over_quantiles=False)
+        self.critic.optimizer.zero_grad()
+        critic_loss.backward()
+        self.critic.optimizer.step()
+        logs["critic_loss"] = critic_loss.item()
+        logs["cost_critic_loss"] = self.fit_cost_critic(batch, next_actions)
+
+        self.actor.optimizer.zero_grad()
+        with self.critics_constant():
+            chosen = self.critic(batch.observations, actions)
+            chosen = chosen.mean(dim=2).mean(dim=1, keepdim=True)
+            expected = values.mean(dim=2).mean(dim=1, keepdim=True)
+            loss = self.penalized(alpha * log_prob - chosen, batch, actions, expected).mean()
+            loss.backward()
+        self.actor.optimizer.step()
+        logs["actor_loss"] = loss.item()
+
+        if step % self.target_update_interval == 0:
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+            self.cost_critic.follow(self.tau)
+        return logs

@@ -257,7 +257,8 @@ def execute(runs: Sequence[Run], executor: Executor, stop: Path, board: Board) -
                 try:
                     run.state, run.error = future.result()
                 except Exception as error:  # those of runs are caught where they run
-                    raise UsageError(f"a worker is gone: {one_line(error)}") from error
+                    why = one_line(error).rstrip(".")
+                    raise UsageError(f"a worker or scheduler is gone: {why}") from error
                 board.note(run)
             board.update(runs)
     if received:

@@ -108,6 +108,16 @@ def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
     yield f"An episode has {steps} steps of {env.engine.control_step:g} s."
 
 
+def drawn_table(env: GuardVectorEnv) -> str:
+    """Name and range of what is drawn anew in each episode, and what it is in this one."""
+    drawn = env.engine.drawn
+    rows = [
+        [name, f"{low:g} to {high:g}", f"{drawn.values[name][0]:g}"]
+        for name, (low, high) in drawn.ranges.items()
+    ]
+    return table(["drawn in each episode", "range", "in the picture"], rows)
+
+
 def unsteady(env: GuardVectorEnv) -> str | None:
     """What is wrong with a robot after a second alone, or of random actions: it falls, explodes."""
     return _watch(env, alone=True) or _watch(env, alone=False)
@@ -214,6 +224,8 @@ def show(flags: Flags) -> int:
     print(yaml.safe_dump(data, sort_keys=False))
     print(*costs(env, spec.id), "", sep="\n")
     print(observation_table(env), action_table(env), sep="\n\n")
+    if env.engine.drawn.ranges:
+        print("\n" + drawn_table(env))
     path = Path(flags.output) if flags.output else Path(f"{file.stem.removesuffix('-v0')}.png")
     with explained("no picture", RenderingError, OSError, ValueError):
         from matplotlib import image

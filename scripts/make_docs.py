@@ -68,6 +68,8 @@ def parameters(part: type[Part]) -> str:
                 limits.append(f"{sign}{field.metadata[key]:g}")
         if field.metadata.get("choices"):
             limits.append(", ".join(map(str, field.metadata["choices"])))
+        if field.metadata.get("drawn"):
+            limits.append("may be [drawn](../customizing.md#domain-randomisation)")
         meaning = field.metadata.get("doc", "")
         rows.append([f"`{field.name}`", f"`{field.default}`", meaning, "; ".join(limits)])
     return table(["parameter", "default", "what it is", "allowed"], rows)

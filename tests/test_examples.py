@@ -25,6 +25,7 @@ SAYS = {
     "custom_robot": (["21 observations, 2 actions", "return "], ["puck.xml"]),
     "custom_task": (["metres: ["], []),
     "deploy_filtered_policy": (["with the layer: ", "without the layer: "], ["filtered_policy.pt"]),
+    "domain_randomization": (["drawn: {'hazards.num': ", "mass × 0.5: ", "mass × 2.0: "], []),
     "ppo_lagrangian": (["return "], []),
     "record_video": (["point.mp4"], ["point.mp4"]),
     "safety_gymnasium_env": (["return ", "cost "], []),

@@ -64,7 +64,11 @@ class GuardVecEnv(VecEnv):
 
     def reset(self) -> Any:
         obs = self.envs.begin(self._seeds)
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        drawn = self.envs.engine.drawn.info()
+        self.reset_infos = [
+            {name: values[row].item() for name, values in drawn.items()}
+            for row in range(self.num_envs)
+        ]
         self._reset_seeds()
         self._reset_options()
         return self.envs.view(obs, self.envs.look())
@@ -79,9 +83,9 @@ class GuardVecEnv(VecEnv):
         infos: list[dict[str, Any]] = [
             {"cost": cost, "TimeLimit.truncated": False} for cost in out.cost.tolist()
         ]
-        for name, costs in out.costs.items():
-            for info, cost in zip(infos, costs.tolist(), strict=True):
-                info[name] = cost
+        for name, values in out.details.items():
+            for info, value in zip(infos, values.tolist(), strict=True):
+                info[name] = value
         for name, happened in out.events.items():
             if np.count_nonzero(happened):
                 for row in np.flatnonzero(happened).tolist():

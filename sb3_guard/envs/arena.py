@@ -17,6 +17,7 @@ INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
 LONGEST = 0.05  # s of a physics step: contacts of robots are lost in longer ones
+PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 STILL = 1e-8  # m/s: 2e-10 m in a control step, less than what any test tells from rest
 WALL = 0.3  # m, height of walls as they are drawn around robots in the plane
 
@@ -31,6 +32,46 @@ class WorldSpec:
 
     robot: Robot
     spec: mujoco.MjSpec
+
+    def __post_init__(self) -> None:
+        """Note the floors: planes that are added later are walls."""
+        self._floors = [geom for geom in self.spec.worldbody.geoms if geom.type == PLANE]
+
+    def rub(self, body: str) -> int:
+        """State the contacts with the floor of all geoms from ``body`` on, as pairs of geoms.
+
+        Each pair has what MuJoCo would give the contact itself, so that nothing changes but that
+        its friction is one row of ``pair_friction``.
+
+        :return: how many there can be
+        """
+        count = 0
+        for geom in self.spec.body(body).find_all("geom"):
+            for floor in self._floors:
+                if not (geom.contype & floor.conaffinity or floor.contype & geom.conaffinity):
+                    continue
+                geom.name = geom.name or f"{body}/rubs{count}"
+                floor.name = floor.name or "floor"
+                self._add_pair(geom, floor)
+                count += 1
+        return count
+
+    def _add_pair(self, geom: mujoco.MjsGeom, floor: mujoco.MjsGeom) -> None:
+        """What two geoms with priorities, or without, make of their contact."""
+        most = max(geom.priority, floor.priority)
+        ruling = [g for g in (geom, floor) if g.priority == most]
+        mixed = [g.solmix for g in ruling]
+        slide, spin, roll = np.max([g.friction for g in ruling], axis=0)
+        self.spec.add_pair(
+            geomname1=floor.name,
+            geomname2=geom.name,
+            condim=max(g.condim for g in ruling),
+            friction=[slide, slide, spin, roll, roll],
+            solref=np.average([g.solref for g in ruling], axis=0, weights=mixed),
+            solimp=np.average([g.solimp for g in ruling], axis=0, weights=mixed),
+            margin=geom.margin + floor.margin,  # MuJoCo 4 adds them
+            gap=geom.gap + floor.gap,
+        )
 
     def feel(self, name: str, body: str, force: bool = False) -> None:
         """Count contacts between any part of the robot and ``body``; 0 if there are none.
@@ -174,7 +215,7 @@ def _add_wall(
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.column_stack([right, up, np.cross(right, up)]).ravel())
     spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        type=PLANE,
         pos=place,
         quat=quat,
         size=[*half, 1.0],

@@ -19,8 +19,10 @@ from numpy.typing import DTypeLike
 from sb3_guard.checks import NumberError
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.check_part import check_moving, per_row
+from sb3_guard.envs.drawn import Drawn
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import (
+    AWAY,
     Footprint,
     Layout,
     LayoutError,
@@ -83,11 +85,11 @@ class Engine:
         self._any = cost == "any"
         self.num_envs = int(num_envs)
         self.num_threads = min(num_threads or _cpus(), self.num_envs)
+        self._arrays: dict[str, Array] = {}
         self._build()
 
         self._process: int | None = os.getpid()  # whose threads step it; None: closed
         self.rngs = [np.random.default_rng() for _ in range(self.num_envs)]
-        self._arrays: dict[str, Array] = {}
         self.steps = self.array("steps", dtype=np.int64)
         self.steps[:] = -1  # no episode has begun
         self._begun = False
@@ -106,6 +108,7 @@ class Engine:
         world = self.arena.world(self.robot)
         for part in self.parts:
             part.build(world)
+        self.drawn = Drawn(self, world)
         self.model = world.spec.compile()
         frame_skip = self.arena.frame_skip or self.robot.frame_skip
         self.control_step = frame_skip * float(self.model.opt.timestep)
@@ -147,6 +150,7 @@ class Engine:
         for part in self.parts:
             part.bind(self)
             check_moving(part, self.num_envs)
+        self.drawn.bind(self.model)
         self._motion = Motion(self.parts)
         self.observer = Observer(self.robot, self.parts, lidar, self.extras.components)
         self.observation_size = self.observer.size
@@ -232,6 +236,9 @@ class Engine:
             for row in ids.tolist():
                 bits = self.rngs[row].bit_generator
                 bits.state = self._origins.setdefault(row, bits.state)
+        if self.drawn.ranges:
+            self.drawn.draw(ids)
+            self._restarts.forget(ids)  # layouts that are kept may be of another number of objects
         pending = ids
         refusals: dict[tuple[str, str], int] = {}  # starts not used, by reason and remedy
         for _ in range(CLEAN_STARTS):
@@ -257,9 +264,11 @@ class Engine:
         self.batch.clear(ids)
         for row in ids.tolist():
             rng = self.rngs[row]
-            layout = arrange(self._ordered, rng, partial(self._restarts.draw, row, rng))
+            present = [self._owners[f.name].present(f, row) for f in self._ordered]
+            layout = arrange(present, rng, partial(self._restarts.draw, row, rng, present))
             for name, places in layout.items():
-                self.places(name)[row] = places
+                self.places(name)[row] = AWAY
+                self.places(name)[row, : len(places)] = places
         for part in self.parts:
             part.reset(ids, self.rngs)
         self.batch.begin(ids)
@@ -330,8 +339,9 @@ class Engine:
                 ended_by[part.name] = ended & ~terminated
                 terminated |= ended
         return Outcome(
-            self.observe(), reward, costs, total, met, terminated, unplaced, diverged, ended_by
-        )
+            self.observe(), reward, costs, total, met, terminated, unplaced, diverged, ended_by,
+            self.drawn.info(),
+        )  # fmt: skip
 
     def close(self) -> None:
         """Refuse any further step or reset."""
@@ -425,6 +435,7 @@ class Engine:
             self._arrays[name][:] = value
         self.rngs = [_generator(s) for s in state["rngs"]]
         self._origins = dict(state["origins"])
+        self.drawn.apply(np.arange(self.num_envs))
         self.batch.restore(state["batch"])
         self._begun = bool((self.steps >= 0).all())
 

@@ -34,6 +34,10 @@ class Extras(Part):
     qvel: bool = param(False, "velocities of all joints of the world")
     ctrl: bool = param(False, "controls of all actuators")
     com: bool = param(False, "centre of mass of the robot, m")
+    drawn: bool = param(
+        False,
+        "whether info has the parameters that were drawn for the episode, such as 'hazards.size'",
+    )
     components: tuple[str, ...] | None = param(
         None, "names of what is observed, in this order; null: everything, in alphabetical order"
     )

@@ -15,8 +15,9 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs import geometry
-from sb3_guard.envs.layout import Footprint
+from sb3_guard.envs.layout import AWAY, Footprint
 from sb3_guard.envs.observation import Scan
+from sb3_guard.envs.parameters import Range
 from sb3_guard.envs.part import (
     FLOOR,
     ROBOT,
@@ -36,6 +37,7 @@ WELD = [0.02, 1.5]  # solref, s and damping ratio, of welded bodies
 # How strongly a weld turns a box, 1/m times half of its edge: √(mass · edge² / 4 / inertia), as if
 # MuJoCo weighed a turn by the mass, which it did until 2.3.3, and Safety-Gymnasium relies on.
 TURN = math.sqrt(1.5)
+GRIPS = 33  # factors on friction at which heights are computed: within 0.3 µm between 0.2 and 2
 MOST = 1000  # objects in a group: layouts compare every pair
 
 
@@ -55,6 +57,7 @@ class Group:
     :param weld: whether those that can be pushed are pulled along by a mocap body
     :param sink: how deep those that can be pushed begin in the floor, m; None: as they rest
     :param reachable: whether they must lie within the robot's reach
+    :param grip: the part's parameter that is a factor on their friction with the floor
     :param footprint: further arguments of the :class:`~sb3_guard.envs.layout.Footprint`
     """
 
@@ -72,10 +75,11 @@ class Group:
         weld: bool = False,
         sink: float | None = None,
         reachable: bool = False,
+        grip: str | None = None,
         **footprint: Any,
     ) -> None:
         self.part: Any = weakref.proxy(part)  # which has this group
-        self.name, self.size, self.solid = name, float(part.size), shape is not None
+        self.name, self.solid, self._grip = name, shape is not None, grip
         fields = {
             "placements": part.placements,
             "locations": part.locations,
@@ -90,7 +94,8 @@ class Group:
         clear = max(usual, fields["cover"]) if keepout is None else keepout
         self.footprint = Footprint(name, num, clear, **fields)
         number = num if shape else 0
-        self.bodies = Bodies(world, name, number, shape or _no_shape, free, weld, sink)
+        grips = part.span(grip) if grip else Range(1.0, 1.0)
+        self.bodies = Bodies(world, name, number, shape or _no_shape, free, weld, sink, grips)
 
     def bind(self, sim: Simulation) -> None:
         """Take live views: ``places``, where they were put, and ``centers``, [N, num, 3] m."""
@@ -101,7 +106,8 @@ class Group:
     def reset(self, ids: Array, rngs: Generators) -> None:
         """Set solid objects down at their places in rows ``ids``."""
         if self.solid:
-            self.bodies.put(ids, self.places[ids], rngs)
+            grips = self.part.current(self._grip)[ids] if self._grip else np.ones(len(ids))
+            self.bodies.put(ids, self.places[ids], rngs, grips)
 
     def scan(self, visible: Array | None = None) -> Scan:
         """What lidar sees of them, in all rows or in the ``visible`` ones, [N] bool."""
@@ -110,9 +116,10 @@ class Group:
     def draw(self, painter: Painter, row: int) -> None:
         """Draw one row's objects that are not bodies."""
         if not self.solid:
+            half_height, size = 0.01 if self.part.planar else 0.0, self.part.current("size")[row]
             for center in self.centers[row]:
-                half_height = 0.01 if self.part.planar else 0.0
-                painter.zone(center, self.size, half_height, self.part.color)
+                if center[0] < AWAY[0]:
+                    painter.zone(center, size, half_height, self.part.color)
 
 
 def _no_shape(body: mujoco.MjsBody) -> None:
@@ -129,6 +136,7 @@ class Bodies:
     :param free: half height of bodies that can be pushed, m; None: they stay where they are put
     :param weld: whether each is welded, softly, to a mocap body below it
     :param sink: how deep free ones begin in the floor, m; None: as they rest
+    :param grips: range of factors on their friction with the floor
     :raises ValueError: another part's bodies have this name
     """
 
@@ -138,20 +146,22 @@ class Bodies:
         name: str,
         num: int,
         shape: Shape,
-        free: float | None = None,
-        weld: bool = False,
-        sink: float | None = None,
+        free: float | None,
+        weld: bool,
+        sink: float | None,
+        grips: Range,
     ) -> None:
         if num and world.spec.body(f"{name}/0") is not None:
             raise ValueError(
                 f"two parts have bodies called {name!r}; give the constraint another name"
             )
         self.name, self.num, self.free = name, num, free is not None
-        self._height = 0.0
-        if free is not None:
+        # how high they are set down, m, at some factors on their friction
+        self._grips = np.linspace(*grips, 1 if grips.low == grips.high else GRIPS)
+        self._heights = np.full(len(self._grips), 0.0 if free is None else free - (sink or 0.0))
+        if free is not None and sink is None:
             timestep = world.spec.option.timestep
-            rest = resting_height(shape, free, timestep) if sink is None else free - sink
-            self._height = rest
+            self._heights[:] = [resting_height(shape, free, timestep, g) for g in self._grips]
         for i in range(num):
             body = world.spec.worldbody.add_body(name=f"{name}/{i}", mocap=not self.free)
             if self.free:
@@ -201,14 +211,22 @@ class Bodies:
             self._mover_turns = batch.bind("mocap_quat")[:, first : first + k]
 
     @property
+    def movable(self) -> list[str]:
+        """Names of the bodies that can be pushed."""
+        return [f"{self.name}/{i}" for i in range(self.num)] if self.free else []
+
+    @property
     def touched(self) -> Array:
         """Which bodies the robot touches, [N, num] bool."""
         return self._found > 0
 
-    def put(self, ids: Array, places: Array, rngs: Generators) -> None:
-        """Set bodies down in rows ``ids`` at [n, num, 3] m, each with a random heading."""
+    def put(self, ids: Array, places: Array, rngs: Generators, grips: Array) -> None:
+        """Set bodies down in rows ``ids`` at [n, num, 3] m, each with a random heading.
+
+        :param grips: factors on their friction, [n]
+        """
         self._places[ids] = places
-        self._places[ids, :, 2] += self._height
+        self._places[ids, :, 2] += np.interp(grips, self._grips, self._heights)[:, None]
         for i in ids.tolist():
             heading = rngs[i].uniform(0, 2 * math.pi, self.num)
             self._turns[i] = geometry.yaw_quaternion(heading)
@@ -225,14 +243,16 @@ class Bodies:
         self._movers[rows, :, 2] += self._lift
 
 
-def resting_height(shape: Shape, half_height: float, timestep: float) -> float:
+def resting_height(shape: Shape, half_height: float, timestep: float, grip: float = 1.0) -> float:
     """Height at which a free body lies still on the floor, m.
 
-    Contacts are soft: set down anywhere else it would bounce when an episode begins.
+    Contacts are soft, the softer the more friction they have: set down anywhere else it would
+    bounce when an episode begins.
 
     :param shape: adds the geoms of the body
     :param half_height: of the body, m
     :param timestep: s; how soft depends on it
+    :param grip: factor on the friction of the body and the floor
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = timestep
@@ -244,6 +264,7 @@ def resting_height(shape: Shape, half_height: float, timestep: float) -> float:
     body.add_freejoint()
     shape(body)
     model = spec.compile()
+    model.geom_friction *= grip
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=1000)
     return float(data.qpos[2])

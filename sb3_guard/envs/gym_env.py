@@ -206,8 +206,8 @@ class Simulated:
 def step_info(outcome: Outcome, row: int) -> dict[str, Any]:
     """The info of one row: its costs, and what happened if something did."""
     info: dict[str, Any] = {"cost": float(outcome.cost[row])}
-    for name, cost in outcome.costs.items():
-        info[name] = float(cost[row])
+    for name, values in outcome.details.items():
+        info[name] = values[row].item()
     info |= {name: True for name, rows in outcome.events.items() if rows[row]}
     for name, rows in outcome.ended_by.items():
         if rows[row]:
@@ -263,7 +263,8 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         self._so_far[:] = 0.0
         if self.render_mode == "human":
             self.render()
-        return self.view(self.engine.observe(), self.look(), 0), {}
+        info = {name: values[0].item() for name, values in self.engine.drawn.info().items()}
+        return self.view(self.engine.observe(), self.look(), 0), info
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by one control step, of ten physics steps unless the robot says otherwise.

@@ -13,7 +13,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ Array = np.ndarray
 Rectangle = tuple[float, float, float, float]
 StartOver = Callable[[Array, Array, Array, bool], Array | None]
 
+AWAY = (1e6, 1e6, 0.0)  # m: where objects are that an episode is without, out of sight and reach
 DRAWS = 128
 PATIENCE = 4000  # placements, or 4 of each object, before a layout is called impossible
 
@@ -186,6 +187,12 @@ class Footprint:
         """Which centres, [2, n] m, leave no height within reach, [n] bool."""
         dx, dy = draws[0] - self.base[0], draws[1] - self.base[1]
         return dx**2 + dy**2 > self.reach**2 - self._lowest**2
+
+
+@functools.lru_cache
+def first(footprint: Footprint, num: int) -> Footprint:
+    """The footprint of the first ``num`` of its objects."""
+    return replace(footprint, num=num, locations=footprint.locations[:num])
 
 
 def arrange(

@@ -7,6 +7,7 @@ depends on whether the robot is within r1 (Zhao et al. 2024, §4: ghosts, chase 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -36,7 +37,7 @@ class Law:
     :param settle: speed towards the origin beyond r1 of the robot
     :param home: speed towards the origin beyond r0 of it
     :param apart: speed away from each like mover closer than ``gap``
-    :param gap: m
+    :param gap: m, or [N] m, live, where it is not the same in all rows
     :param r0: radius around the origin that is not left, m
     :param r1: distance from the robot at which the behaviour changes, m
     :param origin: (x, y, z) m
@@ -48,7 +49,7 @@ class Law:
     settle: float = 0.0
     home: float = 0.0
     apart: float = 0.0
-    gap: float = 0.0
+    gap: float | Array = 0.0
     r0: float = np.inf
     r1: float = 0.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -94,9 +95,14 @@ class MoverGroup:
         movers = np.arange(k)
         self._from = np.concatenate([movers, movers, pairs[0]])
         self._to = np.concatenate([np.full(k, 2 * k), k + movers, pairs[1]])
-        gaps = np.nextafter([laws[i].gap for i in pairs[1]], -1.0)  # below the gap, not at it
-        radii = [law.r1 for law in laws], [law.r0 for law in laws], gaps
-        self._radii = np.concatenate(radii)[:, None]
+        ends = (2 * k + np.cumsum([0, *(p.shape[1] for p in each)])).tolist()
+        spans = [slice(i, j) for i, j in itertools.pairwise(ends)]  # of each group's pairs
+        self._gaps = [(s, laws[c.start].gap) for s, c in zip(spans, part, strict=True)]
+        self._drawn = any(np.ndim(gap) for _, gap in self._gaps)
+        self._radii = np.empty((2 * k + pairs.shape[1], n if self._drawn else 1))
+        self._radii[:k, :] = np.array([[law.r1] for law in laws])
+        self._radii[k : 2 * k, :] = np.array([[law.r0] for law in laws])
+        self._update_gaps()
         # speeds towards robot and origin, [2, 4 K]: outside r0 twice, within it far and near
         self._speeds = np.array(
             [
@@ -122,6 +128,8 @@ class MoverGroup:
         offset = self._points.take(self._to, axis=1)  # [2 or 3, 2 K + pairs, N]
         offset -= self._points.take(self._from, axis=1)
         k, n = len(self._outside), offset.shape[2]
+        if self._drawn:
+            self._update_gaps()
         if self._level:
             offset[2, k : 2 * k] = 0.0
         distance = length(offset)
@@ -140,6 +148,11 @@ class MoverGroup:
             self._part(move, offset, distance, close)
         for live, columns in zip(self._live, self._columns, strict=True):
             live += move[:, columns]
+
+    def _update_gaps(self) -> None:
+        """Movers part below the gap, not at it."""
+        for pairs, gap in self._gaps:
+            self._radii[pairs] = np.nextafter(gap, -1.0)
 
     def _part(self, move: Array, offset: Array, distance: Array, close: Array) -> None:
         """Add a push away from each like mover of the row that is closer than the gap.

@@ -8,7 +8,7 @@ import numpy as np
 from sb3_guard.envs import motion
 from sb3_guard.envs.groups import CYLINDER, SPHERE, add_geom
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import HEIGHT, SPACE, Part, Simulation, World
+from sb3_guard.envs.part import HEIGHT, SPACE, Array, Generators, Part, Simulation, World
 
 
 @dataclass
@@ -44,6 +44,12 @@ class Movers(Part):
                 f"in the floor; the lowest height must be at least {self.size}"
             )
 
+    @property
+    def _gap(self) -> float | Array:
+        """Twice their size, m; [N], live, if that is drawn."""
+        drawn = "size" in self.ranges
+        return self.sim.array(f"{self.name}/gap") if drawn else 2 * self.size
+
     def law(self) -> motion.Law:
         """How they move."""
         raise NotImplementedError
@@ -53,7 +59,7 @@ class Movers(Part):
         return motion.Law(
             home=self.speed if self.v0 is None else self.v0,
             apart=self.speed,
-            gap=2 * self.size,
+            gap=self._gap,
             r0=self.r0,
             origin=self.origin,
             unit=self.speed_law == "unit",
@@ -86,12 +92,17 @@ class Movers(Part):
             ("the origin", law.home, law.r0),
         )
         for aim, speed, stop in aims if law.unit else ():
-            most = max(2 * stop, self.size)
+            most = max(2 * stop, self.span("size").low)
             if speed > most:
                 raise ValueError(
                     f"{self.name}: with {speed:g} m per control step towards {aim} they would jump "
                     f"across it forever: at most {most:g} m; lower speed, or v0, v1, v2"
                 )
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        super().reset(ids, rngs)
+        if "size" in self.ranges:
+            self._gap[ids] = 2 * self.current("size")[ids]  # type: ignore[index]
 
     def moving(self) -> tuple[motion.Moving, ...]:
         return (motion.Moving(self.group.places, self.motion, self.planar),)

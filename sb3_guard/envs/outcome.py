@@ -19,6 +19,7 @@ class Outcome:
     :param ended_by: by a part's name, the rows that it was the first to end, [N] bool each
     :param unplaced: no room was left for the next goal: the episode is to be cut, [N] bool
     :param physics_error: the physics diverged, [N] bool
+    :param drawn: parameters drawn for the episodes, by name, [N] each, if asked for
     """
 
     obs: Array
@@ -30,6 +31,12 @@ class Outcome:
     unplaced: Array
     physics_error: Array
     ended_by: dict[str, Array]
+    drawn: dict[str, Array]
+
+    @property
+    def details(self) -> dict[str, Array]:
+        """What info says of every row beside the cost, by key, [N] each."""
+        return {**self.costs, **self.drawn}
 
     @property
     def events(self) -> dict[str, Array]:

@@ -1,7 +1,8 @@
 """Parameters that check themselves: the dataclass fields of every part of an environment.
 
 A bad name, type or value fails where the part is made, in one line that names the parameter, the
-value and what is allowed. Plain JSON and YAML values are enough: lists become tuples.
+value and what is allowed. Plain JSON and YAML values are enough: lists become tuples. Where
+``param(..., drawn=True)`` says so, a :class:`Range` may stand in place of a number.
 """
 
 import dataclasses
@@ -11,7 +12,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,16 @@ def check_count(name: str, value: Any) -> None:
         raise ValueError(f"{name} = {value!r} must be an integer of at least 1")
 
 
+class Range(NamedTuple):
+    """What a number is drawn from, uniformly, when an episode begins; integers include both ends.
+
+    Users write ``{"low": a, "high": b}``.
+    """
+
+    low: float
+    high: float
+
+
 def param(
     default: Any,
     doc: str,
@@ -42,6 +53,7 @@ def param(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[Any, ...] | None = None,
+    drawn: bool | str = False,
 ) -> Any:
     """A dataclass field that is checked on construction and documents itself.
 
@@ -51,9 +63,11 @@ def param(
     :param low: the value must be at least this
     :param high: the value must be at most this
     :param choices: the value must be one of these
+    :param drawn: whether the number may be drawn anew in each episode, from a :class:`Range`;
+        ``"mass"`` or ``"friction"``: it may, and multiplies those of the part's bodies
     """
     limits = {"doc": doc, "above": above, "low": low, "high": high, "choices": choices}
-    return field(default=default, metadata=limits)
+    return field(default=default, metadata={**limits, "drawn": drawn})
 
 
 _WORDS = {  # what an error message calls one value of a type, and several
@@ -117,39 +131,83 @@ def _plain(value: Any) -> Any:
     return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value
 
 
+def _check(label: str, value: Any, kind: Any, limits: Mapping[str, Any]) -> None:
+    """
+    :raises ValueError: a value of another type, or not within the limits of its field
+    """
+    if not _matches(value, kind):
+        raise ValueError(f"{label} = {value!r} must be {in_words(kind)}")
+    if limits.get("choices") is not None and value not in limits["choices"]:
+        names = ["null" if c is None else str(c) for c in limits["choices"]]
+        raise ValueError(f"{label} = {value!r}: {did_you_mean(value, names)}")
+    for v in value if isinstance(value, tuple) else (value,):
+        if not isinstance(v, (int, float)):
+            continue
+        if limits.get("above") is not None and not v > limits["above"]:
+            raise ValueError(f"{label} = {value!r} must be greater than {limits['above']}")
+        if limits.get("low") is not None and not v >= limits["low"]:
+            raise ValueError(f"{label} = {value!r} must be at least {limits['low']}")
+        if limits.get("high") is not None and not v <= limits["high"]:
+            raise ValueError(f"{label} = {value!r} must be at most {limits['high']}")
+
+
 class Parameters:
     """A dataclass of parameters that are checked when it is made.
+
+    A parameter that is drawn anew in each episode has the greatest value of its range.
 
     :raises ValueError: a value of the wrong type or out of range, in one line that names the
         parameter, the value and what is allowed
     """
 
     name: str = ""  # what messages call it, and users the keyword that sets its parameters
+    ranges: Mapping[str, Range] = types.MappingProxyType({})  # of what is drawn, by parameter
     # what to write instead of parameters that it does not have, though others have them
     instead: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
+        ranges: dict[str, Range] = {}
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = _plain(getattr(self, f.name))
-            object.__setattr__(self, f.name, value)
+            value, kind = _plain(getattr(self, f.name)), hints[f.name]
             label = f"{self.name or type(self).__name__}.{f.name}"
-            if not _matches(value, hints[f.name]):
-                raise ValueError(f"{label} = {value!r} must be {in_words(hints[f.name])}")
-            m = f.metadata
-            if m.get("choices") is not None and value not in m["choices"]:
-                names = ["null" if c is None else str(c) for c in m["choices"]]
-                raise ValueError(f"{label} = {value!r}: {did_you_mean(value, names)}")
-            numbers = value if isinstance(value, tuple) else (value,)
-            for v in numbers:
-                if not isinstance(v, (int, float)):
-                    continue
-                if m.get("above") is not None and not v > m["above"]:
-                    raise ValueError(f"{label} = {value!r} must be greater than {m['above']}")
-                if m.get("low") is not None and not v >= m["low"]:
-                    raise ValueError(f"{label} = {value!r} must be at least {m['low']}")
-                if m.get("high") is not None and not v <= m["high"]:
-                    raise ValueError(f"{label} = {value!r} must be at most {m['high']}")
+            if isinstance(value, Mapping) and not _matches(value, kind):
+                ranges[f.name] = self._range(f, label, value, kind)
+                value = ranges[f.name].high
+            else:
+                _check(label, value, kind, f.metadata)
+            object.__setattr__(self, f.name, value)
+        if ranges:
+            object.__setattr__(self, "ranges", ranges)
+
+    def _range(self, f: Any, label: str, value: Mapping[str, Any], kind: Any) -> Range:
+        """The range that a mapping states.
+
+        :raises ValueError: this is no range, or the parameter cannot be drawn
+        """
+        if not f.metadata.get("drawn"):
+            names = [g.name for g in dataclasses.fields(self) if g.metadata.get("drawn")]  # type: ignore[arg-type]
+            others = f"; of {self.name} can: {', '.join(names)}" if names else ""
+            raise ValueError(
+                f"{label} = {value!r} must be {in_words(kind)}: it cannot be drawn anew in each "
+                f"episode{others}"
+            )
+        if set(value) != {"low", "high"}:
+            raise ValueError(
+                f"{label} = {value!r} must be {in_words(kind)}, or {{'low': a, 'high': b}} to draw "
+                "it anew in each episode"
+            )
+        low, high = _plain(value["low"]), _plain(value["high"])
+        for end, limit in (("low", low), ("high", high)):
+            _check(f"{label}.{end}", limit, kind, f.metadata)
+        if low > high:
+            raise ValueError(f"{label} = {value!r}: low must be at most high")
+        return Range(low, high) if kind is int else Range(float(low), float(high))
+
+    def span(self, name: str) -> Range:
+        """The least and the greatest value of a parameter: the same unless it is drawn."""
+        value = getattr(self, name)
+        return self.ranges.get(name, Range(value, value))
 
     @classmethod
     def from_params(cls, params: Mapping[str, Any], name: str | None = None) -> typing.Self:

@@ -17,7 +17,8 @@ A task adds ``measure``, ``reward``, ``succeeded`` and ``advance``; a constraint
 part may end an episode with ``terminated``. ``observations``, ``measure``, ``reward``,
 ``cost`` and ``terminated`` only read. A part keeps no arrays of its own between steps: it takes
 them by name from the engine (:meth:`Simulation.array`), so that an engine's state can be saved and
-restored whole.
+restored whole. A parameter that is drawn anew in each episode, ``param(..., drawn=True)``, is read
+by :meth:`Part.current`; as an attribute it is its greatest value.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ SPACE = param(
     None, "planar or spatial; null: the robot's workspace", choices=(None, "planar", "spatial")
 )
 HEIGHT = param((0.5, 1.5), "range of z in space, m", low=0)
+# parameters of parts that have bodies: factors on what the bodies have without them
+MASS = param(1.0, "factor on masses and inertias", above=0, drawn="mass")
+FRICTION = param(1.0, "factor on friction with the floor", low=0, drawn="friction")
 Generators = Sequence[np.random.Generator]
 
 # Contact bits. A robot's geoms collide with bit ROBOT, the floor with bit FLOOR: a robot that
@@ -58,6 +62,11 @@ class World(Protocol):
 
     spec: mujoco.MjSpec
     robot: Robot
+
+    def rub(self, body: str) -> int:
+        """State the contacts with the floor of all geoms from ``body`` on, as pairs of geoms whose
+        friction may differ between simulations. Returns how many there can be.
+        """
 
     def feel(self, name: str, body: str, force: bool = False) -> None:
         """Add a sensor ``name`` of the robot's contacts with ``body``: how many there are, 0 or 1,
@@ -144,9 +153,25 @@ class Part(Parameters):
         if self.height[0] > self.height[1]:
             raise ValueError(f"{self.name}.height = {self.height!r} must be (low, high), in metres")
 
+    def current(self, name: str) -> Array:
+        """The parameter ``name`` in the running episodes, [N], live if it is drawn anew in each."""
+        value = getattr(self, name)
+        if name in self.ranges:
+            return self.sim.array(f"{self.name}.{name}", dtype=type(value))
+        return np.full(self.sim.num_envs, value)
+
+    @property
+    def roots(self) -> tuple[str, ...]:
+        """The bodies that, with all that hangs on them, have the part's mass and friction."""
+        return tuple(name for group in self.groups for name in group.bodies.movable)
+
     def footprints(self) -> tuple[Footprint, ...]:
         """What has to be placed when an episode begins: at least its groups."""
         return tuple(group.footprint for group in self.groups)
+
+    def present(self, footprint: Footprint, row: int) -> Footprint:
+        """As many of a footprint's objects as there are in the episode of ``row``."""
+        return footprint
 
     def positions(self, footprint: str) -> Array:
         """Where the objects of a footprint are now, [N, num, 3] m."""
@@ -246,6 +271,10 @@ class Robot(Part):
         The robot is in it: :meth:`build` has nothing to attach.
         """
         return None
+
+    @property
+    def roots(self) -> tuple[str, ...]:
+        return (self.root,)
 
     @property
     def base(self) -> tuple[float, float]:

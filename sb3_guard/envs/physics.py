@@ -31,9 +31,10 @@ class Physics(Batch):
 
     ``step`` evaluates the sensors in every physics step, which takes up to a sixth of an arm's
     time, though they are read when the control step ends. Here they are switched off until then,
-    with the same results bit for bit. The switch is in a copy of the model that the batch runs on.
-    Every physics step evaluates the sensors where that copy cannot be, because someone gives
-    simulations fields or models of their own; where it could make a difference, because sensors
+    with the same results bit for bit. The switch is in a copy of the model that the batch runs on,
+    or, once simulations have fields of their own, one of these fields. Every physics step evaluates
+    the sensors where someone gives simulations models of their own; where it could make a
+    difference, because sensors
     have a history or may fall asleep with what they are on, plugins read sensors or nothing is
     computed at the new state; and for a lone simulation, where it gains little. A physics callback
     in C (``mjcb_control``) reads them as of the last control step.
@@ -80,22 +81,35 @@ class Physics(Batch):
         :return: which simulations diverged or were given up, [N] bool; they are to be reset
         """
         failed = np.zeros(self.nsim, dtype=bool)
-        if self._copy is None or not self._late:
-            self._steps(failed, before, self.stage)
-        else:
-            option = self._copy.opt
-            flags = option.disableflags
-            option.disableflags = flags | SENSOR
+        if self._late:
+            flags = self._disabled
+            self._disabled = flags | SENSOR
             try:
                 self._steps(failed, before, NONE)
             finally:
-                option.disableflags = flags
+                self._disabled = flags
             _run(self.forward, failed, stage=self.stage)
+        else:
+            self._steps(failed, before, self.stage)
         changed = self._warnings != self._warned
         if np.count_nonzero(changed):  # MuJoCo has reset these simulations by itself
             failed |= changed.any(axis=1)
             self._warned[:] = self._warnings
         return failed
+
+    @property
+    def _disabled(self) -> Any:
+        """What the simulations leave out, bits of :class:`mujoco.mjtDisableBit`: an integer, or
+        [N] if they have fields of their own.
+        """
+        return self._flags.copy() if self._copy is None else self._copy.opt.disableflags
+
+    @_disabled.setter
+    def _disabled(self, flags: Any) -> None:
+        if self._copy is None:
+            self._flags[:] = flags
+        else:
+            self._copy.opt.disableflags = flags
 
     def _steps(self, failed: Array, before: Callable[[], None] | None, stage: int) -> None:
         """The physics steps of a control step, then ``stage`` at the new state."""
@@ -182,12 +196,28 @@ class Physics(Batch):
 
     def set_models(self, models: mujoco.MjModel | Sequence[mujoco.MjModel] | None) -> None:
         super().set_models(models)
-        self._copy = None  # not before: the batch reads it as long as the call may fail
+        # not before: the batch reads the copy as long as the call may fail
+        self._copy, self._late = None, False
 
     def _release(self) -> None:
         """Run on the batch's own model again: only its fields can differ between simulations."""
         if self._copy is not None:
-            self.set_models(None)
+            super().set_models(None)
+            self._copy = None
+            if self._late:
+                self._flags = super().expand("opt.disableflags")
+
+    def scale(self, field: str, rows: Array, ids: Array, factors: Array) -> None:
+        """Give simulations multiples of what the model has.
+
+        :param field: of the model
+        :param rows: of the field, [R]
+        :param ids: simulations, [n]
+        :param factors: [n]
+        """
+        usual = getattr(self.model, field)[rows]  # [R, ...]
+        shape = (-1, *[1] * usual.ndim)
+        self.expand(field)[np.ix_(ids, rows)] = factors.reshape(shape) * usual
 
 
 def _run(call: Callable[..., None], failed: Array, **arguments: int) -> None:

@@ -28,9 +28,9 @@ class Restarts:
     def __init__(
         self, footprints: Sequence[Footprint], count: int, array: Callable[..., Array]
     ) -> None:
-        self._owner = [f for f in footprints for _ in range(f.num)]
         self._blocks = math.ceil(count / BLOCK)
-        self._kept = array("restarts/kept", (KEPT if count else 0, 2, len(self._owner)))
+        objects = sum(f.num for f in footprints)
+        self._kept = array("restarts/kept", (KEPT if count else 0, 2, objects))
         self._left = array("restarts/left", dtype=np.int64)  # how many are kept, [N]
 
     def forget(self, rows: Array | int) -> None:
@@ -41,6 +41,7 @@ class Restarts:
         self,
         row: int,
         rng: np.random.Generator,
+        footprints: Sequence[Footprint],
         apart: Array,
         xy: Array,
         fixed: Array,
@@ -48,30 +49,40 @@ class Restarts:
     ) -> Array | None:
         """A layout in which each object in turn found room among 100 draws.
 
+        :param footprints: what to place in this episode, in order; K objects, as when those
+            layouts were begun that are kept
         :param apart: squared distances that objects keep, [K, K, 1] m²
         :param xy: where those are that have a fixed place, [2, K, 1] m
         :param fixed: which these are, [K] bool
         :param begin: whether layouts are begun if none is kept
         :return: all places, [2, K, 1] m, or None if there is no such layout
         """
+        owner = [f for f in footprints for _ in range(f.num)]
         for _ in range(self._blocks * begin):
             if self._left[row]:
                 break
-            layouts = self._begin(rng, apart, xy, fixed)
+            layouts = self._begin(owner, rng, apart, xy, fixed)
             self._left[row] = len(layouts)
-            self._kept[row, : len(layouts)] = layouts[::-1]
+            self._kept[row, : len(layouts), :, : len(owner)] = layouts[::-1]
         if not self._left[row]:
             return None
         self._left[row] -= 1
-        return self._kept[row, self._left[row], :, :, None].copy()
+        return self._kept[row, self._left[row], :, : len(owner), None].copy()
 
-    def _begin(self, rng: np.random.Generator, apart: Array, xy: Array, fixed: Array) -> Array:
+    def _begin(
+        self,
+        owner: Sequence[Footprint],
+        rng: np.random.Generator,
+        apart: Array,
+        xy: Array,
+        fixed: Array,
+    ) -> Array:
         """The first of a block of layouts that succeed, [up to KEPT, 2, K] m."""
         order = np.append(np.flatnonzero(fixed), np.flatnonzero(~fixed))
         layouts = np.repeat(xy[:, order], BLOCK, axis=2)
         for i in range(int(fixed.sum()), len(order)):
             k, before = order[i], order[:i]
-            room = _place(self._owner[k], apart[k, before, None], layouts, i, rng)
+            room = _place(owner[k], apart[k, before, None], layouts, i, rng)
             layouts = layouts[:, :, room]
         out = np.empty((min(layouts.shape[2], KEPT), *layouts.shape[:2]))
         out[..., order] = np.moveaxis(layouts[:, :, :KEPT], 2, 0)

@@ -148,7 +148,11 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
                 raise ValueError(f"reset_mask must be [{self.num_envs}] bool with a True in it")
             ids = np.flatnonzero(mask)
             seeds = [s if m else None for s, m in zip(seeds, mask, strict=True)]
-        return self.view(self.begin(seeds, ids), self.look()), {}
+        obs = self.begin(seeds, ids)
+        infos: dict[str, Any] = self.engine.drawn.info()
+        everyone = np.ones(self.num_envs, dtype=bool)
+        infos |= {f"_{name}": everyone for name in infos}
+        return self.view(obs, self.look()), infos
 
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Advance every row by one control step."""
@@ -156,8 +160,8 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         out = t.outcome
         everyone = np.ones(self.num_envs, dtype=bool)
         infos: dict[str, Any] = {"cost": out.cost, "_cost": everyone}
-        for name, cost in out.costs.items():
-            infos[name], infos[f"_{name}"] = cost, everyone
+        for name, values in out.details.items():
+            infos[name], infos[f"_{name}"] = values, everyone
         for name, rows in out.events.items():
             if rows.any():
                 infos[name] = infos[f"_{name}"] = rows

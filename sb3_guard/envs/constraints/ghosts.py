@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from sb3_guard.envs import motion
 from sb3_guard.envs.constraints.obstacles import Obstacles
 from sb3_guard.envs.groups import check_reachable, check_size
+from sb3_guard.envs.layout import AWAY
 from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Simulation
@@ -39,10 +40,15 @@ class Ghosts(Movers, Obstacles):
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        near = self.size + (sim.robot.extent if self.solid else 0.0)
+        near = self.span("size").low + (sim.robot.extent if self.solid else 0.0)
         check_reachable(self, near, everywhere=False)
         if self.num and not self.solid:
             check_size(self, self.name, self.size)
+
+    def before_step(self) -> None:
+        if "num" in self.ranges:  # their law has led home who is away
+            self.group.places[self.absent] = AWAY
+        super().before_step()
 
     def law(self) -> motion.Law:
         return self._law(far=self.speed if self.v1 is None else self.v1, r1=self.r1)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.groups import BOX, add_geom
+from sb3_guard.envs.groups import BOX, MOST, add_geom
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Array, Generators, Simulation
 
@@ -34,6 +34,7 @@ class Gremlins(Obstacles):
         "speed": "set rate, the angular speed on the circle, rad/s",
     }
 
+    num: int = param(8, "number of objects", low=0, high=MOST)
     size: float = param(0.1, "half of an edge, m", above=0)
     keepout: float | None = param(
         None,

@@ -26,6 +26,6 @@ class Hazards(Obstacles):
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        check_reachable(self, self.size, everywhere=False)
+        check_reachable(self, self.span("size").low, everywhere=False)
         if self.num:
             check_size(self, self.name, self.size)

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs.groups import MOST, Group
-from sb3_guard.envs.layout import Rectangle
+from sb3_guard.envs.layout import Footprint, Rectangle, first
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Constraint, World
+from sb3_guard.envs.part import Array, Constraint, Simulation, World
 
 
 @dataclass
@@ -22,8 +22,8 @@ class Obstacles(Constraint):
     touches when the control step ends, each counted once however many contact points it has.
     """
 
-    num: int = param(8, "number of objects", low=0, high=MOST)
-    size: float = param(0.3, "radius of an object, m", above=0)
+    num: int = param(8, "number of objects", low=0, high=MOST, drawn=True)
+    size: float = param(0.3, "radius of an object, m", above=0, drawn=True)
     keepout: float | None = param(
         None, "radius kept clear around an object, m; null: 0.4, or what covers a solid one", low=0
     )
@@ -38,6 +38,15 @@ class Obstacles(Constraint):
     welded = False  # whether they can be pushed but are pulled back
     moves: ClassVar[bool] = False  # whether they leave their places by themselves
     reachable: ClassVar[bool] = False  # whether they lie within the robot's reach
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.solid and "size" in self.ranges:
+            low, high = self.ranges["size"]
+            raise ValueError(
+                f"{self.name}.size = {{'low': {low:g}, 'high': {high:g}}} cannot be drawn of solid "
+                "ones, which are bodies: give one number"
+            )
 
     @property
     def cover(self) -> float:
@@ -68,15 +77,30 @@ class Obstacles(Constraint):
             self.welded,
             self.begins,
             reachable=self.reachable,
+            grip="friction" if self.free else None,
             mover=self.moves,
         )
         self.groups = (self.group,)
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        self._nums, self._sizes = self.current("num")[:, None], self.current("size")[:, None]
+
+    def present(self, footprint: Footprint, row: int) -> Footprint:
+        is_mine = footprint.name == self.name
+        return first(footprint, int(self._nums[row, 0])) if is_mine else footprint
+
+    @property
+    def absent(self) -> Array:
+        """Which objects the episodes are without, [N, num] bool."""
+        absent: Array = np.arange(self.num) >= self._nums
+        return absent
 
     def amounts(self) -> Array:
         """What each object costs, [N, num]."""
         if self.solid:
             return self.weight * self.group.bodies.touched
-        depth = self.size - self.sim.robot.clearance(self.group.centers, self.planar)
+        depth = self._sizes - self.sim.robot.clearance(self.group.centers, self.planar)
         return self.weight * np.maximum(depth, 0.0)
 
     def cost(self) -> Array:

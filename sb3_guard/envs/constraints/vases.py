@@ -8,9 +8,9 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.groups import BOX, add_geom
+from sb3_guard.envs.groups import BOX, MOST, add_geom
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array
+from sb3_guard.envs.part import FRICTION, MASS, Array
 
 
 @dataclass
@@ -30,6 +30,7 @@ class Vases(Obstacles):
     free = True
     usual_keepout = 0.15
 
+    num: int = param(8, "number of objects", low=0, high=MOST)
     size: float = param(0.1, "half of an edge, m", above=0)
     keepout: float | None = param(
         None, "radius kept clear around a vase, m; null: 0.15, or what covers it", low=0
@@ -38,6 +39,8 @@ class Vases(Obstacles):
         None, "how deep they begin in the floor, m; null: as deep as they rest", low=0
     )
     density: float = param(0.01, "kg/m³", above=0)
+    mass: float = MASS
+    friction: float = FRICTION
     displacement_weight: float = param(0.0, "cost per metre from its place", low=0)
     displacement_threshold: float = param(1e-3, "least displacement that costs, m", low=0)
     velocity_weight: float = param(1.0, "cost per m/s", low=0)

@@ -31,7 +31,7 @@ from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.observation import Observations, Values
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Generators, Robot, Simulation, World
+from sb3_guard.envs.part import FRICTION, MASS, Array, Generators, Robot, Simulation, World
 from sb3_guard.envs.robots import mjcf
 from sb3_guard.spelling import did_you_mean
 
@@ -85,6 +85,11 @@ class MJCFRobot(Robot):
     action_noise: float = param(
         0.0, "standard deviation of Gaussian noise on every action, in units of actions", low=0
     )
+    delay: int = param(
+        0, "control steps that pass until an action has effect", low=0, high=100, drawn=True
+    )
+    mass: float = MASS
+    friction: float = FRICTION
     sensing: tuple[str, ...] | None = param(
         None, "bodies that carry lidar and compass; null: the robot's own choice"
     )
@@ -173,6 +178,9 @@ class MJCFRobot(Robot):
             self.action_range = low, high
             self._center, self._half = np.zeros(model.nu), np.ones(model.nu)
         self._ctrl = batch.bind("ctrl")
+        if self.delay:  # rings of the latest actions, by step
+            self._actions = sim.array("robot/actions", (self.delay + 1, model.nu))
+            self._delays = self.current("delay")
         self._qpos = batch.bind("qpos")
         start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, prefix + "start")
         self._start = model.key_qpos[start] if start >= 0 else model.qpos0
@@ -260,6 +268,8 @@ class MJCFRobot(Robot):
 
     def reset(self, ids: Array, rngs: Generators) -> None:
         self._qpos[ids, : len(self._start)] = self._start
+        if self.delay:
+            self._actions[ids] = 0.0
         if self.complete:
             return
         places = self.sim.places("robot")
@@ -275,7 +285,15 @@ class MJCFRobot(Robot):
         if self.action_noise:
             noise = [rng.standard_normal(self.action_size) for rng in self.sim.rngs]
             actions = actions + self.action_noise * np.array(noise)
+        if self.delay:
+            actions = self._delayed(actions)
         self._ctrl[:] = self._center + self._half * actions
+
+    def _delayed(self, actions: Array) -> Array:
+        """The actions of ``delay`` steps ago, [N, action_size], keeping those of now for later."""
+        rows, steps, slots = np.arange(len(actions)), self.sim.steps, self.delay + 1
+        self._actions[rows, steps % slots] = actions
+        return self._actions[rows, (steps - self._delays) % slots]
 
     def observations(self) -> Observations:
         out = dict(self._live)

@@ -17,7 +17,9 @@ REDRAWS = 20  # new places drawn before one that is reached already is accepted
 class Destination(Task):
     """A place that the robot, or what it pushes, has to reach."""
 
-    size: float = param(0.5, "radius within which the goal counts as reached, m", above=0)
+    size: float = param(
+        0.5, "radius within which the goal counts as reached, m", above=0, drawn=True
+    )
     keepout: float = param(0.4, "radius kept clear around the goal, m", low=0)
     reward_distance: float = param(1.0, "reward per metre gained")
     reward_limit: float | None = param(
@@ -63,6 +65,7 @@ class Destination(Task):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self.place = sim.places("goal")[:, 0]  # [N, 3] m
+        self.sizes = self.current("size")  # [N] m
 
     def advance(self, ids: Array) -> Array:
         return np.array([i for i in ids.tolist() if not self._redraw(i)], dtype=int)
@@ -87,4 +90,4 @@ class Destination(Task):
 
     def draw(self, painter: Painter, row: int) -> None:
         lift = 0.25 if self.planar else 0.0
-        painter.zone(self.place[row] + [0, 0, lift], self.size, lift, self.color)
+        painter.zone(self.place[row] + [0, 0, lift], self.sizes[row], lift, self.color)

@@ -25,7 +25,7 @@ class Goal(Destination):
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        check_reachable(self, self.size, everywhere=True)
+        check_reachable(self, self.span("size").low, everywhere=True)
         check_size(self, "goal", self.size)
 
     def measure(self) -> Array:
@@ -36,4 +36,4 @@ class Goal(Destination):
         return self.reward_distance * (before[:, 0] - now[:, 0])
 
     def succeeded(self, now: Array) -> Array:
-        return now[:, 0] <= self.size
+        return now[:, 0] <= self.sizes

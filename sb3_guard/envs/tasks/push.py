@@ -39,6 +39,12 @@ class Push(Destination):
     )
     object_size: float = param(0.2, "radius of the ball, half an edge of the box, m", above=0)
     object_density: float = param(1e-3, "density of the object, kg/m³", above=0)
+    object_mass: float = param(
+        1.0, "factor on the object's mass and inertia", above=0, drawn="mass"
+    )
+    object_friction: float = param(
+        1.0, "factor on the object's friction with the floor", low=0, drawn="friction"
+    )
     object_rolling: float = param(
         0.05, "rolling friction of the ball, m; with 0.005 it rolls on for metres", low=0
     )
@@ -87,6 +93,7 @@ class Push(Destination):
             sink=self.sink,
             reachable=True,
             label=f"{self.name}.object_keepout",
+            grip="object_friction",
             placements=self.object_placements or self.placements,
             locations=self.object_locations,
             margin=self.margin if self.object_margin is None else self.object_margin,
@@ -134,7 +141,7 @@ class Push(Destination):
         return self.reward_approach * gain[:, 0] * far + self.reward_distance * gain[:, 1]
 
     def succeeded(self, now: Array) -> Array:
-        return now[:, 1] <= self.size
+        return now[:, 1] <= self.sizes
 
     def observations(self) -> Observations:
         out = {**super().observations(), "box_compass": Compass(self.center, self.planar)}

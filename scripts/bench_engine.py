@@ -9,18 +9,21 @@ comes and goes in minutes; with ``--threads 1``, by the time that one core had, 
 ``--beside PYTHON`` runs the real Safety-Gymnasium, in the environment that
 ``scripts/check_safety_gymnasium.py`` sets up, in turn with our task of the same id: on one core by
 its time, or with ``--threads 2`` ours on two, both by the clock on the wall. The best slices of 40
-steps count.
+steps count. ``--params '{"robot": {"mass": {"low": 0.5, "high": 2}}}'`` prints what parameters
+cost: a suite in turn with the same suite that has them.
 """
 
 from __future__ import annotations
 
 import argparse
 import fnmatch
+import json
 import math
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 import mujoco
@@ -95,6 +98,36 @@ def batch_rates(
     engine.steps[:] = np.arange(n) * (full.envs.max_episode_steps // n)
     clock = time.process_time if threads == 1 else time.perf_counter
     return best({"full": step_full, "bare": step_bare}, seconds, slices, clock)
+
+
+def param_rates(
+    env_id: str,
+    params: dict[str, Any],
+    n: int,
+    seconds: float,
+    slices: int,
+    threads: int | None = None,
+) -> dict[str, float]:
+    """Full vector steps of a suite as it is and with other parameters, N = n."""
+
+    def stepper(**changes: Any) -> Callable[[], int]:
+        env = GuardVecEnv(env_spec(env_id).kwargs["scenario"], n, num_threads=threads, **changes)
+        env.seed(0)
+        env.reset()
+        env.envs.engine.steps[:] = np.arange(n) * (env.envs.max_episode_steps // n)
+        shape = (64, n, *env.action_space.shape)
+        actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
+        turn = iter(range(10**12))
+
+        def step() -> int:
+            for _ in range(4):
+                env.step(actions[next(turn) % 64])
+            return 4 * n
+
+        return step
+
+    clock = time.process_time if threads == 1 else time.perf_counter
+    return best({"as it is": stepper(), "changed": stepper(**params)}, seconds, slices, clock)
 
 
 def single_rates(env_id: str, seconds: float, slices: int) -> dict[str, float]:
@@ -209,6 +242,9 @@ def main() -> None:
         help="a table of the suites whose ids match, such as '*_Arm?_*'",
     )
     table.add_argument("--beside", metavar="PYTHON", help="that Python's Safety-Gymnasium instead")
+    table.add_argument(
+        "--params", type=json.loads, metavar="JSON", help="the suite beside itself with these"
+    )
     parser.add_argument("--seconds", type=float, default=6.0, help="time for each figure")
     parser.add_argument("--slices", type=int, default=20, help="slices that alternate")
     parser.add_argument("--rounds", type=int, default=1, help="times through a table")
@@ -216,6 +252,13 @@ def main() -> None:
     args = parser.parse_args()
     if args.beside:
         return beside(args.beside, args.env, args.threads or 1)
+    if args.params:
+        for n in (1, 30):
+            rates = param_rates(args.env, args.params, n, args.seconds, args.slices, args.threads)
+            usual, changed = rates.values()
+            print(f"{args.env}, N = {n}: {usual:,.0f} steps/s; with params {changed:,.0f}, "
+                  f"{100 * (1 - changed / usual):.1f} % fewer")  # fmt: skip
+        return
     patterns = ["*"] if args.all else args.suites or []
     if args.rounds < 1:
         parser.error(f"--rounds {args.rounds} must be at least 1")

@@ -1,6 +1,7 @@
 """Ids of environments: one rule for a version that is left out."""
 
 import re
+from collections.abc import Iterable
 
 import gymnasium
 from gymnasium.envs.registration import find_highest_version
@@ -10,9 +11,17 @@ class UnknownId(ValueError):
     """An id that names no environment."""
 
 
-def with_version(name: str) -> str:
-    """An id in full: without a version, the latest that is registered with Gymnasium, else v0."""
+def with_version(name: str, others: Iterable[str] = ()) -> str:
+    """An id in full: without a version, the latest that is registered with Gymnasium, else v0.
+
+    :param others: ids that count beside the registered ones
+    """
     if re.search(r"-v\d+$", name) or name in gymnasium.registry:
         return name
     namespace, _, short = name.rpartition("/")
-    return f"{name}-v{find_highest_version(namespace or None, short) or 0}"
+    versions = [find_highest_version(namespace or None, short) or 0]
+    for other in others:
+        stem, _, version = other.rpartition("-v")
+        if stem == name:
+            versions.append(int(version))
+    return f"{name}-v{max(versions)}"

@@ -211,7 +211,6 @@ def test_scenarios_from_files(tmp_path):
     ("text", "message"),
     [
         ("task: Goal\nrobot: Ant\ntask: Push\n", "line 3 has the key 'task' again, after line 1: "),
-        ("task: Goal\nconstraints: &all [*all]\n", "found .* recursive .* line 2, column 14"),
         ("constraints:\n  hazards:\n    num: 2\n    num: 3\n", "line 4 .* 'num' .* line 3: "),
         ("task: Goal\nconstraints: {hazards: {num: 2, num: 2}}\n", "line 2 .* 'num' .* line 2: "),
         ("constraints:\n  ghosts:\n  'ghosts': {num: 2}\n", "line 3 has the key 'ghosts' again"),

@@ -33,7 +33,7 @@ def env_ids(suite: str | None = None) -> list[str]:
 
 def episode_steps(name: str) -> int:
     """Control steps after which an episode of this id is cut."""
-    env_id = with_version(name)
+    env_id = with_version(name, env_ids())
     return next((s.steps[env_id] for s in SUITES.values() if env_id in s.steps), EPISODE_STEPS)
 
 
@@ -42,7 +42,7 @@ def fields(name: str) -> Fields:
 
     :raises UnknownId: no family knows it
     """
-    env_id = with_version(name)
+    env_id = with_version(name, env_ids())
     for suite in SUITES.values():
         found = suite.scenarios.get(env_id)
         if found is None:

@@ -13,6 +13,7 @@ arXiv 2111.00072) bound what that may cost.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -61,7 +62,7 @@ def importance(log_ratio: th.Tensor) -> tuple[th.Tensor, float]:
 class _Part(NamedTuple):
     """An earlier rollout as an update sees it, N rows."""
 
-    observations: PyTorchObs
+    observations: Callable[[], PyTorchObs]  # made when they are needed: they take much memory
     actions: th.Tensor
     log_prob: th.Tensor  # of the old policy, (N,)
     weighted: th.Tensor  # W · A, (N, m)
@@ -93,8 +94,9 @@ class PooledSurrogates(CostSurrogates):
         distribution = self.actor.policy.get_distribution
         changes = [self.shares[0] * super().changes(ratio)]
         for part, share in zip(self.parts, self.shares[1:], strict=True):
+            observations = part.observations()
             log_prob = [
-                distribution(rows(part.observations, index)).log_prob(part.actions[index])
+                distribution(rows(observations, index)).log_prob(part.actions[index])
                 for index in chunks(len(part.log_prob))
             ]
             moved = th.exp(th.cat(log_prob) - part.log_prob) - 1.0
@@ -232,7 +234,8 @@ class Reuse(TrustRegion):
         advantages = self._cost_advantages(rollout, observations, traces).to(weights)
         weighted = weights[:, None] * (advantages - weights @ advantages)
         gradients = th.stack([actor.score(column) for column in weighted.unbind(dim=1)])
-        return _Part(observations, actions, actor.old_log_prob, weighted, gradients, size)
+        again = partial(self._today, rollout.observations, 2)
+        return _Part(again, actions, actor.old_log_prob, weighted, gradients, size)
 
     def _today(self, observations: Any, lead: int = 1) -> PyTorchObs:
         """Kept observations as the policy sees them today; ``lead`` axes become one of rows."""

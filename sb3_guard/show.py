@@ -96,7 +96,9 @@ def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
         stated: Any = fields(part)  # type: ignore[arg-type]  # every part is a dataclass
         changed = {f.name for f in stated if getattr(part, f.name) != f.default}
         named = words | {"weight", "indicator"} & changed
-        values = ", ".join(f"{f.name} {getattr(part, f.name)}" for f in stated if f.name in named)
+        ranges = {name: f"{low:g} to {high:g}" for name, (low, high) in part.ranges.items()}
+        shown = {f.name: ranges.get(f.name, getattr(part, f.name)) for f in stated}
+        values = ", ".join(f"{name} {value}" for name, value in shown.items() if name in named)
         yield f"info['cost_{part.name}']: {text}" + (f" Here: {values}." if values else "")
     how = "1 if any of these costs" if env.scenario.cost == "any" else "their sum"
     if len(parts) > 1:

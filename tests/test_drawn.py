@@ -12,7 +12,7 @@ from worlds import ROW, actions, assert_rows_are_lone_environments, world
 from sb3_guard import Scenario, make, make_vec_env
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.layout import AWAY
-from sb3_guard.show import drawn_table
+from sb3_guard.show import costs, drawn_table
 
 SPREAD = {"low": 0.5, "high": 2.0}
 DELAY = {"low": 0, "high": 25}
@@ -288,9 +288,11 @@ def test_info_has_what_was_drawn_if_asked():
 
 def test_show_lists_what_is_drawn():
     params = {"hazards": {"size": {"low": 0.1, "high": 0.3}}, "robot": {"delay": DELAY}}
-    table = drawn_table(GuardVectorEnv(1, "Goal_Point_8Hazards", **params))
+    env = GuardVectorEnv(1, "Goal_Point_8Hazards", **params)
+    table = drawn_table(env)
     rows = [[cell.strip() for cell in row.split("|")[1:3]] for row in table.splitlines()]
     assert ["hazards.size", "0.1 to 0.3"] in rows and ["robot.delay", "0 to 25"] in rows
+    assert "Here: size 0.1 to 0.3." in next(costs(env, "Goal_Point_8Hazards-v0"))
 
 
 def test_free_objects_lie_still_whatever_their_friction():

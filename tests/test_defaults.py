@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from sb3_guard import ALGORITHMS, make_model, make_vec_env, train
-from sb3_guard.algorithms import SACLag, TD3Lag
+from sb3_guard.algorithms import CostReplay
 from sb3_guard.zoo.hyperparams import RUN_KEYS, build, check, parameters, read_hyperparams
 from sb3_guard.zoo.make_envs import seed_rows
 from sb3_guard.zoo.usage import UsageError
@@ -45,7 +45,7 @@ def test_entries_hold_only_what_depends_on_the_environment(algo: str, env_id: st
 
 def shortened(algo: str) -> dict[str, Any]:
     """What makes an update short."""
-    if issubclass(ALGORITHMS[algo], SACLag | TD3Lag):
+    if issubclass(ALGORITHMS[algo], CostReplay):
         return {"n_envs": N_ENVS, "learning_starts": 200, "buffer_size": 10_000}
     return {"n_envs": N_ENVS, "n_steps": ROLLOUT}
 

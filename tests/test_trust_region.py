@@ -1,7 +1,6 @@
 """The base algorithm: Fisher products, critics, line search and hooks, and TRPO's reference."""
 
 import copy
-import random
 from typing import Any
 
 import numpy as np
@@ -590,37 +589,6 @@ def test_surrogate_is_ascended_and_fit_comes_after_the_step() -> None:
     a, b = moves
     assert nn.functional.cosine_similarity(a, b, dim=0) < -0.9
     assert model.order[0] == "surrogate" and model.order[-1] == "fit"
-
-
-def test_generators_are_kept_from_before_the_rollout() -> None:
-    states: list[tuple[Any, Any]] = []
-
-    class Record(BaseCallback):
-        def _on_rollout_start(self) -> None:
-            states.append((self.model._rng_at_rollout, th.get_rng_state()))
-
-        def _on_step(self) -> bool:
-            return True
-
-    env = make_vec_env(CostPoint, 1, seed=0)
-    model = TRPO("MlpPolicy", env, n_steps=10, n_critic_updates=1, use_sde=True, seed=0)
-    before = th.get_rng_state()
-    model.learn(10, callback=Record())
-    python, numpy, torch = states[0][0]
-    assert th.equal(torch, before), "taken before gSDE draws its noise"
-    assert not th.equal(states[0][1], before)
-    random.setstate(python)
-    np.random.set_state(numpy)  # noqa: NPY002
-
-
-@pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
-def test_generators_of_a_gpu_are_kept_from_before_the_rollout() -> None:
-    env = make_vec_env(CostPoint, 1, seed=0)
-    model = TRPO("MlpPolicy", env, n_steps=10, n_critic_updates=1, use_sde=True, device="cuda")
-    before = th.cuda.get_rng_state()
-    model.learn(10)
-    assert th.equal(model._cuda_at_rollout[th.cuda.current_device()], before)
-    assert not th.equal(th.cuda.get_rng_state(), before)
 
 
 @pytest.mark.parametrize("cls", [TRPO, CPO])

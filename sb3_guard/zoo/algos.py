@@ -3,7 +3,6 @@
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard.algorithms import ALGORITHMS
-from sb3_guard.algorithms.common.generators import KeepsGenerators
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.usage import UsageError
 
@@ -15,15 +14,7 @@ def baselines() -> dict[str, type[BaseAlgorithm]]:
     """RL-Zoo's algorithms by key: unconstrained, with their costs logged; ``trpo`` is ours."""
     from rl_zoo3.utils import ALGOS
 
-    others = {key: ALGOS[key] for key in ALGOS if key not in ALGORITHMS and key not in NOT_HERE}
-    return {key: _keeping(cls) for key, cls in others.items()}
-
-
-def _keeping(cls: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
-    """The class, with its generators kept, under its name, which logs and tables show."""
-    if issubclass(cls, KeepsGenerators):  # a user's, that RL-Zoo has been told of
-        return cls
-    return type(cls.__name__, (KeepsGenerators, cls), {})
+    return {key: ALGOS[key] for key in ALGOS if key not in ALGORITHMS and key not in NOT_HERE}
 
 
 def algorithm(key: str) -> type[BaseAlgorithm]:

@@ -19,6 +19,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
@@ -37,8 +38,10 @@ REPLAY_BUFFER = "replay_buffer.pkl"
 EARLIER = "earlier"  # folder beside the checkpoint: earlier rollouts, each written once
 # Checkpoints take at most this share of the time: those with a replay buffer are large.
 LARGEST_SHARE = 0.05
+# The tensors with gSDE's noise, of all environments and of one each.
+GSDE_NOISE = "exploration_mat", "exploration_matrices"
 # Increased when the content changes, and the formats that can be continued.
-FORMAT, FORMATS = 6, (5, 6)
+FORMAT, FORMATS = 7, (5, 6, 7)
 
 
 class Interrupted(Exception):
@@ -50,12 +53,21 @@ def random_state() -> tuple[Any, Any, th.Tensor]:
     return random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
 
 
-def set_random_state(state: tuple[Any, Any, th.Tensor]) -> None:
-    """Put the global generators where :func:`random_state` found them."""
-    python, numpy, torch = state
+def set_random_state(state: Mapping[str, Any]) -> None:
+    """Put the generators of the process, and of its GPUs, where a checkpoint found them."""
+    python, numpy, torch = state["generators"]
     random.setstate(python)
     np.random.set_state(numpy)  # noqa: NPY002
     th.set_rng_state(torch)
+    if state["cuda"] and th.cuda.is_available():
+        th.cuda.set_rng_state_all(state["cuda"])
+
+
+def _exploration(model: BaseAlgorithm) -> StateDependentNoiseDistribution | None:
+    """The distribution whose noise gSDE draws before callbacks hear of a rollout, if it is used."""
+    actor = getattr(model.policy, "actor", None) or model.policy
+    distribution = getattr(actor, "action_dist", None)
+    return distribution if isinstance(distribution, StateDependentNoiseDistribution) else None
 
 
 class Checkpoints(BaseCallback):
@@ -93,6 +105,7 @@ class Checkpoints(BaseCallback):
         self._elapsed = 0.0  # seconds of training before this process
         self._start = 0  # steps at which the run, not this process, began
         self._noise: ActionNoise | None = None  # as a checkpoint found it
+        self._resumed: dict[str, Any] | None = None  # the checkpoint, until the next rollout starts
         self._last = -np.inf
         self._took = 0.0  # seconds to write the last one
         self._between = True
@@ -106,15 +119,12 @@ class Checkpoints(BaseCallback):
             self.model.action_noise = self._noise
 
     def _on_rollout_start(self) -> None:
+        self._continue_rollout()
         pause = max(self.every, self._took / LARGEST_SHARE if self.every > 0 else 0.0)
         due = time.monotonic() - self._last >= pause
         self.stop |= self.asked()
         if self.stop or (due and self.rollouts % self.log_interval == 0):
-            # gSDE has drawn its noise by now; the algorithm remembers how things were before.
-            self.write(
-                getattr(self.model, "_rng_at_rollout", None) or random_state(),
-                getattr(self.model, "_cuda_at_rollout", None),
-            )
+            self.write(at_rollout=True)
         if self.stop:
             raise Interrupted
         self._between = False
@@ -129,16 +139,20 @@ class Checkpoints(BaseCallback):
     def _on_training_end(self) -> None:
         # A callback may have stopped training within a rollout: then the last boundary stands.
         if self._between:
-            self.write(random_state())
+            self.write(at_rollout=False)
 
-    def write(
-        self, generators: tuple[Any, Any, th.Tensor], cuda: list[th.Tensor] | None = None
-    ) -> None:
+    def _continue_rollout(self) -> None:
+        """In the first rollout of a resumed run, take the noise that gSDE drew for it before."""
+        state, self._resumed = self._resumed or {}, None
+        if state.get("noise") is not None:
+            set_random_state(state)
+            vars(_exploration(self.model)).update(state["noise"])
+
+    def write(self, at_rollout: bool) -> None:
         """
         Write the checkpoint, replacing the one before in one step.
 
-        :param generators: see :func:`random_state`
-        :param cuda: the GPUs' generators, as they are now if there is nothing to go back to
+        :param at_rollout: whether a rollout starts, for which gSDE has drawn its noise
         """
         assert isinstance(self.logger, RunLogger)
         began = time.monotonic()
@@ -150,16 +164,17 @@ class Checkpoints(BaseCallback):
                 "This environment can't save its state (it can't be pickled and has no state()): "
                 "if the run is resumed, its episodes are restarted."
             )
-        if not cuda and th.cuda.is_available():
-            cuda = th.cuda.get_rng_state_all()
+        exploration = _exploration(self.model) if at_rollout else None
         state = {
             "format": FORMAT,
             "what": self.what,
             "num_timesteps": self.model.num_timesteps,
-            "generators": generators,
+            "generators": random_state(),
+            "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
+            "noise": exploration
+            and {name: vars(exploration)[name].detach() for name in GSDE_NOISE},
             # Off-policy algorithms fill their buffers with random actions from here.
             "action_space": self.model.action_space.np_random,
-            "cuda": cuda or [],
             "environments": environments,
             # Seeded again for each evaluation, but a wrapper may remember more than its episode.
             "evaluation": [capture(env) for env in self._evaluation_envs()],
@@ -198,6 +213,7 @@ class Checkpoints(BaseCallback):
         :param noise: the loaded model's exploration noise, which `learn` resets
         """
         self._noise = copy.deepcopy(noise)
+        self._resumed = state
         self.rollouts = state["rollouts"]
         self._elapsed = state["elapsed"]
         self._start = state["start"]
@@ -357,7 +373,5 @@ def restore_run(model: BaseAlgorithm, state: dict[str, Any], folder: Path) -> No
         # ones of the run again.
         model._last_obs = None
         seed_rows(env, model.seed or 0, 0, state["num_timesteps"])
-    set_random_state(state["generators"])
+    set_random_state(state)
     model.action_space._np_random = state["action_space"]
-    if state["cuda"] and th.cuda.is_available():
-        th.cuda.set_rng_state_all(state["cuda"])

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -31,7 +32,6 @@ from sb3_guard.algorithms.common.arguments import (
     with_defaults,
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
-from sb3_guard.algorithms.common.generators import KeepsGenerators
 from sb3_guard.algorithms.common.limits import CostLimits
 from sb3_guard.algorithms.common.loading import LoadsOthers
 from sb3_guard.checks import NumberError, is_number
@@ -50,7 +50,7 @@ def _within(callback: BaseCallback) -> Iterator[BaseCallback]:
         yield from _within(one)
 
 
-class Constrained(LoadsOthers, CostLimits, KeepsGenerators):
+class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
     """Cost keys, limits and episode costs beside an algorithm of Stable-Baselines3.
 
     Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. A subclass states its

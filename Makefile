@@ -8,7 +8,7 @@ STEPS ?= 1000000
 LIMIT ?= $(if $(filter cpo_Goal_Point_8Hazards,$(ALGO)_$(ENV)),5)
 ARGS ?=
 
-.PHONY: train test test-slow test-lowest check format type docs gallery bench clean
+.PHONY: train test test-slow test-lowest check format type docs gallery bench fingerprint clean
 
 # torch goes first and alone: a requirement that another package leaves open would fetch CUDA builds
 $(VENV)/ready: pyproject.toml constraints.txt
@@ -50,6 +50,10 @@ type: $(VENV)/ready
 bench: $(VENV)/ready
 	$(BIN)/python scripts/bench_engine.py
 	$(BIN)/python scripts/bench_training.py
+
+# Hashes of what environments and algorithms compute; ARGS="--match cpo" for some of them.
+fingerprint: $(VENV)/ready
+	@$(BIN)/python scripts/fingerprint.py $(ARGS)
 
 $(VENV)/docs-ready: $(VENV)/ready
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"

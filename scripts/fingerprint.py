@@ -2,8 +2,8 @@
 
 A refactoring must leave every line as it was::
 
-    python scripts/fingerprint.py > before.txt        # then change the code
-    python scripts/fingerprint.py | diff before.txt -
+    make -s fingerprint > before.txt        # then change the code
+    make -s fingerprint | diff before.txt -
 
 Each suite is stepped 200 times in three rows with random actions: observations, rewards, costs and
 ends of episodes are hashed. Each algorithm learns for a few seconds: its weights are hashed. The

@@ -2,7 +2,6 @@
 
 import functools
 import importlib.util
-import os
 import re
 import subprocess
 import sys
@@ -119,8 +118,19 @@ def test_commands_named_in_the_readme_exist():
     text = (ROOT / "README.md").read_text()
     for module in re.findall(r"python -m (sb3_guard\.\w+)", text):
         assert importlib.util.find_spec(module), module
-    for path in re.findall(r"python (scripts/\w+\.py)", text):
-        assert os.access(ROOT / path, os.R_OK), path
+
+
+def test_scripts_exist_where_they_are_named_and_each_is_named_somewhere():
+    code = [path for part in ("sb3_guard", "examples", "scripts", "tests")
+            for path in (ROOT / part).rglob("*.py")]  # fmt: skip
+    guides = [*{*DOCUMENTS} - {ROOT / "CHANGELOG.md"}, ROOT / "Makefile"]
+    named = {
+        path: set(re.findall(r"\bscripts/[\w/]+\.py", path.read_text())) for path in guides + code
+    }
+    for path, scripts in named.items():
+        assert not {name for name in scripts if not (ROOT / name).exists()}, path
+    scripts = {path.relative_to(ROOT).as_posix() for path in (ROOT / "scripts").rglob("*.py")}
+    assert scripts <= set().union(*(named[path] for path in guides))
 
 
 def test_tables_of_results_are_made_of_their_logs():

@@ -7,15 +7,13 @@ used.
 import importlib
 from typing import Any
 
+from sb3_guard.algorithms import CLASSES
+
 __version__ = "0.1.0"
 
 # module -> the public names that it has
 _EXPORTS = {
-    "sb3_guard.algorithms": (
-        "CPO", "PCPO", "TRPO", "TRPOFAC", "TRPOIPO", "TRPOLag", "TRPOSL", "TRPOUSL",
-        "PPOLag", "CPPOPID", "FOCOPS", "CUP", "P3O", "CRPO", "RCPO", "SCPO",
-        "SACLag", "TD3Lag", "TQCLag", "ALGORITHMS", "register_algorithm",
-    ),
+    "sb3_guard.algorithms": (*CLASSES.values(), "ALGORITHMS", "register_algorithm"),
     "sb3_guard.common.callbacks": ("CostEvalCallback", "LogCosts"),
     "sb3_guard.common.evaluation": ("evaluate_policy",),
     "sb3_guard.common.monitor": ("CostMonitor",),

@@ -128,6 +128,10 @@ def test_nothing_imports_the_zoo_but_the_commands():
 @pytest.mark.parametrize(
     ("statement", "absent"),
     [
+        (
+            "from sb3_guard.algorithms import register_algorithm, CLASSES",
+            ["torch", "stable_baselines3"],
+        ),
         ("import sb3_guard.envs", ["torch", "stable_baselines3", "rl_zoo3", "optuna"]),
         (  # where MuJoCo is missing, too
             "import sys; sys.modules['mujoco'] = None\n"

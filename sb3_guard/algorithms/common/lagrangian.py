@@ -57,6 +57,7 @@ class Multiplier(nn.Module):
         self,
         n_costs: int,
         rate: float,
+        *,
         init: float = 0.0,
         maximum: float | None = None,
         adam: bool = False,
@@ -192,14 +193,14 @@ class Lagrangian(Constrained):
         self.multiplier = Multiplier(
             len(self.cost_keys),
             self.lambda_lr,
-            self.lambda_init,
-            highest,
-            self.lambda_optimizer == "adam",
-            self.proportional_gain,
-            self.derivative_gain,
-            self.lambda_smoothing,
-            self.lambda_delay,
-            relative,
+            init=self.lambda_init,
+            maximum=highest,
+            adam=self.lambda_optimizer == "adam",
+            proportional=self.proportional_gain,
+            derivative=self.derivative_gain,
+            smoothing=self.lambda_smoothing,
+            delay=self.lambda_delay,
+            relative=relative,
         )
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

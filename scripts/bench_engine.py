@@ -32,7 +32,8 @@ from mujoco.batch import Batch
 
 from sb3_guard.common.vec_env import GuardVecEnv
 from sb3_guard.envs import env_ids, env_spec
-from sb3_guard.envs.physics import ACC, FRAME_SKIP, profiling_clock
+from sb3_guard.envs.mujoco_gaps import profiling_clock
+from sb3_guard.envs.physics import ACC, FRAME_SKIP
 from sb3_guard.envs.vector_env import GuardVectorEnv
 
 CLOCK = profiling_clock()

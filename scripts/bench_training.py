@@ -30,7 +30,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_guard import ALGORITHMS, make_vec_env
-from sb3_guard.envs.physics import profiling_clock
+from sb3_guard.envs.mujoco_gaps import profiling_clock
 from sb3_guard.zoo.hyperparams import build, check, read_hyperparams
 
 N_ENVS, N_STEPS = 30, 1000

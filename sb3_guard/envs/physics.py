@@ -1,18 +1,18 @@
-"""The simulations of a world: the one module that knows :mod:`mujoco.batch`.
+"""The simulations of a world: the one module that makes a :class:`mujoco.batch.Batch`.
 
 It advances them by control steps, evaluates the sensors once in each, and tells which simulations
 diverged.
 """
 
 import copy
-import ctypes
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
+
+from sb3_guard.envs.mujoco_gaps import put_to_sleep, silence_profiler
 
 Array = np.ndarray
 FRAME_SKIP = 10
@@ -20,7 +20,6 @@ ACC = int(mujoco.mjtStage.mjSTAGE_ACC)  # touch, accelerometer and contacts desc
 NONE = int(mujoco.mjtStage.mjSTAGE_NONE)
 SENSOR = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-REST = int(mujoco.mjMINAWAKE)  # physics steps at rest after which a body may fall asleep
 _NEVER = (mujoco.mjtSleepPolicy.mjSLEEP_NEVER, mujoco.mjtSleepPolicy.mjSLEEP_AUTO_NEVER)
 # CONTACTFULL, CNSTRFULL, BADQPOS, BADQVEL, BADQACC: the result is not to be trusted
 _BAD = slice(int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
@@ -56,7 +55,7 @@ class Physics(Batch):
         frame_skip: int = FRAME_SKIP,
         stage: int = ACC,
     ) -> None:
-        _silence_profiler()
+        silence_profiler()
         mujoco.set_mju_user_warning(_ignore_warning)
         super().__init__(model, nsim, nthread, persistent=True)
         self.frame_skip, self.stage = frame_skip, stage
@@ -141,49 +140,11 @@ class Physics(Batch):
         """Continue from a :meth:`snapshot`, bit for bit."""
         state = snapshot[:, : self.nstate]
         if self._sleeps:
-            self._put_to_sleep(state, snapshot[:, self.nstate :])
+            put_to_sleep(self, self._copy or self.models, state, snapshot[:, self.nstate :])
         self.state[:] = state
         self.forward(stage=ACC)
         self.state[:] = state  # without the solver's warm start of the new computation
         self._warned[:] = self._warnings
-
-    def _put_to_sleep(self, state: Array, asleep: Array) -> None:
-        """Put to sleep the bodies that were, and restore how long the others have been at rest.
-
-        MuJoCo's state does not hold this, and nothing writes it. So all are woken and physics steps
-        taken, each from ``state``, in which bodies count as at rest however fast they are, except
-        where a force of -0.0 is applied, which changes no result: MuJoCo compares its bytes with 0.
-
-        :param state: [N, nstate]
-        :param asleep: MuJoCo's ``tree_asleep``, [N, trees]: at least 0 is asleep; else the physics
-            steps at rest - 11, where -2 means the same as -1: the next at rest is the last awake
-        """
-        rest = np.where(asleep >= 0, REST, np.minimum(asleep, -2) + REST + 1)
-        trees, force = self.model.body_treeid, self.bind("xfrc_applied")
-        self.reset(stage=NONE)
-        tolerances = self._sleep_tolerances(np.full(self.nsim, np.inf))
-        try:
-            for left in range(REST)[::-1]:
-                self.state[:] = state
-                force[(rest <= left)[:, trees] & (trees >= 0)] = -0.0
-                self.step()
-        finally:
-            self._sleep_tolerances(tolerances)
-
-    def _sleep_tolerances(self, new: Array) -> Array:
-        """Set the speed, m/s, below which bodies are at rest; return what it was, [N] both."""
-        if self._copy is None and self.models is None:
-            field = self.expand("opt.sleep_tolerance")
-            old: Array = field.copy()
-            field[:] = new
-            return old
-        models = self._copy or self.models
-        several = models if isinstance(models, tuple) else [models] * self.nsim
-        options = [model.opt for model in several]
-        old = np.array([option.sleep_tolerance for option in options])
-        for option, value in zip(options, new, strict=True):
-            option.sleep_tolerance = value
-        return old
 
     def expand(self, name: str) -> Array:
         self._release()
@@ -251,24 +212,3 @@ def _sensors_stay_awake(model: mujoco.MjModel) -> bool:
 
 def _ignore_warning(message: str) -> None:
     """Keep MuJoCo from writing MUJOCO_LOG.TXT: the warning counters are read instead."""
-
-
-def profiling_clock() -> ctypes.c_void_p | None:
-    """Where MuJoCo keeps the clock that its Python bindings install; None if it is not found."""
-    for path in Path(mujoco.__file__).parent.glob("*mujoco*"):
-        if path.name.startswith(("libmujoco", "mujoco.dll")):
-            try:
-                return ctypes.c_void_p.in_dll(ctypes.CDLL(str(path)), "mjcb_time")
-            except (OSError, ValueError):
-                continue
-    return None
-
-
-def _silence_profiler() -> None:
-    """Remove the profiling clock, which slows short steps by 5 to 44 %.
-
-    Only the timers of MjData lose their values; the simulation is the same.
-    """
-    clock = profiling_clock()
-    if clock is not None:
-        clock.value = None

@@ -69,7 +69,6 @@ class GymRobot(MJCFRobot):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self._qvel = sim.batch.bind("qvel")
-        self._point = np.zeros((sim.num_envs, 3))
 
     def reset(self, ids: Array, rngs: Generators) -> None:
         for i in ids.tolist():
@@ -85,8 +84,9 @@ class GymRobot(MJCFRobot):
     @property
     def position(self) -> Array:
         """Along the ground, [N, 3] m: what velocities are measured by."""
-        self._point[:, : self.hidden] = self._qpos[:, : self.hidden]
-        return self._point
+        point = np.zeros((len(self._qpos), 3))
+        point[:, : self.hidden] = self._qpos[:, : self.hidden]
+        return point
 
     def observations(self) -> Observations:
         speeds = np.minimum(np.maximum(self._qvel, -self.fastest), self.fastest)

@@ -1,6 +1,6 @@
 """Train on the original Safety-Gymnasium package.
 
-It needs older versions of MuJoCo and Gymnasium, so scripts/check_safety_gymnasium.py installs it in
+It needs older versions of MuJoCo and Gymnasium, so scripts/safety_gymnasium/check.py installs it in
 a Python environment of its own. Elsewhere the same lines train on sb3_guard's task of this name.
 """
 

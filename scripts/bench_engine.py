@@ -7,7 +7,7 @@ model alternate, and the best slice of each counts; of a reset, the best of five
 the table five times and takes the best of each figure, which may be of different rounds: noise
 comes and goes in minutes; with ``--threads 1``, by the time that one core had, it hardly counts.
 ``--beside PYTHON`` runs the real Safety-Gymnasium, in the environment that
-``scripts/check_safety_gymnasium.py`` sets up, in turn with our task of the same id: on one core by
+``scripts/safety_gymnasium/check.py`` sets up, in turn with our task of the same id: on one core by
 its time, or with ``--threads 2`` ours on two, both by the clock on the wall. The best slices of 40
 steps count. ``--params '{"robot": {"mass": {"low": 0.5, "high": 2}}}'`` prints what parameters
 cost: a suite in turn with the same suite that has them.

@@ -225,7 +225,7 @@ def test_absent_package_says_where_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "safety_gymnasium", None)
     # not even importlib.util can find it: as if it had never been installed
     for ask in (make_vec_env, make_safety_gymnasium):
-        with pytest.raises(DependencyNotInstalled, match="check_safety_gymnasium"):
+        with pytest.raises(DependencyNotInstalled, match="safety_gymnasium/check"):
             ask("safety_gymnasium:SafetyPointGoal9-v0")
     with pytest.raises(ValueError, match="use 'SafetyPointGoal1-v0'"):
         make_vec_env("SafetyPointGoal9-v0")  # what there is without the package

@@ -134,7 +134,7 @@ def test_scripts_exist_where_they_are_named_and_each_is_named_somewhere():
 
 
 def test_tables_of_results_are_made_of_their_logs():
-    for path, text in script("make_tables").pages().items():
-        assert path.read_text() == text, "run `python scripts/make_tables.py`"
+    for path, text in script("results").pages().items():
+        assert path.read_text() == text, "run `python scripts/results.py`"
     for path, text in script("known_optima").pages().items():
         assert path.read_text() == text, "run `python scripts/known_optima.py --seeds`"

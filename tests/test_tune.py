@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 import yaml
 from cost_envs import CostPoint
-from kill_tuner import campaign, faults, work
+from kills import campaign, faults, work
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState, create_trial
@@ -467,7 +467,7 @@ def test_a_seeded_search_is_the_same_again(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_no_trial_is_lost_whatever_is_killed(tmp_path):
-    """`python scripts/kill_tuner.py` does the same for longer."""
+    """`python scripts/chaos.py tune` does the same for longer."""
     study = campaign(str(tmp_path / "journal"), tmp_path, n_trials=12, n_workers=3, kills=6)
     assert faults(study, 12, n_workers=3) == []
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import optuna
 import pytest
-from kill_tuner import campaign, faults
+from kills import campaign, faults
 from postgres import Server, free_port, programs, running
 from sqlalchemy.exc import OperationalError
 from test_bad_input import refused

@@ -79,7 +79,7 @@ def _import_safety_gymnasium(env_id: str) -> Any:
             f"{env_id!r} needs the package safety-gymnasium, which "
             + ("is not installed" if absent else f"can't be imported here ({reason})")
             + ". It wants MuJoCo 2.3, Gymnasium 0.29 and a mended source from Python 3.11 on: "
-            "scripts/check_safety_gymnasium.py sets up an environment that works "
+            "scripts/safety_gymnasium/check.py sets up an environment that works "
             "(docs/your_environment.md)"
         ) from error
     return safety_gymnasium

@@ -1,29 +1,38 @@
-"""Write the tables of results into the pages, from the logs: ``python scripts/make_tables.py``.
+"""Write the tables of results into the pages, from the logs: ``python scripts/results.py``.
 
 ``docs/data/NAME.tar.xz`` holds the logs of a grid of runs, as ``benchmark`` writes them, without
 models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
-a page stands what this makes of them, or of one suite in short, ``<!-- runs: NAME SUITE -->``.
-Instead of ``runs`` there are ``learnt: NAME``, what the agents earned in the end beside the
-untrained ones of ``docs/data/untrained.csv``, ``scores: NAME``, returns and costs as parts of
-TRPO's, ``sweep: NAME SUITE``, what was earned and paid at each limit N of ``NAME_limitN.tar.xz``,
-and, within a line, ``beside: NAME SUITE ALGO``, what an algorithm earned and paid. ``--pack FOLDER
-NAME`` packs the logs of a folder.
+a page stands the table of its runs, or of one environment in short, ``<!-- runs: NAME SUITE -->``.
+Instead of ``runs`` there are ``learnt: NAME``, returns in the end beside the untrained agents of
+``docs/data/untrained.csv``; ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep: NAME
+SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; and, within a line, ``beside:
+NAME SUITE ALGO``. ``--pack FOLDER NAME`` packs the logs of a folder.
+
+``--curves`` draws the learning curves: of each algorithm's page, beside an unconstrained algorithm,
+from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of all algorithms of
+``PAPER``, ``curves_<suite>.png``; and good runs of docs/healthy.md beside bad ones,
+``healthy_<algo>.png``.
 """
 
 import argparse
 import re
 import tarfile
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
-from sb3_guard.zoo.figures import Data, save
+from sb3_guard.zoo.figures import COLORS, INK, STYLE, WIDTH, Data, finish, save
 from sb3_guard.zoo.paper import draw
-from sb3_guard.zoo.runs import read_episodes, read_results
+from sb3_guard.zoo.runs import Results, read_episodes, read_results
 from sb3_guard.zoo.statistics import aggregate, normalize, with_safety
 from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 
@@ -39,14 +48,46 @@ LAST = 90  # episodes: three rollouts of 30 environments
 APART = 3.0  # standard errors: what counts as learnt
 LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml")
 
+# Archives, the suite, and whom an algorithm is beside.
+GRIDS = (
+    (("safety_gymnasium", "safety_gymnasium_others"), "SafetyPointGoal1-v0", "ppo"),
+    (("guard_limit2",), "Goal_Point_8Hazards", "trpo"),
+    (("off_policy",), "SafetyPointGoal1-v0", None),
+)
+
+# Of docs/benchmark.md, with the paper's settings: archive and suites.
+PAPER = {
+    "guard_paper": [f"Goal_{robot}_8Hazards" for robot in ("Point", "Drone", "Arm3", "Walker")],
+    "goal_point_1m_limit0": ["Goal_Point_8Ghosts"],
+}
+HAZARDS = "Goal_Point_8Hazards-v0"
+# Of docs/healthy.md, a good run and a bad one: label, limit, archive and folder.
+HEALTHY = {
+    "pcpo": (
+        ("seed 23", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_24"),
+        ("seed 22", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_23"),
+    ),
+    "trpo_lag": (
+        ("default", 2.0, "guard_limit2", f"guard_limit2/trpo_lag/{HAZARDS}_23"),
+        ("-conf paper", 0.0, "guard_paper", f"guard_paper/trpo_lag/{HAZARDS}_1"),
+    ),
+}
+
+
+@contextmanager
+def unpacked(*names: str) -> Iterator[Results]:
+    """The runs of packed grids, whose logs are there within the block."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            with tarfile.open(DATA / f"{name}.tar.xz") as archive:
+                archive.extractall(folder, filter="data")
+        yield read_results([folder])
+
 
 @cache
 def runs(name: str) -> pd.DataFrame:
     """The runs of a packed grid, with what is asked about their safety."""
-    with tempfile.TemporaryDirectory() as folder:
-        with tarfile.open(DATA / f"{name}.tar.xz") as archive:
-            archive.extractall(folder, filter="data")
-        found = read_results([folder])
+    with unpacked(name) as found:
         assert not found.left_out, found.left_out
         ends = [read_episodes(path).tail(LAST) for path in found.runs["path"]]
         for path, steps in zip(found.runs["path"], found.runs["steps"], strict=True):
@@ -210,10 +251,75 @@ def pack(folder: Path, name: str) -> None:
             archive.addfile(info, BytesIO(text))
 
 
+def draw_healthy(algo: str) -> Figure:
+    """A good and a bad run: return, J_C beside its limit, and what is to keep the limit."""
+    rows, columns = (2, 2) if algo == "pcpo" else (1, 3)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 0.7 + 2.1 * rows), layout="constrained")
+        axes = figure.subplots(rows, columns).ravel()
+        for (name, limit, archive, folder), color in zip(HEALTHY[algo], COLORS, strict=False):
+            with tarfile.open(DATA / f"{archive}.tar.xz") as packed:
+                file = packed.extractfile(f"{folder}/progress.csv")
+                assert file is not None
+                log = pd.read_csv(file, index_col="time/total_timesteps")
+            log.columns = log.columns.str.rpartition("/").get_level_values(-1)
+            means = log.rolling(10, min_periods=3).mean()
+            lines = {"return": log["ep_rew_mean"]}
+            lines["episode cost"] = means["constraint_violation"] + limit
+            if algo == "pcpo":
+                lines["cost_margin"] = log["cost_margin"]
+                lines["cost_change"] = means["cost_change"]
+                axes[3].plot(
+                    means["cost_change_promised"], color=color, linestyle=(0, (5, 1.5)),
+                    label=f"{name}, promised",
+                )  # fmt: skip
+            else:
+                # In units of cost, as the paper has them, λ is the price.
+                lines["price"] = log["price" if "price" in log else "multiplier"]
+            for axis, (label, line) in zip(axes, lines.items(), strict=True):
+                axis.plot(line, color=color, linewidth=1.5, label=name)
+                axis.set(xlabel="steps", ylabel=label, xlim=(0, line.index[-1]))
+                axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes[1].axhline(limit, color=INK, linestyle=(0, (1, 2)), label=f"limit, {limit:g}")
+        for axis in axes[1:3]:
+            axis.set_ylim(bottom=0)
+        finish(figure, "")
+    return figure
+
+
+def draw_curves(runs: pd.DataFrame, name: str) -> None:
+    """Save the curves of runs of a suite as an image."""
+    (drawing,) = draw("curves", Data(runs))
+    assert drawing.figure is not None, drawing.missing
+    save(drawing.figure, DOCS / "images" / f"{name}.png")
+    print(name)
+
+
+def curves() -> None:
+    """Draw all of them."""
+    left = {page.stem for page in DOCS.glob("algorithms/*.md")}
+    for names, suite, reference in GRIDS:
+        with unpacked(*names) as found:
+            runs = found.runs[found.runs["suite"] == suite]
+            for algo in sorted(left & {*runs["algo"]}):
+                draw_curves(runs[runs["algo"].isin([algo, reference])], f"curve_{algo}")
+                left.remove(algo)
+    print("without logs:", *sorted(left))
+    for name, suites in PAPER.items():
+        with unpacked(name) as found:
+            for suite in suites:
+                draw_curves(found.runs[found.runs["suite"] == suite], f"curves_{suite}")
+    for algo in HEALTHY:
+        save(draw_healthy(algo), DOCS / "images" / f"healthy_{algo}.png")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--pack", nargs=2, metavar=("FOLDER", "NAME"), help="pack a folder's logs")
+    parser.add_argument("--curves", action="store_true", help="draw the learning curves instead")
     args = parser.parse_args()
+    if args.curves:
+        return curves()
     if args.pack:
         pack(Path(args.pack[0]), args.pack[1])
     for path, text in pages().items():

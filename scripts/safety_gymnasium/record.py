@@ -1,10 +1,10 @@
 """Record what Safety-Gymnasium 1.0.0 does, as the yardstick of our own tasks of the same names.
 
-``scripts/check_safety_gymnasium.py`` sets up the environment that this runs in::
+``scripts/safety_gymnasium/check.py`` sets up the environment that this runs in::
 
-    .venv-mujoco-2.3.3/bin/python scripts/record_safety_gymnasium.py          # all 52 ids
-    .venv-mujoco-2.3.3/bin/python scripts/record_safety_gymnasium.py --match Button1
-    .venv-mujoco-2.3.3/bin/python scripts/record_safety_gymnasium.py --distributions
+    .venv-mujoco-2.3.3/bin/python scripts/safety_gymnasium/record.py          # all 52 ids
+    .venv-mujoco-2.3.3/bin/python scripts/safety_gymnasium/record.py --match Button1
+    .venv-mujoco-2.3.3/bin/python scripts/safety_gymnasium/record.py --distributions
 
 For each id, ``tests/data/safety_gymnasium/<name>.npz`` holds at least 200 states and what one step
 made of each. A trace is made of segments: the robot is placed next to an object and driven at it,
@@ -32,7 +32,7 @@ import numpy as np
 import safety_gymnasium
 import safety_gymnasium.world as world_module
 
-OUT = Path(__file__).resolve().parent.parent / "tests" / "data" / "safety_gymnasium"
+OUT = Path(__file__).resolve().parents[2] / "tests" / "data" / "safety_gymnasium"
 ROBOTS = ("Point", "Car", "Ant", "Doggo")
 TASKS = [f"{t}{n}" for t in ("Goal", "Button", "Push", "Circle") for n in range(3)] + ["Run0"]
 GRID = {"qpos": 2.0**-20, "qvel": 2.0**-19}

@@ -1,8 +1,8 @@
 """Record single steps of Safety-Gymnasium 1.0.0's velocity tasks, most of them in contact.
 
-``scripts/check_safety_gymnasium.py`` sets up the environment that this runs in::
+``scripts/safety_gymnasium/check.py`` sets up the environment that this runs in::
 
-    .venv-mujoco-2.3.3/bin/python scripts/record_velocity.py
+    .venv-mujoco-2.3.3/bin/python scripts/safety_gymnasium/record_velocity.py
 
 ``tests/data/safety_gymnasium/velocity.npz`` holds, for each robot, the states in which episodes of
 seeds 0 to 9 begin, and 200 states with the next state, reward, cost and end that one random action
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import safety_gymnasium
-from record_safety_gymnasium import GRID, OUT, save, shorten
+from record import GRID, OUT, save, shorten
 
 ROBOTS = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "Swimmer", "Walker2d")
 STEPS, EPISODE, SEEDS = 200, 20, 10

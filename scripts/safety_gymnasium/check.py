@@ -1,6 +1,6 @@
 """Train CPO on Safety-Gymnasium's own SafetyPointGoal1-v0, beside the old packages it needs.
 
-``python3.11 scripts/check_safety_gymnasium.py`` sets up ``.venv-mujoco-2.3.3`` from PyPI, about a
+``python3.11 scripts/safety_gymnasium/check.py`` sets up ``.venv-mujoco-2.3.3`` from PyPI, about a
 gigabyte, and trains a few thousand steps there, from Python and by ``python -m sb3_guard.train
 --algo cpo --env SafetyPointGoal1-v0``. It must be Python 3.11: MuJoCo 2.3 has no wheels
 for a newer one, and sb3_guard needs at least that. ``--mujoco 3.3.7`` takes another MuJoCo, and
@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 MUJOCO = "2.3.3"
 
 

@@ -43,7 +43,7 @@ STUDY = "kills"
 DONE = (TrialState.COMPLETE, TrialState.PRUNED)
 TUNE = (
     "--algo trpo_lag --gym-packages instant_training --env Still-v0 -params n_envs:1 n_steps:10 "
-    f"-n 40 --eval-episodes 1 --device cpu --num-threads 1 --study-name {STUDY}"
+    f"cost_limit:1 -n 40 --eval-episodes 1 --device cpu --num-threads 1 --study-name {STUDY}"
 ).split()
 
 

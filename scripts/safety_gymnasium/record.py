@@ -39,15 +39,7 @@ GRID = {"qpos": 2.0**-20, "qvel": 2.0**-19}
 # what begins ahead of a robot's centre, m, and which way that is in its own frame
 NOSE = {"Point": 0.15, "Car": 0.175, "Ant": 0.2, "Doggo": 0.13}
 AHEAD = {"Point": 0.0, "Car": -np.pi / 2, "Ant": 0.0, "Doggo": 0.0}
-EPISODES = (
-    "PointGoal1",
-    "CarGoal2",
-    "PointButton1",
-    "CarPush1",
-    "PointCircle1",
-    "PointRun0",
-    "AntGoal1",
-)
+EPISODES = "PointGoal1 CarGoal2 PointButton1 CarPush1 PointCircle1 PointRun0 AntGoal1".split()
 OBJECTS = {"hazards": 0.2, "vases": 0.1, "pillars": 0.2, "gremlins": 0.1, "buttons": 0.1}
 
 
@@ -139,14 +131,10 @@ class Recorder:
             return
         joint = data.joint("root" if self.robot == "Ant" else "agent")
         joint.qpos[:3] = [*xy, more.get("z", self.task.agent.z_height)]
-        tilt = np.zeros(4)
-        lean = more.get("lean", 0.0)
-        mujoco.mju_mulQuat(
-            tilt,
-            np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)]),
-            np.array([np.cos(lean / 2), np.sin(lean / 2), 0, 0]),
-        )
-        joint.qpos[3:] = tilt
+        pose, lean = np.zeros(4), more.get("lean", 0.0)
+        upright = np.array([np.cos(turn / 2), 0, 0, np.sin(turn / 2)])
+        mujoco.mju_mulQuat(pose, upright, np.array([np.cos(lean / 2), np.sin(lean / 2), 0, 0]))
+        joint.qpos[3:] = pose
         joint.qvel[:] = 0.0
         joint.qvel[:2] = forward * speed
         joint.qvel[2] = more.get("rise", 0.0)
@@ -192,16 +180,8 @@ class Recorder:
             with contextlib.redirect_stdout(io.StringIO()):
                 _, reward, _, terminated, truncated, info = self.env.step(action)
             assert not truncated
-            self.steps.append(
-                {
-                    "action": action,
-                    "reward": reward,
-                    "terminated": terminated,
-                    "info": info,
-                    "touched": self.touched(),
-                    "state": len(self.states) - 1,
-                }
-            )
+            step = {"action": action, "reward": reward, "terminated": terminated, "info": info}
+            self.steps.append({**step, "touched": self.touched(), "state": len(self.states) - 1})
             self.settle()
             self.note(first=False)
 
@@ -217,15 +197,14 @@ class Recorder:
         return sorted(out - {"floors"})
 
     def note(self, first: bool) -> None:
-        data, buttons = self.data, getattr(self.task, "buttons", None)
+        data, task = self.data, self.task
+        buttons, goal = getattr(task, "buttons", None), getattr(task, "goal", None)
         self.states.append(
             {
                 **{field: getattr(data, field).copy() for field in GRID},
                 "time": data.time,
                 "mocap": data.mocap_pos[0].copy() if len(data.mocap_pos) else np.zeros(3),
-                "goal": self.task.goal.pos[:2].copy()
-                if hasattr(self.task, "goal")
-                else np.zeros(2),
+                "goal": goal.pos[:2].copy() if goal is not None else np.zeros(2),
                 "timer": 0 if buttons is None else buttons.timer,
                 "goal_button": 0 if buttons is None else buttons.goal_button,
                 "world": len(self.worlds) - 1,
@@ -293,12 +272,8 @@ class Recorder:
             joint = self.task.model.jnt("push_box")
             first, speed = int(joint.qposadr[0]), int(joint.dofadr[0])
             self.data.qpos[first : first + 2] = box
-            self.data.qpos[first + 3 : first + 7] = [
-                np.cos(inwards / 2),
-                0,
-                0,
-                np.sin(inwards / 2),
-            ]
+            turned = [np.cos(inwards / 2), 0, 0, np.sin(inwards / 2)]
+            self.data.qpos[first + 3 : first + 7] = turned
             self.data.qvel[speed : speed + 6] = 0.0
             back = 1.25 * half + NOSE[self.robot] + 0.02
             self.place(box + back * direction, inwards + np.pi, speed=self.speed)
@@ -363,14 +338,10 @@ def planes(values: Any) -> Any:
 
 def save(path: Path, arrays: dict[str, Any]) -> None:
     """A compressed archive; arrays of floats in planes of bytes, under names with their type."""
-    packed = {}
-    for name, values in arrays.items():
-        kind = values.dtype
-        packed[f"{name}:{kind}" if kind.kind == "f" else name] = (
-            planes(values) if kind.kind == "f" else values
-        )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
-        for name, values in packed.items():
+        for name, values in arrays.items():
+            if values.dtype.kind == "f":
+                name, values = f"{name}:{values.dtype}", planes(values)
             with archive.open(f"{name}.npy", "w") as file:
                 np.lib.format.write_array(file, np.asarray(values))
 
@@ -378,15 +349,11 @@ def save(path: Path, arrays: dict[str, Any]) -> None:
 def layouts(name: str, count: int) -> dict[str, Any]:
     """Where things are when episodes begin, [count, things, 2] m, and what they are."""
     env = safety_gymnasium.make(f"Safety{name}-v0").unwrapped
-    places = []
+    drawn = []
     for seed in range(count):
         env.reset(seed=seed)
-        layout = env.task.world_info.layout
-        places.append([layout[thing] for thing in sorted(layout)])
-    return {
-        f"layout_{name}": shorten(np.array(places), 10).astype(np.float32),
-        f"things_{name}": np.array(sorted(layout)),
-    }
+        drawn.append(dict(env.task.world_info.layout))
+    return named(name, drawn)
 
 
 def button_layouts(name: str, count: int) -> dict[str, Any]:
@@ -395,7 +362,11 @@ def button_layouts(name: str, count: int) -> dict[str, Any]:
     env.reset(seed=0)
     generator = env.task.random_generator
     generator.set_random_seed(12345)
-    drawn = [generator.build_layout() for _ in range(count)]
+    return named(name, [generator.build_layout() for _ in range(count)])
+
+
+def named(name: str, drawn: list[dict[str, Any]]) -> dict[str, Any]:
+    """Layouts as arrays."""
     things = sorted(drawn[0])
     places = np.array([[layout[thing] for thing in things] for layout in drawn])
     return {

@@ -4,7 +4,6 @@
 
     .venv-mujoco-2.3.3/bin/python scripts/safety_gymnasium/record.py          # all 52 ids
     .venv-mujoco-2.3.3/bin/python scripts/safety_gymnasium/record.py --match Button1
-    .venv-mujoco-2.3.3/bin/python scripts/safety_gymnasium/record.py --distributions
 
 For each id, ``tests/data/safety_gymnasium/<name>.npz`` holds at least 200 states and what one step
 made of each. A trace is made of segments: the robot is placed next to an object and driven at it,
@@ -12,8 +11,6 @@ so that every event that the task knows happens; others are random. After the ph
 before the package computes rewards, costs and observations from it, the state is rounded to a grid
 and the start of the solver, ``qacc_warmstart``, set to 0: positions and velocities in the files are
 exact and small. Observations have 21 bits.
-
-``distributions.npz`` holds layouts of new episodes and returns and costs of random ones.
 """
 
 from __future__ import annotations
@@ -39,7 +36,6 @@ GRID = {"qpos": 2.0**-20, "qvel": 2.0**-19}
 # what begins ahead of a robot's centre, m, and which way that is in its own frame
 NOSE = {"Point": 0.15, "Car": 0.175, "Ant": 0.2, "Doggo": 0.13}
 AHEAD = {"Point": 0.0, "Car": -np.pi / 2, "Ant": 0.0, "Doggo": 0.0}
-EPISODES = "PointGoal1 CarGoal2 PointButton1 CarPush1 PointCircle1 PointRun0 AntGoal1".split()
 OBJECTS = {"hazards": 0.2, "vases": 0.1, "pillars": 0.2, "gremlins": 0.1, "buttons": 0.1}
 
 
@@ -346,72 +342,12 @@ def save(path: Path, arrays: dict[str, Any]) -> None:
                 np.lib.format.write_array(file, np.asarray(values))
 
 
-def layouts(name: str, count: int) -> dict[str, Any]:
-    """Where things are when episodes begin, [count, things, 2] m, and what they are."""
-    env = safety_gymnasium.make(f"Safety{name}-v0").unwrapped
-    drawn = []
-    for seed in range(count):
-        env.reset(seed=seed)
-        drawn.append(dict(env.task.world_info.layout))
-    return named(name, drawn)
-
-
-def button_layouts(name: str, count: int) -> dict[str, Any]:
-    """The same for Button, whose resets draw nothing more: without building each world."""
-    env = safety_gymnasium.make(f"Safety{name}-v0").unwrapped
-    env.reset(seed=0)
-    generator = env.task.random_generator
-    generator.set_random_seed(12345)
-    return named(name, [generator.build_layout() for _ in range(count)])
-
-
-def named(name: str, drawn: list[dict[str, Any]]) -> dict[str, Any]:
-    """Layouts as arrays."""
-    things = sorted(drawn[0])
-    places = np.array([[layout[thing] for thing in things] for layout in drawn])
-    return {
-        f"layout_{name}": shorten(places, 10).astype(np.float32),
-        f"things_{name}": np.array(things),
-    }
-
-
-def episodes(name: str, count: int, steps: int) -> dict[str, Any]:
-    """Returns, costs and lengths of random episodes of at most ``steps`` steps, [count, 3]."""
-    env = safety_gymnasium.make(f"Safety{name}-v0").unwrapped
-    rng = np.random.default_rng(0)
-    out = np.zeros((count, 3))
-    for episode in out:
-        env.reset(seed=int(rng.integers(2**31)))
-        for _ in range(steps):
-            action = rng.uniform(-1, 1, env.action_space.shape)
-            _, reward, cost, terminated, _, _ = env.step(action)
-            episode += np.ravel(reward)[0], cost, 1
-            if terminated:
-                break
-    return {f"episodes_{name}": out}
-
-
-def record_distributions() -> None:
-    arrays: dict[str, Any] = {}
-    for name in ("CarPush1", *(f"Point{task}" for task in TASKS)):
-        arrays.update(layouts(name, 400))
-    for name in ("PointButton1", "PointButton2"):  # 52 and more attempts each
-        arrays.update(button_layouts(name, 1000))
-    for name in EPISODES:
-        arrays.update(episodes(name, 200, 100))
-        print(name, arrays[f"episodes_{name}"].mean(axis=0), flush=True)
-    save(OUT / "distributions.npz", arrays)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--match", default="", help="only ids that contain this")
-    parser.add_argument("--distributions", action="store_true", help="layouts and returns instead")
     args = parser.parse_args()
     without_textures()
     OUT.mkdir(parents=True, exist_ok=True)
-    if args.distributions:
-        return record_distributions()
     for i, name in enumerate(r + t for r in ROBOTS for t in TASKS):
         if args.match in name:
             recorder = Recorder(name, seed=i)
@@ -421,7 +357,6 @@ def main() -> None:
             flags = {k: int(v.sum()) for k, v in arrays.items() if v.dtype == bool and k != "first"}
             size = (OUT / f"{name}.npz").stat().st_size
             print(name, len(arrays["reward"]), "steps", size, "bytes", flags, flush=True)
-    return None
 
 
 if __name__ == "__main__":

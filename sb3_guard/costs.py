@@ -1,9 +1,9 @@
-"""Costs as environments report them in ``info``: read in one way, refused in one line."""
+"""Costs as environments report them in ``info``: read, summed and refused in one way."""
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -85,3 +85,69 @@ def read_costs(
         values = itertools.chain(*rows)
         costs = np.array([*map(number, values, places)]).reshape(shape)
     return costs.astype(np.float64), seen
+
+
+class EpisodeCost(NamedTuple):
+    """What an episode that has ended cost, by each of the m costs.
+
+    :param row: its environment
+    :param total: undiscounted sum over its steps, shape (m,)
+    :param highest: highest cost of a step, 0 where none is above it, shape (m,)
+    :param bounded: the one of these two that the limits bound, shape (m,)
+    :param length: its steps
+    """
+
+    row: int
+    total: np.ndarray
+    highest: np.ndarray
+    bounded: np.ndarray
+    length: int
+
+
+class EpisodeCosts:
+    """The costs of the episodes under way, in all rows of a vectorised environment.
+
+    :param n_envs: number of rows
+    :param n_costs: number m of costs
+    :param limit_on: what of an episode's costs the limits bound: their sum, or the highest one of a
+        step. Then the charge of a step is what it adds to the highest before it, 0 at first
+    """
+
+    def __init__(self, n_envs: int, n_costs: int, limit_on: Literal["sum", "max"] = "sum") -> None:
+        self.limit_on = limit_on
+        self.totals = np.zeros((n_envs, n_costs))
+        self.highest = np.zeros((n_envs, n_costs))
+        self.lengths = np.zeros(n_envs, dtype=np.int64)
+        #: what the last step added to what the limits bound, [n_envs, m]
+        self.charges = np.zeros((n_envs, n_costs))
+
+    def step(self, costs: np.ndarray, dones: np.ndarray) -> list[EpisodeCost]:
+        """
+        Add a step of every row.
+
+        :param costs: shape (n_envs, m)
+        :param dones: rows whose episodes it ended, shape (n_envs,)
+        :return: these episodes
+        :raises NumberError: a cost is negative where limits bound the highest one
+        """
+        before = self.highest
+        self.highest = np.maximum(before, costs)
+        self.charges = costs
+        if self.limit_on == "max":
+            if np.min(costs) < 0.0:
+                raise NumberError(
+                    f"a cost is {np.min(costs)}: a limit on the highest cost of a step needs costs "
+                    "of at least 0"
+                )
+            self.charges = self.highest - before
+        self.totals += costs
+        self.lengths += 1
+        return [self.end(row) for row in np.flatnonzero(dones).tolist()]
+
+    def end(self, row: int) -> EpisodeCost:
+        """Begin a new episode in a row; return what the last one cost."""
+        total, highest = self.totals[row].copy(), self.highest[row].copy()
+        bounded = highest if self.limit_on == "max" else total
+        length = int(self.lengths[row])
+        self.totals[row] = self.highest[row] = self.lengths[row] = 0
+        return EpisodeCost(row, total, highest, bounded, length)

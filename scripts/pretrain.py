@@ -86,7 +86,7 @@ AGENTS = (
 # What only training needs: loaded without it, an agent begins a new training where it stands.
 TRAINING_ONLY = (
     "_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer",
-    "ep_success_buffer", "ep_cost_buffer", "running_costs", "running_lengths", "last_costs",
+    "ep_success_buffer", "ep_cost_buffer", "episodes", "last_costs",
     "total_costs", "costs", "timing", "start_time", "_ended_costs", "_ended_lengths", "_warned",
 )  # fmt: skip
 

@@ -303,7 +303,7 @@ def test_episodes_and_rollouts_of_any_length(
     numbers = [v for v in model.logger.name_to_value.values() if isinstance(v, int | float)]
     assert np.isfinite(numbers).all()
     steps = 4 * n_steps
-    np.testing.assert_array_equal(model.running_lengths, steps % episode_length)
+    np.testing.assert_array_equal(model.episodes.lengths, steps % episode_length)
     assert len(model.ep_cost_buffer) == min(100, n_envs * (steps // episode_length))
 
 
@@ -567,7 +567,7 @@ def test_save_and_load_keep_everything(cls: type[TrustRegion], tmp_path: Path) -
         "cost_keys",
     ):
         assert getattr(model, name) == getattr(again, name), name
-    for name in ("cost_limits", "total_costs", "running_costs", "running_lengths", "last_costs"):
+    for name in ("cost_limits", "total_costs", "last_costs"):
         np.testing.assert_array_equal(getattr(model, name), getattr(again, name), err_msg=name)
     np.testing.assert_array_equal(np.array(model.ep_cost_buffer), np.array(again.ep_cost_buffer))
     if cls.uses_cost_critic:
@@ -608,7 +608,7 @@ def test_load_with_another_number_of_envs(cls: type[TrustRegion], tmp_path: Path
     small(cls, points(2), n_critic_updates=1).learn(80).save(tmp_path / "model")
     model = cls.load(tmp_path / "model", env=points(3), device="cpu")
     model.learn(120, reset_num_timesteps=False)
-    assert model.running_costs.shape == (3, 1) and model.num_timesteps == 200
+    assert model.episodes.totals.shape == (3, 1) and model.num_timesteps == 200
 
 
 def test_a_replaced_policy_is_the_one_that_learns() -> None:
@@ -642,10 +642,10 @@ def test_set_env_starts_new_episodes(cls: type[TrustRegion]) -> None:
     model = small(cls, points(2, episode_length=1000), n_critic_updates=1)
     model._warned = {"no episode has ended yet and the environment states no max_episode_steps"}
     model.learn(80)
-    assert (model.running_lengths == 40).all()
+    assert (model.episodes.lengths == 40).all()
     model.set_env(points(2))
     model.learn(80, reset_num_timesteps=False)
-    assert (model.running_lengths == 10).all()
+    assert (model.episodes.lengths == 10).all()
 
 
 class _Checkpoint(BaseCallback):
@@ -699,8 +699,8 @@ def test_resumed_equals_uninterrupted(
     assert resumed.num_timesteps == whole.num_timesteps == 400
     assert_equal(parameters(whole), parameters(resumed))
     assert whole.total_cost == resumed.total_cost
-    np.testing.assert_array_equal(whole.running_costs, resumed.running_costs)
-    np.testing.assert_array_equal(whole.running_lengths, resumed.running_lengths)
+    np.testing.assert_array_equal(whole.episodes.totals, resumed.episodes.totals)
+    np.testing.assert_array_equal(whole.episodes.lengths, resumed.episodes.lengths)
     np.testing.assert_array_equal(np.array(whole.ep_cost_buffer), np.array(resumed.ep_cost_buffer))
     for key, value in whole.logger.name_to_value.items():
         if key.startswith(("train/", "rollout/")):
@@ -930,4 +930,4 @@ def test_a_callback_may_stop_and_training_go_on(cls: type[TrustRegion]) -> None:
     model.learn(160, reset_num_timesteps=False)
     assert model.num_timesteps == 280
     model.learn(80)
-    assert model.num_timesteps == 80 and (model.running_lengths == 10).all()
+    assert model.num_timesteps == 80 and (model.episodes.lengths == 10).all()

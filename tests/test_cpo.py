@@ -186,7 +186,7 @@ def test_violation_is_in_units_of_the_cost_surrogate() -> None:
         assert estimate.episode_cost[0] == pytest.approx(ended.mean(), rel=1e-6)
         assert estimate.violation[0] == pytest.approx((ended.mean() - 0.7) / 40, rel=1e-6)
     assert model.total_cost == pytest.approx(costs.sum(), rel=1e-6)
-    np.testing.assert_allclose(model.running_costs[:, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(model.episodes.totals[:, 0], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("costs", [(5.0, 45.0), (45.0, 5.0)], ids=str)

@@ -384,7 +384,7 @@ def test_a_callback_that_stops_loses_no_cost() -> None:
     model = SACLag("MlpPolicy", points(1), **settings())
     for _ in range(2):
         model.learn(100, Stop(), reset_num_timesteps=False)
-    assert model.num_timesteps == 60 and model.running_lengths.tolist() == [0]
+    assert model.num_timesteps == 60 and model.episodes.lengths.tolist() == [0]
     assert model.total_cost == pytest.approx(sum(float(cost[0]) for cost in model.ep_cost_buffer))
     assert len(model.ep_cost_buffer) == 2
 

@@ -619,7 +619,7 @@ def test_a_callback_that_stops_a_rollout_loses_no_cost():
 
     model.learn(200, callback=Count(50))
     assert model.num_timesteps == 50
-    assert model.running_lengths is not None and model.running_lengths.tolist() == [25, 25]
+    assert model.episodes.lengths is not None and model.episodes.lengths.tolist() == [25, 25]
     assert model.total_cost == pytest.approx(sum(seen))
 
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.monitor import total_cost
-from sb3_guard.costs import read_costs, verdict
+from sb3_guard.costs import EpisodeCost, EpisodeCosts, read_costs, verdict
 
 
 class Estimate(NamedTuple):
@@ -230,12 +230,10 @@ def evaluate_policy(
             observations, rewards, starts, infos = env.step(actions)
             steps += 1
             last_costs, _ = read_costs(infos, keys, zero_if_missing)
-            tally.add(rewards, last_costs, infos)
             if on_step is not None:
                 on_step()
-            for i in np.flatnonzero(starts):
-                last_costs[i] = 0.0
-                tally.end(int(i), infos[i])
+            tally.step(rewards, last_costs, starts, infos)
+            last_costs[np.flatnonzero(starts)] = 0.0
     return tally.evaluation(
         limit_on=getattr(model, "limit_on", "sum"),
         limits=tuple(model.final_cost_limits.tolist())
@@ -262,56 +260,67 @@ class _Tally:
         self.keys, self.on_episode = keys, on_episode
         self.monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
         self.left = np.array([(n_eval_episodes + i) // n for i in range(n)])
-        self.returns, self.lengths = np.zeros(n), np.zeros(n, dtype=np.int64)
-        self.costs, self.highest = np.zeros((n, len(keys))), np.zeros((n, len(keys)))  # [n, m]
-        self.totals = np.zeros(n)
-        self.ended: list[tuple[float, float, int, np.ndarray, np.ndarray]] = []
+        self.returns = np.zeros(n)
+        self.costs = EpisodeCosts(n, len(keys) + 1)  # each of the keys, then all costs
+        self.ended: list[tuple[float, int, EpisodeCost]] = []  # return, steps, costs
         self.successes: list[bool] = []
 
-    def add(self, rewards: np.ndarray, costs: np.ndarray, infos: list[dict[str, Any]]) -> None:
-        """One step of every environment."""
+    def step(
+        self,
+        rewards: np.ndarray,
+        costs: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Add a step of every environment, and the episodes that it ends."""
         self.returns += rewards
-        self.lengths += 1
-        self.costs += costs
-        self.highest = np.maximum(self.highest, costs)
         if len(self.keys) == 1:
-            self.totals += costs[:, 0]
+            totals = costs
         else:
-            self.totals += [total_cost(info, self.keys) for info in infos]
+            totals = np.array([[total_cost(info, self.keys)] for info in infos])
+        over = np.array(dones, dtype=bool)
+        for i in np.flatnonzero(dones):
+            over[i] = self._is_over(infos[i])
+        for cost in self.costs.step(np.hstack([costs, totals]), over):
+            self._end(cost, infos[cost.row])
 
-    def end(self, i: int, info: dict[str, Any]) -> None:
-        """The episode of environment ``i`` is over; it counts if one is still to be played."""
-        episode = info.get("episode")
-        if self.monitored and episode is None and "budget_exceeded" not in info:
-            # A wrapper outside the monitor cut the episode (a life lost, in Atari): its
-            # true end is still to come. Only what EarlyTermination ends is over.
-            return
+    def _is_over(self, info: dict[str, Any]) -> bool:
+        """Whether an episode that a step ended has come to its true end.
+
+        That of one cut by a wrapper outside the monitor (a life lost, in Atari) is still to come,
+        unless the wrapper is EarlyTermination.
+        """
+        return not self.monitored or "episode" in info or "budget_exceeded" in info
+
+    def _end(self, cost: EpisodeCost, info: dict[str, Any]) -> None:
+        """Count an episode that is over, if one is still to be played."""
+        i = cost.row
         if self.left[i]:
             self.left[i] -= 1
-            earned, steps = float(self.returns[i]), int(self.lengths[i])
+            earned, steps = float(self.returns[i]), cost.length
+            episode = info.get("episode")
             if episode is not None:
                 earned, steps = float(episode["r"]), int(episode["l"])
-            total = float(self.totals[i])
-            self.ended.append((earned, total, steps, self.costs[i].copy(), self.highest[i].copy()))
+            self.ended.append((earned, steps, cost))
             if "is_success" in info:
                 self.successes.append(bool(info["is_success"]))
             if self.on_episode is not None:
-                self.on_episode(earned, total, steps)
-        self.returns[i] = self.totals[i] = self.lengths[i] = 0
-        self.costs[i] = self.highest[i] = 0.0
+                self.on_episode(earned, float(cost.total[-1]), steps)
+        self.returns[i] = 0.0
 
     def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
         """What was seen."""
         shape = len(self.ended), len(self.keys)
-        under_way = np.stack([self.returns, self.totals, self.lengths], axis=1)
+        lengths = self.costs.lengths
+        under_way = np.stack([self.returns, self.costs.totals[:, -1], lengths], axis=1)
         return Evaluation(
-            returns=np.array([episode[0] for episode in self.ended]),
-            costs=np.array([episode[1] for episode in self.ended]),
-            lengths=np.array([episode[2] for episode in self.ended], dtype=np.int64),
-            key_costs=np.array([episode[3] for episode in self.ended]).reshape(shape),
+            returns=np.array([earned for earned, _, _ in self.ended]),
+            costs=np.array([cost.total[-1] for _, _, cost in self.ended]),
+            lengths=np.array([steps for _, steps, _ in self.ended], dtype=np.int64),
+            key_costs=np.array([cost.total[:-1] for _, _, cost in self.ended]).reshape(shape),
             successes=np.array(self.successes, dtype=bool),
-            unfinished=under_way[(self.left > 0) & (self.lengths > 0)],
-            max_costs=np.array([episode[4] for episode in self.ended]).reshape(shape),
+            unfinished=under_way[(self.left > 0) & (lengths > 0)],
+            max_costs=np.array([cost.highest[:-1] for _, _, cost in self.ended]).reshape(shape),
             limit_on=limit_on,
             limits=limits,
             cost_keys=self.keys,

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_guard.checks import NumberError
 from sb3_guard.common.vec_budgets import end_rows
-from sb3_guard.costs import number, read_costs
+from sb3_guard.costs import EpisodeCost, EpisodeCosts, number, read_costs
 
 
 def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) -> float:
@@ -31,8 +31,7 @@ def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) ->
 
 # What a run continues with
 KEPT = (
-    "episode_returns", "episode_lengths", "episode_costs", "_key_costs", "episode_count",
-    "total_cost", "total_steps", "physics_errors", "t_start",
+    "episode_returns", "episode_count", "total_cost", "total_steps", "physics_errors", "t_start",
 )  # fmt: skip
 
 
@@ -85,9 +84,8 @@ class CostMonitor(VecMonitor):
 
     def _clear(self) -> None:
         self.episode_returns: np.ndarray = np.zeros(self.num_envs)
-        self.episode_lengths = np.zeros(self.num_envs, dtype=np.int64)
-        self.episode_costs = np.zeros(self.num_envs)
-        self._key_costs = np.zeros((len(self._columns), self.num_envs))
+        # all costs, then each of the keys that are reported
+        self.episodes = EpisodeCosts(self.num_envs, 1 + len(self._columns))
 
     def reset(self) -> VecEnvObs:
         """
@@ -109,44 +107,44 @@ class CostMonitor(VecMonitor):
         obs, rewards, dones, infos = self.venv.step_wait()
         _require_finite("reward", rewards)
         _require_finite("observation", obs)
-        costs = [total_cost(info, self.cost_keys) for info in infos]
-        self.episode_returns += rewards
-        self.episode_lengths += 1
-        self.episode_costs += costs
-        self.total_cost += sum(costs)
-        self.total_steps += self.num_envs
+        totals = [total_cost(info, self.cost_keys) for info in infos]
+        costs = np.array(totals, np.float64)[:, None]
         if self._columns:
-            self._key_costs += read_costs(infos, self.cost_keys, zero_if_missing=True)[0].T
-        if dones.any():
-            # Infos may be the environment's own objects: a copy gets the new entry.
-            infos = list(infos)
-            for i in np.flatnonzero(dones).tolist():
-                infos[i] = {**infos[i], "episode": self._end_episode(i, infos[i])}
+            keys, _ = read_costs(infos, self.cost_keys, zero_if_missing=True)
+            costs = np.hstack([costs, keys])
+        self.episode_returns += rewards
+        self.total_cost += sum(totals)
+        self.total_steps += self.num_envs
+        infos = list(infos)
+        for episode in self.episodes.step(costs, dones):
+            self._report(episode, infos)
         return obs, rewards, dones, infos
 
     def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
         """Report the episodes that a wrapper outside ends, and begin new ones."""
         for i in rows:
-            infos[i] = {**infos[i], "episode": self._end_episode(i, infos[i])}
+            self._report(self.episodes.end(i), infos)
         return end_rows(self.venv, rows, infos)
 
-    def _end_episode(self, i: int, info: dict[str, Any]) -> dict[str, Any]:
+    def _report(self, ended: EpisodeCost, infos: list[dict[str, Any]]) -> None:
+        """Put an episode that has ended into its last info, and into the csv."""
+        info = infos[ended.row]
+        cost, *keys = ended.total.tolist()
         episode: dict[str, Any] = {
-            "r": float(self.episode_returns[i]),
-            "l": int(self.episode_lengths[i]),
+            "r": float(self.episode_returns[ended.row]),
+            "l": ended.length,
             "t": round(time.time() - self.t_start, 6),
-            "c": float(self.episode_costs[i]),
+            "c": cost,
+            **dict(zip(self._columns, keys, strict=True)),
+            **{key: info[key] for key in self.info_keywords},
         }
-        episode.update(zip(self._columns, self._key_costs[:, i].tolist(), strict=True))
-        episode.update((key, info[key]) for key in self.info_keywords)
         self.episode_count += 1
         self.physics_errors += bool(info.get("physics_error", False))
-        for sums in (self.episode_returns, self.episode_lengths, self.episode_costs):
-            sums[i] = 0
-        self._key_costs[:, i] = 0.0
+        self.episode_returns[ended.row] = 0.0
         if self.results_writer is not None:
             self.results_writer.write_row(episode)
-        return episode
+        # Infos may be the environment's own objects: a copy gets the new entry.
+        infos[ended.row] = {**info, "episode": episode}
 
     def log_to(self, filename: str | os.PathLike[str], append: bool = False) -> None:
         """
@@ -169,12 +167,19 @@ class CostMonitor(VecMonitor):
         """What :meth:`restore` needs to continue counting, and ``"length"``, the csv's bytes."""
         writer = self.results_writer
         length = 0 if writer is None else os.path.getsize(writer.file_handler.name)
-        return {**{name: copy.copy(getattr(self, name)) for name in KEPT}, "length": length}
+        counts = {name: copy.copy(getattr(self, name)) for name in KEPT}
+        return {**counts, "episodes": copy.deepcopy(self.episodes), "length": length}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue counting from :meth:`state`; the csv is left as it is."""
         for name in KEPT:
             setattr(self, name, copy.copy(state[name]))
+        if "episodes" in state:
+            self.episodes = copy.deepcopy(state["episodes"])
+        else:  # checkpoints of formats 5 and 6
+            totals = [state["episode_costs"], *state["_key_costs"]]
+            self.episodes.totals = np.stack(totals, axis=1)
+            self.episodes.lengths = state["episode_lengths"].copy()
 
 
 def _require_finite(name: str, values: VecEnvObs) -> None:

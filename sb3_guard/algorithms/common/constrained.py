@@ -34,8 +34,8 @@ from sb3_guard.algorithms.common.arguments import (
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.limits import CostLimits
 from sb3_guard.algorithms.common.loading import LoadsOthers
-from sb3_guard.checks import NumberError, is_number
-from sb3_guard.costs import read_costs
+from sb3_guard.checks import is_number
+from sb3_guard.costs import EpisodeCosts, read_costs
 
 _LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
 
@@ -72,8 +72,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
     paper: ClassVar[str] = ""
     #: Whether training depends on costs at all.
     constrained: ClassVar[bool] = True
-    #: What of an episode's costs the limits bound: their sum, or the highest one of a step. Then
-    #: the cost of a step is what it adds to the highest before it, which is 0 at first.
+    #: What of an episode's costs the limits bound, see :class:`~sb3_guard.costs.EpisodeCosts`.
     limit_on: ClassVar[Literal["sum", "max"]] = "sum"
     #: Default values of keyword arguments, where they differ from those of the bases.
     defaults: ClassVar[dict[str, Any]] = {}
@@ -119,9 +118,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
 
         # Running episodes outlive rollouts, and a run may be saved between two; set by `learn`.
         none: Any = None
-        self.running_costs: np.ndarray = none  # [n_envs, m]
-        self.running_charges: np.ndarray = none  # [n_envs, m], what a limit bounds
-        self.running_lengths: np.ndarray = none  # [n_envs]
+        self.episodes: EpisodeCosts = none
         # What the last step cost, 0 before the first one of an episode.
         self.last_costs: np.ndarray | None = None  # [n_envs, m]
         # Somebody else has reset the environments, so the next `learn` begins new episodes.
@@ -162,8 +159,18 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
     def _setup_model(self) -> None:
         self._check_hyperparameters()
         self.cost_keys = tuple(self.cost_keys)  # loading turns tuples into lists
+        self._read_running_episodes()
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
+
+    def _read_running_episodes(self) -> None:
+        """Take over the episodes under way from a file that has them as three arrays."""
+        arrays = [
+            vars(self).pop(f"running_{name}", None) for name in ("costs", "charges", "lengths")
+        ]
+        if self.episodes is None and arrays[0] is not None:
+            self.episodes = EpisodeCosts(*arrays[0].shape, self.limit_on)
+            self.episodes.totals, self.episodes.highest, self.episodes.lengths = arrays
 
     def _choose_buffer(self) -> None:
         """Say which buffer SB3 is to make, and what it has to know of the costs."""
@@ -225,9 +232,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
             self._last_obs, self.begin_anew = None, False
         # The environments are reset under the same condition.
         if reset_num_timesteps or self._last_obs is None:
-            self.running_costs = np.zeros((self.n_envs, n_costs))
-            self.running_charges = np.zeros((self.n_envs, n_costs))
-            self.running_lengths = np.zeros(self.n_envs, dtype=np.int64)
+            self.episodes = EpisodeCosts(self.n_envs, n_costs, self.limit_on)
             self.last_costs = np.zeros((self.n_envs, n_costs))
         if reset_num_timesteps:
             self._begin_statistics()
@@ -256,24 +261,14 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         # A vectorised environment without anything to say may leave infos out.
         infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
         costs, seen = read_costs(infos, self.cost_keys, self.missing_cost == "zero")
-        if self.limit_on == "max" and np.min(costs) < 0.0:  # the highest so far begins at 0
-            raise NumberError(f"a cost is {np.min(costs)}: {self.label} needs costs of at least 0")
+        for episode in self.episodes.step(costs, dones):
+            self._ended_costs.append(episode.bounded)
+            self._ended_lengths.append(episode.length)
+            self.ep_cost_buffer.append(episode.total)
         self._cost_seen_lately |= seen
-        # [n_envs, m], for the buffer; of the highest cost so far, what the step adds to it
-        self.step_costs = costs
-        if self.limit_on == "max":
-            self.step_costs = np.maximum(costs - self.running_charges, 0.0)
+        self.step_costs = self.episodes.charges  # [n_envs, m], for the buffer
         self.total_costs += costs.sum(axis=0)
-        self.running_costs += costs
-        self.running_charges += self.step_costs
-        self.running_lengths += 1
         self.last_costs = np.where(dones[:, None], 0.0, costs)
-        for i in np.flatnonzero(dones):
-            self._ended_costs.append(self.running_charges[i].copy())
-            self._ended_lengths.append(int(self.running_lengths[i]))
-            self.ep_cost_buffer.append(self.running_costs[i].copy())
-            self.running_costs[i] = self.running_charges[i] = 0.0
-            self.running_lengths[i] = 0
 
     def _count_last_step(self, callback: BaseCallback) -> None:
         """Read the infos of a step at which a callback stopped training: SB3 only counts it."""
@@ -322,7 +317,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
             pass  # a vectorised environment need not tell: then no limit is known, as below
         if limits and all(is_number(limit) and limit > 0 for limit in limits):
             return float(np.mean(limits))
-        longest = float(self.running_lengths.max())
+        longest = float(self.episodes.lengths.max())
         if self.constrained:
             self._warn_once(
                 "no episode has ended yet and the environment states no max_episode_steps: until "

@@ -1,0 +1,74 @@
+"""The costs of episodes, compared with a loop over rows and steps."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from cost_envs import CostPoint
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_guard import PPOLag
+from sb3_guard.checks import NumberError
+from sb3_guard.common.monitor import CostMonitor
+from sb3_guard.costs import EpisodeCosts
+
+
+@pytest.mark.parametrize("limit_on", ["sum", "max"])
+def test_sums_and_highest_costs_are_those_of_a_loop(limit_on: Any) -> None:
+    rng = np.random.default_rng(0)
+    costs = rng.uniform(0.0, 2.0, (60, 3, 2))
+    dones = rng.uniform(size=(60, 3)) < 0.2
+    episodes = EpisodeCosts(3, 2, limit_on)
+    under_way: list[list[np.ndarray]] = [[], [], []]
+    for now, done in zip(costs, dones, strict=True):
+        ended = {episode.row: episode for episode in episodes.step(now, done)}
+        assert sorted(ended) == np.flatnonzero(done).tolist()
+        for row, steps in enumerate(under_way):
+            before = max([np.zeros(2), *steps], key=lambda step: step[0])[0]
+            steps.append(now[row])
+            if limit_on == "max":
+                charge = max(now[row, 0] - before, 0.0)
+                assert episodes.charges[row, 0] == pytest.approx(charge)
+            else:
+                assert (episodes.charges[row] == now[row]).all()
+            if row in ended:
+                total, highest = np.sum(steps, axis=0), np.max(steps, axis=0)
+                np.testing.assert_allclose(ended[row].total, total)
+                np.testing.assert_array_equal(ended[row].highest, highest)
+                bounded = highest if limit_on == "max" else total
+                np.testing.assert_allclose(ended[row].bounded, bounded)
+                assert ended[row].length == len(steps)
+                steps.clear()
+    assert episodes.lengths.tolist() == [len(steps) for steps in under_way]
+
+
+def test_a_negative_cost_has_no_highest_one_to_limit() -> None:
+    costs, dones = np.full((1, 1), -0.5), np.zeros(1, dtype=bool)
+    assert EpisodeCosts(1, 1).step(costs, dones) == []
+    with pytest.raises(NumberError, match=r"a cost is -0\.5: .* at least 0"):
+        EpisodeCosts(1, 1, "max").step(costs, dones)
+
+
+def test_files_with_three_arrays_are_read(tmp_path) -> None:
+    env = make_vec_env(lambda: CostPoint(episode_length=50), 2)
+    model = PPOLag("MlpPolicy", env, n_steps=20, batch_size=20, n_epochs=1, cost_limit=1.0)
+    model.learn(40)
+    sums, lengths = model.episodes.totals, model.episodes.lengths
+    model.running_costs, model.running_charges, model.running_lengths = sums, sums, lengths
+    model.episodes = None
+    model.save(tmp_path / "model")
+    again = PPOLag.load(tmp_path / "model", env=env, force_reset=False)
+    np.testing.assert_array_equal(again.episodes.totals, sums)
+    np.testing.assert_array_equal(again.episodes.lengths, [20, 20])
+    assert not [name for name in vars(again) if name.startswith("running_")]
+
+
+def test_states_of_a_monitor_with_three_arrays_are_read() -> None:
+    monitor = CostMonitor(make_vec_env(CostPoint, 2), cost_keys=("cost", "heat"))
+    state = monitor.state()
+    del state["episodes"]
+    state["episode_costs"], state["episode_lengths"] = np.array([1.0, 2.0]), np.array([3, 4])
+    state["_key_costs"] = np.array([[0.5, 1.5], [0.5, 0.5]])  # by key
+    monitor.restore(state)
+    assert monitor.episodes.totals.tolist() == [[1.0, 0.5, 0.5], [2.0, 1.5, 0.5]]
+    assert monitor.episodes.lengths.tolist() == [3, 4]

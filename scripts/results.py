@@ -5,8 +5,9 @@ models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and 
 a page stands the table of its runs, or of one environment in short, ``<!-- runs: NAME SUITE -->``.
 Instead of ``runs`` there are ``learnt: NAME``, returns in the end beside the untrained agents of
 ``docs/data/untrained.csv``; ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep: NAME
-SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; and, within a line, ``beside:
-NAME SUITE ALGO``. ``--pack FOLDER NAME`` packs the logs of a folder.
+SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; ``agents: pretrained``, how the
+package's agents keep their limits; and, within a line, ``beside: NAME SUITE ALGO``. ``--pack
+FOLDER NAME`` packs the logs of a folder.
 
 ``--curves`` draws the learning curves: of each algorithm's page, beside an unconstrained algorithm,
 from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of all algorithms of
@@ -15,6 +16,7 @@ from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of al
 """
 
 import argparse
+import json
 import re
 import tarfile
 import tempfile
@@ -30,6 +32,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+import sb3_guard
+from sb3_guard.costs import verdict
 from sb3_guard.zoo.figures import COLORS, INK, STYLE, WIDTH, Data, finish, save
 from sb3_guard.zoo.paper import draw
 from sb3_guard.zoo.runs import Results, read_episodes, read_results
@@ -39,7 +43,7 @@ from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
 BLOCK = re.compile(
-    r"(<!-- (runs|learnt|scores|sweep|beside): (\S+)(?: (\S+))?(?: (\S+))? -->\n?).*?"
+    r"(<!-- (runs|learnt|scores|sweep|agents|beside): (\S+)(?: (\S+))?(?: (\S+))? -->\n?).*?"
     r"(<!-- end -->)",
     re.DOTALL,
 )
@@ -204,6 +208,31 @@ def beside(name: str, suite: str, algo: str) -> str:
     )
 
 
+def agents(folder: str) -> str:
+    """A table of the constrained agents in a folder of the package: 100 episodes in each mode."""
+    rows = []
+    for path in sorted((Path(sb3_guard.__file__).parent / folder).glob("*/*/result.json")):
+        result = json.loads(path.read_text())
+        limit = result.get("cost_limit")
+        if limit is None:
+            continue
+        row = {
+            "environment": result["env"],
+            "algorithm": result["label"],
+            "trained at": f"{result.get('trained_at', limit):g}",
+            "limit": f"{limit:g}",
+        }
+        for mode, actions in (("stochastic", "sampled"), ("deterministic", "most likely")):
+            cost, _, low, high = result["played"][mode]["cost"]
+            row[f"return, {actions} actions"] = number(result["played"][mode]["return"][0], 1)
+            row[f"cost, {actions} actions"] = (
+                f"{number(cost, 1)} [{number(low, 1)}, {number(high, 1)}], "
+                f"{verdict(low, high, limit)}"
+            )
+        rows.append(row)
+    return markdown(spelled(pd.DataFrame(rows), {name: name for name in rows[0]}))
+
+
 def _published(known: pd.DataFrame, algo: str) -> str:
     if algo not in known.index:
         return "–"
@@ -219,7 +248,7 @@ def filled(page: str) -> str:
         begin, kind, name, only, algo, end = match.groups()
         if kind == "beside":
             return f"{begin}{beside(name, only, algo)}{end}"
-        made = {"learnt": learnt, "scores": scores}
+        made = {"learnt": learnt, "scores": scores, "agents": agents}
         if kind == "sweep":
             text = sweep(name, only)
         else:

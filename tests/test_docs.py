@@ -1,7 +1,9 @@
 """The documents are true: examples run, pages match the code, links lead somewhere."""
 
 import functools
+import importlib
 import importlib.util
+import inspect
 import re
 import subprocess
 import sys
@@ -11,6 +13,7 @@ import gymnasium
 import pytest
 
 import sb3_guard
+from sb3_guard.algorithms import TrustRegion
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -18,7 +21,10 @@ PAGES = [path for path in sorted(DOCS.rglob("*.md")) if "_build" not in path.par
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *PAGES]
 GUIDES = [
     ROOT / "README.md",
-    *(DOCS / f"{name}.md" for name in ("quickstart", "concepts", "trust", "writing_an_algorithm")),
+    *(
+        DOCS / f"{name}.md"
+        for name in ("quickstart", "concepts", "keeping_a_limit", "trust", "writing_an_algorithm")
+    ),
     *sorted((DOCS / "algorithms").glob("*.md")),
 ]
 # The samples as written, but for the length of the training.
@@ -26,6 +32,8 @@ SHORTER = {
     r"(\.learn\(|total_timesteps=)[\d_]+": r"\g<1>40",
     r"n_steps=1000": "n_steps=20",
     r"n_envs=\d+": "n_envs=2",
+    # Off-policy, n_steps are those of a return.
+    r"(make_model\(\"(?!sac|td3|tqc)[^()]*?),?\s*\)": r"\g<1>, n_envs=2, n_steps=20)",
     r"n_eval_episodes=\d+": "n_eval_episodes=2",
     r"progress_bar=True": "progress_bar=False",
 }
@@ -63,6 +71,8 @@ def anchors(document):
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.stem)
 def test_the_guides_samples_run_in_order(guide, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    registered = gymnasium.registry["Goal_Point_8Hazards-v0"]
+    monkeypatch.setattr(registered, "max_episode_steps", 20)
     blocks = python_blocks(guide)
     assert blocks
     names = {"gymnasium": gymnasium}
@@ -70,6 +80,49 @@ def test_the_guides_samples_run_in_order(guide, tmp_path, monkeypatch):
         for long, short in SHORTER.items():
             block = re.sub(long, short, block)
         exec(compile(block, guide.name, "exec"), names)
+
+
+def stated_defaults(page):
+    """The rows of a page's tables of parameters: {name: default, or the class that has it}."""
+    stated = {}
+    header = r"^\| parameter \| default \|.*\n\|.*\n"
+    for table in re.findall(rf"{header}((?:\|.*\n)+)", page, re.MULTILINE):
+        for row in table.splitlines():
+            names, default, meaning = row.strip("| ").split(" | ", 2)
+            names = re.findall(r"`(\w+)`", names)
+            if default == "SB3's":
+                base = re.search(r"SB3(?:-contrib)?'s (\w+)", meaning)[1]
+                values = [sb3_class(base)] * len(names)
+            elif default.startswith("as for"):
+                values = [sb3_guard.ALGORITHMS[default.split("`")[1].lower()]] * len(names)
+            else:
+                values = eval(f"[{default}]")
+            stated |= dict(zip(names, values, strict=True))
+    return stated
+
+
+def sb3_class(name):
+    package = "sb3_contrib" if name == "TQC" else "stable_baselines3"
+    return getattr(importlib.import_module(package), name)
+
+
+@functools.cache
+def defaults(cls):
+    return {name: p.default for name, p in inspect.signature(cls).parameters.items()}
+
+
+@pytest.mark.parametrize("key", sb3_guard.ALGORITHMS)
+def test_tables_of_parameters_have_the_defaults_of_the_classes(key):
+    cls = sb3_guard.ALGORITHMS[key]
+    stated = stated_defaults((DOCS / "algorithms" / f"{key}.md").read_text())
+    if issubclass(cls, TrustRegion):  # a row of the algorithm's own page comes first
+        every = stated_defaults((DOCS / "algorithms.md").read_text())
+        assert {"target_kl", "cost_gae_lambda", "missing_cost"} <= every.keys()
+        stated = {name: every[name] for name in every if name in defaults(cls)} | stated
+    assert stated
+    for name, value in stated.items():
+        value = defaults(value)[name] if isinstance(value, type) else value
+        assert defaults(cls)[name] == value, name
 
 
 @pytest.mark.parametrize("path", sorted(generated_pages()))

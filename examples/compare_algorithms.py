@@ -6,17 +6,18 @@
 import matplotlib.pyplot as plt
 from stable_baselines3.common.monitor import load_results
 
-from sb3_guard import ALGORITHMS, make_vec_env
+from sb3_guard import make_model
 
 LIMIT = 5.0
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
 for name in ("trpo", "cpo", "trpo_lag"):
     log = f"compare/{name}"
-    env = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=0, monitor_path=f"{log}/0")
-    model = ALGORITHMS[name]("MlpPolicy", env, n_steps=1000, cost_limit=LIMIT, seed=0)
+    model = make_model(
+        name, "Goal_Point_8Hazards", cost_limit=LIMIT, n_envs=10, seed=0, monitor_path=f"{log}/0"
+    )
     model.learn(300_000)
-    env.close()
+    model.get_env().close()
     episodes = load_results(log)  # a row per episode: return r, cost c, length l
     means = episodes.groupby(episodes.index // 10 * 10_000 + 10_000).mean()  # ten per update
     axes[0].plot(means.index, means["r"], label=name)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_guard import TRPOLag, evaluate_policy, make_vec_env, register_constraint
+from sb3_guard import evaluate_policy, make_model, register_constraint
 from sb3_guard.envs.observation import Values
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Constraint
@@ -30,7 +30,8 @@ class Fence(Constraint):
 
 
 register_constraint("Fence", Fence)
-env = make_vec_env("Goal_Point_4Hazards", 10, seed=0, env_kwargs={"fence": {"radius": 1.2}})
-model = TRPOLag("MlpPolicy", env, n_steps=1000, cost_keys=["cost_fence"], cost_limit=25, seed=0)
-model.learn(300_000)
+limit = {"cost_keys": ["cost_fence"], "cost_limit": 25.0}
+fence = {"fence": {"radius": 1.2}}
+model = make_model("trpo_lag", "Goal_Point_4Hazards", env_kwargs=fence, n_envs=10, seed=0, **limit)
+env = model.learn(300_000).get_env()
 print("steps outside:", evaluate_policy(model, env, n_eval_episodes=10, seed=1).key_costs[:, 0])

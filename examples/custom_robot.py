@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sb3_guard import CPO, evaluate_policy, make_vec_env, register_robot
+from sb3_guard import evaluate_policy, make_model, register_robot
 
 Path("puck.xml").write_text("""
 <mujoco model="puck">
@@ -26,9 +26,9 @@ Path("puck.xml").write_text("""
 register_robot("Puck", xml="puck.xml")
 
 # Every task and every constraint knows it now, and so do `sb3_guard.make` and the commands.
-env = make_vec_env("Goal_Puck_8Hazards", n_envs=10, seed=0)
+model = make_model("cpo", "Goal_Puck_8Hazards", cost_limit=5.0, n_envs=10, seed=0)
+env = model.get_env()
 print(f"{env.observation_space.shape[0]} observations, {env.action_space.shape[0]} actions")
-model = CPO("MlpPolicy", env, n_steps=1000, cost_limit=5.0, seed=0)
 model.learn(300_000)
 evaluation = evaluate_policy(model, env, n_eval_episodes=10, seed=1)
 print(f"return {evaluation.returns.mean():.1f}, cost {evaluation.costs.mean():.2f}")

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_guard import CPO, evaluate_policy, make_vec_env, register_task
+from sb3_guard import evaluate_policy, make_model, register_task
 from sb3_guard.envs.observation import Compass, Values
 from sb3_guard.envs.part import Task
 
@@ -33,6 +33,6 @@ class Lap(Task):
 
 
 register_task("Lap", Lap)
-env = make_vec_env("Lap_Point_4Hazards", n_envs=10, seed=0)
-model = CPO("MlpPolicy", env, n_steps=1000, cost_limit=5.0, seed=0).learn(300_000)
+model = make_model("cpo", "Lap_Point_4Hazards", cost_limit=5.0, n_envs=10, seed=0)
+env = model.learn(300_000).get_env()
 print("metres:", evaluate_policy(model, env, n_eval_episodes=10, seed=1).returns.round(1))

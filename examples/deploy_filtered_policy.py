@@ -3,12 +3,12 @@
 import gymnasium
 import numpy as np
 
-from sb3_guard import TRPOSL, make_vec_env
+from sb3_guard import make_model
 from sb3_guard.algorithms.common.policies import FilteredPolicy
 
-env = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=0)
 # After a third of the training, the layer corrects actions whose predicted cost is above 0.
-model = TRPOSL("MlpPolicy", env, n_steps=1000, cost_limit=0.0, seed=0).learn(300_000)
+model = make_model("trpo_sl", "Goal_Point_8Hazards", cost_limit=0.0, n_envs=10, seed=0)
+model.learn(300_000)
 model.policy.save("filtered_policy.pt")
 
 # The file holds the network and its layer: no algorithm, critic or environment is needed.

@@ -1,18 +1,19 @@
 """Two constraints, each with a limit of its own."""
 
-from sb3_guard import CPO, evaluate_policy, make_vec_env
+from sb3_guard import evaluate_policy, make_model
 
 costs = ("cost_hazards", "cost_ghosts")  # each constraint reports its own; "cost" is the sum
 
-env = make_vec_env(
+model = make_model(
+    "cpo",
     "Goal_Point_8Hazards",
+    env_kwargs={"ghosts": {"num": 4, "speed": 0.002}},  # speed: m per control step
+    cost_keys=costs,
+    cost_limit=[5.0, 2.0],
     n_envs=10,
     seed=0,
-    env_kwargs={"ghosts": {"num": 4, "speed": 0.002}},  # speed: m per control step
-    monitor_kwargs={"cost_keys": costs},
 )
-model = CPO("MlpPolicy", env, n_steps=1000, cost_keys=costs, cost_limit=[5.0, 2.0], seed=0)
-model.learn(300_000)
+env = model.learn(300_000).get_env()
 
 evaluation = evaluate_policy(model, env, n_eval_episodes=10, seed=1)
 print("return", evaluation.estimate(evaluation.returns))

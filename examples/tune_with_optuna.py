@@ -5,22 +5,20 @@
 
 import optuna
 
-from sb3_guard import TRPOLag, evaluate_policy, make_vec_env
+from sb3_guard import evaluate_policy, make_model
 
 LIMIT = 5.0  # cost of an episode
-env = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=0)
 
 
 def objective(trial: optuna.Trial) -> float:
-    model = TRPOLag(
-        "MlpPolicy",
-        env,
-        n_steps=1000,
-        cost_limit=LIMIT,
-        target_kl=trial.suggest_float("target_kl", 0.005, 0.05, log=True),
-        lambda_lr=trial.suggest_float("lambda_lr", 0.02, 1.0, log=True),
-        seed=0,
-    ).learn(200_000)
+    settings = {
+        "target_kl": trial.suggest_float("target_kl", 0.005, 0.05, log=True),
+        "lambda_lr": trial.suggest_float("lambda_lr", 0.02, 1.0, log=True),
+    }
+    model = make_model(
+        "trpo_lag", "Goal_Point_8Hazards", cost_limit=LIMIT, n_envs=10, seed=0, **settings
+    )
+    env = model.learn(200_000).get_env()
     evaluation = evaluate_policy(model, env, n_eval_episodes=10, seed=1)
     trial.set_constraint("cost", evaluation.costs.mean() - LIMIT)  # feasible if at most 0
     return evaluation.returns.mean()

@@ -39,6 +39,7 @@ SAYS = {
 LENGTHS = {
     r"[1235]00_000": "200",
     r"n_steps=(1000|500)": "n_steps=20",
+    r"(make_model\([^()]*?),?\s*\)": r"\1, n_steps=20)",
     r"batch_size=1000": "batch_size=200",
     r"buffer_size=100_000": "buffer_size=200",
     r"n_trials=20": "n_trials=2",

@@ -1,9 +1,12 @@
 """What the project says of itself in several places is the same."""
 
+import re
 import tomllib
 from pathlib import Path
 
 import yaml
+
+import sb3_guard
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -25,3 +28,9 @@ def test_pre_commit_has_the_ruff_of_make_check():
     assert [f"ruff=={rev[1:].rpartition('.')[0]}.*" for rev in revisions] == [
         name for name in needs if name.startswith("ruff")
     ]
+
+
+def test_the_version_is_the_changelogs_latest():
+    released = re.findall(r"(?m)^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text())
+    assert released[:2] == ["Unreleased", sb3_guard.__version__]
+    assert f"version: {sb3_guard.__version__}" in (ROOT / "CITATION.cff").read_text()

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from sb3_guard.zoo import runs as reading
-from sb3_guard.zoo.figures import FORMATS, Data, save
+from sb3_guard.zoo.figure_data import Data
+from sb3_guard.zoo.figures import FORMATS, save
 from sb3_guard.zoo.flags import Command, command, flag
 from sb3_guard.zoo.paper import FIGURES, draw
 from sb3_guard.zoo.report import report

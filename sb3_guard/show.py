@@ -228,7 +228,7 @@ def show(flags: Flags) -> int:
     print(observation_table(env), action_table(env), sep="\n\n")
     if env.engine.drawn.ranges:
         print("\n" + drawn_table(env))
-    path = Path(flags.output) if flags.output else Path(f"{file.stem.removesuffix('-v0')}.png")
+    path = Path(flags.output) if flags.output else Path(f"{file.stem}.png")
     with explained("no picture", RenderingError, OSError, ValueError):
         from matplotlib import image
 

@@ -429,7 +429,8 @@ def test_an_arm_trains_plays_and_records(tmp_path):
     frames = imageio_ffmpeg.read_frames(str(video))
     next(frames)
     pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
-    assert len(pictures) == 5  # of 10 steps at 50 a second, 25 pictures a second
+    # 5 of 10 steps at 50 a second, 25 pictures a second; the last one stays for a second.
+    assert len(pictures) == 5 + 25
     assert np.ptp(pictures[0]) > 100 and not np.array_equal(pictures[0], pictures[-1])
 
 
@@ -614,6 +615,14 @@ def test_list_shows_the_pretrained_agents(capsys):
     assert head[:2] == ["pretrained agent", "environment"]
     assert ["cpo", "trpo"] == [r[0] for r in cells if r[1] == "Goal_Point_8Hazards-v0"]
     assert len(cells) == len([*PRETRAINED.glob("*/*_1")])
+
+
+def test_show_draws_each_version_into_a_file_of_its_name(tmp_path, monkeypatch):
+    require_rendering()
+    monkeypatch.chdir(tmp_path)
+    for name in ("SafetyHopperVelocity", "SafetyHopperVelocity-v0"):
+        assert cli.main(["show", name]) == 0
+        assert (tmp_path / f"{name}.png").is_file()
 
 
 def test_show_names_the_joints_of_a_velocity_task(tmp_path, capsys):

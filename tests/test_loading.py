@@ -12,6 +12,7 @@ from cost_envs import CostPoint
 import sb3_guard
 from sb3_guard import CPO, TRPOUSL, PPOLag, SACLag, TD3Lag, TQCLag, TRPOLag, train
 from sb3_guard.algorithms.common.arguments import stated
+from sb3_guard.zoo.checkpoint import read_normalizer
 
 SMALL = {"seed": 0, "gamma": 0.97}
 ON = {"n_steps": 40, "policy_kwargs": {"net_arch": [16]}, **SMALL}
@@ -77,6 +78,28 @@ def test_a_missing_network_of_sb3s_is_still_an_error(tmp_path):
     model = PPOLag("MlpPolicy", CostPoint(10), n_steps=40, batch_size=20, cost_limit=1.0)
     with pytest.raises(ValueError, match="policy"):
         model.set_parameters({"policy.optimizer": model.policy.optimizer.state_dict()})
+
+
+@pytest.mark.parametrize("beside", ["ppo_vecnormalize.pkl", "run/vecnormalize.pkl", None])
+def test_train_goes_on_with_the_statistics_beside_the_agent(tmp_path, capsys, beside):
+    env = sb3.common.vec_env.DummyVecEnv([lambda: CostPoint(20)])
+    statistics = sb3.common.vec_env.VecNormalize(env)
+    statistics.obs_rms.count = 5000.0
+    (tmp_path / "run").mkdir()
+    if beside:
+        statistics.save(str(tmp_path / beside))
+    agent = sb3.PPO("MlpPolicy", statistics, n_steps=30, batch_size=30, seed=0)
+    agent.save(tmp_path / "ppo")
+    run = "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:20".split()
+    run += "-params n_envs:2 n_steps:30 batch_size:60 cost_limit:4.0 normalize:True".split()
+    run += ["--algo", "ppo_lag", "-n", "60", "--eval-freq", "-1", "--device", "cpu"]
+    run += ["-f", str(tmp_path / "logs"), "-i", str(tmp_path / "ppo.zip")]
+    with pytest.warns(UserWarning, match="PPOLag takes over"):
+        assert train.main(run) == 0
+    said = "ppo.zip: observation statistics begin anew"
+    assert capsys.readouterr().out.count(said) == (beside is None)
+    (file,) = (tmp_path / "logs" / "ppo_lag").rglob("vecnormalize.pkl")
+    assert (read_normalizer(file).obs_rms.count > 5000) == (beside is not None)
 
 
 def test_train_goes_on_from_an_agent_of_sb3s(tmp_path):

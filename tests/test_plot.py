@@ -17,7 +17,8 @@ from sb3_guard import cli, plot
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.suites.guard import SUITE_ROBOTS
 from sb3_guard.zoo import figures
-from sb3_guard.zoo.figures import INK, Data, fit_costs, inline_svg, pareto_front, save
+from sb3_guard.zoo.figure_data import COLORS, INK, Data
+from sb3_guard.zoo.figures import fit_costs, inline_svg, pareto_front, save
 from sb3_guard.zoo.paper import FIGURES, draw
 from sb3_guard.zoo.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.report import report
@@ -241,7 +242,7 @@ def contrast(color, page) -> float:
 
 
 def test_colours_are_readable_on_white_and_in_the_dark():
-    for color in (INK, *figures.COLORS):
+    for color in (INK, *COLORS):
         for page in ("#ffffff", "#131416"):
             assert contrast(color, page) > (4 if color == INK else 2.8), (color, page)
 

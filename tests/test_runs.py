@@ -7,14 +7,8 @@ import pandas as pd
 import pytest
 from fake_runs import fake_run
 
-from sb3_guard.zoo.runs import (
-    COLUMNS,
-    choose,
-    notices,
-    read_curve,
-    read_results,
-    select,
-)
+from sb3_guard.zoo.curves import read_curve
+from sb3_guard.zoo.runs import COLUMNS, choose, notices, read_results, select
 from sb3_guard.zoo.usage import UsageError
 
 HAZARDS, GHOSTS = "Goal_Point_8Hazards", "Goal_Point_8Ghosts"

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 from fake_runs import LABELS, fake_run
 
+from sb3_guard.zoo.curves import read_curve
 from sb3_guard.zoo.markdown import escaped
-from sb3_guard.zoo.runs import COLUMNS, read_curve, read_results
+from sb3_guard.zoo.runs import COLUMNS, read_results
 from sb3_guard.zoo.statistics import (
     SAFETY,
     aggregate,

@@ -179,6 +179,8 @@ class Experiment:
             for name in ("policy", "policy_kwargs"):
                 arguments.pop(name, None)
             path = Path(flags.trained_agent)
+            if self.setup.normalize is not None and self._statistics_beside() is None:
+                print(f"no vecnormalize.pkl beside {path}: observation statistics begin anew")
             return load_model(self.algorithm, path, env, flags.device, **arguments)
         space = env.action_space
         noise = self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
@@ -189,11 +191,18 @@ class Experiment:
 
     def _warm_start_normalizer(self) -> VecNormalize | None:
         """Observation statistics that belong to the agent given by ``-i model.zip``."""
-        agent = self.flags.trained_agent
-        if self.folder is not None or not agent or self.setup.normalize is None:
+        file = self._statistics_beside()
+        return read_normalizer(file) if file else None
+
+    def _statistics_beside(self) -> Path | None:
+        """The file of observation statistics that a run or an evaluation wrote beside its model."""
+        agent = Path(self.flags.trained_agent)
+        if self.folder is not None or not agent.name or self.setup.normalize is None:
             return None
-        found = sorted(Path(agent).parent.glob("*/vecnormalize.pkl"))
-        return read_normalizer(found[0]) if found else None
+        best = agent.with_name(f"{agent.stem}_vecnormalize.pkl")  # of best_model.zip
+        if best.is_file():
+            return best
+        return min(agent.parent.glob("*/vecnormalize.pkl"), default=None)
 
 
 def _check_device(name: str) -> None:

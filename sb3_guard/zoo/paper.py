@@ -9,16 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from sb3_guard.zoo.figure_data import COLORS, DASHES, INK, Data, Look
 from sb3_guard.zoo.figures import (
-    COLORS,
-    DASHES,
-    INK,
     SCORE_AXES,
     STYLE,
     WIDTH,
-    Data,
     Drawing,
-    Look,
     curves,
     curves_of,
     finish,

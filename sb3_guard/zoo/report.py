@@ -9,16 +9,8 @@ import jinja2
 import pandas as pd
 
 import sb3_guard
-from sb3_guard.zoo.figures import (
-    INK,
-    Data,
-    Look,
-    cost_name,
-    draw_curves,
-    draw_pareto,
-    inline_svg,
-    panel,
-)
+from sb3_guard.zoo.figure_data import INK, Data, Look
+from sb3_guard.zoo.figures import cost_name, draw_curves, draw_pareto, inline_svg, panel
 from sb3_guard.zoo.paper import FIGURES, draw
 from sb3_guard.zoo.runs import VERSIONS
 from sb3_guard.zoo.tables import RUNS, spelled, tables

@@ -93,7 +93,8 @@ class RunFlags(EvaluationFlags, TrainingFlags):
     :param env: environment id; the version may be left out (default: Goal_Point_8Hazards)
     :param seed: random seed (default: -1, a random one)
     :param trained_agent: a run folder or checkpoint.zip: continue that run in place, exactly; any
-        other model.zip: begin a new run from that agent
+        other model.zip: begin a new run from that agent, with the observation statistics in
+        <model>_vecnormalize.pkl or */vecnormalize.pkl beside it
 
     Files:
 

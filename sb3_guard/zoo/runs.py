@@ -13,12 +13,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.run_folder import MEASURES, RunFolder
-from sb3_guard.zoo.usage import UsageError, explained, one_line
+from sb3_guard.zoo.usage import UsageError, one_line
 
 REFERENCE = "trpo"  # scores are relative to it
 # Columns of the figures of merit, and their key in result.json
@@ -40,7 +39,6 @@ SETTINGS = (
     "n_envs", "n_steps", "gamma", "gae_lambda", "target_kl", "policy_kwargs", "normalize",
 )  # fmt: skip
 VERDICTS = ("exceeded", "undecided", "kept")  # the worst one first
-CURVE_POINTS = 200  # at most as many per run, of epochs taken together
 
 
 class Results(NamedTuple):
@@ -370,45 +368,3 @@ def _differences(group: pd.DataFrame) -> Iterable[str]:
 def compared(table: pd.DataFrame) -> "pd.Series[bool]":
     """Which rows are of the reference or of constrained algorithms, rather than of baselines."""
     return (table["algo"] == REFERENCE) | (table["family"].fillna("") != "")
-
-
-# Episodes
-
-
-def read_episodes(path: str | Path) -> pd.DataFrame:
-    """
-    All training episodes of a run.
-
-    :return: ``step`` at which the episode ended, ``J_r``, ``M_c``, of several costs also
-        ``M_c/<key>``, and ``rho_c`` (cumulative cost ÷ steps until then)
-    :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
-    """
-    file = Path(path) / "0.monitor.csv"
-    with explained(f"can't read {file}", OSError, ValueError, KeyError):
-        table = pd.read_csv(file, skiprows=1).filter(regex="^([rlc]|c_.*)$").astype(float)
-        steps = table.pop("l").cumsum()
-        rate = table["c"].cumsum() / steps
-    if not len(table) or table.isna().any(axis=None):
-        raise UsageError(f"can't use {file}: it has no episodes, or is truncated")
-    names = {"r": "J_r", "c": "M_c"}
-    table.columns = [names.get(name, f"M_c/{name[2:]}") for name in map(str, table)]
-    return table.assign(step=steps, rho_c=rate)
-
-
-def read_curve(path: str | Path, epoch: float = math.nan) -> pd.DataFrame:
-    """
-    How a run went, epoch by epoch.
-
-    :param path: the run folder
-    :param epoch: steps per point; NaN or too few: 1/200 of the run
-    :return: ``step`` (the end of an epoch), ``J_r``, ``M_c`` and ``M_c/<key>`` (means over the
-        episodes that ended in it), and ``rho_c`` (cumulative cost ÷ steps of all episodes until
-        then)
-    :raises UsageError: see :func:`read_episodes`
-    """
-    table = read_episodes(path)
-    total = table["step"].iloc[-1]
-    rollout = epoch if epoch > 0 else total / CURVE_POINTS
-    size = rollout * max(1, math.ceil(total / rollout / CURVE_POINTS))
-    epochs = table.groupby(np.ceil(table["step"] / size) * size)
-    return epochs.mean().assign(rho_c=epochs["rho_c"].last()).drop(columns="step").reset_index()

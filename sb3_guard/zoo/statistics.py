@@ -14,8 +14,9 @@ import numpy as np
 import pandas as pd
 from scipy.stats import trim_mean
 
+from sb3_guard.zoo.curves import read_episodes
 from sb3_guard.zoo.run_folder import EPOCH
-from sb3_guard.zoo.runs import METRICS, REFERENCE, compared, read_episodes
+from sb3_guard.zoo.runs import METRICS, REFERENCE, compared
 from sb3_guard.zoo.usage import UsageError
 
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
@@ -65,7 +66,7 @@ def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, floa
     """
     What users ask about the safety of a run; all but ``cost_total`` of its last ten epochs.
 
-    :param episodes: see :func:`~sb3_guard.zoo.runs.read_episodes`
+    :param episodes: see :func:`~sb3_guard.zoo.curves.read_episodes`
     :param epoch: steps; NaN: 30,000, or a twentieth of a shorter run
     :param limit: of an episode's cost; NaN: there is none
     :return: ``return_last`` and ``cost_last``, means over epochs of their episodes' means;

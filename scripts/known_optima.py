@@ -42,6 +42,8 @@ STATEWISE = {
     "contexts": ("trpo_fac", "trpo_sl", "trpo_usl"),
     "wall": ("scpo", "trpo_sl", "trpo_usl"),
 }
+#: Problems with a limit of 0, and who is tried on them.
+ZERO = {"brink": ("cpo", "pcpo", "trpo_lag", "trpo_ipo", "trpo_fac", "trpo_sl", "trpo_usl")}
 KEPT = 0.8  # share of the optimum that those need that act within a limit
 
 
@@ -49,8 +51,9 @@ def fits(algo: str, name: str) -> bool:
     """Whether an algorithm is meant for a problem."""
     cls, problem = ALGORITHMS[algo], problems()[name]
     box = isinstance(problem.world().action_space, spaces.Box)
-    if name in STATEWISE:
-        return algo in STATEWISE[name]
+    chosen = {**STATEWISE, **ZERO}
+    if name in chosen:
+        return algo in chosen[name]
     if issubclass(cls, FilteredTrustRegion) or algo in ("trpo", "scpo"):
         return False
     return box or not issubclass(cls, CostReplay)

@@ -207,6 +207,36 @@ class WallWorld(World):
         return state + moved, moved, np.maximum(0.0, state + moved)[:, None]
 
 
+class Brink(World):
+    """A cart that is paid to move right and must stop before a brink at 0: a limit of 0.
+
+    Observation: position and speed; action: acceleration. Each step costs the depth beyond 0.
+    Episodes start at rest at -1 to -0.6, so that whoever stops at the brink gets 0.8 on average;
+    at full speed the cart needs its last 0.2 units to stop.
+    """
+
+    horizon = 40
+    top, push = 0.1, 0.025  # units a step, and a step squared
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-4.0, 4.0, (2,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def start(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        return np.stack([rng.uniform(-1.0, -0.6, n), np.zeros(n)], axis=1)
+
+    def observe(self, state: np.ndarray, time: int) -> np.ndarray:
+        return np.stack([state[:, 0], 10.0 * state[:, 1]], axis=1).astype(np.float32)
+
+    def move(
+        self, state: np.ndarray, time: int, action: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        pushed = state[:, 1] + self.push * np.clip(action[:, 0].astype(np.float64), -1.0, 1.0)
+        speed = np.clip(pushed, -self.top, self.top)
+        position = state[:, 0] + speed
+        return np.stack([position, speed], axis=1), speed, np.maximum(0.0, position)[:, None]
+
+
 class Worlds(VecEnv):
     """n rows of a world as a vectorised environment whose episodes report their sums.
 
@@ -292,6 +322,7 @@ class Problem:
     :param updates: until the policy is judged
     :param statewise: whether the limits are those of the worst step
     :param by_context: whether they hold from each first state, not on the average over them
+    :param unit: what costs are given in where the limit is 0
     """
 
     world: Callable[[], World]
@@ -303,6 +334,7 @@ class Problem:
     updates: int = 60
     statewise: bool = False
     by_context: bool = False
+    unit: float = 1.0
 
     def make_env(self, seed: int = 0, scale: float = 1.0) -> Worlds:
         """The environment; ``scale`` multiplies the costs, whose limits go with them."""
@@ -346,7 +378,10 @@ LARGE = 50.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """Return as a share of the constrained optimum, and costs as shares of their limits, (m,)."""
+    """Return as a share of the constrained optimum, and costs as shares of their limits, (m,).
+
+    Where the limit is 0, costs are shares of what the unconstrained optimum costs.
+    """
 
     value: float
     cost: np.ndarray
@@ -388,7 +423,8 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
     if problem.by_context:
         firsts = np.array(outcomes.firsts)
         costs = np.max([each[firsts == first].mean(axis=0) for first in set(firsts)], axis=0)
-    return Outcome(float(np.mean(outcomes.returns)) / problem.best, costs / limits)
+    units = np.where(limits > 0.0, limits, scale * problem.unit)
+    return Outcome(float(np.mean(outcomes.returns)) / problem.best, costs / units)
 
 
 def budget(cls: type, problem: Problem) -> Problem:
@@ -466,4 +502,5 @@ def problems() -> dict[str, Problem]:
         ),
         "contexts": _bandit((1.0,), target=(0.6, 0.4), normals=[[1, 1]], offsets=[[1.0], [-1.0]]),
         "wall": Problem(WallWorld, (0.5,), 1.25, 3.0, n_steps=60, statewise=True),
+        "brink": Problem(Brink, (0.0,), 0.8, 3.85, n_steps=40, unit=48.0),
     }

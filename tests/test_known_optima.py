@@ -115,6 +115,33 @@ def test_whoever_stops_at_the_limit_has_the_walls_optimum() -> None:
     assert value == pytest.approx(problem.unconstrained) and worst > 4 * problem.limits[0]
 
 
+def test_whoever_brakes_in_time_has_the_brinks_optimum() -> None:
+    """The fastest speed from which the cart can still stop reaches the brink, at no cost."""
+    problem = PROBLEMS["brink"]
+    world = problem.world()
+    pushes = np.linspace(-1.0, 1.0, 201)
+
+    def drive(brakes: bool) -> tuple[float, float]:
+        rng = np.random.default_rng(0)
+        state, total, costs = world.start(rng, 2000), 0.0, 0.0
+        for time in range(world.horizon):
+            action = np.ones(len(state))
+            if brakes:
+                speed = np.clip(state[:, 1:] + world.push * pushes, -world.top, world.top)
+                slower = (np.maximum(speed - k * world.push, 0.0) for k in range(1, 5))
+                stops = state[:, :1] + speed + sum(slower) <= 1e-12
+                action = np.where(stops, pushes, -1.0).max(axis=1)
+            state, reward, cost = world.move(state, time, action[:, None], rng)
+            total, costs = total + reward.mean(), costs + cost.mean()
+        return total, costs
+
+    value, cost = drive(brakes=True)
+    assert cost == 0.0 and value == pytest.approx(problem.best, rel=0.01)
+    value, cost = drive(brakes=False)
+    assert value == pytest.approx(problem.unconstrained)
+    assert cost == pytest.approx(problem.unit, rel=0.01)
+
+
 def test_rows_are_the_environment_that_gymnasium_has() -> None:
     """Means of random episodes agree between a batch and SB3's vectorised single environments."""
     problem = PROBLEMS["table-3"]

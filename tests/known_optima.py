@@ -423,7 +423,7 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
     if problem.by_context:
         firsts = np.array(outcomes.firsts)
         costs = np.max([each[firsts == first].mean(axis=0) for first in set(firsts)], axis=0)
-    units = np.where(limits > 0.0, limits, scale * problem.unit)
+    units = np.where(limits == 0.0, scale * problem.unit, limits)
     return Outcome(float(np.mean(outcomes.returns)) / problem.best, costs / units)
 
 

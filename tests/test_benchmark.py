@@ -267,7 +267,7 @@ def test_another_run_in_the_folder_is_not_touched(tmp_path, here, capsys):
     assert benchmark.main(arguments) == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     for change, part in (
-        (["-params", "cost_limit:5"], "cost_limit: none there, 5.0 here"),
+        (["-params", "cost_limit:5"], "cost_limit: 2.0 there, 5.0 here"),
         (["-n", "240"], "n_timesteps: 120 there, 240 here"),
         (["--eval-freq", "60"], "eval_freq: -1 there, 60 here"),
     ):
@@ -377,7 +377,7 @@ def test_a_run_looks_for_the_file_after_each_rollout(tmp_path, here):
             return len(asked) > 3
 
     flags = RunFlags(log_folder=str(tmp_path), gym_packages=["registered_envs"], eval_freq=-1)
-    flags.hyperparams = {"n_envs": 2, "n_steps": 30}
+    flags.hyperparams = {"n_envs": 2, "n_steps": 30, "cost_limit": 2.0}
     (run,) = grid.expand([("CostPoint-v0", "cpo")], [0], replace(flags, n_timesteps=600))
     assert grid.carry_out(run, "", Appearing(stop)) == ("stopped", "")
     assert len(asked) == 4 and (run.path / "checkpoint.zip").exists()

@@ -31,7 +31,7 @@ def test_samples_run(tmp_path, monkeypatch):
     (scenario,) = re.findall(r"```yaml\n(.*?)```", PAGE, flags=re.DOTALL)
     Path("my_scenario.yml").write_text(scenario)
     samples = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
-    assert len(samples) == 12
+    assert len(samples) == 13
     known = dict(gymnasium.registry)
     try:
         with own_parts():

@@ -56,8 +56,6 @@ class TRPOIPO(TrustRegion):
         "t": {"low": 2.0, "high": 100.0, "log": True},
         "max_multiplier": {"low": 0.5, "high": 20.0, "log": True},
     }
-    # Costs far ahead are noisy in a rollout, so they are left to the cost critic.
-    defaults: ClassVar[dict[str, Any]] = {"cost_gae_lambda": 0.5}
 
     t: float = hyperparameter(20.0, ends="()")
     max_multiplier: float = hyperparameter(2.0, ends="()")

@@ -21,5 +21,4 @@ class TRPOLag(PenalizedTrustRegion):
     """
 
     label, family, paper = "TRPO-Lagrangian", "Lagrangian", "Ray et al. 2019"
-    # Costs far ahead are noisy in a rollout, so they are left to the cost critic.
-    defaults: ClassVar[dict[str, Any]] = {"cost_gae_lambda": 0.5, "derivative_gain": 0.5}
+    defaults: ClassVar[dict[str, Any]] = {"derivative_gain": 0.5}

@@ -17,7 +17,8 @@ _EXPORTS = {
     "sb3_guard.common.callbacks": ("CostEvalCallback", "LogCosts"),
     "sb3_guard.common.evaluation": ("evaluate_policy",),
     "sb3_guard.common.monitor": ("CostMonitor",),
-    "sb3_guard.common.vec_env": ("GuardVecEnv", "make_vec_env"),
+    "sb3_guard.common.native": ("GuardVecEnv",),
+    "sb3_guard.common.vec_env": ("make_vec_env",),
     "sb3_guard.zoo.make_model": ("make_model",),
     "sb3_guard.envs": (
         "GuardEnv", "GuardVectorEnv", "Scenario", "env_ids", "make", "register",

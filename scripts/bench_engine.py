@@ -30,7 +30,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from sb3_guard.common.vec_env import GuardVecEnv
+from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.envs import env_ids, env_spec
 from sb3_guard.envs.mujoco_gaps import profiling_clock
 from sb3_guard.envs.physics import ACC, FRAME_SKIP

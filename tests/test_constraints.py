@@ -384,20 +384,6 @@ def test_zones_may_overlap_and_usual_sizes_keep_their_usual_distance():
     assert {name: engine.footprints[name].keepout for name in usual} == usual
 
 
-def test_solid_ghosts_hang_where_some_part_of_the_robot_may_be():
-    """An Ant's position is 0.14 m up, its legs are 0.3 m long: 0.74 m with a ghost of 0.3 m."""
-
-    def build(robot, low, **params):
-        ghosts = {"solid": True, "space": "spatial", "height": [low, low + 1], **params}
-        Scenario(robot=robot, constraints={"ghosts": ghosts}).build()
-
-    build("Ant", 0.5)
-    with pytest.raises(ValueError, match=r"ghosts.height = \(2, 3\) is out of reach: .* 0\.74 m"):
-        build("Ant", 2)
-    build("Humanoid", 2)
-    build("Drone", 5)  # it flies
-
-
 def test_what_hangs_in_the_air_can_be_met():
     """Zones that a robot on the floor would never enter, and bodies in the floor, are refused."""
 

@@ -122,7 +122,10 @@ def test_episodes_begin_without_a_cost_and_inside_the_layout_rule(env_id):
     for _ in range(3):
         env.reset()
         assert not any(c.cost().any() for c in engine.constraints)
-        groups = [(f, engine._owners[f.name].positions(f.name)) for f in engine.footprints.values()]
+        groups = [
+            (f, engine.placing.owners[name].positions(name))
+            for name, f in engine.footprints.items()
+        ]
         xy = np.concatenate([p[..., :2] for _, p in groups], axis=1)
         keep = np.concatenate([np.full(f.num, f.keepout) for f, _ in groups])
         gap = np.linalg.norm(xy[:, :, None] - xy[:, None], axis=-1)

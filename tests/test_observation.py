@@ -9,7 +9,8 @@ import pytest
 from sb3_guard.envs import Scenario, geometry
 from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.engine import Engine
-from sb3_guard.envs.observation import Compass, Lidar, Observer, Scan, Values, compass
+from sb3_guard.envs.observation import Compass, Lidar, Scan, Values, compass
+from sb3_guard.envs.observer import Observer
 from sb3_guard.envs.robots import Point
 from sb3_guard.envs.tasks import Goal
 

@@ -9,7 +9,7 @@ import pytest
 from gymnasium.envs import mujoco as their_robots
 from worlds import gymnasium_robot, own_parts, world
 
-from sb3_guard.common.vec_env import GuardVecEnv
+from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.envs import GuardVectorEnv, Scenario, make, register_constraint, register_robot
 from sb3_guard.envs.layout import LayoutError
 from sb3_guard.envs.part import Constraint, Task

@@ -39,7 +39,7 @@ def starting_over(footprints, rng, count=1000):
         return arrays.setdefault(name, np.zeros((1, *shape), dtype))
 
     restarts = Restarts(footprints, count, array)
-    return lambda: arrange(footprints, rng, partial(restarts.draw, 0, rng))
+    return lambda: arrange(footprints, rng, partial(restarts.draw, 0, rng, footprints))
 
 
 def test_the_distribution_is_that_of_starting_over():

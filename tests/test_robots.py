@@ -18,10 +18,10 @@ from worlds import own_parts
 
 from sb3_guard.envs import register_robot, robots
 from sb3_guard.envs.engine import Engine
-from sb3_guard.envs.part import FLOOR
 from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.suites.guard import SUITE_ROBOTS
+from sb3_guard.envs.types import FLOOR
 
 
 class Facts(NamedTuple):
@@ -333,51 +333,6 @@ def test_point_thrusts_along_its_nose_and_turns_on_the_spot() -> None:
     drive(engine, [1, 0], 75)
     moved = engine.robot.position[0, :2] - start
     assert np.hypot(*moved) > 1.0 and moved @ nose > 0.999 * np.hypot(*moved)
-
-
-@pytest.mark.parametrize("robot", ["Point", "Ant", "Doggo", "Humanoid", "Walker", "Hopper"])
-def test_no_pose_reaches_beyond_the_extent(robot: str) -> None:
-    engine = world(robot)
-    model = engine.model
-    data = engine.batch.get_data(0)
-    mine = [g for g in range(model.ngeom) if model.geom(g).name != "floor"]
-    center = model.body(f"robot/{engine.robot.center}").id
-    root = model.body("robot/robot").id
-    hinges = [
-        j for j in range(model.njnt)
-        if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE and model.jnt_bodyid[j] != root
-    ]  # fmt: skip
-    rng = np.random.default_rng(0)
-    farthest = 0.0
-    for _ in range(300):
-        for j in hinges:
-            data.qpos[model.jnt_qposadr[j]] = rng.uniform(-math.pi, math.pi)
-        mujoco.mj_kinematics(model, data)
-        gaps = np.linalg.norm(data.geom_xpos[mine] - data.xpos[center], axis=1)
-        farthest = max(farthest, float((gaps + model.geom_size[mine].min(axis=1)).max()))
-    assert farthest <= engine.robot.extent + 1e-9
-    assert engine.robot.extent < 2 * farthest + 0.1  # and it says something
-
-
-@pytest.mark.parametrize(
-    ("joint", "extent"),
-    [
-        ('type="hinge" axis="0 0 1"', 0.2 + 0.1),
-        ('type="hinge" axis="0 0 1" pos="0.5 0 0"', 0.2 + 2 * 0.5 + 0.1),  # about 0.7 m off
-        ('type="slide" axis="0 0 1" range="-0.1 0.4"', 0.2 + 0.4 + 0.1),
-        ('type="slide" axis="0 0 1"', math.inf),
-    ],
-)
-def test_the_extent_counts_every_joint(joint: str, extent: float, tmp_path: Path) -> None:
-    """A ball of 0.1 m, 0.2 m from the middle, on one joint."""
-    (tmp_path / "crank.xml").write_text(f"""
-    <mujoco><compiler autolimits="true"/><worldbody><body name="robot" pos="0 0 0.5">
-      <joint name="x" type="slide" axis="1 0 0"/><geom size="0.05"/>
-      <body name="arm" pos="0.2 0 0"><joint name="j" {joint}/><geom size="0.1"/></body>
-    </body></worldbody><actuator><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>""")
-    with own_parts():
-        register_robot("Crank", xml=tmp_path / "crank.xml")
-        assert world("Crank").robot.extent == pytest.approx(extent)
 
 
 @pytest.mark.parametrize(

@@ -461,7 +461,7 @@ def test_parts_are_called_by_the_names_they_are_registered_under():
                 ({task: {"tol": 1}}, f"^{task} has no parameter 'tol'"),
                 ({task: {"space": "spatial"}}, f"^{task}.space = 'spatial' cannot be set"),
                 ({task: {"object_keepout": 0.01}}, f"^{task}.object_keepout = 0.01 lets"),
-                ({task: {"size": 9}}, f"^{task}.size = 9 holds the ball"),
+                ({task: {"size": -9}}, f"^{task}.size = -9 must be greater than 0"),
                 ({"push": {"toll": 1}}, f"set its parameters with {task}={{...}}"),
                 ({"robot": {"heading": "up"}}, "^robot.heading = 'up'"),
             ):

@@ -13,8 +13,8 @@ from cost_envs import CostPoint
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_guard import CostMonitor, Scenario, make_vec_env
+from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.common.sources import find
-from sb3_guard.common.vec_env import GuardVecEnv
 from sb3_guard.zoo.make_envs import full_id
 from sb3_guard.zoo.run_flags import RunFlags
 from sb3_guard.zoo.start import prepare

@@ -17,6 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import DependencyNotInstalled
 
 from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
+from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.ids import UnknownId, with_version
 from sb3_guard.spelling import nearest
 
@@ -111,8 +112,6 @@ def _ours(env_id: str | Path | Mapping[str, Any] | Scenario) -> Source:
         ) from None
 
     def batch(n_envs: int, **kwargs: Any) -> VecEnv:
-        from sb3_guard.common.vec_env import GuardVecEnv
-
         registered = {name: value for name, value in spec.kwargs.items() if name != "scenario"}
         if spec.max_episode_steps is not None:
             registered["max_episode_steps"] = spec.max_episode_steps

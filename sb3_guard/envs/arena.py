@@ -8,7 +8,8 @@ import numpy as np
 
 from sb3_guard.envs.layout import Rectangle
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import ROBOT, Part, Robot, Simulation, World
+from sb3_guard.envs.part import Part, Robot, Simulation, World
+from sb3_guard.envs.types import ROBOT
 
 INTEGRATORS = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,

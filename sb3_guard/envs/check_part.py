@@ -8,55 +8,17 @@ a test of yours.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sb3_guard.envs.parameters import PartError, misshapen
+from sb3_guard.envs.parameters import PartError
 
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine
     from sb3_guard.envs.outcome import Outcome
-    from sb3_guard.envs.part import Part
 
-Array = np.ndarray
 ROWS, STEPS = 3, 12
-
-
-def per_row(part: Part, verb: str, value: Any, rows: int, dtype: type = float) -> Array:
-    """What a verb of a part gave, [N], a copy: the part may keep and change its own.
-
-    :param rows: N
-    :raises PartError: it has another shape
-    """
-    out: Array = np.array(value, dtype=dtype)
-    if out.shape != (rows,):
-        raise PartError(misshapen(f"{verb} of {part.name}", out.shape, (rows,)))
-    return out
-
-
-def check_moving(part: Part, rows: int) -> None:
-    """Refuse movers that are none.
-
-    :param rows: N
-    :raises PartError: names the part and what it must give
-    """
-    from sb3_guard.envs.motion import Law, Moving
-
-    moving = part.moving()
-    for group in moving if isinstance(moving, tuple | list) else (moving,):
-        if not (
-            isinstance(group, Moving)
-            and isinstance(group.points, np.ndarray)
-            and isinstance(group.law, Law)
-        ):
-            raise PartError(
-                f"moving() of {part.name} gives {group!r}: it must be a tuple of "
-                "Moving(points, law, planar), of an array [N, K, 3] and a Law"
-            )
-        shape = group.points.shape
-        if len(shape) != 3 or (shape[0], shape[2]) != (rows, 3):
-            raise PartError(misshapen(f"moving() of {part.name}", shape, (rows, "K", 3)))
 
 
 def exploded(engine: Engine, outcome: Outcome) -> bool:

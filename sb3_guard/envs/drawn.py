@@ -9,16 +9,13 @@ from __future__ import annotations
 import dataclasses
 import weakref
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-if TYPE_CHECKING:
-    from sb3_guard.envs.engine import Engine
-    from sb3_guard.envs.part import World
+from sb3_guard.envs.part import Part, Simulation, World
+from sb3_guard.envs.types import Array
 
-Array = np.ndarray
 # what a factor multiplies: fields of the model
 FIELDS = {"mass": ("body_mass", "body_inertia"), "friction": ("pair_friction",)}
 
@@ -26,21 +23,23 @@ FIELDS = {"mass": ("body_mass", "body_inertia"), "friction": ("pair_friction",)}
 class Drawn:
     """What is drawn in a world.
 
-    :param engine: whose parts have been built, but not its model
+    :param parts: which have been built
     :param world: what they were built into
+    :param sim: the engine, whose model has not been compiled
+    :param told: whether info says what was drawn
     :raises ValueError: a factor on something that a part does not have
     """
 
-    def __init__(self, engine: Engine, world: World) -> None:
-        self._engine = weakref.proxy(engine)
-        self.ranges = {f"{p.name}.{key}": r for p in engine.parts for key, r in p.ranges.items()}
+    def __init__(self, parts: Sequence[Part], world: World, sim: Simulation, told: bool) -> None:
+        self._sim, self._told = weakref.proxy(sim), told
+        self.ranges = {f"{p.name}.{key}": r for p in parts for key, r in p.ranges.items()}
         self.values: dict[str, Array] = {}  # by the same names, [N] each
         for name, (_, high) in self.ranges.items():
-            self.values[name] = engine.array(name, dtype=type(high))
+            self.values[name] = sim.array(name, dtype=type(high))
             self.values[name][:] = high
         self._factors = [
             (part, f.name, f.metadata["drawn"])
-            for part in engine.parts
+            for part in parts
             for f in dataclasses.fields(part)  # type: ignore[arg-type]
             if f.metadata.get("drawn") in FIELDS and part.span(f.name) != (1.0, 1.0)
         ]
@@ -59,12 +58,12 @@ class Drawn:
             rows = np.array(bodies) if kind == "mass" else np.flatnonzero(rubs)
             self._scaled += [(field, rows, part.current(name)) for field in FIELDS[kind]]
         self._weighs = any(kind == "mass" for *_, kind in self._factors)
-        self.apply(np.arange(self._engine.num_envs, dtype=np.int32))
+        self.apply(np.arange(self._sim.num_envs, dtype=np.int32))
 
     def draw(self, ids: Array) -> None:
         """Draw what the episodes of rows ``ids``, [n], have."""
         for row in ids.tolist():
-            rng = self._engine.rngs[row]
+            rng = self._sim.rngs[row]
             for name, (low, high) in self.ranges.items():
                 whole = isinstance(high, int)
                 value = rng.integers(low, high, endpoint=True) if whole else rng.uniform(low, high)
@@ -73,7 +72,7 @@ class Drawn:
 
     def apply(self, ids: Array) -> None:
         """Let the physics of rows ``ids``, [n], follow what was drawn."""
-        batch = self._engine.batch
+        batch = self._sim.batch
         for field, rows, factors in self._scaled:
             batch.scale(field, rows, ids, factors[ids])
         if self._weighs:
@@ -81,8 +80,7 @@ class Drawn:
 
     def info(self) -> dict[str, Array]:
         """What info says of the running episodes, by name, [N] each: nothing if not asked to."""
-        asked = self._engine.extras.drawn
-        return {name: values.copy() for name, values in self.values.items() if asked}
+        return {name: values.copy() for name, values in self.values.items() if self._told}
 
 
 def _below(model: mujoco.MjModel, roots: Sequence[str]) -> list[int]:

@@ -8,8 +8,6 @@ limit: those belong to the gymnasium classes above it.
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,27 +16,19 @@ from numpy.typing import DTypeLike
 
 from sb3_guard.checks import NumberError
 from sb3_guard.envs.arena import Arena
-from sb3_guard.envs.check_part import check_moving, per_row
+from sb3_guard.envs.contract import check_moving, per_row
 from sb3_guard.envs.drawn import Drawn
 from sb3_guard.envs.extras import Extras
-from sb3_guard.envs.layout import (
-    AWAY,
-    Footprint,
-    Layout,
-    LayoutError,
-    arrange,
-    check_covers,
-    check_locations,
-    farthest,
-    redraw,
-)
+from sb3_guard.envs.layout import Footprint, Layout, LayoutError
 from sb3_guard.envs.motion import Motion
-from sb3_guard.envs.observation import Channel, Lidar, Observer
+from sb3_guard.envs.observation import Channel, Lidar
+from sb3_guard.envs.observer import Observer
 from sb3_guard.envs.outcome import Outcome
 from sb3_guard.envs.parameters import PartError, check_count, misshapen
-from sb3_guard.envs.part import Array, Constraint, Part, Robot, Task
+from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.physics import Physics
-from sb3_guard.envs.restarts import Restarts
+from sb3_guard.envs.placing import Placing
+from sb3_guard.envs.types import Array
 from sb3_guard.spelling import did_you_mean
 
 CLEAN_STARTS = 100  # layouts drawn before a start with a cost is an error
@@ -93,10 +83,12 @@ class Engine:
         self.steps = self.array("steps", dtype=np.int64)
         self.steps[:] = -1  # no episode has begun
         self._begun = False
-        self._layout = layout or Layout()
+        layout = layout or Layout()
+        self._randomize = layout.randomize
         # where the generators begin every episode of rows whose layout is not to change
         self._origins: dict[int, Any] = {}
-        self._lay_out()
+        self.placing = Placing(self.parts, layout, self.arena.placements, self.array)
+        self.footprints: dict[str, Footprint] = self.placing.footprints
         self._bind(lidar or Lidar())
 
     def _build(self) -> None:
@@ -108,42 +100,13 @@ class Engine:
         world = self.arena.world(self.robot)
         for part in self.parts:
             part.build(world)
-        self.drawn = Drawn(self, world)
+        self.drawn = Drawn(self.parts, world, self, self.extras.drawn)
         self.model = world.spec.compile()
         frame_skip = self.arena.frame_skip or self.robot.frame_skip
         self.control_step = frame_skip * float(self.model.opt.timestep)
         self.batch = Physics(
             self.model, self.num_envs, self.num_threads, frame_skip, int(self.robot.stage)
         )
-
-    def _lay_out(self) -> None:
-        """Collect what is placed when an episode begins."""
-        self.footprints: dict[str, Footprint] = {}
-        self._owners: dict[str, Part] = {}
-        placements = self._layout.placements or self.arena.placements
-        for part in self.parts:
-            for f in part.footprints():
-                if f.name in self.footprints:
-                    raise ValueError(
-                        f"{part.name} and {self._owners[f.name].name} both place {f.name!r}; "
-                        "give the constraint another name"
-                    )
-                self.footprints[f.name] = replace(
-                    f,
-                    placements=f.placements or placements,
-                    margin=max(f.margin, self._layout.margin),
-                )
-                self._owners[f.name] = part
-                self.array(f"places/{f.name}", (f.num, 3))
-        order = self._layout.order
-        self._ordered = sorted(  # stable: what is not named keeps its place in the order of parts
-            self.footprints.values(),
-            key=lambda f: order.index(f.name) if f.name in order else len(order),
-        )
-        self._restarts = Restarts(self._ordered, self._layout.restarts, self.array)
-        check_locations(list(self.footprints.values()))
-        if not self._layout.overlap:
-            check_covers(list(self.footprints.values()))
 
     def _bind(self, lidar: Lidar) -> None:
         """Give the parts their views, and look at what they move, observe and measure."""
@@ -190,28 +153,11 @@ class Engine:
 
     def places(self, name: str) -> Array:
         """The live places of footprint ``name``, [N, num, 3] m."""
-        return self._arrays[f"places/{name}"]
-
-    def farthest(self, one: str, other: str) -> float:
-        """Greatest distance in the plane at which two footprints may begin, m."""
-        return farthest(self.footprints[one], self.footprints[other])
+        return self.placing.places[name]
 
     def redraw(self, name: str, row: int) -> bool:
-        """Draw the first object of footprint ``name`` again in one row.
-
-        It keeps clear of where everything is now; movers are ignored if there is no room otherwise.
-
-        :return: whether a place was found
-        """
-        others = {
-            f: self._owners[f.name].positions(f.name)[row]
-            for f in self.footprints.values()
-            if f.name != name
-        }
-        place = redraw(self.footprints[name], others, self.rngs[row])
-        if place is not None:
-            self.places(name)[row, 0] = place
-        return place is not None
+        """Draw the first object of footprint ``name`` again in one row; whether it found room."""
+        return self.placing.redraw(name, row, self.rngs[row])
 
     def observe(self, dtype: DTypeLike = np.float32) -> Array:
         """The flat observation of every row, [N, D], a new array; float64 before the cast."""
@@ -220,7 +166,7 @@ class Engine:
     def seed(self, row: int, rng: np.random.Generator) -> None:
         """Give one row its generator; its layouts and its movers draw from nothing else."""
         self.rngs[row] = rng
-        self._restarts.forget(row)
+        self.placing.forget(row)
         self._origins.pop(row, None)
 
     def reset(self, ids: Array) -> None:
@@ -231,14 +177,14 @@ class Engine:
         self._check_open()
         ids = np.asarray(ids, dtype=np.int32)
         self.steps[ids] = 0
-        if not self._layout.randomize:
-            self._restarts.forget(ids)
+        if not self._randomize:
+            self.placing.forget(ids)
             for row in ids.tolist():
                 bits = self.rngs[row].bit_generator
                 bits.state = self._origins.setdefault(row, bits.state)
         if self.drawn.ranges:
             self.drawn.draw(ids)
-            self._restarts.forget(ids)  # layouts that are kept may be of another number of objects
+            self.placing.forget(ids)  # layouts that are kept may be of another number of objects
         pending = ids
         refusals: dict[tuple[str, str], int] = {}  # starts not used, by reason and remedy
         for _ in range(CLEAN_STARTS):
@@ -263,12 +209,7 @@ class Engine:
         """Draw a layout for rows ``ids``, [n], and put everything there."""
         self.batch.clear(ids)
         for row in ids.tolist():
-            rng = self.rngs[row]
-            present = [self._owners[f.name].present(f, row) for f in self._ordered]
-            layout = arrange(present, rng, partial(self._restarts.draw, row, rng, present))
-            for name, places in layout.items():
-                self.places(name)[row] = AWAY
-                self.places(name)[row, : len(places)] = places
+            self.placing.draw(row, self.rngs[row])
         for part in self.parts:
             part.reset(ids, self.rngs)
         self.batch.begin(ids)
@@ -277,13 +218,13 @@ class Engine:
         """Why no episode is to begin as everything is now: reason and remedy, and rows [N] bool."""
         task, n = self.task, self.num_envs
         invalid = per_row(task, "invalid_start()", task.invalid_start(), n, bool)
-        faults = {(f"{task.name}: {task.invalid_reason}", task.remedy): invalid}
+        faults = {(f"{_sized(task)}: {task.invalid_reason}", task.remedy): invalid}
         for c in self.constraints:
             pays = per_row(c, "cost()", c.cost(), n) > 0
-            faults[f"{c.name}: a cost at the start", c.remedy] = pays
+            faults[f"{_sized(c)}: a cost at the start", c.remedy] = pays
         for p in self._enders:
             ends = per_row(p, "terminated()", p.terminated(), n, bool)
-            faults[f"{p.name}: it ends the episode immediately", p.remedy] = ends
+            faults[f"{_sized(p)}: it ends the episode immediately", p.remedy] = ends
         return faults
 
     def step(self, actions: Array) -> Outcome:
@@ -438,6 +379,11 @@ class Engine:
         self.drawn.apply(np.arange(self.num_envs))
         self.batch.restore(state["batch"])
         self._begun = bool((self.steps >= 0).all())
+
+
+def _sized(part: Part) -> str:
+    """What messages call a part whose size may be at fault."""
+    return f"{part.name}.size = {part.size}" if hasattr(part, "size") else part.name
 
 
 def _generator(state: Mapping[str, Any]) -> np.random.Generator:

@@ -9,7 +9,7 @@ NumPy's inner loops run along the rows and not along x, y, z, which is several t
 
 import numpy as np
 
-Array = np.ndarray
+from sb3_guard.envs.types import Array
 
 
 def by_coordinate(points: Array) -> Array:

@@ -9,7 +9,6 @@ where both do.
 import math
 import weakref
 from collections.abc import Callable
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,16 +17,8 @@ from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import AWAY, Footprint
 from sb3_guard.envs.observation import Scan
 from sb3_guard.envs.parameters import Range
-from sb3_guard.envs.part import (
-    FLOOR,
-    ROBOT,
-    Array,
-    Generators,
-    Painter,
-    Part,
-    Simulation,
-    World,
-)
+from sb3_guard.envs.part import Painter, Part, Simulation, World
+from sb3_guard.envs.types import FLOOR, ROBOT, Array, Generators
 
 Shape = Callable[[mujoco.MjsBody], None]  # adds the geoms of one object to its body
 BOX = mujoco.mjtGeom.mjGEOM_BOX
@@ -38,64 +29,44 @@ WELD = [0.02, 1.5]  # solref, s and damping ratio, of welded bodies
 # MuJoCo weighed a turn by the mass, which it did until 2.3.3, and Safety-Gymnasium relies on.
 TURN = math.sqrt(1.5)
 GRIPS = 33  # factors on friction at which heights are computed: within 0.3 µm between 0.2 and 2
-MOST = 1000  # objects in a group: layouts compare every pair
 
 
 class Group:
     """Like objects of a part: discs on the floor, spheres in the air, or solid bodies.
 
-    :param part: whose they are; its ``size``, ``placements``, ``locations``, ``margin``,
-        ``planar``, ``height`` and ``color`` are theirs
+    :param part: whose they are; its ``planar`` and ``color`` are theirs, and the ``size`` of those
+        that are not solid
     :param world: the world under construction
-    :param name: what they are called in layouts, observations and bodies
-    :param num: how many
-    :param keepout: radius kept clear around each, m; None: ``usual``, or ``cover`` if that is more
-    :param usual: keep-out of objects that it covers, m
-    :param cover: radius around its place that a solid object never leaves, m
+    :param footprint: how many, what they are called and where they are placed
     :param shape: adds the geoms of a solid object, whose frame is its place; None: not solid
     :param free: half height of solid objects that can be pushed, m; None: they stay
     :param weld: whether those that can be pushed are pulled along by a mocap body
     :param sink: how deep those that can be pushed begin in the floor, m; None: as they rest
-    :param reachable: whether they must lie within the robot's reach
     :param grip: the part's parameter that is a factor on their friction with the floor
-    :param footprint: further arguments of the :class:`~sb3_guard.envs.layout.Footprint`
     """
 
     def __init__(
         self,
-        part: Any,
+        part: Part,
         world: World,
-        name: str,
-        num: int,
-        keepout: float | None,
-        usual: float = 0.4,
-        cover: float = 0.0,
+        footprint: Footprint,
         shape: Shape | None = None,
         free: float | None = None,
         weld: bool = False,
         sink: float | None = None,
-        reachable: bool = False,
         grip: str | None = None,
-        **footprint: Any,
     ) -> None:
-        self.part: Any = weakref.proxy(part)  # which has this group
-        self.name, self.solid, self._grip = name, shape is not None, grip
-        fields = {
-            "placements": part.placements,
-            "locations": part.locations,
-            "margin": part.margin,
-            "height": 0.0 if part.planar else part.height,
-            "reach": world.robot.reach if reachable else math.inf,
-            "base": world.robot.base,
-            "cover": cover if shape else 0.0,
-            "label": f"{part.name}.keepout",
-            **footprint,
-        }
-        clear = max(usual, fields["cover"]) if keepout is None else keepout
-        self.footprint = Footprint(name, num, clear, **fields)
-        number = num if shape else 0
+        self.part: Part = weakref.proxy(part)  # which has this group
+        self.name, self.footprint = footprint.name, footprint
+        self.solid, self._grip = shape is not None, grip
+        number = footprint.num if shape else 0
         grips = part.span(grip) if grip else Range(1.0, 1.0)
-        self.bodies = Bodies(world, name, number, shape or _no_shape, free, weld, sink, grips)
+        self.bodies = Bodies(world, self.name, number, shape or _no_shape, free, weld, sink, grips)
+
+    @property
+    def movable(self) -> list[str]:
+        """Names of the bodies that can be pushed."""
+        return self.bodies.movable
 
     def bind(self, sim: Simulation) -> None:
         """Take live views: ``places``, where they were put, and ``centers``, [N, num, 3] m."""
@@ -298,17 +269,16 @@ def add_geom(
     )
 
 
-def check_reachable(part: Part, near: float, everywhere: bool) -> None:
-    """Refuse to hang what a robot on the floor cannot get to.
+def check_reachable(part: Part, everywhere: bool) -> None:
+    """Refuse to hang what a robot on the floor cannot get to: within their size.
 
-    :param part: whose ``height`` it is
-    :param near: how near to the objects the robot's position has to come, m
+    :param part: whose ``height`` and ``size`` it is
     :param everywhere: whether this has to be so at every height of the range, not only at one
     :raises ValueError: names the heights that are near enough
     """
     if part.planar or part.sim.robot.workspace != "planar":
         return
-    z, (low, high) = part.sim.robot.altitude, part.height
+    z, near, (low, high) = part.sim.robot.altitude, part.span("size").low, part.height
     gap = max(z - low, high - z) if everywhere else max(z - high, low - z)
     if gap >= near:
         raise ValueError(
@@ -316,23 +286,4 @@ def check_reachable(part: Part, near: float, everywhere: bool) -> None:
             f"{z:.2f} m above the floor, and only heights between {max(z - near, 0.0):.2f} and "
             f"{z + near:.2f} m count; set {part.name}={{'height': [low, high]}} within these, "
             "or {'space': 'planar'}"
-        )
-
-
-def check_size(part: Part, footprint: str, size: float) -> None:
-    """Refuse what would hold the robot wherever an episode began.
-
-    :param part: whose ``height`` it is
-    :param footprint: where the objects are placed
-    :param size: their radius, m
-    :raises ValueError: names the size below which it does not
-    """
-    robot, (low, high) = part.sim.robot, part.height
-    z = robot.altitude
-    rise = 0.0 if part.planar else max(abs(z - low), abs(z - high))
-    far = math.hypot(part.sim.farthest(footprint, "robot") + robot.offset, rise)
-    if size >= far:
-        raise ValueError(
-            f"{part.name}.size = {size} encloses the robot at the start of every episode: it is at "
-            f"most {far:.2f} m away; make size smaller, or placements larger"
         )

@@ -15,9 +15,9 @@ from sb3_guard.envs.outcome import Outcome
 from sb3_guard.envs.parameters import check_count
 from sb3_guard.envs.rendering import CAMERAS, Renderer
 from sb3_guard.envs.scenario import Scenario
+from sb3_guard.envs.types import Array
 from sb3_guard.spelling import did_you_mean
 
-Array = np.ndarray
 ROW = np.zeros(1, dtype=np.int32)
 SMOOTH = 25  # pictures a second of a film, at least
 

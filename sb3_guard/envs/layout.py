@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sb3_guard.envs.parameters import Parameters, param
+from sb3_guard.envs.types import Array
 
-Array = np.ndarray
 Rectangle = tuple[float, float, float, float]
 StartOver = Callable[[Array, Array, Array, bool], Array | None]
 
@@ -278,12 +278,6 @@ def arrange(
                 raise LayoutError(f"{f.name} finds no room once everything else has its place")
             out[f.name][0] = drawn
     return out
-
-
-def farthest(one: Footprint, other: Footprint) -> float:
-    """Greatest distance in the plane at which two groups' objects may begin, m; 0 of none."""
-    offset = one.corners[:, None] - other.corners  # [n, m, 2] m
-    return float(np.hypot(offset[..., 0], offset[..., 1]).max(initial=0.0))
 
 
 def square_distance(draws: Array, xy: Array) -> Array:

@@ -10,16 +10,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from sb3_guard.envs.geometry import length
+from sb3_guard.envs.types import Array
 
-if TYPE_CHECKING:
-    from sb3_guard.envs.part import Part
-
-Array = np.ndarray
 TINY = 1e-12  # m: the unit vector of a zero offset is zero
 LARGE = 32  # movers of a group that moves on its own
 
@@ -173,13 +170,20 @@ class MoverGroup:
         move += np.bincount(moved.ravel(), away.ravel(), move.size).reshape(move.shape)
 
 
+class Mover(Protocol):
+    """What is asked what moves, before every control step: a part."""
+
+    def moving(self) -> tuple[Moving, ...]:
+        """What moves by a law."""
+
+
 class Motion:
     """All that moves by a law, in as few groups as can be.
 
     :param parts: whose movers they are
     """
 
-    def __init__(self, parts: Sequence[Part]) -> None:
+    def __init__(self, parts: Sequence[Mover]) -> None:
         self._parts = parts
         self._moving: list[Moving] = []
         self._groups: list[MoverGroup] = []

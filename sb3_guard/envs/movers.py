@@ -8,11 +8,13 @@ import numpy as np
 from sb3_guard.envs import motion
 from sb3_guard.envs.groups import CYLINDER, SPHERE, add_geom
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import HEIGHT, SPACE, Array, Generators, Part, Simulation, World
+from sb3_guard.envs.part import HEIGHT, SPACE, Simulation, World
+from sb3_guard.envs.placed import Placed
+from sb3_guard.envs.types import Array, Generators
 
 
 @dataclass
-class Movers(Part):
+class Movers(Placed):
     """Objects that chase the robot or flee from it (Zhao et al. 2024, §4).
 
     Speeds are metres per control step under ``speed_law="unit"`` and, with the paper's equations,

@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-Array = np.ndarray
+from sb3_guard.envs.types import Array
+
 REST = int(mujoco.mjMINAWAKE)  # physics steps at rest after which a body may fall asleep
 
 

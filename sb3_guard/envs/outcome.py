@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from sb3_guard.envs.part import Array
+from sb3_guard.envs.types import Array
 
 
 @dataclass

@@ -25,23 +25,20 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import mujoco
 import numpy as np
 
 from sb3_guard.envs.layout import Footprint
 from sb3_guard.envs.motion import Moving
-from sb3_guard.envs.observation import Observations
+from sb3_guard.envs.observation import Observations, Scan
 from sb3_guard.envs.parameters import Parameters, param
-from sb3_guard.envs.physics import FRAME_SKIP
+from sb3_guard.envs.physics import FRAME_SKIP, Physics
+from sb3_guard.envs.types import Array, Generators
 
-if TYPE_CHECKING:
-    from sb3_guard.envs.groups import Group
-
-Array = np.ndarray
 # parameters of parts that exist on the floor and in the air
 SPACE = param(
     None, "planar or spatial; null: the robot's workspace", choices=(None, "planar", "spatial")
@@ -50,11 +47,6 @@ HEIGHT = param((0.5, 1.5), "range of z in space, m", low=0)
 # parameters of parts that have bodies: factors on what the bodies have without them
 MASS = param(1.0, "factor on masses and inertias", above=0, drawn="mass")
 FRICTION = param(1.0, "factor on friction with the floor", low=0, drawn="friction")
-Generators = Sequence[np.random.Generator]
-
-# Contact bits. A robot's geoms collide with bit ROBOT, the floor with bit FLOOR: a robot that
-# hovers or slides at a fixed height leaves FLOOR out and saves the pair.
-ROBOT, FLOOR = 1, 2
 
 
 class World(Protocol):
@@ -77,7 +69,7 @@ class World(Protocol):
 class Simulation(Protocol):
     """N running simulations, as a part sees them after :meth:`Part.bind`."""
 
-    batch: mujoco.batch.Batch
+    batch: Physics
     model: mujoco.MjModel
     num_envs: int
     robot: Robot
@@ -97,9 +89,6 @@ class Simulation(Protocol):
     def sensor(self, name: str) -> Array:
         """Live values of a sensor, [N, d], such as ``"robot/gyro"`` of the robot's file."""
 
-    def farthest(self, one: str, other: str) -> float:
-        """Greatest distance in the plane at which two footprints may begin, m."""
-
     def redraw(self, name: str, row: int) -> bool:
         """Draw footprint ``name`` again in one row, clear of everything's current place."""
 
@@ -116,6 +105,30 @@ class Painter(Protocol):
         """A see-through wall, 20 cm high, on the floor between two places, [2] m."""
 
 
+class Objects(Protocol):
+    """Like objects of a part: see :class:`sb3_guard.envs.groups.Group`."""
+
+    name: str
+    footprint: Footprint
+    centers: Array  # [N, num, 3] m
+
+    @property
+    def movable(self) -> list[str]:
+        """Names of the bodies that can be pushed."""
+
+    def bind(self, sim: Simulation) -> None:
+        """Take live views of the running simulations."""
+
+    def reset(self, ids: Array, rngs: Generators) -> None:
+        """Begin an episode in rows ``ids``."""
+
+    def scan(self) -> Scan:
+        """What lidar sees of them."""
+
+    def draw(self, painter: Painter, row: int) -> None:
+        """Draw one row's objects that are not bodies."""
+
+
 class Part(Parameters):
     """A robot, a task or a constraint: see the module's text for the verbs."""
 
@@ -127,11 +140,7 @@ class Part(Parameters):
     size: float  # m, radius of its objects
     # how to let episodes begin clean, where it spoils every start
     remedy: ClassVar[str] = "make size or num smaller, or keepout or placements larger"
-    if TYPE_CHECKING:
-        groups: tuple[Group, ...]
-        group: Group  # where it has one
-    else:
-        groups = ()  # its objects, made by build()
+    groups: tuple[Objects, ...] = ()  # its objects, made by build()
     every: str = "control"  # before which steps before_step is called: "control" or "physics"
     solid: bool = False  # whether its objects are bodies that the robot bumps into
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
@@ -163,7 +172,7 @@ class Part(Parameters):
     @property
     def roots(self) -> tuple[str, ...]:
         """The bodies that, with all that hangs on them, have the part's mass and friction."""
-        return tuple(name for group in self.groups for name in group.bodies.movable)
+        return tuple(name for group in self.groups for name in group.movable)
 
     def footprints(self) -> tuple[Footprint, ...]:
         """What has to be placed when an episode begins: at least its groups."""
@@ -260,8 +269,6 @@ class Robot(Part):
     root: ClassVar[str]  # name of the outermost body in the compiled world
     reach: ClassVar[float] = math.inf  # m from its base: where goals and hazards make sense
     altitude: float = 0.0  # m, z of its position when an episode begins
-    offset: float = 0.0  # m, distance of that position from its place in the plane
-    extent: float = math.inf  # m, how far from its position its body may reach in any pose
     action_size: int
     action_range: tuple[Array | float, Array | float] = (-1.0, 1.0)  # lowest and highest actions
 

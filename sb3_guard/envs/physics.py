@@ -13,8 +13,8 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 
 from sb3_guard.envs.mujoco_gaps import put_to_sleep, silence_profiler
+from sb3_guard.envs.types import Array
 
-Array = np.ndarray
 FRAME_SKIP = 10
 ACC = int(mujoco.mjtStage.mjSTAGE_ACC)  # touch, accelerometer and contacts describe the new state
 NONE = int(mujoco.mjtStage.mjSTAGE_NONE)

@@ -23,12 +23,12 @@ import numpy as np
 from mujoco.rendering.classic import gl_context
 
 from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, geoms_below, has_arena
+from sb3_guard.envs.types import Array
 
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine
     from sb3_guard.envs.part import Robot
 
-Array = np.ndarray
 CAMERAS = ("fixed", "track", "top")
 ELEVATION = {"fixed": 58.0, "track": 55.0, "top": 90.0}  # degrees
 RUNNING = 25.0  # degrees, elevation from which a robot is followed where there is no arena

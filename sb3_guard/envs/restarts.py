@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sb3_guard.envs.layout import Array, Footprint, square_distance
+from sb3_guard.envs.layout import Footprint, square_distance
+from sb3_guard.envs.types import Array
 
 TRIES = (6, 12, 20, 30, 32)  # draws of an object, 100, each batch only if those before clash
 BLOCK = 256  # layouts begun at once

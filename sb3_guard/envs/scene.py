@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from sb3_guard.envs.types import Array
+
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine
 
-Array = np.ndarray
 COST_COLOR = (0.85, 0.1, 0.1)
 SHADOW = (0.58, 0.60, 0.63)
 RING, RING_STEP = 0.15, 0.06  # m, radius of the first lidar ring, and how much wider each next is

@@ -21,8 +21,7 @@ from sb3_guard.envs.outcome import Outcome
 from sb3_guard.envs.parameters import check_count
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.suites import EPISODE_STEPS, episode_steps
-
-Array = np.ndarray
+from sb3_guard.envs.types import Array
 
 
 @dataclass

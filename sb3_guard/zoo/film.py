@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.files import replacing
-from sb3_guard.common.vec_env import GuardVecEnv
+from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.costs import read_costs
 from sb3_guard.zoo.usage import UsageError, explained
 

@@ -5,16 +5,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import pandas as pd
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sb3_guard.zoo.run_folder import RunFolder, cost_words
-
-if TYPE_CHECKING:
-    from sb3_guard.zoo.grid import Run
 
 REFRESH = 1.0  # seconds between looks into the folders
 LINE_EVERY = 60.0  # seconds between plain lines of progress
@@ -23,6 +20,21 @@ LOGGED = {
     "return": "rollout/ep_rew_mean",
     "cost": "rollout/ep_cost_mean",
 }
+
+
+class Run(Protocol):
+    """What is shown of a run of a grid."""
+
+    state: str  # such as waiting, running or done
+    error: str  # what went wrong, in a line
+
+    @property
+    def path(self) -> Path:
+        """Its folder."""
+
+    @property
+    def steps(self) -> int:
+        """Its length, environment steps."""
 
 
 def read_progress(run: Path) -> dict[str, float]:
@@ -63,7 +75,7 @@ class Board:
         """Print a line, above the bars if there are any."""
         self.console.print(text, markup=False, soft_wrap=True)
 
-    def note(self, run: "Run") -> None:
+    def note(self, run: Run) -> None:
         """Say what has become of a run."""
         line = f"{time.strftime('%H:%M:%S')}  {run.state}: {run}"
         if run.state == "done":
@@ -74,7 +86,7 @@ class Board:
             line += f": {run.error}"
         self.say(line)
 
-    def update(self, runs: Sequence["Run"], now: bool = False) -> None:
+    def update(self, runs: Sequence[Run], now: bool = False) -> None:
         """
         Look into the folders and show what is there, but not too often.
 
@@ -100,7 +112,7 @@ class Board:
                     last = read_progress(run.path)
                     self.say(f"          {run}: {reached_words(last)}")
 
-    def _show(self, run: "Run") -> float:
+    def _show(self, run: Run) -> float:
         """A bar for a run while it is under way; how many steps it has done."""
         last = {"steps": float(run.steps)} if run.state == "done" else read_progress(run.path)
         shown = run.state == "running"
@@ -120,7 +132,7 @@ def reached_words(last: Mapping[str, float]) -> str:
     return ", ".join(words + [f"{n} {last[n]:.2f}" for n in ("return", "cost") if n in last])
 
 
-def summary(runs: Sequence["Run"]) -> str:
+def summary(runs: Sequence[Run]) -> str:
     """The grid on one line: how many runs are where."""
     counts = Counter(run.state for run in runs)
     others = [f"{n} {state}" for state, n in counts.items() if state != "done"]

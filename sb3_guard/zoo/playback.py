@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
-from sb3_guard.common.vec_env import GuardVecEnv
+from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.zoo.agent_flags import AgentFlags, EnjoyFlags
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import load_model, read_normalizer

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Constraint, Painter
+from sb3_guard.envs.part import Constraint, Painter
+from sb3_guard.envs.types import Array
 
 ENDLESS = 50.0  # m, how far a line is drawn that has no end
 

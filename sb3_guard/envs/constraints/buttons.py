@@ -8,7 +8,7 @@ import numpy as np
 from sb3_guard.envs.constraints.obstacles import Obstacles
 from sb3_guard.envs.groups import SPHERE, add_geom
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array
+from sb3_guard.envs.types import Array
 
 
 @dataclass

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from sb3_guard.envs import motion
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.groups import check_reachable, check_size
+from sb3_guard.envs.groups import check_reachable
 from sb3_guard.envs.layout import AWAY
 from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.parameters import param
@@ -40,10 +40,8 @@ class Ghosts(Movers, Obstacles):
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        near = self.span("size").low + (sim.robot.extent if self.solid else 0.0)
-        check_reachable(self, near, everywhere=False)
-        if self.num and not self.solid:
-            check_size(self, self.name, self.size)
+        if not self.solid:
+            check_reachable(self, everywhere=False)
 
     def before_step(self) -> None:
         if "num" in self.ranges:  # their law has led home who is away

@@ -9,9 +9,11 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.groups import BOX, MOST, add_geom
+from sb3_guard.envs.groups import BOX, add_geom
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Generators, Simulation
+from sb3_guard.envs.part import Simulation
+from sb3_guard.envs.placed import MOST
+from sb3_guard.envs.types import Array, Generators
 
 
 @dataclass

@@ -7,7 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Constraint, Generators, Simulation
+from sb3_guard.envs.part import Constraint, Simulation
+from sb3_guard.envs.types import Array, Generators
 
 
 @dataclass

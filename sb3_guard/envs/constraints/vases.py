@@ -8,9 +8,11 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.constraints.obstacles import Obstacles
-from sb3_guard.envs.groups import BOX, MOST, add_geom
+from sb3_guard.envs.groups import BOX, add_geom
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import FRICTION, MASS, Array
+from sb3_guard.envs.part import FRICTION, MASS
+from sb3_guard.envs.placed import MOST
+from sb3_guard.envs.types import Array
 
 
 @dataclass

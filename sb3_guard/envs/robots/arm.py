@@ -6,8 +6,9 @@ from typing import ClassVar
 import numpy as np
 
 from sb3_guard.envs import geometry
-from sb3_guard.envs.part import Array, Simulation
+from sb3_guard.envs.part import Simulation
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot, as_slice
+from sb3_guard.envs.types import Array
 
 
 @dataclass

@@ -20,9 +20,10 @@ import numpy as np
 
 from sb3_guard.envs.arena import furnish
 from sb3_guard.envs.observation import Observations, Values
-from sb3_guard.envs.part import Array, Generators, Simulation
+from sb3_guard.envs.part import Simulation
 from sb3_guard.envs.robots import mjcf
 from sb3_guard.envs.robots.robot import MJCFRobot
+from sb3_guard.envs.types import Array, Generators
 
 
 @dataclass

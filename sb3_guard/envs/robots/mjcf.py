@@ -1,12 +1,11 @@
 """A robot's MJCF file on its way into a world: read, looked over, given its contact bits."""
 
-import math
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from sb3_guard.envs.part import FLOOR, ROBOT
+from sb3_guard.envs.types import FLOOR, ROBOT
 
 SHIFT = 2  # a robot's own contact bits begin after ROBOT and FLOOR
 NEAR = 1e-6  # m: geoms whose height is fixed meet the floor if they are as near
@@ -121,33 +120,3 @@ def _rises(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
                 return True
         body = int(model.body_parentid[body])
     return False
-
-
-def extent(model: mujoco.MjModel, root: int, center: int) -> float:
-    """How far from the origin of body ``center`` any geom may reach, whatever the joints do, m.
-
-    Joints of the root place the robot; one that lifts it has no bound.
-    """
-    reach = {root: 0.0}  # m, of a body's origin from the root's
-    outermost = 0.0
-    for body in range(root, model.nbody):
-        if body != root:
-            parent = int(model.body_parentid[body])
-            if parent not in reach:
-                continue
-            reach[body] = reach[parent] + float(np.linalg.norm(model.body_pos[body]))
-        first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
-            if model.jnt_type[joint] == _SLIDE:
-                if body == root and not model.jnt_axis[joint][2]:
-                    continue
-                if body == root or not model.jnt_limited[joint]:
-                    return math.inf
-                reach[body] += float(np.abs(model.jnt_range[joint]).max())
-            elif body != root:  # the origin turns about the anchor
-                reach[body] += 2 * float(np.linalg.norm(model.jnt_pos[joint]))
-        first = int(model.body_geomadr[body])
-        for geom in range(first, first + int(model.body_geomnum[body])):
-            size = float(np.linalg.norm(model.geom_pos[geom]) + model.geom_rbound[geom])
-            outermost = max(outermost, reach[body] + size)
-    return outermost + reach[center]

@@ -31,8 +31,9 @@ from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.observation import Observations, Values
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import FRICTION, MASS, Array, Generators, Robot, Simulation, World
+from sb3_guard.envs.part import FRICTION, MASS, Robot, Simulation, World
 from sb3_guard.envs.robots import mjcf
+from sb3_guard.envs.types import Array, Generators
 from sb3_guard.spelling import did_you_mean
 
 Vector = tuple[float, float, float]
@@ -192,8 +193,6 @@ class MJCFRobot(Robot):
         pose.qpos[: len(self._start)] = self._start
         mujoco.mj_kinematics(model, pose)
         self.altitude = float(pose.xpos[center, 2])
-        self.offset = math.dist(pose.xpos[center, :2], pose.qpos[:2] if self._free else (0.0, 0.0))
-        self.extent = mjcf.extent(model, model.body(self.root).id, center)
         if not self.complete:
             self._bind_place(sim)
         ids = [model.body(prefix + name).id for name in self.sensing or self.lidar_bodies]

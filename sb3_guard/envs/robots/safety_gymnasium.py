@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sb3_guard.envs.observation import Observations, Values
-from sb3_guard.envs.part import Array, Generators, Simulation
+from sb3_guard.envs.part import Simulation
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
+from sb3_guard.envs.types import Array, Generators
 
 _SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer")
 

@@ -6,17 +6,19 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs import geometry
-from sb3_guard.envs.groups import MOST, SPHERE, Group, add_geom
-from sb3_guard.envs.layout import Footprint, Rectangle
+from sb3_guard.envs.groups import SPHERE, add_geom
+from sb3_guard.envs.layout import Footprint
 from sb3_guard.envs.observation import Compass, Observations, Scan, Values
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Generators, Painter, Simulation, Task, World
+from sb3_guard.envs.part import Painter, Simulation, Task
+from sb3_guard.envs.placed import MOST, Placed
+from sb3_guard.envs.types import Array, Generators
 
 GREEN = (0.1, 0.75, 0.2)
 
 
 @dataclass
-class Button(Task):
+class Button(Placed, Task):
     """Press the right one of several buttons (Ray et al. 2019).
 
     Reward: the distance gained on the lit button, times ``reward_distance``, plus ``bonus`` when it
@@ -31,15 +33,14 @@ class Button(Task):
     targets = "one"
     spaces = ("planar",)
     solid = True
+    usual_keepout = 0.3
+    reachable = True
 
     num: int = param(4, "number of buttons", low=1, high=MOST)
     size: float = param(0.1, "radius of a button, m", above=0)
     keepout: float | None = param(
         None, "radius kept clear around a button, m; null: 0.3, or what covers it", low=0
     )
-    locations: tuple[tuple[float, float], ...] = param((), "fixed places (x, y), m")
-    placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
-    margin: float = param(0.0, "extra distance to every other object, m", low=0)
     lidar: bool = param(False, "whether a lidar of its own sees the right button")
     marker: float | None = param(
         None, "radius kept clear for a marker that begins elsewhere, m; null: there is none", low=0
@@ -56,27 +57,11 @@ class Button(Task):
     bonus: float = param(1.0, "reward for pressing the lit button")
     ends: bool = param(False, "whether pressing the lit button ends the episode")
 
-    def build(self, world: World) -> None:
-        super().build(world)
-        self.group = Group(
-            self,
-            world,
-            self.name,
-            self.num,
-            self.keepout,
-            usual=0.3,
-            cover=self.size,
-            shape=self.shape,
-            reachable=True,
-        )
-        self.groups = (self.group,)
-
     def footprints(self) -> tuple[Footprint, ...]:
         marker = () if self.marker is None else (Footprint("goal", 1, self.marker),)
         return (*super().footprints(), *marker)
 
     def shape(self, body: mujoco.MjsBody) -> None:
-        """Add the geom of a button."""
         add_geom(body, SPHERE, (self.size,), self.color, lift=self.size)
 
     def bind(self, sim: Simulation) -> None:

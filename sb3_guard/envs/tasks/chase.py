@@ -6,8 +6,8 @@ import numpy as np
 
 from sb3_guard.envs import motion
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array
 from sb3_guard.envs.tasks.targets import Targets
+from sb3_guard.envs.types import Array
 
 
 @dataclass

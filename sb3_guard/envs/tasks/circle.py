@@ -7,7 +7,8 @@ import numpy as np
 from sb3_guard.envs import geometry
 from sb3_guard.envs.observation import Observations, Scan
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Painter, Simulation, Task
+from sb3_guard.envs.part import Painter, Simulation, Task
+from sb3_guard.envs.types import Array
 
 
 @dataclass

@@ -6,8 +6,9 @@ import numpy as np
 
 from sb3_guard.envs import geometry, motion
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Painter, Simulation
+from sb3_guard.envs.part import Painter, Simulation
 from sb3_guard.envs.tasks.targets import Targets
+from sb3_guard.envs.types import Array
 
 SLATE = (0.30, 0.35, 0.45)
 

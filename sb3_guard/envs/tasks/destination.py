@@ -8,7 +8,8 @@ from sb3_guard.envs import geometry
 from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.observation import Compass, Observations, Scan, Values
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Painter, Simulation, Task, World
+from sb3_guard.envs.part import Painter, Simulation, Task, World
+from sb3_guard.envs.types import Array
 
 REDRAWS = 20  # new places drawn before one that is reached already is accepted
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Simulation, Task
+from sb3_guard.envs.part import Simulation, Task
+from sb3_guard.envs.types import Array
 
 
 @dataclass

@@ -8,11 +8,12 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.groups import BOX, SPHERE, Group, add_geom
-from sb3_guard.envs.layout import Rectangle
+from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.observation import Compass, Observations, Scan
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Simulation, World
+from sb3_guard.envs.part import Simulation, World
 from sb3_guard.envs.tasks.destination import Destination
+from sb3_guard.envs.types import Array
 
 YELLOW = (0.95, 0.8, 0.1)
 
@@ -80,23 +81,26 @@ class Push(Destination):
     def build(self, world: World) -> None:
         super().build(world)
         self._flat = world.robot.workspace == "planar"
+        footprint = Footprint(
+            self.object,
+            1,
+            self.object_radius if self.object_keepout is None else self.object_keepout,
+            self.object_placements or self.placements,
+            self.object_locations,
+            self.margin if self.object_margin is None else self.object_margin,
+            reach=world.robot.reach,
+            base=world.robot.base,
+            cover=self.object_radius,
+            label=f"{self.name}.object_keepout",
+        )
         self.group = Group(
             self,
             world,
-            self.object,
-            1,
-            self.object_keepout,
-            usual=0.0,
-            cover=self.object_radius,
-            shape=self.shape,
+            footprint,
+            self.shape,
             free=self.object_size,
             sink=self.sink,
-            reachable=True,
-            label=f"{self.name}.object_keepout",
             grip="object_friction",
-            placements=self.object_placements or self.placements,
-            locations=self.object_locations,
-            margin=self.margin if self.object_margin is None else self.object_margin,
         )
         self.groups = (self.group,)
 
@@ -117,12 +121,6 @@ class Push(Destination):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self.center = self.group.centers[:, 0]  # [N, 3] m
-        far = sim.farthest("goal", self.object)
-        if self.size >= far:
-            raise ValueError(
-                f"{self.name}.size = {self.size} holds the {self.object} wherever an episode "
-                f"begins: it is at most {far:.2f} m away; make size smaller, or placements larger"
-            )
 
     def measure(self) -> Array:
         """Distances robot to object and object to goal, [N, 2] m."""

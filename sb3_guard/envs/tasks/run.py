@@ -6,7 +6,8 @@ import numpy as np
 
 from sb3_guard.envs import geometry
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Simulation, Task
+from sb3_guard.envs.part import Simulation, Task
+from sb3_guard.envs.types import Array
 
 
 @dataclass

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
-from sb3_guard.envs.groups import MOST, Group
-from sb3_guard.envs.layout import Rectangle
 from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import Array, Task, World
+from sb3_guard.envs.part import Task
+from sb3_guard.envs.placed import MOST
+from sb3_guard.envs.types import Array
 
 
 @dataclass
@@ -17,6 +17,9 @@ class Targets(Movers, Task):
     interactive = True
     contact = False
     targets = "many"
+    objects = "targets"
+    usual_keepout = 0.5
+    moves = True
     invalid_reason = "a solid target touches the robot immediately"
 
     num: int = param(2, "number of targets", low=1, high=MOST)
@@ -24,9 +27,6 @@ class Targets(Movers, Task):
     keepout: float | None = param(
         None, "radius kept clear around an object, m; null: 0.5, or what covers a solid one", low=0
     )
-    locations: tuple[tuple[float, float], ...] = param((), "fixed places (x, y), m")
-    placements: tuple[Rectangle, ...] = param((), "rectangles to draw from, m; empty: the arena")
-    margin: float = param(0.0, "extra distance to every other object, m", low=0)
     r0: float = param(2.0, "radius around the origin that they do not leave, m", low=0)
     v1: float | None = param(None, "speed away from the robot; null: 10 speed", low=0)
     reward_limit: float | None = param(
@@ -37,14 +37,6 @@ class Targets(Movers, Task):
         super().__post_init__()
         self.contact = self.solid
         self.targets = "one" if self.num == 1 else "many"
-
-    def build(self, world: World) -> None:
-        super().build(world)
-        shape = self.shape if self.solid else None
-        self.group = Group(
-            self, world, "targets", self.num, self.keepout, 0.5, self.size, shape, mover=True
-        )
-        self.groups = (self.group,)
 
     def invalid_start(self) -> Array:
         """Whether a solid target is touched: it hangs in the link of an arm, [N] bool."""

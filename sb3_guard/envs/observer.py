@@ -1,0 +1,182 @@
+"""The observation: what all parts let the robot observe, in one pass over all points."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from sb3_guard.envs.contract import check_observations
+from sb3_guard.envs.geometry import into_frames
+from sb3_guard.envs.observation import Channel, Compass, Lidar, Observations, Scan, Values, compass
+from sb3_guard.envs.part import Part, Robot
+from sb3_guard.envs.types import Array
+from sb3_guard.spelling import did_you_mean
+
+
+class Observer:
+    """Makes the observation of what the parts of a world let the robot observe.
+
+    :param robot: whose lidar bodies see all scans and compasses
+    :param parts: what they are of
+    :param lidar: settings of the pseudo-lidar
+    :param components: names of what is observed, in the order of the flat observation; None:
+        everything, in alphabetical order
+    :raises ValueError: an unknown component, with the nearest match; two parts observe one name; a
+        part's observations are not what they must be
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        parts: Sequence[Part],
+        lidar: Lidar,
+        components: Sequence[str] | None = None,
+    ) -> None:
+        self._robot, self._parts, self._lidar = robot, parts, lidar
+        self._level = robot.workspace == "planar"
+        self._rows, self._bodies = robot.frames[0].shape[:2]
+        self._checked = False  # whether points and values have been found to be finite
+        self._seen: list[tuple[str, tuple[int, ...], bool]] = []  # name, shape, planar
+        known: dict[str, Channel] = {}
+        for part in parts:
+            check_observations(part, self._rows)
+            for name, channel in self.channels_of(part).items():
+                if name in known:
+                    raise ValueError(
+                        f"{part.name} and another part both observe {name!r}; give the constraint, "
+                        "or the robot's sensor, another name"
+                    )
+                known[name] = channel
+        self._names = known.keys()
+        for name in components or ():
+            if name not in known:
+                hint = did_you_mean(name, sorted(known))
+                raise ValueError(f"observe.components names no component {name!r}: {hint}")
+        chosen = sorted(known) if components is None else components
+        self.channels = {name: known[name] for name in chosen}
+        self.slices: dict[str, slice] = {}
+        self.size = 0
+        for name, channel in self.channels.items():
+            self.slices[name] = slice(self.size, self.size + channel.size)
+            self.size += channel.size
+
+    def _coordinates(self, what: Scan | Compass) -> int:
+        """How many coordinates of its points, in the bodies' frames, count."""
+        return 2 if what.planar and (self._level or isinstance(what, Scan)) else 3
+
+    def channels_of(self, part: Part) -> dict[str, Channel]:
+        """Size, bounds and unit of what one part lets the robot observe, by name."""
+        return {name: self._channel(what) for name, what in part.observations().items()}
+
+    def _channel(self, what: Scan | Compass | Values) -> Channel:
+        if isinstance(what, Values):
+            return Channel(what.values.shape[1], what.low, what.high, what.unit)
+        if isinstance(what, Scan):
+            return self._lidar.channel(self._bodies, what.planar)
+        return Channel(self._bodies * self._coordinates(what), -1.0, 1.0, "direction")
+
+    def observe(self, dtype: DTypeLike = np.float32) -> Array:
+        """The flat observation of every row, [N, D], a new array.
+
+        :param dtype: what the observation, computed in float64, is cast to
+        :raises ValueError: names or sizes are not those of the first observation
+        """
+        if not self._checked:
+            for part in self._parts:
+                check_observations(part, self._rows, finite=True)
+            self._checked = True
+        found: dict[str, Scan | Compass | Values] = {}
+        for part in self._parts:
+            found.update(part.observations())
+        if found.keys() != self._names:
+            odd = ", ".join(map(repr, sorted(found.keys() ^ self._names)))
+            raise ValueError(
+                f"observations() must always have the same names; {odd} came or went: for what is "
+                "not seen, give a Scan that is not visible, or zeros"
+            )
+        try:
+            seen = self.look({name: found[name] for name in self.channels})
+        except Exception:
+            for part in self._parts:  # whose fault is it?
+                check_observations(part, self._rows, finite=True)
+            raise
+        obs = np.concatenate([seen[name] for name in self.slices], axis=1, dtype=dtype)
+        if obs.shape[1] != self.size:
+            widths = {name: (c.size, np.shape(seen[name])[1]) for name, c in self.channels.items()}
+            name = next(n for n, (size, width) in widths.items() if size != width)
+            raise ValueError(
+                f"{name!r} of the observation has {widths[name][1]} columns; at first it had "
+                f"{widths[name][0]}"
+            )
+        return obs
+
+    def readings(self, row: int) -> list[tuple[Array, int, tuple[float, float, float]]]:
+        """Every lidar of a row: closeness [bodies · bins], bins around, and color."""
+        scans = {
+            name: (scan, part.color if scan.color is None else scan.color)
+            for part in self._parts
+            for name, scan in part.observations().items()
+            if isinstance(scan, Scan)
+        }
+        seen = self.look({name: scan for name, (scan, _) in scans.items()})
+        return [
+            (seen[name][row], self._lidar.bins if scan.planar else self._lidar.azimuth, color)
+            for name, (scan, color) in scans.items()
+        ]
+
+    def _arrange(self, points: Mapping[str, Scan | Compass]) -> None:
+        """Settle in which order points are looked at: alike ones side by side."""
+        kinds: dict[tuple[bool, int], list[str]] = {}
+        for name, what in points.items():
+            kind = (isinstance(what, Compass), self._coordinates(what))
+            kinds.setdefault(kind, []).append(name)
+        self._order = [name for kind in sorted(kinds) for name in kinds[kind]]
+        self._size = max((size for _, size in kinds), default=2)
+        self._flat = 0  # points seen as lying on the floor, whatever their height; they come first
+        self._scans: list[tuple[int, slice, list[int], list[str]]] = []
+        self._compasses: list[tuple[int, slice, list[str]]] = []
+        start = 0
+        for towards, size in sorted(kinds):
+            names = kinds[towards, size]
+            each = [1 if towards else points[name][0].shape[1] for name in names]
+            where = slice(start, start + sum(each))
+            if towards:
+                self._compasses.append((size, where, names))
+            else:
+                self._scans.append((size, where, each, names))
+                self._flat = where.stop if size == 2 else self._flat
+            start = where.stop
+
+    def look(self, observations: Observations) -> dict[str, Array]:
+        """What is observed, by name: [N, bodies · bins], [N, bodies · coordinates] or values."""
+        out: dict[str, Array] = {}
+        points: dict[str, Scan | Compass] = {}
+        for name, what in observations.items():
+            if isinstance(what, Values):
+                out[name] = what.values
+            else:
+                points[name] = what
+        if not points:
+            return out
+        seen = [(name, s[0].shape, s.planar) for name, s in points.items()]
+        if seen != self._seen:
+            self._arrange(points)
+            self._seen = seen
+        origin, rotation = self._robot.frames
+        columns = [points[name][0].T for name in self._order]  # of a compass [3, N]
+        places = np.concatenate([c if c.ndim == 3 else c[:, None] for c in columns], axis=1)
+        places[2, : self._flat] = 0.0
+        v = into_frames(origin, rotation, places, self._size)  # [2 or 3, B, K, N]
+        n = len(origin)
+        for size, where, groups, names in self._scans:
+            closeness = self._lidar.scan(v[:size, :, where], groups)
+            for i, name in enumerate(names):
+                out[name] = closeness[:, :, i].reshape(n, -1)
+                visible = points[name].visible  # type: ignore[union-attr]
+                if visible is not None:
+                    out[name][~np.asarray(visible, dtype=bool)] = 0.0
+        for size, where, names in self._compasses:
+            directions = compass(v[:size, :, where])
+            for i, name in enumerate(names):
+                out[name] = directions[:, :, i].T.reshape(n, -1)
+        return out

@@ -166,6 +166,7 @@ def test_overrides_change_add_and_remove_parts():
     assert [c.name for c in engine.constraints] == ["hazards", "danger"]
     assert engine.task.size == 0.3
     assert base.override(hazards=None).build().constraints == ()
+    assert base.override(ghosts=None, goal=None, lidar=None) == base  # there is none to remove
 
 
 def test_two_constraints_of_a_type_are_charged_apart():

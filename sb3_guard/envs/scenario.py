@@ -175,18 +175,10 @@ class Scenario:
         :raises ValueError: an unknown keyword or parameter
         """
         changes: dict[str, Any] = {"constraints": dict(self.constraints), "cost": cost or self.cost}
-        own = {**KEYWORDS, self.task.lower(): "task_params"}
-        kinds = {name.lower() for name in CONSTRAINTS}
-        tasks = {name.lower(): name for name in TASKS}
+        table = self._keywords()
         for key, value in params.items():
-            known = {*own, *kinds, *changes["constraints"], *tasks}
-            new = isinstance(value, Mapping) and "type" in value
-            if key not in known and not new:
-                hint = self._instead(key)
-                if hint is None:
-                    allowed = did_you_mean(key, [*own, *sorted(kinds), *OPTIONS])
-                    hint = f"{allowed}; {_OWN_NAME}"
-                raise ValueError(f"unknown parameter {key!r}: {hint}")
+            if key not in table and not (isinstance(value, Mapping) and "type" in value):
+                raise ValueError(f"unknown parameter {key!r}: {self._instead(key)}")
             if value is not None and not isinstance(value, Mapping):
                 such = "{'size': 0.3}"
                 if key == "robot":
@@ -194,31 +186,36 @@ class Scenario:
                 raise ValueError(
                     f"{key} = {value!r} must be a mapping of parameters, such as {key}={such}"
                 )
-            if key in own:
-                name = own[key]
+            name = table.get(key, "constraints")
+            if name != "constraints":
                 changes[name] = {**changes.get(name, getattr(self, name)), **(value or {})}
-            elif value is None and key in changes["constraints"]:
-                del changes["constraints"][key]
-            elif new or key in kinds or key in changes["constraints"]:
-                old = changes["constraints"].get(key, {})
-                changes["constraints"][key] = {**old, **(value or {})}
+            elif value is None:
+                changes[name].pop(key, None)
             else:
-                wanted = f"{tasks[key]}_{self.robot}_8Hazards-v0"
-                raise ValueError(
-                    f"{key} = {value!r}: this scenario's task is {self.task}, not {tasks[key]}: "
-                    f"set its parameters with {self.task.lower()}={{...}}, or choose the other "
-                    f"task with an id such as {wanted!r}"
-                )
+                changes[name][key] = {**changes[name].get(key, {}), **value}
         if self.observe.get("components") and "components" not in (params.get("observe") or {}):
             components = self._components(changes["constraints"])
             changes["observe"] = {**changes.get("observe", self.observe), "components": components}
         return replace(self, **changes)
 
-    def _instead(self, key: str) -> str | None:
-        """What to write for a parameter that belongs to a part, or None: it belongs to none."""
+    def _keywords(self) -> dict[str, str]:
+        """The field that each keyword of :meth:`override` changes."""
+        constraints = [*sorted(map(str.lower, CONSTRAINTS)), *self.constraints]
+        own = {**KEYWORDS, self.task.lower(): "task_params"}
+        return own | dict.fromkeys(constraints, "constraints")
+
+    def _instead(self, key: str) -> str:
+        """What to write for a keyword that does not exist."""
         if key == "indicator":
             return "write cost='any' for costs of 0 or 1"
-        key = {"reward_clip": "reward_limit"}.get(key, key)
+        task = next((name for name in TASKS if name.lower() == key), None)
+        if task is not None:
+            return (
+                f"the task is {self.task}, not {task}: set its parameters with "
+                f"{self.task.lower()}={{...}}, or choose the other task with an id such as "
+                f"'{task}_{self.robot}_8Hazards-v0'"
+            )
+        parameter = {"reward_clip": "reward_limit"}.get(key, key)
         parts: dict[str, Any] = {
             "arena": Arena,
             self.task.lower(): TASKS[self.task],
@@ -227,8 +224,10 @@ class Scenario:
             "lidar": Lidar,
             "observe": Extras,
         }
-        owners = [name for name, cls in parts.items() if key in {f.name for f in fields(cls)}]
-        return f"write {' or '.join(f'{n}={{{key!r}: ...}}' for n in owners)}" if owners else None
+        owners = [name for name, cls in parts.items() if parameter in {f.name for f in fields(cls)}]
+        if owners:
+            return f"write {' or '.join(f'{name}={{{parameter!r}: ...}}' for name in owners)}"
+        return f"{did_you_mean(key, [*self._keywords(), *OPTIONS])}; {_OWN_NAME}"
 
     def _components(self, constraints: Mapping[str, Params]) -> list[str]:
         """What is observed with these constraints: not those that go, and the objects that come."""

@@ -44,7 +44,15 @@ import stable_baselines3
 from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard.algorithms import ALGORITHMS, FirstOrder, SACLag, TD3Lag, TQCLag, TrustRegion
+from sb3_guard.algorithms import (
+    ALGORITHMS,
+    FirstOrder,
+    PPOLag,
+    SACLag,
+    TD3Lag,
+    TQCLag,
+    TrustRegion,
+)
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 from sb3_guard.algorithms.common.policies import FilteredPolicy
 
@@ -55,6 +63,7 @@ A2C = {"n_steps": 16, "normalize_advantage": False}
 REPLACED: dict[type, dict[str, dict[str, dict[str, Any]]]] = {
     TrustRegion: {"sb3": {"A2C": A2C, "PPO": {}}, "contrib": {"TRPO": {}}},
     FirstOrder: {"sb3": {"PPO": {}}, "contrib": {}},
+    PPOLag: {"sb3": {"PPO": {}}, "contrib": {}},
     SACLag: {"sb3": {"SAC": {}}, "contrib": {}},
     TD3Lag: {"sb3": {"TD3": {}}, "contrib": {}},
     TQCLag: {"sb3": {}, "contrib": {"TQC": {}}},

@@ -16,11 +16,12 @@ import numpy as np
 from cost_envs import TabularCMDP
 from gymnasium import spaces
 from scipy.optimize import minimize
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_guard.algorithms import CRPO, CUP, P3O, TRPOFAC, TRPOIPO, FirstOrder, TD3Lag
+from sb3_guard.algorithms import CRPO, CUP, P3O, TRPOFAC, TRPOIPO, TD3Lag
 
 
 class World:
@@ -411,7 +412,7 @@ def solve(cls: type, problem: Problem, seed: int, scale: float = 1.0, **kwargs: 
     outcomes = Outcomes(problem.total_timesteps)
     settings = {"seed": seed, "device": "cpu", **kwargs}
     made: VecEnv = env
-    if issubclass(cls, FirstOrder) and problem.unconstrained >= LARGE:
+    if issubclass(cls, PPO) and problem.unconstrained >= LARGE:
         made = VecNormalize(env, norm_obs=False)
     if issubclass(cls, OnPolicyAlgorithm):
         settings.setdefault("n_steps", problem.n_steps)
@@ -439,7 +440,7 @@ def budget(cls: type, problem: Problem) -> Problem:
     SAC- and TQC-Lagrangian 15,000: their temperature falls slowly at SB3's rate.
     """
     if issubclass(cls, OnPolicyAlgorithm):
-        slow = issubclass(cls, FirstOrder | CRPO | TRPOIPO | TRPOFAC)
+        slow = issubclass(cls, PPO | CRPO | TRPOIPO | TRPOFAC)
         times = 8 if issubclass(cls, CUP | P3O) else 4 if slow else 2
         return replace(problem, updates=times * problem.updates)
     return replace(problem, n_envs=1, n_steps=1, updates=8_000 if cls is TD3Lag else 15_000)

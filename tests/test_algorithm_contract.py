@@ -45,7 +45,6 @@ from sb3_guard.algorithms import (
 from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.buffers import CostRolloutBuffer
 from sb3_guard.algorithms.common.critics import CostCritic
-from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.costs import read_costs
 
@@ -92,7 +91,7 @@ def small(cls: type[TrustRegion], env: Any, policy: str = "MlpPolicy", **kwargs:
         kwargs.pop("n_critic_updates", None)
     else:
         defaults["n_steps"] = 40
-    if issubclass(cls, FirstOrder):
+    if issubclass(cls, PPO):
         # Whole rollouts: none here is larger than this.
         defaults |= {"n_epochs": kwargs.pop("n_critic_updates", 3), "batch_size": 10_000}
     elif cls not in OFF_POLICY:

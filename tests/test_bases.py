@@ -24,6 +24,7 @@ from sb3_guard.algorithms import (
     PPOLag,
     register_algorithm,
 )
+from sb3_guard.algorithms.common.first_order import mean_kl
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -70,9 +71,16 @@ def test_first_order_with_ppos_loss_is_ppo_bit_for_bit() -> None:
 def test_passes_stop_by_the_kl_of_the_rollout() -> None:
     """One pass where the first already goes too far, all where none does."""
     for target, passes in ((1e-9, 1), (1e9, 10)):
-        model = FirstOrder("MlpPolicy", points(), n_steps=32, kl_stop="epoch", target_kl=target)
-        assert model.learn(128)._n_updates == passes
-        assert 0.0 < model._mean_kl(None) < 1.0
+        kwargs: dict[str, Any] = {"n_steps": 32, "target_kl": target, "cost_limit": 1e6, "seed": 0}
+        models = [
+            cls("MlpPolicy", points(), kl_stop="epoch", **kwargs) for cls in (FirstOrder, PPOLag)
+        ]
+        for model in models:
+            model.set_random_seed(0)
+            assert model.learn(128)._n_updates == passes
+            assert 0.0 < mean_kl(model) < 1.0
+            assert (model.n_epochs, model.target_kl) == (10, target)
+        assert state_of(models[0]) == state_of(models[1])  # SB3's passes, and written out
 
 
 @pytest.mark.parametrize("gamma", [0.9, 1.0])

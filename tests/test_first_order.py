@@ -173,27 +173,37 @@ def test_prices_in_units_of_cost_weigh_costs_against_standardised_advantages() -
     """As Ray et al. and OmniSafe do: A standardised over the rollout, A_C only centred."""
     fixed = {"lambda_init": 0.5, "lambda_lr": 0.0, "proportional_gain": 0.0}
     model = make(PPOLag, lambda_units="cost", **fixed)
-    buffer, descend = model.rollout_buffer, model.descend
+    buffer, reprice = model.rollout_buffer, model.reprice
+    seen: list[np.ndarray] = []
 
-    def before(*args: Any) -> None:
-        raw, costs = seen
+    def priced() -> None:
+        raw, costs = buffer.advantages.copy(), buffer.cost_advantages[..., 0].copy()
+        reprice()
+        seen.append(buffer.advantages)
         expected = raw - 0.5 * raw.std() * (costs - costs.mean())
         np.testing.assert_allclose(buffer.advantages, expected, rtol=1e-4, atol=1e-5)
-        descend(*args)
-        seen.clear()
 
-    seen: list[np.ndarray] = []
-    train = model.train
-    model.train = lambda: (
-        seen.extend([buffer.advantages.copy(), buffer.cost_advantages[..., 0].copy()]),
-        train(),
-    )
-    model.descend = before
+    model.reprice = priced
     model.learn(128)
-    assert not seen
+    assert len(seen) == 1
 
 
-@pytest.mark.parametrize("cls", [FOCOPS, P3O, PPOLag, TRPOLag, TRPOFAC, TRPOIPO, TRPOSL])
+def test_ppo_lagrangians_price_does_not_know_the_unit_of_reward() -> None:
+    """Advantages × 100: the priced ones are × 100, and differ from those without costs."""
+    priced = []
+    for scale in (1.0, 100.0):
+        model = make(PPOLag, cost_limit=0.01)
+        buffer = model.rollout_buffer
+        model.train = lambda: None
+        model.learn(128)
+        raw = buffer.advantages = scale * buffer.advantages
+        model.reprice()
+        assert np.abs(buffer.advantages - raw).max() > 0.1 * raw.std()
+        priced.append(buffer.advantages)
+    np.testing.assert_allclose(100.0 * priced[0], priced[1], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("cls", [FOCOPS, P3O, TRPOLag, TRPOFAC, TRPOIPO, TRPOSL])
 def test_the_weight_of_a_cost_does_not_know_the_unit_of_reward(cls: Any) -> None:
     """Advantages × 100, which are not standardised: the same gradient × 100."""
     name = "surrogate" if issubclass(cls, TrustRegion) else "loss"

@@ -2,11 +2,10 @@
 
 from typing import Any, ClassVar
 
-from sb3_guard.algorithms.common.first_order import PenalizedPPO
-from sb3_guard.algorithms.common.lagrangian import RELATIVE
+from sb3_guard.algorithms.ppo_lag import PPOLag
 
 
-class CPPOPID(PenalizedPPO):
+class CPPOPID(PPOLag):
     """PPO on the Lagrangian, priced by a controller (Stooke et al., 2020, arXiv 2007.03964).
 
     ::
@@ -22,12 +21,6 @@ class CPPOPID(PenalizedPPO):
 
     label, family, paper = "CPPO-PID", "Lagrangian", "Stooke et al. 2020"
     search_space: ClassVar[dict[str, Any]] = {
-        "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
-        "proportional_gain": {"low": 0.0, "high": 4.0},
         "derivative_gain": {"low": 0.0, "high": 4.0},
     }
-    defaults: ClassVar[dict[str, Any]] = {
-        **RELATIVE,
-        "derivative_gain": 0.5,
-        "lambda_smoothing": 0.5,
-    }
+    defaults: ClassVar[dict[str, Any]] = {"derivative_gain": 0.5, "lambda_smoothing": 0.5}

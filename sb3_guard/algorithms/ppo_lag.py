@@ -1,12 +1,18 @@
 """PPO-Lagrangian: the cost joins PPO's objective at a price that follows the violation."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
-from sb3_guard.algorithms.common.first_order import PenalizedPPO
-from sb3_guard.algorithms.common.lagrangian import RELATIVE
+import numpy as np
+import torch as th
+from stable_baselines3 import PPO
+
+from sb3_guard.algorithms.common.arguments import hyperparameter
+from sb3_guard.algorithms.common.first_order import FirstOrder, check_ppo, mean_kl
+from sb3_guard.algorithms.common.lagrangian import RELATIVE, Lagrangian
+from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 
 
-class PPOLag(PenalizedPPO):
+class PPOLag(Lagrangian, CostRollouts, PPO):
     """PPO on the Lagrangian (Ray et al., 2019; multipliers as in arXiv 2007.03964).
 
     ::
@@ -17,11 +23,64 @@ class PPOLag(PenalizedPPO):
     with J_C and d of whole episodes; a proportional term keeps them from circling the optimum.
     Then SB3's PPO learns from ``A - Σ λ_i A_Ci``, each in its standard deviation. While no limit
     is exceeded the run equals PPO's, bit for bit.
+
+    :param target_kl: where the passes over a rollout stop; None for never
+    :param kl_stop: ``"minibatch"`` stops before the first minibatch whose KL exceeds
+        1.5 ``target_kl``, as SB3 does; ``"epoch"`` after the first pass at whose end the mean over
+        the rollout exceeds ``target_kl``, as OmniSafe does. Losses are logged of the last pass
     """
 
     label, family, paper = "PPO-Lagrangian", "Lagrangian", "Ray et al. 2019"
     search_space: ClassVar[dict[str, Any]] = {
+        **FirstOrder.search_space,
         "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
         "proportional_gain": {"low": 0.0, "high": 4.0},
     }
-    defaults: ClassVar[dict[str, Any]] = RELATIVE
+    defaults: ClassVar[dict[str, Any]] = {**FirstOrder.defaults, **RELATIVE}
+    policy_defaults: ClassVar[dict[str, Any]] = CALM
+
+    kl_stop: Literal["minibatch", "epoch"] = hyperparameter("epoch")
+
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        check_ppo(self)
+
+    def train(self) -> None:
+        """SB3's update on priced advantages, then the cost critic."""
+        self.reprice()
+        try:
+            if self.kl_stop == "epoch" and self.target_kl is not None:
+                self._take_passes(self.n_epochs, self.target_kl)
+            else:
+                super().train()
+        except ValueError:  # torch refuses distributions of parameters that are not finite
+            finite = all(bool(th.isfinite(weights).all()) for weights in self.policy.parameters())
+            self._check_finite("policy_gradient_loss", 0.0 if finite else np.nan)
+            raise
+        for name in ("policy_gradient_loss", "value_loss"):
+            self._check_finite(name, self.logger.name_to_value[f"train/{name}"])
+        self.fit_cost_critic()
+
+    def reprice(self) -> None:
+        """Take the priced cost advantages off the rollout's advantages.
+
+        PPO standardises the result by minibatch, so a division by 1 + Σ λ would change nothing.
+        """
+        buffer = self.rollout_buffer
+        # Where the reward's advantages are all alike, their unit is 1.
+        spread = float(buffer.advantages.std()) or 1.0
+        price = self.price(spread * self.centre_costs())
+        if self.lambda_units == "cost" and self.normalize_advantage:
+            price *= np.float32(spread)  # as published: λ weighs A_C against the standardised A
+        buffer.advantages = buffer.advantages - buffer.cost_advantages @ price
+
+    def _take_passes(self, n_epochs: int, target_kl: float) -> None:
+        """SB3's update, one pass at a time, until the mean KL over the rollout is too large."""
+        self.n_epochs, self.target_kl = 1, None
+        try:
+            for _ in range(n_epochs):
+                super().train()
+                if mean_kl(self) > target_kl:
+                    break
+        finally:
+            self.n_epochs, self.target_kl = n_epochs, target_kl

@@ -9,7 +9,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from sb3_guard.algorithms.common.advantage import discounted_returns
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.lagrangian import inverse
+from sb3_guard.algorithms.common.costs import inverse
 from sb3_guard.algorithms.common.penalized import PenalizedTrustRegion
 from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
 

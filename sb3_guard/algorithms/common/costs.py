@@ -43,3 +43,8 @@ def same_at_every_step(costs: np.ndarray) -> np.ndarray:
     """
     first = costs[0, 0]
     return (first != 0.0) & (costs == first).all(axis=(0, 1))
+
+
+def inverse(deviation: np.ndarray) -> np.ndarray:
+    """1 / deviation, 0 where that is 0."""
+    return np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0.0)

@@ -1,8 +1,8 @@
-"""Epochs of minibatches, as in SB3's PPO, on a loss of one's own.
+"""Epochs of minibatches, as in SB3's PPO, on a custom loss.
 
 What differs from PPO is one hook, ``loss``. Critic, entropy bonus, gradient clipping, early
 stopping and logs are PPO's, bit for bit: with the loss it comes with, the class is PPO. Algorithms
-that need no other loss than PPO's stand on ``CostRollouts`` and SB3's own ``PPO`` instead.
+that need no other loss than PPO's, as PPO-Lagrangian, inherit from SB3's own ``PPO`` instead.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,6 @@ from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.fast.actor import distribution_of
 from sb3_guard.algorithms.common.fast.optimizers import fuse
-from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 from sb3_guard.checks import check_integer, check_number
 
@@ -57,12 +56,7 @@ class FirstOrder(CostRollouts, PPO):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        for name in ("n_steps", "batch_size", "n_epochs"):
-            check_integer(name, getattr(self, name))
-        for name in ("gamma", "gae_lambda"):
-            check_number(name, getattr(self, name), 0.0, 1.0, "[]")
-        if self.target_kl is not None:
-            check_number("target_kl", self.target_kl, ends="()")
+        check_ppo(self)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -99,16 +93,6 @@ class FirstOrder(CostRollouts, PPO):
         variance = explained_variance(values.flatten(), returns.flatten())
         self.logger.record("train/explained_variance", variance)
         self.fit_cost_critic()
-
-    def centre_costs(self) -> np.ndarray:
-        """Centre the buffer's cost advantages.
-
-        :return: their inverse standard deviations, 0 where they are all alike, shape (m,)
-        """
-        buffer = self.rollout_buffer
-        deviation = buffer.cost_advantages.std(axis=(0, 1), dtype=np.float64)
-        buffer.cost_advantages = buffer.cost_advantages - buffer.cost_advantages.mean(axis=(0, 1))
-        return inverse(deviation)
 
     def snapshot(self) -> Before:
         """The policy as it is now on the rollout, to measure distances from while it learns."""
@@ -157,7 +141,7 @@ class FirstOrder(CostRollouts, PPO):
         parameters = list(self.policy.parameters())
         for batch in self.rollout_buffer.get(self.batch_size):
             if values:
-                predicted, log_prob, entropy = self._evaluate(batch)
+                predicted, log_prob, entropy = _evaluate(self, batch)
                 distribution = self.policy.action_dist
             else:
                 distribution = policy(batch.observations)
@@ -174,7 +158,7 @@ class FirstOrder(CostRollouts, PPO):
                 losses["value_loss"] = self._value_loss(batch, predicted.flatten())
                 total = total + self.ent_coef * losses["entropy_loss"]
                 total = total + self.vf_coef * losses["value_loss"]
-            divergence = self._divergence(batch, log_prob.detach(), start)
+            divergence = _divergence(batch, log_prob.detach(), start)
             for name, value in {**losses, kl_name: divergence}.items():
                 history.setdefault(name, []).append(number := value.item())
                 self._check_finite(name, number)
@@ -188,12 +172,8 @@ class FirstOrder(CostRollouts, PPO):
         return (
             self.kl_stop == "epoch"
             and self.target_kl is not None
-            and self._mean_kl(start) > self.target_kl
+            and mean_kl(self, start) > self.target_kl
         )
-
-    def _evaluate(self, batch: CostRolloutBufferSamples) -> tuple[th.Tensor, ...]:
-        """Values, log-probabilities and entropies; the distribution is ``policy.action_dist``."""
-        return self.policy.evaluate_actions(batch.observations, self._taken(batch.actions))  # type: ignore
 
     def _value_loss(self, batch: CostRolloutBufferSamples, values: th.Tensor) -> th.Tensor:
         if self.clip_range_vf is not None:
@@ -202,47 +182,45 @@ class FirstOrder(CostRollouts, PPO):
             values = batch.old_values + change
         return F.mse_loss(batch.returns, values)
 
-    @th.no_grad()
-    def _divergence(
-        self,
-        batch: CostRolloutBufferSamples,
-        log_prob: th.Tensor,
-        start: Before | None,
-    ) -> th.Tensor:
-        """KL(start ‖ policy), estimated on the actions taken as SB3 does."""
-        old = batch.old_log_prob if start is None else start.log_prob[batch.places]
-        return _approximate_kl(log_prob - old)
 
-    @th.no_grad()
-    def _mean_kl(self, start: Before | None) -> float:
-        """The same of the whole rollout."""
-        batch = self.rollout_buffer.whole()
-        total = 0.0
-        for index in chunks(len(batch.actions)):
-            part = CostRolloutBufferSamples(*(rows(field, index) for field in batch))
-            _, log_prob, _ = self._evaluate(part)
-            total += float(self._divergence(part, log_prob, start)) * len(log_prob)
-        return total / len(batch.actions)
-
-
-class PenalizedPPO(Lagrangian, FirstOrder):
-    """PPO on A - Σ λ_i A_Ci.
-
-    PPO standardises the changed advantages by minibatch, so that a division by 1 + Σ λ would change
-    nothing. At λ = 0 it is SB3's PPO, bit for bit.
+def check_ppo(model: PPO) -> None:
     """
+    Refuse values of PPO's arguments that SB3 takes silently, or fails at later.
 
-    def train(self) -> None:
-        buffer = self.rollout_buffer
-        # where the reward's advantages are all alike, their unit is 1
-        spread = float(buffer.advantages.std()) or 1.0
-        price = self.price(spread * self.centre_costs())
-        if self.lambda_units == "cost" and self.normalize_advantage:
-            price *= np.float32(spread)  # as published: λ weighs A_C against the standardised A
-        buffer.advantages = buffer.advantages - buffer.cost_advantages @ price
-        super().train()
+    :raises ValueError: one is out of its range
+    """
+    for name in ("n_steps", "batch_size", "n_epochs"):
+        check_integer(name, getattr(model, name))
+    for name in ("gamma", "gae_lambda"):
+        check_number(name, getattr(model, name), 0.0, 1.0, "[]")
+    if model.target_kl is not None:
+        check_number("target_kl", model.target_kl, ends="()")
 
 
-def _approximate_kl(log_ratio: th.Tensor) -> th.Tensor:
+@th.no_grad()
+def mean_kl(model: CostRollouts, start: Before | None = None) -> float:
+    """The mean over a rollout of KL(start ‖ policy), estimated on the actions taken as SB3 does.
+
+    :param start: None for the policy that acted
+    """
+    batch = model.rollout_buffer.whole()
+    total = 0.0
+    for index in chunks(len(batch.actions)):
+        part = CostRolloutBufferSamples(*(rows(field, index) for field in batch))
+        _, log_prob, _ = _evaluate(model, part)
+        total += float(_divergence(part, log_prob, start)) * len(log_prob)
+    return total / len(batch.actions)
+
+
+def _evaluate(model: CostRollouts, batch: CostRolloutBufferSamples) -> tuple[th.Tensor, ...]:
+    """Values, log-probabilities and entropies; the distribution is ``policy.action_dist``."""
+    return model.policy.evaluate_actions(batch.observations, model._taken(batch.actions))  # type: ignore
+
+
+@th.no_grad()
+def _divergence(
+    batch: CostRolloutBufferSamples, log_prob: th.Tensor, start: Before | None
+) -> th.Tensor:
     """KL(old ‖ new) from samples of the old one (Schulman, http://joschu.net/blog/kl-approx.html)."""
+    log_ratio = log_prob - (batch.old_log_prob if start is None else start.log_prob[batch.places])
     return th.mean((th.exp(log_ratio) - 1) - log_ratio)

@@ -130,11 +130,6 @@ def _average(before: th.Tensor, now: th.Tensor, keep: float) -> th.Tensor:
     return th.where(th.isinf(before), now, keep * before + (1.0 - keep) * now)
 
 
-def inverse(deviation: np.ndarray) -> np.ndarray:
-    """1 / deviation, 0 where that is 0."""
-    return np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0.0)
-
-
 class Lagrangian(Constrained):
     """Prices of the costs that follow the violations, for any algorithm that takes them.
 

@@ -5,7 +5,8 @@ from typing import Any, ClassVar
 import torch as th
 
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
+from sb3_guard.algorithms.common.costs import inverse
+from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 

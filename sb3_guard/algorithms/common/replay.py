@@ -26,8 +26,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.cost_critics import CostQ
-from sb3_guard.algorithms.common.costs import CostEstimate
-from sb3_guard.algorithms.common.lagrangian import Lagrangian, inverse
+from sb3_guard.algorithms.common.costs import CostEstimate, inverse
+from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
 

@@ -27,7 +27,7 @@ from sb3_guard.algorithms.common.buffers import (
     CostRolloutBuffer,
 )
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.algorithms.common.costs import discounted_limit, same_at_every_step
+from sb3_guard.algorithms.common.costs import discounted_limit, inverse, same_at_every_step
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.fast.threads import one_thread
 
@@ -268,6 +268,16 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         if getattr(self, "normalize_advantage", False):
             return 1.0
         return float(self.rollout_buffer.advantages.std()) or 1.0
+
+    def centre_costs(self) -> np.ndarray:
+        """Centre the buffer's cost advantages.
+
+        :return: their inverse standard deviations, 0 where they are all alike, shape (m,)
+        """
+        buffer = self.rollout_buffer
+        deviation = buffer.cost_advantages.std(axis=(0, 1), dtype=np.float64)
+        buffer.cost_advantages = buffer.cost_advantages - buffer.cost_advantages.mean(axis=(0, 1))
+        return inverse(deviation)
 
     def _taken(self, actions: th.Tensor) -> th.Tensor:
         """Actions of the buffer as the policy's distribution takes them."""

@@ -11,7 +11,6 @@ import torch as th
 from cost_envs import SB3_POLICY, CostPoint, TabularCMDP
 from known_optima import problems, solve
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from torch.distributions import Normal
@@ -344,33 +343,17 @@ def test_rcpo_takes_the_whole_step() -> None:
     assert model.logger.name_to_value["train/line_search_step"] == 1.0
 
 
-def test_rcpo_may_put_the_penalty_into_the_reward(tmp_path: Path) -> None:
-    """One critic learns r - Σ λ_i c_i, and there is no other; the penalty is λ in the logs."""
-    model = make(RCPO, 2, penalized_reward=True, cost_limit=[0.5, 1.0], lambda_init=0.3)
-    seen: dict[str, Any] = {}
-
-    class Keep(BaseCallback):
-        def _on_step(self) -> bool:
-            return True
-
-        def _on_rollout_end(self) -> None:
-            seen["rewards"] = self.model.rollout_buffer.rewards.copy()
-            seen["costs"] = self.model.rollout_buffer.costs.copy()
-
-    model.learn(128, callback=Keep())
-    logged = model.logger.name_to_value
-    prices = [logged[f"train/price/{key}"] for key in model.cost_keys]
-    assert min(prices) > 0.0 and seen["costs"].sum() > 0.0
-    expected = seen["rewards"] - seen["costs"] @ np.array(prices, np.float32)
-    np.testing.assert_allclose(model.rollout_buffer.rewards, expected, rtol=1e-5)
-    # undiscounted within the rollout: what an episode's first step is worth to the critic
-    gains = [expected[t, 0] * model.gamma**t for t in range(30)]
-    assert model.rollout_buffer.returns[0] == pytest.approx(sum(gains), rel=1e-4)
-    assert "cost_critic" not in model.get_parameters()
+def test_a_file_with_the_penalty_in_the_reward_is_refused_in_a_line(tmp_path: Path) -> None:
+    model = make(RCPO)
+    model.penalized_reward = False
     model.save(tmp_path / "model")
-    again = RCPO.load(tmp_path / "model", env=model.env, device="cpu")
-    again.learn(128, reset_num_timesteps=False)
-    assert again.penalized_reward and not hasattr(again, "cost_critic")
+    RCPO.load(tmp_path / "model")
+    model.penalized_reward = True
+    model.save(tmp_path / "model")
+    with pytest.raises(ValueError, match="penalized_reward=True: this version has no RCPO"):
+        RCPO.load(tmp_path / "model")
+    with pytest.raises(TypeError, match="RCPO takes no argument 'penalized_reward'"):
+        make(RCPO, penalized_reward=True)
 
 
 def test_epochs_stop_by_the_mean_over_the_rollout() -> None:
@@ -435,8 +418,6 @@ def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
         (P3O, {"penalty_units": "x"}, "penalty_units='x'"),
         (CRPO, {"tolerance": -0.1}, "tolerance=-0.1"),
         (P3O, {"n_epochs": 0}, "n_epochs=0: must be an integer of at least 1"),
-        (RCPO, {"penalized_reward": True, "cost_gamma": 0.9}, "cost_gamma=0.9: .*; set gamma"),
-        (RCPO, {"penalized_reward": True, "cost_gae_lambda": 0.9}, "cost_gae_.*; set gae_lambda"),
     ],
 )
 def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) -> None:
@@ -480,10 +461,8 @@ def test_focops_takes_no_clip_range() -> None:
 # Known optima
 
 
-@pytest.mark.parametrize(
-    ("key", "kwargs"), [*((key, {}) for key in KEYS), ("rcpo", {"penalized_reward": True})], ids=str
-)
-def test_a_known_optimum(key: str, kwargs: dict[str, Any]) -> None:
+@pytest.mark.parametrize("key", KEYS)
+def test_a_known_optimum(key: str) -> None:
     """The five-step table under three quarters of its optimum's cost.
 
     Networks learn faster than by default, and so do multipliers, which takes seconds in place of
@@ -498,7 +477,7 @@ def test_a_known_optimum(key: str, kwargs: dict[str, Any]) -> None:
     if issubclass(ALGORITHMS[key], Lagrangian):
         gains = {"cup": (0.08, 0.33), "rcpo": (0.3, 10.0)}.get(key, (0.5, 2.0))
         fast["lambda_lr"], fast["proportional_gain"] = gains
-    outcome = solve(ALGORITHMS[key], problem, 0, **fast, **kwargs)
+    outcome = solve(ALGORITHMS[key], problem, 0, **fast)
     assert outcome.good, outcome
 
 

@@ -617,6 +617,14 @@ def test_list_shows_the_pretrained_agents(capsys):
     assert len(cells) == len([*PRETRAINED.glob("*/*_1")])
 
 
+@pytest.mark.parametrize("name, version", [("SafetyHopperVelocity", 1), ("CostPoint", 0)])
+def test_a_run_is_of_the_latest_version_where_none_is_given(tmp_path, name, version):
+    for number in (0, 1):
+        (tmp_path / "cpo" / f"{name}-v{number}_1" / f"{name}-v{number}").mkdir(parents=True)
+        (tmp_path / "cpo" / f"{name}-v{number}_1" / f"{name}-v{number}" / "args.yml").touch()
+    assert playback.find_run(tmp_path, "cpo", name).path.name == f"{name}-v{version}_1"
+
+
 def test_show_draws_each_version_into_a_file_of_its_name(tmp_path, monkeypatch):
     require_rendering()
     monkeypatch.chdir(tmp_path)

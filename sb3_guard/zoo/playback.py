@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.common.native import GuardVecEnv
+from sb3_guard.ids import with_version
 from sb3_guard.zoo.agent_flags import AgentFlags, EnjoyFlags
 from sb3_guard.zoo.algos import algorithm
 from sb3_guard.zoo.checkpoint import load_model, read_normalizer
@@ -48,14 +49,12 @@ def find_run(
     The folder of a run.
 
     :param folder: log folder
-    :param env_id: the version may be left out if it is 0
+    :param env_id: without a version it is the latest one
     :param number: of the run; 0: the latest, -1: ``<folder>/<algo>`` itself, as in RL-Zoo
     :param packages: modules that the environment needs, for the command in the message
     :raises UsageError: there is none; the message lists those that there are
     """
-    parent, name = Path(folder) / algo, folder_name(env_id)
-    if not latest_run(parent, name) and not name.rpartition("-v")[2].isdigit():
-        name = f"{name}-v0"
+    parent, name = Path(folder) / algo, folder_name(with_version(env_id))
     number = number or latest_run(parent, name)
     if number:
         return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")

@@ -20,8 +20,8 @@ ALLOWED = {
     "Stable-Baselines3's hooks for subclasses and their state": {
         "_convert_train_freq", "_current_progress_remaining", "_get_indices",
         "_last_episode_starts", "_on_event", "_reset_options", "_reset_seeds",
-        "_stats_window_size", "_total_timesteps", "_update_features_extractor", "_update_learning_rate",
-        "_vec_normalize_env", "_wrap_env",
+        "_stats_window_size", "_total_timesteps", "_update_features_extractor",
+        "_update_learning_rate", "_vec_normalize_env", "_wrap_env",
     },
     "Gymnasium's hook for vector environments": {"_add_info"},
     "documented in Python": {"_asdict", "_exit", "_replace"},

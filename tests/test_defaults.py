@@ -1,5 +1,6 @@
 """One set of defaults: the command, ``make_model`` and the class train the same agent."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,14 @@ def test_make_model_takes_what_a_file_cannot_hold() -> None:
     assert model.policy.activation_fn is nn.ReLU and (model.policy.log_std == -0.5).all()
     (scenario,) = model.get_env().get_attr("scenario", 0)
     assert scenario.constraints["hazards"]["size"] == 0.2
+
+
+def test_sizes_of_a_file_are_not_warned_of() -> None:
+    """OmniSafe's minibatches of 64 leave a smaller one at the end of a rollout of 20,000 steps."""
+    with warnings.catch_warnings(action="error"):
+        make_model("ppo_lag", "Goal_Point_8Hazards", conf="omnisafe", seed=0)
+    with pytest.warns(UserWarning, match="mini-batch size of 64"):
+        make_model("ppo_lag", "Goal_Point_8Hazards", conf="omnisafe", n_steps=999, seed=0)
 
 
 @pytest.mark.parametrize("algo", ["ppo", "sac"])

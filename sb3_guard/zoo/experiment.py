@@ -1,6 +1,7 @@
 """What one training is, as data, and what makes its parts: environments, model, evaluation."""
 
 import copy
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -186,7 +187,11 @@ class Experiment:
         noise = self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
         if noise is not None:
             arguments["action_noise"] = noise
-        with explained(f"{flags.algo} can't be made", *BAD_ARGUMENTS, RuntimeError, MemoryError):
+        errors = (*BAD_ARGUMENTS, RuntimeError, MemoryError)
+        with warnings.catch_warnings(), explained(f"{flags.algo} can't be made", *errors):
+            if not {"batch_size", "n_envs", "n_steps"} & {*(flags.hyperparams or {})}:
+                # The sizes of a file are on purpose, a last minibatch that is smaller included.
+                warnings.filterwarnings("ignore", "You have specified a mini-batch size")
             return self.algorithm(env=env, device=flags.device, **arguments)
 
     def _warm_start_normalizer(self) -> VecNormalize | None:

@@ -165,11 +165,11 @@ def test_a_picture_says_the_speed_and_its_limit(monkeypatch):
     env.reset(seed=0)
     speed = env.unwrapped.engine.constraints[0]
     assert speed.words(0) == {"speed": "0.00 m/s, limit 0.74"}
-    position, duration = env.unwrapped.engine.robot.position, 0.008
+    robot, duration = env.unwrapped.engine.robot, 0.008
     for _ in range(3):
-        before = position[0, 0]
+        before = robot.position[0, 0]
         env.step(np.ones(3))
-    fast = (position[0, 0] - before) / duration
+    fast = (robot.position[0, 0] - before) / duration
     assert abs(fast) > 0.01
     assert speed.words(0) == {"speed": f"{fast:.2f} m/s, limit 0.74"}
     said = env.render().astype(int)

@@ -292,7 +292,8 @@ def test_formats(small, tmp_path, form):
 # The command
 
 
-def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys):
+def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
     out = tmp_path / "figures"
     (small / "cpo" / f"{POINT}-v0_2" / "0.monitor.csv").write_text("#{}\nr,l,t,c\n")
     assert cli.main(["plot", str(small), "-o", str(out)]) == 0

@@ -110,7 +110,7 @@ class Command:
                 group = groups[name]
             options = {"help": help_, **_options(field, hint)}
             if meta["positional"]:
-                group.add_argument(field.name, **{"default": _default(field), **options})
+                group.add_argument(field.name, **{"default": None, **options})
             else:
                 group.add_argument(*_names(field), dest=field.name, **options)
         return result
@@ -124,8 +124,9 @@ class Command:
         :raises UsageError: a flag is unknown, with the nearest name, or a value is not allowed
         """
         parsed = vars(cls.parser().parse_args(argv))
-        # What is absent is not there at all, except where a value goes without a flag.
-        return cls.of({name: value for name, value in parsed.items() if value is not None})
+        # What is absent is not there at all, except where values go without a flag.
+        bare = {field.name for field, _ in cls._flags() if field.metadata["positional"]}
+        return cls.of({n: v for n, v in parsed.items() if n not in bare or v not in (None, [])})
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:

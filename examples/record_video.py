@@ -4,7 +4,7 @@ import gymnasium
 import imageio_ffmpeg
 
 from sb3_guard import CPO
-from sb3_guard.zoo.playback import find_pretrained
+from sb3_guard.zoo.agents.playback import find_pretrained
 
 # camera: "fixed", "track" behind the robot, or "top"
 env = gymnasium.make(

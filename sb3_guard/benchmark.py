@@ -11,16 +11,23 @@ import yaml
 from filelock import FileLock
 
 from sb3_guard.common.files import replacing
-from sb3_guard.zoo.flags import HOST, IDENTITY, command, flag
-from sb3_guard.zoo.run_flags import (
+from sb3_guard.zoo.cli.flags import HOST, IDENTITY, command, flag
+from sb3_guard.zoo.cli.usage import (
+    UsageError,
+    explained,
+    factor,
+    positive,
+    read_mapping,
+    seed_number,
+)
+from sb3_guard.zoo.run.flags import (
     EvaluationFlags,
     RunFlags,
     TrainingFlags,
 )
-from sb3_guard.zoo.usage import UsageError, explained, factor, positive, read_mapping, seed_number
 
 if TYPE_CHECKING:
-    from sb3_guard.zoo.grid import Run
+    from sb3_guard.zoo.grids.grid import Run
 
 # The file that says what a grid is, in its folder; `--grid` reads such a file.
 RECORD = "grid.yml"
@@ -88,7 +95,7 @@ class Flags(EvaluationFlags, TrainingFlags):
 
         :raises UsageError: nothing says which, or two flags do
         """
-        from sb3_guard.zoo.presets import ALGOS, preset
+        from sb3_guard.zoo.grids.presets import ALGOS, preset
 
         algos: list[str] | None = None
         if self.algos is not None:
@@ -114,7 +121,7 @@ def with_file(flags: Flags) -> Flags:
     :raises UsageError: the file can't be read, has an unknown entry, or names modules that the
         command line does not name
     """
-    from sb3_guard.zoo.names import is_program, require_named
+    from sb3_guard.zoo.cli.names import is_program, require_named
 
     path = Path(flags.grid or Path(flags.log_folder) / RECORD)
     if not flags.grid and (flags.given & {"suites", "preset"} or not path.is_file()):
@@ -137,7 +144,7 @@ def with_file(flags: Flags) -> Flags:
 
 def show_plan(runs: Sequence["Run"]) -> None:
     """Print the runs and how far they are."""
-    from sb3_guard.zoo.live import summary
+    from sb3_guard.zoo.grids.live import summary
 
     for one in runs:
         print(f"{one.state:<7} {one.path}  {one.steps:,} steps")
@@ -165,9 +172,9 @@ def benchmark(flags: Flags) -> int:
     of_a_run = RunFlags.shared(flags, log_folder=str(folder), verbose=flags.verbose)
     of_a_run.check()
 
-    from sb3_guard.zoo.grid import expand, run_grid, try_out
-    from sb3_guard.zoo.names import is_program
-    from sb3_guard.zoo.usage import packages_flag
+    from sb3_guard.zoo.cli.names import is_program
+    from sb3_guard.zoo.cli.usage import packages_flag
+    from sb3_guard.zoo.grids.grid import expand, run_grid, try_out
 
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
     if flags.dry_run:

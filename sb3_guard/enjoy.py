@@ -3,9 +3,9 @@
 import os
 import sys
 
-from sb3_guard.zoo.agent_flags import EnjoyFlags as Flags
-from sb3_guard.zoo.flags import command
-from sb3_guard.zoo.usage import UsageError
+from sb3_guard.zoo.agents.flags import EnjoyFlags as Flags
+from sb3_guard.zoo.cli.flags import command
+from sb3_guard.zoo.cli.usage import UsageError
 
 
 def _has_display() -> bool:
@@ -28,7 +28,7 @@ def enjoy(flags: Flags) -> int:
         elif flags.verbose > 0:
             print("There is no display: nothing is shown. --record makes a video.", file=sys.stderr)
 
-    from sb3_guard.zoo.playback import play
+    from sb3_guard.zoo.agents.playback import play
 
     return play(flags, render_mode)
 

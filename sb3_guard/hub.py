@@ -2,15 +2,15 @@
 
 import sys
 
-from sb3_guard.zoo.agent_flags import HubFlags as Flags
-from sb3_guard.zoo.flags import command
+from sb3_guard.zoo.agents.flags import HubFlags as Flags
+from sb3_guard.zoo.cli.flags import command
 
 
 def hub(flags: Flags) -> int:
     """Upload an agent, or download one."""
     flags.check()
 
-    from sb3_guard.zoo import hub
+    from sb3_guard.zoo.agents import hub
 
     return hub.push(flags) if flags.direction == "push" else hub.load(flags)
 

@@ -9,9 +9,9 @@ from sb3_guard.envs import Scenario
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.suites import SUITES, Suite
 from sb3_guard.envs.suites.guard import LADDER
-from sb3_guard.zoo.flags import Command, command, flag
-from sb3_guard.zoo.markdown import table
-from sb3_guard.zoo.usage import UsageError, explained, import_packages
+from sb3_guard.zoo.cli.flags import Command, command, flag
+from sb3_guard.zoo.cli.markdown import table
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
 
 
 def summary(part: type) -> str:
@@ -84,8 +84,8 @@ def constraints() -> str:
 
 def agents() -> str:
     """The agents that the package ships, for ``enjoy --pretrained``."""
-    from sb3_guard.zoo.playback import PRETRAINED
-    from sb3_guard.zoo.run_folder import RunFolder, is_run
+    from sb3_guard.zoo.agents.playback import PRETRAINED
+    from sb3_guard.zoo.run.folder import RunFolder, is_run
 
     rows = []
     for path in sorted(PRETRAINED.glob("*/*_1")):

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from sb3_guard.zoo import runs as reading
-from sb3_guard.zoo.figure_data import Data
-from sb3_guard.zoo.figures import FORMATS, save
-from sb3_guard.zoo.flags import Command, command, flag
-from sb3_guard.zoo.paper import FIGURES, draw
-from sb3_guard.zoo.report import report
-from sb3_guard.zoo.run_folder import require_writable
-from sb3_guard.zoo.statistics import with_safety
-from sb3_guard.zoo.tables import check_table, tables, terminal, write_table, written
-from sb3_guard.zoo.usage import UsageError, positive
+from sb3_guard.zoo.cli.flags import Command, command, flag
+from sb3_guard.zoo.cli.usage import UsageError, positive
+from sb3_guard.zoo.results import runs as reading
+from sb3_guard.zoo.results.figure_data import Data
+from sb3_guard.zoo.results.figures import FORMATS, save
+from sb3_guard.zoo.results.paper import FIGURES, draw
+from sb3_guard.zoo.results.report import report
+from sb3_guard.zoo.results.statistics import with_safety
+from sb3_guard.zoo.results.tables import check_table, tables, terminal, write_table, written
+from sb3_guard.zoo.run.folder import require_writable
 
 TITLES = "\n".join(f"  {name:<10} {one.__doc__}" for name, one in FIGURES.items())
 

@@ -17,10 +17,10 @@ import yaml
 from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.check_part import exploded
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
-from sb3_guard.zoo.flags import Command, command, flag
-from sb3_guard.zoo.hyperparams import entry, read_file, shipped_file
-from sb3_guard.zoo.markdown import table
-from sb3_guard.zoo.usage import UsageError, explained, import_packages
+from sb3_guard.zoo.cli.flags import Command, command, flag
+from sb3_guard.zoo.cli.markdown import table
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
+from sb3_guard.zoo.run.hyperparams import entry, read_file, shipped_file
 
 # Names and units of what a free joint, a ball, a slide and a hinge add to qpos and to qvel
 _QUATERNION = [(f"q{axis}", "") for axis in "wxyz"]

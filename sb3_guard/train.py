@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from sb3_guard.zoo.flags import command, flag
-from sb3_guard.zoo.run_flags import RunFlags
-from sb3_guard.zoo.usage import UsageError, positive, seed_number
+from sb3_guard.zoo.cli.flags import command, flag
+from sb3_guard.zoo.cli.usage import UsageError, positive, seed_number
+from sb3_guard.zoo.run.flags import RunFlags
 
 
 @dataclass
@@ -50,7 +50,7 @@ def train(flags: Flags) -> int:
         if flags.jobs is not None:
             raise UsageError("--jobs goes with several seeds, such as --seeds 0 1 2")
 
-        from sb3_guard.zoo.start import continues_run, resume, start
+        from sb3_guard.zoo.run.start import continues_run, resume, start
 
         if run.trained_agent and continues_run(run.trained_agent):
             return resume(run)
@@ -59,8 +59,8 @@ def train(flags: Flags) -> int:
         if value:
             raise UsageError(f"{name} is for a single run; leave it out, or --seeds")
 
-    from sb3_guard.zoo.grid import expand, run_grid, try_out
-    from sb3_guard.zoo.run_folder import folder_name
+    from sb3_guard.zoo.grids.grid import expand, run_grid, try_out
+    from sb3_guard.zoo.run.folder import folder_name
 
     runs = expand([(run.env, run.algo)], flags.seeds, run)
     try_out(runs)

@@ -3,8 +3,8 @@
 import os
 import sys
 
-from sb3_guard.zoo.flags import command
-from sb3_guard.zoo.tune_flags import TuneFlags
+from sb3_guard.zoo.cli.flags import command
+from sb3_guard.zoo.tuning.flags import TuneFlags
 
 
 def _tune(flags: TuneFlags) -> int:
@@ -13,7 +13,7 @@ def _tune(flags: TuneFlags) -> int:
     # Read when torch is imported, below.
     os.environ.setdefault("OMP_NUM_THREADS", str(flags.num_threads))
 
-    from sb3_guard.zoo.tuning import tune
+    from sb3_guard.zoo.tuning.search import tune
 
     return tune(flags)
 

@@ -31,7 +31,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_guard import ALGORITHMS, make_vec_env
 from sb3_guard.envs.mujoco_gaps import profiling_clock
-from sb3_guard.zoo.hyperparams import build, check, read_hyperparams
+from sb3_guard.zoo.run.hyperparams import build, check, read_hyperparams
 
 N_ENVS, N_STEPS = 30, 1000
 # What one of SB3's algorithms becomes, and how much longer its update may then take.

@@ -24,7 +24,7 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
 from kills import DONE, Campaign, TrialState, campaign, differences, faults
 from postgres import running
@@ -78,5 +78,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    multiprocessing.set_forkserver_preload(["sb3_guard.zoo.tuning"])
+    multiprocessing.set_forkserver_preload(["sb3_guard.zoo.tuning.search"])
     sys.exit(main())

@@ -21,7 +21,7 @@ from sb3_guard.envs.part import Part
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.list import KINDS, summary, yes
 from sb3_guard.show import action_table, observation_table
-from sb3_guard.zoo.markdown import table
+from sb3_guard.zoo.cli.markdown import table
 
 ROOT = Path(__file__).parents[1]
 # Robots that tell the sizes of an observation apart: in the plane, in space, with several lidars.

@@ -28,13 +28,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard import evaluate_policy, make_vec_env, train
 from sb3_guard.common.evaluation import Estimate
-from sb3_guard.zoo.algos import algorithm
-from sb3_guard.zoo.checkpoint import read_normalizer
-from sb3_guard.zoo.hyperparams import build, check
-from sb3_guard.zoo.make_envs import full_id, make_envs
-from sb3_guard.zoo.playback import PRETRAINED
-from sb3_guard.zoo.run_flags import RunFlags
-from sb3_guard.zoo.run_folder import RunFolder, run_path
+from sb3_guard.zoo.agents.playback import PRETRAINED
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.checkpoint import read_normalizer
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import RunFolder, run_path
+from sb3_guard.zoo.run.hyperparams import build, check
+from sb3_guard.zoo.run.make_envs import full_id, make_envs
 
 
 class Agent(NamedTuple):

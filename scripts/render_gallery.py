@@ -20,8 +20,8 @@ from sb3_guard import ALGORITHMS, make_vec_env, train
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.envs.suites.velocity import TABLE
-from sb3_guard.zoo.playback import find_pretrained, find_run
-from sb3_guard.zoo.usage import UsageError
+from sb3_guard.zoo.agents.playback import find_pretrained, find_run
+from sb3_guard.zoo.cli.usage import UsageError
 
 TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
 PERIOD = 2  # control steps, of 0.02 s, from frame to frame

@@ -34,13 +34,13 @@ from matplotlib.ticker import EngFormatter
 
 import sb3_guard
 from sb3_guard.costs import verdict
-from sb3_guard.zoo.curves import read_episodes
-from sb3_guard.zoo.figure_data import COLORS, INK, Data
-from sb3_guard.zoo.figures import STYLE, WIDTH, finish, save
-from sb3_guard.zoo.paper import draw
-from sb3_guard.zoo.runs import Results, read_results
-from sb3_guard.zoo.statistics import aggregate, normalize, with_safety
-from sb3_guard.zoo.tables import markdown, number, spelled, spread, whole
+from sb3_guard.zoo.results.curves import read_episodes
+from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
+from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish, save
+from sb3_guard.zoo.results.paper import draw
+from sb3_guard.zoo.results.runs import Results, read_results
+from sb3_guard.zoo.results.statistics import aggregate, normalize, with_safety
+from sb3_guard.zoo.results.tables import markdown, number, spelled, spread, whole
 
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"

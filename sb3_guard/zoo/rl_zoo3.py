@@ -7,8 +7,8 @@ sb3-contrib's and ours is ``guard_trpo``. RL-Zoo evaluates and searches by retur
 """
 
 from sb3_guard.algorithms import ALGORITHMS
-from sb3_guard.zoo.hyperparams import read_file, shipped_file
-from sb3_guard.zoo.spaces import SPACES, rl_zoo_sampler, space_of
+from sb3_guard.zoo.run.hyperparams import read_file, shipped_file
+from sb3_guard.zoo.tuning.spaces import SPACES, rl_zoo_sampler, space_of
 
 
 def key_in_rl_zoo(algo: str) -> str:

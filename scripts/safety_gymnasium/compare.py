@@ -23,13 +23,13 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 from safety_distributions import episode_gaps, layout_gaps
 from safety_traces import Trace, load, velocity_steps
 
 from sb3_guard.envs.suites import velocity
 from sb3_guard.envs.suites.safety_gymnasium import LEVELS, NAMES
-from sb3_guard.zoo.tables import table
+from sb3_guard.zoo.results.tables import table
 
 # what the components of an observation begin with, in the order of the table's rows
 QUANTITIES = {

@@ -17,8 +17,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.critics import Regression, StateNetwork
-from sb3_guard.algorithms.common.fast.mlp import TanhMlp, softplus_slope
 from sb3_guard.algorithms.common.natural_gradient import shortest
+from sb3_guard.algorithms.fast.mlp import TanhMlp, softplus_slope
 
 
 class ActionFilter(nn.Module):

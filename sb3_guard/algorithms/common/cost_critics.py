@@ -12,7 +12,7 @@ from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.fast.optimizers import fuse
+from sb3_guard.algorithms.fast.optimizers import fuse
 
 
 class Stacked(nn.Module):

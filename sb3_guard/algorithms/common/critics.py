@@ -16,9 +16,9 @@ from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.actor import actor_modules, value_parameters
 from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
-from sb3_guard.algorithms.common.fast.actor import parameterless
-from sb3_guard.algorithms.common.fast.mlp import TanhMlp, squared_error
-from sb3_guard.algorithms.common.fast.optimizers import fuse
+from sb3_guard.algorithms.fast.actor import parameterless
+from sb3_guard.algorithms.fast.mlp import TanhMlp, squared_error
+from sb3_guard.algorithms.fast.optimizers import fuse
 
 
 class StateNetwork(nn.Module):

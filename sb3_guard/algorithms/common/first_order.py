@@ -19,9 +19,9 @@ from sb3_guard.algorithms.common.actor import Before
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.fast.actor import distribution_of
-from sb3_guard.algorithms.common.fast.optimizers import fuse
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
+from sb3_guard.algorithms.fast.actor import distribution_of
+from sb3_guard.algorithms.fast.optimizers import fuse
 from sb3_guard.checks import check_integer, check_number
 
 #: ``loss(batch, ratio, distribution)``, see :meth:`FirstOrder.loss`

@@ -29,7 +29,7 @@ from sb3_guard.algorithms.common.buffers import (
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import discounted_limit, inverse, same_at_every_step
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
-from sb3_guard.algorithms.common.fast.threads import one_thread
+from sb3_guard.algorithms.fast.threads import one_thread
 
 SMALL = 500_000  # weights of a policy that acts on one thread
 # First policies that hardly move: robots learn from them twice as fast as from SB3's, orthogonal

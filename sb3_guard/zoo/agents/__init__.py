@@ -1,0 +1,1 @@
+"""Trained agents: played, filmed, shared."""

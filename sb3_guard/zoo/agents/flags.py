@@ -1,0 +1,145 @@
+"""The flags of the commands that take a trained agent: ``enjoy`` and ``hub``."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+from sb3_guard.zoo.cli.flags import Command, flag
+from sb3_guard.zoo.cli.usage import UsageError, positive, seed_number
+
+
+@dataclass
+class AgentFlags(Command):
+    """
+    Which agent, and how it acts.
+
+    Which agent:
+
+    :param algo: algorithm (default: cpo)
+    :param env: environment id (default: Goal_Point_8Hazards)
+    :param folder: log folder (default: logs)
+    :param exp_id: number of the run; 0: the latest, -1: the folder itself (default: 0)
+    :param load_best: the best model, safe first
+    :param pretrained: an agent that comes with the package
+    :param load_checkpoint: the model kept at so many steps
+    :param load_last_checkpoint: the last model that was kept
+
+    What is played:
+
+    :param n_episodes: episodes (default: 30 at once; 5 in a window or of an environment that is not
+        this package's, 1 to record, 10 for the hub)
+    :param stochastic: sampled actions
+    :param seed: seed of the episodes (default: 0)
+    :param env_kwargs: arguments of the environment, over those of training
+    :param gym_packages: modules to import first, such as those that training imported
+
+    Output:
+
+    :param device: torch device (default: auto)
+    :param num_threads: threads of torch
+    """
+
+    algo: str = flag(default="cpo")
+    env: str = flag(default="Goal_Point_8Hazards-v0")
+    folder: str = flag("-f", default="logs", metavar="DIR")
+    exp_id: int = flag(default=0, metavar="K")
+    load_best: bool = flag(default=False, exclusive="model")
+    pretrained: bool = flag(default=False, exclusive="model")
+    load_checkpoint: int | None = flag(kind=positive, metavar="STEPS", exclusive="model")
+    load_last_checkpoint: bool = flag(default=False, exclusive="model")
+    n_episodes: int | None = flag(kind=positive, metavar="N", exclusive="length")
+    stochastic: bool = flag(default=False, exclusive="actions")
+    seed: int = flag(default=0, kind=seed_number)
+    env_kwargs: dict[str, Any] | None = flag()
+    gym_packages: list[str] = flag(default=[], metavar="MODULE")
+    device: str = flag(default="auto")
+    num_threads: int = flag(default=-1, metavar="N")
+
+
+@dataclass
+class EnjoyFlags(AgentFlags):
+    """
+    Play a trained agent and print return and cost of each episode.
+
+    What is played:
+
+    :param n_timesteps: steps instead
+    :param deterministic: the most likely actions (the default)
+
+    Output:
+
+    :param record: write a video, with return, cost and limit above the pictures; no display is
+        needed (default: beside the model; of a pretrained agent in the current folder)
+    :param json: write the statistics there as JSON
+    :param window: MuJoCo's viewer, the default where there is a display: Space pauses, Tab opens
+        menus, F shows contact forces
+    :param no_render: open no window
+    :param verbose: 0: the means only
+    """
+
+    prog: ClassVar[str] = "sb3-guard enjoy"
+    examples: ClassVar[str] = """examples:
+  python -m sb3_guard.enjoy --pretrained
+  python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards -f logs
+  python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards --load-best --n-episodes 20
+  python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards --pretrained --record agent.mp4
+"""
+    n_timesteps: int | None = flag("-n", kind=positive, metavar="N", exclusive="length")
+    deterministic: bool = flag(default=False, exclusive="actions")
+    record: str | None = flag(nargs="?", const="", metavar="FILE.mp4")
+    json: str | None = flag(metavar="FILE")
+    window: bool = flag(default=False, exclusive="window")
+    no_render: bool = flag(default=False, exclusive="window")
+    verbose: Literal[0, 1] = flag(default=1)
+
+
+@dataclass
+class HubFlags(AgentFlags):
+    """
+    Upload a trained agent to the Hugging Face hub, or download one. Downloaded agents are programs:
+    load only from people you trust.
+
+    Which agent:
+
+    :param direction: upload or download
+    :param organization: user or organization
+    :param repo_name: repository (default: <algo>-<env>)
+    :param repo_id: both in one
+
+    Push:
+
+    :param commit_message: of the upload
+    :param private: make the repository private
+    :param no_video: do not film an episode
+    :param dry_run: write all files, upload nothing
+    :param to: where the files are written first
+    """
+
+    prog: ClassVar[str] = "sb3-guard hub"
+    examples: ClassVar[str] = """examples:
+  sb3-guard hub push --algo cpo --env Goal_Point_8Hazards -f logs -orga me
+  sb3-guard hub push --algo cpo --env Goal_Point_8Hazards -orga me --dry-run --to card
+  sb3-guard hub load --algo cpo --env Goal_Point_8Hazards -orga me -f logs
+"""
+    direction: Literal["push", "load"] = flag(positional=True)
+    organization: str | None = flag("-orga", metavar="NAME")
+    repo_name: str | None = flag("-name", metavar="NAME")
+    repo_id: str | None = flag(metavar="USER/NAME")
+    commit_message: str = flag("-m", default="Upload a trained agent", metavar="TEXT")
+    private: bool = flag(default=False)
+    no_video: bool = flag(default=False)
+    dry_run: bool = flag(default=False)
+    to: str | None = flag(metavar="DIR")
+
+    def check(self) -> None:
+        """
+        Take ``--repo-id`` apart.
+
+        :raises UsageError: the repository's owner is missing, or its name has another form
+        """
+        if self.repo_id is not None:
+            organization, slash, name = self.repo_id.partition("/")
+            if not (organization and slash and name) or "/" in name:
+                raise UsageError(f"--repo-id {self.repo_id!r} must be of the form user/name")
+            self.organization, self.repo_name = organization, name
+        elif self.organization is None:
+            raise UsageError("the repository has no owner; give -orga NAME, or --repo-id user/name")

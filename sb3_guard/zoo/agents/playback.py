@@ -1,0 +1,320 @@
+"""A trained agent found in its run folder, played, and filmed."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
+from sb3_guard.common.files import replacing
+from sb3_guard.common.native import GuardVecEnv
+from sb3_guard.ids import with_version
+from sb3_guard.zoo.agents.film import filming, render
+from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
+from sb3_guard.zoo.cli.names import packages_flag, require_named
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
+from sb3_guard.zoo.run.folder import (
+    RunFolder,
+    folder_name,
+    is_run,
+    latest_run,
+    require_writable,
+)
+from sb3_guard.zoo.run.hyperparams import build, check
+from sb3_guard.zoo.run.make_envs import (
+    ERRORS_OF_OURS,
+    full_id,
+    make_envs,
+    source_of,
+)
+
+BATCH = 30  # episodes at once: as many as tell whether a limit is kept
+VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
+#: The trained agents that the package ships: a log folder, written by ``scripts/pretrain.py``.
+PRETRAINED = Path(__file__).parents[2] / "pretrained"
+
+
+def find_run(
+    folder: str | Path, algo: str, env_id: str, number: int = 0, packages: Sequence[str] = ()
+) -> RunFolder:
+    """
+    The folder of a run.
+
+    :param folder: log folder
+    :param env_id: without a version it is the latest one
+    :param number: of the run; 0: the latest, -1: ``<folder>/<algo>`` itself, as in RL-Zoo
+    :param packages: modules that the environment needs, for the command in the message
+    :raises UsageError: there is none; the message lists those that there are
+    """
+    parent, name = Path(folder) / algo, folder_name(with_version(env_id))
+    number = number or latest_run(parent, name)
+    if number:
+        return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
+    algorithm(algo), full_id(env_id)  # a misspelt name has a message of its own
+    where = "" if folder == PRETRAINED else f" -f {folder}"
+    ships = where and latest_run(PRETRAINED / algo, name)
+    runs = [one for one in sorted(Path(folder).glob("*/*_*")) if is_run(one)]
+    there = dict.fromkeys(f"{one.parent.name} on {one.name.rpartition('_')[0]}" for one in runs)
+    raise UsageError(
+        f"there is no run of {algo} on {env_id} in {str(folder)!r}; train one with: "
+        f"python -m sb3_guard.train --algo {algo} --env {env_id}{where}{packages_flag(packages)}"
+        + (f"; or play one of those there: {', '.join(there)}" if there else "")
+        + ("; or play the package's own with --pretrained" if ships else "")
+    )
+
+
+def find_pretrained(algo: str, env_id: str) -> RunFolder:
+    """
+    The run folder of an agent that the package ships.
+
+    :raises UsageError: it ships none of that kind; the message lists what there is
+    """
+    return find_run(PRETRAINED, algo, env_id)
+
+
+def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
+    """
+    The model that the flags ask for, and where its observation statistics are, if it has any.
+
+    Without a flag: the final model, or the checkpoint of a run that has not come to its end.
+
+    :raises UsageError: the run has no such model
+    """
+    kept = {int(one.stem.split("_")[2]): one for one in run.path.glob("rl_model_*_steps.zip")}
+    steps = flags.load_checkpoint
+    if flags.load_last_checkpoint and kept:
+        steps = max(kept)
+    model, statistics = run.model, run.normalizer
+    if flags.load_best:
+        model, statistics = run.path / "best_model.zip", run.path / "best_model_vecnormalize.pkl"
+    elif steps is not None:
+        if steps not in kept:
+            known = ", ".join(map(str, sorted(kept))) or "none"
+            raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {known}")
+        model, statistics = kept[steps], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
+    elif flags.load_last_checkpoint or not model.exists():
+        model = statistics = run.checkpoint
+    if not model.is_file():
+        raise UsageError(f"there is no {model}: the run has not come so far")
+    return model, statistics
+
+
+@dataclass
+class Agent:
+    """
+    A trained agent and an environment to play it in.
+
+    :param run: where it comes from
+    :param path: its model file
+    :param normalizer: its observation statistics; the file exists only if it has any
+    :param env_id: full id of the environment
+    """
+
+    run: RunFolder
+    path: Path
+    normalizer: Path
+    env_id: str
+    model: BaseAlgorithm
+    env: VecEnv
+
+
+def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> Agent:
+    """
+    Load an agent and make an environment for it, wrapped as in training.
+
+    :param flags: of the command
+    :param render_mode: None, ``"human"``, or ``"rgb_array"``
+    :param n_envs: environments of ours, which are one batch; of others there is one
+    :raises UsageError: there is no such agent, or it does not fit the environment
+    """
+    import_packages(flags.gym_packages)
+    folder = PRETRAINED if flags.pretrained else flags.folder
+    run = find_run(folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
+    path, normalizer = find_model(run, flags)
+    require_named(run.path, flags.gym_packages, run.args().get("gym_packages") or [])
+    values = {**run.hyperparams(), "callback": None}  # nobody calls one here
+    cls = algorithm(flags.algo)
+    source = source_of(flags.env)
+    env_id, ours = str(source.env_id), source.batch is not None
+    setup = build(check(flags.algo, cls, values))
+    if flags.num_threads > 0:
+        import torch as th
+
+        th.set_num_threads(flags.num_threads)
+    model = load_model(cls, path, None, flags.device)
+    # A batch has no window, and no wrappers of single environments.
+    native = ours and not setup.env_wrapper and render_mode != "human"
+    env = make_envs(
+        env_id,
+        setup,
+        n_envs=n_envs if native else 1,
+        seed=flags.seed,
+        vec_env="native" if native else "dummy",
+        env_kwargs={
+            **(VIDEO if ours and render_mode else {}),
+            **setup.env_kwargs,
+            **(flags.env_kwargs or {}),
+        },
+        cost_keys=getattr(model, "cost_keys", ("cost",)),
+        evaluation=True,
+        normalizer=None if setup.normalize is None else read_normalizer(normalizer),
+        render_mode=render_mode,
+    )
+    if env.observation_space != model.observation_space:
+        raise UsageError(
+            f"{path} was trained on observations {model.observation_space}, "
+            f"but {env_id} has {env.observation_space}"
+        )
+    return Agent(run, path, normalizer, env_id, model, env)
+
+
+def play(flags: EnjoyFlags, render_mode: str | None) -> int:
+    """
+    Play an agent and print what it gets and what it costs.
+
+    :param render_mode: None, ``"human"``, or ``"rgb_array"`` to record
+    """
+    for name in ("record", "json"):
+        if getattr(flags, name):
+            _require_file(Path(getattr(flags, name)), f"--{name}")
+    alone = render_mode is not None or flags.n_timesteps is not None
+    agent = open_agent(flags, render_mode, 1 if alone else min(flags.n_episodes or BATCH, BATCH))
+    video = None
+    if flags.record is not None:
+        beside = agent.path.with_suffix(".mp4")
+        own = f"{flags.algo}-{beside.name}"  # the package's folder is not the user's to write to
+        video = Path(flags.record or (own if flags.pretrained else beside))
+        _require_file(video, "--record")
+    episodes = flags.n_episodes
+    if episodes is None and flags.n_timesteps is None:
+        episodes = 1 if flags.record is not None else max(agent.env.num_envs, 5)
+    if flags.verbose > 0:
+        print(f"Playing {agent.path} on {agent.env_id}")
+    with (
+        closing(agent.env),
+        explained(f"can't play {agent.env_id}", *ERRORS_OF_OURS),
+        _stage(agent, video, flags, episodes) as env,
+    ):
+        evaluation = evaluate_policy(
+            agent.model,
+            env,
+            n_eval_episodes=episodes or flags.n_timesteps or 1,
+            deterministic=not flags.stochastic,
+            seed=flags.seed,
+            max_steps=flags.n_timesteps,
+            on_step=(lambda: render(env)) if render_mode == "human" else None,
+            on_episode=(lambda *one: print(_episode(*one))) if flags.verbose > 0 else None,
+        )
+    print(_means(evaluation))
+    if flags.verbose > 0:
+        for one in evaluation.unfinished:
+            print(_episode(*one), "so far: this episode did not end and is not counted")
+        trained = (agent.run.read_result() or {}).get("return")
+        if not flags.stochastic and trained is not None:
+            best = evaluation.estimate(evaluation.returns).high
+            if best < trained - 0.5 * abs(trained):
+                print(f"With noise, in training, its return was {trained:.2f}: see --stochastic")
+        for line in _when_shipped(flags, agent):
+            print(line)
+    if flags.json:
+        played = {name: getattr(flags, name) for name in ("algo", "seed", "stochastic")}
+        content = {"model": str(agent.path), "env": agent.env_id, **played, **summary(evaluation)}
+        Path(flags.json).parent.mkdir(parents=True, exist_ok=True)
+        with replacing(flags.json) as file:
+            file.write(json.dumps(content, indent=2, allow_nan=False).encode())
+    if video is not None and flags.verbose > 0:
+        print(f"Video: {video}")
+    return 0
+
+
+def _stage(
+    agent: Agent, video: Path | None, flags: EnjoyFlags, episodes: int | None
+) -> AbstractContextManager[VecEnv]:
+    """The environment to play in, which is filmed if there is to be a video."""
+    if video is None:
+        return nullcontext(agent.env)
+    steps, native = flags.n_timesteps, agent.env.unwrapped
+    if steps is None and episodes is not None and isinstance(native, GuardVecEnv):
+        steps = episodes * native.envs.max_episode_steps
+    return filming(agent.env, agent.model, video, steps, bar=flags.verbose > 0)
+
+
+def _require_file(path: Path, flag: str) -> None:
+    """Raise if a file can't be written, before anything is played for it."""
+    if path.is_dir():
+        raise UsageError(f"{flag}: {str(path)!r} is a folder; name a file")
+    require_writable(path.parent, flag)
+
+
+def summary(evaluation: Evaluation) -> dict[str, Any]:
+    """
+    Return, cost and length as plain data.
+
+    :return: the number of ``episodes``, and for ``return``, ``cost`` and ``length``, and ``worst``,
+        the highest cost of a step, of an agent that limits that, the ``mean``,
+        ``std``, the 95 % interval of the mean (``low``, ``high``) and the ``values``, one an
+        episode; None where there are too few episodes for it
+    """
+    out: dict[str, Any] = {"episodes": len(evaluation)}
+    for name, values in _columns(evaluation).items():
+        estimate = evaluation.estimate(values)._asdict()
+        known = {key: None if np.isnan(one) else one for key, one in estimate.items()}
+        out[name] = {**known, "values": values.tolist()}
+    return out
+
+
+def _columns(evaluation: Evaluation) -> dict[str, np.ndarray]:
+    return {
+        "return": evaluation.returns,
+        "cost": evaluation.costs,
+        "length": evaluation.lengths,
+        **({"worst": evaluation.worst} if evaluation.limit_on == "max" else {}),
+    }
+
+
+def _episode(episode_return: float, cost: float, length: float) -> str:
+    return f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length:.0f} steps"
+
+
+def _means(evaluation: Evaluation) -> str:
+    count = len(evaluation)
+    if count == 0:
+        return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"
+    rows: dict[str, tuple[Estimate, float | None]] = {
+        name: (evaluation.estimate(values), None) for name, values in _columns(evaluation).items()
+    }
+    if len(evaluation.cost_keys) > 1:  # each has its limit, their sum has none
+        rows |= evaluation.by_key()
+    elif evaluation.limits:
+        name = "worst" if evaluation.limit_on == "max" else "cost"
+        rows[name] = rows[name][0], evaluation.limits[0]
+    title = f"Mean ± std of {count} episodes, 95 % interval of the mean:"
+    return "\n".join(["One episode:" if count == 1 else title, *_rows(rows)])
+
+
+def _rows(rows: Mapping[str, tuple[Estimate, float | None]]) -> Iterator[str]:
+    width = max(map(len, rows))
+    for name, (estimate, limit) in rows.items():
+        mean, std, low, high = estimate
+        interval = "" if np.isnan(low) else f" ± {std:.3f}   [{low:.3f}, {high:.3f}]"
+        end = "" if limit is None else f"   {estimate.against(limit)}"
+        yield f"  {name:<{width}} {mean:9.3f}{interval}{end}"
+
+
+def _when_shipped(flags: EnjoyFlags, agent: Agent) -> Iterator[str]:
+    """What the package says of its own agents, where they act as then: few episodes say little."""
+    result = agent.run.read_result() or {}
+    if flags.pretrained and not flags.env_kwargs and "played" in result:
+        limits = {"cost": result.get("cost_limit")}
+        for mode in ("stochastic", "deterministic"):
+            yield f"100 episodes of other seeds, when it was shipped (--{mode}):"
+            played = result["played"][mode].items()
+            yield from _rows({name: (Estimate(*one), limits.get(name)) for name, one in played})

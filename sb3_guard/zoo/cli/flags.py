@@ -1,0 +1,275 @@
+"""The flags of a command, each stated once, as a field of a dataclass.
+
+From the field come the parser, the default, the help, the typed attribute, the check of the same
+value in a file, and whether it is part of what a run *is*::
+
+    @dataclass
+    class Flags(Command):
+        \"\"\"
+        Train an agent.
+
+        What is trained:
+
+        :param algo: algorithm
+        :param n_timesteps: length
+        \"\"\"
+
+        algo: str = flag(default="cpo", role=IDENTITY)
+        n_timesteps: int = flag("-n", default=-1, kind=positive, metavar="N")
+
+    main = command(Flags, train)  # train(flags: Flags) -> exit status
+
+The long name is the field's (``--n-timesteps``), headings and help are the docstring's; a flag that
+has no line there is not shown. Annotations choose how a value is read: ``bool``
+is a switch, ``bool | None`` has a ``--no-…``, ``list[int]`` takes several, ``dict`` takes
+``key:value``, ``Literal`` one of its values.
+"""
+
+import argparse
+import dataclasses
+import inspect
+import re
+import sys
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Literal, Self
+
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.cli.usage import KeyValues, Parser, UsageError, parse_pairs, run
+from sb3_guard.zoo.cli.values import kind_of
+
+# Roles of a flag: it says what a run is, how it is started, or how it is hosted and watched,
+# which may change when the run is resumed.
+IDENTITY, START, HOST = "identity", "start", "host"
+
+
+def flag(
+    *names: str,
+    default: Any = None,
+    role: str = START,
+    kind: Callable[[Any], Any] | None = None,
+    exclusive: str | None = None,
+    positional: bool = False,
+    **argparse_options: Any,
+) -> Any:
+    """
+    One flag of a command, as the default of a dataclass field.
+
+    :param names: short names
+    :param default: value where the flag is not given; a list or dictionary is copied
+    :param role: ``IDENTITY``, ``START`` or ``HOST``
+    :param kind: makes the value of its text or number, and raises ``ArgumentTypeError``
+    :param exclusive: at most one flag of the same ``exclusive`` can be given
+    :param positional: the value is given without the flag's name
+    :param argparse_options: for ``add_argument``, e.g. ``metavar``
+    """
+    meta = {
+        "names": names, "role": role, "kind": kind, "exclusive": exclusive,
+        "positional": positional, "options": argparse_options,
+    }  # fmt: skip
+    if isinstance(default, list | dict):
+        copied = default
+        return dataclasses.field(default_factory=lambda: copied.copy(), metadata=meta)
+    return dataclasses.field(default=default, metadata=meta)
+
+
+@dataclasses.dataclass
+class Command:
+    """Flags and values of a command; subclasses are dataclasses whose docstring describes it."""
+
+    prog: ClassVar[str] = "sb3-guard"
+    examples: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        #: names of the flags that were given, on the command line or in a file
+        self.given: frozenset[str] = frozenset()
+
+    @classmethod
+    def parser(cls) -> Parser:
+        """The flags as a parser; what is not given is absent from its result."""
+        result = Parser(
+            prog=cls.prog,
+            description=inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0],
+            epilog=cls.examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            argument_default=argparse.SUPPRESS,
+        )
+        groups: dict[str, Any] = {}
+        said = cls._said()
+        for field, hint in cls._flags():
+            meta = field.metadata
+            heading, help_ = said.get(field.name, ("options", argparse.SUPPRESS))
+            group = groups.get(heading)
+            if group is None:
+                group = groups[heading] = result.add_argument_group(heading)
+            if meta["exclusive"]:
+                name = meta["exclusive"]
+                if name not in groups:
+                    groups[name] = group.add_mutually_exclusive_group()
+                group = groups[name]
+            options = {"help": help_, **_options(field, hint)}
+            if meta["positional"]:
+                group.add_argument(field.name, **{"default": None, **options})
+            else:
+                group.add_argument(*_names(field), dest=field.name, **options)
+        return result
+
+    @classmethod
+    def parse(cls, argv: Sequence[str] | None = None) -> Self:
+        """
+        The values of a command line.
+
+        :param argv: arguments; None: those of the process
+        :raises UsageError: a flag is unknown, with the nearest name, or a value is not allowed
+        """
+        parsed = vars(cls.parser().parse_args(argv))
+        # What is absent is not there at all, except where values go without a flag.
+        bare = {field.name for field, _ in cls._flags() if field.metadata["positional"]}
+        return cls.of({n: v for n, v in parsed.items() if n not in bare or v not in (None, [])})
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Self:
+        """The flags with some values given, typed already."""
+        result = cls(**given)
+        result.given = frozenset(given)
+        return result
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any], where: object, but: Sequence[str] = ()) -> Self:
+        """
+        The values of a file, checked as on the command line; data stays data.
+
+        :param data: flags by name, in either spelling
+        :param where: the file, for the message
+        :param but: flags that a file can't give
+        :raises UsageError: a name is unknown, or a value not allowed
+        """
+        known = {field.name: (field, hint) for field, hint in cls._flags() if field.name not in but}
+        given = {}
+        for key, value in data.items():
+            name = str(key).replace("-", "_")
+            if name not in known:
+                raise UsageError(f"{where}: unknown entry {key!r}; {did_you_mean(name, known)}")
+            field, hint = known[name]
+            if value is not None and value != _default(field):
+                try:
+                    value = _typed(hint, field.metadata["kind"], value)
+                except (ValueError, TypeError, argparse.ArgumentTypeError) as error:
+                    raise UsageError(
+                        f"{where}: {key}: {value!r} is not allowed; it must be {_words(hint)}"
+                        + (f" ({error})" if isinstance(error, argparse.ArgumentTypeError) else "")
+                    ) from None
+                given[name] = value
+        return cls.of(given)
+
+    def values(self, *roles: str) -> dict[str, Any]:
+        """The flags by name, of these roles only if any are named."""
+        return {name: getattr(self, name) for name in sorted(self.names(*roles))}
+
+    @classmethod
+    def names(cls, *roles: str) -> set[str]:
+        """Names of the flags, of these roles only if any are named."""
+        return {f.name for f, _ in cls._flags() if not roles or f.metadata["role"] in roles}
+
+    @classmethod
+    def _said(cls) -> dict[str, tuple[str, str]]:
+        """Heading and help of the flags, as the docstrings of the class and its bases have them."""
+        found = {}
+        for base in reversed(cls.__mro__):
+            heading = "options"
+            for part in re.split(r"\n\s*\n|\n(?=\s*:param)", base.__doc__ or ""):
+                text = " ".join(part.split())
+                if flag := re.fullmatch(r":param (\w+): (.*)", text):
+                    found[flag[1]] = heading, flag[2].replace("%", "%%")
+                elif text.endswith(":"):
+                    heading = text[:-1].lower()
+        return found
+
+    @classmethod
+    def _flags(cls) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
+        hints = typing.get_type_hints(cls)
+        for field in dataclasses.fields(cls):
+            if "role" in field.metadata:
+                yield field, hints[field.name]
+
+
+def command(flags: type[Any], function: Callable[[Any], int]) -> Callable[..., int]:
+    """
+    The ``main`` of a command.
+
+    :param flags: its :class:`Command`
+    :param function: carries it out, returns the exit status, and raises :class:`UsageError`
+    """
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        """
+        Run the command.
+
+        :param argv: arguments; None: those of the process
+        :return: exit status: 0, 2 for wrong usage, 130 or 128 + the signal's number if interrupted
+        """
+        return run(lambda: function(flags.parse(sys.argv[1:] if argv is None else argv)))
+
+    return main
+
+
+def _names(field: "dataclasses.Field[Any]") -> list[str]:
+    return [*field.metadata["names"], "--" + field.name.replace("_", "-")]
+
+
+def _default(field: "dataclasses.Field[Any]") -> Any:
+    made = field.default_factory
+    return field.default if made is dataclasses.MISSING else made()
+
+
+def _bare(hint: Any) -> Any:
+    """An annotation without its ``| None``."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return next(arm for arm in typing.get_args(hint) if arm is not type(None))
+    return hint
+
+
+def _options(field: "dataclasses.Field[Any]", hint: Any) -> dict[str, Any]:
+    """What argparse needs to know of a flag."""
+    meta, bare = field.metadata, _bare(hint)
+    origin, arguments = typing.get_origin(bare), typing.get_args(bare)
+    options: dict[str, Any] = {}
+    if bare is bool:
+        options["action"] = "store_true" if bare is hint else argparse.BooleanOptionalAction
+    elif (origin or bare) is dict:
+        options |= {"nargs": "+", "action": KeyValues, "metavar": "KEY:VALUE"}
+    elif origin is list:
+        options |= {"nargs": "+", "type": meta["kind"] or arguments[0]}
+    elif origin is Literal:
+        options |= {"choices": list(arguments), "type": type(arguments[0])}
+    else:
+        options["type"] = meta["kind"] or bare
+    return options | meta["options"]
+
+
+def _typed(hint: Any, kind: Callable[[Any], Any] | None, value: Any) -> Any:
+    """A value of a file as the flag has it."""
+    bare = _bare(hint)
+    origin, arguments = typing.get_origin(bare), typing.get_args(bare)
+    if (origin or bare) is dict:
+        return dict(value) if isinstance(value, Mapping) else parse_pairs(_several(value))
+    if origin is list:
+        return [_typed(arguments[0], kind, one) for one in _several(value)]
+    made = kind_of(bare)[1](value)
+    return kind(value) if kind else made
+
+
+def _several(value: Any) -> list[Any]:
+    if isinstance(value, Mapping) or value == []:
+        raise TypeError
+    return value if isinstance(value, list) else [value]
+
+
+def _words(hint: Any) -> str:
+    bare = _bare(hint)
+    if (typing.get_origin(bare) or bare) is dict:
+        return "a mapping or a list of key:value"
+    if typing.get_origin(bare) is list:
+        return "one value or a list of them"
+    return kind_of(bare)[0]

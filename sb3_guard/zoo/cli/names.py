@@ -1,0 +1,146 @@
+"""The classes that data names: looked up, and checked before anyone calls them.
+
+Hyper-parameters name wrappers, callbacks and policies. A module runs code when it is imported, so a
+file may name classes of :data:`KNOWN` packages only, and of modules that the command line names
+(``--gym-packages``), which are imported by then.
+"""
+
+import importlib
+import operator
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
+
+from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag
+from sb3_guard.zoo.cli.values import read_expression
+
+KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
+# Files of what differs from an algorithm's own file, which `-conf NAME` reads; not code.
+PRESETS = {"paper": "the paper", "omnisafe": "the settings that OmniSafe has published"}
+# Hyper-parameters that name classes, one or several, perhaps with arguments; and of what kind.
+BASES: dict[str, type] = {
+    "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
+}  # fmt: skip
+
+
+def entries(name: str, value: Any) -> list[tuple[str, dict[str, Any]]]:
+    """
+    The classes that ``env_wrapper``, ``vec_env_wrapper`` or ``callback`` names.
+
+    :param value: ``module.Class``, ``{module.Class: {argument: value}}``, or a list of such
+    :return: dotted names and arguments
+    :raises UsageError: it is not of that form
+    """
+    found: list[tuple[str, dict[str, Any]]] = []
+    for one in [] if value is None else value if isinstance(value, list) else [value]:
+        path, kwargs = one, None
+        if isinstance(one, Mapping) and len(one) == 1:
+            path, kwargs = next(iter(one.items()))
+        if not isinstance(path, str) or not isinstance(kwargs or {}, Mapping):
+            raise UsageError(
+                f"hyper-parameter {name}: {one!r} is not allowed; it must be module.Class, or "
+                "{module.Class: {argument: value}}"
+            )
+        found.append((path, dict(kwargs or {})))
+    return found
+
+
+def import_class(name: str, path: str, base: type) -> Any:
+    """
+    The class of a dotted name, which is checked before anyone calls it.
+
+    :param name: the hyper-parameter, for the message
+    :param base: what it must be a subclass of
+    :raises UsageError: there is no such class, it is another kind of thing, or its module is not
+        imported yet and of none of the :data:`KNOWN` packages
+    """
+    module, _, attribute = path.rpartition(".")
+    if module and module.partition(".")[0] not in KNOWN and module not in sys.modules:
+        raise UsageError(
+            f"{name}: {path!r} is not of {', '.join(sorted(KNOWN))}, nor of a module that the "
+            f"command line names; add --gym-packages {module}"
+        )
+    with explained(f"{name}: there is no class {path!r}"):
+        found = getattr(importlib.import_module(module), attribute)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise UsageError(f"{name}: {path!r} is not allowed; it must be a {base.__name__}")
+    return found
+
+
+def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:
+    """
+    What ``env_wrapper``, ``vec_env_wrapper`` or ``callback`` names: classes and their arguments.
+
+    :raises UsageError: one is not there, not of its kind, or a monitor that writes a file
+    """
+    result = []
+    for path, arguments in entries(name, value):
+        cls = import_class(name, path, BASES[name])
+        if issubclass(cls, Monitor | VecMonitor) and arguments.get("filename") is not None:
+            raise UsageError(
+                f"{name}: {path} would write to {arguments['filename']!r}, which may be another "
+                "run's; leave it out, since 0.monitor.csv of the run has all episodes"
+            )
+        result.append((cls, arguments))
+    return result
+
+
+def torch_class(path: str) -> Any:
+    """
+    A class or a type of numbers of torch: ``nn.ReLU``, ``th.optim.Adam``, ``th.float32``.
+
+    :raises ValueError: it is anything else
+    """
+    import torch as th
+
+    root, _, names = path.partition(".")
+    try:
+        value = operator.attrgetter(names)({"th": th, "torch": th, "nn": th.nn}.get(root))
+    except AttributeError as error:
+        raise ValueError(f"{path}: {error}") from None
+    # torch's modules hold others, such as subprocess: what was found must be torch's own.
+    own = isinstance(value, type) and value.__module__.split(".")[0] == "torch"
+    if not own and not isinstance(value, th.dtype):
+        raise ValueError(f"{path} is not a class of torch")
+    return value
+
+
+def evaluate(name: str, text: str) -> Any:
+    """
+    The value of a hyper-parameter such as ``dict(activation_fn=nn.ReLU)``.
+
+    :raises UsageError: it is more than literals and classes of torch
+    """
+    what = f"hyper-parameter {name}: {text!r} can't be evaluated"
+    allowed = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
+    with explained(what, ValueError, fix=allowed):
+        return read_expression(text, torch_class)
+
+
+def require_named(where: Path, named: Sequence[str], modules: Sequence[str]) -> None:
+    """
+    Refuse modules that only a file names, before any of them is imported.
+
+    :param where: the folder or file
+    :param named: the modules that the command line names, which replace the file's
+    :param modules: those that the file names
+    :raises UsageError: the command line names none of them
+    """
+    if modules and not named:
+        raise UsageError(
+            f"{where} needs modules, which only the command line may name; look at them, then add"
+            + packages_flag(modules)
+        )
+
+
+def is_program(conf_file: str | None) -> bool:
+    """Whether ``-conf`` has a Python file or module run, rather than a YAML file read."""
+    return bool(conf_file) and not (
+        conf_file in PRESETS or str(conf_file).endswith((".yml", ".yaml"))
+    )

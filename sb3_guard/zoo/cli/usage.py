@@ -1,0 +1,282 @@
+"""What a command says when it can't do what was asked: one line, exit status 2, no traceback."""
+
+import argparse
+import errno
+import importlib
+import math
+import os
+import re
+import shlex
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+
+from sb3_guard.plain_yaml import load_yaml
+from sb3_guard.spelling import nearest
+from sb3_guard.zoo.cli.values import parse_value
+
+LONGEST = 500  # characters of an error that are printed
+
+
+class UsageError(Exception):
+    """Something the user can put right; the message names the value, what is allowed, the fix."""
+
+    status = 2  # the exit status of the command
+
+
+class TrainingStopped(UsageError):
+    """A reward, cost, observation or loss is not a number, or an episode can't begin."""
+
+    status = 1
+
+
+def one_line(error: BaseException) -> str:
+    """An exception's message on one line, its type where the message alone says too little."""
+    text = " ".join(str(error).split())
+    if isinstance(error, (UsageError, ValueError)) and text:
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+@contextmanager
+def explained(what: str, *errors: type[BaseException], fix: str = "") -> Iterator[None]:
+    """
+    Say in one line what a block could not do, why, and how to mend it.
+
+    :param what: what it could not do, e.g. ``can't read x.yml``
+    :param errors: the errors meant; none: all, where the code is a user's
+    :raises UsageError: instead of them
+    """
+    try:
+        yield
+    except UsageError:
+        raise
+    except Exception as error:
+        if errors and not isinstance(error, errors):
+            raise
+        why = getattr(error, "strerror", None) or one_line(error)
+        raise UsageError(f"{what}: {why}" + (fix and f"; {fix}")) from error
+
+
+def read_mapping(path: str | Path, what: str, form: str) -> dict[Any, Any]:
+    """
+    The plain data of a YAML file.
+
+    :param what: what the file is, for the message
+    :param form: what it must be, likewise
+    :raises UsageError: it can't be read, or is not a mapping
+    """
+    errors = OSError, ValueError, yaml.YAMLError
+    with explained(f"can't read {what} {path} as YAML", *errors):
+        content = load_yaml(Path(path).read_text(encoding="utf-8"))
+    if not isinstance(content, dict):
+        raise UsageError(f"{what} {path} is damaged: it must map {form}")
+    return content
+
+
+def import_packages(names: Sequence[str]) -> None:
+    """
+    Import modules that register environments (``--gym-packages``), the current folder's too.
+
+    :raises UsageError: one can't be imported
+    """
+    if names and os.getcwd() not in sys.path:  # as with python -m, also for the script sb3-guard
+        sys.path.insert(0, os.getcwd())
+    for name in names:
+        if not all(part.isidentifier() for part in name.split(".")):
+            raise UsageError(
+                f"--gym-packages: {name!r} is not a module's name; it must be like my_envs or "
+                "package.my_envs, importable from the current folder"
+            )
+        with explained(f"--gym-packages: can't import {name!r}", ImportError):
+            importlib.import_module(name)
+
+
+def packages_flag(modules: Sequence[str]) -> str:
+    """The flag that names modules, for a command that is printed; empty: there are none."""
+    return f" --gym-packages {shlex.join(map(str, modules))}" if modules else ""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser that raises :class:`UsageError` and knows which flag was meant."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs.setdefault("allow_abbrev", False)
+        super().__init__(*args, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise instead of printing the usage, which would bury the message."""
+        unknown = re.match(r"unrecognized arguments: (-\S+)", message)
+        if unknown:
+            flag = unknown[1].split("=")[0]
+            flags = [one for one in self._option_string_actions if one.startswith("--")]
+            near = nearest(flag, flags)
+            hint = f"did you mean {near}?" if near else "see --help"
+            raise UsageError(f"unknown flag {flag}; {hint}")
+        extra = re.match(r"unrecognized arguments: (\S+)", message)
+        if extra:
+            raise UsageError(f"{extra[1]!r} does not belong to a flag; see --help")
+        raise UsageError(" ".join(message.split()))
+
+
+def run(command: Callable[[], int]) -> int:
+    """
+    Run a command and turn what the user can put right into one line on stderr.
+
+    :return: the exit status: the command's own, 130 for Ctrl-C, 141 if nobody reads its output any
+        longer (``| head``), that of a :class:`UsageError`, 2 for a package that does not import
+    """
+    # OpenMP's idle threads spin by default: on a machine shared with other work, torch's threads
+    # then wait for one another's time slices and training is ten times slower. Read when torch is
+    # imported, which the commands do later.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # "±" on a terminal that is not UTF-8 becomes "?"
+            stream.reconfigure(errors="replace")
+    try:
+        status = command()
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        try:
+            print(flush=True)
+        except BrokenPipeError:
+            pass
+        else:
+            raise  # some other pipe, such as one of an environment
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return 141
+    except (UsageError, ImportError, OSError) as error:
+        # an absent package, or no backend for MuJoCo; a name too long, no room where output goes
+        if isinstance(error, OSError) and error.errno not in (errno.ENAMETOOLONG, errno.ENOSPC):
+            raise
+        text = one_line(error)
+        print(f"error: {text if len(text) <= LONGEST else text[:LONGEST] + ' …'}", file=sys.stderr)
+        return getattr(error, "status", 2)
+    except KeyboardInterrupt:
+        return 130
+
+
+@contextmanager
+def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
+    """
+    Let Ctrl-C and SIGTERM ask for an end in good order; a second one ends immediately.
+
+    A signal that the process ignores, as workers ignore Ctrl-C, is left alone.
+
+    :param stop: called with the number of the first signal, between two steps of whatever runs
+    :return: the numbers of the signals received
+    """
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+
+    def handle(number: int, frame: Any) -> None:
+        received.append(number)
+        if len(received) > 1:
+            raise KeyboardInterrupt
+        stop(number)
+
+    before = {
+        number: signal.signal(number, handle)
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def interrupts_ignored() -> Iterator[None]:
+    """Let processes that are started in the block ignore Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def number(
+    allowed: str, fits: Callable[[float], bool], kind: Callable[[float], float] = int
+) -> Callable[[Any], Any]:
+    """
+    What makes a number of a flag's text; ``3e5`` is a whole one, too.
+
+    :param allowed: which numbers, in words
+    :param fits: whether it is one of them; not asked for those that are not whole
+    :param kind: ``int`` or ``float``
+    """
+
+    def read(text: Any) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if kind is int and not value.is_integer():
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not a whole number, such as 300000 or 3e5"
+            )
+        if not fits(value):
+            raise argparse.ArgumentTypeError(f"{text!r} is not allowed; it must be {allowed}")
+        return kind(value)
+
+    return read
+
+
+steps = number("a whole number", lambda n: True)
+positive = number("at least 1", lambda n: n >= 1)
+count = number("at least 0", lambda n: n >= 0)
+amount = number("at least 0", lambda n: 0 <= n < math.inf, float)
+factor = number("above 0", lambda n: 0 < n < math.inf, float)
+seed_number = number("at least 0 and less than 2**32", lambda n: 0 <= n < 2**32)
+seed_or_random = number("less than 2**32; if negative, it is random", lambda n: n < 2**32)
+interval = number("at least 1, or -2 for never", lambda n: n >= 1 or n in (-1, -2))
+
+
+def parse_pairs(pairs: Sequence[str], what: str = "key:value") -> dict[str, Any]:
+    """
+    The mapping that ``["n_steps:512", "cost_limit:25.0"]`` stands for.
+
+    :param what: what it is given to, for the message
+    :raises UsageError: one has no colon
+    """
+    values = {}
+    for pair in pairs:
+        key, colon, value = str(pair).partition(":")
+        if not colon or not key:
+            raise UsageError(f"{what}: {pair!r} is not of the form key:value")
+        values[key] = parse_value(value)
+    return values
+
+
+class KeyValues(argparse.Action):
+    """
+    ``key:value`` pairs, as RL-Zoo takes them: ``-params n_steps:512 cost_limit:25.0``.
+
+    The flag may be repeated; what comes later wins.
+    """
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the pairs to the dictionary; a pair without a colon is an error."""
+        before = getattr(namespace, self.dest, None) or {}
+        pairs = parse_pairs(values, option_string or self.dest)
+        setattr(namespace, self.dest, {**before, **pairs})

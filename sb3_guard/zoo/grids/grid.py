@@ -1,0 +1,319 @@
+"""A grid of training runs, suites × algorithms × seeds: checked in full, then carried out.
+
+A run of a grid is a training run like any other, in ``<folder>/<algo>/<env>_<seed + 1>/``, so it is
+played, plotted and resumed like any other. An executor of :mod:`concurrent.futures` carries the
+runs out, here or on a Dask cluster, and all that matters is in the run folders: the lock says that
+a run is under way, ``result.json``, written last, that it is done. So a grid can be killed and
+started again anywhere.
+"""
+
+import multiprocessing
+import os
+import shlex
+import socket
+import sys
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, interrupts_ignored, one_line
+from sb3_guard.zoo.grids.live import REFRESH, Board, summary
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.experiment import Experiment
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import RunInUse
+from sb3_guard.zoo.run.hyperparams import annotations
+from sb3_guard.zoo.run.start import complete, path_of, prepare, standing
+from sb3_guard.zoo.run.training import Training
+
+
+@dataclass(eq=False)
+class Run:
+    """
+    One run of a grid.
+
+    :param flags: all flags, as its folder states them
+    :param values: all hyper-parameters, likewise
+    :param ignored: those given for the grid that its algorithm does not have
+    """
+
+    flags: RunFlags
+    values: dict[str, Any]
+    ignored: list[str]
+    #: at first done · resume · new; later waiting · running · in use · done · failed · stopped
+    state: str
+    #: what went wrong, in a line
+    error: str = ""
+
+    @property
+    def path(self) -> Path:
+        """Its folder."""
+        return path_of(self.flags)
+
+    @property
+    def steps(self) -> int:
+        """Its length, environment steps."""
+        return int(self.values["n_timesteps"])
+
+    def __str__(self) -> str:
+        return f"{self.flags.algo} on {self.flags.env}, seed {self.flags.seed}"
+
+
+def expand(
+    pairs: Sequence[tuple[str, str]],
+    seeds: Sequence[int],
+    flags: RunFlags,
+    scale: float = 1.0,
+) -> list[Run]:
+    """
+    The runs of a grid, checked, and how far they are; those of the first seed come first.
+
+    A hyper-parameter given for the whole grid is passed to the algorithms that have it.
+
+    :param pairs: environments and algorithms
+    :param seeds: at least 0
+    :param flags: what all runs share
+    :param scale: factor of every run's length
+    :raises UsageError: a name or value is wrong for any of the runs, or a folder holds another run
+        than the one that belongs there
+    """
+    given = flags.hyperparams or {}
+    known = {
+        algo: annotations(algorithm(algo)) for algo in dict.fromkeys(algo for _, algo in pairs)
+    }
+    every = sorted(set[str]().union(*known.values()))
+    for name in given.keys() - every:
+        hint = did_you_mean(name, every)
+        raise UsageError(f"none of the algorithms has a hyper-parameter {name!r}; {hint}")
+    first = {}
+    flags = replace(flags, progress=False, num_threads=max(flags.num_threads, 1))
+    for env_id, algo in pairs:
+        own = {name: value for name, value in given.items() if name in known[algo]}
+        mine = replace(flags, env=env_id, algo=algo, seed=0, hyperparams=own or None)
+        one, values = prepare(mine)
+        one.n_timesteps = values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
+        first[one.env, algo] = one, values, sorted(given.keys() - own.keys())
+    runs = []
+    for seed in dict.fromkeys(seeds):
+        for one, values, ignored in first.values():
+            mine = replace(one, seed=seed)
+            runs.append(Run(mine, values, ignored, standing(mine, values)))
+    return runs
+
+
+def try_out(runs: Sequence[Run]) -> None:
+    """
+    Make each suite and each algorithm once, so that a value that is refused only there ends the
+    grid before it begins.
+
+    :raises UsageError: one is refused
+    """
+    import torch as th
+
+    seen: set[str] = set()
+    for run in runs:
+        flags = run.flags
+        if run.state == "done" or {flags.env, flags.algo} <= seen:
+            continue
+        seen |= {flags.env, flags.algo}
+        here = replace(flags, device="cpu", num_threads=1, tensorboard_log="", track=False)
+        if flags.vec_env == "subproc":
+            here.vec_env = "dummy"
+        try:
+            if flags.device != "auto":
+                th.device(flags.device)
+            Training(Experiment(here, run.values)).close()
+        except (UsageError, RuntimeError) as error:
+            raise UsageError(f"{flags.algo} on {flags.env}: {one_line(error)}") from error
+
+
+# In a worker
+
+_one_at_a_time = threading.Lock()  # random generators and thread counts belong to the process
+
+
+def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
+    """
+    Complete a run; what goes wrong is also written to ``error.txt`` in its folder.
+
+    :param command: the command line, for the run folder
+    :param stop: a file; once it is there, the run ends after the rollout under way
+    :return: the state it is left in, ``done``, ``stopped``, ``failed`` or ``in use`` by another
+        process; and what went wrong
+    """
+    if not stop.parent.is_dir():
+        return "failed", f"{socket.gethostname()} does not see the folder {stop.parent}"
+    with _one_at_a_time:
+        if stop.exists():
+            return "stopped", ""
+        try:
+            status = complete(run.flags, run.values, command, stop.exists)
+        except RunInUse as error:
+            return "in use", one_line(error)
+        except Exception as error:
+            # The grid's summary says it too, so a record that can't be written is no failure.
+            with suppress(OSError), open(run.path / "error.txt", "a") as file:
+                now = time.strftime("%Y-%m-%d %H:%M:%S")
+                file.write(f"--- {now}\n{traceback.format_exc()}\n")
+            return "failed", one_line(error)
+    return "stopped" if status else "done", ""
+
+
+def _begin_worker() -> None:
+    """Let a process of this machine's pool end when the grid's process does, however that ends."""
+    warnings.simplefilter("ignore")  # which the process that checked the grid has shown
+    grid = multiprocessing.parent_process()
+    assert grid is not None
+
+    def end_with(grid: Any) -> None:
+        grid.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with, args=(grid,), daemon=True).start()
+
+
+# Executors
+
+
+def cores() -> int:
+    """How many this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def processes(number: int) -> Iterator[Executor]:
+    """Processes of this machine; they are killed when the block is left by an exception."""
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(number, mp_context=context, initializer=_begin_worker)
+    try:
+        yield pool
+    except BaseException:
+        for process in multiprocessing.active_children():
+            process.kill()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Executor]:
+    """
+    The workers of a Dask cluster.
+
+    :param address: of its scheduler
+    :raises UsageError: Dask is not installed, or no scheduler answers
+    """
+    install = "install it with: pip install 'sb3-guard[cluster]'"
+    with explained("--scheduler needs Dask's package distributed", ImportError, fix=install):
+        from distributed import Client
+    start = "start one with: dask scheduler"
+    with explained(f"no Dask scheduler answers at {address}", OSError, ValueError, fix=start):
+        client = Client(address, timeout=10, set_as_default=False)
+    with client:
+        yield client.get_executor(retries=0, pure=False)
+
+
+# Here
+
+
+def execute(runs: Sequence[Run], executor: Executor, stop: Path, board: Board) -> int:
+    """
+    Train what is not done yet.
+
+    :param runs: as :func:`expand` returns them; their states follow
+    :param executor: whose workers see the runs' folders
+    :param stop: file that asks the runs to stop
+    :param board: shows how it goes
+    :return: exit status: 0, 1 if runs failed, or 128 + the signal's number when interrupted
+    :raises UsageError: a worker or the scheduler is gone
+    """
+    command = shlex.join(sys.orig_argv)
+
+    def ask_to_stop(number: int) -> None:
+        stop.touch()
+        board.say("Stopping after the rollouts under way; Ctrl-C again stops immediately.")
+
+    with interrupts(ask_to_stop) as received:
+        with interrupts_ignored():  # by the processes that this starts
+            todo = [run for run in runs if run.state != "done"]
+            futures = {executor.submit(carry_out, run, command, stop): run for run in todo}
+        for run in todo:
+            run.state = "waiting"
+        pending = set(futures)
+        while pending:
+            done, pending = wait(pending, REFRESH, FIRST_COMPLETED)
+            for future in done:
+                run = futures[future]
+                try:
+                    run.state, run.error = future.result()
+                except Exception as error:  # those of runs are caught where they run
+                    why = one_line(error).rstrip(".")
+                    raise UsageError(f"a worker or scheduler is gone: {why}") from error
+                board.note(run)
+            board.update(runs)
+    if received:
+        return 128 + received[0]
+    return int(any(run.state != "done" for run in runs))
+
+
+def run_grid(
+    runs: Sequence[Run],
+    folder: Path,
+    again: str,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    verbose: int = 1,
+    stop: str = "stop",
+) -> int:
+    """
+    Carry out what is not done, and say what has become of it.
+
+    :param runs: expanded and tried out
+    :param folder: where they are
+    :param again: the command that continues it
+    :param jobs: runs at once on this machine; None: as many as there are cores for this process
+    :param scheduler: address of a Dask cluster's scheduler; None: this machine
+    :param verbose: 0: errors only
+    :param stop: name of the file in the folder that asks the runs to stop
+    :return: exit status, see :func:`execute`
+    :raises UsageError: a worker or the scheduler is gone
+    """
+    status, stop_file = 0, folder / stop
+    board = Board(str(folder), verbose)
+    todo = sum(run.state != "done" for run in runs)
+    with board.bars:
+        for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
+            board.say(f"{algo} has no {', '.join(names)}: left out there")
+        if todo:
+            board.say(f"{folder}: {summary(runs)}")
+            with explained(
+                f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"
+            ):
+                folder.mkdir(parents=True, exist_ok=True)
+                stop_file.unlink(missing_ok=True)
+            number = min(jobs or cores(), todo)
+            try:
+                with cluster(scheduler) if scheduler else processes(number) as executor:
+                    status = execute(runs, executor, stop_file, board)
+            except UsageError as error:
+                raise UsageError(f"{one_line(error)}; continue with: {again}") from error
+            stop_file.unlink(missing_ok=True)
+    board.say(f"{folder}: {summary(runs)}")
+    for run in runs:
+        if run.state == "failed":
+            print(f"failed: {run}: {run.error}\n  {run.path / 'error.txt'}", file=sys.stderr)
+    if any(run.state != "done" for run in runs):
+        board.say(f"Continue with: {again}")
+    else:
+        board.say(f"See the results with: sb3-guard plot {shlex.quote(str(folder))}")
+    return status

@@ -1,0 +1,145 @@
+"""The data of figures: the runs, their means, scores and curves, and the look of each algorithm.
+
+Colours are readable on white and on black, and in the manner of Okabe and Ito's told apart by
+colour-blind readers; line styles and markers tell algorithms apart without them.
+"""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from itertools import cycle
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sb3_guard.zoo.cli.usage import UsageError, one_line
+from sb3_guard.zoo.results.curves import read_curve
+from sb3_guard.zoo.results.runs import REFERENCE, described
+from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize
+
+# Text, axes and the reference; a grey that is readable on white and on black. No other colour is
+# the same, so a page can replace it by its own.
+INK = "#7b7b7b"
+COLORS = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#C08A00", "#3D9BD6", "#8F6FD1", "#8A8A00",
+    "#A65E3A", "#4FA38F",
+)  # fmt: skip
+MARKERS = "Ddsv^P*Xph<>"
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1)))
+LOOSE = (0, (4, 2.5))  # baselines, which are of no family
+
+
+class Look(NamedTuple):
+    """How an algorithm, or a family, is drawn wherever it is drawn."""
+
+    label: str
+    color: str
+    dashes: Any
+    marker: str
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """Arguments of a line without markers."""
+        return {"label": self.label, "color": self.color, "linestyle": self.dashes}
+
+
+class Data:
+    """
+    What figures are drawn from, worked out when a figure asks.
+
+    :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
+    """
+
+    def __init__(self, runs: pd.DataFrame):
+        self.runs = runs
+        #: why the curve of a run can't be drawn, by its path
+        self.unread: dict[str, str] = {}
+        self._curves: dict[str, pd.DataFrame] = {}
+
+    @cached_property
+    def means(self) -> pd.DataFrame:
+        """Means over seeds, see :func:`~sb3_guard.zoo.results.statistics.aggregate`."""
+        return aggregate(self.runs)
+
+    @cached_property
+    def scores(self) -> pd.DataFrame:
+        """Means with scores, of algorithms and of families; index suite and either's key."""
+        scores = normalize(self.means, self.means)
+        families = by_family(scores).rename(columns={"family": "algo"})
+        return pd.concat([scores, families]).set_index(["suite", "algo"])
+
+    @cached_property
+    def looks(self) -> dict[str, Look]:
+        """By key of an algorithm, the reference first and family by family, then by family."""
+        table = self.runs.drop_duplicates("algo").fillna({"family": ""})
+        table = table.assign(first=table["algo"] != REFERENCE)
+        looks, colors, markers = {}, cycle(COLORS), cycle(MARKERS)
+        families = [one for one in sorted({*table["family"]}) if one]
+        dashes = dict(zip(families, cycle(DASHES), strict=False)) | {"": LOOSE}
+        for row in table.sort_values(["first", "family", "label"]).to_dict("records"):
+            if row["algo"] == REFERENCE:
+                looks[REFERENCE] = Look(row["label"], INK, "-", "o")
+                continue
+            style = next(colors), dashes[row["family"]], next(markers)
+            looks[row["algo"]] = Look(row["label"], *style)
+        for family in families:
+            own = table.loc[(table["family"] == family) & table["first"], "algo"].sort_values()
+            if len(own):
+                looks[family] = looks[own.iloc[0]]._replace(label=family)
+        return looks
+
+    @property
+    def families(self) -> list[str]:
+        """The families of constrained algorithms."""
+        return [key for key in self.looks if key not in {*self.runs["algo"]}]
+
+    @property
+    def suites(self) -> list[str]:
+        """The suites that there are runs of."""
+        return list(dict.fromkeys(self.runs["suite"]))
+
+    def algos(self, suite: str) -> list[str]:
+        """The algorithms that there are runs of."""
+        have = {*self.runs.loc[self.runs["suite"] == suite, "algo"]}
+        return [algo for algo in self.looks if algo in have]
+
+    def curves(self, suite: str, algo: str) -> list[pd.DataFrame]:
+        """The seeds' learning curves; one that can't be read is left out, see ``unread``."""
+        own = self.runs[(self.runs["suite"] == suite) & (self.runs["algo"] == algo)]
+        for path, epoch in zip(own["path"], own["epoch"], strict=True):
+            if path not in self._curves and path not in self.unread:
+                try:
+                    self._curves[path] = read_curve(path, epoch)
+                except UsageError as error:
+                    self.unread[path] = one_line(error)
+        return [self._curves[path] for path in own["path"] if path in self._curves]
+
+    def costs(self, suite: str) -> list[str]:
+        """Columns of episode costs: the total, and those that have limits of their own."""
+        runs = self.runs[self.runs["suite"] == suite].dropna(axis=1, how="all")
+        return ["M_c", *runs.filter(regex="^M_c/")]
+
+    def panels(self, suite: str) -> list[str]:
+        """Columns that have a learning curve."""
+        return ["J_r", *self.costs(suite), "rho_c"]
+
+    def score(self, suite: str, algo: str, name: str) -> float:
+        """A score of an algorithm or a family, NaN if there is none."""
+        return float(self.scores[name].get((suite, algo), np.nan))
+
+    def _label(self, algo: str) -> str:
+        return self.looks[algo].label if algo in self.looks else described(algo)["label"]
+
+    def missing(self, suites: Iterable[str], algos: Sequence[str]) -> str:
+        """Which algorithms lack runs on which suites, in words."""
+        have = {*zip(self.runs["suite"], self.runs["algo"], strict=True)}
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for suite in suites:
+            absent = tuple(algo for algo in algos if (suite, algo) not in have)
+            if absent:
+                groups.setdefault(absent, []).append(suite)
+        return "; ".join(
+            ("all algorithms" if len(absent) == 8 else ", ".join(map(self._label, absent)))
+            + f" on {', '.join(names)}"
+            for absent, names in groups.items()
+        )

@@ -1,0 +1,316 @@
+"""Figures: learning curves, and what to read safety off at a glance; ``paper.py`` has the paper's.
+
+A figure is drawn from the runs there are and says which are missing.
+"""
+
+import io
+import textwrap
+from collections.abc import Callable, Iterable, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from sb3_guard.zoo.results.figure_data import INK, Data
+from sb3_guard.zoo.results.statistics import SCORES, interval, mean_curve, normalize, overall
+from sb3_guard.zoo.results.tables import written
+
+FORMATS = ("png", "svg", "pdf")
+WIDTH = 8.0  # inches: at the width of a page, text has the size of the page's
+AXES = {"J_r": "return", "M_c": "episode cost", "rho_c": "cost rate, per step"}
+SCORE_AXES = {
+    "reward": "reward / TRPO's",
+    "cost": "episode cost / TRPO's",
+    "cost_rate": "cost rate / TRPO's",
+}
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "axes.axisbelow": True,
+    "figure.constrained_layout.wspace": 0.03,
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "svg.hashsalt": "sb3_guard",  # the same figure is the same file
+    **{
+        key: INK
+        for key in ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color",
+                    "grid.color")
+    },
+}  # fmt: skip
+
+
+class Drawing(NamedTuple):
+    """A figure with its name, or None where there is nothing to draw, and the runs it lacks."""
+
+    name: str
+    figure: Figure | None
+    missing: str
+
+
+# Elements
+
+
+def fit_costs(axis: Axes, values: Iterable[Any], way: str = "y") -> None:
+    """
+    Begin a cost axis at 0, and end it where one outlier does not squash all others.
+
+    :param values: all lines and points that are drawn, arrays or numbers; bands may be cut
+    :param way: which axis, ``x`` or ``y``
+    """
+    finite = np.concatenate([np.ravel(np.asarray(one, float)) for one in values])
+    finite = finite[np.isfinite(finite)]
+    set_limits, end = getattr(axis, f"set_{way}lim"), getattr(axis, f"get_{way}lim")()[1]
+    set_limits(0, end)
+    if not len(finite) or not finite.max() > 0:
+        return
+    highest, enough = finite.max(), 5 * np.quantile(finite, 0.75)
+    set_limits(0, min(end, 1.5 * highest))
+    if 0 < enough < highest:
+        set_limits(0, min(1.5 * finite[finite <= enough].max(), 1.05 * enough))
+        if way == "y":
+            text = f"↑ up to {highest:.3g}"
+            axis.annotate(text, (0.99, 0.98), xycoords="axes fraction", ha="right", va="top")
+
+
+def cost_name(column: str) -> str:
+    """What an axis calls a column of :meth:`Data.costs`."""
+    return "episode cost" + (f", {column[4:]}" if column != "M_c" else "")
+
+
+def draw_limit(line: Callable[..., Any], data: Data, suite: str, cost: str) -> float:
+    """Mark a cost's limit of a suite's constrained runs with an axis's axhline or axvline."""
+    column = cost.replace("M_c", "cost_limit", 1)
+    limits = data.runs.loc[data.runs["suite"] == suite, column].dropna()
+    if not len(limits):
+        return np.nan
+    name = f"cost limit, {limits.iloc[0]:g}"
+    line(limits.iloc[0], color=INK, linewidth=1.2, linestyle=(0, (1, 2)), label=name)
+    return float(limits.iloc[0])
+
+
+def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
+    """Draw one figure of merit against steps: means of the seeds, shaded ± their deviation."""
+    drawn: list[Any] = []
+    for algo in data.algos(suite):
+        curves = [curve for curve in data.curves(suite, algo) if metric in curve]
+        if not curves:
+            continue
+        table, look = mean_curve(curves, metric), data.looks[algo]
+        steps = table.index.to_numpy()
+        axis.plot(steps, table["mean"], linewidth=1.5, **look.line)
+        drawn.append(table["mean"])
+        if len(curves) > 1:
+            low, high = table["mean"] - table["std"], table["mean"] + table["std"]
+            axis.fill_between(steps, low, high, color=look.color, alpha=0.15, linewidth=0)
+    if metric.startswith("M_c"):
+        drawn.append(draw_limit(axis.axhline, data, suite, metric))
+    axis.set(xlabel="steps", ylabel=AXES.get(metric) or cost_name(metric))
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axis.set_xlim(left=0)
+    if metric != "J_r" and drawn:
+        fit_costs(axis, drawn)
+
+
+def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
+    """Return against an episode cost: means large, seeds small, and the front of the means."""
+    means = data.means[(data.means["suite"] == suite)].dropna(subset=[cost, "J_r"])
+    runs = data.runs[data.runs["suite"] == suite]
+    front = means.iloc[pareto_front(means[cost].to_numpy(), means["J_r"].to_numpy())]
+    axis.plot(
+        front[cost], front["J_r"], color=INK, alpha=0.35, linewidth=5, solid_capstyle="round",
+        drawstyle="steps-post", label="Pareto front", zorder=1,
+    )  # fmt: skip
+    limit = draw_limit(axis.axvline, data, suite, cost)
+    for row in means.to_dict("records"):
+        look = data.looks[row["algo"]]
+        own = runs[runs["algo"] == row["algo"]]
+        style: dict[str, Any] = {"color": look.color, "marker": look.marker}
+        axis.scatter(own[cost], own["J_r"], s=14, alpha=0.6, **style)
+        axis.scatter(row[cost], row["J_r"], s=80, label=look.label, zorder=3, **style)
+    axis.set(xlabel=cost_name(cost), ylabel="return", title=suite)
+    axis.margins(0.08)
+    fit_costs(axis, [means[cost], limit], "x")
+    end = axis.get_xlim()[1]
+    for row in means[means[cost] > end].to_dict("records"):
+        look = data.looks[row["algo"]]
+        at = 0.97 * end, row["J_r"]
+        axis.scatter(*at, s=80, color=look.color, marker=look.marker, zorder=3)
+        axis.annotate(
+            f"{row[cost]:.3g} →", at, (-8, 0), textcoords="offset points", color=look.color,
+            ha="right", va="center",
+        )  # fmt: skip
+    axis.set_xlim(left=-0.03 * end)
+
+
+def pareto_front(costs: np.ndarray, returns: np.ndarray) -> np.ndarray:
+    """The points that no other beats in both cost and return: their indices, by cost."""
+    order = np.lexsort((-returns, costs))
+    best = np.maximum.accumulate(np.concatenate([[-np.inf], returns[order]]))
+    return order[returns[order] > best[:-1]]
+
+
+def finish(figure: Figure, missing: str) -> None:
+    """Add one legend for all panels, above them, where it covers nothing, and what is missing."""
+    entries: dict[str, Any] = {}
+    for axis in figure.axes:
+        for handle, name in zip(*axis.get_legend_handles_labels(), strict=True):
+            entries.setdefault(name, handle)
+    if entries:
+        rows = -(-len(entries) // max(round(figure.get_figwidth() / 2), 1))
+        figure.legend(
+            [*entries.values()], [*entries], loc="outside upper center",
+            ncols=-(-len(entries) // rows), handlelength=2.6,
+        )  # fmt: skip
+    if missing:
+        width = int(figure.get_figwidth() * 14)
+        text = textwrap.shorten(f"Missing: {missing}", 4 * width, placeholder=" …")
+        text = "\n".join(textwrap.wrap(text, width))
+        figure.supxlabel(text, x=0.01, ha="left", fontsize=7, alpha=0.8)
+
+
+# Figures
+
+
+def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
+    """One row of panels per suite that has runs: return, episode costs, cost rate."""
+    drawn = [suite for suite in suites if any(data.curves(suite, a) for a in data.algos(suite))]
+    if not drawn:
+        return None
+    columns = max(len(data.panels(suite)) for suite in drawn)
+    size = WIDTH * columns / 3, 0.8 + 2.2 * len(drawn)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(len(drawn), columns, squeeze=False)
+    for row, suite in zip(grid, drawn, strict=True):
+        for axis, metric in zip_longest(row, data.panels(suite)):
+            if metric is None:
+                axis.set_axis_off()
+            else:
+                draw_curves(axis, data, suite, metric)
+        row[1].set_title(suite, fontweight="bold")
+    return figure
+
+
+def curves(data: Data, suite: str) -> Figure | None:
+    """Return, episode cost and cost rate against steps, a figure per suite."""
+    return curves_of(data, [suite])
+
+
+def pareto(data: Data, suite: str) -> Figure | None:
+    """Return against each cost with the Pareto front and the limit, a figure per suite."""
+    if not len(data.means[data.means["suite"] == suite].dropna(subset=["M_c", "J_r"])):
+        return None
+    costs = data.costs(suite)
+    width = WIDTH * (0.7 if len(costs) == 1 else 0.5 * len(costs))
+    figure = Figure(figsize=(width, 0.6 * WIDTH), layout="constrained")
+    for axis, cost in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
+        draw_pareto(axis, data, suite, cost)
+    return figure
+
+
+def _reached(values: np.ndarray, axis: int, tau: np.ndarray, score: str) -> np.ndarray:
+    """The part of the values that are at least τ, or of costs at most τ, [B, len(tau)]."""
+    ordered = np.sort(values, axis=axis)
+    side: Any = "left" if score == "reward" else "right"
+    below = np.stack([np.searchsorted(one, tau, side=side) for one in ordered])
+    part = below / values.shape[axis]
+    return 1 - part if score == "reward" else part
+
+
+def profiles(data: Data) -> Figure | None:
+    """Performance profiles: the part of all runs that reach a score, with 95 % bands."""
+    single = normalize(data.runs, data.means)
+    if single[list(SCORES.values())].isna().all(axis=None):
+        return None
+    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
+    for axis, score in zip(figure.subplots(1, 3), SCORES.values(), strict=True):
+        finite = single[score].dropna()
+        # Costs have no upper bound: one run must not squeeze all others to the left.
+        highest = 1.0 if score == "reward" else max(1.2, float(finite.quantile(0.98)))
+        tau = np.linspace(min(0.0, float(finite.quantile(0.02))), highest, 201)
+        for algo, own in single.groupby("algo", sort=False):
+            groups = [group.dropna().to_numpy() for _, group in own.groupby("suite")[score]]
+            values, look = np.concatenate(groups), data.looks[str(algo)]
+            if not len(values):
+                continue
+            axis.plot(tau, _reached(values[None], 1, tau, score)[0], linewidth=1.5, **look.line)
+            low, high = interval(groups, lambda v, axis, t=tau, s=score: _reached(v, axis, t, s))
+            if not np.isscalar(low):
+                axis.fill_between(tau, low, high, color=look.color, alpha=0.12, linewidth=0)
+        sign = "≥" if score == "reward" else "≤"
+        axis.set(xlabel=f"{SCORE_AXES[score]}, τ", ylabel=f"part of runs {sign} τ")
+        axis.set_ylim(-0.02, 1.02)
+    return figure
+
+
+def iqm(data: Data) -> Figure | None:
+    """Interquartile means of the scores over runs and suites, with 95 % intervals."""
+    table = overall(data.runs, data.means).set_index("algo")
+    table = table.dropna(subset=[f"{score}_iqm" for score in SCORES.values()], how="all")
+    if not len(table):
+        return None
+    figure = Figure(figsize=(WIDTH, 1.2 + 0.32 * len(table)), layout="constrained")
+    rows = np.arange(len(table))[::-1]
+    for axis, score in zip(figure.subplots(1, 3, sharey=True), SCORES.values(), strict=True):
+        for y, (algo, row) in zip(rows, table.iterrows(), strict=True):
+            color = data.looks[str(algo)].color
+            low, high, middle = (row[f"{score}_{end}"] for end in ("low", "high", "iqm"))
+            if not np.isnan(low):
+                pale = to_rgba(color, 0.5)
+                axis.barh(y, high - low, 0.6, left=low, color=pale, edgecolor=INK, linewidth=0.5)
+            axis.plot(middle, y, marker="|", markersize=13, markeredgewidth=2, color=color)
+        axis.set_yticks(rows, table["label"])
+        axis.set(xlabel=SCORE_AXES[score])
+        axis.use_sticky_edges = False
+        axis.margins(0.06)
+        axis.axvline(1, color=INK, linewidth=1, linestyle=(0, (1, 2)))
+        axis.grid(axis="y", visible=False)
+    return figure
+
+
+# Files
+
+
+def panel(draw_on: Callable[[Axes], None], size: tuple[float, float] = (4.4, 3.2)) -> Figure:
+    """One panel by itself, without legend or title."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        axis = figure.subplots()
+        draw_on(axis)
+        axis.set_title("")
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """
+    Write a figure in the format of the file's name, PNG, SVG or PDF, with a transparent background.
+
+    :raises UsageError: the file can't be written
+    """
+    # No dates: the same figure is the same file.
+    metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(path.suffix[1:])
+    with mpl.rc_context(STYLE), written(path) as file:
+        figure.savefig(
+            file, format=path.suffix[1:], dpi=180, transparent=True, metadata=metadata
+        )  # fmt: skip
+
+
+def inline_svg(figure: Figure, title: str) -> str:
+    """A figure as part of an HTML page: its ink is the page's text colour."""
+    buffer = io.StringIO()
+    nothing: Any = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    with mpl.rc_context(STYLE):
+        figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :].replace(INK, "currentColor")
+    return text.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)

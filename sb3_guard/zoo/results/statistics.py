@@ -1,0 +1,227 @@
+"""Statistics of runs: how safe each is, means over seeds, and scores as the GUARD paper has them.
+
+Scores are relative to TRPO's (arXiv 2305.13681). Intervals and interquartile means follow Agarwal
+et al. 2021 (arXiv 2108.13264). Their library, rliable, saw its last release in 2024 and does not
+import beside pandas 3 (through ``arch``), so the stratified bootstrap, the one piece needed, is
+:func:`interval`.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import trim_mean
+
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.results.curves import read_episodes
+from sb3_guard.zoo.results.runs import METRICS, REFERENCE, compared
+from sb3_guard.zoo.run.folder import EPOCH
+
+SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
+EPOCHS = 10  # at the end of a run, that its safety is judged by
+#: of :func:`safety`
+SAFETY = (
+    "return_last", "cost_last", "above_limit", "cost_p95", "cost_max", "cost_total", "feasible_iqm",
+)  # fmt: skip
+RESAMPLES = 2000
+
+
+def iqm(values: Any, axis: int = 0) -> Any:
+    """The mean of the middle half of the values along an axis."""
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def interval(
+    groups: Sequence[np.ndarray],
+    statistic: Callable[..., np.ndarray] = np.mean,
+) -> tuple[Any, Any]:
+    """
+    A 95 % percentile bootstrap interval, stratified: each group is resampled by itself.
+
+    :param groups: values of independent runs, [n_g] each; NaN are left out
+    :param statistic: called with ``axis=1`` on [B, Σ n_g] resamples; returns [B, …]
+    :return: lower and upper end, each of the statistic's shape; NaN where no group has two values,
+        since one seed says nothing about another
+    """
+    groups = [group[~np.isnan(group)] for group in map(np.asarray, groups)]
+    if not any(len(group) > 1 for group in groups):
+        return math.nan, math.nan
+    rng = np.random.default_rng(0)
+    draws = [
+        group[rng.integers(len(group), size=(RESAMPLES, len(group)))]
+        for group in groups
+        if len(group)
+    ]
+    values = statistic(np.concatenate(draws, axis=1), axis=1)
+    low, high = np.quantile(values, [0.025, 0.975], axis=0)
+    return low, high
+
+
+# One run
+
+
+def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, float]:
+    """
+    What users ask about the safety of a run; all but ``cost_total`` of its last ten epochs.
+
+    :param episodes: see :func:`~sb3_guard.zoo.results.curves.read_episodes`
+    :param epoch: steps; NaN: 30,000, or a twentieth of a shorter run
+    :param limit: of an episode's cost; NaN: there is none
+    :return: ``return_last`` and ``cost_last``, means over epochs of their episodes' means;
+        ``above_limit``, the part of the episodes whose cost exceeds the limit; ``cost_p95`` and
+        ``cost_max``, the 95th percentile and the greatest of their costs; ``cost_total``, the cost
+        of all training; ``feasible_iqm``, the interquartile mean of the returns of the episodes
+        within the limit (NaN: none is)
+    """
+    total = episodes["step"].iloc[-1]
+    size = epoch if epoch > 0 else min(EPOCH, total / 20)
+    number: Any = np.ceil(episodes["step"] / size)
+    last = episodes[number > number.iloc[-1] - EPOCHS]
+    means = last.groupby(number)[["J_r", "M_c"]].mean().mean()
+    within = last.loc[last["M_c"] <= limit, "J_r"]
+    return {
+        "return_last": means["J_r"],
+        "cost_last": means["M_c"],
+        "above_limit": math.nan if math.isnan(limit) else 1 - len(within) / len(last),
+        "cost_p95": last["M_c"].quantile(0.95),
+        "cost_max": last["M_c"].max(),
+        "cost_total": episodes["M_c"].sum(),
+        "feasible_iqm": iqm(within) if len(within) else math.nan,
+    }
+
+
+def with_safety(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    The table of runs with the columns of :func:`safety`; NaN where episodes can't be read.
+
+    Unconstrained runs are judged by the limit of the others on their suite, if that is the same for
+    all of them.
+    """
+    limits = runs.groupby("suite")["cost_limit"].unique().map(lambda all_: all_[~np.isnan(all_)])
+
+    def row(run: Any) -> dict[str, float]:
+        others = limits[run["suite"]]
+        common = others[0] if len(others) == 1 else math.nan
+        limit = common if pd.isna(run["limits"]) else run["cost_limit"]
+        try:
+            return safety(read_episodes(run["path"]), run["epoch"], limit)
+        except UsageError:
+            return dict.fromkeys(SAFETY, math.nan)
+
+    rows = [row(run) for run in runs.to_dict("records")]
+    return runs.assign(**pd.DataFrame(rows, columns=list(SAFETY), index=runs.index, dtype=float))
+
+
+# Over seeds
+
+
+def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    Means over seeds, a row per suite and algorithm.
+
+    :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
+    :return: ``suite``, ``algo``, ``label``, ``family``, limits, verdicts (of a single seed),
+        ``seeds``, ``steps``, and for each of :data:`~sb3_guard.zoo.results.runs.METRICS`, and
+        ``M_c/<key>`` if the runs have it, its mean, ``_std`` (of the sample; NaN for one
+        seed), ``_low`` and ``_high`` (95 % bootstrap interval of the mean). If the runs have
+        :data:`SAFETY`: their means, ``_se`` (standard error: ``_std`` ÷ √seeds), and the greatest
+        ``cost_max``
+    """
+    groups = runs.groupby(["suite", "algo"], sort=False)
+    stated = runs.filter(regex="^(label|family|limits|cost_limit|verdict)").columns
+    parts = [groups[list(stated)].first(), groups["seed"].nunique()]
+    parts.append(groups["steps"].max())
+    for name in (*METRICS, *runs.filter(regex="^M_c/")):
+        ends = [interval([group.to_numpy()]) for _, group in groups[name]]
+        low, high = np.array(ends).reshape(-1, 2).T
+        part = groups[name].agg(["mean", "std"]).assign(low=low, high=high)
+        parts.append(part.set_axis([name, *(f"{name}_{end}" for end in ("std", "low", "high"))],
+                                   axis=1))  # fmt: skip
+    if "return_last" in runs:
+        parts.append(groups[list(SAFETY)].mean().assign(cost_max=groups["cost_max"].max()))
+        parts.append(groups[list(SAFETY[:2])].sem().add_suffix("_se"))
+    return pd.concat(parts, axis=1).reset_index().rename(columns={"seed": "seeds"})
+
+
+def mean_curve(curves: Sequence[pd.DataFrame], name: str) -> pd.DataFrame:
+    """
+    The mean over seeds of one column of their curves.
+
+    :return: index ``step``, as far as all seeds go; ``mean`` and ``std`` (of the sample)
+    """
+    columns = [curve.set_index("step")[name] for curve in curves]
+    table = pd.concat(columns, axis=1).sort_index().interpolate(method="index", limit_area="inside")
+    table = table.dropna()
+    return pd.DataFrame({"mean": table.mean(axis=1), "std": table.std(axis=1)})
+
+
+# Scores
+
+
+def normalize(rows: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
+    """
+    Scores relative to TRPO's, by the paper's three equations and its rule for negative returns.
+
+    ``reward`` is min(J_r / J_r(TRPO), 1), ``cost`` is M_c / M_c(TRPO), ``cost_rate`` is
+    ρ_c / ρ_c(TRPO), not capped. If any mean return of a suite is negative, the least one less 1 %
+    of their range (if all are equal: less their size) is first subtracted from all returns of the
+    suite.
+
+    :param rows: a table with ``suite``, ``algo`` and the metrics, of means or of runs
+    :param means: the means, of :func:`aggregate`, that TRPO's values and the shift come from;
+        unconstrained baselines do not count for the shift
+    :return: ``rows`` with the scores; NaN where TRPO has no runs or its value is 0
+    """
+    rows = rows.copy()
+    ours = means[compared(means)].groupby("suite")["J_r"]
+    low, high = ours.min(), ours.max()
+    margin = (0.01 * (high - low)).where(high > low, -low)
+    shift = (margin - low).where(low < 0, 0.0)
+    reference = means[means["algo"] == REFERENCE].set_index("suite")
+    for name, score in SCORES.items():
+        offset = rows["suite"].map(shift) if name == "J_r" else 0.0
+        unit = rows["suite"].map(reference[name]) + offset
+        rows[score] = ((rows[name] + offset) / unit.where(unit != 0)).astype(float)
+    rows["reward"] = rows["reward"].clip(upper=1.0)
+    return rows
+
+
+def by_family(scores: pd.DataFrame) -> pd.DataFrame:
+    """
+    Mean scores of each family's algorithms, per suite.
+
+    :param scores: what :func:`normalize` makes of means
+    :return: ``suite``, ``family``, ``algorithms`` (how many), and the scores
+    """
+    table = scores[(scores["family"].fillna("") != "") & (scores["algo"] != REFERENCE)]
+    groups = table.groupby(["suite", "family"], sort=False)
+    means = groups[list(SCORES.values())].mean()
+    means.insert(0, "algorithms", groups["algo"].nunique())
+    return means.reset_index()
+
+
+def overall(runs: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
+    """
+    Scores of each algorithm over all suites.
+
+    :return: ``algo``, ``label``; for each score its mean over suites, ``_n`` (suites that have
+        one), ``_iqm`` (interquartile mean over runs and suites) with ``_low`` and ``_high`` (95 %
+        stratified bootstrap interval)
+    """
+    scores, single = normalize(means, means), normalize(runs, means)
+    order = means.sort_values("algo", key=lambda a: a != REFERENCE, kind="stable")
+    rows: list[dict[str, Any]] = []
+    for algo in dict.fromkeys(order["algo"]):
+        own, each = (table[table["algo"] == algo] for table in (scores, single))
+        row: dict[str, Any] = {"algo": algo, "label": own["label"].iloc[0]}
+        for score in SCORES.values():
+            groups = [group.dropna().to_numpy() for _, group in each.groupby("suite")[score]]
+            values = np.concatenate(groups)
+            low, high = interval(groups, iqm)
+            row |= {score: own[score].mean(), f"{score}_n": int(own[score].notna().sum())}
+            row[f"{score}_iqm"] = iqm(values) if len(values) else math.nan
+            row |= {f"{score}_low": low, f"{score}_high": high}
+        rows.append(row)
+    return pd.DataFrame(rows)

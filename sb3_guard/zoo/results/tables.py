@@ -1,0 +1,253 @@
+"""Tables that read well in a terminal, in Markdown, in LaTeX and on a web page."""
+
+import io
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from io import BufferedRandom
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from sb3_guard.common.files import replacing
+from sb3_guard.costs import verdict
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.cli.markdown import escaped, table
+from sb3_guard.zoo.cli.usage import UsageError, explained
+
+# A column's name, or a function of a row; by heading
+Cell = str | Callable[[Any], str]
+Columns = dict[str, Cell]
+FORMATS = (".md", ".tex", ".csv")
+DIGITS = {"rho_c": 5}
+HEADINGS = {"J_r": "return J_r", "M_c": "episode cost M_c", "rho_c": "cost rate ρ_c"}
+SCORE_HEADINGS = {"reward": "reward / TRPO", "cost": "cost / TRPO", "cost_rate": "rate / TRPO"}
+_LATEX = {"±": r"$\pm$", "−": "$-$", "ρ": r"$\rho$", "–": "--", "\N{NO-BREAK SPACE}": "~"}
+
+
+def terminal(data: pd.DataFrame) -> str:
+    """A table of text that fits the terminal, or 120 columns; intervals have their own lines."""
+    console = Console(width=shutil.get_terminal_size((120, 0)).columns, file=io.StringIO())
+    grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in map(str, data):
+        grid.add_column(name, no_wrap=name in ("suite", "algorithm"))
+    for row in data.astype(str).to_numpy():
+        grid.add_row(*(Text(cell.replace(" [", "\n[")) for cell in row))
+    with console.capture() as captured:
+        console.print(grid)
+    return "\n".join(map(str.rstrip, captured.get().splitlines())).strip("\n")
+
+
+def markdown(data: pd.DataFrame) -> str:
+    """A table of text for a Markdown page."""
+    return table(list(data.columns), data.astype(str).map(escaped).to_numpy().tolist())
+
+
+def latex(data: pd.DataFrame) -> str:
+    """A table of text in LaTeX; it needs ``\\usepackage{booktabs}``."""
+    style = (
+        data.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis=1)
+    )
+    text = style.to_latex(hrules=True, column_format="l" * len(data.columns)).strip()
+    for plain, symbol in _LATEX.items():
+        text = text.replace(plain, symbol)
+    for plain, symbol in ((r"J\_r", "$J_r$"), (r"M\_c", "$M_c$"), (r"$\rho$\_c", r"$\rho_c$")):
+        text = text.replace(f" {plain}", f" {symbol}")
+    return text
+
+
+# Numbers
+
+
+def number(value: Any, digits: int = 2) -> str:
+    """A number with its minus sign, or a dash if there is none."""
+    return "–" if pd.isna(value) else f"{value:,.{digits}f}".replace("-", "−")
+
+
+def spread(value: float, error: float | None, digits: int = 2) -> str:
+    """A number ± its error, which no line break separates from it."""
+    text = number(value, digits)
+    return text if pd.isna(error) else f"{text}\xa0±\xa0{number(error, digits)}"
+
+
+def spelled(data: pd.DataFrame, columns: Columns) -> pd.DataFrame:
+    """
+    A table of text.
+
+    :param columns: by heading: a column's name, or a function of a row
+    """
+    rows = data.to_dict("records")
+
+    def cell(row: Any, column: Cell) -> str:
+        if callable(column):
+            return column(row)
+        value = row[column]
+        return value if isinstance(value, str) else number(value, DIGITS.get(column, 2))
+
+    return pd.DataFrame(
+        {heading: [cell(row, column) for row in rows] for heading, column in columns.items()},
+        columns=list(columns),
+    )
+
+
+def whole(name: str) -> Callable[[Any], str]:
+    """A cell with a number of no decimals."""
+    return lambda row: number(row[name], 0)
+
+
+def _with_interval(name: str, middle: str = "") -> Callable[[Any], str]:
+    """A cell with a value, its standard deviation if there is one, and its interval."""
+    digits = DIGITS.get(name, 2)
+
+    def cell(row: Any) -> str:
+        text = spread(row[name + middle], row.get(f"{name}_std"), digits)
+        low, high = (row[f"{name}_{end}"] for end in ("low", "high"))
+        return text if pd.isna(low) else f"{text} [{number(low, digits)}, {number(high, digits)}]"
+
+    return cell
+
+
+def _limit(row: Any, end: str = "") -> str:
+    """A limit, and whether the mean over seeds keeps it; of one seed, the run's own verdict."""
+    limit, low = row[f"cost_limit{end}"], row.get(f"M_c{end}_low")
+    name = f"{limit:g}" if end else row["limits"]
+    if pd.isna(name):
+        return "–"
+    words = row[f"verdict{end}"]
+    if not pd.isna(low):
+        words = None if pd.isna(limit) else verdict(low, row[f"M_c{end}_high"], limit)
+    return name if pd.isna(words) else f"{name}: {words}"
+
+
+def _limits(means: pd.DataFrame) -> pd.DataFrame:
+    """Where limits are on other costs than the total: a row for each of them."""
+    parts = []
+    for name in map(str, means.filter(regex="^cost_limit/")):
+        end = name.removeprefix("cost_limit")
+        columns: Columns = {
+            "suite": "suite", "algorithm": "label", "cost": lambda row, end=end: end[1:],  # type: ignore[misc]
+            "mean of an episode": _with_interval(f"M_c{end}"),
+            "limit": lambda row, end=end: _limit(row, end),  # type: ignore[misc]
+        }  # fmt: skip
+        parts.append(spelled(means.dropna(subset=[name]), columns))
+    return pd.concat(parts).sort_values("suite", kind="stable") if parts else pd.DataFrame()
+
+
+SAFETY_HEADINGS: Columns = {
+    "return, last epochs": lambda row: spread(row["return_last"], row["return_last_se"]),
+    "cost, last epochs": lambda row: spread(row["cost_last"], row["cost_last_se"]),
+    "above limit, %": lambda row: number(100 * row["above_limit"], 1),
+    "95 % of costs": "cost_p95",
+    "worst cost": "cost_max",
+    "cost of training": whole("cost_total"),
+    "feasible IQM return": "feasible_iqm",
+}
+
+
+def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """
+    The tables of a report as text, by title.
+
+    :param runs: see :func:`~sb3_guard.zoo.results.runs.select`, with the columns of
+        :func:`~sb3_guard.zoo.results.statistics.with_safety`
+    """
+    from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize, overall
+
+    means = aggregate(runs)
+    scores = normalize(means, means)
+    who: Columns = {"suite": "suite", "algorithm": "label"}
+    shown: Columns = {heading: score for score, heading in SCORE_HEADINGS.items()}
+    result = {
+        "Results": spelled(
+            means,
+            {**who, "limit": _limit, "seeds": whole("seeds"), "steps": whole("steps")}
+            | {heading: _with_interval(name) for name, heading in HEADINGS.items()},
+        ),
+        "Limits": _limits(means),
+        "Safety": spelled(means, {**who, **SAFETY_HEADINGS}),
+    }
+    result = {title: table for title, table in result.items() if len(table)}
+    if scores[["reward", "cost"]].isna().all(axis=None):
+        return result
+    result["Relative to TRPO"] = spelled(scores, who | shown)
+    families = by_family(scores)
+    if len(families):
+        columns: Columns = {"suite": "suite", "family": "family", "algorithms": whole("algorithms")}
+        result["Families, relative to TRPO"] = spelled(families, columns | shown)
+    if scores["suite"].nunique() > 1:
+        columns = {"algorithm": "label"}
+        for score, heading in SCORE_HEADINGS.items():
+            columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"  # type: ignore[misc]
+            columns[f"{heading}, IQM"] = _with_interval(score, "_iqm")
+        result["All suites, relative to TRPO"] = spelled(overall(runs, means), columns)
+    return result
+
+
+RUNS: Columns = {
+    "suite": "suite", "algorithm": "label", "seed": whole("seed"), "limit": _limit,
+    "steps": whole("steps"), **{heading: name for name, heading in HEADINGS.items()},
+    "physics errors": whole("physics_errors"), "seconds": whole("seconds"),
+    "commit": lambda row: "–" if pd.isna(row["commit"])
+    else row["commit"][:10] + "-dirty" * row["commit"].endswith("-dirty"),
+    "folder": "path",
+}  # fmt: skip
+
+
+# Files
+
+
+@contextmanager
+def written(path: Path) -> Iterator[BufferedRandom]:
+    """
+    A file that appears complete or not at all, in a folder that is made if need be.
+
+    :raises UsageError: it can't be written
+    """
+    with explained(f"can't write to {str(path)!r}", OSError, fix="choose another place"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as file:
+            yield file
+
+
+def check_table(path: Path) -> None:
+    """
+    Find out before work is done whether a table can be written in the format its name asks for.
+
+    :raises UsageError: the format is unknown
+    """
+    if path.suffix not in FORMATS:
+        raise UsageError(
+            f"--table {str(path)!r}: unknown format {path.suffix!r}; "
+            f"{did_you_mean(path.suffix, FORMATS)}"
+        )
+
+
+def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> None:
+    """
+    Write a table in the format that the file's name says.
+
+    :param path: ``.csv`` gets a row per run; ``.md`` and ``.tex`` the means over
+        seeds and the scores, see :func:`tables`
+    :param runs: with the columns of :func:`~sb3_guard.zoo.results.statistics.with_safety`; for
+        means, those that may be averaged
+    :param notes: what a reader of the means should know; written below them
+    :raises UsageError: see :func:`check_table`; or the file can't be written
+    """
+    check_table(path)
+    parts: list[str] = []
+    if path.suffix == ".md":
+        parts = [f"## {title}\n\n{markdown(one)}" for title, one in tables(runs).items()]
+        parts += ["\n".join(f"- {escaped(note)}" for note in notes)] if notes else []
+    elif path.suffix == ".tex":
+        parts = [f"% {title}\n{latex(one)}" for title, one in tables(runs).items()]
+        parts += ["\n".join(f"% {note}" for note in notes)] if notes else []
+    with written(path) as file:
+        if path.suffix == ".csv":
+            runs.to_csv(file, index=False)
+        else:
+            file.write(("\n\n".join(parts) + "\n").encode())

@@ -1,0 +1,1 @@
+"""One training run: hyperparameters, environments, its folder and its checkpoint."""

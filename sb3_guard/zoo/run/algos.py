@@ -1,0 +1,32 @@
+"""The algorithms that the commands know, by key: this package's, and RL-Zoo's as baselines."""
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_guard.algorithms import ALGORITHMS
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.cli.usage import UsageError
+
+# ARS plays whole episodes in workers of its own, past the monitor that counts costs.
+NOT_HERE = {"ars": "its costs can't be counted; RL-Zoo's own rl_zoo3.train runs it"}
+
+
+def baselines() -> dict[str, type[BaseAlgorithm]]:
+    """RL-Zoo's algorithms by key: unconstrained, with their costs logged; ``trpo`` is ours."""
+    from rl_zoo3.utils import ALGOS
+
+    return {key: ALGOS[key] for key in ALGOS if key not in ALGORITHMS and key not in NOT_HERE}
+
+
+def algorithm(key: str) -> type[BaseAlgorithm]:
+    """
+    The class of an algorithm.
+
+    :raises UsageError: there is none of that name
+    """
+    if key in NOT_HERE:
+        raise UsageError(f"algorithm {key!r} is not available here: {NOT_HERE[key]}")
+    # RL-Zoo, which takes a while to import, is asked only where it must be.
+    table = ALGORITHMS if key in ALGORITHMS else {**ALGORITHMS, **baselines()}
+    if key not in table:
+        raise UsageError(f"unknown algorithm {key!r}; {did_you_mean(key, table)}")
+    return table[key]

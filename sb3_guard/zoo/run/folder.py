@@ -1,0 +1,348 @@
+"""One training run on disk, laid out as RL-Zoo lays it out, and owned by one process at a time."""
+
+import errno
+import glob
+import json
+import math
+import os
+import shlex
+import socket
+import sys
+import tempfile
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from filelock import SoftFileLease, Timeout
+
+from sb3_guard.common.files import replacing
+from sb3_guard.zoo.cli.flags import IDENTITY
+from sb3_guard.zoo.cli.usage import UsageError, explained, one_line, packages_flag, read_mapping
+from sb3_guard.zoo.run.flags import RunFlags
+
+CHECKPOINT = "checkpoint.zip"
+# What the system says when a disk is full, read-only or broken.
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
+# What a result measures: return, episode cost and cost rate; null where no episode has ended.
+MEASURES = ("return", "cost", "cost_rate")
+EPOCH = 30_000  # steps, the paper's; of algorithms whose rollouts are a few steps long
+SILENCE = 120.0  # seconds without a sign of life after which another host takes a lock over
+
+WAIT = 1.2 * SILENCE  # seconds in which such a silence is certainly seen
+
+
+class RunInUse(UsageError):
+    """Another process has the run."""
+
+
+def is_disk_error(error: BaseException | None) -> bool:
+    """Whether an exception, or what caused it, is a full, read-only or broken disk."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+            return True
+        error = error.__cause__
+    return False
+
+
+def plain(value: Any) -> Any:
+    """A value as the files of a run give it back: lists for tuples."""
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    return [plain(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def read_data(path: Path) -> dict[str, Any]:
+    """
+    The plain data of a run's file, RL-Zoo's included.
+
+    :raises UsageError: it can't be read, or is not a mapping
+    """
+    return read_mapping(path, "the run's file", "names to values")
+
+
+def cost_words(result: Mapping[str, Any]) -> str:
+    """The costs of a run as of its ``result.json``, each with its limit: ``cost 27.31 > 25``."""
+    words = []
+    for key, cost in result["costs"].items():
+        mean, limit = cost["mean"], cost["limit"]
+        if mean is not None and limit is not None:
+            words.append(f"{key} {mean:.2f} {'≤' if mean <= limit else '>'} {limit:g}")
+    return ", ".join(words) or f"cost {result['cost']:.2f}"
+
+
+def folder_name(env_id: str) -> str:
+    """An environment id as part of a path: no module prefix, no slashes (RL-Zoo's rule)."""
+    return env_id.rsplit(":", 1)[-1].replace("/", "-")
+
+
+def run_path(log_folder: str, algo: str, env_id: str, number: int) -> Path:
+    """The folder of a run: ``<log folder>/<algo>/<env>_<number>``."""
+    return Path(log_folder) / algo / f"{folder_name(env_id)}_{number}"
+
+
+def claim(parent: Path, name: str, suffix: str = "") -> Path:
+    """
+    Make a folder with the next free number.
+
+    :param parent: the algorithm's folder, which exists
+    :param name: the environment's, see :func:`folder_name`
+    """
+    number = latest_run(parent, name) + 1
+    while True:
+        path = parent / f"{name}_{number}{suffix}"
+        try:
+            # Making the folder claims the number: another process may be here too.
+            path.mkdir()
+            return path
+        except FileExistsError:
+            number += 1
+
+
+def is_run(path: Path) -> bool:
+    """Whether a folder holds a run, rather than nothing yet or what was left half made."""
+    return any(path.glob("*/args.yml"))
+
+
+def require_writable(folder: Path, flag: str) -> None:
+    """
+    Find out whether a folder can be made or written to before work is lost; nothing is left there.
+
+    :param folder: it need not exist yet
+    :param flag: the flag that names it, for the message
+    :raises UsageError: no file can be made in it, or in what exists of the path to it
+    """
+    what = f"{flag}: can't write to folder {str(folder)!r}"
+    with explained(what, OSError, fix="choose another"):
+        whole = folder.absolute()
+        existing = next(one for one in (whole, *whole.parents) if one.exists())
+        # Permission bits mean little to root and on special file systems: only trying tells.
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+
+
+class RunFolder:
+    """
+    The files of one run.
+
+    ``<log folder>/<algo>/<env>_<k>/`` holds ``<env>/config.yml`` (hyper-parameters),
+    ``<env>/args.yml`` (flags), ``<env>/command.txt``, ``0.monitor.csv``, ``progress.csv``,
+    ``evaluations.npz``, ``best_model.zip``, ``rl_model_<steps>_steps.zip`` if asked for, the final
+    model ``<env>.zip``, ``checkpoint.zip`` to resume from, and, once the run is complete,
+    ``result.json``.
+
+    :param path: the folder
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        arguments = sorted(path.glob("*/args.yml"))
+        if len(arguments) != 1:
+            raise UsageError(f"{path} is not a run folder: it should hold one <env>/args.yml")
+        self.params = arguments[0].parent
+        self.name = self.params.name
+        #: the csv of all training episodes
+        self.monitor = path / "0.monitor.csv"
+        #: what a killed run resumes from
+        self.checkpoint = path / CHECKPOINT
+        #: the final model, and its observation statistics if it was trained with VecNormalize
+        self.model, self.normalizer = path / f"{self.name}.zip", self.params / "vecnormalize.pkl"
+        #: written last: its presence says that the run is complete
+        self.result = path / "result.json"
+
+    @classmethod
+    def create(
+        cls,
+        flags: RunFlags,
+        hyperparams: Mapping[str, Any],
+        command: str,
+        path: Path | None = None,
+    ) -> "RunFolder":
+        """
+        Take a folder and write down what the run is.
+
+        :param flags: all flags
+        :param hyperparams: all hyper-parameters, plain data
+        :param command: the command line
+        :param path: its folder, on which the caller has :func:`lock`; None: the next free number
+        :raises UsageError: the folder can't be written to, or there is more than plain data
+        """
+        name = folder_name(flags.env)
+        files = _dump(flags.values(), hyperparams)
+        parent = Path(flags.log_folder) / flags.algo
+        suffix = f"_{uuid.uuid4()}" if flags.uuid else ""
+        what = f"can't write to log folder {flags.log_folder!r}"
+        with explained(what, OSError, fix="choose another with -f"):
+            parent.mkdir(parents=True, exist_ok=True)
+            path = path or claim(parent, name, suffix)
+            params = path / name
+            params.mkdir(parents=True, exist_ok=True)
+            (params / "command.txt").write_text(command, encoding="utf-8")
+            _write(params, files)
+        return cls(path)
+
+    @classmethod
+    def open(cls, path: str | Path) -> "RunFolder":
+        """
+        The run in a folder, or the one that a ``checkpoint.zip`` belongs to.
+
+        :raises UsageError: it is not there, or it is not a run
+        """
+        path = Path(path)
+        if not path.exists():
+            raise UsageError(f"there is no run folder or file {path}")
+        return cls(path if path.is_dir() else path.parent)
+
+    def args(self) -> dict[str, Any]:
+        """The flags the run was started with."""
+        return read_data(self.params / "args.yml")
+
+    def flags(self) -> RunFlags:
+        """
+        The flags the run was started with: all of them, since one guessed would be another run.
+
+        :raises UsageError: one is absent, or has a value that it can't have
+        """
+        saved = self.args()
+        absent = sorted(RunFlags.names() - saved.keys())
+        try:
+            if absent:
+                raise UsageError(f"args.yml: there is no {', '.join(absent[:4])}")
+            return RunFlags.read(saved, "args.yml")
+        except UsageError as error:
+            raise UsageError(
+                f"{self.params / 'args.yml'} is damaged ({one_line(error)}); put the file back as "
+                "it was, or start a new run without -i"
+            ) from error
+
+    def what(self) -> dict[str, Any]:
+        """What makes the run the run it is: flags of that role, and hyper-parameters."""
+        args = self.args()
+        return {**{name: args.get(name) for name in RunFlags.names(IDENTITY)}, **self.hyperparams()}
+
+    def hyperparams(self) -> dict[str, Any]:
+        """The hyper-parameters the run was started with."""
+        return read_data(self.params / "config.yml")
+
+    def events(self, flags: RunFlags) -> Path:
+        """The folder of its TensorBoard events, with its number: a resumed run finds it again."""
+        name = f"{flags.algo}{self.path.name[len(self.name) :]}"
+        return Path(flags.tensorboard_log or "runs") / self.name / name
+
+    def again(self, flags: RunFlags) -> str:
+        """The flags of ``train`` that continue the run, for messages."""
+        return f"-i {shlex.quote(str(self.path))}{packages_flag(flags.gym_packages)}"
+
+    def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
+        """Replace what :meth:`create` wrote, e.g. to make a finished run longer."""
+        _write(self.params, _dump(args, hyperparams))
+
+    def write_result(self, result: Mapping[str, Any]) -> None:
+        """Mark the run as complete."""
+        with replacing(self.result) as file:
+            file.write(json.dumps(result, indent=2).encode())
+
+    def checked_result(self) -> dict[str, Any]:
+        """
+        The result of a complete run.
+
+        :raises UsageError: there is none, or it is damaged
+        """
+        fix = f"sb3-guard train -i {self.path} writes it again"
+        with explained("result.json is damaged", fix=fix):
+            result: dict[str, Any] = json.loads(self.result.read_bytes())
+            for key, value in {key: result[key] for key in ("n_timesteps", *MEASURES)}.items():
+                if value is not None and not math.isfinite(value):
+                    raise ValueError(f"{key} = {value!r} should be a number")
+        if "costs" not in result:  # as older versions wrote it: of several costs only the total
+            limit = result.get("cost_limit")
+            bounded = None if "limit_on" in result else result["cost"]
+            limit = None if isinstance(limit, list) else limit
+            result["costs"] = {"cost": {"mean": bounded, "limit": limit}}
+        return result
+
+    def read_result(self) -> dict[str, Any] | None:
+        """The result of a complete run; None if there is none, or it is damaged."""
+        try:
+            return self.checked_result()
+        except UsageError:
+            return None
+
+
+@contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """
+    Hold a run's lock, so that no other process writes to it meanwhile.
+
+    The lock of a process that died here is taken over immediately. That of another host shows signs
+    of life; it is taken over after a long silence, for which this waits.
+
+    :param folder: it exists, and is a run or about to become one
+    :raises RunInUse: another process has it
+    :raises UsageError: the folder can't be written to
+    """
+    path = folder / ".lock"
+    holder = owner(folder)
+    elsewhere = holder.get("host", socket.gethostname()) != socket.gethostname()
+    lease = SoftFileLease(path, lease_duration=SILENCE, on_compromise=_lost, is_singleton=False)
+    if elsewhere:
+        print(f"{folder} has a lock of {holder['host']}: waiting for a sign of life of its process")
+    with explained(f"can't write to {folder}", OSError):
+        try:
+            lease.acquire(timeout=WAIT if elsewhere else 0)
+        except Timeout:
+            holder = owner(folder)
+            raise RunInUse(
+                f"{folder} is in use by process {holder.get('pid')} on {holder.get('host')}; "
+                f"if that is gone, remove {path}"
+            ) from None
+    try:
+        yield
+    finally:
+        lease.release()
+
+
+def owner(folder: Path) -> dict[str, str]:
+    """Who has the lock of a run, or had it when it died: ``host``, ``pid``; empty: nobody."""
+    try:
+        lines = (folder / ".lock").read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return {}
+    return {key: value for key, _, value in (line.partition("=") for line in lines) if value}
+
+
+def _lost(compromise: Any) -> None:
+    """End the process, which slept so long that another host took its run over."""
+    print(
+        f"{compromise.lock_file} was taken over while this process gave no sign of life; "
+        "it ends here",
+        file=sys.stderr,
+        flush=True,
+    )
+    os._exit(1)
+
+
+def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, bytes]:
+    """The configuration files, by name."""
+    fix = "write classes and calls as text, such as policy_kwargs: dict(activation_fn=nn.ReLU)"
+    files = {}
+    for name, content in (("config.yml", hyperparams), ("args.yml", args)):
+        with explained(f"{name} can hold plain data only", yaml.YAMLError, fix=fix):
+            files[name] = yaml.safe_dump(dict(content)).encode()
+    return files
+
+
+def _write(params: Path, files: Mapping[str, bytes]) -> None:
+    # args.yml is what makes a folder a run, so it comes last.
+    for name, content in files.items():
+        with replacing(params / name) as file:
+            file.write(content)
+
+
+def latest_run(parent: Path, name: str) -> int:
+    """The greatest number of the runs of an environment, 0 if there is none."""
+    from rl_zoo3.utils import get_latest_run_id
+
+    return int(get_latest_run_id(glob.escape(str(parent)), name))

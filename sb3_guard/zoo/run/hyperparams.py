@@ -1,0 +1,317 @@
+"""Hyper-parameters as data: found, merged, checked, and turned into what constructors take.
+
+They are RL-Zoo's files: ``hyperparams/<algo>.yml`` with a ``default`` entry, entries for single
+environments or patterns of them (``Safety*``), and YAML anchors. What is read stays plain data, so
+that the run folder's ``config.yml`` says exactly what was used; only :func:`build` makes objects of
+it.
+"""
+
+import importlib
+import inspect
+import runpy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import BaseBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import (
+    ActionNoise,
+    NormalActionNoise,
+    OrnsteinUhlenbeckActionNoise,
+)
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_guard.algorithms.common.arguments import signature
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.cli.names import PRESETS, classes, evaluate, import_class
+from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
+from sb3_guard.zoo.cli.values import kind_of
+
+# What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
+# `selection_limit` is ours (see CostEvalCallback).
+RUN_KEYS: dict[str, Any] = {
+    "n_timesteps": int,
+    "n_envs": int,
+    "normalize": bool | str | dict,
+    "frame_stack": int | None,
+    "env_kwargs": dict | None,
+    "env_wrapper": str | list | dict | None,
+    "vec_env_wrapper": str | list | dict | None,
+    "callback": str | list | dict | None,
+    "monitor_kwargs": dict | str,
+    "selection_limit": float | list[float] | None,
+}
+N_TIMESTEPS = 1_000_000  # the length of training where neither a file nor a flag says
+# RL-Zoo's two for the exploration noise of off-policy algorithms.
+NOISE_KEYS: dict[str, Any] = {
+    "noise_type": Literal["normal", "ornstein-uhlenbeck"] | None,
+    "noise_std": float,
+}
+# Arguments of an algorithm that are flags of the command.
+FLAGS = {"env": "--env", "seed": "--seed", "device": "--device", "verbose": "--verbose"}
+NOT_HYPERPARAMETERS = {*FLAGS, "self", "tensorboard_log", "_init_setup_model", "policy_base"}
+
+
+def hyperparams_folder() -> Path:
+    """Where the shipped files are: inside an installed package, beside it in a checkout."""
+    package = Path(__file__).parents[2]
+    inside = package / "hyperparams"
+    return inside if inside.is_dir() else package.parent / "hyperparams"
+
+
+def read_file(path: str | Path) -> dict[str, Any]:
+    """
+    The content of a hyper-parameter file: environment (or ``default``) to hyper-parameters.
+
+    :param path: a YAML file, or a Python file or module that has a dictionary ``hyperparams``
+    :raises UsageError: it is absent, not readable or not of that form
+    """
+    name = str(path)
+    form = (
+        "environments, or 'default', to hyper-parameters ('default:' and below it lines such as "
+        "'  n_steps: 1000')"
+    )
+    if name.endswith((".yml", ".yaml")):
+        content = read_mapping(name, "hyper-parameter file", form)
+    else:
+        fix = f"give a .yml file, a Python file or module, or {' or '.join(map(repr, PRESETS))}"
+        with explained(f"can't read hyper-parameters from {name}", fix=fix):
+            python = name.endswith(".py")
+            module = runpy.run_path(name) if python else vars(importlib.import_module(name))
+        content = module.get("hyperparams", {None: None})
+    if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
+        raise UsageError(f"{name} must map {form}")
+    for entry, values in content.items():
+        for key in values:
+            if not isinstance(key, str):
+                raise UsageError(f"{name}: {key!r} below {entry!r} is not a name but a value")
+    return content
+
+
+def shipped_file(algo: str) -> Path:
+    """The hyper-parameter file of an algorithm: ours, else RL-Zoo's."""
+    ours = hyperparams_folder() / f"{algo}.yml"
+    if ours.is_file():
+        return ours
+    import rl_zoo3
+
+    theirs = Path(rl_zoo3.__file__).parent / "hyperparams" / f"{algo}.yml"
+    return theirs if theirs.is_file() else ours
+
+
+def preset(name: str, algo: str, env_id: str) -> dict[str, Any]:
+    """
+    The hyperparameters in which a preset differs from the shipped file of an algorithm.
+
+    :param name: one of ``PRESETS``; below ``all``, its file has entries like those of a
+        hyperparameter file, and below the key of an algorithm what is different for that one
+    :raises UsageError: the algorithm is not in it
+    """
+    content = read_file(hyperparams_folder() / f"{name}.yml")
+    common = entry(content.pop("all", {}), env_id) or {}
+    if algo not in content:
+        raise UsageError(
+            f"-conf {name}: {algo!r} is not in {PRESETS[name]}; {did_you_mean(algo, content)}"
+        )
+    return {**common, **content[algo]}
+
+
+def read_hyperparams(
+    algo: str, env_id: str, conf_file: str | None = None, overrides: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """
+    The hyper-parameters of an algorithm on an environment, sorted by name, not yet checked.
+
+    :param algo: key of the algorithm, names the shipped file
+    :param env_id: its own entry is taken, with or without a version, else the first pattern that
+        fits, else ``default``
+    :param conf_file: file to read instead of the shipped one, or a preset: ``paper`` for the
+        paper's table, ``omnisafe`` for OmniSafe's published settings
+    :param overrides: what the command line says
+    :raises UsageError: the file can't be read, or has no entry that fits
+    """
+    changes = preset(conf_file, algo, env_id) if conf_file in PRESETS else {}
+    path = shipped_file(algo) if conf_file is None or conf_file in PRESETS else conf_file
+    # An algorithm of a user has no shipped file; its own defaults serve.
+    own = conf_file is None and not Path(path).is_file()
+    content: dict[str, Any] = {"default": {}} if own else read_file(path)
+    values = entry(content, env_id)
+    if values is None:
+        raise UsageError(
+            f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
+        )
+    return dict(sorted({**values, **changes, **(overrides or {})}.items()))
+
+
+def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] | None:
+    """The entry of a file that an environment takes; None: there is none."""
+    env_id = env_id.rpartition(":")[2]  # without the module that registers it
+    patterns = (name for name in content if "*" in name and fnmatchcase(env_id, name))
+    for name in (env_id, env_id.rsplit("-v", 1)[0], *patterns, "default"):
+        if name in content:
+            return content[name]
+    return None
+
+
+def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
+    """The hyper-parameters an algorithm takes, from its constructor and those it hands on to."""
+    found = signature(algorithm, getattr(algorithm, "fixed_arguments", frozenset())).parameters
+    return {name: one for name, one in found.items() if name not in NOT_HYPERPARAMETERS}
+
+
+def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
+    """The hyper-parameters that runs of an algorithm may have: name to type annotation."""
+    known = {
+        name: Any if one.annotation is one.empty else one.annotation
+        for name, one in parameters(algorithm).items()
+    }
+    return {**known, **RUN_KEYS, **(NOISE_KEYS if "action_noise" in known else {})}
+
+
+def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    The same hyper-parameters with numbers in their proper type, or an error that says what to mend.
+
+    :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, a
+        NaN, or a count below 1
+    """
+    known = annotations(algorithm)
+    checked = {}
+    for name, value in values.items():
+        if name in FLAGS:
+            raise UsageError(f"{name!r} is not a hyper-parameter; use the flag {FLAGS[name]}")
+        if name not in known:
+            raise UsageError(
+                f"{algo} has no hyper-parameter {name!r}; {did_you_mean(name, sorted(known))}"
+            )
+        words, make = kind_of(known[name])
+        try:
+            checked[name] = make(value)
+        except TypeError:
+            raise UsageError(
+                f"hyper-parameter {name}: {value!r} is not allowed; it must be {words}"
+            ) from None
+    if isinstance(checked.get("env_kwargs"), str):
+        checked["env_kwargs"] = evaluate("env_kwargs", checked["env_kwargs"])
+    checked.setdefault("n_envs", 1)
+    checked.setdefault("n_timesteps", N_TIMESTEPS)
+    aliases = algorithm.policy_aliases
+    policy = checked.setdefault("policy", next(iter(aliases)))  # MlpPolicy, or its recurrent twin
+    if isinstance(policy, str) and "." not in policy and policy not in aliases:
+        raise UsageError(
+            f"{algo} has no policy {policy!r}; {did_you_mean(policy, aliases)}, "
+            "or the dotted name of a class"
+        )
+    for name in ("n_envs", "n_timesteps", "n_steps", "batch_size", "frame_stack"):
+        value = checked.get(name)
+        if isinstance(value, int) and value < 1:
+            raise UsageError(
+                f"hyper-parameter {name}: {value} is not allowed; it must be at least 1"
+            )
+    return dict(sorted(checked.items()))
+
+
+@dataclass
+class Setup:
+    """
+    Hyper-parameters as objects, ready for the constructors.
+
+    :param model: arguments of the algorithm
+    :param n_envs: number of parallel environments
+    :param n_timesteps: length of training, steps of all environments together
+    :param normalize: arguments of VecNormalize; None: not used
+    :param frame_stack: number of stacked observations; None: not used
+    :param env_kwargs: arguments of the environment
+    :param env_wrapper: classes that wrap each single environment, and their arguments
+    :param vec_env_wrapper: those that wrap the vectorised environment
+    :param monitor_kwargs: arguments of the monitor
+    :param callback: names of callbacks; :meth:`callbacks` makes them
+    :param selection_limit: see CostEvalCallback
+    :param noise_type: kind of exploration noise; None: none
+    :param noise_std: its standard deviation, in the units of the actions
+    """
+
+    model: dict[str, Any]
+    n_envs: int
+    n_timesteps: int
+    normalize: dict[str, Any] | None = None
+    frame_stack: int | None = None
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_wrapper: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
+    vec_env_wrapper: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
+    monitor_kwargs: dict[str, Any] = field(default_factory=dict)
+    callback: Any = None
+    selection_limit: float | list[float] | None = None
+    noise_type: str | None = None
+    noise_std: float = 0.0
+
+    def callbacks(self) -> list[BaseCallback]:
+        """
+        The callbacks, made only where somebody trains.
+
+        :raises UsageError: one is not there, not a callback, or refuses its arguments
+        """
+        found = classes("callback", self.callback)
+        with explained("a callback can't be made"):
+            return [cls(**kwargs) for cls, kwargs in found]
+
+    def action_noise(self, actions: int) -> ActionNoise | None:
+        """
+        Exploration noise, as the hyper-parameters ``noise_type`` and ``noise_std`` say.
+
+        :param actions: number of action dimensions
+        """
+        if self.noise_type is None:
+            return None
+        mean, std = np.zeros(actions), np.full(actions, self.noise_std)
+        if self.noise_type == "normal":
+            return NormalActionNoise(mean, std)
+        return OrnsteinUhlenbeckActionNoise(mean, std)
+
+
+def build(values: Mapping[str, Any]) -> Setup:
+    """
+    Make objects of checked hyper-parameters: schedules, classes, wrappers.
+
+    :raises UsageError: text that should name a class or be an expression does not
+    """
+    not_models = {**RUN_KEYS, **NOISE_KEYS}
+    model = {name: value for name, value in values.items() if name not in not_models}
+    for name, value in model.items():
+        if name == "policy":
+            if "." in value:
+                model[name] = import_class(name, value, BasePolicy)
+        elif isinstance(value, str) and value.startswith("lin_") and name != "cost_limit":
+            model[name] = _schedule(name, value)
+        elif isinstance(value, str) and value.startswith("dict("):
+            model[name] = evaluate(name, value)
+        elif name == "train_freq" and isinstance(value, list):
+            model[name] = tuple(value)
+        elif isinstance(value, str) and name.endswith("_class"):
+            model[name] = import_class(name, value, BaseBuffer)
+    run = {n: value for n, value in values.items() if n in not_models and value is not None}
+    for name in ("normalize", "monitor_kwargs"):
+        if isinstance(run.get(name), str):
+            run[name] = evaluate(name, run[name])
+    if run.get("normalize"):
+        # Returns are scaled by the discount they are learned with.
+        learned = {"gamma": values["gamma"]} if "gamma" in values else {}
+        run["normalize"] = {**learned, **({} if run["normalize"] is True else run["normalize"])}
+    else:
+        run["normalize"] = None
+    for name in ("env_wrapper", "vec_env_wrapper"):
+        run[name] = classes(name, run.get(name))
+    return Setup(model, **run)
+
+
+def _schedule(name: str, value: str) -> Callable[[float], float]:
+    from rl_zoo3 import linear_schedule
+
+    what = f"hyper-parameter {name}: {value!r} is not a schedule"
+    with explained(what, ValueError, fix="write e.g. lin_0.001"):
+        return linear_schedule(value.removeprefix("lin_"))

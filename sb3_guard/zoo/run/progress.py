@@ -1,0 +1,237 @@
+"""What a person watching a run wants to see: how far it is, how well it does, how safely."""
+
+import platform
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from tqdm import tqdm
+
+import sb3_guard
+from sb3_guard.algorithms.common.limits import limits_at
+from sb3_guard.common.evaluation import estimate
+from sb3_guard.common.monitor import find_monitor
+from sb3_guard.costs import read_costs, verdict
+from sb3_guard.zoo.run.folder import EPOCH, cost_words
+
+PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")
+
+
+def commit() -> str | None:
+    """
+    The git commit that this package's code is at, followed by ``-dirty`` if it was changed since.
+
+    :return: None if the code is not under git, as when it was installed
+    """
+    git = ["git", "-C", str(Path(sb3_guard.__file__).parent)]
+    describe = "describe --always --dirty --abbrev=40 --exclude=*".split()
+    options: dict[str, Any] = {"capture_output": True, "text": True, "check": True, "timeout": 20}
+    try:
+        # A virtual environment inside somebody's checkout is not part of that checkout.
+        subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], **options)
+        return str(subprocess.run([*git, *describe], **options).stdout.strip())
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def provenance() -> dict[str, Any]:
+    """What a result was made with: ``versions`` of what is there, git ``commit``, ``platform``."""
+    versions = {"sb3_guard": sb3_guard.__version__, "python": platform.python_version()}
+    for package in PACKAGES:
+        with suppress(metadata.PackageNotFoundError):  # the algorithms train without MuJoCo, too
+            versions[package] = metadata.version(package)
+    return {"versions": versions, "commit": commit(), "platform": platform.platform()}
+
+
+class Epochs(BaseCallback):
+    """
+    Collect the episodes of each epoch, and show them on a progress bar.
+
+    The paper's figures of merit are means over the episodes that ended in the final *epoch*, the
+    final rollout; :meth:`result` has them. Off-policy algorithms, whose rollouts are too short to
+    end many episodes, have epochs of 30,000 steps.
+
+    :param total: steps at which training ends
+    :param bar: show a progress bar on stderr
+    """
+
+    def __init__(self, total: int, bar: bool = False):
+        super().__init__()
+        self.total = total
+        self.show = bar
+        self.bar: Any = None
+        # step at which it ended, return, cost, length, and what the m limits bound: the episodes
+        # of the epoch under way
+        self._episodes: list[list[float]] = []
+        #: the same without the step, of the last epoch in which any ended, [E, 3 + m]
+        self.last = np.zeros((0, 4))
+        # highest costs of a step in the episodes under way, [n_envs, m], where limits bound those
+        self._worst: Any = 0.0
+        # Taken now: what lies on disk may change while the run continues.
+        self._provenance = provenance()
+        #: steps after each part of the run that was to be shorter than it came to be
+        self.learned: list[int] = []
+        self._seconds = 0.0  # of the processes before this one
+        self._began: float | None = None
+
+    def _on_training_start(self) -> None:
+        self._began = time.monotonic()
+        if self.show:
+            self.bar = tqdm(
+                total=self.total,
+                initial=self.model.num_timesteps,
+                unit=" steps",
+                unit_scale=True,
+                dynamic_ncols=True,
+                file=sys.stderr,
+            )
+            self._describe()
+
+    def _on_rollout_start(self) -> None:
+        if not isinstance(self.model, OffPolicyAlgorithm):
+            self._episodes = []
+
+    def _on_step(self) -> bool:
+        dones, infos, limits_worst = self.locals["dones"], self.locals["infos"], self._limits_worst
+        if limits_worst:
+            costs, _ = read_costs(infos, self._keys, zero_if_missing=True)
+            self._worst = np.maximum(self._worst, costs)
+        for i in np.flatnonzero(dones):
+            episode = infos[i].get("episode")
+            if episode is not None:
+                bounded = [episode.get(f"c_{key}", episode["c"]) for key in self._keys]
+                if limits_worst:
+                    bounded = self._worst[i].tolist()
+                of_all = [episode[name] for name in "rcl"]
+                self._episodes.append([self.model.num_timesteps, *of_all, *bounded])
+        if limits_worst:
+            self._worst[dones] = 0.0
+        if self.bar is not None:
+            self.bar.update(self.model.num_timesteps - self.bar.n)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if isinstance(self.model, OffPolicyAlgorithm):
+            begin = self.model.num_timesteps - EPOCH
+            self._episodes = [episode for episode in self._episodes if episode[0] > begin]
+        if self._episodes:
+            self.last = np.array(self._episodes)[:, 1:]
+            self._describe()
+        errors = find_monitor(self.training_env).physics_errors
+        if errors:
+            self.logger.record("rollout/physics_errors", errors)
+
+    def _on_training_end(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+            self.bar = None
+
+    def _describe(self) -> None:
+        if self.bar is not None and len(self.last):
+            earned, cost = self.last[:, :2].mean(axis=0)
+            self.bar.set_postfix_str(
+                f"return {earned:.2f}, {cost_words({'cost': cost, 'costs': self._costs()})}, "
+                f"rate {self._cost_rate():.4f}"
+            )
+
+    @property
+    def _keys(self) -> tuple[str, ...]:
+        return tuple(getattr(self.model, "cost_keys", ("cost",)))
+
+    @property
+    def _limits_worst(self) -> bool:
+        return getattr(self.model, "limit_on", "sum") == "max"
+
+    def _cost_rate(self) -> float | None:
+        monitor = find_monitor(self.training_env)
+        return monitor.total_cost / monitor.total_steps if monitor.total_steps else None
+
+    def _costs(self) -> dict[str, dict[str, Any]]:
+        """Mean of what its limit bounds, and limit, by cost key."""
+        model: Any = self.model
+        constrained = getattr(model, "constrained", False)
+        limits = model.final_cost_limits.tolist() if constrained else [None] * len(self._keys)
+        means = self.last[:, 3:].mean(axis=0).tolist() if len(self.last) else [None] * len(limits)
+        rows = zip(self._keys, means, limits, strict=True)
+        return {key: {"mean": mean, "limit": limit} for key, mean, limit in rows}
+
+    def _verdicts(self) -> dict[str, dict[str, Any]]:
+        """The same with the 95 % interval of the mean, and whether the limit is kept."""
+        costs = self._costs()
+        for cost, episodes in zip(costs.values(), self.last[:, 3:].T, strict=False):
+            interval = estimate(episodes)
+            if not np.isnan(interval.low):
+                cost |= {"low": interval.low, "high": interval.high}
+                if cost["limit"] is not None:
+                    cost["verdict"] = verdict(interval.low, interval.high, cost["limit"])
+        return costs
+
+    def result(self) -> dict[str, Any]:
+        """
+        J_r, M_c and ρ_c as the paper defines them, and what they were obtained with.
+
+        :return: ``label`` and ``family`` that the algorithm's class states (None: it states none),
+            ``return``, ``cost`` and ``length``, means over the episodes of the last epoch in
+            which any ended (None if none did), their number ``episodes``, ``costs``, for each
+            cost key the ``mean`` of what its limit bounds, the 95 % interval of that mean
+            (``low``, ``high``), the ``limit`` (None: unconstrained) and the ``verdict``, "kept",
+            "exceeded" or "undecided" (without interval and verdict if fewer than two episodes
+            ended), ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the
+            number of episodes that ended because the physics diverged, ``cost_limit`` (None:
+            unconstrained), ``limit_on`` of an algorithm that limits the worst step,
+            ``seconds`` of training, and :func:`provenance`. ``learned``, absent from a straight
+            run, is the steps at which it was made longer, since warm-up and schedules were those
+            of shorter runs until then
+        """
+        monitor = find_monitor(self.training_env)
+        means = self.last[:, :3].mean(axis=0).tolist() if len(self.last) else [None] * 3
+        constrained = getattr(self.model, "constrained", False)
+        limit = limits_at(getattr(self.model, "cost_limit", None), 0.0) if constrained else None
+        algorithm = type(self.model)
+        return {
+            "label": getattr(algorithm, "label", None),
+            "family": getattr(algorithm, "family", None),
+            **dict(zip(("return", "cost", "length"), means, strict=True)),
+            "costs": self._verdicts(),
+            "cost_rate": self._cost_rate(),
+            "episodes": len(self.last),
+            "n_timesteps": self.model.num_timesteps,
+            "physics_errors": monitor.physics_errors,
+            "cost_limit": limit,
+            **({"limit_on": "max"} if self._limits_worst else {}),
+            "seconds": round(self._elapsed(), 3),
+            **({"learned": self.learned} if self.learned else {}),
+            **self._provenance,
+        }
+
+    def _elapsed(self) -> float:
+        return self._seconds + (0 if self._began is None else time.monotonic() - self._began)
+
+    def state(self) -> dict[str, Any]:
+        """What a resumed run needs to tell the same result."""
+        return {
+            "last": self.last,
+            "episodes": self._episodes,
+            "worst": self._worst,
+            "seconds": self._elapsed(),
+            "total": self.total,
+            "steps": self.model.num_timesteps,
+            "learned": self.learned,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state`."""
+        if "worst" in state:  # else it knows no costs by key: the epoch begins anew
+            self.last, self._worst = state["last"], state["worst"]
+            self._episodes = list(state["episodes"])
+        self._seconds = state["seconds"]
+        self.learned = list(state["learned"])
+        if state["total"] != self.total:
+            self.learned.append(state["steps"])

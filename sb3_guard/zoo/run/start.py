@@ -1,0 +1,237 @@
+"""Runs that begin, runs of a grid that are brought to their end, and runs that are resumed."""
+
+import dataclasses
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_guard.zoo.cli.flags import HOST, IDENTITY
+from sb3_guard.zoo.cli.names import require_named
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
+from sb3_guard.zoo.cli.values import is_data
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.checkpoint import is_checkpoint, read_checkpoint
+from sb3_guard.zoo.run.experiment import Experiment
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import CHECKPOINT, RunFolder, is_run, lock, plain, run_path
+from sb3_guard.zoo.run.hyperparams import check, parameters, read_hyperparams
+from sb3_guard.zoo.run.make_envs import full_id, source_of
+from sb3_guard.zoo.run.training import Training
+
+
+def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
+    """
+    What a new run is: all its flags and hyper-parameters, as its folder will state them.
+
+    :return: flags and hyper-parameters, checked as far as that goes without making anything
+    :raises UsageError: anything is wrong with them
+    """
+    flags = dataclasses.replace(flags)
+    import_packages(flags.gym_packages)  # which may register algorithms, too
+    cls = algorithm(flags.algo)
+    source = source_of(flags.env)
+    flags.env = str(source.env_id)
+    if flags.seed < 0:
+        flags.seed = int(np.random.default_rng().integers(2**31))
+    overrides = dict(flags.hyperparams or {})
+    if flags.n_timesteps > 0:
+        overrides["n_timesteps"] = flags.n_timesteps
+    values = check(
+        flags.algo, cls, read_hyperparams(flags.algo, flags.env, flags.conf_file, overrides)
+    )
+    if getattr(cls, "constrained", False) and "cost_limit" not in values:
+        raise UsageError(
+            f"no cost limit is known for {flags.env}: give cost_limit, the highest cost of an "
+            "episode that you accept, such as half of what an episode costs PPO "
+            "(-params cost_limit:25)"
+        )
+    if flags.env_kwargs:
+        values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
+    # What wraps single environments needs single ones.
+    native = source.batch is not None and values.get("env_wrapper") is None
+    flags.vec_env = flags.vec_env or ("native" if native else "dummy")
+    return flags, values
+
+
+def start(flags: RunFlags) -> int:
+    """
+    Start a new run.
+
+    :return: exit status
+    :raises UsageError: anything is wrong with the flags; nothing has been written then
+    """
+    flags, values = prepare(flags)
+    training = Training(Experiment(flags, values))
+    try:
+        folder = RunFolder.create(flags, values, shlex.join(sys.orig_argv))
+    except UsageError:
+        training.close()
+        raise
+    with lock(folder.path):
+        return training.train(folder)
+
+
+def path_of(flags: RunFlags) -> Path:
+    """The folder of a run of a grid, whose number is its seed's."""
+    return run_path(flags.log_folder, flags.algo, flags.env, flags.seed + 1)
+
+
+def standing(flags: RunFlags, values: Mapping[str, Any]) -> str:
+    """
+    How far a run of a grid is: ``new``, ``done``, or to ``resume``.
+
+    :param flags: as :func:`prepare` returns them
+    :param values: its hyper-parameters, likewise
+    :raises UsageError: its folder holds another run, or is damaged
+    """
+    path = path_of(flags)
+    if not is_run(path):
+        return "new"
+    folder = RunFolder(path)
+    found = differences(folder.what(), plain({**flags.values(IDENTITY), **values}))
+    if found:
+        said = [f"{name}: {a} there, {b} here" for name, a, b in found[:3]]
+        raise UsageError(
+            f"{path} holds another run ({'; '.join(said)}); choose another folder with -f"
+        )
+    if folder.read_result() is not None:
+        return "done"
+    # Without a checkpoint nothing of it is worth keeping, and it restarts in its place.
+    return "resume" if folder.checkpoint.exists() else "new"
+
+
+def complete(
+    flags: RunFlags, values: Mapping[str, Any], command: str, asked_to_stop: Callable[[], bool]
+) -> int:
+    """
+    Bring a run of a grid to its end: start it, or continue it from where it was cut.
+
+    :param flags: as :func:`prepare` returns them
+    :param values: its hyper-parameters, likewise
+    :param command: the command line it is part of
+    :param asked_to_stop: when it says so, training ends after the rollout under way
+    :return: exit status, 0 if it is complete, now or already before
+    :raises RunInUse: another process has the run
+    :raises UsageError: it can't be trained, or the folder holds another run
+    """
+    import_packages(flags.gym_packages)
+    path = path_of(flags)
+    with explained(f"can't make folder {path}", OSError):
+        path.mkdir(parents=True, exist_ok=True)
+    with lock(path):
+        state = standing(flags, values)
+        if state == "done":
+            return 0
+        made = is_run(path)
+        folder = RunFolder(path) if made else RunFolder.create(flags, values, command, path)
+        quiet = dataclasses.replace(flags, progress=False, verbose=0)
+        begun = folder if state == "resume" else None
+        return Training(Experiment(quiet, values, begun)).train(folder, asked_to_stop)
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """What differs between two runs: name and both values, ``none`` for those that are absent."""
+
+    def shown(value: Any) -> Any:
+        return "none" if value in ("", None) else value
+
+    return [
+        (name, shown(there.get(name)), shown(here.get(name)))
+        for name in sorted({*there, *here})
+        if there.get(name) != here.get(name)
+    ]
+
+
+def continues_run(agent: str) -> bool:
+    """
+    Whether ``-i path`` means a run to continue, rather than a model to begin from.
+
+    :raises UsageError: it is neither
+    """
+    path = Path(agent)
+    if path.is_dir() or path.name == CHECKPOINT or is_checkpoint(path):
+        return True
+    if not path.is_file():
+        raise UsageError(f"-i: there is no run folder or model {agent!r}")
+    return False
+
+
+def resume(given: RunFlags) -> int:
+    """
+    Continue a run in its folder.
+
+    :param given: the flags given now; ``trained_agent`` is the run's folder or checkpoint
+    :return: exit status
+    :raises UsageError: the run can't be continued, or a flag contradicts what it is
+    """
+    folder = RunFolder.open(given.trained_agent)
+    with lock(folder.path):
+        flags, values = folder.flags(), folder.hyperparams()
+        require_named(folder.path, given.gym_packages, flags.gym_packages)
+        import_packages(given.gym_packages)
+        _refuse(differences(*_compared(given, flags, values, folder)), f"when {folder.path} began")
+        for name in {*(given.given & RunFlags.names(HOST)), "progress"}:
+            setattr(flags, name, getattr(given, name))
+        if flags.tensorboard_log and "tensorboard_log" not in given.given:
+            # A file may name any folder: it is followed to where the run has written before.
+            if not folder.events(flags).is_dir():
+                print(f"no events in {folder.events(flags)}; --tensorboard-log says where to write")
+                flags.tensorboard_log = ""
+        state = read_checkpoint(folder.checkpoint)
+        defaults = defaults_of(flags.algo)
+        ours, its = (
+            {**defaults, **what, "n_timesteps": None} for what in (folder.what(), state["what"])
+        )
+        _refuse(differences(its, ours), f"of the training so far, in {folder.params}")
+        done, wanted = state["num_timesteps"], given.n_timesteps
+        if 0 < wanted < done:
+            raise UsageError(
+                f"-n {wanted} is less than the {done} steps that {folder.path} has done"
+            )
+        if wanted > 0:
+            values["n_timesteps"] = flags.n_timesteps = wanted
+        values = check(flags.algo, algorithm(flags.algo), values)
+        if folder.read_result() is not None and done >= values["n_timesteps"]:
+            print(
+                f"{folder.path} is finished: {done} of {values['n_timesteps']} steps; "
+                "a larger -n continues it"
+            )
+            return 0
+        return Training(Experiment(flags, values, folder)).train(folder, restate=True)
+
+
+def _compared(
+    given: RunFlags, saved: RunFlags, values: Mapping[str, Any], folder: RunFolder
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What the run was begun with, and what is given now instead, as far as it may not change."""
+    hosted = {*RunFlags.names(HOST), "trained_agent", "n_timesteps", "hyperparams"}
+    now = {name: getattr(given, name) for name in given.given & RunFlags.names() - hosted}
+    if "env" in now:
+        now["env"] = full_id(given.env)
+    if "log_folder" in now:
+        now["log_folder"] = str(Path(given.log_folder).resolve())
+    if given.hyperparams:
+        asked = check(saved.algo, algorithm(saved.algo), {**values, **given.hyperparams})
+        now |= {name: asked[name] for name in given.hyperparams}
+    was = {**defaults_of(saved.algo), **saved.values(), **values}
+    was["log_folder"] = str(folder.path.parent.parent.resolve())
+    return {name: plain(was.get(name)) for name in now}, plain(now)
+
+
+def defaults_of(algo: str) -> dict[str, Any]:
+    """The hyperparameters that an algorithm has where a run does not say."""
+    defaults = {name: one.default for name, one in parameters(algorithm(algo)).items()}
+    return {name: plain(value) for name, value in defaults.items() if is_data(value)}
+
+
+def _refuse(found: Sequence[tuple[str, Any, Any]], when: str) -> None:
+    """Raise if something is not what it was."""
+    for name, was, now in found:
+        raise UsageError(
+            f"{name} = {now} contradicts {was} {when}; put it back or leave it out, or start a new "
+            "run with it, without -i"
+        )

@@ -1,0 +1,266 @@
+"""A training run from flags to result: checked in full first, then made and trained.
+
+RL-Zoo's ``ExperimentManager`` makes the run folder before it has looked at the hyper-parameters,
+and resets counters, seeds and environments when it continues; so its pieces are used here
+(schedules, run numbers, file layout, flags) and its class is not.
+"""
+
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
+from sb3_guard.common.evaluation import bounded_name
+from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import find_monitor
+from sb3_guard.zoo.cli.usage import (
+    TrainingStopped,
+    UsageError,
+    explained,
+    interrupts,
+    one_line,
+    packages_flag,
+)
+from sb3_guard.zoo.run.checkpoint import (
+    Checkpoints,
+    Interrupted,
+    cut_logs,
+    read_checkpoint,
+    restore_run,
+)
+from sb3_guard.zoo.run.experiment import Experiment
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import RunFolder, is_disk_error
+from sb3_guard.zoo.run.logger import RunLogger
+from sb3_guard.zoo.run.make_envs import (
+    BAD_NUMBERS,
+    PROCESS_DIED,
+)
+from sb3_guard.zoo.run.progress import Epochs
+from sb3_guard.zoo.run.tracking import Tracker
+
+
+class Training:
+    """
+    A run whose environments and model are made; it is on disk once it has a folder.
+
+    :param experiment: what is trained
+    :raises UsageError: something can't be made, or is not there
+    """
+
+    def __init__(self, experiment: Experiment):
+        folder, flags = experiment.folder, experiment.flags
+        self.experiment, self.flags, self.setup = experiment, flags, experiment.setup
+        self.callbacks = self.setup.callbacks()
+        #: the checkpoint to continue from
+        self.state = None if folder is None else read_checkpoint(folder.checkpoint)
+        experiment.try_out()
+        self.model = experiment.make_model()
+        self.env: VecEnv = self.model.get_env()  # type: ignore[assignment]
+        self.evaluation: CostEvalCallback | None = None
+        self.tracker: Tracker | None = None
+        try:
+            self.model.verbose = max(flags.verbose - 1, 0)
+            if flags.eval_freq > 0:
+                self.evaluation = experiment.make_evaluation(self.model)
+            if flags.track:
+                self.tracker = Tracker(flags, experiment.hyperparams, folder)
+        except BaseException:
+            self.close()
+            raise
+
+    def _make_callbacks(self, folder: RunFolder) -> tuple[Checkpoints, Epochs, list[BaseCallback]]:
+        flags = self.flags
+        epochs = Epochs(self.setup.n_timesteps, bar=bool(flags.progress))
+        others: list[BaseCallback] = [epochs]
+        if not isinstance(self.model, Constrained):
+            others.append(LogCosts())
+        if flags.save_freq > 0:
+            every = max(flags.save_freq // self.setup.n_envs, 1)
+            path = str(folder.path)
+            others.append(CheckpointCallback(every, path, save_vecnormalize=True))
+        if self.evaluation is not None:
+            self.evaluation.log_path = str(folder.path / "evaluations")
+            self.evaluation.best_model_save_path = str(folder.path)
+            others.append(self.evaluation)
+        others += self.callbacks
+        checkpoints = Checkpoints(
+            folder.checkpoint,
+            others,
+            every=flags.checkpoint_every,
+            log_interval=flags.log_interval,
+            what=folder.what(),
+        )
+        # The checkpoint comes first: it must see the others as the last rollout left them.
+        return checkpoints, epochs, [checkpoints, *others]
+
+    def train(
+        self,
+        folder: RunFolder,
+        asked_to_stop: Callable[[], bool] = lambda: False,
+        restate: bool = False,
+    ) -> int:
+        """
+        Train to the end, or to an interrupt, and report.
+
+        :param folder: the run's folder, owned by this process
+        :param asked_to_stop: training ends after the rollout under way when this says so
+        :param restate: state flags and hyper-parameters again once training can continue
+        :return: exit status: 0, or 128 + the signal's number when interrupted
+        :raises UsageError: training can't continue, or the disk is full or read-only
+        """
+        try:
+            return self._train(folder, asked_to_stop, restate)
+        except PROCESS_DIED as error:
+            print(flush=True)  # fails again if it is the reader of our output that is gone
+            if self.flags.vec_env != "subproc":
+                raise
+            raise UsageError(
+                "a process of --vec-env subproc has died, because of an error printed above or for "
+                f"lack of memory; continue with {folder.again(self.flags)}"
+            ) from error
+        except OSError as error:
+            if not is_disk_error(error):
+                raise
+            raise UsageError(
+                f"can't write to {folder.path}: {error.strerror}; what was written before is "
+                f"intact: make room, then continue with {folder.again(self.flags)}"
+            ) from error
+        finally:
+            self.close()
+
+    @property
+    def _envs(self) -> list[VecEnv]:
+        return [self.env, *([] if self.evaluation is None else [self.evaluation.eval_env])]
+
+    def close(self) -> None:
+        """Release the environments, and let Weights & Biases have what it has not yet."""
+        for env in self._envs:
+            with suppress(*PROCESS_DIED):
+                env.close()
+        if self.tracker is not None:
+            self.tracker.finish()
+
+    def _train(self, folder: RunFolder, asked: Callable[[], bool], restate: bool) -> int:
+        state, verbose = self.state, self.flags.verbose > 0
+        if verbose:
+            print(f"Run folder: {folder.path} (seed {self.flags.seed})")
+        if self.tracker is not None:
+            self.tracker.remember(folder)
+        with explained(f"can't write to {folder.path}", OSError):
+            if state is not None:
+                cut_logs(folder.path, state)
+            goes_on = state is not None and folder.monitor.exists()
+            find_monitor(self.env).log_to(folder.monitor, append=goes_on)
+            logger = RunLogger(
+                folder.path,
+                stdout=self.experiment.prints_tables,
+                tensorboard=folder.events(self.flags) if self.experiment.events else None,
+                state=None if state is None else state["logger"],
+            )
+        self.model.set_logger(logger)
+        checkpoints, epochs, callbacks = self._make_callbacks(folder)
+        checkpoints.asked = asked
+        if state is not None:
+            checkpoints.restore(state, self.model.action_noise)
+            # In this order, and only now: a result in the folder is always that of its config.
+            folder.result.unlink(missing_ok=True)
+            if restate:
+                folder.write_config(self.flags.values(), self.experiment.hyperparams)
+                checkpoints.what = folder.what()
+            restore_run(self.model, state, folder.path)
+
+        def stop(number: int) -> None:
+            checkpoints.stop = True
+            if verbose:
+                print(
+                    "\nStopping after this rollout; Ctrl-C again stops immediately.",
+                    file=sys.stderr,
+                )
+
+        began = time.monotonic()
+        with interrupts(stop) as received, ExitStack() as last:
+            last.callback(epochs.on_training_end)  # leaves the terminal tidy
+            finished = self._learn(callbacks)
+        with replacing(folder.model) as file:
+            self.model.save(file)
+        normalizer = self.model.get_vec_normalize_env()
+        if normalizer is not None:
+            normalizer.save(str(folder.normalizer))
+        logger.close()
+        result = epochs.result()
+        if finished:
+            folder.write_result({"algo": self.flags.algo, "env": self.flags.env, **result})
+        if verbose:
+            print(summary(folder, self.flags, result, time.monotonic() - began, finished))
+        return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
+
+    def _learn(self, callbacks: list[BaseCallback]) -> bool:
+        left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
+        interval = self.flags.log_interval
+        kwargs: dict[str, Any] = {}
+        if interval != -1:
+            kwargs["log_interval"] = interval if interval > 0 else None
+        try:
+            self.model.learn(
+                left, callback=callbacks, reset_num_timesteps=self.state is None, **kwargs
+            )
+        except Interrupted:
+            return False
+        except BAD_NUMBERS as error:
+            if self.flags.verbose > 1:
+                raise
+            raise TrainingStopped(
+                f"training stopped at {self.model.num_timesteps} steps: {one_line(error)} "
+                "(--verbose 2 shows where)"
+            ) from error
+        return True
+
+
+def summary(
+    folder: RunFolder, flags: RunFlags, result: Mapping[str, Any], seconds: float, finished: bool
+) -> str:
+    """What a run came to, as the paper measures it, on a few lines."""
+
+    def number(value: float | None, digits: int) -> str:
+        return "– (no episode has ended)" if value is None else f"{value:.{digits}f}"
+
+    def bounded(cost: Mapping[str, Any]) -> str:
+        text = number(cost["mean"], 3)
+        if "low" in cost:
+            text += f"   [{cost['low']:.3f}, {cost['high']:.3f}]"
+        if cost["limit"] is not None:
+            text += f"   limit {cost['limit']:g}"
+        return text + (f": {cost['verdict']}" if "verdict" in cost else "")
+
+    costs, limit_on = result["costs"], result.get("limit_on", "sum")
+    alone = len(costs) == 1 and limit_on == "sum"
+    lines = [
+        f"{'Finished' if finished else 'Interrupted'} at {result['n_timesteps']:,} steps, "
+        f"{seconds:.0f} s",
+        f"  run folder         {folder.path}",
+        f"  return       J_r   {number(result['return'], 3)}",
+        f"  episode cost M_c   {bounded(*costs.values()) if alone else number(result['cost'], 3)}",
+        *(
+            f"    {bounded_name(key, limit_on):<16} {bounded(cost)}"
+            for key, cost in ({} if alone else costs).items()
+        ),
+        f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
+    ]
+    packages = packages_flag(flags.gym_packages)
+    if not finished:
+        lines.append(f"  continue with      {folder.again(flags)}")
+    elif (own := folder.path.name[len(folder.name) + 1 :]).isdigit():
+        lines.append(
+            f"  see the agent      sb3-guard enjoy --algo {flags.algo} --env {flags.env} "
+            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {own}{packages}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Hyperparameter searches: studies, their trials, and reports of them."""

@@ -1,0 +1,138 @@
+"""The flags of tuning, and those that a study's folder remembers."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from sb3_guard.zoo.cli.flags import flag
+from sb3_guard.zoo.cli.usage import (
+    UsageError,
+    amount,
+    count,
+    positive,
+    read_mapping,
+    seed_number,
+    seed_or_random,
+)
+from sb3_guard.zoo.run.flags import TrainingFlags
+
+EXAMPLES = """examples:
+  python -m sb3_guard.tune --algo trpo_lag --env Goal_Point_8Hazards --n-trials 50 -n 1e6
+  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards -params cost_limit:5 --n-jobs 2
+  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards --seeds 0 1 2 --pruner halving
+  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards --pareto --study-name trade-off
+  python -m sb3_guard.tune ... --storage postgresql://me:secret@server/studies
+
+The same command continues a study that was stopped, and joins one that runs: --n-trials counts the
+trials of the study, not of the process. So does its folder:
+
+  python -m sb3_guard.tune -i logs/cpo/Goal_Point_8Hazards-v0_tune --n-trials 100
+"""
+# The file of a study's folder that `-i` reads; flags that it does not state.
+RECORD = "study.yml"
+HOW = ("resume", "log_folder", "gym_packages", "verbose")
+
+
+@dataclass
+class TuneFlags(TrainingFlags):
+    """
+    Find the hyper-parameters with the highest return under a cost limit.
+
+    What is trained:
+
+    :param algo: algorithm, e.g. cpo or ppo (default: cpo)
+    :param env: environment id; the version may be left out (default: Goal_Point_8Hazards)
+    :param cost_limit: highest episode cost of a feasible trial, one for all or one per cost
+        (default: selection_limit, else the algorithm's cost_limit, but at least 1)
+    :param pareto: search the trade-off of return and cost instead; the limit is only drawn
+    :param search_space: YAML file of ranges and lists to search (default: that of the algorithm)
+
+    Search:
+
+    :param n_trials: finished trials of the study in all, pruned ones included (default: 50)
+    :param seeds: seeds that every trial trains with (default: 0)
+    :param n_seeds: the first so many seeds: 0 1 2 …
+    :param seed: seed of the sampler (default: -1, a random one)
+    :param sampler: what chooses hyper-parameters (default: tpe)
+    :param pruner: what ends bad trials early (default: median)
+    :param n_startup_trials: trials before the sampler learns and the pruner prunes (default: 10)
+    :param n_evaluations: evaluations per training (default: one per 100,000 steps, but at least 4)
+    :param eval_episodes: episodes each time (default: 5)
+
+    Storage and workers:
+
+    :param resume: folder of a study to continue or to join, with the flags that it was begun with
+    :param log_folder: where studies go (default: logs)
+    :param study_name: to have several studies (default: <algo>_<env>)
+    :param storage: postgresql://… for workers on many machines, or a journal file (default: a
+        journal file in the study's folder, for one machine)
+    :param n_jobs: processes that work on it (default: 1)
+    :param num_threads: threads of torch and of the native engine in each process (default: 1)
+    :param verbose: 0 nothing, 1 progress, 2 with tracebacks (default: 1)
+    """
+
+    prog: ClassVar[str] = "sb3-guard tune"
+    examples: ClassVar[str] = EXAMPLES
+
+    algo: str = flag(default="cpo")
+    env: str = flag(default="Goal_Point_8Hazards-v0")
+    cost_limit: list[float] | None = flag(kind=amount, metavar="D")
+    pareto: bool = flag(default=False)
+    search_space: str | None = flag(metavar="FILE")
+
+    n_trials: int = flag("--max-total-trials", default=50, kind=positive, metavar="N")
+    seeds: list[int] = flag(default=[0], kind=seed_number, metavar="S", exclusive="seeds")
+    n_seeds: int | None = flag(kind=positive, metavar="N", exclusive="seeds")
+    seed: int = flag(default=-1, kind=seed_or_random)
+    sampler: Literal["tpe", "gp", "nsgaii", "random"] = flag(default="tpe")
+    pruner: Literal["median", "halving", "none"] = flag(default="median")
+    n_startup_trials: int = flag(default=10, kind=count, metavar="N")
+    n_evaluations: int | None = flag(kind=positive, metavar="N")
+    eval_episodes: int = flag(default=5, kind=positive, metavar="N")
+
+    resume: str | None = flag("-i", metavar="FOLDER")
+    log_folder: str = flag("-f", default="logs", metavar="DIR")
+    study_name: str | None = flag(metavar="NAME")
+    storage: str | None = flag(metavar="URL")
+    n_jobs: int = flag(default=1, kind=positive, metavar="N")
+    num_threads: int = flag(default=1, kind=positive, metavar="N")
+    verbose: Literal[0, 1, 2] = flag(default=1)
+
+    def check(self) -> None:
+        """
+        Complete the flags with what follows from others.
+
+        :raises UsageError: two contradict each other
+        """
+        if self.n_seeds is not None:
+            self.seeds = list(range(self.n_seeds))
+        if len(set(self.seeds)) < len(self.seeds):
+            raise UsageError(f"--seeds {' '.join(map(str, self.seeds))}: a seed is given twice")
+        if self.pareto and self.pruner != "none" and "pruner" in self.given:
+            raise UsageError("--pruner: there is no pruning with --pareto; leave it out")
+
+    def recorded(self) -> dict[str, Any] | None:
+        """The flags for the study's folder; None for a database, whose address has a password."""
+        if self.storage is not None and "://" in self.storage:
+            return None
+        return {name: getattr(self, name) for name in sorted(self.given - {*HOW})}
+
+    def completed(self) -> "TuneFlags":
+        """
+        The flags completed by those that the study to continue was begun with.
+
+        :raises UsageError: there is no such study
+        """
+        if self.resume is None:
+            return self
+        folder = Path(self.resume).absolute()
+        path = folder / RECORD
+        if not path.is_file():
+            raise UsageError(
+                f"-i: {self.resume} has no {RECORD}, so it is not the folder of a study in a "
+                "journal file; the command that began a study continues it"
+            )
+        filed = TuneFlags.read(read_mapping(path, "the study's file", "flags to values"), path, HOW)
+        given = {name: getattr(filed, name) for name in filed.given}
+        given |= {name: getattr(self, name) for name in self.given - {"resume"}}
+        return TuneFlags.of({**given, "log_folder": str(folder.parent.parent)})

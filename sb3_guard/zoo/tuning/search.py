@@ -1,0 +1,321 @@
+"""Tuning: the hyperparameters with the highest return whose agents keep the cost limit.
+
+Between two trials the feasible one is better, then the higher return, then the smaller violation.
+The package adds the objective (:mod:`sb3_guard.zoo.tuning.trials`), the search space and the
+report; ``study.optimize``, samplers, pruners and storages are Optuna's.
+"""
+
+import multiprocessing
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import numpy as np
+import optuna
+import yaml
+from optuna.exceptions import ExperimentalWarning, UpdateFinishedTrialError
+from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
+from optuna.storages import RDBStorage
+from optuna.study import MaxTrialsCallback, StudyDirection
+from optuna.trial import FrozenTrial, TrialState
+
+from sb3_guard.zoo.cli.usage import UsageError, interrupts, interrupts_ignored, run
+from sb3_guard.zoo.run import start
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.experiment import Experiment
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import folder_name, is_disk_error, require_writable
+from sb3_guard.zoo.run.hyperparams import check, read_hyperparams
+from sb3_guard.zoo.run.training import Training
+from sb3_guard.zoo.tuning import studies
+from sb3_guard.zoo.tuning.flags import RECORD, TuneFlags
+from sb3_guard.zoo.tuning.report import FINISHED, Report, short
+from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space
+from sb3_guard.zoo.tuning.studies import Storage, open_storage, repeat_lost_trials
+from sb3_guard.zoo.tuning.trials import GIVEN, Objective, Settings, Stopped
+
+MOST_FAILURES = 3  # in a row, until it is not the hyperparameters' fault
+SETTINGS = "settings"
+
+
+def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
+    """
+    Check everything before anything is written.
+
+    :return: the flags of a training, and what the study is
+    :raises UsageError: something is wrong with the flags
+    """
+    fixed = dict(flags.hyperparams or {})
+    own = dict(fixed)
+    if flags.cost_limit is not None:
+        # Beside the trials: training with the result keeps the best model by the same limit.
+        limit = flags.cost_limit
+        own["selection_limit"] = limit[0] if len(limit) == 1 else limit
+    how = {"hyperparams": own, "seed": flags.seeds[0], "verbose": 0, "progress": False}
+    run, values = start.prepare(RunFlags.shared(flags, **how))
+    n_timesteps = values["n_timesteps"]
+    # Training with the result is as long as the file says, whatever the trials are.
+    filed = read_hyperparams(run.algo, run.env, run.conf_file, own)
+    cls, length = algorithm(run.algo), filed.get("n_timesteps", n_timesteps)
+    base = check(run.algo, cls, {**values, "n_timesteps": length})
+    n_evaluations = flags.n_evaluations or max(n_timesteps // 100_000, 4)
+    if n_evaluations > n_timesteps:
+        raise UsageError(
+            f"--n-evaluations {n_evaluations} is not allowed; there are {n_timesteps} steps"
+        )
+    space = read_space(flags.search_space) if flags.search_space else None
+    search = Search(flags.algo, base, space, fixed)
+    for corner in search.corners():
+        check(run.algo, cls, corner)
+    with closing(Training(Experiment(run, values))) as training:
+        assert training.evaluation is not None
+        limits = training.evaluation.limits().tolist()
+    settings = Settings(
+        algo=run.algo,
+        env=run.env,
+        hyperparams=base,
+        space=search.description(),
+        n_timesteps=n_timesteps,
+        seeds=flags.seeds,
+        n_evaluations=n_evaluations,
+        eval_episodes=flags.eval_episodes,
+        cost_keys=list(training.experiment.cost_keys),
+        cost_limit=limits if np.isfinite(limits).all() else None,
+        pareto=flags.pareto,
+    )
+    return run, settings, search
+
+
+def _pruner(flags: TuneFlags, settings: Settings) -> BasePruner:
+    if flags.pruner == "none" or settings.pareto:
+        return NopPruner()
+    if flags.pruner == "halving":
+        return SuccessiveHalvingPruner(min_resource=1, reduction_factor=4)
+    warmup = settings.n_evaluations // 3 + 1
+    return MedianPruner(n_startup_trials=flags.n_startup_trials, n_warmup_steps=warmup)
+
+
+def open_study(
+    flags: TuneFlags, settings: Settings, search: Search, name: str, storage: Storage, shown: str
+) -> optuna.Study:
+    """
+    Begin the study, or join it.
+
+    :param shown: address of the storage, for the message
+    :raises UsageError: it was begun with other settings
+    """
+    directions = [StudyDirection.MAXIMIZE]
+    if settings.pareto:
+        directions += [StudyDirection.MINIMIZE] * len(settings.cost_keys)
+    study = optuna.create_study(
+        storage=storage,
+        study_name=name,
+        directions=directions,
+        load_if_exists=True,
+        pruner=_pruner(flags, settings),
+    )
+    saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
+    if saved is not None:
+        settings.refuse_others(saved, name)
+    elif begun or study.directions != directions:
+        raise UsageError(
+            f"{shown} has a study {name!r} that is not one of sb3_guard's; "
+            "choose another --study-name"
+        )
+    else:
+        # First of all: a worker may die after any of these lines, and the next one continues.
+        study.set_user_attr(SETTINGS, asdict(settings))
+    if not begun:
+        # So that the best is never worse than the starting point.
+        first = search.first()
+        study.enqueue_trial(first, user_attrs={GIVEN: bool(first)}, skip_if_exists=True)
+    # Workers that drew the same numbers would try the same things: only the first has the seed.
+    seed = flags.seed if not begun and flags.seed >= 0 else None
+    study.sampler = SAMPLERS[flags.sampler](seed, flags.n_startup_trials)
+    return study
+
+
+class Work:
+    """
+    One process's work on a study.
+
+    :param study: which may be shared with other processes
+    :param storage: of the study
+    :param objective: of its trials
+    :param report: rewritten after each of them
+    """
+
+    def __init__(self, study: optuna.Study, storage: Storage, objective: Objective, report: Report):
+        self.study, self.storage = study, storage
+        self.objective, self.report = objective, report
+        self.flags = objective.flags
+
+    def _after(self, study: optuna.Study, trial: FrozenTrial) -> None:
+        trials = study.get_trials(deepcopy=False)
+        self.report.write(study)
+        if self.flags.verbose:
+            print(self.report.line(trials, trial), flush=True)
+        failures = self.objective.failures
+        if failures >= MOST_FAILURES:
+            raise UsageError(
+                f"{failures} trials in a row failed, the last one: {trial.user_attrs['error']}"
+            )
+        if self.objective.stopped():
+            study.stop()
+
+    def _optimize(self, n_trials: int | None = None) -> None:
+        enough = [] if n_trials else [MaxTrialsCallback(self.flags.n_trials, states=FINISHED)]
+        try:
+            self.study.optimize(self.objective, n_trials, callbacks=[self._after, *enough])
+        except Stopped:
+            pass
+        except (ValueError, UpdateFinishedTrialError) as error:
+            if isinstance(error, ValueError) and not self.objective.taken:
+                raise
+            raise UsageError(
+                f"this process gave no sign of life for {studies.GRACE} s, and its trial was "
+                "given to another; the same command joins the study again"
+            ) from error
+
+    def _count(self, *states: TrialState) -> int:
+        return len(self.study.get_trials(deepcopy=False, states=states))
+
+    def do(self) -> None:
+        """
+        Work until the study has all its trials, or until stopped.
+
+        :raises UsageError: trial after trial fails
+        """
+        repeat_lost_trials(self.study, self.storage)
+        if self._count(*FINISHED) < self.flags.n_trials:
+            self._optimize()
+
+    def finish(self) -> None:
+        """Do the trials again whose workers died meanwhile; on a database, their silence tells."""
+        wait = isinstance(self.storage, RDBStorage) and self._count(TrialState.RUNNING)
+        if wait and self.flags.verbose:
+            print(f"Waiting up to {studies.GRACE} s in case a worker is gone", flush=True)
+        end = time.monotonic() + studies.GRACE + 1.0 if wait else 0.0
+        while time.monotonic() < end and not self.objective.stopped():
+            time.sleep(0.5)
+            if not self._count(TrialState.RUNNING):
+                break
+        repeat_lost_trials(self.study, self.storage)
+        while self._count(TrialState.WAITING) and not self.objective.stopped():
+            self._optimize(n_trials=1)
+
+
+def tune(flags: TuneFlags, main: bool = True) -> int:
+    """
+    Tune.
+
+    :param main: this is the process that the user started, not one of ``--n-jobs``
+    :return: exit status: 0, or 128 + the signal's number when interrupted
+    :raises UsageError: something is wrong with the flags, or the study can't be written
+    """
+    optuna.logging.set_verbosity(optuna.logging.CRITICAL)
+    again = "its trials are kept, and the same command continues the study"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ExperimentalWarning)
+            warnings.filterwarnings("ignore", message="The number of trials is too small")
+            warnings.filterwarnings("ignore", module="optuna.importance")
+            warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes")
+            return _tune(flags, main)
+    except Exception as error:
+        if isinstance(error, OSError) and is_disk_error(error):
+            raise UsageError(f"can't write the study: {error.strerror}; {again}") from error
+        if (text := studies.database_error(error)) is None:
+            raise
+        raise UsageError(f"the study's database fails: {text}; {again}") from error
+
+
+def _tune(flags: TuneFlags, main: bool) -> int:
+    training, settings, search = prepare(flags)
+    suffix = f"_{folder_name(flags.study_name)}" if flags.study_name else ""
+    folder = Path(flags.log_folder) / settings.algo / f"{folder_name(settings.env)}_tune{suffix}"
+    require_writable(folder, "-f")
+    name = flags.study_name or f"{settings.algo}_{settings.env}"
+    storage, shown = open_storage(flags.storage, folder / "study.journal")
+    study = open_study(flags, settings, search, name, storage, shown)
+    objective = Objective(flags, training, settings, search)
+    record = flags.recorded()
+    report = Report(folder, asdict(settings), flags.gym_packages, resumable=record is not None)
+    if main and record is not None:
+        report.save({RECORD: yaml.safe_dump(record, sort_keys=False).encode()})
+    work = Work(study, storage, objective, report)
+    loud = main and flags.verbose > 0
+    if loud:
+        print(_header(flags, settings, study, folder, shown), flush=True)
+
+    def stop(number: int) -> None:
+        objective.stop = True
+        if loud:
+            print("\nStopping; Ctrl-C again stops immediately.", file=sys.stderr)
+
+    with interrupts(stop) as received:
+        with _other_workers(flags, flags.n_jobs - 1 if main else 0) as others:
+            work.do()
+            while not objective.stopped() and any(process.is_alive() for process in others):
+                time.sleep(0.2)
+        if main:
+            work.finish()
+    if main:
+        report.write(study)
+        report.plot(study)
+        if loud:
+            print(report.summary(study, interrupted=bool(received)))
+    return 128 + received[0] if received else 0
+
+
+@contextmanager
+def _other_workers(flags: TuneFlags, n: int) -> Iterator[list[BaseProcess]]:
+    """Let more processes work on the study; those left at the end of the block are stopped."""
+    context = multiprocessing.get_context("spawn")
+    others: list[BaseProcess] = [
+        context.Process(target=_work_beside, args=(flags,)) for _ in range(n)
+    ]
+    with interrupts_ignored():  # by those that inherit it; Ctrl-C reaches this process
+        for process in others:
+            process.start()
+    try:
+        yield others
+    finally:
+        for process in others:
+            process.terminate()
+        for process in others:
+            process.join()
+
+
+def _work_beside(flags: TuneFlags) -> None:
+    sys.exit(run(lambda: tune(flags, main=False)))
+
+
+def _header(
+    flags: TuneFlags, settings: Settings, study: optuna.Study, folder: Path, shown: str
+) -> str:
+    finished = len(study.get_trials(deepcopy=False, states=FINISHED))
+    if settings.pareto:
+        goal = "the trade-off of return and episode cost"
+    elif settings.cost_limit is None:
+        goal = f"the highest return ({settings.algo} has no cost limit; --cost-limit sets one)"
+    else:
+        limits = ", ".join(short(limit) for limit in settings.cost_limit)
+        goal = f"the highest return with an episode cost of at most {limits}"
+    seeds = f" × {len(settings.seeds)} seeds" if len(settings.seeds) > 1 else ""
+    pruner = "none" if settings.pareto else flags.pruner
+    return "\n".join(
+        [
+            f"Study {study.study_name}: {finished} of {flags.n_trials} trials are finished",
+            f"  searching    {goal}",
+            f"  each trial   {settings.n_timesteps:,} steps{seeds}, sampler {flags.sampler}, "
+            f"pruner {pruner}",
+            f"  folder       {folder}",
+            f"  watch with   optuna-dashboard {shown}",
+        ]
+    )

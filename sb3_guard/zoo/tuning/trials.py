@@ -1,0 +1,293 @@
+"""A trial of a tuner: an agent trained for each seed with the same hyper-parameters.
+
+Each is evaluated a few times on the way and once at the end; the means over the seeds count. Each
+cost is a constraint of the study, ``J_C - limit <= 0``, so samplers know which trials are feasible.
+"""
+
+import multiprocessing
+import os
+import socket
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import optuna
+from optuna.exceptions import TrialPruned, UpdateFinishedTrialError
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+
+from sb3_guard.envs.layout import LayoutError
+from sb3_guard.zoo.cli.usage import UsageError, one_line
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.experiment import Experiment
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.hyperparams import check
+from sb3_guard.zoo.run.make_envs import PROCESS_DIED
+from sb3_guard.zoo.run.start import differences
+from sb3_guard.zoo.run.training import Training
+from sb3_guard.zoo.tuning.flags import TuneFlags
+from sb3_guard.zoo.tuning.report import short
+from sb3_guard.zoo.tuning.spaces import Search
+from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
+
+# What the hyper-parameters of a trial may lead to; anything else is a mistake in the code.
+FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError, LayoutError)
+FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
+INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
+PROGRESS = 15.0  # seconds between two lines about a trial under way
+GIVEN = "given"  # its hyper-parameters are those of the file
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    What a trial is: the same for all workers of a study, and whenever it is continued.
+
+    :param algo: key of the algorithm
+    :param env: full id of the environment
+    :param hyperparams: where the space says nothing
+    :param space: what is searched, as data
+    :param n_timesteps: length of one training
+    :param seeds: of the trainings of a trial
+    :param n_evaluations: evaluations per training
+    :param eval_episodes: episodes per evaluation
+    :param cost_keys: entries of info that are costs
+    :param cost_limit: highest feasible episode cost, one per cost key; None: no constraint
+    :param pareto: search the trade-off of return and cost instead
+    """
+
+    algo: str
+    env: str
+    hyperparams: dict[str, Any]
+    space: Any
+    n_timesteps: int
+    seeds: list[int]
+    n_evaluations: int
+    eval_episodes: int
+    cost_keys: list[str]
+    cost_limit: list[float] | None
+    pareto: bool
+
+    def outcome(self, mean: Sequence[float]) -> dict[str, float]:
+        """Return, costs by key, and by how much they exceed their limits in all."""
+        costs, violation = list(mean[1:]), 0.0
+        if self.cost_limit is not None:
+            violation = float(np.maximum(np.subtract(costs, self.cost_limit), 0.0).sum())
+        named = dict(zip(self.cost_keys, costs, strict=True))
+        return {"return": mean[0], **named, "violation": violation}
+
+    def refuse_others(self, saved: Mapping[str, Any], study: str) -> None:
+        """
+        Compare with those that a study was begun with.
+
+        :raises UsageError: they are not the same
+        """
+
+        def flat(one: Mapping[str, Any]) -> dict[str, Any]:
+            own = {f"hyperparams {name}": value for name, value in one["hyperparams"].items()}
+            return {**one, "hyperparams": None, **own}
+
+        for name, old, value in differences(flat(saved), flat(asdict(self))):
+            raise UsageError(
+                f"study {study!r} was begun with {name} {old}, not {value}: "
+                "continue it as it was begun, or begin another with --study-name"
+            )
+
+
+class Stopped(Exception):
+    """A signal asked to stop: the trial under way is done again, later or by another worker."""
+
+
+class Evaluations(BaseCallback):
+    """
+    Evaluate an agent evenly through its training.
+
+    :param training: what is trained
+    :param settings: of the study
+    :param after: called with all evaluations so far, each a list of the mean return and the mean
+        episode costs; False ends the training
+    :param on_step: called with the number of steps so far; what it raises ends the training
+    """
+
+    def __init__(
+        self,
+        training: Training,
+        settings: Settings,
+        after: Callable[[list[list[float]]], bool],
+        on_step: Callable[[int], None],
+    ):
+        super().__init__()
+        self.training, self.settings = training, settings
+        self.after, self.on_step_taken = after, on_step
+        self.history: list[list[float]] = []
+        self.ended = False
+
+    def _on_step(self) -> bool:
+        self.on_step_taken(self.num_timesteps)
+        done = len(self.history) + 1
+        due = done * self.settings.n_timesteps / self.settings.n_evaluations
+        # The last one is for the agent that has learned all it could: see finish.
+        if done < self.settings.n_evaluations and self.num_timesteps >= due:
+            self.ended = not self._evaluate()
+        return not self.ended
+
+    def finish(self) -> None:
+        """Evaluate what training came to, unless it was ended."""
+        while len(self.history) < self.settings.n_evaluations and not self.ended:
+            self.ended = not self._evaluate()
+
+    def _evaluate(self) -> bool:
+        assert self.training.evaluation is not None
+        result = self.training.evaluation.evaluate()
+        row = [float(result.returns.mean()), *result.limited.mean(axis=0).tolist()]
+        if not np.isfinite(row).all():
+            raise FloatingPointError(f"an evaluation gave {row}")
+        self.history.append(row)
+        return self.after(self.history)
+
+
+class Objective:
+    """
+    What Optuna optimises: a trial's hyper-parameters to its return, or return and costs.
+
+    :param flags: of the command
+    :param training: of each training but for its seed
+    :param settings: of the study
+    :param search: where hyper-parameters come from
+    """
+
+    def __init__(self, flags: TuneFlags, training: RunFlags, settings: Settings, search: Search):
+        self.flags, self.training = flags, training
+        self.settings, self.search = settings, search
+        self.stop = False
+        self.taken = False  # the trial under way was given to another worker
+        self.failures = 0  # in a row
+        self._said = 0.0
+
+    def stopped(self) -> bool:
+        """Whether to stop: a signal came, or the process that started this one is gone."""
+        parent = multiprocessing.parent_process()
+        return self.stop or (parent is not None and not parent.is_alive())
+
+    def __call__(self, trial: optuna.Trial) -> float | list[float]:
+        """
+        Train an agent for each seed.
+
+        :return: means over the seeds: return, and with ``pareto`` each episode cost
+        :raises optuna.TrialPruned: it compares badly, or its hyper-parameters fail
+        :raises Stopped: it is to be done again
+        """
+        self._said = time.monotonic()
+        try:
+            trial.set_user_attr(WORKER, f"{socket.gethostname()}-{os.getpid()}")
+            mean = self._train_seeds(trial)
+        except TrialPruned:
+            raise
+        except UpdateFinishedTrialError:
+            self.taken = True
+            raise
+        except FAILURES as error:
+            if self.flags.verbose > 1:
+                raise
+            self.failures += 1
+            trial.set_user_attr("error", one_line(error)[:600])
+            self._constrain(trial, None)
+            raise TrialPruned from error
+        except BaseException:  # a signal, a lost connection: not the hyperparameters' fault
+            with suppress(*DATABASE_ERRORS):
+                repeat(trial.study, trial.study.trials[trial.number], most=None)
+            raise
+        self.failures = 0
+        return mean if self.settings.pareto else mean[0]
+
+    def _constrain(self, trial: optuna.Trial, mean: Sequence[float] | None) -> None:
+        """Tell the sampler by how much each cost is below its limit; once in a trial."""
+        if self.settings.cost_limit is None or self.settings.pareto:
+            return
+        costs = [FAILED_VIOLATION] * len(self.settings.cost_keys) if mean is None else mean[1:]
+        for key, cost, limit in zip(
+            self.settings.cost_keys, costs, self.settings.cost_limit, strict=True
+        ):
+            trial.set_constraint(key, cost - limit)
+
+    def _train_seeds(self, trial: optuna.Trial) -> list[float]:
+        values = self.search.draw(trial)
+        trial.set_user_attr("hyperparams", values)
+        settings, finished = self.settings, list[list[list[float]]]()
+        last = settings.n_evaluations * len(settings.seeds)
+        # The best is to be compared with the file's hyper-parameters: they are never pruned.
+        given = trial.user_attrs.get(GIVEN, False)
+        mean: list[float] = []
+
+        def after(history: list[list[float]]) -> bool:
+            """Report the mean of the seeds so far; whether to continue."""
+            mean[:] = np.mean([one[-1] for one in [*finished, history]], axis=0).tolist()
+            outcome = settings.outcome(mean)
+            trial.set_user_attr("result", outcome)
+            if settings.pareto:
+                return True
+            step = settings.n_evaluations * len(finished) + len(history)
+            violation = outcome["violation"]
+            trial.report(INFEASIBLE - violation if violation else mean[0], step)
+            return step == last or given or not trial.should_prune()
+
+        for seed in settings.seeds:
+            # A trial that is done again has kept the seeds that were done.
+            history = trial.user_attrs.get(f"seed {seed}")
+            if history is None:
+                history, on = self._train(trial, values, seed, after)
+                if on:
+                    trial.set_user_attr(f"seed {seed}", history)
+            else:
+                on = all(after(history[: i + 1]) for i in range(len(history)))
+            if not on:
+                break
+            finished.append(history)
+        self._constrain(trial, mean)
+        if len(finished) < len(settings.seeds):
+            raise TrialPruned
+        return mean
+
+    def _train(
+        self,
+        trial: optuna.Trial,
+        values: Mapping[str, Any],
+        seed: int,
+        after: Callable[[list[list[float]]], bool],
+    ) -> tuple[list[list[float]], bool]:
+        """One training: its evaluations, and whether it went to the end."""
+        settings = self.settings
+        checked = check(
+            settings.algo,
+            algorithm(settings.algo),
+            {**values, "n_timesteps": settings.n_timesteps},
+        )
+        training = Training(Experiment(replace(self.training, seed=seed), checked))
+
+        def on_step(steps: int) -> None:
+            if self.stopped():
+                raise Stopped
+            if self.flags.verbose and time.monotonic() - self._said >= PROGRESS:
+                self._said = time.monotonic()
+                of = f" of seed {seed}" if len(settings.seeds) > 1 else ""
+                text = f"Trial {trial.number}: {steps:,} of {settings.n_timesteps:,} steps{of}"
+                if evaluations.history:
+                    text += f", return {short(evaluations.history[-1][0])}"
+                    text += f", cost {', '.join(map(short, evaluations.history[-1][1:]))}"
+                print(text, flush=True)
+
+        evaluations = Evaluations(training, settings, after, on_step)
+        try:
+            training.model.set_logger(Logger(folder=None, output_formats=[]))
+            training.model.learn(settings.n_timesteps, callback=[evaluations, *training.callbacks])
+            evaluations.finish()
+        except PROCESS_DIED as error:
+            if self.stopped():  # the signal was for all processes
+                raise Stopped from error
+            raise UsageError("a process of --vec-env subproc has died") from error
+        finally:
+            training.close()
+        return evaluations.history, not evaluations.ended

@@ -1,0 +1,232 @@
+"""The bases carry algorithms of anyone's: PPO-Lagrangian as the example has it, SAC with costs."""
+
+import inspect
+import json
+import random
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import SB3_POLICY, CostPoint, LinearCostBandit
+from ppo_lagrangian import PPOLagrangian
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_guard import train
+from sb3_guard.algorithms import (
+    ALGORITHMS,
+    CPO,
+    TRPO,
+    Constrained,
+    FirstOrder,
+    PPOLag,
+    register_algorithm,
+)
+from sb3_guard.algorithms.common.first_order import mean_kl
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def points(n_envs: int = 4, **kwargs: Any) -> Any:
+    return make_vec_env(lambda: CostPoint(30, hazard=(-1.0, 0.0), **kwargs), n_envs, seed=0)
+
+
+def state_of(model: Any) -> list[Any]:
+    """Weights, optimizer and generators as plain values."""
+    optimizer = model.policy.optimizer.state_dict()["state"]
+    moments = [value for entry in optimizer.values() for value in entry.values()]
+    tensors = [*model.policy.state_dict().values(), *moments, th.get_rng_state()]
+    return [*(tensor.tolist() for tensor in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
+
+
+@pytest.mark.parametrize("batch_size", [64, 128])
+def test_without_a_price_it_is_sb3s_ppo_bit_for_bit(batch_size: int) -> None:
+    """128 is the whole rollout; episodes are cut by a time limit of 30 steps."""
+    kwargs: dict[str, Any] = {"n_steps": 32, "batch_size": batch_size, "seed": 0, "device": "cpu"}
+    a = state_of(PPO("MlpPolicy", points(), **kwargs).learn(512))
+    model = PPOLagrangian("MlpPolicy", points(), cost_limit=1e6, **kwargs).learn(512)
+    assert a == state_of(model)
+    assert model.total_cost > 0.0 and float(model.multiplier.value) == 0.0
+    assert model.logger.name_to_value["train/cost_value_loss"] > 0.0
+
+
+def test_first_order_with_ppos_loss_is_ppo_bit_for_bit() -> None:
+    kwargs: dict[str, Any] = {"n_steps": 32, "batch_size": 48, "seed": 0, "device": "cpu"}
+    kwargs |= {"target_kl": 0.005, "clip_range_vf": 0.1, "ent_coef": 0.01, "gae_lambda": 0.9}
+    kwargs["policy_kwargs"] = SB3_POLICY
+    model = FirstOrder("MlpPolicy", points(), kl_stop="minibatch", cost_limit=1.0, **kwargs)
+    models = [PPO("MlpPolicy", points(), **kwargs), model]
+    states = []
+    for model in models:
+        model.set_random_seed(0)
+        states.append(state_of(model.learn(512)))
+    assert states[0] == states[1]
+    theirs, ours = (model.logger.name_to_value for model in models)
+    for name in ("value_loss", "approx_kl", "policy_gradient_loss", "explained_variance"):
+        assert ours[f"train/{name}"] == pytest.approx(theirs[f"train/{name}"], rel=1e-5), name
+
+
+def test_passes_stop_by_the_kl_of_the_rollout() -> None:
+    """One pass where the first already goes too far, all where none does."""
+    for target, passes in ((1e-9, 1), (1e9, 10)):
+        kwargs: dict[str, Any] = {"n_steps": 32, "target_kl": target, "cost_limit": 1e6, "seed": 0}
+        models = [
+            cls("MlpPolicy", points(), kl_stop="epoch", **kwargs) for cls in (FirstOrder, PPOLag)
+        ]
+        for model in models:
+            model.set_random_seed(0)
+            assert model.learn(128)._n_updates == passes
+            assert 0.0 < mean_kl(model) < 1.0
+            assert (model.n_epochs, model.target_kl) == (10, target)
+        assert state_of(models[0]) == state_of(models[1])  # SB3's passes, and written out
+
+
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+def test_undiscounted_costs_end_with_the_time_limit(gamma: float) -> None:
+    """γ V_C of the last observation is added at a time-out where γ < 1, and nothing at γ = 1."""
+    model = CPO("MlpPolicy", points(2), n_steps=40, cost_gamma=gamma, n_critic_updates=1, seed=0)
+    seen: list[np.ndarray] = []
+    model.train = lambda: seen.append(model.rollout_buffer.cost_bootstraps.copy())
+    model.learn(80)
+    assert np.count_nonzero(seen[0]) == (2 if gamma < 1.0 else 0)
+    assert np.count_nonzero(seen[0][29]) == np.count_nonzero(seen[0])
+
+
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+def test_undiscounted_rewards_end_with_the_time_limit(gamma: float) -> None:
+    """SB3 adds γ V of the last observation at a time-out; a trust region has that at γ < 1."""
+    model = CPO("MlpPolicy", points(2), n_steps=40, gamma=gamma, n_critic_updates=1, seed=0)
+    paid: list[np.ndarray] = []
+    model.train = lambda: None  # type: ignore[method-assign]
+    model.learn(80, lambda local, _: not paid.append(local["rewards"].copy()))  # type: ignore
+    added = model.rollout_buffer.rewards - paid
+    assert np.count_nonzero(added) == np.count_nonzero(added[29]) == (2 if gamma < 1.0 else 0)
+
+
+def test_with_a_price_it_keeps_a_positive_limit() -> None:
+    """A bandit whose best action costs 1.5; under the limit 0.5 the best return is 0.5."""
+    env = make_vec_env(LinearCostBandit, 8, seed=0)
+    model = PPOLagrangian(
+        "MlpPolicy", env, n_steps=64, batch_size=512, n_epochs=4, learning_rate=1e-2,
+        cost_limit=0.5, lambda_lr=0.1, seed=0, device="cpu",
+    ).learn(20_000)  # fmt: skip
+    assert float(model.multiplier.value) > 0.1
+    action, _ = model.predict(np.ones((1, 1), np.float32), deterministic=True)
+    np.testing.assert_allclose(action[0], LinearCostBandit().optimum(0.5), atol=0.15)
+    assert np.mean(model.ep_cost_buffer) == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_saved_model_goes_on_from_its_multiplier_and_critic(tmp_path: Path) -> None:
+    model = PPOLagrangian("MlpPolicy", points(), n_steps=32, cost_limit=0.1, seed=0).learn(256)
+    model.save(tmp_path / "model")
+    again = PPOLagrangian.load(tmp_path / "model", env=points())
+    assert float(again.multiplier.value) == float(model.multiplier.value) > 0.0
+    observation = th.ones(3, 4)
+    assert th.equal(model.cost_critic(observation), again.cost_critic(observation))
+    assert again.cost_rng.random() == model.cost_rng.random()
+
+
+class CostlySAC(Constrained, SAC):
+    """SAC whose costs are counted: what stands before a replay buffer."""
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        self._estimate_costs()
+        super().train(gradient_steps, batch_size)
+
+
+def test_costs_of_an_off_policy_algorithm(tmp_path: Path) -> None:
+    """Counted, estimated from the episodes that ended, logged, saved; SAC stays what it is."""
+    kwargs: dict[str, Any] = {"learning_starts": 60, "seed": 0, "device": "cpu", "batch_size": 16}
+    a = state_of_off_policy(SAC("MlpPolicy", points(2), **kwargs).learn(200))
+    model = CostlySAC("MlpPolicy", points(2), cost_limit=2.0, **kwargs).learn(200)
+    assert a == state_of_off_policy(model)
+    assert model.costs.horizon == 30 and len(model.ep_cost_buffer) == 6
+    assert model.costs.violation[0] == pytest.approx((model.costs.episode_cost[0] - 2.0) / 30)
+    np.testing.assert_allclose(np.array(list(model.ep_cost_buffer)[-2:]).mean(0), model.costs[0])
+    model.save(tmp_path / "model")
+    again = CostlySAC.load(tmp_path / "model")
+    assert again.total_cost == model.total_cost > 0.0 and again.cost_limit == 2.0
+    with pytest.raises(TypeError, match="CostlySAC takes no argument 'bufer_size'; did you mean"):
+        CostlySAC("MlpPolicy", points(2), bufer_size=3)
+
+
+def state_of_off_policy(model: Any) -> list[Any]:
+    tensors = [*model.policy.state_dict().values(), th.get_rng_state()]
+    return [*(tensor.tolist() for tensor in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
+
+
+def test_policies_begin_calm_unless_told_otherwise() -> None:
+    """Key by key: what a user says of the networks leaves the first σ as it is."""
+    for cls in (CPO, PPOLag):
+        model = cls("MlpPolicy", points(2), n_steps=32, policy_kwargs={"net_arch": [8]})
+        assert model.policy_kwargs == {"log_std_init": -0.5, "ortho_init": False, "net_arch": [8]}
+        assert (model.policy.log_std == -0.5).all() and not model.policy.ortho_init
+        loud = cls("MlpPolicy", points(2), n_steps=32, policy_kwargs={"log_std_init": 0.0})
+        assert (loud.policy.log_std == 0.0).all() and not loud.policy.ortho_init
+
+
+def test_defaults_are_stated_where_only_they_differ() -> None:
+    """The signature shows them, a call overrides them, and so does a class further down."""
+
+    class Hasty(PPOLag):
+        defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.7, "n_steps": 32}
+
+    class Hastier(Hasty):
+        defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.9}
+
+    for cls, rate in ((PPOLag, 0.1), (Hasty, 0.7), (Hastier, 0.9)):
+        taken = inspect.signature(cls).parameters
+        assert taken["lambda_lr"].default == rate and taken["lambda_units"].default == "relative"
+        assert list(taken)[:3] == ["policy", "env", "learning_rate"]
+        model = cls("MlpPolicy", points(2), batch_size=16)
+        assert model.lambda_lr == rate and model.lambda_units == "relative"
+        assert model.n_steps == taken["n_steps"].default == (2048 if cls is PPOLag else 32)
+        assert cls("MlpPolicy", points(2), batch_size=16, lambda_lr=0.3).lambda_lr == 0.3
+
+
+# Algorithms from outside the package
+
+
+def test_a_users_algorithm_trains_by_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Registered by a module of the user's, with hyper-parameters from there."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(ALGORITHMS, "trpo_price", TRPO)  # to be forgotten afterwards
+    del ALGORITHMS["trpo_price"]
+    path = tmp_path / "my_algorithm.py"
+    path.write_text((EXAMPLES / "custom_algorithm.py").read_text())
+    command = (
+        "--gym-packages my_algorithm --algo trpo_price --verbose 0 -conf my_algorithm.py "
+        "--env Goal_Point_8Hazards -n 80 --eval-freq -1 --seed 0 "
+        "-params n_envs:2 n_steps:20 n_critic_updates:1"
+    )
+    assert train.main(command.split()) == 0
+    run = tmp_path / "logs" / "trpo_price" / "Goal_Point_8Hazards-v0_1"
+    result = json.loads((run / "result.json").read_text())
+    assert (result["n_timesteps"], result["cost_limit"]) == (80, 5.0)
+
+
+def test_what_can_be_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_guard.algorithms.ALGORITHMS", table := dict(ALGORITHMS))
+    register_algorithm("ppo_lagrangian", PPOLagrangian)
+    register_algorithm("ppo_lagrangian", PPOLagrangian)
+    assert table["ppo_lagrangian"].label == "PPOLagrangian"
+    for key, value, error, named in (
+        ("PPO-Lag", PPOLagrangian, ValueError, "'PPO-Lag'"),
+        ("cpo", PPOLagrangian, ValueError, "'cpo' is CPO already"),
+        ("mine", "PPOLagrangian", TypeError, "'PPOLagrangian'"),
+    ):
+        with pytest.raises(error, match=named):
+            register_algorithm(key, value)
+
+
+@pytest.mark.parametrize("key", list(ALGORITHMS))
+def test_every_algorithm_says_what_it_is(key: str) -> None:
+    cls = ALGORITHMS[key]
+    own = vars(cls)
+    assert own["label"] and cls.family
+    assert own["paper"][-4:].isdigit() and own["paper"].split()[0] in (cls.__doc__ or "")

@@ -1,0 +1,115 @@
+"""An agent of an algorithm that knows no cost becomes one that keeps a limit."""
+
+import warnings
+
+import numpy as np
+import pytest
+import sb3_contrib
+import stable_baselines3 as sb3
+import torch as th
+from cost_envs import CostPoint
+
+import sb3_guard
+from sb3_guard import CPO, TRPOUSL, PPOLag, SACLag, TD3Lag, TQCLag, TRPOLag, train
+from sb3_guard.algorithms.common.arguments import stated
+from sb3_guard.zoo.run.checkpoint import read_normalizer
+
+SMALL = {"seed": 0, "gamma": 0.97}
+ON = {"n_steps": 40, "policy_kwargs": {"net_arch": [16]}, **SMALL}
+OFF = {"learning_starts": 10, "buffer_size": 100, "batch_size": 8, **SMALL}
+PAIRS = [
+    (sb3.PPO, PPOLag, ON | {"n_epochs": 3, "batch_size": 20}),
+    (sb3.A2C, PPOLag, ON),
+    (sb3.PPO, CPO, ON | {"batch_size": 20}),
+    (sb3.PPO, TRPOUSL, ON | {"batch_size": 20}),
+    (sb3_contrib.TRPO, CPO, ON),
+    (sb3_contrib.TRPO, TRPOLag, ON),
+    (sb3_guard.TRPO, CPO, ON),
+    (sb3.SAC, SACLag, OFF),
+    (sb3.TD3, TD3Lag, OFF),
+    (sb3_contrib.TQC, TQCLag, OFF),
+]
+
+
+@pytest.mark.parametrize(("theirs", "ours", "arguments"), PAIRS)
+def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
+    old = theirs("MlpPolicy", CostPoint(10), **arguments)
+    old.learn(60)
+    old.save(tmp_path / "agent")
+    with pytest.warns(UserWarning, match=f"{ours.__name__} takes over .* begin anew") as said:
+        new = ours.load(tmp_path / "agent", env=CostPoint(10, hazard=(-1, 0)), cost_limit=3.0)
+    (said,) = (str(one.message) for one in said if "takes over" in str(one.message))
+    assert said.endswith("cost_limit is 3.0")
+    weights = new.policy.state_dict()
+    for name, values in old.policy.state_dict().items():
+        th.testing.assert_close(weights[name], values)
+    obs = np.zeros((5, 4), np.float32)
+    np.testing.assert_array_equal(
+        new.predict(obs, deterministic=True)[0], old.predict(obs, deterministic=True)[0]
+    )
+    assert (new.gamma, new.cost_limit) == (0.97, 3.0)
+    assert ("clip_range" in said) == (theirs is sb3.PPO and ours is not PPOLag)
+    assert ("cost_critic" in said) == (ours is not TRPOUSL)
+    new.learn(80)
+    assert new.total_cost > 0
+    # From then on it is an agent like others.
+    new.save(tmp_path / "safe")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = ours.load(tmp_path / "safe", env=CostPoint(10))
+    np.testing.assert_array_equal(again.predict(obs)[0].shape, new.predict(obs)[0].shape)
+
+
+def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
+    """sb3-contrib's KL is a mean over the dimensions of an action, ours a sum."""
+    sb3_contrib.TRPO("MlpPolicy", CostPoint(10), target_kl=0.5, n_steps=40).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match="takes over"):
+        model = CPO.load(tmp_path / "a", env=CostPoint(10))
+    assert model.target_kl == stated(CPO)["target_kl"].default and model.n_steps == 40
+
+
+def test_another_kind_of_policy_is_refused(tmp_path):
+    sb3.SAC("MlpPolicy", CostPoint(10)).save(tmp_path / "sac")
+    with pytest.raises(ValueError, match="PPOLag can't take over an agent with a SACPolicy"):
+        PPOLag.load(tmp_path / "sac", env=CostPoint(10))
+
+
+def test_a_missing_network_of_sb3s_is_still_an_error(tmp_path):
+    model = PPOLag("MlpPolicy", CostPoint(10), n_steps=40, batch_size=20, cost_limit=1.0)
+    with pytest.raises(ValueError, match="policy"):
+        model.set_parameters({"policy.optimizer": model.policy.optimizer.state_dict()})
+
+
+@pytest.mark.parametrize("beside", ["ppo_vecnormalize.pkl", "run/vecnormalize.pkl", None])
+def test_train_goes_on_with_the_statistics_beside_the_agent(tmp_path, capsys, beside):
+    env = sb3.common.vec_env.DummyVecEnv([lambda: CostPoint(20)])
+    statistics = sb3.common.vec_env.VecNormalize(env)
+    statistics.obs_rms.count = 5000.0
+    (tmp_path / "run").mkdir()
+    if beside:
+        statistics.save(str(tmp_path / beside))
+    agent = sb3.PPO("MlpPolicy", statistics, n_steps=30, batch_size=30, seed=0)
+    agent.save(tmp_path / "ppo")
+    run = "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:20".split()
+    run += "-params n_envs:2 n_steps:30 batch_size:60 cost_limit:4.0 normalize:True".split()
+    run += ["--algo", "ppo_lag", "-n", "60", "--eval-freq", "-1", "--device", "cpu"]
+    run += ["-f", str(tmp_path / "logs"), "-i", str(tmp_path / "ppo.zip")]
+    with pytest.warns(UserWarning, match="PPOLag takes over"):
+        assert train.main(run) == 0
+    said = "ppo.zip: observation statistics begin anew"
+    assert capsys.readouterr().out.count(said) == (beside is None)
+    (file,) = (tmp_path / "logs" / "ppo_lag").rglob("vecnormalize.pkl")
+    assert (read_normalizer(file).obs_rms.count > 5000) == (beside is not None)
+
+
+def test_train_goes_on_from_an_agent_of_sb3s(tmp_path):
+    agent = sb3.PPO("MlpPolicy", CostPoint(20), n_steps=30, batch_size=30, seed=0)
+    agent.save(tmp_path / "ppo")
+    run = "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:20".split()
+    run += "-params n_envs:2 n_steps:30 batch_size:60 cost_limit:4.0 normalize:False".split()
+    run += ["--algo", "ppo_lag", "-n", "60", "--eval-freq", "-1", "--verbose", "0"]
+    run += ["--device", "cpu", "-f", str(tmp_path / "logs"), "-i", str(tmp_path / "ppo.zip")]
+    with pytest.warns(UserWarning, match="PPOLag takes over"):
+        assert train.main([*run, "--save-freq", "60"]) == 0
+    (folder,) = (tmp_path / "logs" / "ppo_lag").iterdir()
+    assert (folder / "result.json").exists()

@@ -1,0 +1,193 @@
+"""The documents are true: examples run, pages match the code, links lead somewhere."""
+
+import functools
+import importlib
+import importlib.util
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+import sb3_guard
+from sb3_guard.algorithms import TrustRegion
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = [path for path in sorted(DOCS.rglob("*.md")) if "_build" not in path.parts]
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *PAGES]
+GUIDES = [
+    ROOT / "README.md",
+    *(
+        DOCS / f"{name}.md"
+        for name in ("quickstart", "concepts", "keeping_a_limit", "trust", "writing_an_algorithm")
+    ),
+    *sorted((DOCS / "algorithms").glob("*.md")),
+]
+# The samples as written, but for the length of the training.
+SHORTER = {
+    r"(\.learn\(|total_timesteps=)[\d_]+": r"\g<1>40",
+    r"n_steps=1000": "n_steps=20",
+    r"n_envs=\d+": "n_envs=2",
+    # Off-policy, n_steps are those of a return.
+    r"(make_model\(\"(?!sac|td3|tqc)[^()]*?),?\s*\)": r"\g<1>, n_envs=2, n_steps=20)",
+    r"n_eval_episodes=\d+": "n_eval_episodes=2",
+    r"progress_bar=True": "progress_bar=False",
+}
+
+
+@functools.cache
+def script(name):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@functools.cache
+def generated_pages():
+    return script("make_docs").pages()
+
+
+def python_blocks(document):
+    return re.findall(r"```python\n(.*?)```", document.read_text(), flags=re.DOTALL)
+
+
+def prose(document):
+    return re.sub(r"```.*?```", "", document.read_text(), flags=re.DOTALL)
+
+
+@functools.cache
+def anchors(document):
+    """What GitHub and the site call the headings of a document."""
+    headings = re.findall(r"^#+ (.*)$", prose(document), flags=re.MULTILINE)
+    plain = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {heading.strip().replace(" ", "-") for heading in plain}
+
+
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.stem)
+def test_the_guides_samples_run_in_order(guide, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    registered = gymnasium.registry["Goal_Point_8Hazards-v0"]
+    monkeypatch.setattr(registered, "max_episode_steps", 20)
+    blocks = python_blocks(guide)
+    assert blocks
+    names = {"gymnasium": gymnasium}
+    for block in blocks:
+        for long, short in SHORTER.items():
+            block = re.sub(long, short, block)
+        exec(compile(block, guide.name, "exec"), names)
+
+
+def stated_defaults(page):
+    """The rows of a page's tables of parameters: {name: default, or the class that has it}."""
+    stated = {}
+    header = r"^\| parameter \| default \|.*\n\|.*\n"
+    for table in re.findall(rf"{header}((?:\|.*\n)+)", page, re.MULTILINE):
+        for row in table.splitlines():
+            names, default, meaning = row.strip("| ").split(" | ", 2)
+            names = re.findall(r"`(\w+)`", names)
+            if default == "SB3's":
+                base = re.search(r"SB3(?:-contrib)?'s (\w+)", meaning)[1]
+                values = [sb3_class(base)] * len(names)
+            elif default.startswith("as for"):
+                values = [sb3_guard.ALGORITHMS[default.split("`")[1].lower()]] * len(names)
+            else:
+                values = eval(f"[{default}]")
+            stated |= dict(zip(names, values, strict=True))
+    return stated
+
+
+def sb3_class(name):
+    package = "sb3_contrib" if name == "TQC" else "stable_baselines3"
+    return getattr(importlib.import_module(package), name)
+
+
+@functools.cache
+def defaults(cls):
+    return {name: p.default for name, p in inspect.signature(cls).parameters.items()}
+
+
+@pytest.mark.parametrize("key", sb3_guard.ALGORITHMS)
+def test_tables_of_parameters_have_the_defaults_of_the_classes(key):
+    cls = sb3_guard.ALGORITHMS[key]
+    stated = stated_defaults((DOCS / "algorithms" / f"{key}.md").read_text())
+    if issubclass(cls, TrustRegion):  # a row of the algorithm's own page comes first
+        every = stated_defaults((DOCS / "algorithms.md").read_text())
+        assert {"target_kl", "cost_gae_lambda", "missing_cost"} <= every.keys()
+        stated = {name: every[name] for name in every if name in defaults(cls)} | stated
+    assert stated
+    for name, value in stated.items():
+        value = defaults(value)[name] if isinstance(value, type) else value
+        assert defaults(cls)[name] == value, name
+
+
+@pytest.mark.parametrize("path", sorted(generated_pages()))
+def test_generated_pages_match_the_code(path):
+    assert (DOCS / path).read_text() == generated_pages()[path], "run `python scripts/make_docs.py`"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(document):
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", prose(document)):
+        if target.startswith(("http://", "https://")):
+            continue
+        file = document.parent / target if target else document
+        assert file.exists(), f"{document.name} links to {target}"
+        if anchor:
+            assert anchor in anchors(file.resolve()), f"{document.name} links to {target}#{anchor}"
+
+
+def test_every_page_is_in_the_contents():
+    listed = {"index"}
+    for page in PAGES:
+        for tree in re.findall(r"```{toctree}\n(.*?)```", page.read_text(), flags=re.DOTALL):
+            names = [line for line in tree.split() if not line.startswith(":")]
+            folder = page.parent.relative_to(DOCS)
+            listed |= {(folder / name).as_posix() for name in names}
+    assert listed >= {page.relative_to(DOCS).with_suffix("").as_posix() for page in PAGES}
+
+
+def test_every_public_name_is_in_the_api_reference():
+    text = (DOCS / "api" / "index.md").read_text()
+    missing = [name for name in sb3_guard.__all__ if f"`{name}`" not in text]
+    assert missing == ["__version__"]
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", DOCS, tmp_path / "html"]
+    done = subprocess.run(
+        [*command, "-d", tmp_path / "doctrees"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "html" / "index.html").exists()
+
+
+def test_commands_named_in_the_readme_exist():
+    text = (ROOT / "README.md").read_text()
+    for module in re.findall(r"python -m (sb3_guard\.\w+)", text):
+        assert importlib.util.find_spec(module), module
+
+
+def test_scripts_exist_where_they_are_named_and_each_is_named_somewhere():
+    code = [path for part in ("sb3_guard", "examples", "scripts", "tests")
+            for path in (ROOT / part).rglob("*.py")]  # fmt: skip
+    guides = [*{*DOCUMENTS} - {ROOT / "CHANGELOG.md"}, ROOT / "Makefile"]
+    named = {
+        path: set(re.findall(r"\bscripts/[\w/]+\.py", path.read_text())) for path in guides + code
+    }
+    for path, scripts in named.items():
+        assert not {name for name in scripts if not (ROOT / name).exists()}, path
+    scripts = {path.relative_to(ROOT).as_posix() for path in (ROOT / "scripts").rglob("*.py")}
+    assert scripts <= set().union(*(named[path] for path in guides))
+
+
+def test_tables_of_results_are_made_of_their_logs():
+    for path, text in script("results").pages().items():
+        assert path.read_text() == text, "run `python scripts/results.py`"
+    for path, text in script("known_optima").pages().items():
+        assert path.read_text() == text, "run `python scripts/known_optima.py --seeds`"

@@ -1,0 +1,134 @@
+"""The examples run, as they are written but for the length of the training, and are short."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import gymnasium
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from test_adapters import install
+
+import sb3_guard.envs
+from sb3_guard.algorithms import ALGORITHMS
+from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.envs.rendering import RenderingError, gl_backend
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+# example: what it prints, in the order of the lines, and the files that it leaves
+SAYS = {
+    "compare_algorithms": (["trpo {'r'", "cpo {'r'", "trpo_lag {'r'"], ["compare", "compare.png"]),
+    "custom_algorithm": (["cost of an episode: ["], []),
+    "custom_constraint": (["steps outside: ["], []),
+    "custom_robot": (["21 observations, 2 actions", "return "], ["puck.xml"]),
+    "custom_task": (["metres: ["], []),
+    "deploy_filtered_policy": (["with the layer: ", "without the layer: "], ["filtered_policy.pt"]),
+    "domain_randomization": (["drawn: {'hazards.num': ", "mass × 0.5: ", "mass × 2.0: "], []),
+    "ppo_lagrangian": (["return "], []),
+    "record_video": (["point.mp4"], ["point.mp4"]),
+    "safety_gymnasium_env": (["return ", "cost "], []),
+    "saute": (["PPO 10 episodes", "SAC 10 episodes"], []),
+    "several_constraints": (["return", "cost_hazards, limit 5.0", "cost_ghosts, limit 2.0"], []),
+    "train_cpo": (["ep_cost_mean", ", limit 5: "], ["cpo_point.zip"]),
+    "tune_with_optuna": (["0 ", "1 ", "limit"], []),
+    "vector_env": (["steps per second, observations (32, 62)", "return and cost"], []),
+    "your_own_env": (["costs of episodes: [", "off-policy: [", "steps off the middle: ["], []),
+}
+LENGTHS = {
+    r"[1235]00_000": "200",
+    r"n_steps=(1000|500)": "n_steps=20",
+    r"(make_model\([^()]*?),?\s*\)": r"\1, n_steps=20)",
+    r"batch_size=1000": "batch_size=200",
+    r"buffer_size=100_000": "buffer_size=200",
+    r"n_trials=20": "n_trials=2",
+    r"range\(3000\)": "range(20)",
+    r"range\(500\)": "range(3)",
+    r'__name__ == "__main__"': "True",
+}
+
+
+def shorten(code: str) -> str:
+    for long, short in LENGTHS.items():
+        code = re.sub(long, short, code)
+    return code
+
+
+def require_rendering():
+    try:
+        gl_backend()
+    except RenderingError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
+def quick(monkeypatch, tmp_path):
+    """Episodes of ten steps, a folder of one's own, and no trace of what is registered."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sb3_guard.envs.suites, "EPISODE_STEPS", 10)
+    for name in ("Goal_Point_8Hazards-v0", "Goal_Ant_8Hazards-v0"):
+        monkeypatch.setattr(gymnasium.registry[name], "max_episode_steps", 10)
+    tables = (ALGORITHMS, ROBOTS, TASKS, CONSTRAINTS, gymnasium.registry)
+    before = [dict(table) for table in tables]
+    yield tmp_path
+    for table, old in zip(tables, before, strict=True):
+        table.clear()
+        table.update(old)
+
+
+def test_every_example_is_tried_and_fits_a_page():
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(SAYS)
+    for path in EXAMPLES.glob("*.py"):
+        assert len(path.read_text().splitlines()) <= 40, path.name
+
+
+@pytest.mark.parametrize("name", SAYS)
+def test_example(name, quick, monkeypatch, capsys):
+    if name == "safety_gymnasium_env":
+        install(monkeypatch)
+    if name == "record_video":
+        require_rendering()
+    path = EXAMPLES / f"{name}.py"
+    # a module of its own: dataclasses look for it
+    module = type(sys)("__example__")
+    monkeypatch.setitem(sys.modules, "__example__", module)
+    exec(compile(shorten(path.read_text()), path, "exec"), vars(module))
+    lines, (says, leaves) = capsys.readouterr().out.splitlines(), SAYS[name]
+    for text in says:
+        while text not in lines.pop(0):
+            assert lines, f"{name} does not say {text!r}"
+    assert sorted(one.name for one in quick.iterdir()) == leaves
+
+
+NOTEBOOK = EXAMPLES / "quickstart.ipynb"
+SHORT_EPISODES = """
+import gymnasium, torch
+import sb3_guard
+torch.set_num_threads(1)
+gymnasium.registry["Goal_Point_8Hazards-v0"].max_episode_steps = 10
+"""
+
+
+def test_the_notebook_runs(tmp_path):
+    require_rendering()
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    for cell in notebook.cells:
+        cell.source = shorten(cell.source).replace("frames=150", "frames=3")
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(SHORT_EPISODES))
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": tmp_path}}).execute()
+    made = {path.name for path in tmp_path.iterdir()}
+    assert made == {"cpo_hazards", "cpo_ghosts", "hazards.mp4", "ghosts.mp4"}
+    kinds = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert not [output for output in kinds if output.get("name") == "stderr"]
+    assert sum("image/png" in output.get("data", {}) for output in kinds) == 3
+
+
+def test_the_notebook_shows_what_it_is_about_and_stays_small():
+    assert NOTEBOOK.stat().st_size < 700_000
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == [*range(1, len(code) + 1)]
+    shown = json.dumps([cell.outputs for cell in code])
+    assert shown.count("image/png") == 3 and shown.count("<video") == 2
+    assert "/tmp" not in shown and "stderr" not in shown

@@ -1,0 +1,491 @@
+"""Whatever is typed wrongly: one line that helps, exit status 2, nothing written."""
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import yaml
+from cost_envs import CostPoint
+from registered_envs import Broken, Filmed
+from typed import refused
+
+from sb3_guard import ALGORITHMS, CPO, enjoy, train
+from sb3_guard.envs.rendering import RenderingError
+from sb3_guard.plain_yaml import load_yaml
+from sb3_guard.zoo.agents import playback
+from sb3_guard.zoo.run.checkpoint import MEMBER
+
+SUPPORT = Path(__file__).parents[1] / "support"
+TOY = ["--gym-packages", "registered_envs", "--env", "CostPoint-v0"]
+LIMITED = [*TOY, "-params", "cost_limit:2"]
+GO_ON = [*TOY[:2], "-i"]
+SMALL = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3", "cost_limit:2",
+         "-n", "60", "--verbose", "0", "--env-kwargs", "episode_length:20",
+         "--eval-freq", "-1", "--seed", "1"]  # fmt: skip
+
+
+TRAIN = [
+    # algorithm
+    (["--algo", "cpp"], ["unknown algorithm 'cpp'", "did you mean 'cpo'?", "trpo"]),
+    # environment
+    (["--env", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
+    (["--env", "scene.yml"], ["'scene.yml' is a file", "sb3_guard.register"]),
+    (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),
+    (["--env", "Goal_Point_8Hazzards-v0"], ["'Hazzards'", "'Hazards'"]),
+    (["--env", "CartPole-v99"], ["CartPole-v99"]),
+    (["--env", "Nonsense"], ["'Nonsense'"]),
+    (["--env", "no_such_module:Env-v0"], ["no_such_module"]),
+    (["--gym-packages", "no_such_package"], ["--gym-packages", "'no_such_package'"]),
+    (["--env-kwargs", "hazard:{}"], ["'hazard'", "hazards"]),
+    (["--env-kwargs", "hazards:{'num': -1}"], ["num", "-1"]),
+    (["--env-kwargs", "hazards:{'size': 'big'}"], ["size", "'big'"]),
+    (["--env-kwargs", "speed:{limit:0.4}", "hazards:{sise:0.4}"], ["'sise'", "'size'"]),
+    (["--env-kwargs", "max_steps:100"], ["'max_steps'", "'max_episode_steps'"]),
+    (["--env-kwargs", "hazards"], ["'hazards' is not of the form key:value"]),
+    ([*LIMITED, "--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
+    (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError", "hazards"]),
+    (["--eval-env-kwargs", "hazards:{'num':200}"], ["LayoutError", "hazards"]),
+    ([*LIMITED, "--vec-env", "native"],
+     ["'CostPoint-v0' is not an sb3_guard environment", "'dummy' or 'subproc'"]),
+    (["--vec-env", "fast"], ["--vec-env", "'fast'", "native"]),
+    (["-params", "env_wrapper:gymnasium.wrappers.FlattenObservation", "--vec-env", "native"],
+     ["env_wrapper of a run", "'dummy' or 'subproc'"]),
+    # an environment without the cost key
+    ([*LIMITED, "--env", "NoCost-v0"],
+     ["no cost 'cost'", "depth", "cost_keys", "missing_cost:zero"]),
+    ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost 'heat'"]),
+    # hyper-parameters
+    (["-params", "n_step:10"], ["no hyper-parameter 'n_step'", "did you mean 'n_steps'?"]),
+    (["-params", "n_steps:ten"], ["n_steps: 'ten'", "a whole number"]),
+    (["-params", "n_steps:-5"], ["n_steps: -5", "at least 1"]),
+    (["-params", "n_envs:0"], ["n_envs: 0", "at least 1"]),
+    (["-params", "n_envs"], ["'n_envs' is not of the form key:value"]),
+    (["-params", "gamma:1.5"], ["gamma", "1.5"]),
+    (["-params", "gamma:nan"], ["gamma: 'nan'", "a number"]),
+    (["-params", "target_kl:0"], ["target_kl"]),
+    (["-params", "learning_rate:-1"], ["learning_rate"]),
+    (["-params", "cost_limit:[1.0,2.0]"], ["cost_limit", "cost"]),
+    (["-params", "cost_limit:nan"], ["cost_limit: 'nan'"]),
+    (["--algo", "cup", "-params", "gamma:1"], ["gamma=1.0: CUP weighs costs", "such as 0.99"]),
+    (["--algo", "cup", "-params", "cost_limit:[1.0,2.0]"], ["one for each of the 1 cost keys"]),
+    (["--algo", "focops", "-params", "lambda_init:2", "lambda_max:1"],
+     ["lambda_max=1.0", "lambda_init=2.0"]),
+    (["--algo", "sac_lag", "--env", "CartPole-v1", "-params", "missing_cost:zero", "cost_limit:1"],
+     ["continuous actions (Box)", "PPOLag"]),
+    (["-params", "policy:MlpPolcy"], ["no policy 'MlpPolcy'", "did you mean 'MlpPolicy'?"]),
+    (["-params", "policy:Foo"], ["no policy 'Foo'", "allowed: ", "MlpPolicy", "dotted name"]),
+    (["-params", "policy:no.such.Policy"], ["no.such.Policy' is not of", "--gym-packages no.such"]),
+    (["-params", "selection_limit:[1,2]"],
+     ["selection_limit=[1.0, 2.0]", "one number, or one for each of the 1 cost keys", "cost"]),
+    (["-params", "selection_limit:[]"], ["selection_limit=[]", "one number"]),
+    ([*LIMITED, "--env-kwargs", "cost_keys:('cost','heat')", "-params", "cost_keys:['cost','heat']",
+      "selection_limit:[1]"], ["selection_limit=[1.0]", "heat"]),
+    (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
+    (["-params", "seed:3"], ["use the flag --seed"]),
+    (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
+    (["--gym-packages", "../x"], ["'../x' is not a module's name"]),
+    (["--gym-packages", ""], ["'' is not a module's name"]),
+    (["-conf", "absent.yml"], ["can't read hyper-parameter file absent.yml", "No such file"]),
+    # flags
+    (["--sede", "3"], ["unknown flag --sede", "--seed"]),
+    (["cpo"], ["'cpo' does not belong to a flag", "--help"]),
+    (["-params", "frame_stack:0"], ["frame_stack: 0", "at least 1"]),
+    (["-n", "0"], ["-n", "at least 1"]),
+    (["-n", "1.5"], ["'1.5' is not a whole number"]),
+    (["-n", "many"], ["'many' is not a whole number"]),
+    (["--seed", "one"], ["--seed", "'one'"]),
+    (["--seed", "4294967296"], ["--seed: '4294967296'", "2**32"]),
+    (["--eval-episodes", "0"], ["--eval-episodes", "at least 1"]),
+    (["--n-eval-envs", "-2"], ["--n-eval-envs", "at least 1"]),
+    (["--checkpoint-every", "nan"], ["--checkpoint-every: 'nan'"]),
+    (["--log-interval", "0"], ["--log-interval: '0'"]),
+    (["--device", "abacus"], ["abacus"]),
+    (["-i", "absent"], ["no run folder or model 'absent'"]),
+    ([*LIMITED, "-tb", "/dev/null"], ["--tensorboard-log", "'/dev/null'", "choose another"]),
+    ([*LIMITED, "-tb", "/proc/foo/bar"],
+     ["--tensorboard-log", "'/proc/foo/bar'", "choose another"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "parts"), TRAIN, ids=lambda one: " ".join(one)[:40])
+def test_train(arguments, parts, capsys, empty):
+    refused(train.main, ["-n", "100", "--verbose", "0", *arguments], capsys, *parts)
+
+
+ENJOY = [
+    (["--algo", "cpp"], ["unknown algorithm 'cpp'"]),
+    (["--env", "Goal_Pint_8Hazards"], ["'Pint'"]),
+    ([], ["there is no run of cpo on Goal_Point_8Hazards-v0 in 'logs'", "sb3_guard.train"]),
+    (["--exp-id", "7"], ["there is no run folder", "_7"]),
+    (["-f", "nowhere"], ["'nowhere'"]),
+    (["--n-episodes", "0"], ["--n-episodes", "at least 1"]),
+    (["--n-episodes", "1", "-n", "5"], ["not allowed with"]),
+    (["--seed", "-1"], ["--seed: '-1'"]),
+    (["--load-bets"], ["unknown flag --load-bets", "--load-best"]),
+]
+
+
+@pytest.mark.parametrize(("arguments", "parts"), ENJOY, ids=lambda one: " ".join(one)[:40])
+def test_enjoy(arguments, parts, capsys, empty):
+    refused(enjoy.main, ["--no-render", *arguments], capsys, *parts)
+
+
+@pytest.mark.parametrize("error", [ValueError, TypeError])
+def test_constructor_of_an_environment(error, capsys, empty, monkeypatch):
+    """What a user's environment refuses is one line, however many its message has."""
+    whole = CostPoint.__init__
+
+    def refuse(self, kind="fine", **kwargs):
+        if kind != "fine":
+            raise error(f"{kind}\n  is allowed\n  nowhere")
+        whole(self, **kwargs)
+
+    monkeypatch.setattr(CostPoint, "__init__", refuse)
+    for flag in ("--env-kwargs", "--eval-env-kwargs"):
+        arguments = ["-n", "60", *LIMITED, flag, "kind:odd"]
+        refused(train.main, arguments, capsys, "can't make CostPoint-v0", "odd is allowed nowhere")
+
+
+def test_more_environments_than_memory_holds(capsys, empty, monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("sb3_guard.zoo.run.make_envs.make_vec_env", refuse)
+    refused(train.main, [*TOY, *SMALL], capsys, "can't make CostPoint-v0: MemoryError")
+
+
+def test_track_without_wandb(capsys, empty, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    refused(train.main, ["--track"], capsys, "--track needs wandb", "pip install wandb")
+
+
+def test_track_without_a_key(capsys, empty, monkeypatch):
+    def init(**_: object) -> None:
+        raise RuntimeError("no API key\nconfigured")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    refused(
+        train.main, [*TOY, *SMALL, "--track"], capsys,
+        "--track: Weights & Biases can't be used: RuntimeError: no API key configured",
+        "wandb login",
+    )  # fmt: skip
+
+
+def test_corrupt_yaml(capsys, tmp_path):
+    (tmp_path / "bad.yml").write_text("default:\n  n_steps: [1, 2\nx: }")
+    arguments = ["-conf", str(tmp_path / "bad.yml"), "-f", str(tmp_path / "logs")]
+    refused(train.main, arguments, capsys, "bad.yml as YAML", "line")
+    assert not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("inner", ["[1]", "[[1]]", "{a: 1}", "[[[[a], 1]]]", "text"])
+def test_an_ordered_mapping_that_is_none(inner, capsys, tmp_path):
+    path = tmp_path / "ordered.yml"
+    path.write_text(f"default: !!python/object/apply:collections.OrderedDict {inner}")
+    refused(train.main, ["-conf", str(path)], capsys, "ordered.yml as YAML")
+
+
+def test_ordered_mappings_as_rl_zoo_writes_them():
+    tag = "!!python/object/apply:collections.OrderedDict"
+    assert load_yaml(f"{tag}\n- - [a, 1]\n  - [b, {{c: 2}}]") == {"a": 1, "b": {"c": 2}}
+    assert load_yaml(f"{tag} []") == {}
+
+
+def test_a_csv_that_was_deleted(run):
+    csv = run / "0.monitor.csv"
+    header = csv.read_text().splitlines()[1]
+    csv.unlink()
+    assert train.main([*GO_ON, str(run), "-n", "120", "--verbose", "0"]) == 0
+    lines = csv.read_text().splitlines()
+    assert lines[1] == header and len(lines) > 3
+
+
+def test_more_than_plain_data(capsys, tmp_path):
+    conf = tmp_path / "conf.py"
+    conf.write_text(
+        "from torch import nn\n"
+        "hyperparams = {'default': {'policy_kwargs': {'activation_fn': nn.ReLU}, 'n_steps': 30}}\n"
+    )
+    arguments = [*LIMITED, "-n", "60", "-conf", str(conf), "-f", str(tmp_path / "logs")]
+    refused(train.main, arguments, capsys, "config.yml can hold plain data only", "nn.ReLU")
+    assert not (tmp_path / "logs").exists()
+
+
+def test_unwritable_log_folder(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    arguments = [*TOY, *SMALL, "-f", str(tmp_path / "file")]
+    refused(train.main, arguments, capsys, "can't write to log folder", "choose another with -f")
+    if os.getuid() != 0:  # nothing is forbidden to root
+        (tmp_path / "locked").mkdir(mode=0o500)
+        refused(train.main, [*TOY, *SMALL, "-f", str(tmp_path / "locked")], capsys, "locked")
+
+
+@pytest.fixture
+def run(tmp_path):
+    assert train.main([*TOY, *SMALL, "-f", str(tmp_path)]) == 0
+    return tmp_path / "cpo" / "CostPoint-v0_1"
+
+
+def test_a_cost_that_is_not_a_number(capsys, tmp_path):
+    arguments = [*TOY, *SMALL, "--env", "Flickering-v0", "-f", str(tmp_path)]
+    arguments += ["--env-kwargs", "episode_length:40"]
+    refused(train.main, arguments, capsys, "info['cost'] is nan", status=1)
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip at all", None])
+def test_corrupt_checkpoint(content, capsys, run):
+    if content is None:
+        content = run.joinpath("checkpoint.zip").read_bytes()[:-2000]
+    run.joinpath("checkpoint.zip").write_bytes(content)
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    for path in (run, run / "checkpoint.zip"):
+        arguments = [*GO_ON, str(path), "-n", "120"]
+        refused(train.main, arguments, capsys, "checkpoint.zip is damaged")
+    after = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    assert before == after
+
+
+def test_checkpoints_that_are_none(capsys, run):
+    run.joinpath("checkpoint.zip").unlink()
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "start it again without -i")
+    shutil.copy(run / "CostPoint-v0.zip", run / "checkpoint.zip")
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "is a model, not a checkpoint")
+    with zipfile.ZipFile(run / "checkpoint.zip", "a") as archive:
+        archive.writestr(MEMBER, pickle.dumps({"other": 1}))
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "checkpoint.zip is damaged")
+
+
+def test_corrupt_model(capsys, run, tmp_path):
+    run.joinpath("CostPoint-v0.zip").write_bytes(b"no zip at all")
+    refused(
+        enjoy.main,
+        [*TOY, "-f", str(tmp_path), "--no-render"],
+        capsys,
+        "can't load",
+        "CostPoint-v0.zip",
+    )
+    warm = [*TOY, *SMALL, "-i", str(run / "CostPoint-v0.zip"), "-f", str(tmp_path / "new")]
+    refused(train.main, warm, capsys, "can't load")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["--seed", "2"], ["seed = 2 contradicts 1"]),
+        (["--algo", "trpo"], ["algo = trpo contradicts cpo"]),
+        (["--env", "NoCost-v0"], ["env = NoCost-v0 contradicts CostPoint-v0"]),
+        (["-params", "n_steps:31"], ["n_steps = 31 contradicts 30"]),
+        (["-params", "gama:1"], ["no hyper-parameter 'gama'", "'gamma'"]),
+        (["-f", "elsewhere"], ["contradicts"]),
+        (["-n", "30"], ["-n 30 is less than the 60 steps"]),
+    ],
+)
+def test_flags_that_contradict_the_run(arguments, parts, capsys, run):
+    refused(train.main, [*GO_ON, str(run), *arguments], capsys, *parts)
+
+
+def test_the_runs_own_flags_may_be_repeated(run):
+    arguments = ["-i", str(run), *TOY, "-params", "n_steps:3e1", "-n", "120"]
+    assert train.main([*arguments, "--env-kwargs", "episode_length:20", "--seed", "1"]) == 0
+
+
+def test_other_algorithms_agent(capsys, run, tmp_path):
+    warm = [*TOY, *SMALL, "--algo", "trpo", "-i", str(run / "CostPoint-v0.zip")]
+    refused(train.main, [*warm, "-f", str(tmp_path / "new")], capsys, "can't load", "as TRPO")
+
+
+def test_agent_of_another_environment(capsys, run, tmp_path):
+    warm = [*SMALL, "--env", "CartPole-v1", "-i", str(run / "CostPoint-v0.zip"), "--algo", "cpo"]
+    warm = [one for one in warm if one not in ("--env-kwargs", "episode_length:20")]
+    arguments = [*warm, "-params", "missing_cost:zero", "-f", str(tmp_path / "new")]
+    refused(train.main, arguments, capsys, "can't load")
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (lambda args: {"a": 1}, ["there is no algo, checkpoint_every"]),
+        (
+            lambda args: {k: v for k, v in args.items() if k != "eval_freq"},
+            ["there is no eval_freq"],
+        ),
+        (lambda args: {**args, "seed": "one"}, ["seed: 'one' is not allowed"]),
+    ],
+)
+def test_damaged_flags(change, parts, capsys, run):
+    path = run / "CostPoint-v0" / "args.yml"
+    path.write_text(yaml.safe_dump(change(yaml.safe_load(path.read_text()))))
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "args.yml is damaged", *parts)
+    assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("record", "parts"),
+    [
+        ("/proc/foo.mp4", ["--record", "'/proc'", "choose another"]),
+        ("/dev/null/foo.mp4", ["--record", "'/dev/null'", "choose another"]),
+        (".", ["'.' is a folder"]),
+        ("x" * 300 + ".mp4", ["File name too long", "xxx"]),
+    ],
+)
+def test_unwritable_video(record, parts, capsys, run, tmp_path, monkeypatch):
+    def nothing(*args, **kwargs):
+        raise AssertionError("played before the file was known to be writable")
+
+    monkeypatch.setattr(playback, "make_envs", nothing)
+    refused(enjoy.main, [*TOY, "-f", str(tmp_path), "--record", record], capsys, *parts)
+
+
+def test_playing_in_a_world_without_room(capsys, tmp_path):
+    ours = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path)]
+    small = [one for one in SMALL if one not in ("--env-kwargs", "episode_length:20")]
+    assert train.main([*ours, *small]) == 0
+    play = [*ours, "--env-kwargs", "hazards:{'num':200}", "--no-render"]
+    refused(enjoy.main, play, capsys, "Goal_Point_2Hazards-v0", "LayoutError", "hazards")
+
+
+@pytest.mark.parametrize("where", ["__init__", "reset", "render"])
+def test_no_backend_for_a_window(where, capsys, tmp_path, monkeypatch):
+    """Whatever needs OpenGL first says so on one line."""
+
+    def fail(self, *args, **kwargs):
+        raise RenderingError("no OpenGL backend works here")
+
+    filmed = [*TOY, "--env", "Filmed-v0", "-f", str(tmp_path)]
+    assert train.main([*filmed, *SMALL]) == 0
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setitem(Filmed.metadata, "render_modes", ["human"])
+    monkeypatch.setattr(Filmed, where, fail)
+    refused(enjoy.main, filmed, capsys, "RenderingError: no OpenGL backend works here")
+
+
+def test_an_update_that_is_not_a_number(capsys, tmp_path, monkeypatch):
+    """No result and no model of a run that diverged; a model that was there before stays."""
+    whole = CPO.train
+
+    def diverge(self) -> None:
+        if self.num_timesteps > 60:
+            raise FloatingPointError("value_loss is nan")
+        whole(self)
+
+    arguments = [*TOY, *SMALL, "-f", str(tmp_path)]
+    run = tmp_path / "cpo" / "CostPoint-v0_1"
+    with monkeypatch.context() as patch:
+        patch.setattr(CPO, "train", diverge)
+        parts = ("120 steps: ", "value_loss is nan")
+        refused(train.main, [*arguments, "-n", "180"], capsys, *parts, status=1)
+        assert not (run / "result.json").exists() and not (run / "CostPoint-v0.zip").exists()
+        assert train.main(arguments) == 0
+        run = run.with_name("CostPoint-v0_2")
+        model = (run / "CostPoint-v0.zip").read_bytes()
+        refused(train.main, [*GO_ON, str(run), "-n", "180"], capsys, parts[1], status=1)
+    assert not (run / "result.json").exists()
+    assert (run / "CostPoint-v0.zip").read_bytes() == model
+    assert train.main([*GO_ON, str(run)]) == 0
+    assert (run / "result.json").exists()
+
+
+def test_kept_model_that_is_not_there(capsys, run, tmp_path):
+    play = [*TOY, "-f", str(tmp_path), "--no-render"]
+    refused(enjoy.main, [*play, "--load-checkpoint", "30"], capsys, "no model at 30 steps")
+    refused(enjoy.main, [*play, "--load-best"], capsys, "best_model.zip")
+
+
+@pytest.mark.parametrize(
+    ("env", "parts"),
+    [("Flickering-v0", ["training stopped at", "is nan: a cost must be a finite number"]),
+     ("Wordy-v0", ["fails at its first step: info['cost'] is 'high': a cost must be"])],
+)  # fmt: skip
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+def test_costs_of_a_baseline(algo, env, parts, capsys, tmp_path):
+    params = "n_steps:64" if algo == "ppo" else "learning_starts:10"
+    arguments = f"--algo {algo} --env {env} -n 64 -params n_envs:1 batch_size:32 {params}".split()
+    arguments += ["--gym-packages", "registered_envs", "--eval-freq", "-1", "--device", "cpu"]
+    status = 1 if "stopped" in parts[0] else 2
+    refused(train.main, [*arguments, "-f", str(tmp_path)], capsys, *parts, status=status)
+    assert not list(tmp_path.rglob("result.json"))
+
+
+@pytest.mark.parametrize(
+    ("error", "after"),
+    [
+        (RuntimeError("out of order"), 20),
+        (ValueError("of somebody's"), 20),
+        (BrokenPipeError("of a simulator"), 20),
+        (EOFError("of a simulator"), 20),
+        (KeyError("mine"), -1),
+    ],
+)
+def test_an_exception_of_the_users_keeps_its_traceback(error, after, tmp_path, monkeypatch):
+    """The first step is no exception."""
+    monkeypatch.setattr(Broken, "error", error)
+    monkeypatch.setattr(Broken, "after", after)
+    arguments = "--algo ppo --env Broken-v0 -n 64 -params n_envs:1 n_steps:64 batch_size:32".split()
+    arguments += ["--gym-packages", "registered_envs", "--eval-freq", "-1", "--device", "cpu"]
+    with pytest.raises(type(error), match=error.args[0]):
+        train.main([*arguments, "-f", str(tmp_path)])
+
+
+@pytest.mark.parametrize("what", ["reward", "observation"])
+@pytest.mark.parametrize("algo", ["sac", "td3", "ppo", "cpo", "sac_lag"])
+def test_what_is_not_a_number_ends_training_in_a_line(algo, what, capsys, tmp_path):
+    params = ["learning_starts:10" if algo in ("sac", "td3", "sac_lag") else "n_steps:64"]
+    params += ["cost_limit:2"] if algo in ALGORITHMS else []
+    arguments = f"--algo {algo} --env Undefined-v0 -n 64 --env-kwargs what:{what}".split()
+    arguments += [*TOY[:2], "--eval-freq", "-1", "-params", "n_envs:1", "batch_size:32", *params]
+    assert train.main([*arguments, "-f", str(tmp_path)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: training stopped at 30 steps: the {what} of environment 0 is ")
+    assert not list(tmp_path.rglob("result.json"))
+
+
+def test_a_gpu_that_is_not_there(capsys, tmp_path):
+    refused(train.main, ["--device", "cuda:99", "-f", str(tmp_path)], capsys, "--device 'cuda:99'")
+
+
+def test_a_run_whose_files_were_edited(run, capsys):
+    path = run / "CostPoint-v0" / "config.yml"
+    values = yaml.safe_load(path.read_text())
+    path.write_text(yaml.safe_dump({**values, "n_steps": 31}))
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "n_steps = 31 contradicts 30")
+    path.write_text(yaml.safe_dump(values))
+
+
+def test_a_terminal_that_is_not_utf_8(tmp_path):
+    """What it can't show becomes "?"; errors end after some 500 characters."""
+    code = "from sb3_guard.zoo.cli.usage import run, UsageError\n"
+    code += "def long(): print('±ρ'); raise UsageError('é' * 900)\nraise SystemExit(run(long))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    assert (done.returncode, done.stdout) == (2, b"??\n")
+    assert len(done.stderr) < 520
+
+
+OUTPUT = (
+    "--algo ppo --env CostPoint-v0 -n 64 --eval-freq -1 --device cpu "
+    "--gym-packages registered_envs -params n_steps:32 batch_size:32 n_envs:1 -f"
+).split()
+
+
+def test_output_that_nobody_reads(tmp_path):
+    """As with ``| head -3``, which is no process of environments that died."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "sb3_guard.train", *OUTPUT, str(tmp_path)],
+        stdout=writer, stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(SUPPORT)},
+    )  # fmt: skip
+    os.close(writer)
+    assert done.returncode == 141 and b"subproc" not in done.stderr

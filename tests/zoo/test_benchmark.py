@@ -1,0 +1,603 @@
+"""Grids: refused in full or carried out in full, whatever dies meanwhile."""
+
+import csv
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from killed import assert_same_run, environment, lines, runs_of, wait_for
+from kills import Campaign, differences
+from rich.console import Console
+from typed import TOY, refused
+
+from sb3_guard import benchmark, cli, enjoy, train
+from sb3_guard.zoo.grids import grid
+from sb3_guard.zoo.grids.live import Board, read_progress
+from sb3_guard.zoo.grids.presets import PRESETS, preset
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import RunFolder, lock
+
+SUPPORT = Path(__file__).parents[1] / "support"
+PACKAGE = TOY[:2]
+SMALL = [
+    *PACKAGE,
+    *"-params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:2 --eval-freq -1".split(),
+    *"--env-kwargs episode_length:25 --device cpu --num-threads 1".split(),
+]
+GRID = ["--suites", "CostPoint-v0", *SMALL, "-n", "120"]
+
+
+class Here(Executor):
+    """Does the work at once, in this process."""
+
+    def __init__(self) -> None:
+        #: the runs carried out, in their order
+        self.runs: list[grid.Run] = []
+        self.before: Callable[[grid.Run], object] = lambda run: None
+
+    def submit(self, function, run, /, *args) -> Future:
+        self.runs.append(run)
+        future: Future = Future()
+        try:
+            self.before(run)
+            future.set_result(function(run, *args))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Carry out grids in this process."""
+    executor = Here()
+    monkeypatch.setattr(grid, "processes", lambda number: nullcontext(executor))
+    return executor
+
+
+def results(folder: Path) -> dict[str, dict]:
+    return {
+        str(path.parent.relative_to(folder)): json.loads(path.read_text())
+        for path in sorted(folder.glob("*/*/result.json"))
+    }
+
+
+def without_clock(result: dict) -> dict:
+    return {name: value for name, value in result.items() if name != "seconds"}
+
+
+# what a grid is
+
+
+def test_presets_are_the_papers():
+    sizes = {name: len(preset(name)) for name in PRESETS}
+    robots = 9
+    assert sizes == {
+        "paper45": 45 * 8, "main8": 8 * 8, "q1": 8 * 8, "q2": 2 * robots + 2 * 7, "q3": 4 * 8,
+        "q4": robots * 8, "q5": robots * 3, "q6": robots * 3, "q7": robots * 3, "q8": 45 * 8,
+        "ladder": 10 * 8,
+    }  # fmt: skip
+    paper = {suite for suite, _ in preset("paper45")}
+    assert {suite for suite, _ in preset("main8")} < paper
+    assert sum(suite.endswith("Ghosts-v0") for suite in paper) == robots
+    for name in PRESETS:  # scores are relative to TRPO's
+        assert {suite for suite, _ in preset(name)} == {s for s, a in preset(name) if a == "trpo"}
+
+
+@pytest.mark.parametrize("name", ["q2", "ladder"])
+def test_every_run_of_a_preset_is_valid(name, tmp_path):
+    flags = RunFlags(log_folder=str(tmp_path), conf_file="paper")
+    runs = grid.expand(preset(name), [0, 1], flags)
+    assert len({run.path for run in runs}) == len(runs) == 2 * len(preset(name))
+    assert [run.flags.seed + 1 for run in runs] == [1] * (len(runs) // 2) + [2] * (len(runs) // 2)
+    for run in runs:  # the paper's lengths
+        long = "_Ant_" in run.flags.env or "_Walker_" in run.flags.env
+        assert run.steps == (30_000_000 if long else 6_000_000)
+
+
+def test_scale_shortens_every_run_alike(tmp_path, capsys):
+    arguments = ["--suites", "Goal_Point_8Hazards", "Goal_Ant_8Ghosts", "--algos", "cpo", "trpo_sl"]
+    arguments += ["--seeds", "3", "--scale", "0.01", "-f", str(tmp_path / "a"), "--dry-run"]
+    arguments += ["-conf", "paper"]
+    assert benchmark.main(arguments) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert [line.split()[2] for line in out[:4]] == ["60,000"] * 2 + ["300,000"] * 2
+    assert out[0].split()[:2] == ["new", str(tmp_path / "a" / "cpo" / "Goal_Point_8Hazards-v0_4")]
+    assert out[4] == "0 of 4 done, 4 new; 720,000 steps in all"
+    assert list(tmp_path.iterdir()) == []
+    flags = RunFlags(conf_file="paper")
+    (run,) = grid.expand([("Goal_Point_8Hazards", "trpo_sl")], [0], flags, scale=0.5)
+    assert run.values["warmup"] == pytest.approx(1 / 3)  # a ratio of whatever the length is
+
+
+def test_a_hyperparameter_goes_to_those_that_have_it():
+    args = RunFlags(hyperparams={"cost_limit": 5.0})
+    cpo, ppo = grid.expand([("Goal_Point_8Hazards", a) for a in ("cpo", "ppo")], [0], args)
+    assert (cpo.values["cost_limit"], cpo.ignored) == (5.0, [])
+    assert ("cost_limit" in ppo.values, ppo.ignored) == (False, ["cost_limit"])
+
+
+def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
+    file = tmp_path / "my.yml"
+    file.write_text(
+        "suites: [CostPoint-v0]\nalgos: [cpo, trpo]\nseeds: [1]\nn_timesteps: 1e3\nscale: 0.06\n"
+        "eval_freq: -1\ngym_packages: [registered_envs]\nenv_kwargs: {episode_length: 25}\n"
+        "hyperparams: {n_envs: 2, n_steps: 30, n_critic_updates: 3, policy: MlpPolicy}\n"
+    )
+    folder = tmp_path / "grid"
+    # What is given now wins; hyper-parameters are merged.
+    arguments = [*PACKAGE, "--grid", str(file), "-f", str(folder)]
+    arguments += ["--algos", "trpo", "-params", "n_envs:1"]
+    assert benchmark.main(arguments) == 0
+    (run,) = folder.glob("*/*_*")
+    assert run == folder / "trpo" / "CostPoint-v0_2"
+    values = RunFolder(run).hyperparams()
+    assert (values["n_timesteps"], values["n_envs"], values["n_steps"]) == (60, 1, 30)
+    # The folder's record is such a file: it is enough to go on.
+    assert yaml.safe_load((folder / "grid.yml").read_text())["algos"] == ["trpo"]
+    capsys.readouterr()
+    assert benchmark.main([*PACKAGE, "-f", str(folder), "--dry-run"]) == 0
+    assert capsys.readouterr().out.startswith(f"done    {run}  60 steps")
+
+
+REFUSED = [
+    (["--suites", "Goal_Point_8Hazards", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
+    (["--algos", "cpo", "pcpq"], ["unknown algorithm 'pcpq'", "did you mean 'pcpo'?"]),
+    (["--preset", "main9"], ["--preset", "leave out"]),
+    (["--seeds", "-1"], ["--seeds: '-1'", "at least 0"]),
+    (["--seeds", "one"], ["--seeds", "'one'"]),
+    (["--scale", "0"], ["--scale", "above 0"]),
+    (["--scale", "half"], ["--scale", "'half'"]),
+    (["-n", "0"], ["-n", "at least 1"]),
+    (["-params", "cost_limt:5"], ["none of the algorithms", "'cost_limt'", "'cost_limit'"]),
+    (["-params", "gamma:1.5"], ["cpo on Goal_Point_8Hazards-v0", "gamma", "1.5"]),
+    (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError"]),
+    (["--device", "abacus"], ["abacus"]),
+    (["--jobs", "0"], ["--jobs", "at least 1"]),
+    (["--scheduler", "x", "--jobs", "2"], ["--nworkers"]),
+    (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
+    (["--suite", "x"], ["unknown flag --suite", "--suites"]),
+    (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
+]
+
+
+@pytest.mark.parametrize(("arguments", "parts"), REFUSED, ids=lambda one: " ".join(one)[:40])
+def test_refused_before_anything_starts(arguments, parts, capsys, tmp_path, monkeypatch, here):
+    monkeypatch.chdir(tmp_path)
+    start = ["--suites", "Goal_Point_8Hazards", "--algos", "cpo", "trpo", "-n", "100"]
+    refused(benchmark.main, [*start, *arguments], capsys, *parts)
+    assert (here.runs, list(tmp_path.iterdir())) == ([], [])
+
+
+GRID_FILES = [
+    ("suites: [a", "g.yml as YAML"),
+    ("just text", "must map flags to values"),
+    ("seeds: 1\nsuites: [Goal_Point_8Hazards]\nseeds: 2", "line 3 has the key 'seeds' again"),
+    ("suits: [CostPoint-v0]", "unknown entry 'suits'; did you mean 'suites'?"),
+    ("suites: [Goal_Point_8Hazards]\nscale: 0", "g.yml: scale: 0 is not allowed"),
+    ("suites: []", "suites: [] is not allowed; it must be one value or a"),
+    ("suites: {Goal_Point_8Hazards: 1}", "it must be one value or a list of them"),
+    (
+        "suites: [Goal_Point_8Hazards]\nscale: [1, 2]",
+        "scale: [1, 2] is not allowed; it must be",
+    ),
+    ("suites: [Goal_Point_8Hazards]\ntrack: maybe", "'maybe' is not allowed; it must be True or"),
+    ("suites: [Goal_Point_8Hazards]\nn_timesteps: true", "n_timesteps: True is not allowed"),
+    ("suites: [Goal_Point_8Hazards]\nhyperparams: [a]", "not of the form key:value"),
+    ("suites: [Goal_Point_8Hazards]\nseeds: [zero]", "g.yml: seeds: ['zero'] is not allowed"),
+    ("seeds: [0]", "which grid?"),
+]
+
+
+@pytest.mark.parametrize(("content", "part"), GRID_FILES)
+def test_bad_grid_file(content, part, capsys, tmp_path):
+    (tmp_path / "g.yml").write_text(content)
+    folder = tmp_path / "logs"
+    refused(benchmark.main, ["--grid", str(tmp_path / "g.yml"), "-f", str(folder)], capsys, part)
+    assert not folder.exists()
+
+
+def test_a_preset_in_a_grid_file_is_no_program(capsys, tmp_path):
+    grid = "suites: [Goal_Point_8Hazards]\nalgos: [cpo]\nconf_file: omnisafe"
+    (tmp_path / "g.yml").write_text(grid)
+    assert benchmark.main(["--grid", str(tmp_path / "g.yml"), "--dry-run"]) == 0
+
+
+# what becomes of it
+
+
+def test_runs_are_runs_of_train(tmp_path, here, capsys):
+    folder = tmp_path / "grid"
+    assert benchmark.main([*GRID, "--algos", "cpo", "--seeds", "3", "-f", str(folder)]) == 0
+    one = ["--algo", "cpo", "--env", "CostPoint-v0", *SMALL, "-n", "120", "--seed", "3"]
+    assert train.main([*one, "-f", str(tmp_path / "train"), "--verbose", "0"]) == 0
+    # The number is the seed's, so that a seed is found again.
+    (folder / "cpo" / "CostPoint-v0_4").rename(folder / "cpo" / "CostPoint-v0_1")
+    mine, other = runs_of(folder), runs_of(tmp_path / "train")
+    for name in ("config.yml", "args.yml"):
+        a, b = (yaml.safe_load((run / "CostPoint-v0" / name).read_text()) for run in (mine, other))
+        for flag in ("log_folder", "progress", "verbose"):
+            a.pop(flag, None), b.pop(flag, None)
+        assert a == b
+    assert (mine / "0.monitor.csv").read_text().count("\n") > 3
+    a, b = (next(iter(results(f).values())) for f in (folder, tmp_path / "train"))
+    assert without_clock(a) == without_clock(b)
+    assert enjoy.main([*TOY, "-f", str(folder), "--no-render", "-n", "25"]) == 0
+
+
+def test_done_is_skipped_and_half_written_made_whole(tmp_path, here, capsys):
+    arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
+    assert benchmark.main(arguments) == 0
+    whole = results(tmp_path)
+    assert len(here.runs) == 2
+    capsys.readouterr()
+
+    assert benchmark.main(arguments) == 0
+    assert len(here.runs) == 2
+    assert "2 of 2 done" in capsys.readouterr().out
+
+    cpo, trpo = tmp_path / "cpo" / "CostPoint-v0_1", tmp_path / "trpo" / "CostPoint-v0_1"
+    # A corrupt result: the checkpoint of its end is still there.
+    (cpo / "result.json").write_text('{"n_timest')
+    # Killed while the folder was being made: nothing of the run, or half of its configuration.
+    for path in (*trpo.glob("*.*"), trpo / "CostPoint-v0" / "args.yml"):
+        path.unlink()
+    assert benchmark.main(arguments) == 0
+    assert len(here.runs) == 4
+    assert "0 of 2 done, 1 resume, 1 new" in capsys.readouterr().out
+    after = results(tmp_path)
+    assert {k: without_clock(v) for k, v in whole.items()} == {
+        k: without_clock(v) for k, v in after.items()
+    }
+
+
+def test_another_run_in_the_folder_is_not_touched(tmp_path, here, capsys):
+    arguments = [*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)]
+    assert benchmark.main(arguments) == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for change, part in (
+        (["-params", "cost_limit:5"], "cost_limit: 2.0 there, 5.0 here"),
+        (["-n", "240"], "n_timesteps: 120 there, 240 here"),
+        (["--eval-freq", "60"], "eval_freq: -1 there, 60 here"),
+    ):
+        refused(benchmark.main, [*arguments, *change], capsys, "holds another run", part, "-f")
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    # Another grid that contains it, with flags that only say how to watch.
+    more = [*arguments, "--seeds", "0", "1", "--checkpoint-every", "0"]
+    assert benchmark.main(more) == 0
+    assert len(here.runs) == 2
+
+
+def test_a_warm_start_is_another_run(tmp_path, here, capsys):
+    one = ["--algo", "cpo", "--env", *GRID[1:], "--verbose", "0"]
+    assert train.main([*one, "--seed", "5", "-f", str(tmp_path / "first")]) == 0
+    model = str(runs_of(tmp_path / "first") / "CostPoint-v0.zip")
+    assert train.main([*one, "--seed", "0", "-i", model, "-f", str(tmp_path / "grid")]) == 0
+    refused(
+        train.main, [*one, "--seeds", "0", "-f", str(tmp_path / "grid")], capsys,
+        "holds another run", f"trained_agent: {model} there, none here",
+    )  # fmt: skip
+
+
+def test_a_failure_leaves_the_others_alone(tmp_path, here, monkeypatch, capsys):
+    complete, left = grid.complete, [1]
+
+    def failing(flags, *rest):
+        if flags.algo == "cpo" and left:
+            left.pop()
+            raise ValueError("no luck")
+        return complete(flags, *rest)
+
+    monkeypatch.setattr(grid, "complete", failing)
+    arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
+    (tmp_path / "cpo" / "CostPoint-v0_1").mkdir(parents=True)
+    assert benchmark.main(arguments) == 1
+    assert [run.flags.algo for run in here.runs] == ["cpo", "trpo"]
+    assert results(tmp_path).keys() == {"trpo/CostPoint-v0_1"}
+    out, err = capsys.readouterr()
+    assert "failed: cpo on CostPoint-v0, seed 0: no luck" in out and "no luck" in err
+    text = (tmp_path / "cpo" / "CostPoint-v0_1" / "error.txt").read_text()
+    assert text.count("Traceback") == 1 and "ValueError: no luck" in text
+    again = out.split("Continue with: sb3-guard benchmark ")[1].split()
+    # Once more: the failed one is tried again, the other is not.
+    assert benchmark.main(again) == 0
+    assert here.runs[-1].flags.algo == "cpo" and len(here.runs) == 3
+    assert f"See the results with: sb3-guard plot {tmp_path}" in capsys.readouterr().out
+
+
+def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
+    def die(run):
+        raise BrokenProcessPool("terminated abruptly.")
+
+    here.before = die
+    refused(
+        benchmark.main, [*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)], capsys,
+        "a worker or scheduler is gone", "abruptly;",
+        f"continue with: sb3-guard benchmark -f {tmp_path}",
+    )  # fmt: skip
+
+
+def test_a_run_that_another_process_has_is_left_to_it(tmp_path, here, capsys):
+    run = tmp_path / "cpo" / "CostPoint-v0_1"
+    run.mkdir(parents=True)
+    arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
+    with lock(run):
+        assert benchmark.main(arguments) == 1
+    assert "1 of 2 done, 1 in use" in capsys.readouterr().out
+    assert benchmark.main(arguments) == 0
+
+
+def test_a_full_disk_is_named(tmp_path, here, capsys):
+    arguments = [*GRID, "--algos", "trpo", "cpo", "--seeds", "0", "-f", str(tmp_path)]
+    run = tmp_path / "cpo" / "CostPoint-v0_1"
+    run.mkdir(parents=True)
+    (run / "0.monitor.csv").symlink_to("/dev/full")
+    assert benchmark.main(arguments) == 1
+    err = capsys.readouterr().err
+    assert f"can't write to {run}: No space left on device" in err and "Traceback" not in err
+    (run / "0.monitor.csv").unlink()  # room is made
+    assert benchmark.main(["-f", str(tmp_path), *PACKAGE]) == 0
+    assert len(results(tmp_path)) == 2
+
+
+def test_asked_to_stop(tmp_path, here, capsys):
+    """What runs ends with a checkpoint, what waits does not begin, and all is done later."""
+    arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
+
+    def interrupt(run):
+        if run.flags.algo == "cpo":
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    here.before = interrupt
+    assert benchmark.main(arguments) == 143
+    assert len(here.runs) == 2
+    assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in capsys.readouterr().out
+    assert results(tmp_path) == {} and not (tmp_path / "stop").exists()
+    here.before = lambda run: None
+    assert benchmark.main(arguments) == 0 and len(results(tmp_path)) == 2
+
+
+def test_a_run_looks_for_the_file_after_each_rollout(tmp_path, here):
+    stop, asked = tmp_path / "stop", []
+
+    class Appearing(type(stop)):
+        def exists(self, **kwargs):
+            asked.append(True)
+            return len(asked) > 3
+
+    flags = RunFlags(log_folder=str(tmp_path), gym_packages=["registered_envs"], eval_freq=-1)
+    flags.hyperparams = {"n_envs": 2, "n_steps": 30, "cost_limit": 2.0}
+    (run,) = grid.expand([("CostPoint-v0", "cpo")], [0], replace(flags, n_timesteps=600))
+    assert grid.carry_out(run, "", Appearing(stop)) == ("stopped", "")
+    assert len(asked) == 4 and (run.path / "checkpoint.zip").exists()
+    (run,) = grid.expand([("CostPoint-v0", "cpo")], [0], replace(flags, n_timesteps=600))
+    assert run.state == "resume"
+    assert grid.carry_out(run, "", tmp_path / "elsewhere" / "stop")[0] == "failed"
+
+
+# what is shown
+
+
+def test_progress_is_read_from_the_folder(tmp_path):
+    assert read_progress(tmp_path) == {"steps": 0}
+    path = tmp_path / "progress.csv"
+    names = "rollout/ep_rew_mean,time/total_timesteps,rollout/ep_cost_mean"
+    path.write_text(f"{names}\n1.5,60,2.5\n,,9.5\n1.75")  # being written
+    assert read_progress(tmp_path) == {"steps": 60, "return": 1.75, "cost": 9.5}
+    path.write_text("")
+    assert read_progress(tmp_path) == {"steps": 0}
+
+
+def test_bars_of_what_runs(tmp_path):
+    args = RunFlags(log_folder=str(tmp_path))
+    runs = grid.expand([("Goal_Point_8Hazards", a) for a in ("cpo", "trpo")], [0, 1], args)
+    for run, state in zip(runs, ("waiting", "failed", "done", "waiting"), strict=True):
+        run.state = state
+    runs[0].path.mkdir(parents=True)
+    (runs[0].path / ".lock").touch()  # it runs
+    with open(runs[0].path / "progress.csv", "w", newline="") as file:
+        rows = csv.DictWriter(file, ["time/total_timesteps", "rollout/ep_rew_mean"])
+        rows.writeheader()
+        rows.writerow({"time/total_timesteps": 1_500_000, "rollout/ep_rew_mean": 12.345})
+    console = Console(width=200, record=True, force_terminal=True, file=open(os.devnull, "w"))
+    board = Board("logs/x", console=console)
+    with board.bars:
+        board.update(runs, now=True)
+        console.print(board.bars)
+    text = console.export_text()
+    for part in (
+        "logs/x: 1 of 4 done, 1 running, 1 failed, 1 waiting",
+        "cpo on Goal_Point_8Hazards-v0, seed 0", "1,500,000 steps, return 12.35",
+    ):  # fmt: skip
+        assert part in text, text
+    assert "trpo on Goal_Point" not in text
+    # The same without a terminal
+    console = Console(width=200, record=True, file=open(os.devnull, "w"))
+    Board("logs/x", console=console).update(runs, now=True)
+    assert "cpo on Goal_Point_8Hazards-v0, seed 0: 1,500,000 steps, return 12.35" in (
+        console.export_text()
+    )
+
+
+# train --seeds
+
+
+@pytest.mark.parametrize(("jobs", "number"), [("5", 2), ("1", 1)])
+def test_no_more_workers_than_runs(jobs, number, tmp_path, here, monkeypatch):
+    asked = []
+    monkeypatch.setattr(grid, "processes", lambda n: asked.append(n) or nullcontext(here))
+    flags = ["--algo", "cpo", "--env", "CostPoint-v0", *SMALL, "-n", "60", "-f", str(tmp_path)]
+    assert train.main([*flags, "--seeds", "0", "1", "--jobs", jobs]) == 0
+    assert asked == [number]
+
+
+def test_seeds_of_train(tmp_path, here, capsys):
+    one = ["--algo", "cpo", "--env", "CostPoint-v0", *SMALL, "-n", "60", "-f", str(tmp_path)]
+    assert train.main([*one, "--seeds", "0", "4", "--verbose", "0"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert list(results(tmp_path)) == ["cpo/CostPoint-v0_1", "cpo/CostPoint-v0_5"]
+    assert train.main([*one, "--seeds", "0", "4", "5"]) == 0
+    assert len(here.runs) == 3 and "2 of 3 done, 1 new" in capsys.readouterr().out
+    assert not (tmp_path / "grid.yml").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--seeds", "0", "--seed", "1"], "not allowed with"),
+        (["--seeds", "0", "-i", "x"], "-i is for a single run"),
+        (["--seeds", "0", "--uuid"], "--uuid is for a single run"),
+        (["--jobs", "2"], "--jobs goes with several seeds"),
+    ],
+)
+def test_seeds_of_train_refused(arguments, part, capsys):
+    refused(train.main, arguments, capsys, part)
+
+
+# real processes
+
+
+CHAOS = Path(__file__).parents[2] / "scripts" / "chaos.py"
+
+
+def campaign(tmp_path, what: str, kills: int, *flags: str) -> str:
+    run = subprocess.run(
+        [sys.executable, CHAOS, what, "--kills", str(kills), "--folder", tmp_path, "--", *flags],
+        env=environment(), capture_output=True, text=True, timeout=580, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout + run.stderr
+    return run.stdout
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="kills processes")
+def test_a_grid_that_is_killed_is_the_same_grid(tmp_path, here, monkeypatch):
+    """A real worker is killed, at a random moment; see ``kills.py``."""
+    monkeypatch.setenv("PYTHONPATH", str(SUPPORT))
+    flags = ["--suites", "CostPoint-v0", *SMALL, "-n", "1200", "--algos", "cpo", "--jobs", "1"]
+    killed = Campaign("grid", flags, tmp_path / "killed", random.Random(0))
+    killed.run(["worker"])
+    assert killed.kills == {"main": 0, "worker": 1}
+    assert benchmark.main([*killed.flags, "-f", str(tmp_path / "undisturbed")]) == 0
+    assert len(results(tmp_path / "killed")) == 1
+    assert differences(tmp_path / "killed", tmp_path / "undisturbed") == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="kills processes")
+@pytest.mark.parametrize(("what", "kills"), [("grid", 20), ("train", 20)])
+def test_chaos(what, kills, tmp_path):
+    flags = ["--suites", "CostPoint-v0"] if what == "grid" else ["--env", "CostPoint-v0"]
+    assert "nothing is lost" in campaign(tmp_path, what, kills, *flags, *SMALL, "-n", "6000")
+
+
+def start(arguments: list[str], **kwargs) -> subprocess.Popen:
+    command = [sys.executable, "-m", "sb3_guard.benchmark", *arguments]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, env=environment(), **pipes, **kwargs)
+
+
+def episodes(folder: Path) -> int:
+    return sum(lines(path) for path in folder.rglob("0.monitor.csv"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_interrupted_once_and_twice(number, tmp_path):
+    """Once: with a checkpoint. Twice: immediately, and the workers end, too."""
+    arguments = [*GRID, "-n", "600000", "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)]
+    with start(arguments, start_new_session=True) as process:
+        wait_for(lambda: episodes(tmp_path) > 20, process, 180)
+        os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + number and "Traceback" not in out + err
+    assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in out
+    before = episodes(tmp_path)
+    with start([*PACKAGE, "-f", str(tmp_path)]) as process:
+        wait_for(lambda: episodes(tmp_path) > before + 10, process, 180)
+        process.send_signal(number)
+        time.sleep(0.1)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=30)
+    assert process.returncode in (130, 128 + number) and "Traceback" not in out + err
+
+
+# a cluster
+
+
+def test_no_scheduler_there(tmp_path, monkeypatch, capsys):
+    distributed = pytest.importorskip("distributed")
+    whole = distributed.Client.__init__
+    monkeypatch.setattr(
+        distributed.Client, "__init__", lambda self, a, timeout, **k: whole(self, a, timeout=1, **k)
+    )
+    arguments = [*GRID, "--algos", "cpo", "-f", str(tmp_path)]
+    for address in ("tcp://127.0.0.1:1", "nonsense"):
+        refused(
+            benchmark.main, [*arguments, "--scheduler", address], capsys,
+            f"no Dask scheduler answers at {address}", "start one with: dask scheduler",
+        )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_cluster_with_a_worker_killed(tmp_path):
+    """A scheduler and two workers started as commands, one killed: nothing is lost."""
+    address = tmp_path / "scheduler.json"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment()}
+    place = ["--scheduler-file", str(address), "--no-dashboard"]
+    processes = []
+
+    def begin(*arguments: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", *arguments, *place]
+        processes.append(subprocess.Popen(command, cwd=tmp_path, **quiet))
+        return processes[-1]
+
+    try:
+        scheduler = begin("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+        wait_for(address.exists, scheduler, 120)
+        flags = ["--nthreads", "1", "--no-nanny"]
+        workers = [begin("distributed.cli.dask_worker", *flags) for _ in range(2)]
+        folder = tmp_path / "grid"
+        arguments = ["--suites", "CostPoint-v0", *SMALL, "--algos", "cpo", "trpo", "--seeds", "0"]
+        arguments += ["-n", "6000", "--checkpoint-every", "0", "-f", str(folder)]
+        where = json.loads(address.read_text())["address"]
+        with start([*arguments, "--scheduler", where]) as process:
+
+            def both_run() -> bool:
+                logs = list(folder.glob("*/*/0.monitor.csv"))
+                return len(logs) == 2 and all(lines(path) > 30 for path in logs)
+
+            wait_for(both_run, process, 600)
+            workers[0].kill()
+            workers[0].wait()  # a zombie would still hold its lock
+            out, err = process.communicate(timeout=400)
+        assert process.returncode == 0, out + err
+    finally:
+        for one in processes:
+            one.kill()
+            one.wait()
+    # One go on this machine comes to the same, to the last bit.
+    with start([*arguments[:-1], str(tmp_path / "whole")]) as process:
+        process.communicate(timeout=400)
+    for algo in ("cpo", "trpo"):
+        for one in ("whole", "grid"):
+            (tmp_path / f"{one}-{algo}").mkdir()
+            (tmp_path / one / algo).rename(tmp_path / f"{one}-{algo}" / algo)
+        assert_same_run(tmp_path / f"whole-{algo}", tmp_path / f"grid-{algo}")
+
+
+def test_the_command_has_its_names(capsys):
+    assert cli.main(["benchmark", "--seeds"]) == 2
+    with pytest.raises(SystemExit):
+        cli.main(["benchmark", "--help"])
+    assert "python -m sb3_guard.benchmark --preset main8" in capsys.readouterr().out

@@ -1,0 +1,769 @@
+"""The commands as users type them."""
+
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from cost_envs import CostPoint
+from matplotlib import image
+from PIL import Image
+from rl_zoo3.utils import EnvironmentName, get_model_path
+from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from typed import LENGTH, PLAY, SMALL, TOY, require_rendering, trained
+from worlds import own_parts
+
+from sb3_guard import ALGORITHMS, CPO, cli, enjoy, make_vec_env, train
+from sb3_guard.envs import Scenario, register, register_constraint
+from sb3_guard.envs.part import Constraint
+from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
+from sb3_guard.zoo.agents import playback
+from sb3_guard.zoo.agents.playback import PRETRAINED
+from sb3_guard.zoo.cli import usage
+from sb3_guard.zoo.run.hyperparams import build, check
+from sb3_guard.zoo.run.make_envs import make_envs
+
+
+def test_track_sends_what_tensorboard_gets_and_goes_on(tmp_path, monkeypatch, capsys):
+    """With a stand-in for wandb, which sees the event files that are opened after init only."""
+    calls, logs = [], tmp_path / "logs"
+
+    def init(**kwargs):
+        # Nothing is written yet, of a new run not even its folder.
+        calls.append((kwargs, len(list(tmp_path.rglob("events.*"))), logs.exists()))
+        return SimpleNamespace(id="w1", config=SimpleNamespace(update=update), finish=finish)
+
+    def update(values, allow_val_change):
+        assert values == {"folder": str(logs / "cpo" / "CostPoint-v0_1")}
+
+    def finish():
+        assert (logs / "cpo" / "CostPoint-v0_1" / "result.json").exists()
+        raise OSError("no network")
+
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
+    run = trained(logs, "--track", "-tb", str(tmp_path / "tb"))
+    assert "did not get everything: OSError: no network" in capsys.readouterr().err
+    assert train.main(["-i", str(run), *TOY[:2], "-n", "180", "--verbose", "0"]) == 0
+    assert json.loads((run / "result.json").read_text())["n_timesteps"] == 180
+    (first, *before), (second, *after) = calls
+    assert (before, after) == ([0, False], [1, True])
+    assert all(one["sync_tensorboard"] for one in (first, second))
+    assert (first["id"], first["resume"]) == (None, None)
+    assert (second["id"], second["resume"]) == ("w1", "allow")
+
+
+def test_run_folder_is_rl_zoos(tmp_path):
+    run = trained(tmp_path, "--save-freq", "60")
+    assert run.name == "CostPoint-v0_1"
+    assert {path.name for path in run.iterdir() if path.name[0] != "."} == {
+        "CostPoint-v0", "CostPoint-v0.zip", "0.monitor.csv", "progress.csv", "evaluations.npz",
+        "best_model.zip", "checkpoint.zip", "result.json", "rl_model_60_steps.zip",
+        "rl_model_120_steps.zip",
+    }  # fmt: skip
+    for flags in ({}, {"load_best": True}, {"load_last_checkpoint": True}):
+        name = EnvironmentName("CostPoint-v0")
+        assert get_model_path(0, str(tmp_path), "cpo", name, **flags)[2] == str(run)
+    args = yaml.safe_load((run / "CostPoint-v0" / "args.yml").read_text())
+    config = yaml.safe_load((run / "CostPoint-v0" / "config.yml").read_text())
+    assert (args["seed"], args["env"]) == (3, "CostPoint-v0")
+    assert (config["n_envs"], config["n_timesteps"], config["policy"]) == (2, 120, "MlpPolicy")
+    assert (run / "CostPoint-v0" / "command.txt").read_text()
+    assert CPO.load(run / "CostPoint-v0.zip").num_timesteps == 120
+    assert trained(tmp_path).name == "CostPoint-v0_2"
+
+
+def test_costs_are_in_the_files(tmp_path):
+    run = trained(tmp_path)
+    episodes = load_results(str(run))
+    assert len(episodes) == 6 and (episodes["l"] == 20).all() and (episodes["c"] >= 0).all()
+    log = pd.read_csv(run / "progress.csv")
+    for key in ("rollout/ep_cost_mean", "rollout/cost_rate", "eval/mean_ep_cost", "train/kl"):
+        assert log[key].notna().any()
+    assert np.load(run / "evaluations.npz")["costs"].shape == (2, 2)
+    result = json.loads((run / "result.json").read_text())
+    # Of 20 steps each: one ended in the first rollout of 30 per environment, two in the second.
+    last = episodes.sort_values("t").tail(4)
+    assert result["episodes"] == 4
+    assert result["return"] == pytest.approx(last["r"].mean())
+    assert result["cost"] == pytest.approx(last["c"].mean())
+    assert result["cost_rate"] == pytest.approx(episodes["c"].sum() / 120)
+
+
+def outcome(run):
+    """What a run came to, its duration aside."""
+    return json.loads((run / "result.json").read_text()) | {"seconds": None}
+
+
+def test_same_seed_same_run(tmp_path):
+    one, other = trained(tmp_path), trained(tmp_path)
+    assert outcome(one) == outcome(other)
+    assert outcome(trained(tmp_path, "--seed", "4")) != outcome(one)
+
+
+def test_summary_names_folder_and_figures(tmp_path, capsys):
+    trained(tmp_path)
+    assert capsys.readouterr() == ("", "")  # --verbose 0
+    assert train.main([*TOY, *SMALL, *LENGTH, "-n", "60", "-f", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    for text in (str(tmp_path / "cpo" / "CostPoint-v0_2"), "J_r", "M_c", "ρ_c", "ep_cost_mean"):
+        assert text in out
+
+
+def test_no_episode_ends(tmp_path, capsys):
+    arguments = [*TOY, *SMALL, "-n", "60", "-f", str(tmp_path), "--eval-freq", "-1"]
+    assert train.main([*arguments, "--env-kwargs", "episode_length:1000"]) == 0
+    assert "no episode has ended" in capsys.readouterr().out
+
+
+def test_progress_bar_shows_return_and_cost(tmp_path, capsys):
+    trained(tmp_path, "--progress", "--verbose", "1")
+    err = capsys.readouterr().err
+    assert "120/120" in err
+    assert "return" in err and "rate" in err and re.search(r", cost [\d.]+ [≤>] 2, ", err)
+
+
+def test_every_limit_has_a_verdict(tmp_path, capsys):
+    limits = ["cost_keys:['cost','heat']", "cost_limit:[1000.0, 0.0]"]
+    arguments = [*TOY, *SMALL, *LENGTH, "-n", "120", "-f", str(tmp_path), "--progress"]
+    world = ["cost_keys:['cost','heat']", "hazard:[-1.0, 0.0]"]
+    assert train.main([*arguments, "-params", *limits, "--env-kwargs", *world]) == 0
+    (run,) = tmp_path.glob("cpo/*_1")
+    out, err = capsys.readouterr()
+    result = json.loads((run / "result.json").read_text())
+    cost, heat = result["costs"]["cost"], result["costs"]["heat"]
+    assert heat["mean"] == pytest.approx(2 * cost["mean"])  # as the environment has it
+    assert cost["mean"] == pytest.approx(result["cost"])
+    assert (cost["limit"], cost["verdict"]) == (1000, "kept")
+    assert (heat["limit"], heat["verdict"]) == (0, "exceeded")
+    assert cost["low"] <= cost["mean"] <= cost["high"]
+    assert f"cost {cost['mean']:.2f} ≤ 1000, heat {heat['mean']:.2f} > 0, rate" in err
+    shown = [line.split() for line in out.splitlines()]
+    for key, end in (("cost", ["1000:", "kept"]), ("heat", ["0:", "exceeded"])):
+        assert any(words[:1] == [key] and words[-2:] == end for words in shown), key
+
+
+@pytest.mark.parametrize("vec_env", ["native", "dummy"])
+def test_our_environments(tmp_path, vec_env, capsys):
+    run = trained(
+        tmp_path, "--vec-env", vec_env, "--env-kwargs", "goal:dict(size=0.5)", "--eval-freq", "-1",
+        env="Goal_Point_3Hazards-v0",
+    )  # fmt: skip
+    config = yaml.safe_load((run / "Goal_Point_3Hazards-v0" / "config.yml").read_text())
+    assert config["env_kwargs"]["goal"] == {"size": 0.5}
+    capsys.readouterr()
+    play = [
+        *TOY[:2],
+        "--env",
+        "Goal_Point_3Hazards",
+        "-f",
+        str(tmp_path),
+        "--no-render",
+        "-n",
+        "20",
+    ]
+    assert enjoy.main(play) == 0
+    assert "No episode ended" in capsys.readouterr().out
+
+
+def test_trpo_on_an_environment_without_costs(tmp_path):
+    trained(tmp_path, "--env", "NoCost-v0", algo="trpo", env="NoCost-v0")
+
+
+def test_missing_costs_may_count_as_zero(tmp_path):
+    trained(tmp_path, "-params", "missing_cost:zero", "n_steps:30", env="NoCost-v0")
+
+
+def test_warm_start_begins_a_new_run_from_an_agent(tmp_path):
+    run = trained(tmp_path, "-params", "normalize:True")
+    second = trained(tmp_path, "-params", "normalize:True", "-i", str(run / "CostPoint-v0.zip"))
+    assert second.name == "CostPoint-v0_2"
+    assert CPO.load(second / "CostPoint-v0.zip").num_timesteps == 120
+    first, later = (np.load(one / "evaluations.npz")["results"] for one in (run, second))
+    assert not np.array_equal(first, later)
+
+
+def test_tensorboard_and_uuid(tmp_path):
+    run = trained(tmp_path / "logs", "-tb", str(tmp_path / "tb"), "-uuid")
+    assert len(run.name) > len("CostPoint-v0_1_") + 30
+    (events,) = (tmp_path / "tb").rglob("events.*")
+    assert events.parent.parent.name == "CostPoint-v0"
+
+
+def test_schedules_and_other_conf_file(tmp_path):
+    conf = tmp_path / "conf.yml"
+    conf.write_text(
+        "default: {n_timesteps: 60, n_envs: 1, n_steps: 60, learning_rate: lin_0.01, cost_limit: 2}"
+    )
+    arguments = [
+        *TOY,
+        "-conf",
+        str(conf),
+        "-f",
+        str(tmp_path),
+        "--verbose",
+        "0",
+        "--eval-freq",
+        "-1",
+    ]
+    assert train.main([*arguments, "--env-kwargs", "episode_length:20"]) == 0
+    log = pd.read_csv(tmp_path / "cpo" / "CostPoint-v0_1" / "progress.csv")
+    assert log["time/total_timesteps"].tolist() == [60]
+
+
+# enjoy
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    trained(folder, "--save-freq", "60", "-params", "normalize:True", env="Filmed-v0")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "which",
+    [
+        [],
+        ["--load-best"],
+        ["--load-last-checkpoint"],
+        ["--load-checkpoint", "60"],
+        ["--exp-id", "1"],
+    ],
+)
+def test_enjoy_prints_return_and_cost(logs, which, capsys):
+    assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "3", *which]) == 0
+    out = capsys.readouterr().out
+    rows = [line for line in out.splitlines() if line.endswith("20 steps")]
+    assert len(rows) == 3 and all("return" in row and "cost" in row for row in rows)
+    assert "Mean ± std of 3 episodes" in out
+    returns = [float(row.split()[1]) for row in rows]
+    (mean,) = (line for line in out.splitlines() if line.startswith("  return") and "±" in line)
+    assert float(mean.split()[1]) == pytest.approx(np.mean(returns), abs=1e-3)
+
+
+def test_enjoy_says_what_was_cut_and_what_noise_does(logs, capsys):
+    run = logs / "cpo" / "Filmed-v0_1"
+    result = run.joinpath("result.json").read_text()
+    run.joinpath("result.json").write_text(json.dumps(json.loads(result) | {"return": 1e3}))
+    try:
+        assert enjoy.main([*PLAY, "-f", str(logs), "-n", "50"]) == 0
+        out = capsys.readouterr().out
+        assert "10 steps so far" in out and "--stochastic" in out
+        assert enjoy.main([*PLAY, "-f", str(logs), "-n", "50", "--verbose", "0"]) == 0
+        first, *means = capsys.readouterr().out.splitlines()
+    finally:
+        run.joinpath("result.json").write_text(result)
+    assert first.startswith("Mean") and [one.split()[0] for one in means] == [
+        "return", "cost", "length"
+    ]  # fmt: skip
+    assert "limit 2: " in means[1]
+
+
+def test_enjoy_writes_its_statistics(logs, tmp_path):
+    file = tmp_path / "made" / "played.json"
+    assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "3", "--json", str(file)]) == 0
+    played = json.loads(file.read_text())
+    assert played["episodes"] == 3 and played["algo"] == "cpo" and played["env"] == "Filmed-v0"
+    for name in ("return", "cost", "length"):
+        values = played[name]["values"]
+        assert len(values) == 3 and played[name]["mean"] == pytest.approx(np.mean(values))
+        assert played[name]["low"] <= played[name]["mean"] <= played[name]["high"]
+    assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "1", "--json", str(file)]) == 0
+    assert json.loads(file.read_text())["cost"]["low"] is None
+
+
+def test_enjoy_is_seeded_and_deterministic_by_default(logs, capsys):
+    def play(*arguments):
+        assert enjoy.main([*PLAY, "-f", str(logs), *arguments]) == 0
+        return capsys.readouterr().out
+
+    assert play() == play("--deterministic", "--seed", "0") == play()
+    assert play("--seed", "1") != play() != play("--stochastic")
+    assert play("--stochastic") == play("--stochastic")
+
+
+def test_enjoy_uses_the_environment_of_training(logs, capsys):
+    assert enjoy.main([*PLAY, "-f", str(logs), "--env-kwargs", "episode_length:7"]) == 0
+    assert "7 steps" in capsys.readouterr().out
+
+
+def test_an_unfinished_run_is_played_from_its_checkpoint(logs, tmp_path, capsys):
+    run = trained(tmp_path, "-params", "normalize:True")
+    play = [*TOY, "-f", str(tmp_path), "--no-render"]
+
+    def table() -> list[str]:
+        assert enjoy.main(play) == 0
+        first, *rest = capsys.readouterr().out.splitlines()
+        return [first.split()[1], *rest]
+
+    final = table()
+    (run / "CostPoint-v0.zip").unlink()
+    (run / "CostPoint-v0" / "vecnormalize.pkl").unlink()
+    # The last checkpoint is the final agent, observation statistics included.
+    assert table() == [str(run / "checkpoint.zip"), *final[1:]]
+
+
+def test_enjoy_normalises_as_training_did(tmp_path, capsys):
+    run = trained(tmp_path, "-params", "normalize:True")
+    play = [*TOY, "-f", str(tmp_path), "--no-render"]
+    path = run / "CostPoint-v0" / "vecnormalize.pkl"
+    assert enjoy.main(play) == 0
+    before = capsys.readouterr().out
+    statistics = VecNormalize.load(str(path), DummyVecEnv([CostPoint]))
+    statistics.obs_rms.mean += 5.0
+    statistics.save(str(path))
+    assert enjoy.main(play) == 0
+    assert capsys.readouterr().out != before
+    path.unlink()
+    assert enjoy.main(play) == 2
+    assert "can't read the observation statistics" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("evaluation", [True, False])
+def test_only_training_adds_to_the_statistics(evaluation):
+    setup = build(check("cpo", CPO, {"n_timesteps": 1, "normalize": True}))
+    env = make_envs(
+        "CartPole-v1", setup, n_envs=2, seed=0, vec_env="dummy", env_kwargs={},
+        evaluation=evaluation,
+    )  # fmt: skip
+    assert (env.training, env.norm_reward) == (not evaluation, not evaluation)
+
+
+def test_record_writes_a_video(logs, tmp_path):
+    import imageio_ffmpeg
+
+    video = tmp_path / "made" / "film.mp4"
+    assert enjoy.main([*PLAY, "-f", str(logs), "-n", "12", "--record", str(video)]) == 0
+    assert [path.name for path in video.parent.iterdir()] == ["film.mp4"]
+    frames = imageio_ffmpeg.read_frames(str(video))
+    meta = next(frames)
+    assert meta["size"] == (64, 64 + 16) and meta["fps"] == 10  # below a line of text
+    pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
+    assert len(pictures) == 12
+    assert pictures[0].max() > 200 and abs(int(np.median(pictures[0])) - 60) < 10
+
+
+def test_record_our_environment(tmp_path):
+    require_rendering()
+    trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
+    video = tmp_path / "film.mp4"
+    play = [
+        *TOY[:2],
+        "--env",
+        "Goal_Point_2Hazards",
+        "-f",
+        str(tmp_path),
+        "-n",
+        "3",
+        "--record",
+        str(video),
+    ]
+    assert enjoy.main(play) == 0
+    assert video.stat().st_size > 1000
+
+
+def test_packages_are_found_in_the_current_folder(tmp_path, monkeypatch):
+    """The script sb3-guard has its own folder on the path, not the current one."""
+    (tmp_path / "parts_of_mine.py").touch()
+    monkeypatch.setattr(sys, "path", [one for one in sys.path if one not in ("", os.getcwd())])
+    monkeypatch.chdir(tmp_path)
+    usage.import_packages(["parts_of_mine"])
+    assert sys.modules.pop("parts_of_mine")
+
+
+def test_an_arm_trains_plays_and_records(tmp_path):
+    import imageio_ffmpeg
+
+    from sb3_guard.envs.rendering import RenderingError, gl_backend
+
+    try:
+        gl_backend()
+    except RenderingError as error:
+        pytest.skip(str(error))
+    command = "--algo cpo --env Goal_Arm6_8Hazards -n 120 --seed 0 --verbose 0 -f".split()
+    small = "--env-kwargs max_episode_steps:10 --eval-freq 60 --eval-episodes 2".split()
+    params = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3"]
+    assert train.main([*command, str(tmp_path), *small, *params]) == 0
+    run = tmp_path / "cpo" / "Goal_Arm6_8Hazards-v0_1"
+    assert json.loads((run / "result.json").read_text())["episodes"] == 6
+    video, played = tmp_path / "film.mp4", tmp_path / "played.json"
+    play = ["--algo", "cpo", "--env", "Goal_Arm6_8Hazards", "-f", str(tmp_path), "--load-best"]
+    assert enjoy.main([*play, "-n", "10", "--record", str(video), "--json", str(played)]) == 0
+    assert json.loads(played.read_text())["length"]["values"] == [10]
+    frames = imageio_ffmpeg.read_frames(str(video))
+    next(frames)
+    pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
+    # 5 of 10 steps at 50 a second, 25 pictures a second; the last one stays for a second.
+    assert len(pictures) == 5 + 25
+    assert np.ptp(pictures[0]) > 100 and not np.array_equal(pictures[0], pictures[-1])
+
+
+def test_our_environment_has_a_window(tmp_path, monkeypatch):
+    frames = []
+    monkeypatch.setattr("sb3_guard.envs.GuardEnv.render", lambda self: frames.append(self))
+    monkeypatch.setenv("DISPLAY", ":0")
+    trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
+    play = [*TOY[:2], "--env", "Goal_Point_2Hazards", "-f", str(tmp_path), "-n", "3"]
+    assert enjoy.main(play) == 0
+    assert len(frames) >= 3 and {env.render_mode for env in frames} == {"human"}
+
+
+def test_no_backend_no_video(tmp_path, monkeypatch, capsys):
+    import sb3_guard.envs.rendering as rendering
+
+    def nothing() -> str:
+        raise rendering.RenderingError("no OpenGL backend works here, tried egl; install EGL")
+
+    monkeypatch.setattr(rendering, "gl_backend", nothing)
+    trained(tmp_path, "--eval-freq", "-1", env="Goal_Point_2Hazards-v0")
+    video = tmp_path / "film.mp4"
+    play = [
+        *TOY[:2],
+        "--env",
+        "Goal_Point_2Hazards",
+        "-f",
+        str(tmp_path),
+        "-n",
+        "3",
+        "--record",
+        str(video),
+    ]
+    assert enjoy.main(play) == 2
+    assert "error: can't render: RenderingError: no OpenGL backend" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.mp4")) and not list(tmp_path.glob(".*"))
+
+
+# the agents that the package ships
+
+SHIPPED = sorted(PRETRAINED.glob("*/*_1"))
+
+
+@pytest.mark.parametrize("run", SHIPPED, ids=lambda run: f"{run.parent.name}-{run.name}")
+def test_a_shipped_agent_is_small_good_and_goes_on_learning(run):
+    algo, env_id = run.parent.name, run.name.removesuffix("_1")
+    files = [path for path in run.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 120_000
+    text = "".join(path.read_text() for path in files if path.suffix not in (".zip", ".pkl"))
+    assert "/tmp" not in text and "/work" not in text and f"--env {env_id[:-3]}" in text
+    result = json.loads((run / "result.json").read_text())
+    for played in result["played"].values():  # means of 100 episodes
+        assert played["cost"][0] < result.get("cost_limit", np.inf)
+    env = make_vec_env(env_id, 20, seed=5, max_episode_steps=300)
+    if (statistics := run / env_id / "vecnormalize.pkl").exists():
+        env = VecNormalize.load(str(statistics), env)
+        env.training = env.norm_reward = False
+    model = ALGORITHMS[algo].load(run / f"{env_id}.zip", env=env, device="cpu", n_steps=10)
+    assert model.ep_info_buffer is None and not model.policy.optimizer.state
+    obs, total = env.reset(), np.zeros(20)
+    for _ in range(300):
+        obs, rewards, *_ = env.step(model.predict(obs, deterministic=True)[0])
+        total += rewards
+    # It earns as in whole episodes, but for the start; random actions: about 0.
+    assert total.mean() > 0.6 * 0.3 * result["played"]["deterministic"]["return"][0]
+    model.learn(200)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", ["Goal_Point_8Hazards", "Goal_Point_8Ghosts"])
+@pytest.mark.parametrize("noise", [[], ["--stochastic"]])
+def test_a_shipped_agent_keeps_its_limit(env_id, noise, tmp_path):
+    """On average: 200 episodes with a standard error of 0.3."""
+    file = tmp_path / "played.json"
+    which = ["--pretrained", "--no-render", "--verbose", "0", "--env", env_id, *noise]
+    assert enjoy.main([*which, "--n-episodes", "200", "--json", str(file)]) == 0
+    assert 1 < json.loads(file.read_text())["cost"]["mean"] < 5.3
+
+
+def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):
+    made = []
+    monkeypatch.setattr(
+        playback,
+        "make_envs",
+        lambda *args, **kwargs: made.append(make_envs(*args, **kwargs)) or made[-1],
+    )
+    which = ["--pretrained", "--no-render", "--env-kwargs", "max_episode_steps:5"]
+    file = tmp_path / "played.json"
+    for flags, episodes, at_once in (
+        ([], 30, 30),
+        (["--n-episodes", "3"], 3, 3),
+        (["-n", "10"], 2, 1),
+    ):
+        assert enjoy.main([*which, *flags, "--json", str(file)]) == 0
+        assert json.loads(file.read_text())["episodes"] == episodes
+        assert made[-1].num_envs == at_once
+
+
+def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert enjoy.main(["--pretrained", "-n", "20", "--no-render"]) == 0
+    out = capsys.readouterr().out
+    assert "cpo/Goal_Point_8Hazards-v0_1" in out
+    shown = out.split("100 episodes of other seeds, when it was shipped (--deterministic):")[1]
+    assert shown.rstrip().endswith("limit 5: kept")
+    which = ["--algo", "trpo", "--env", "Goal_Point_8Hazards", "--no-render"]
+    short = ["--n-episodes", "1", "--env-kwargs", "max_episode_steps:30"]
+    assert enjoy.main([*which, "--pretrained", *short, "--json", "played.json"]) == 0
+    assert json.loads((tmp_path / "played.json").read_text())["length"]["values"] == [30]
+    assert enjoy.main(which) == 2
+    assert "or play the package's own with --pretrained" in capsys.readouterr().err
+
+
+def test_a_film_of_a_shipped_agent_is_not_written_into_the_package(tmp_path, monkeypatch):
+    require_rendering()
+    monkeypatch.chdir(tmp_path)
+    assert enjoy.main(["--pretrained", "-n", "3", "--record"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["cpo-Goal_Point_8Hazards-v0.mp4"]
+
+
+def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch):
+    require_rendering()
+    script = runpy.run_path(str(PRETRAINED.parent.parent / "scripts" / "render_gallery.py"))
+    animation = script["animation"]
+    monkeypatch.setitem(animation.__globals__, "FRAMES", 2)
+    animation(tmp_path / "film.gif", 0)
+    with Image.open(tmp_path / "film.gif") as film:
+        assert (film.n_frames, film.size) == (2, (808, 304))
+    clip = script["clip"]
+    monkeypatch.setitem(clip.__globals__, "CLIP", 2)
+    clip("Goal_Point_8Hazards-v0", tmp_path / "clip.webp", "fixed", "no runs", 0)
+    with Image.open(tmp_path / "clip.webp") as film:
+        assert (film.n_frames, film.size) == (2, (300, 250))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--algo", "ppo", "--env", "Goal_Ant_8Hazards"],
+            "one of those there: cpo on Goal_Point_8Ghosts-v0, cpo on Goal_Point_8Hazards-v0, ",
+        ),
+        (["-f", "logs"], "leave out --folder and --exp-id"),
+        (["--exp-id", "1"], "leave out --folder and --exp-id"),
+        (["--load-best"], "not allowed with argument"),
+    ],
+)
+def test_what_is_not_shipped_is_not_played(arguments, message, capsys):
+    assert enjoy.main(["--pretrained", "--no-render", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+# list and show
+
+
+def rows(text: str) -> list[list[str]]:
+    """The cells of the tables in what a command printed."""
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_list_prints_what_there_is(capsys):
+    assert cli.main(["list"]) == 0
+    cells = rows(capsys.readouterr().out)
+    names = [row[0] for row in cells]
+    assert (
+        sum(row.count(f"{row[0]}_8Hazards") + row.count(f"{row[0]}_8Ghosts") for row in cells) == 72
+    )
+    for kind, known in (("robot", ROBOTS), ("task", TASKS), ("constraint", CONSTRAINTS)):
+        first = names.index(kind) + 1
+        assert names[first : first + len(known)] == list(known)
+    assert ["Ant", "8", "planar", "0.2"] in [row[:4] for row in cells]
+    assert ["Goal", "no", "no", "one", "planar, spatial"] in [row[:5] for row in cells]
+    assert ["Ghosts", "yes; no if solid", "active", "planar, spatial"] in [r[:4] for r in cells]
+    assert cli.main(["list", "robots"]) == 0
+    assert [row[0] for row in rows(capsys.readouterr().out)] == ["robot", *ROBOTS]
+
+
+def test_list_shows_the_pretrained_agents(capsys):
+    assert cli.main(["list", "agents"]) == 0
+    head, *cells = rows(capsys.readouterr().out)
+    assert head[:2] == ["pretrained agent", "environment"]
+    assert ["cpo", "trpo"] == [r[0] for r in cells if r[1] == "Goal_Point_8Hazards-v0"]
+    assert len(cells) == len([*PRETRAINED.glob("*/*_1")])
+
+
+@pytest.mark.parametrize("name, version", [("SafetyHopperVelocity", 1), ("CostPoint", 0)])
+def test_a_run_is_of_the_latest_version_where_none_is_given(tmp_path, name, version):
+    for number in (0, 1):
+        (tmp_path / "cpo" / f"{name}-v{number}_1" / f"{name}-v{number}").mkdir(parents=True)
+        (tmp_path / "cpo" / f"{name}-v{number}_1" / f"{name}-v{number}" / "args.yml").touch()
+    assert playback.find_run(tmp_path, "cpo", name).path.name == f"{name}-v{version}_1"
+
+
+def test_show_draws_each_version_into_a_file_of_its_name(tmp_path, monkeypatch):
+    require_rendering()
+    monkeypatch.chdir(tmp_path)
+    for name in ("SafetyHopperVelocity", "SafetyHopperVelocity-v0"):
+        assert cli.main(["show", name]) == 0
+        assert (tmp_path / f"{name}.png").is_file()
+
+
+def test_show_names_the_joints_of_a_velocity_task(tmp_path, capsys):
+    require_rendering()
+    assert cli.main(["show", "SafetyHopperVelocity", "-o", str(tmp_path / "hopper.png")]) == 0
+    text = capsys.readouterr().out
+    assert "faster than limit (Zhang" in text and "Here: limit 0.7402." in text
+    cells = rows(text)
+    # Gymnasium's own documentation of the observation: height, angle of the torso, ...
+    assert [row[::3] for row in cells[1:4]] == [
+        ["qpos rootz", "m"], ["qpos rooty", "rad"], ["qpos thigh_joint", "rad"]
+    ]  # fmt: skip
+    assert cells[6] == ["qvel rootx", "5", "[-inf, inf]", "m/s"]
+    assert cells[-1][:2] == ["2", "foot_joint"]
+
+
+def test_nobody_needs_to_read_to_the_end():
+    done = subprocess.run(
+        f"{sys.executable} -m sb3_guard.cli list robots | true; echo ${{PIPESTATUS[0]}}",
+        shell=True,
+        executable="/bin/bash",
+        capture_output=True,
+        text=True,
+    )
+    assert (done.stdout.strip(), done.stderr) == ("141", "")  # 128 + SIGPIPE, as of other programs
+
+
+def test_list_shows_what_users_registered(capsys):
+    @dataclass
+    class Quiet(Constraint):
+        def cost(self):
+            return np.zeros(self.sim.num_envs)
+
+    with own_parts():
+        register_constraint("Quiet", Quiet)
+        assert cli.main(["list", "constraints"]) == 0
+    assert ["Quiet", "", "", "planar, spatial"] in [r[:4] for r in rows(capsys.readouterr().out)]
+
+
+def test_a_ladder_of_difficulty(capsys):
+    assert cli.main(["list", "--ladder", "Goal_Point", "Hazards"]) == 0
+    ids = [f"Goal_Point_{n}Hazards-v0" for n in (1, 2, 4, 8, 16)]
+    assert capsys.readouterr().out.split() == ids
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["robot"], "invalid choice: 'robot' (choose from"),
+        (["--ladder"], "not 0 values: for example --ladder Goal_Point Hazards"),
+        (["--ladder", "Goal_Point"], "not 1 values: for example --ladder Goal_Point Hazards"),
+        (["--ladder", "goal_point", "hazards"], "did you mean 'Goal_Point_1Hazards'?"),
+    ],
+)
+def test_list_says_what_it_takes(arguments, message, capsys):
+    assert cli.main(["list", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
+    require_rendering()
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["show", "Goal_Ant_8Ghosts"]) == 0
+    text = capsys.readouterr().out
+    scenario = yaml.safe_load(text.partition("\n\n")[0])
+    ghosts = {"ghosts": {"num": 8}}
+    assert scenario == {"robot": "Ant", "task": "Goal", "constraints": ghosts, "cost": "sum"}
+    cells = rows(text)
+    assert ["accelerometer", "0:3", "[-inf, inf]", "m/s²"] in cells
+    costs = text.split("\n\n")[1].splitlines()
+    assert costs[0].startswith("info['cost_ghosts']: Cost: Σ max(0, size − distance)")
+    assert costs[0].endswith("Here: size 0.3, solid False.")
+    assert costs[1:] == [
+        "Usual cost limit of an episode: 2.", "An episode has 1000 steps of 0.2 s."
+    ]  # fmt: skip
+    assert ["ghosts_lidar", "3:19", "[0, 1]", "closeness"] in cells
+    assert cells[cells.index(["action", "actuator", "range", "control"]) - 1][1].endswith(":62")
+    assert [row[1] for row in cells[-8:]] == [
+        f"{j}_{i}" for i in (1, 2, 3, 4) for j in ("hip", "ankle")
+    ]
+    assert text.endswith("wrote Goal_Ant_8Ghosts.png\n")
+    frame = image.imread(tmp_path / "Goal_Ant_8Ghosts.png")[..., :3]
+    red, green, blue = np.moveaxis(frame, -1, 0)
+    assert ((red - green > 0.25) & (blue > green)).sum() > 1000  # ghosts
+    assert ((green - red > 0.25) & (green > blue)).sum() > 1000  # the goal
+
+
+def test_show_knows_an_observed_camera_and_lets_its_options_be_changed(tmp_path, capsys):
+    require_rendering()
+    scenario, picture = tmp_path / "seen.yml", tmp_path / "seen.png"
+    scenario.write_text("robot: Car\nobserve: {camera: [32, 24]}\n")
+    show = ["show", str(scenario), "-o", str(picture), "--env-kwargs"]
+    assert cli.main([*show, "num_envs:2", "width:40", "height:30"]) == 0
+    cells = rows(capsys.readouterr().out)
+    assert ["camera", "image 24 × 32 × 3", "[0, 255]", "red, green, blue"] in cells
+    assert image.imread(picture).shape[:2] == (30, 40)
+    assert cli.main([*show, "flatten:True"]) == 2
+    assert "observe.camera = (32, 24) needs flatten=False" in capsys.readouterr().err
+
+
+def test_show_knows_what_users_registered(tmp_path, request, capsys):
+    require_rendering()
+    request.addfinalizer(lambda: gymnasium.registry.pop("TwoPits-v0", None))
+    register("TwoPits-v0", Scenario(constraints={"pits": {"type": "hazards", "num": 2}}))
+    assert cli.main(["show", "TwoPits-v0", "-o", str(tmp_path / "pits.png")]) == 0
+    assert "pits_lidar" in capsys.readouterr().out
+    assert cli.main(["show", "CartPole-v1"]) == 2
+    assert "'CartPole-v1' is not an environment of sb3_guard's" in capsys.readouterr().err
+    assert cli.main(["show", "goal_ant_8ghosts"]) == 2
+    assert "did you mean 'Goal_Ant_8Ghosts'?" in capsys.readouterr().err
+
+
+# help and the dispatcher
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_help_shows_an_example(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main([command, "--help"])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    examples = text[text.index("examples:") :]
+    assert f"sb3_guard.{command} " in examples or f"sb3-guard {command}" in examples
+
+
+@pytest.mark.parametrize("command", ["train", "enjoy"])
+def test_help_is_quick_and_loads_nothing_heavy(command):
+    script = (
+        "import sys\n"
+        f"from sb3_guard import {command}\n"
+        "try:\n"
+        f"    {command}.main(['--help'])\n"
+        "except SystemExit as end:\n"
+        "    assert end.code == 0\n"
+        "import time\n"
+        "print(sorted({'torch', 'rl_zoo3', 'stable_baselines3'} & sys.modules.keys()))\n"
+        "print(time.process_time())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=300
+    )
+    *text, heavy, seconds = done.stdout.splitlines()
+    assert heavy == "[]" and "--env" in "\n".join(text)
+    assert float(seconds) < 5  # of the processor, whatever else runs; usually 0.5
+
+
+def test_threads_wait_without_spinning(monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    assert usage.run(lambda: int(os.environ["OMP_WAIT_POLICY"] != "PASSIVE")) == 0
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    assert usage.run(lambda: int(os.environ["OMP_WAIT_POLICY"] != "ACTIVE")) == 0
+
+
+def test_dispatcher(capsys, tmp_path):
+    assert cli.main([]) == cli.main(["--help"]) == 0
+    assert "train" in capsys.readouterr().out
+    assert cli.main(["--version"]) == 0
+    assert cli.main(["trian"]) == 2
+    assert "unknown command 'trian'; did you mean 'train'?" in capsys.readouterr().err
+    assert cli.main(["enjoy", "-f", str(tmp_path), "--no-render"]) == 2
+    assert "there is no run of cpo on Goal_Point_8Hazards-v0" in capsys.readouterr().err

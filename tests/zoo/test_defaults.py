@@ -1,0 +1,155 @@
+"""One set of defaults: the command, ``make_model`` and the class train the same agent."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
+
+from sb3_guard import ALGORITHMS, make_model, make_vec_env, train
+from sb3_guard.algorithms import CostReplay
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.run.hyperparams import RUN_KEYS, build, check, parameters, read_hyperparams
+from sb3_guard.zoo.run.make_envs import seed_rows
+
+ENVS = ["SafetyPointGoal1-v0", "Goal_Point_8Hazards-v0"]
+#: Entries hold what depends on the environment: its limit, the shape of rollouts, wrappers …
+OF_THE_ENVIRONMENT = {*RUN_KEYS, "policy", "policy_kwargs", "cost_limit", "n_steps", "batch_size"}
+OF_THE_ENVIRONMENT |= {"noise_type", "noise_std", "learning_starts", "train_freq", "gradient_steps"}
+#: … and where robots need other values than known optima.
+DEPARTURES = {
+    ("trpo_lag", ENVS[0]): {"cost_gae_lambda", "lambda_lr", "proportional_gain"},
+    ("trpo_lag", ENVS[1]): {"cost_gae_lambda"},
+    **{("trpo_ipo", env): {"cost_gae_lambda"} for env in ENVS},
+    **{(algo, env): {"lambda_lr"} for algo in ("sac_lag", "td3_lag", "tqc_lag") for env in ENVS},
+    **{
+        ("trpo_fac", env): {
+            "mode", "cost_gae_lambda", "lambda_ascent", "lambda_lr", "lambda_epochs",
+            "lambda_init", "proportional_gain", "trace",
+        }
+        for env in ENVS
+    },
+}  # fmt: skip
+SEED, ROLLOUT, N_ENVS = 3, 100, 4
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_entries_hold_only_what_depends_on_the_environment(algo: str, env_id: str) -> None:
+    values, known = read_hyperparams(algo, env_id), parameters(ALGORITHMS[algo])
+    assert values.get("policy_kwargs", {}).keys() <= {"net_arch"}
+    beside = values.keys() - OF_THE_ENVIRONMENT
+    assert beside == DEPARTURES.get((algo, env_id), set())
+    assert all(values[name] != known[name].default for name in beside)  # else it can go
+
+
+def shortened(algo: str) -> dict[str, Any]:
+    """What makes an update short."""
+    if issubclass(ALGORITHMS[algo], CostReplay):
+        return {"n_envs": N_ENVS, "learning_starts": 200, "buffer_size": 10_000}
+    return {"n_envs": N_ENVS, "n_steps": ROLLOUT}
+
+
+def weights(model: Any) -> dict[str, np.ndarray]:
+    """All that ``save`` keeps of networks, multipliers and optimizers."""
+    arrays: dict[str, np.ndarray] = {}
+    for name, state in model.get_parameters().items():
+        entries = state.items() if isinstance(state, dict) else [("", state)]
+        for key, value in entries:
+            if isinstance(value, th.Tensor):
+                arrays[f"{name}.{key}"] = value.detach().numpy().copy()
+    return arrays
+
+
+@pytest.mark.parametrize("env_id", ENVS)
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_command_function_and_class_train_the_same_agent(
+    algo: str, env_id: str, tmp_path: Path
+) -> None:
+    cls, entry = ALGORITHMS[algo], read_hyperparams(algo, env_id)
+    short, steps = shortened(algo), ROLLOUT * N_ENVS
+    params = [f"{name}:{value}" for name, value in short.items()]
+    assert not train.main(
+        ["--algo", algo, "--env", env_id, "-n", str(steps), "--seed", str(SEED), "--verbose", "0",
+         "--eval-freq", "-1", "--device", "cpu", "-f", str(tmp_path), "-params", *params]
+    )  # fmt: skip
+    trained = weights(cls.load(tmp_path / algo / f"{env_id}_1" / f"{env_id}.zip"))
+
+    model = make_model(algo, env_id, seed=SEED, device="cpu", **short)
+    begun = weights(model)
+    made = weights(model.learn(steps))
+
+    env = make_vec_env(env_id, N_ENVS)
+    setup = build(check(algo, cls, {**entry, **short}))
+    for wrapper, arguments in setup.vec_env_wrapper:
+        env = wrapper(env, **arguments)
+    if setup.normalize is not None:
+        env = VecNormalize(env, **setup.normalize)
+    noise = setup.action_noise(env.action_space.shape[0])
+    extra = {} if noise is None else {"action_noise": noise}
+    model = cls(env=env, seed=SEED, device="cpu", **setup.model, **extra)
+    seed_rows(env, SEED)
+    by_class = weights(model.learn(steps))
+
+    assert trained.keys() == made.keys() == by_class.keys()
+    for name, array in trained.items():
+        np.testing.assert_array_equal(array, made[name], err_msg=name)
+        np.testing.assert_array_equal(array, by_class[name], err_msg=name)
+    assert any(not np.array_equal(array, begun[name]) for name, array in trained.items())
+
+
+def test_make_model_takes_what_a_file_cannot_hold() -> None:
+    model = make_model(
+        "cpo",
+        "Goal_Point_2Hazards",
+        cost_limit=3,
+        n_envs=2,
+        n_steps=20,
+        learning_rate=lambda left: 1e-3 * left,
+        policy_kwargs={"activation_fn": nn.ReLU},
+        env_kwargs={"hazards": {"size": 0.2}},
+        seed=0,
+    )
+    assert (model.cost_limit, model.n_envs, model.lr_schedule(0.5)) == (3.0, 2, 5e-4)
+    assert model.policy.activation_fn is nn.ReLU and (model.policy.log_std == -0.5).all()
+    (scenario,) = model.get_env().get_attr("scenario", 0)
+    assert scenario.constraints["hazards"]["size"] == 0.2
+
+
+def test_sizes_of_a_file_are_not_warned_of() -> None:
+    """OmniSafe's minibatches of 64 leave a smaller one at the end of a rollout of 20,000 steps."""
+    with warnings.catch_warnings(action="error"):
+        make_model("ppo_lag", "Goal_Point_8Hazards", conf="omnisafe", seed=0)
+    with pytest.warns(UserWarning, match="mini-batch size of 64"):
+        make_model("ppo_lag", "Goal_Point_8Hazards", conf="omnisafe", n_steps=999, seed=0)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac"])
+def test_make_model_makes_baselines(algo: str) -> None:
+    model = make_model(algo, "SafetyPointGoal1", n_envs=2)
+    assert type(model).__name__ == algo.upper()
+    assert (model.get_vec_normalize_env() is not None) == (algo == "ppo")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (("cp", "Goal_Point_8Hazards", {}), "unknown algorithm 'cp'; did you mean 'cpo'"),
+        (("cpo", "Goal_Pint_8Hazards", {}), "'Pint'.*'Point'"),
+        (("cpo", "Goal_Point_8Hazards", {"costlimit": 1}), "did you mean 'cost_limit'"),
+        (("p3o", "Goal_Point_8Hazards", {"cost_limit": -1.0}), "must be at least 0"),
+        (("cpo", "Goal_Point_8Hazards", {"cost_limit": "much"}), "a number"),
+        (("cpo", "Goal_Point_8Hazards", {"conf": "papr"}), "'papr'|papr"),
+        (("cpo", "Goal_Point_8Hazards", {"seed": "x"}), "seed"),
+        (("cpo", "CartPole-v1", {}), "no cost limit is known for CartPole-v1: give cost_limit"),
+    ],
+)
+def test_make_model_refuses_in_a_line(call: tuple[str, str, dict[str, Any]], message: str) -> None:
+    algo, env_id, kwargs = call
+    with pytest.raises(ValueError, match=message) as error:
+        make_model(algo, env_id, **kwargs)
+    assert "\n" not in str(error.value) and not isinstance(error.value, UsageError)

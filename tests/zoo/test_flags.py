@@ -1,0 +1,130 @@
+"""Flags stated once: parser, defaults, files, roles and tables come from the same field."""
+
+import argparse
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import pytest
+
+from sb3_guard.zoo.cli.flags import HOST, IDENTITY, Command, command, flag
+from sb3_guard.zoo.cli.usage import UsageError, positive
+from sb3_guard.zoo.run.flags import RunFlags
+
+
+@dataclass
+class Toy(Command):
+    """
+    Play with flags.
+
+    What there is:
+
+    :param kind: size
+    :param length: steps
+    :param params: values
+    :param seeds: seeds
+    :param seed: a seed
+    :param bar: a bar
+    :param dry_run: nothing
+    :param rate: factor, which
+        may be 100 %
+    """
+
+    kind: Literal["big", "small"] = flag(default="big", positional=True, nargs="?")
+    length: int = flag("-n", default=-1, kind=positive, metavar="N", role=IDENTITY)
+    params: dict[str, Any] | None = flag("-params", role=IDENTITY)
+    seeds: list[int] = flag(default=[0, 1], exclusive="seed")
+    seed: int = flag(default=0, exclusive="seed")
+    bar: bool | None = flag("-P", role=HOST)
+    dry_run: bool = flag(default=False)
+    rate: float = flag(default=1.0)
+    secret: str | None = flag()
+
+
+def test_typed_attributes_and_what_was_given():
+    toy = Toy.parse(["small", "-n", "3e2", "-params", "a:1", "b:dict(c=[x])", "--no-bar"])
+    assert (toy.kind, toy.length, toy.params) == ("small", 300, {"a": 1, "b": "dict(c=[x])"})
+    assert (toy.bar, toy.dry_run, toy.seeds, toy.rate) == (False, False, [0, 1], 1.0)
+    assert toy.given == {"kind", "length", "params", "bar"}
+    assert Toy.parse([]).given == frozenset() and Toy.parse([]).bar is None
+    Toy.parse([]).seeds.append(2)
+    assert Toy.parse([]).seeds == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--lenght=3"], "unknown flag --lenght; did you mean --length"),
+        (["-n", "0"], "-n/--length: '0' is not allowed"),
+        (["-n", "2.5"], "'2.5' is not a whole number"),
+        (["medium"], "invalid choice: 'medium'"),
+        (["-params", "a"], "-params: 'a' is not of the form key:value"),
+        (["--seed", "1", "--seeds", "1"], "not allowed with argument --seed"),
+        (["--rate", "fast"], "--rate: invalid float value: 'fast'"),
+    ],
+)
+def test_what_is_not_allowed_on_the_command_line(arguments, message):
+    with pytest.raises(UsageError, match=message):
+        Toy.parse(arguments)
+
+
+def test_a_files_values_are_checked_the_same_way():
+    toy = Toy.read({"length": "3e2", "params": {"a": "1"}, "seeds": 5, "dry-run": True}, "x.yml")
+    assert (toy.length, toy.params, toy.seeds, toy.dry_run) == (300, {"a": "1"}, [5], True)
+    assert Toy.read({"params": ["a:1"], "bar": None}, "x.yml").params == {"a": 1}
+    assert Toy.read({"length": -1}, "x.yml").length == -1  # a default may be no value to give
+    assert toy.given == {"length", "params", "seeds", "dry_run"}
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"lenght": 3}, "x.yml: unknown entry 'lenght'; did you mean 'length'"),
+        ({"seed": 1}, "x.yml: unknown entry 'seed'"),
+        ({"length": 0}, "x.yml: length: 0 is not allowed"),
+        ({"length": [3]}, "length: .*must be a whole number"),
+        ({"length": True}, "length: True is not allowed"),
+        ({"seeds": []}, "seeds: .*one value or a list"),
+        ({"seeds": [1, 2.5]}, "seeds: .*not allowed"),
+        ({"dry_run": "yes"}, "dry_run: 'yes' is not allowed; it must be True or False"),
+        ({"params": 3}, "3 is not of the form key:value"),
+        ({"kind": "medium"}, "kind: 'medium' is not allowed; it must be 'big' or 'small'"),
+    ],
+)
+def test_what_is_not_allowed_in_a_file(data, message):
+    with pytest.raises(UsageError, match=message):
+        Toy.read(data, "x.yml", but=["seed"])
+
+
+def test_roles_and_help():
+    toy = Toy.parse(["-n", "5"])
+    assert toy.values(IDENTITY) == {"length": 5, "params": None}
+    assert Toy.names(HOST) == {"bar"}
+    text = Toy.parser().format_help()
+    assert "secret" not in text and "factor, which may be 100 %" in text
+    assert text.index("Play with flags.\n") < text.index("what there is:") < text.index("a bar")
+
+
+def test_main(capsys):
+    main = command(Toy, lambda toy: toy.length)
+    assert main(["-n", "7"]) == 7
+    assert main(["-n", "x"]) == 2
+    assert capsys.readouterr().err.startswith("error: argument -n/--length: 'x'")
+
+
+def test_every_flag_of_rl_zoo_is_there():
+    """Of those that RL-Zoo's `train` has and that mean something here, to the letter."""
+    ours = RunFlags.parser()._option_string_actions
+    for name in (
+        "--algo --env -tb --tensorboard-log -i --trained-agent --eval-env-kwargs -n --n-timesteps "
+        "--num-threads --log-interval --eval-freq --eval-episodes --n-eval-envs --save-freq -f "
+        "--log-folder --seed --vec-env --device --verbose --gym-packages --env-kwargs -params "
+        "--hyperparams -conf --conf-file -uuid --uuid --track --wandb-project-name --wandb-entity "
+        "-P --progress -tags --wandb-tags"
+    ).split():
+        assert name in ours, name
+        assert isinstance(ours[name], argparse.Action)
+
+
+def test_a_runs_flags_from_those_another_command_shares():
+    run = RunFlags.shared(Toy.parse(["--seed", "3"]), algo="pcpo")
+    assert (run.seed, run.algo, run.eval_freq) == (3, "pcpo", 100_000)

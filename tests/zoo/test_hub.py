@@ -1,0 +1,205 @@
+"""Agents for the hub: what is uploaded, what becomes of a download, and no network."""
+
+import json
+import shlex
+import sys
+
+import gymnasium
+import pytest
+import yaml
+from typed import PLAY, trained
+
+from sb3_guard import enjoy, hub, train
+from sb3_guard.zoo.agents import hub as zoo_hub
+from sb3_guard.zoo.agents.flags import EnjoyFlags, HubFlags
+
+WHICH = ["--env", "Filmed-v0", "--gym-packages", "registered_envs", "--n-episodes", "2"]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    trained(
+        folder, "--eval-freq", "-1", "-params", "normalize:True", "cost_limit:2", env="Filmed-v0"
+    )
+    return folder
+
+
+NAME = "cpo-Goal_Point_8Hazards-v0"
+ZOO = "!!python/object/apply:collections.OrderedDict\n- - [algo, ppo]\n  - [env, X-v0]\n"
+
+
+def staged(logs, folder, *flags):
+    push = ["push", *WHICH, "-f", str(logs), "-orga", "me", "--to", str(folder), *flags]
+    return hub.main(push)
+
+
+def test_what_is_uploaded(logs, tmp_path):
+    assert staged(logs, tmp_path, "--dry-run") == 0
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "cpo-Filmed-v0.zip", "vec_normalize.pkl", "config.yml", "args.yml", "command.txt",
+        "0.monitor.csv", "results.json", "README.md", "replay.mp4",
+    }  # fmt: skip
+    results = json.loads((tmp_path / "results.json").read_text())
+    _, metadata, page = (tmp_path / "README.md").read_text().split("---\n", 2)
+    metrics = yaml.safe_load(metadata)["model-index"][0]["results"][0]["metrics"]
+    values = {one["type"]: float(one["value"].split()[0]) for one in metrics}
+    assert values["mean_cost"] == pytest.approx(results["cost"]["mean"], abs=0.006)
+    assert values["mean_reward"] == pytest.approx(results["return"]["mean"], abs=0.006)
+    assert "under a limit of 2.0" in page and "--repo-id me/cpo-Filmed-v0" in page
+
+
+def test_the_commands_of_the_card_are_commands(logs, tmp_path):
+    """Whether training was started by the script, a path to it, or the module."""
+    params = logs / "cpo" / "Filmed-v0_1" / "Filmed-v0"
+    for program in (
+        "sb3-guard train",
+        "/opt/bin/sb3-guard train",
+        "/opt/python -m sb3_guard.train",
+    ):
+        (params / "command.txt").write_text(f"{program} --algo cpo --env Filmed-v0 -n 60")
+        assert staged(logs, tmp_path, "--dry-run", "--no-video") == 0
+        page = (tmp_path / "README.md").read_text()
+        lines = [one for one in page.splitlines() if one.startswith(("sb3-guard ", "python "))]
+        load, play, again = (shlex.split(one) for one in lines)
+        assert load[:3] == ["sb3-guard", "hub", "load"] and HubFlags.parse(load[2:])
+        assert play[:2] == ["sb3-guard", "enjoy"] and EnjoyFlags.parse(play[2:])
+        assert again[:2] == ["sb3-guard", "train"] or again[:3] == [
+            "python",
+            "-m",
+            "sb3_guard.train",
+        ]
+        train.Flags.parse(again[again.index("--algo") :])
+
+
+def test_no_path_of_this_machine_is_uploaded(logs, tmp_path):
+    params = logs / "cpo" / "Filmed-v0_1" / "Filmed-v0"
+    (params / "command.txt").write_text(f"{logs}/bin/python -m sb3_guard.train -f {logs}")
+    assert staged(logs, tmp_path, "--dry-run", "--no-video") == 0
+    assert str(logs) in (params / "args.yml").read_text()
+    expected = f"python -m sb3_guard.train -f {logs.name}"
+    assert (tmp_path / "command.txt").read_text() == expected
+    for file in ("args.yml", "command.txt", "config.yml", "README.md"):
+        assert str(logs.parent) not in (tmp_path / file).read_text(), file
+    flags = yaml.safe_load((tmp_path / "args.yml").read_text())
+    assert (flags["algo"], flags["log_folder"]) == ("cpo", logs.name)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{algo: cpo, env: X-v0}", "is cpo on X-v0"),
+        (ZOO, "is ppo on X-v0"),
+        ("[", "can't read"),
+        ("a", "is damaged"),
+    ],
+)
+def test_a_download_that_is_another_agent(tmp_path, monkeypatch, capsys, text, message):
+    (tmp_path / "hub").mkdir()
+    for name, content in {"args.yml": text, "config.yml": "", f"{NAME}.zip": ""}.items():
+        (tmp_path / "hub" / name).write_text(content)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "hub"))
+    assert hub.main(["load", "-orga", "me", "-f", str(tmp_path / "logs")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "logs").exists()
+
+
+def test_there_and_back(logs, tmp_path, monkeypatch, capsys):
+    assert staged(logs, tmp_path / "hub", "--dry-run", "--no-video") == 0
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "hub"))
+    load = ["load", *WHICH[:4], "--repo-id", "me/cpo-Filmed-v0", "-f", str(tmp_path / "logs")]
+    (tmp_path / "logs" / "cpo" / "Filmed-v0_1").mkdir(parents=True)
+    monkeypatch.setattr("sb3_guard.zoo.run.folder.latest_run", lambda *_: 0)  # taken meanwhile
+    assert hub.main(load) == 0
+    monkeypatch.undo()
+    out = capsys.readouterr().out
+    assert "load only from people you trust" in out and "Filmed-v0_2" in out
+    outputs = []
+    for folder in (logs, tmp_path / "logs"):
+        capsys.readouterr()
+        play = [*PLAY, "-f", str(folder), "--n-episodes", "2", "--verbose", "0"]
+        assert enjoy.main(play) == 0
+        outputs.append(capsys.readouterr().out)
+    assert outputs[0] == outputs[1]
+
+
+def test_an_environment_that_only_the_runs_package_knows(tmp_path, monkeypatch, capsys):
+    """To push, the command line names the package that the run does; to load, none is needed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "stranger.py").write_text(
+        "import gymnasium\n"
+        "gymnasium.register('Stranger-v0', entry_point='registered_envs:Filmed')\n"
+    )
+    trained(tmp_path / "logs", "--gym-packages", "stranger", "--eval-freq", "-1", env="Stranger-v0")
+
+    def hub_in_a_new_process(direction, *flags):
+        sys.modules.pop("stranger", None)
+        gymnasium.registry.pop("Stranger-v0", None)
+        return hub.main([direction, "--env", "Stranger-v0", "-orga", "me", *flags])
+
+    push = ["push", "--n-episodes", "2", "--to", "card", "--dry-run", "--no-video"]
+    assert hub_in_a_new_process(*push) == 2
+    assert "then add --gym-packages stranger" in capsys.readouterr().err
+    assert hub_in_a_new_process(*push, "--gym-packages", "stranger") == 0
+    page = (tmp_path / "card" / "README.md").read_text()
+    assert "sb3-guard enjoy --algo cpo --env Stranger-v0 -f logs --gym-packages stranger\n" in page
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "card"))
+    assert hub_in_a_new_process("load", "--repo-id", "me/it", "-f", "downloaded") == 0
+    assert hub_in_a_new_process("load", "-f", "other") == 2
+    assert "unknown environment 'Stranger-v0'" in capsys.readouterr().err
+    assert (tmp_path / "downloaded" / "cpo" / "Stranger-v0_1").is_dir()
+
+
+@pytest.mark.parametrize("error", [ConnectionError("no route to host"), TimeoutError()])
+def test_without_a_network(logs, tmp_path, monkeypatch, capsys, error):
+    def fail(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr("huggingface_hub.HfApi.create_repo", fail)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", fail)
+    assert staged(logs, tmp_path / "hub", "--no-video") == 2
+    assert f"the upload of {tmp_path / 'hub'} to me/cpo-Filmed-v0" in capsys.readouterr().err
+    assert (tmp_path / "hub" / "README.md").is_file()  # the work is not lost
+    assert hub.main(["load", "-orga", "me", "-f", str(tmp_path / "logs")]) == 2
+    assert "the hub can't be reached" in capsys.readouterr().err
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_repository_of_another_agent(tmp_path, monkeypatch, capsys):
+    (tmp_path / "hub").mkdir()
+    (tmp_path / "hub" / "ppo-X-v0.zip").touch()
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "hub"))
+    assert hub.main(["load", "-orga", "me", "-f", str(tmp_path / "logs")]) == 2
+    assert "has no cpo-Goal_Point_8Hazards-v0.zip, but ppo-X-v0.zip" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [([], "give -orga"), (["--repo-id", "me"], "user/name"), (["--repo-id", "a/b/c"], "user/name")],
+)
+def test_whose_repository(flags, message, capsys):
+    assert hub.main(["push", *flags]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_login_is_asked_for(logs, tmp_path, monkeypatch, capsys):
+    from huggingface_hub.errors import LocalTokenNotFoundError
+
+    def fail(*args, **kwargs):
+        raise LocalTokenNotFoundError("no token")
+
+    monkeypatch.setattr("huggingface_hub.HfApi.create_repo", fail)
+    assert staged(logs, tmp_path, "--no-video") == 2
+    assert "needs a login" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("flags", [["load", "-f"], ["push", *WHICH, "--to"]])
+def test_folders_that_can_not_be_written(flags, logs, capsys, monkeypatch):
+    monkeypatch.chdir(logs.parent)
+    assert hub.main([*flags, "/dev/null/x", "-orga", "me"]) == 2
+    assert f"{flags[-1].replace('-f', '--folder')}: can't write to" in capsys.readouterr().err
+
+
+def test_names_are_rl_zoos():
+    assert zoo_hub.model_name("cpo", "ALE/Pong-v5") == "cpo-ALE-Pong-v5"

@@ -1,0 +1,443 @@
+"""Hyper-parameters: which entry is read, what is refused, what becomes of the values."""
+
+import re
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch
+import yaml
+from torch import nn
+
+from sb3_guard.algorithms import ALGORITHMS, CPO, SACLag
+from sb3_guard.common.vec_env import make_vec_env
+from sb3_guard.envs import env_ids
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.cli.values import parse_value
+from sb3_guard.zoo.run.algos import baselines
+from sb3_guard.zoo.run.hyperparams import (
+    PRESETS,
+    annotations,
+    build,
+    check,
+    hyperparams_folder,
+    parameters,
+    read_file,
+    read_hyperparams,
+)
+
+FILE = """
+default: &default
+  n_timesteps: !!float 1e5
+  n_steps: 100
+Goal_Point_8Hazards-v0:
+  <<: *default
+  n_steps: 200
+Bare_Name:
+  n_steps: 300
+"*_Ant_*":
+  n_steps: 400
+"""
+
+
+@pytest.fixture
+def conf(tmp_path):
+    path = tmp_path / "cpo.yml"
+    path.write_text(FILE)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "n_steps"),
+    [
+        ("Goal_Point_8Hazards-v0", 200),
+        ("Bare_Name-v0", 300),
+        ("Goal_Ant_8Hazards-v0", 400),
+        ("Anything-v3", 100),
+    ],
+)
+def test_entry_of_the_environment_else_default(conf, env_id, n_steps):
+    assert read_hyperparams("cpo", env_id, conf)["n_steps"] == n_steps
+
+
+@pytest.mark.parametrize("algo", sorted({*ALGORITHMS} - {"trpo", "scpo"}))
+def test_safety_gymnasiums_tasks_have_its_limit(algo):
+    values = read_hyperparams(algo, "SafetyPointGoal1-v0")
+    assert values["cost_limit"] == 25.0
+    check(algo, ALGORITHMS[algo], values)
+
+
+def test_command_line_wins(conf):
+    values = read_hyperparams("cpo", "Anything-v0", conf, {"n_steps": 7, "gamma": 0.9})
+    assert values == {"gamma": 0.9, "n_steps": 7, "n_timesteps": 1e5}
+
+
+def test_python_file_and_module(tmp_path, monkeypatch):
+    (tmp_path / "my_conf.py").write_text("hyperparams = {'default': {'n_steps': 5}}")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in (str(tmp_path / "my_conf.py"), "my_conf"):
+        assert read_hyperparams("cpo", "X-v0", name) == {"n_steps": 5}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("default: [1, 2", "can't read .* as YAML: .*line 1"),
+        ("- a\n- b\n", "must map environments"),
+        ("n_steps: 100\n", "must map environments"),
+        ("Goal_Point_8Hazards-v0: {}\n", "no entry for 'Goal_Point_8Hazard'.*did you mean"),
+        ("\x00\x01", "as YAML"),
+        ("default:\n  n_steps: 1\n  n_steps: 2\n", "line 3 has the key 'n_steps' again, .* line 2"),
+        ("default: {1: 2, n_steps: 3}\n", "1 below 'default' is not a name"),
+    ],
+)
+def test_files_that_are_not_hyperparameters(tmp_path, content, message):
+    path = tmp_path / "bad.yml"
+    path.write_text(content)
+    with pytest.raises(UsageError, match=message) as error:
+        read_hyperparams("cpo", "Goal_Point_8Hazard", str(path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("absent.yml", "can't read hyper-parameter file absent.yml .*: No such file"),
+        ("absent.py", "can't read hyper-parameters from absent.py: .*"),
+        ("papr", "can't read hyper-parameters from papr: .*; give a .yml file.* or 'paper'"),
+    ],
+)
+def test_absent_file(name, message):
+    with pytest.raises(UsageError, match=message):
+        read_hyperparams("cpo", "X-v0", name)
+
+
+def checked(**values):
+    return check("cpo", CPO, {"n_timesteps": 100, **values})
+
+
+def test_arguments_are_the_leafs_and_the_bases():
+    names = annotations(CPO)
+    assert {"cost_reduction", "target_kl", "n_steps", "policy_kwargs"} <= names.keys()
+    assert (
+        not {"env", "seed", "device", "verbose", "self", "kwargs", "_init_setup_model"}
+        & names.keys()
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("n_steps", 1e3, 1000),
+        ("n_steps", "1e3", 1000),
+        ("n_timesteps", 6e6, 6_000_000),
+        ("learning_rate", "1e-3", 0.001),
+        ("learning_rate", 1, 1.0),
+        ("learning_rate", "lin_0.01", "lin_0.01"),
+        ("batch_size", None, None),
+        ("batch_size", 64, 64),
+        ("cost_limit", 25, 25.0),
+        ("cost_limit", [1, 2.5], [1.0, 2.5]),
+        ("cost_keys", ["a", "b"], ["a", "b"]),
+        ("missing_cost", "zero", "zero"),
+        ("normalize_advantage", False, False),
+        ("policy_kwargs", "dict(log_std_init=-1)", "dict(log_std_init=-1)"),
+        ("normalize", True, True),
+        ("selection_limit", 3, 3.0),
+    ],
+)
+def test_values_in_their_proper_type(name, value, expected):
+    result = checked(**{name: value})[name]
+    assert result == expected and type(result) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("n_steps", "many", "a whole number"),
+        ("n_steps", 2.5, "a whole number"),
+        ("n_steps", True, "a whole number"),
+        ("n_steps", None, "a whole number"),
+        ("n_steps", [1], "a whole number"),
+        ("n_steps", 0, "at least 1"),
+        ("n_envs", -3, "at least 1"),
+        ("n_timesteps", 0, "at least 1"),
+        ("gamma", "high", "a number"),
+        ("gamma", float("nan"), "a number"),
+        ("learning_rate", "fast", "a number or a schedule such as lin_0.001"),
+        ("batch_size", 1.5, "a whole number or None"),
+        ("batch_size", 0, "at least 1"),
+        ("normalize_advantage", 1, "True or False"),
+        ("normalize_advantage", "yes", "True or False"),
+        ("missing_cost", "ignore", "'error' or 'zero'"),
+        ("cost_limit", "low", "a number or a schedule such as lin_0.001 or a list"),
+        ("cost_keys", "cost", r"a list \(text each\)"),
+        ("policy", 3, "text or the dotted name of a class"),
+        ("policy_kwargs", 3, "a mapping or None"),
+    ],
+)
+def test_values_of_the_wrong_type(name, value, allowed):
+    with pytest.raises(UsageError, match=rf"{name}.*not allowed; it must be {allowed}"):
+        checked(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "near"), [("n_step", "n_steps"), ("costlimit", "cost_limit"), ("Gamma", "gamma")]
+)
+def test_unknown_name_suggests_the_nearest(name, near):
+    with pytest.raises(
+        UsageError, match=f"cpo has no hyper-parameter '{name}'; did you mean '{near}'"
+    ):
+        checked(**{name: 1})
+
+
+@pytest.mark.parametrize("value", [[1, "episode"], (1, "episode")])
+def test_how_often_to_train_in_episodes(value):
+    """As in RL-Zoo's own files, e.g. that of DDPG."""
+    values = check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": value})
+    assert values["train_freq"] == [1, "episode"]  # as a file holds it
+    assert build(values).model["train_freq"] == (1, "episode")
+    for bad in ([1], ["episode", 1], [1, 2], "episode"):
+        with pytest.raises(UsageError, match="a whole number or a list of a whole number and text"):
+            check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": bad})
+
+
+def test_names_that_are_flags():
+    with pytest.raises(UsageError, match="use the flag --seed"):
+        checked(seed=3)
+
+
+def test_training_takes_a_million_steps_unless_somebody_says_otherwise():
+    assert check("cpo", CPO, {})["n_timesteps"] == 1_000_000
+    for algo in ALGORITHMS:
+        assert read_hyperparams(algo, "Goal_Ant_8Hazards-v0")["n_timesteps"] == 1e6
+
+
+def test_objects_are_made():
+    setup = build(
+        checked(
+            learning_rate="lin_0.01",
+            policy_kwargs="dict(activation_fn=nn.ReLU)",
+            policy="stable_baselines3.common.policies.ActorCriticPolicy",
+            normalize=True,
+            gamma=0.9,
+            env_wrapper="gymnasium.wrappers.FlattenObservation",
+            env_kwargs="dict(a=1)",
+        )
+    )
+    assert setup.model["learning_rate"](0.5) == pytest.approx(0.005)
+    assert setup.model["policy_kwargs"] == {"activation_fn": nn.ReLU}
+    assert setup.model["policy"].__name__ == "ActorCriticPolicy"
+    assert setup.normalize == {"gamma": 0.9}
+    assert setup.env_wrapper == [(gym.wrappers.FlattenObservation, {})]
+    assert setup.env_kwargs == {"a": 1}
+    assert (setup.n_envs, setup.n_timesteps, setup.callbacks()) == (1, 100, [])
+    assert "env_kwargs" not in setup.model and "n_envs" not in setup.model
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("dict(net_arch=dict(pi=[64], vf=[-1, 2.5]))", {"net_arch": {"pi": [64], "vf": [-1, 2.5]}}),
+        ("dict(a=(1, None), b={'c': [dict(d=True)]})", {"a": (1, None), "b": {"c": [{"d": True}]}}),
+        ("dict(optimizer_class=th.optim.RMSprop, t=torch.float32)",
+         {"optimizer_class": torch.optim.RMSprop, "t": torch.float32}),
+        ("dict()", {}),
+    ],
+)  # fmt: skip
+def test_expressions_are_data_and_classes_of_torch(text, value):
+    assert build(checked(policy_kwargs=text)).model["policy_kwargs"] == value
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("policy_kwargs", "dict(activation_fn=nn.Rellu)", "can't be evaluated.*Rellu"),
+        ("policy_kwargs", "dict(a=open('x', 'w'))", "can't be evaluated.*open.* is not allowed"),
+        ("policy_kwargs", "dict(a=th.hub.load)", "th.hub.load is not a class of torch"),
+        ("policy_kwargs", "dict(a=nn.Module.__subclasses__())", "is not allowed"),
+        ("policy_kwargs", "dict([('a', exit())])", r"dict\(.* is not allowed; .*literals"),
+        ("monitor_kwargs", "dict(a=[__import__('os')])", "__import__.* is not allowed"),
+        ("normalize", "dict(**{'a': 1})", "can't be evaluated"),
+        ("normalize", "{'a': exit()}", r"exit\(\) is not allowed"),
+        ("learning_rate", "lin_fast", "not a schedule"),
+        ("policy", "no.such.Policy", "add --gym-packages no.such"),
+        ("env_wrapper", "no.such.Wrapper", "add --gym-packages no.such"),
+    ],
+)
+def test_text_that_names_nothing(name, value, message):
+    with pytest.raises(UsageError, match=message):
+        build(checked(**{name: value}))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 0.001),
+        ("[1, 2]", [1, 2]),
+        ("None", None),
+        ("{'num': 4}", {"num": 4}),
+        ("{limit:0.4}", {"limit": 0.4}),
+        ("dict(num=4, more=dict(a=[1]))", {"num": 4, "more": {"a": [1]}}),
+        ("MlpPolicy", "MlpPolicy"),
+        ("lin_0.001", "lin_0.001"),
+        ("'quoted'", "quoted"),
+        ("dict(activation_fn=nn.ReLU)", "dict(activation_fn=nn.ReLU)"),
+        ("", ""),
+    ],
+)
+def test_values_on_the_command_line(text, value):
+    assert parse_value(text) == value
+
+
+# The paper's table of hyper-parameters, row by row; ... stands for "not used".
+PAPER = "paper"
+COLUMNS = "trpo trpo_lag trpo_sl trpo_usl trpo_ipo trpo_fac cpo pcpo".split()
+TABLE = {
+    "gamma": [0.99] * 8,
+    "gae_lambda": [0.97] * 8,
+    "line_search_max_iter": [100] * 7 + [...],
+    "line_search_shrinking_factor": [0.8] * 7 + [...],
+    "target_kl": [0.02] * 8,
+    "learning_rate": [0.001] * 8,
+    "n_critic_updates": [80] * 8,
+    "batch_size": [None] * 8,
+    "cost_limit": [..., 0, 0, 0, 0, 0, 0, 0],
+    "lambda_lr": [..., 0.005, ..., ..., ..., 0.0001, ..., ...],
+    "steps": [..., ..., ..., 20, ..., ..., ..., ...],
+    "rate": [..., ..., ..., 0.05, ..., ..., ..., ...],
+    "warmup": [..., ..., pytest.approx(1 / 3), pytest.approx(1 / 3), ..., ..., ..., ...],
+    "t": [..., ..., ..., ..., 0.01, ..., ..., ...],
+    "cost_reduction": [..., ..., ..., ..., ..., ..., 0.0, ...],
+}
+# Where the default is another one: (the paper's, ours).
+ALL = {"n_timesteps": (3e7, 1e6)}
+LIMIT = {**ALL, "cost_limit": (0.0, 2.0)}
+LAMBDA = {"cost_gae_lambda": (0.97, 0.5)}
+MARGIN = {"margin_lr": (0.0, 0.1)}
+DIFFERENT = {
+    "trpo": ALL,
+    "cpo": {**LIMIT, **LAMBDA, **MARGIN, "recovery": (1.0, 0.98)},
+    "pcpo": {**LIMIT, **LAMBDA, **MARGIN, "line_search": (False, True)},
+    "trpo_lag": {
+        **LIMIT,
+        **LAMBDA,
+        "lambda_lr": (0.005, 0.2),
+        "lambda_update": ("after", "before"),
+        "lambda_units": ("cost", "relative"),
+        "proportional_gain": (0.0, 1.0),
+        "derivative_gain": (0.0, 0.5),
+    },
+    "trpo_fac": {
+        **LIMIT,
+        **LAMBDA,
+        "mode": ("statewise", "expected"),
+        "lambda_lr": (0.0001, 0.0005),
+        "lambda_init": (None, 0.3),
+        "proportional_gain": (0.0, 1.0),
+        "units": ("cost", "relative"),
+    },
+    "trpo_ipo": {
+        **LIMIT,
+        **LAMBDA,
+        "t": (0.01, 20.0),
+        "max_multiplier": (0.5, 2.0),
+        "units": ("cost", "relative"),
+    },
+    "trpo_sl": {**LIMIT, "tolerance": (0.0, 1.0), "correction_penalty": (0.0, 1.0)},
+    "trpo_usl": {**LIMIT, "correction_penalty": (0.0, 1.0)},
+}
+
+
+@pytest.mark.parametrize("algo", COLUMNS)
+def test_the_papers_preset_is_its_table(algo):
+    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0", PAPER))
+    for row, cells in TABLE.items():
+        cell = cells[COLUMNS.index(algo)]
+        if cell is ... and row.startswith("line_search"):
+            assert values["line_search"] is False
+        elif cell is ...:
+            assert row not in values
+        else:
+            assert values[row] == cell, row
+    epochs, batch, longest = 200, 30_000, 1_000
+    assert values["n_envs"] * values["n_steps"] == batch and values["n_steps"] == longest
+    for env_id in env_ids("guard"):
+        ratio = 5 if env_id.split("_")[1] in ("Ant", "Walker") else 1
+        steps = ratio * epochs * batch
+        assert read_hyperparams(algo, env_id, PAPER) == {**values, "n_timesteps": steps}
+
+
+def in_full(algo: str, env_id: str, conf: str | None = None) -> dict[str, Any]:
+    """What trains: the defaults of the class, and what the file has beside or instead of them."""
+    cls = ALGORITHMS[algo]
+    values = {name: parameter.default for name, parameter in parameters(cls).items()}
+    values |= read_hyperparams(algo, env_id, conf)
+    values["policy_kwargs"] = {**cls.policy_defaults, **(values["policy_kwargs"] or {})}
+    return values
+
+
+@pytest.mark.parametrize("algo", COLUMNS)
+def test_the_default_is_the_papers_but_where_it_says_so(algo):
+    env_id = "Goal_Ant_8Hazards-v0"
+    default, paper = (in_full(algo, env_id, conf) for conf in (None, PAPER))
+    both = {n: (paper.get(n), default.get(n)) for n in {*default, *paper}}
+    assert {n: pair for n, pair in both.items() if pair[0] != pair[1]} == DIFFERENT[algo]
+
+
+@pytest.mark.parametrize("algo", COLUMNS)
+def test_the_models_are_the_papers(algo):
+    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, "Goal_Point_8Hazards-v0", PAPER))
+    model = ALGORITHMS[algo](env=make_vec_env("Goal_Point_8Hazards", 1), **build(values).model)
+    layers = [one for one in model.policy.mlp_extractor.policy_net if isinstance(one, nn.Linear)]
+    assert [one.out_features for one in layers] == [64, 64]
+    assert isinstance(model.policy.mlp_extractor.policy_net[1], nn.Tanh)
+    assert (model.policy.log_std == -0.5).all() and not model.policy.ortho_init
+    assert (model.cost_limit, model.cg_damping > 0) == (0.0, True)
+
+
+def test_the_paper_has_no_other_algorithm():
+    with pytest.raises(
+        UsageError, match=r"-conf paper: 'ppo' is not in the paper; .*allowed: trpo"
+    ):
+        read_hyperparams("ppo", "Goal_Point_8Hazards-v0", PAPER)
+
+
+def omnisafe() -> dict[str, dict[str, Any]]:
+    """The table of docs/omnisafe.md, where later rows replace what earlier ones say."""
+    page = (hyperparams_folder().parent / "docs" / "omnisafe.md").read_text()
+    found: dict[str, dict[str, Any]] = {}
+    for algos, settings in re.findall(r"^\| (`[^|]+) \| (`[^|]+) \|$", page, re.MULTILINE):
+        pairs = re.findall(r"`(\w+)` ([^`]+?)(?=, `|$)", settings)
+        for algo in re.findall(r"\w+", algos):
+            found.setdefault(algo, {}).update((name, yaml.safe_load(one)) for name, one in pairs)
+    return found
+
+
+def test_the_omnisafe_preset_is_the_table_of_its_page():
+    assert read_file(hyperparams_folder() / "omnisafe.yml") == omnisafe()
+
+
+@pytest.mark.parametrize("algo", omnisafe())
+def test_the_omnisafe_preset_makes_a_model(algo):
+    env_id = "Goal_Point_8Hazards-v0"
+    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, env_id, "omnisafe"))
+    on_policy = "n_steps" in values
+    assert not on_policy or values["n_envs"] * values["n_steps"] == 20_000
+    model = ALGORITHMS[algo](env=make_vec_env(env_id, 1), **build(values).model)
+    rates = [model.lr_schedule(left) for left in (1.0, 0.5, 0.0)]
+    falls = on_policy and "n_epochs" in values
+    assert rates == ([3e-4, 1.5e-4, 0.0] if falls else [values["learning_rate"]] * 3)
+    if "lambda_lr" in values:
+        multiplier = model.multiplier
+        assert not multiplier.relative and model.lambda_update == "before"
+        assert multiplier.maximum == values["lambda_max"]
+        assert multiplier.derivative == values.get("derivative_gain", 0.0)
+
+
+def test_every_algorithm_has_a_file_and_every_file_an_algorithm():
+    files = {path.stem for path in hyperparams_folder().glob("*.yml")} - {*PRESETS}
+    assert set(ALGORITHMS) <= files <= {*ALGORITHMS, *baselines()}
+    assert read_file(hyperparams_folder() / "paper.yml").keys() == {"all", *COLUMNS}
+    for file in files:
+        assert "default" in read_file(hyperparams_folder() / f"{file}.yml")

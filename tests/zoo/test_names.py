@@ -1,0 +1,179 @@
+"""Data never runs: hostile files and values try to write a file, and none appears."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from cost_envs import CostPoint
+from typed import SMALL, TOY, refused, trained
+
+from sb3_guard import CPO, benchmark, enjoy, train
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.cli.values import parse_value
+from sb3_guard.zoo.grids import grid
+from sb3_guard.zoo.run.hyperparams import build
+
+# What `eval("dict(...)")` without builtins still ran.
+ESCAPE = (
+    "dict(a=[c for c in ().__class__.__base__.__subclasses__() if c.__name__ == 'Popen'][0]"
+    "('touch {}', shell=True))"
+)
+
+
+@pytest.fixture
+def trap(tmp_path, monkeypatch):
+    """A file that appears when anything of a hostile file runs; the current folder has a module."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    path = tmp_path / "trap"
+    (tmp_path / "hostile.py").write_text(
+        f"open({str(path)!r}, 'w')\nhyperparams = {{'default': {{}}}}\n"
+    )
+    yield path
+    for name in ("hostile", "unittest.__main__"):
+        sys.modules.pop(name, None)
+
+
+def test_values_are_read_not_evaluated(trap):
+    text = ESCAPE.format(trap)
+    assert parse_value(text) == text
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"hyperparams": [f"policy_kwargs:{ESCAPE}"]}, "can't be evaluated"),
+        ({"env_kwargs": {"a": ESCAPE}}, "unknown"),
+        ({"gym_packages": ["hostile"]}, "then add --gym-packages hostile"),
+        ({"gym_packages": ["unittest.__main__"]}, "then add --gym-packages unittest.__main__"),
+        ({"conf_file": "hostile.py"}, "then add -conf hostile.py"),
+        ({"conf_file": "hostile"}, "then add -conf hostile"),
+        ({"suites": ["hostile:X-v0"]}, "write --gym-packages hostile --env X-v0"),
+        ({"hyperparams": {"env_wrapper": "hostile.Wrapper"}}, "add --gym-packages hostile"),
+        ({"hyperparams": {"policy": "hostile.Policy"}}, "add --gym-packages hostile"),
+    ],
+)
+def test_a_grid_file_runs_nothing(tmp_path, trap, entry, message, capsys):
+    text = yaml.safe_dump({"suites": ["Goal_Point_8Hazards"], "algos": ["cpo"], **entry})
+    (tmp_path / "grid.yml").write_text(text.replace("{}", str(trap)))
+    refused(benchmark.main, ["--grid", "grid.yml", "-f", "grid"], capsys, message)
+    assert not trap.exists() and "unittest.__main__" not in sys.modules
+
+
+def test_a_grid_goes_on_by_the_command_it_prints(tmp_path, capsys, monkeypatch):
+    """Its environment and its -conf file are programs, which the folder's record only names."""
+    (tmp_path / "mine.py").write_text("hyperparams = {'default': {'n_timesteps': 100}}\n")
+    monkeypatch.chdir(tmp_path)
+    said = []
+    monkeypatch.setattr(grid, "run_grid", lambda runs, folder, again, *_: said.append(again) or 0)
+    start = ["--suites", "CostPoint-v0", "--algos", "cpo", "-f", "a grid", "-conf", "mine.py"]
+    start += ["-params", "cost_limit:2"]
+    assert benchmark.main([*start, "--gym-packages", "registered_envs"]) == 0
+    assert capsys.readouterr().out == "tables and curves: sb3-guard plot 'a grid'\n"
+    command = shlex.split(said[0])
+    assert command[:3] == ["sb3-guard", "benchmark", "-f"]
+    assert benchmark.main([*command[2:], "--dry-run"]) == 0
+    assert "0 of 2 done" in capsys.readouterr().out
+
+
+@pytest.fixture
+def run(tmp_path):
+    return trained(tmp_path / "logs", "--eval-freq", "-1")
+
+
+def enter(run, file, **entries):
+    """Write entries into a file of a run."""
+    path = run / "CostPoint-v0" / file
+    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), **entries}))
+
+
+def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
+    play = ["--algo", "cpo", *TOY, "-f", str(tmp_path / "logs"), "--no-render", "--n-episodes", "1"]
+    go_on = ["-i", str(run), *TOY[:2], "-n", "240", "--verbose", "0"]
+    popen = {"subprocess.Popen": {"args": f"touch {trap}", "shell": True}}
+    enter(run, "config.yml", callback=[popen])
+    assert enjoy.main(play) == 0  # nobody calls a callback there
+    refused(train.main, go_on, capsys, "contradicts none of the training so far")
+    enter(run, "config.yml", callback=None, env_wrapper="hostile.Wrapper")
+    refused(enjoy.main, play, capsys, "add --gym-packages hostile")
+    refused(train.main, go_on, capsys, "contradicts none of the training so far")
+    enter(run, "config.yml", env_wrapper=None)
+    enter(run, "args.yml", gym_packages=["hostile"])
+    without = [word for word in play if word not in TOY[:2]]
+    refused(enjoy.main, without, capsys, f"{run} needs modules", "add --gym-packages hostile")
+    refused(train.main, [*go_on[:2], "-n", "240"], capsys, "then add --gym-packages hostile")
+    assert not trap.exists()
+    enjoy.main([*without, "--gym-packages", "hostile"])
+    assert trap.exists()
+
+
+def test_printed_commands_name_the_modules(tmp_path, capsys):
+    assert train.main([*TOY, *SMALL, "-n", "120", "-f", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = [line for line in lines if "see the agent" in line]
+    command = shlex.split(line.partition("see the agent")[2])
+    assert command[:2] == ["sb3-guard", "enjoy"]
+    assert command[-2:] == ["--gym-packages", "registered_envs"]
+    assert enjoy.main([*command[2:], "--no-render", "--n-episodes", "1"]) == 0
+    (run,) = (tmp_path / "cpo").iterdir()
+    refused(train.main, ["-i", str(run), "-n", "180"], capsys, "add --gym-packages registered_envs")
+    assert train.main(["-i", str(run), "-n", "180", *command[-2:]]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("policy", "subprocess.Popen"),
+        ("callback", [{"subprocess.Popen": {"args": "true"}}]),
+        ("replay_buffer_class", "subprocess.Popen"),
+        ("env_wrapper", {"subprocess.Popen": {"shell": True}}),
+        ("vec_env_wrapper", ["gymnasium.Wrapper"]),
+        ("env_wrapper", {"stable_baselines3.common.monitor.Monitor": {"filename": "x"}}),
+        ("vec_env_wrapper", {"sb3_guard.common.monitor.CostMonitor": {"filename": "x"}}),
+        ("env_wrapper", [["gymnasium.Wrapper"]]),
+        ("policy_kwargs", "dict(features_extractor_class=th.hub.subprocess.Popen)"),
+        ("policy_kwargs", "dict(features_extractor_class=th.os.PathLike)"),
+    ],
+)
+def test_only_classes_of_their_kind(name, value):
+    with pytest.raises(UsageError, match=name):
+        build({"n_envs": 1, "n_timesteps": 1, name: value}).callbacks()
+
+
+def test_events_go_where_the_run_has_some_or_the_command_line_says(tmp_path, run, capsys):
+    there, go_on = tmp_path / "elsewhere", ["-i", str(run), *TOY[:2], "--verbose", "0", "-n"]
+    enter(run, "args.yml", tensorboard_log=str(there))
+    assert train.main([*go_on, "180"]) == 0
+    assert "--tensorboard-log says where to write" in capsys.readouterr().out
+    assert not there.exists()
+    assert train.main([*go_on, "240", "-tb", str(there)]) == 0
+    assert len([*there.rglob("events.*")]) == 1
+    assert train.main([*go_on, "300"]) == 0
+    assert len([*there.rglob("events.*")]) == 2
+
+
+class Hostile:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_weights_can_be_loaded_without_the_rest(trap, tmp_path):
+    env = CostPoint(10)
+    model = CPO("MlpPolicy", env, n_steps=20, seed=0)
+    model.gift = Hostile(trap)
+    model.save(tmp_path / "gift.zip")
+    other = CPO("MlpPolicy", env, n_steps=20, seed=1)
+    other.set_parameters(tmp_path / "gift.zip")
+    assert not trap.exists()
+    for name, learnt in model.policy.state_dict().items():
+        assert learnt.equal(other.policy.state_dict()[name])
+    CPO.load(tmp_path / "gift.zip")
+    assert trap.exists()  # so it was hostile

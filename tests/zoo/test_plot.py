@@ -1,0 +1,548 @@
+"""Figures, the page about runs, and the command that makes them."""
+
+import re
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+from fake_runs import LABELS, fake_run
+from matplotlib.colors import to_rgb
+
+from sb3_guard import cli, plot
+from sb3_guard.envs import Scenario
+from sb3_guard.envs.suites.guard import SUITE_ROBOTS
+from sb3_guard.zoo.grids.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
+from sb3_guard.zoo.results import figures
+from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
+from sb3_guard.zoo.results.figures import fit_costs, inline_svg, pareto_front, save
+from sb3_guard.zoo.results.paper import FIGURES, draw
+from sb3_guard.zoo.results.report import report
+from sb3_guard.zoo.results.runs import read_results, select
+from sb3_guard.zoo.results.statistics import with_safety
+from sb3_guard.zoo.results.tables import tables
+
+EFFECTS = dict(zip(ALGOS, (1.0, 0.5, 0.6, 0.4, 0.7, 0.9, 0.8, 1.5), strict=True))
+POINT = "Goal_Point_8Hazards"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """The paper's 45 suites, eight algorithms; two seeds on the first suite, one elsewhere."""
+    folder = tmp_path_factory.mktemp("runs")
+    for algo, effect in EFFECTS.items():
+        for seed in (0, 1):
+            fake_run(folder, algo, seed=seed, returns=10 * min(effect, 1) + seed, cost=4 * effect,
+                     epochs=3)  # fmt: skip
+    runs = read_results([folder]).runs
+    one = runs[runs["seed"] == 0]
+    suites = [option.format(robot) for option in OPTIONS.values() for robot in ROBOTS]
+    return Data(pd.concat([runs, *(one.assign(suite=suite) for suite in suites if suite != POINT)]))
+
+
+@pytest.fixture
+def small(tmp_path):
+    """One suite, three algorithms, two seeds."""
+    for algo in ("trpo", "cpo", "ppo"):
+        for seed in (0, 1):
+            fake_run(tmp_path / "logs", algo, seed=seed, returns=10 * EFFECTS.get(algo, 1.0),
+                     cost=4 * EFFECTS.get(algo, 1.0), seconds=60.0, commit="f" * 40)  # fmt: skip
+    return tmp_path / "logs"
+
+
+def read(folder) -> Data:
+    return Data(select(with_safety(read_results([folder]).runs)))
+
+
+def texts(figure) -> str:
+    """All that a figure says."""
+    return "\n".join(text.get_text() for text in figure.findobj(matplotlib.text.Text))
+
+
+def lines(axis) -> dict[str, np.ndarray]:
+    return {line.get_label(): np.asarray(line.get_ydata(), float) for line in axis.get_lines()}
+
+
+# What is drawn
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FIGURES if kind not in ("curves", "pareto")])
+def test_the_papers_figures_are_complete(kind, data):
+    (drawing,) = draw(kind, data)
+    assert drawing.figure is not None and drawing.missing == ""
+    assert "Missing" not in texts(drawing.figure)
+
+
+def test_curves_are_means_of_seeds_with_bands(data):
+    (drawing,) = draw("q1", data)
+    assert len(drawing.figure.axes) == 24
+    axis = drawing.figure.axes[0]
+    names = {LABELS[algo][0] for algo in ALGOS}
+    assert axis.get_ylabel() == "return" and names <= set(lines(axis))
+    # seeds reach 5 and 6 in three equal steps
+    assert lines(axis)["CPO"] == pytest.approx([11 / 6, 11 / 3, 5.5])
+    assert len(axis.collections) == 8
+    assert len(drawing.figure.axes[3].collections) == 0  # one seed has no band
+    assert "cost limit, 0" in lines(drawing.figure.axes[1])
+
+
+def test_q2_shows_trpos_costs_and_the_slopes(data):
+    (drawing,) = draw("q2", data)
+    bars, reward, cost = drawing.figure.axes
+    assert [bar.get_height() for bar in bars.patches] == pytest.approx([4.0] * 2 * len(ROBOTS))
+    assert lines(cost)["TRPO-USL"] == pytest.approx([1.5, 1.5])
+    # Hazards have two seeds: 5.5 of TRPO's 10.5; Ghosts one: 5 of 10
+    assert lines(reward)["CPO"] == pytest.approx([5.5 / 10.5, 0.5])
+
+
+def test_q3_has_a_polygon_per_family_and_trpos_at_1(data):
+    (drawing,) = draw("q3", data)
+    assert [axis.get_title() for axis in drawing.figure.axes] == list(RADAR4)
+    polygons = lines(drawing.figure.axes[1])
+    assert set(polygons) == {"TRPO", "Lagrangian", "CPO-based", "hierarchical"}
+    assert (polygons["TRPO"] == 1).all()
+    assert polygons["Lagrangian"] == pytest.approx([(0.4 + 0.7 + 0.9) / 3] * 4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "shown"),
+    [("q4", {"Lagrangian", "CPO-based", "hierarchical"}), ("q5", {"TRPO-Lagrangian", "TRPO-FAC"}),
+     ("q6", {"CPO", "PCPO"}), ("q7", {"TRPO-USL", "TRPO-SL"})],
+)  # fmt: skip
+def test_q4_to_q7_go_by_degrees_of_freedom(kind, shown, data):
+    (drawing,) = draw(kind, data)
+    for axis in drawing.figure.axes:
+        assert set(lines(axis)) == shown | {"TRPO"}
+        ticks = [tick.get_text() for tick in axis.get_xticklabels()]
+        assert ticks == [f"{robot}\n{number}" for robot, number in ROBOTS.items()]
+
+
+def test_q8_has_a_spider_per_algorithm(data):
+    (drawing,) = draw("q8", data)
+    (usl,) = (lines(a) for a in drawing.figure.axes if a.get_title() == "TRPO-USL")
+    assert len(drawing.figure.axes) == 7 and set(usl) == {"TRPO", "reward", "cost", "cost rate"}
+    assert usl["cost"] == pytest.approx([1.5] * 6) and usl["reward"][2:5] == pytest.approx([1] * 3)
+
+
+def test_robots_are_in_the_order_of_their_actions():
+    actual = {robot: Scenario(robot=robot).build().robot.action_size for robot in SUITE_ROBOTS}
+    assert actual == ROBOTS and list(ROBOTS.values()) == sorted(ROBOTS.values())
+
+
+@pytest.mark.parametrize(
+    ("points", "front"),
+    [
+        ([(1, 1), (2, 2), (3, 3)], [0, 1, 2]),
+        ([(3, 1), (2, 2), (1, 3)], [2]),
+        ([(1, 1), (1, 2), (2, 2)], [1]),  # the last is no better and costs more
+        ([(2, 5), (1, 0), (3, 4)], [1, 0]),
+    ],
+)
+def test_pareto_front(points, front):
+    costs, returns = np.array(points, float).T
+    assert pareto_front(costs, returns).tolist() == front
+
+
+def test_pareto_marks_front_and_limit(small):
+    (drawing,) = draw("pareto", read(small))
+    (axis,) = drawing.figure.axes
+    assert drawing.name == f"pareto_{POINT}"
+    assert lines(axis)["Pareto front"].tolist() == [5.0, 10.0]
+    assert "cost limit, 0" in lines(axis)
+
+
+def test_pareto_shows_an_outlier_at_the_edge(small):
+    fake_run(small, "pcpo", cost=1000.0, returns=7.0)
+    (drawing,) = draw("pareto", read(small))
+    (axis,) = drawing.figure.axes
+    highest = max(cost for cost in read(small).means["M_c"] if cost < 1000)
+    end = axis.get_xlim()[1]
+    assert highest < end <= 1.5 * highest
+    ((cost, value),) = axis.collections[-1].get_offsets()
+    assert 0.9 * end < cost < end and value == 7.0
+    assert "1e+03 →" in texts(drawing.figure)
+
+
+def test_profiles_rise_and_fall(data):
+    (drawing,) = draw("profiles", data)
+    reward, cost, _ = map(lines, drawing.figure.axes)
+    assert (np.diff(reward["CPO"]) <= 0).all() and (np.diff(cost["CPO"]) >= 0).all()
+    assert (reward["CPO"][0], reward["CPO"][-1]) == (1.0, 0.0)
+    assert (cost["CPO"][0], cost["CPO"][-1]) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "end", "text"),
+    [([1.0, 2, 3, 4], None, ""), ([*np.ones(20), 1000.0], 1.5, "↑ up to 1e+03")],
+)
+def test_one_outlier_does_not_squash_a_cost_axis(values, end, text):
+    axis = figures.Figure().subplots()
+    axis.plot(values)
+    fit_costs(axis, [values, np.nan])
+    assert axis.get_ylim()[0] == 0
+    if text:
+        assert axis.get_ylim()[1] == pytest.approx(end) and text in texts(axis.figure)
+    else:
+        assert axis.get_ylim()[1] > max(values) and "↑" not in texts(axis.figure)
+
+
+# What is missing
+
+
+def test_missing_runs_are_named(tmp_path):
+    fake_run(tmp_path, "trpo")
+    fake_run(tmp_path, "cpo")
+    found = read(tmp_path)
+    (drawing,) = draw("q6", found)
+    assert f"PCPO on {POINT}" in drawing.missing
+    assert "TRPO, CPO, PCPO on Goal_Swimmer_8Hazards, " in drawing.missing
+    assert f"Missing: PCPO on {POINT}" in texts(drawing.figure)
+    (drawing,) = draw("q7", found)
+    assert drawing.figure is None and f"TRPO-USL, TRPO-SL on {POINT}" in drawing.missing
+
+
+def test_without_trpo_there_is_nothing_to_compare_with(tmp_path):
+    fake_run(tmp_path, "cpo")
+    found = read(tmp_path)
+    for kind in set(FIGURES) - {"curves", "pareto", "q1"}:
+        (drawing,) = draw(kind, found)
+        assert drawing.figure is None, kind
+        assert "TRPO" in drawing.missing.split(" on ")[0].split(", ") or "all" in drawing.missing
+
+
+def test_a_gap_stays_a_gap(data):
+    runs = data.runs
+    lost = ((runs["algo"] == "pcpo") & (runs["suite"] == "Goal_Arm3_8Hazards")) | (
+        (runs["algo"] == "cpo") & (runs["suite"] == "Push_Ant_8Hazards")
+    )
+    found = Data(runs[~lost])
+    (q6,) = draw("q6", found)
+    assert np.isnan(lines(q6.figure.axes[0])["PCPO"]).tolist() == [n == "Arm3" for n in ROBOTS]
+    (q8,) = draw("q8", found)
+    assert "Push\n(8/9)" in texts(q8.figure) and "Chase\n(" not in texts(q8.figure)
+
+
+# How it looks
+
+
+def contrast(color, page) -> float:
+    """Of a colour on a page, as the WCAG defines it."""
+
+    def luminance(rgb):
+        part = np.array(rgb)
+        part = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+        return part @ [0.2126, 0.7152, 0.0722]
+
+    one, other = sorted((luminance(to_rgb(color)), luminance(to_rgb(page))))
+    return (other + 0.05) / (one + 0.05)
+
+
+def test_colours_are_readable_on_white_and_in_the_dark():
+    for color in (INK, *COLORS):
+        for page in ("#ffffff", "#131416"):
+            assert contrast(color, page) > (4 if color == INK else 2.8), (color, page)
+
+
+def test_no_two_algorithms_look_alike_and_ones_own_has_a_name(tmp_path):
+    for algo in LABELS:
+        fake_run(tmp_path, algo)
+    looks = read(tmp_path).looks
+    own = [looks[algo] for algo in LABELS]
+    for one in (lambda o: (o.color, str(o.dashes)), lambda o: o.marker):
+        assert len({one(look) for look in own}) == len(LABELS)
+    assert looks["mine"].label == "My own" and looks["trpo"].color == INK
+    assert looks["mine"].dashes == looks["trpo_lag"].dashes != looks["cpo"].dashes
+
+
+@pytest.mark.parametrize("kind", FIGURES)
+def test_legends_cover_no_data(kind, small):
+    for drawing in draw(kind, read(small)):
+        if drawing.figure is None or not drawing.figure.legends:
+            continue
+        drawing.figure.draw_without_rendering()
+        (legend,) = drawing.figure.legends
+        box = legend.get_window_extent()
+        assert box.width <= drawing.figure.bbox.width
+        for axis in drawing.figure.axes:
+            assert not box.overlaps(axis.get_window_extent()), (kind, axis)
+
+
+@pytest.mark.parametrize("form", figures.FORMATS)
+def test_formats(small, tmp_path, form):
+    found = read(small)
+    paths = [tmp_path / name / f"figure.{form}" for name in ("a", "b")]
+    for path in paths:
+        (drawing,) = draw("pareto", found)
+        save(drawing.figure, path)
+    content = paths[0].read_bytes()
+    assert content == paths[1].read_bytes()  # the same figure is the same file
+    if form == "png":
+        image = matplotlib.image.imread(paths[0])
+        assert image.shape[2] == 4 and image[0, 0, 3] == 0  # transparent
+    elif form == "svg":
+        assert ET.fromstring(content).tag.endswith("svg")
+    else:
+        assert content.startswith(b"%PDF")
+
+
+# The command
+
+
+def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    out = tmp_path / "figures"
+    (small / "cpo" / f"{POINT}-v0_2" / "0.monitor.csv").write_text("#{}\nr,l,t,c\n")
+    assert cli.main(["plot", str(small), "-o", str(out)]) == 0
+    assert [path.name for path in out.iterdir()] == [f"curves_{POINT}.png"]
+    printed, err = capsys.readouterr()
+    assert max(map(len, printed.splitlines())) <= 120
+    for text in ("return J_r", "5.00\xa0±\xa00.00", "PPO", "0: exceeded"):
+        assert text in printed
+    assert "left out of the curves: can't use" in err and "v0_2/0.monitor.csv" in err
+    (row,) = (line.split() for line in printed.splitlines() if "CPO  " in line and "0:" in line)
+    assert row[:5] == [POINT, "CPO", "0:", "exceeded", "2"]  # its result counts all the same
+
+
+def test_without_folders_it_reads_logs(small, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert plot.main(["--table", "r.md"]) == 0
+    assert "CPO" in (tmp_path / "r.md").read_text()
+
+
+def limited(folder, seed: int) -> None:
+    """A run with limits of 5 and 2 on two costs, whose episodes cost 4 and 3."""
+    path = fake_run(
+        folder, "cpo", seed=seed, cost=7.0, cost_limit=[5.0, 2.0],
+        costs={
+            "heat": {"mean": 4.0, "low": 3.5, "high": 4.5, "limit": 5.0, "verdict": "kept"},
+            "noise": {"mean": 3.0, "low": 1.5, "high": 4.5, "limit": 2.0, "verdict": "undecided"},
+        },
+    )  # fmt: skip
+    file = path / "0.monitor.csv"
+    first, head, *rows = file.read_text().splitlines()
+    rows = [f"{row},4,3" for row in rows]
+    file.write_text("\n".join([first, f"{head},c_heat,c_noise", *rows]) + "\n")
+
+
+def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
+    limited(tmp_path / "logs", 0)
+    found = read(tmp_path / "logs")
+    (row,) = found.runs.to_dict("records")
+    assert (row["M_c/heat"], row["cost_limit/noise"], row["verdict"]) == (4, 2, "undecided")
+    shown = tables(found.runs)
+    assert shown["Results"]["limit"].tolist() == ["5 2: undecided"]
+    assert shown["Limits"][["cost", "limit"]].to_numpy().tolist() == [
+        ["heat", "5: kept"], ["noise", "2: undecided"]
+    ]  # fmt: skip
+    limited(tmp_path / "logs", 1)  # with two seeds it is their mean that is judged
+    fake_run(tmp_path / "logs", "trpo")  # which knows the total only
+    found = read(tmp_path / "logs")
+    assert tables(found.runs)["Limits"]["limit"].tolist() == ["5: kept", "2: exceeded"]
+    for kind, panels in (("curves", 5), ("pareto", 3)):
+        (drawing,) = draw(kind, found)
+        assert len(drawing.figure.axes) == panels
+    (drawing,) = draw("curves", found)
+    heat = next(axis for axis in drawing.figure.axes if "heat" in axis.get_ylabel())
+    assert lines(heat)["CPO"] == pytest.approx([4.0] * 6)
+    assert lines(heat)["cost limit, 5"].tolist() == [5, 5] and "TRPO" not in lines(heat)
+    assert page_of(tmp_path / "logs").count("2: exceeded") == 1
+
+
+def test_what_older_versions_wrote_is_read(tmp_path):
+    fake_run(tmp_path, "cpo", cost_limit=[5.0, 2.0])  # without an entry for each cost
+    fake_run(tmp_path, "pcpo", cost_limit=25.0)
+    (_, several), (_, alone) = read_results([tmp_path]).runs.iterrows()
+    assert (several["limits"], alone["limits"]) == ("5 2", "25")
+    assert pd.isna(several["verdict"]) and pd.isna(alone["verdict"]) and alone["cost_limit"] == 25
+
+
+def test_all_of_it(small, tmp_path, capsys):
+    paths = [str(tmp_path / name) for name in ("runs.csv", "table.md", "table.tex")]
+    run = [str(small), "--figure", "all", "-o", str(tmp_path / "f"), "--format", "svg"]
+    assert plot.main([*run, "--table", *paths]) == 0
+    out, err = capsys.readouterr()
+    assert all(f"wrote {path}" in out for path in paths)
+    made = {path.stem for path in (tmp_path / "f").iterdir()}
+    assert made == {f"curves_{POINT}", f"pareto_{POINT}", "profiles", "iqm", "q1", "q2", "q3", "q4",
+                    "q6", "q8"}  # fmt: skip
+    assert f"q7: is not drawn; missing: TRPO-USL, TRPO-SL on {POINT}" in err
+    # One asked for by name that can't be drawn is a failure.
+    assert plot.main([str(small), "--figure", "q7", "-o", str(tmp_path / "g")]) == 1
+    assert not (tmp_path / "g").exists()
+
+
+def test_a_table_of_runs_has_those_asked_for(small, tmp_path, capsys):
+    file = tmp_path / "r.csv"
+    fake_run(small, "cpo", cost_limit=5.0, seed=2)
+    fake_run(small, "cpo", "Push_Point_8Hazards-v0", epochs=3, number=9)
+    fake_run(small, "cpo", "Push_Point_8Hazards-v0", number=8)
+    for flags, rows in (
+        ([], 9),  # several limits and lengths
+        (["--env", POINT], 7),
+        (["--cost-limit", "5"], 3),
+        (["--steps", "300"], 8),
+    ):
+        assert plot.main([str(small), "--table", str(file), *flags]) == 0
+        assert len(file.read_text().splitlines()) == 1 + rows, flags
+    file.unlink()
+    for flags in (["--env", "Goal_Pint_8Hazards"], ["--cost-limit", "77"], ["--steps", "1"]):
+        assert plot.main([str(small), "--table", str(file), *flags]) == 2
+        assert "there is no run" in capsys.readouterr().err
+    assert not file.exists()
+    means = [str(small), "--table", str(tmp_path / "r.md")]
+    assert plot.main(means) == 2 and "several cost limits, 0, 5" in capsys.readouterr().err
+    assert plot.main([*means, "--cost-limit", "5"]) == 0
+
+
+def test_suites_may_have_limits_of_their_own(small, tmp_path):
+    fake_run(small, "cpo", "SafetyPointGoal1-v0", cost_limit=25.0)
+    assert plot.main([str(small), "--table", str(tmp_path / "r.md")]) == 0
+    text = (tmp_path / "r.md").read_text()
+    assert "| 25 " in text and "| 0: exceeded " in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["absent"], "there is no folder 'absent'"),
+        (["."], "there is no run below '.'"),
+        (["LOGS", "--figure", "q9"], "invalid choice: 'q9' (choose from"),
+        (["LOGS", "--format", "gif"], "invalid choice: 'gif'"),
+        (["LOGS", "--table", "r.xls"], "unknown format '.xls'"),
+        (["LOGS", "--report", "r.pdf"], "--report 'r.pdf' is not an .html file"),
+        (["LOGS", "--figures", "q1"], "did you mean --figure?"),
+        (["LOGS", "-o", "file/x"], "-o: can't write to folder 'file/x'"),
+        (["LOGS", "--table", "file/r.md"], "--table: can't write to folder 'file'"),
+        (["LOGS", "--report", "file/r.html"], "--report: can't write to folder 'file'"),
+    ],
+)
+def test_wrong_usage(small, tmp_path, monkeypatch, capsys, arguments, message):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    (elsewhere / "file").touch()
+    arguments = [str(small) if one == "LOGS" else one for one in arguments]
+    assert plot.main(arguments) == 2
+    err = capsys.readouterr().err
+    assert message in err and "Traceback" not in err
+    assert [path.name for path in elsewhere.iterdir()] == ["file"]
+
+
+def test_only_unfinished_runs(tmp_path, capsys):
+    (fake_run(tmp_path) / "result.json").unlink()
+    assert plot.main([str(tmp_path)]) == 2
+    err = capsys.readouterr().err
+    assert "unfinished" in err and "there is no finished run below" in err
+
+
+def test_help_shows_examples_and_figures(capsys):
+    with pytest.raises(SystemExit):
+        plot.main(["--help"])
+    out = capsys.readouterr().out
+    assert "sb3-guard plot logs" in out and "Feasibility projection: CPO against PCPO." in out
+
+
+# The page
+
+
+def page_of(folder) -> str:
+    found = read_results([folder])
+    runs = select(with_safety(found.runs))
+    return report(Data(runs), "A <grid>", found.left_out, ["a & b"])
+
+
+def test_page_is_complete_and_by_itself(small):
+    broken = small / "cpo" / f"{POINT}-v0_2"
+    (broken / "result.json").write_text("{")
+    page = page_of(small)
+    assert "A &lt;grid&gt;" in page and "a &amp; b" in page
+    assert f"{broken} is left out: result.json is damaged" in page
+    assert "runs: 5, algorithms: 3, suites: 1, steps: 3,000" in page
+    # Names of XML namespaces are the only addresses; nothing is loaded.
+    addresses = set(re.findall(r"https?://[^\"'\s<)]+", page))
+    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
+    assert not re.search(r"<link|<iframe|<script src|@import|url\((?!#)", page)
+    assert INK not in page  # dark pages have light ink
+    for name in ("TRPO", "CPO", "PPO", "f" * 10, "PROFILES", "feasible IQM return"):
+        assert name in page
+    assert page.index("Results</h2>") < page.index("page by sb3_guard")
+    assert page.count("<table") == 5 and page.count("<svg") > 8
+    assert f"<td>{small / 'trpo' / POINT}-v0_1</td>" in page  # nothing is abbreviated
+
+
+def test_page_holds_small_videos_and_names_large_ones(small, monkeypatch):
+    monkeypatch.setattr("sb3_guard.zoo.results.report.FIGURES", {})
+    runs = sorted((small / "cpo").iterdir())
+    (runs[0] / "small.mp4").write_bytes(b"small")
+    (runs[0] / ".half.mp4").write_bytes(b"half")
+    (runs[1] / "videos").mkdir()
+    (runs[1] / "videos" / "large.mp4").write_bytes(b"large" * 10)
+    monkeypatch.setattr("sb3_guard.zoo.results.report.VIDEO_BYTES", 10)
+    page = page_of(small)
+    assert page.count("<video") == 1 and "data:video/mp4;base64,c21hbGw=" in page
+    assert "seed 1: large.mp4, 0.0 MB: " + str(runs[1] / "videos" / "large.mp4") in page
+
+
+def test_inline_figures_are_labelled(small):
+    (drawing,) = draw("pareto", read(small))
+    text = inline_svg(drawing.figure, "title")
+    assert 'role="img" aria-label="title"' in text and ET.fromstring(text) is not None
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no browser: apt-get install chromium")
+def test_tables_sort_in_a_browser(small, tmp_path, monkeypatch):
+    monkeypatch.setattr("sb3_guard.zoo.results.report.FIGURES", {})
+    for seed in range(2, 12):
+        fake_run(small, "cpo", seed=seed, returns=-100.0 + 20 * seed)
+    probe = """<script>
+      const table = [...document.querySelectorAll("table")].at(-1);
+      const column = name => [...table.tHead.rows[0].cells].findIndex(c => c.textContent == name);
+      const read = i => [...table.tBodies[0].rows].map(r => r.cells[i].textContent).join(" ");
+      const click = name => table.tHead.rows[0].cells[column(name)].firstChild.click();
+      const shown = [];
+      for (const name of ["return J_r", "return J_r", "seed", "algorithm", "limit", "limit"]) {
+        click(name); shown.push(read(column(name)));
+      }
+      document.title = "SORTED " + shown.join(";") + ";" +
+        [...table.tHead.rows[0].cells].map(c => c.getAttribute("aria-sort")).filter(Boolean);
+    </script>"""
+    file = tmp_path / "page.html"
+    file.write_text(page_of(small).replace("</body>", probe + "</body>"))
+    shown = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+         f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", file.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    ).stdout  # fmt: skip
+    parts = re.search("<title>SORTED (.*?)</title>", shown)[1].split(";")
+    up, down, seeds, algos, low, high, state = parts
+    values = [float(one.replace("−", "-")) for one in up.split()]
+    assert values == sorted(values) and values[0] == -60 and len(values) == 16
+    assert [float(one.replace("−", "-")) for one in down.split()] == values[::-1]
+    assert [int(one) for one in seeds.split()] == sorted(int(one) for one in seeds.split())
+    assert algos.split() == sorted(algos.split())
+    # What has no limit comes last, up or down.
+    assert low.split()[-2:] == high.split()[-2:] == ["–", "–"]
+    assert state == "descending"
+
+
+def test_the_command_runs_as_a_module_and_loads_no_torch(small, tmp_path):
+    table = tmp_path / "r.csv"
+    code = (
+        "import runpy, sys\n"
+        "try:\n"
+        "    runpy.run_module('sb3_guard.plot', run_name='__main__', alter_sys=True)\n"
+        "finally:\n"
+        "    print([m for m in ('torch', 'rl_zoo3') if m in sys.modules])"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(small), "--table", str(table)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert run.stdout == f"wrote {table}\n[]\n" and run.stderr == ""

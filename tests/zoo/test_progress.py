@@ -1,0 +1,149 @@
+"""What a run's result says: the final epoch, and what it was made with."""
+
+import json
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from cost_envs import CostPoint
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import sb3_guard
+from sb3_guard import CPO, SCPO, TRPO, CostMonitor, train
+from sb3_guard.zoo.results.runs import read_results
+from sb3_guard.zoo.run import progress
+from sb3_guard.zoo.run.progress import Epochs, commit, provenance
+
+RUN = (
+    "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:20 --device cpu "
+    "-params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:4.0 --eval-freq -1 --verbose 0"
+).split()
+
+
+def envs() -> CostMonitor:
+    return CostMonitor(DummyVecEnv([lambda: CostPoint(episode_length=10)]))
+
+
+def test_a_trained_run_says_what_it_was_made_with(tmp_path):
+    assert train.main([*RUN, "--algo", "cpo", "-n", "120", "-f", str(tmp_path)]) == 0
+    (row,) = read_results([tmp_path]).runs.to_dict("records")
+    assert row["mujoco"] == metadata.version("mujoco")
+    assert row["torch"] == metadata.version("torch")
+    assert row["sb3_guard"] == sb3_guard.__version__ and row["python"] == sys.version.split()[0]
+    assert 0 < row["seconds"] < 100 and row["cost_limit"] == 4 and row["steps"] == 120
+    assert row["platform"] and row["epoch"] == 60 and row["label"] == "CPO"
+
+
+def test_seconds_go_on_in_a_resumed_run(tmp_path, monkeypatch):
+    # A clock that is a second later whenever it is looked at: both runs take as long.
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=count().__next__))
+    start = [*RUN, "--algo", "cpo", "-f", str(tmp_path), "-n", "60"]
+    assert train.main(start) == 0
+    (run,) = tmp_path.glob("cpo/*_1")
+    before = json.loads((run / "result.json").read_text())["seconds"]
+    again = ["-i", str(run), *RUN[:2], "-n", "120", "--verbose", "0"]
+    assert train.main(again) == 0
+    assert json.loads((run / "result.json").read_text())["seconds"] > before
+
+
+def test_state_counts_seconds_across_processes():
+    epochs = Epochs(10)
+    epochs.model = SimpleNamespace(num_timesteps=0)
+    epochs.restore({**epochs.state(), "seconds": 100.0})
+    epochs._on_training_start()
+    assert 100 < epochs.state()["seconds"] < 110
+
+
+@pytest.mark.parametrize(("algorithm", "limit"), [(TRPO, None), (CPO, 3.0)])
+def test_only_constrained_algorithms_have_a_limit(algorithm, limit):
+    model = algorithm("MlpPolicy", envs(), n_steps=20, cost_limit=3.0, n_critic_updates=1)
+    epochs = Epochs(20)
+    model.learn(20, callback=epochs)
+    assert epochs.result()["cost_limit"] == limit
+    assert epochs.result()["episodes"] == 2
+
+
+def test_the_worst_step_is_judged_by_the_limit_on_it():
+    env = CostMonitor(DummyVecEnv([lambda: CostPoint(10, hazard=(-1, 0))]))
+    model = SCPO("MlpPolicy", env, n_steps=40, cost_limit=0.0, n_critic_updates=1)
+    epochs = Epochs(40)
+    model.learn(40, callback=epochs)
+    result = epochs.result()
+    (cost,) = result["costs"].values()
+    # What the algorithm itself has found the highest costs of these episodes to be, on average
+    assert cost["mean"] == pytest.approx(model.costs.episode_cost.item())
+    assert cost["limit"] == 0 and result["limit_on"] == "max"
+    assert 0 < cost["mean"] < result["cost"]
+
+
+def test_off_policy_epochs_are_of_the_papers_length(monkeypatch):
+    monkeypatch.setattr(progress, "EPOCH", 45)
+    model = SAC("MlpPolicy", envs(), learning_starts=1000, buffer_size=200)
+    epochs = Epochs(100)
+    model.learn(100, callback=epochs)
+    # A rollout is one step long; episodes ended at 60, 70, 80, 90 and 100 of 100.
+    assert epochs.result()["episodes"] == 5
+    model.learn(7, callback=epochs, reset_num_timesteps=False)
+    assert epochs.result()["episodes"] == 4
+
+
+def test_commit_is_the_checkouts():
+    root = Path(sb3_guard.__file__).parent.parent
+    if not (root / ".git").exists():
+        pytest.skip("no checkout")
+    head = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True)
+    assert commit().removesuffix("-dirty") == head.stdout.strip()
+
+
+def package(folder: Path) -> Path:
+    (folder / "sb3_guard").mkdir(parents=True)
+    file = folder / "sb3_guard" / "__init__.py"
+    file.write_text("")
+    return file
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="no git")
+def test_commit_of_changed_and_of_installed_code(tmp_path, monkeypatch):
+    def git(*arguments):
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        subprocess.run(["git", "-C", tmp_path, *identity, *arguments], check=True,
+                       capture_output=True)  # fmt: skip
+
+    git("init")
+    own = package(tmp_path)
+    git("add", ".")
+    git("commit", "-m", "x")
+    monkeypatch.setattr(sb3_guard, "__file__", str(own))
+    assert len(commit()) == 40
+    own.write_text("changed = True")
+    assert commit().endswith("-dirty")
+    # Installed below somebody's checkout, but no part of it
+    monkeypatch.setattr(sb3_guard, "__file__", str(package(tmp_path / ".venv")))
+    assert commit() is None
+
+
+def test_no_git_no_commit(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert commit() is None
+    assert set(provenance()) == {"versions", "commit", "platform"}
+
+
+def test_a_package_that_is_not_installed_has_no_version(monkeypatch):
+    """The algorithms train beside an old MuJoCo, or without one."""
+    version = metadata.version
+
+    def without_mujoco(package: str) -> str:
+        if package == "mujoco":
+            raise metadata.PackageNotFoundError(package)
+        return version(package)
+
+    assert "mujoco" in provenance()["versions"]
+    monkeypatch.setattr(metadata, "version", without_mujoco)
+    versions = provenance()["versions"]
+    assert "mujoco" not in versions and "torch" in versions

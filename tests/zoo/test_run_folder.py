@@ -1,0 +1,247 @@
+"""Run folders: numbered, whole, and owned by one process."""
+
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+import yaml
+from huggingface_sb3 import EnvironmentName
+from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
+
+from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import KEPT
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.run.checkpoint import cut_logs
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import RunFolder, RunInUse, folder_name, latest_run, lock, owner
+from sb3_guard.zoo.run.logger import RunLogger
+
+
+def create(tmp_path, env_id="Goal_Point_8Hazards-v0", **kwargs) -> RunFolder:
+    flags = RunFlags(log_folder=str(tmp_path), algo="cpo", env=env_id, **kwargs)
+    return RunFolder.create(flags, {"n_steps": 5, "normalize": True}, "train me")
+
+
+def test_numbers_go_up_and_belong_to_one_environment(tmp_path):
+    names = [create(tmp_path).path.name for _ in range(3)]
+    assert names == [f"Goal_Point_8Hazards-v0_{k}" for k in (1, 2, 3)]
+    assert create(tmp_path, "Goal-v0").path.name == "Goal-v0_1"
+    assert create(tmp_path, uuid=True).path.name.startswith("Goal_Point_8Hazards-v0_4_")
+    assert latest_run(tmp_path / "cpo", "Goal_Point_8Hazards-v0") == 3
+
+
+def test_a_number_taken_meanwhile_is_passed_over(tmp_path, monkeypatch):
+    create(tmp_path)
+    monkeypatch.setattr("sb3_guard.zoo.run.folder.latest_run", lambda *_: 0)
+    assert create(tmp_path).path.name.endswith("_2")
+
+
+@pytest.mark.parametrize("env_id", ["A-v0", "package:A-v0", "space/A-v0"])
+def test_names_are_rl_zoos(env_id):
+    assert folder_name(env_id) == EnvironmentName(env_id)
+
+
+def test_rl_zoo_reads_it(tmp_path):
+    run = create(tmp_path)
+    assert get_latest_run_id(str(tmp_path / "cpo"), run.name) == 1
+    values, _ = get_saved_hyperparams(str(run.params), test_mode=True)
+    assert values["n_steps"] == 5 and values["normalize"] is True
+    assert yaml.safe_load((run.params / "args.yml").read_text())["algo"] == "cpo"
+    assert (run.params / "command.txt").read_text() == "train me"
+
+
+def test_found_again_by_folder_and_by_checkpoint(tmp_path):
+    run = create(tmp_path)
+    run.checkpoint.touch()
+    for path in (run.path, run.checkpoint):
+        again = RunFolder.open(path)
+        assert (again.path, again.name) == (run.path, run.name)
+    assert again.args()["env"] == "Goal_Point_8Hazards-v0"
+    assert again.hyperparams() == {"n_steps": 5, "normalize": True}
+
+
+def test_not_a_run(tmp_path):
+    with pytest.raises(UsageError, match="is not a run folder"):
+        RunFolder.open(tmp_path)
+    with pytest.raises(UsageError, match="there is no run folder or file"):
+        RunFolder.open(tmp_path / "absent")
+
+
+@pytest.mark.parametrize("content", ["a: [", "just text"])
+def test_damaged_config(tmp_path, content):
+    run = create(tmp_path)
+    (run.params / "config.yml").write_text(content)
+    with pytest.raises(UsageError, match=r"config\.yml"):
+        run.hyperparams()
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])
+def test_results_are_finite(tmp_path, value):
+    run = create(tmp_path)
+    run.write_result({"n_timesteps": 5, "return": value, "cost": 1.0, "cost_rate": None})
+    with pytest.raises(UsageError, match=r"is damaged: return = .* should be a number"):
+        run.checked_result()
+
+
+def test_log_folder_that_can_not_be(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match=r"can't write to log folder .* choose another with -f"):
+        create(tmp_path / "file")
+
+
+def test_one_owner_at_a_time(tmp_path):
+    run = create(tmp_path)
+    with lock(run.path):
+        with pytest.raises(UsageError, match=f"in use by process {os.getpid()} on"), lock(run.path):
+            pass
+    with lock(run.path):
+        pass
+
+
+def test_a_dead_owner_is_succeeded(tmp_path):
+    run = create(tmp_path)
+    script = (
+        "import os, pathlib, signal\n"
+        "from sb3_guard.zoo.run.folder import lock\n"
+        f"with lock(pathlib.Path({str(run.path)!r})):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == -9
+    assert owner(run.path)["pid"] != str(os.getpid())
+    with lock(run.path):
+        assert owner(run.path)["pid"] == str(os.getpid())
+    assert owner(run.path) == {}
+
+
+def test_an_owner_elsewhere_may_be_alive(tmp_path, monkeypatch, capsys):
+    """Of another host nothing is known but that its process refreshes the lock, or does not."""
+    run = create(tmp_path)
+    with lock(run.path):
+        held = (run.path / ".lock").read_text()
+    (run.path / ".lock").write_text(held.replace(f"host={socket.gethostname()}", "host=elsewhere"))
+    monkeypatch.setattr("sb3_guard.zoo.run.folder.WAIT", 0.1)
+    with pytest.raises(RunInUse, match="on elsewhere; if that is gone, remove"):
+        with lock(run.path):
+            pass
+    assert "waiting for a sign of life" in capsys.readouterr().out
+
+
+def test_files_appear_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "file"
+    with replacing(path) as file:
+        file.write(b"old")
+        assert not path.exists()
+    with pytest.raises(RuntimeError), replacing(path) as file:
+        file.write(b"half of the n")
+        raise RuntimeError
+    assert path.read_bytes() == b"old"
+    with open(path, "rb") as reader:
+        with replacing(path) as file:
+            file.write(b"new")
+        # Who had opened the old file still has all of it.
+        assert (reader.read(), path.read_bytes()) == (b"old", b"new")
+    assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def rows(path) -> list[str]:
+    return (path / "progress.csv").read_text().splitlines()
+
+
+MONITOR = b"#{}\nr,l,t,c\n"
+
+
+def resumed(folder, state) -> RunLogger:
+    environments = [{"episodes": 3}, {**dict.fromkeys(KEPT), "length": len(MONITOR)}, None]
+    cut_logs(folder, {"logger": state, "environments": environments})
+    return RunLogger(folder, state=state)
+
+
+def test_progress_goes_on_where_it_was(tmp_path):
+    logger = RunLogger(tmp_path)
+    for k in range(3):
+        logger.record("a", k)
+        logger.dump(k)
+    logger.record("pending", 7)
+    state = logger.state(iterations=3)
+    logger.record("b", 9)
+    logger.dump(4)  # dropped
+    logger.close()
+
+    again = resumed(tmp_path, state)
+    again.record("a", 10)
+    again.record("time/iterations", 1)
+    again.dump(5)
+    again.close()
+    header, *lines = rows(tmp_path)
+    table = [dict(zip(header.split(","), line.split(","), strict=True)) for line in lines]
+    assert [row["a"] for row in table] == ["0", "1", "2", "10"]
+    assert (table[-1]["pending"], table[-1]["time/iterations"]) == ("7", "4")
+    assert "b" not in header
+
+
+def test_progress_of_no_rows_begins_anew(tmp_path):
+    logger = RunLogger(tmp_path)
+    state = logger.state(iterations=0)
+    logger.record("a", 1)
+    logger.dump()
+    logger.close()
+    again = resumed(tmp_path, state)
+    again.record("b", 2)
+    again.dump()
+    again.close()
+    assert rows(tmp_path) == ["b", "2"]
+
+
+def test_a_sleeper_whose_run_was_taken_over_ends(tmp_path):
+    script = (
+        "import pathlib, time\n"
+        "from sb3_guard.zoo.run import folder as run_folder\n"
+        "run_folder.SILENCE = 0.6\n"
+        f"folder = pathlib.Path({str(tmp_path)!r})\n"
+        "with run_folder.lock(folder):\n"
+        '    (folder / ".lock").unlink()\n'
+        "    time.sleep(120)\n"
+        "    print('alive')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "was taken over while this process gave no sign of life" in done.stderr
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_what_came_after_the_checkpoint_is_cut(older, tmp_path):
+    """New columns too, which extend the rows before; and as checkpoints of format 5 have it."""
+    logger = RunLogger(tmp_path)
+    for k in range(3):
+        logger.record("a", k)
+        logger.dump(k)
+    state = logger.state(iterations=3)
+    before = (tmp_path / "progress.csv").read_bytes()
+    if older:
+        state = {**state, "table": before.decode()}
+        del state["length"]
+    for k in range(3):
+        logger.record("b", k)
+        logger.record("c" * k, k)
+        logger.dump(k)
+    logger.close()
+    (tmp_path / "0.monitor.csv").write_bytes(MONITOR + b"1,1,1,1\n")
+    resumed(tmp_path, state).close()
+    assert (tmp_path / "progress.csv").read_bytes() == before
+    assert (tmp_path / "0.monitor.csv").read_bytes() == MONITOR
+
+
+def test_a_deleted_log_begins_anew(tmp_path):
+    logger = RunLogger(tmp_path)
+    logger.record("a", 1)
+    logger.dump()
+    state = logger.state(iterations=1)
+    logger.close()
+    (tmp_path / "progress.csv").unlink()
+    again = resumed(tmp_path, state)
+    again.record("b", 2)
+    again.dump()
+    again.close()
+    assert rows(tmp_path) == ["b", "2"]

@@ -1,0 +1,214 @@
+"""Tables of runs: read, left out, chosen, and what a reader of their means is told."""
+
+import json
+import math
+
+import pandas as pd
+import pytest
+from fake_runs import fake_run
+
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.results.curves import read_curve
+from sb3_guard.zoo.results.runs import COLUMNS, choose, notices, read_results, select
+
+HAZARDS, GHOSTS = "Goal_Point_8Hazards", "Goal_Point_8Ghosts"
+
+
+def edit(run, **changes):
+    file = run / "result.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+
+
+def params(run, name):
+    return run / f"{HAZARDS}-v0" / name
+
+
+def test_a_row_says_all_about_a_run(tmp_path):
+    versions = {"mujoco": "4.0.0", "python": "3.11.4"}
+    path = fake_run(
+        tmp_path, seed=3, cost_limit=25, seconds=12.5, versions=versions, commit="abc",
+        platform="Linux",
+    )  # fmt: skip
+    table = read_results([tmp_path]).runs
+    assert list(table.columns) == list(COLUMNS)
+    (row,) = table.to_dict("records")
+    expected = {
+        "suite": HAZARDS, "task": "Goal", "robot": "Point", "constraint": "8Hazards",
+        "algo": "cpo", "label": "CPO", "family": "CPO-based", "seed": 3, "steps": 600, "J_r": 20.0,
+        "M_c": 5.0, "rho_c": 0.5, "cost_limit": 25.0, "limits": "25", "seconds": 12.5,
+        "epoch": 100, "mujoco": "4.0.0", "python": "3.11.4", "commit": "abc", "platform": "Linux",
+        "path": str(path), "episodes": 10,
+    }  # fmt: skip
+    assert {key: row[key] for key in expected} == expected
+    assert pd.isna(row["torch"])
+
+
+def test_what_older_versions_did_not_write(tmp_path):
+    fake_run(tmp_path, "ppo", env="CartPole-v1", label=..., family=...)
+    fake_run(tmp_path, "strange", config={"cost_limit": 5.0}, label=...)
+    one, other = read_results([tmp_path]).runs.to_dict("records")
+    assert (one["suite"], one["label"], one["family"]) == ("CartPole-v1", "PPO", "")
+    assert (other["label"], other["cost_limit"]) == ("STRANGE", 5.0)
+    assert pd.isna(one["robot"]) and math.isnan(one["seconds"]) and pd.isna(one["commit"])
+
+
+def test_the_reference_comes_first_then_family_by_family(tmp_path):
+    for algo in ("trpo_lag", "ppo", "cpo", "trpo", "mine", "pcpo"):
+        fake_run(tmp_path, algo)
+    labels = read_results([tmp_path]).runs["label"].tolist()
+    assert labels == ["TRPO", "PPO", "CPO", "PCPO", "My own", "TRPO-Lagrangian"]
+
+
+def test_folders_may_overlap_and_numbers_sort_as_numbers(tmp_path):
+    for number in (10, 9, 2):
+        fake_run(tmp_path, number=number, seed=0)
+    found = read_results([tmp_path, tmp_path / "cpo", tmp_path / "cpo" / ".."]).runs
+    assert [path[-2:] for path in found["path"]] == ["_2", "_9", "10"]
+    # The same run three times: the one with the greatest number counts.
+    (path,) = select(found)["path"]
+    assert path.endswith("_10")
+    lines = notices(found, select(found))
+    assert [line.split(" was repeated")[0][-2:] for line in lines] == ["_2", "_9"]
+    assert len(read_results([path]).runs) == 1
+
+
+DAMAGE = {
+    "unfinished": lambda run: (run / "result.json").unlink(),
+    "is damaged": lambda run: (run / "result.json").write_text('{"return": 1'),
+    "can't decode": lambda run: (run / "result.json").write_bytes(b"\xff\xfe\x00"),
+    "list indices": lambda run: (run / "result.json").write_text("[1]"),
+    "KeyError: 'n_timesteps'": lambda run: (run / "result.json").write_text("{}"),
+    "must be real number": lambda run: edit(run, cost="x"),
+    "could not convert string to float: 'x'": lambda run: edit(run, seconds="x"),
+    "no env, algo or seed": lambda run: params(run, "args.yml").write_text("env: 3"),
+    "one <env>/args.yml": lambda run: params(run, "args.yml").unlink(),
+    "error.txt ends in 'disk on fire'": lambda run: (
+        (run / "error.txt").write_text("Traceback\n  …\ndisk on fire\n"),
+        (run / "result.json").unlink(),
+    ),
+    "config.yml": lambda run: params(run, "config.yml").write_text("a: ["),
+}
+
+
+@pytest.mark.parametrize("why", DAMAGE)
+def test_a_damaged_run_is_named_and_left_out(tmp_path, why):
+    whole, broken = fake_run(tmp_path), fake_run(tmp_path, seed=1)
+    DAMAGE[why](broken)
+    found = read_results([tmp_path])
+    assert found.runs["path"].tolist() == [str(whole)]
+    assert list(found.left_out) == [str(broken)] and why in found.left_out[str(broken)]
+
+
+def test_folders_without_runs(tmp_path):
+    with pytest.raises(UsageError, match=r"no folder '.*absent'"):
+        read_results([tmp_path / "absent"])
+    with pytest.raises(UsageError, match="no run below"):
+        read_results([tmp_path])
+
+
+def test_runs_at_several_limits_are_not_averaged(tmp_path):
+    fake_run(tmp_path, "trpo")
+    for limit in ([1.0, 2.0], [3.0], [50.0, 50.0]):
+        fake_run(tmp_path, cost_limit=limit)
+    found = read_results([tmp_path]).runs
+    assert found["limits"].fillna("–").tolist() == ["–", "3", "1 2", "50 50"]
+    assert found["cost_limit"][1] == 3.0 and found["cost_limit"].notna().sum() == 1
+    with pytest.raises(UsageError, match=r"1 2, 3, 50 50, .*--cost-limit 1 2"):
+        select(found)
+    assert select(choose(found, cost_limit=[50, 50]))["algo"].tolist() == ["trpo", "cpo"]
+    with pytest.raises(UsageError, match=r"no run at cost limit 1; .* 1 2, 3, 50 50"):
+        choose(found, cost_limit=1)
+
+
+def test_suites_are_chosen_by_id(tmp_path):
+    fake_run(tmp_path)
+    fake_run(tmp_path, env=GHOSTS + "-v0")
+    found = read_results([tmp_path]).runs
+    for name in (GHOSTS, GHOSTS + "-v0"):
+        assert choose(found, [name])["suite"].tolist() == [GHOSTS]
+    with pytest.raises(UsageError, match="'Goal_Pint_8Ghosts'; did you mean"):
+        choose(found, ["Goal_Pint_8Ghosts"])
+
+
+def test_runs_of_several_lengths_are_not_averaged(tmp_path):
+    fake_run(tmp_path, "trpo", epochs=4)
+    for epochs in (3, 6):
+        fake_run(tmp_path, epochs=epochs)
+    found = read_results([tmp_path]).runs
+    with pytest.raises(UsageError, match=r"cpo on .* in length, 300, 600 steps.* --steps 600"):
+        select(found)
+    with pytest.raises(UsageError, match=r"no run of 7 steps; .* 300, 400, 600"):
+        choose(found, steps=7)
+    chosen = select(choose(found, steps=300))
+    assert chosen["steps"].tolist() == [400, 300]  # where there is no choice, all stay
+    assert notices(found, chosen) == [f"{HAZARDS}: runs differ in length: 300, 400 steps"]
+
+
+def test_environments_of_other_settings_are_not_compared(tmp_path):
+    fake_run(tmp_path, "trpo", config={"env_kwargs": {"num": 2}})
+    fake_run(tmp_path, config={"env_kwargs": None})
+    with pytest.raises(UsageError, match=r'env_kwargs .*\{"num": 2\} in .*; none in '):
+        select(read_results([tmp_path]).runs)
+
+
+EXTENDED = {"seed": 1, "learned": [300]}
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "line"),
+    [
+        ({}, {"seed": 1, "config": {"a": 0}}, "runs of cpo differ in hyper-parameters"),
+        ({}, {"config": {"a": 0}}, "runs of cpo count twice or more for one seed: 0"),
+        ({}, {"args": {"trained_agent": "old.zip"}}, "some runs started from a model"),
+        ({"commit": "a"}, {"seed": 1}, "runs differ in commit: a, unknown"),
+        ({"versions": {"mujoco": "3"}}, {"seed": 1, "versions": {"mujoco": "4"}},
+         "runs differ in mujoco: 3, 4"),
+        ({"algo": "trpo"}, {"config": {"policy_kwargs": {"net_arch": [8]}}},
+         'algorithms differ in policy_kwargs: default (trpo); {"net_arch": [8]} (cpo)'),
+        ({"algo": "trpo"}, {"config": {"n_steps": 5}},
+         "algorithms differ in n_steps: 50 (trpo); 5 (cpo)"),
+        ({"algo": "trpo", "config": {"gamma": 0.9}}, {},
+         "algorithms differ in gamma: 0.9 (trpo); default (cpo)"),
+        ({"config": {"warmup": 0.3}}, {"config": {"warmup": 0.3}, **EXTENDED}, "were extended"),
+        ({"config": {"learning_rate": "lin_1"}}, {"config": {"learning_rate": "lin_1"}, **EXTENDED},
+         "were extended"),
+    ],
+)  # fmt: skip
+def test_unequal_runs_are_noticed(tmp_path, one, other, line):
+    fake_run(tmp_path, **one)
+    fake_run(tmp_path, **other)
+    found = read_results([tmp_path]).runs
+    lines = notices(found, select(found))
+    assert any(line in note and note.startswith(HAZARDS) for note in lines), lines
+
+
+def test_equal_runs_need_no_note(tmp_path):
+    fake_run(tmp_path, "trpo")
+    fake_run(tmp_path, "ppo", config={"n_steps": 7})  # a baseline's own
+    fake_run(tmp_path, learned=[300])
+    fake_run(tmp_path, seed=1)
+    found = read_results([tmp_path]).runs
+    assert notices(found, select(found)) == []
+    edit(fake_run(tmp_path, seed=2), **{"return": None, "cost": None})
+    found = read_results([tmp_path]).runs
+    assert "no episode ended in" in notices(found, select(found))[0]
+
+
+def test_curve_of_a_run(tmp_path):
+    path = fake_run(tmp_path, returns=60.0, cost=2.0)
+    curve = read_curve(path, 100)
+    assert curve["step"].tolist() == [100, 200, 300, 400, 500, 600]
+    assert curve["J_r"].tolist() == pytest.approx([10, 20, 30, 40, 50, 60])
+    assert curve["M_c"].tolist() == pytest.approx([2.0] * 6)
+    assert curve["rho_c"].iloc[-1] == pytest.approx(0.2)
+    long = fake_run(tmp_path, epochs=60)
+    assert len(read_curve(long, 10)) == len(read_curve(long)) == 200
+
+
+@pytest.mark.parametrize("content", [None, "", "#{}\n", "#{}\nr,l,t\n1,2,3\n", "#{}\nr,l,t,c\n",
+                                     "#{}\nr,l,t,c\n1,10,1,2\n1,1"])  # fmt: skip
+def test_damaged_curve(tmp_path, content):
+    file = fake_run(tmp_path) / "0.monitor.csv"
+    file.unlink() if content is None else file.write_text(content)
+    with pytest.raises(UsageError, match=r"0\.monitor\.csv"):
+        read_curve(file.parent)

@@ -1,0 +1,232 @@
+"""Statistics against cases computed by hand, and the tables that are made of them."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from fake_runs import LABELS, fake_run
+
+from sb3_guard.zoo.cli.markdown import escaped
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.results.curves import read_curve
+from sb3_guard.zoo.results.runs import COLUMNS, read_results
+from sb3_guard.zoo.results.statistics import (
+    SAFETY,
+    aggregate,
+    by_family,
+    interval,
+    iqm,
+    mean_curve,
+    normalize,
+    overall,
+    safety,
+    with_safety,
+)
+from sb3_guard.zoo.results.tables import latex, markdown, tables, terminal, write_table
+
+HAZARDS, GHOSTS = "Goal_Point_8Hazards", "Goal_Point_8Ghosts"
+
+
+def means(**metrics) -> pd.DataFrame:
+    """A table of means of one suite: algorithm to (J_r, M_c, ρ_c)."""
+    rows = [
+        {"suite": HAZARDS, "algo": algo, "label": LABELS[algo][0],
+         "family": LABELS[algo][1].replace("unconstrained", ""), "J_r": j, "M_c": m, "rho_c": r}
+        for algo, (j, m, r) in metrics.items()
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+# One run
+
+
+def test_safety_by_hand():
+    # 12 epochs of 10 steps with two episodes each, of costs 2k and 2k + 1 and the negative returns
+    costs = np.arange(24.0)
+    episodes = pd.DataFrame({"step": 5 * (costs + 1), "J_r": -costs, "M_c": costs})
+    found = safety(episodes, epoch=10, limit=8)
+    # The last ten epochs hold the costs 4 … 23, of which 4 … 8 are within the limit.
+    assert found == pytest.approx(
+        {
+            "return_last": -13.5, "cost_last": 13.5, "above_limit": 15 / 20,
+            "cost_p95": 4 + 0.95 * 19, "cost_max": 23, "cost_total": 276, "feasible_iqm": -6,
+        }
+    )  # fmt: skip
+    assert list(found) == list(SAFETY)
+    unlimited = safety(episodes, epoch=math.nan, limit=math.nan)
+    assert math.isnan(unlimited["above_limit"]) and math.isnan(unlimited["feasible_iqm"])
+    assert math.isnan(safety(episodes, 10, limit=3)["feasible_iqm"])
+
+
+def test_unconstrained_runs_are_judged_by_the_others_limit(tmp_path):
+    fake_run(tmp_path, "trpo", cost=5.0)
+    fake_run(tmp_path, "cpo", cost=1.0, cost_limit=4.0)
+    (fake_run(tmp_path, "pcpo", cost_limit=4.0) / "0.monitor.csv").unlink()
+    runs = read_results([tmp_path]).runs
+    assert with_safety(runs)["above_limit"].tolist()[:2] == [1.0, 0.0]
+    assert with_safety(runs)[list(SAFETY)].iloc[2].isna().all()
+    several = runs.assign(cost_limit=[math.nan, 4.0, 5.0])
+    assert math.isnan(with_safety(several)["above_limit"][0])
+
+
+# Over seeds
+
+
+def test_means_and_intervals_over_seeds(tmp_path):
+    for seed, value in enumerate((10.0, 20.0, 60.0)):
+        fake_run(tmp_path, seed=seed, returns=value, cost=5.0 + seed, cost_limit=0.0)
+    (row,) = aggregate(with_safety(read_results([tmp_path]).runs)).to_dict("records")
+    assert (row["label"], row["J_r"], row["seeds"], row["limits"]) == ("CPO", 30.0, 3, "0")
+    assert row["J_r_std"] == pytest.approx(math.sqrt(700))  # of the sample
+    # 27 resamples of three: the least mean has probability 1/27 > 2.5 %
+    assert (row["J_r_low"], row["J_r_high"]) == (10.0, 60.0)
+    assert row["cost_last"] == pytest.approx(6) and row["above_limit"] == 1
+    assert row["cost_last_se"] == pytest.approx(1 / math.sqrt(3))
+    assert row["cost_total"] == pytest.approx(360)
+    worst = read_results([tmp_path]).runs
+    assert row["cost_max"] == with_safety(worst)["cost_max"].max()
+
+
+def test_interval():
+    assert np.isnan(interval([np.array([3.0, np.nan]), np.array([])])).all()  # one seed
+    # Resampling across the groups would mix 0 and 100; within them nothing varies.
+    assert interval([np.zeros(5), np.full(5, 100.0)]) == (50.0, 50.0)
+    values = np.random.default_rng(0).normal(3.0, 2.0, size=400)
+    error = 1.96 * values.std() / 20
+    normal = values.mean() - error, values.mean() + error
+    assert interval([values]) == pytest.approx(normal, abs=0.02)
+
+
+def test_interquartile_mean():
+    assert iqm(np.array([1000.0, 1, 2, 3, 4, 5, 6, -500])) == 3.5
+    assert iqm(np.array([[0.0, 1, 2, 9]]), axis=1).tolist() == [1.5]
+
+
+def test_mean_of_curves_ends_where_the_shortest_does(tmp_path):
+    curves = [read_curve(fake_run(tmp_path, seed=s, epochs=n, returns=10.0 * n), 100)
+              for s, n in ((0, 4), (1, 6))]  # fmt: skip
+    mean = mean_curve(curves, "J_r")
+    assert mean.index.tolist() == [100, 200, 300, 400]
+    assert mean["mean"].tolist() == pytest.approx([10, 20, 30, 40])
+
+
+# Scores
+
+
+def test_scores_by_hand():
+    table = means(trpo=(20.0, 8.0, 0.1), cpo=(15.0, 2.0, 0.05), pcpo=(30.0, 16.0, 0.3))
+    scores = normalize(table, table).set_index("algo")
+    assert scores.loc["trpo", ["reward", "cost", "cost_rate"]].tolist() == [1, 1, 1]
+    assert scores.loc["cpo", ["reward", "cost", "cost_rate"]].tolist() == [0.75, 0.25, 0.5]
+    # Reward is capped, costs are not.
+    assert scores.loc["pcpo", ["reward", "cost"]].tolist() == [1.0, 2.0]
+
+
+def test_negative_returns_are_shifted():
+    table = means(trpo=(6.0, 2.0, 1.0), cpo=(-4.0, 1.0, 1.0), pcpo=(1.0, 1.0, 1.0))
+    # The range is 10: the least return becomes 0.1, TRPO's 10.1.
+    rewards = normalize(table, table)["reward"].tolist()
+    assert rewards == pytest.approx([1.0, 0.1 / 10.1, 5.1 / 10.1])
+    # Runs are scored on the scale of the means.
+    runs = table.assign(J_r=table["J_r"] - 1, M_c=table["M_c"] + 1)
+    rewards = normalize(runs, table)["reward"].tolist()
+    assert rewards == pytest.approx([9.1 / 10.1, -0.9 / 10.1, 4.1 / 10.1])
+    assert normalize(runs, table)["cost"].tolist() == [1.5, 1.0, 1.0]
+    alone = means(trpo=(-4.0, 1.0, 1.0))
+    assert normalize(alone, alone)["reward"].tolist() == [1.0]
+
+
+def test_baselines_do_not_count_for_the_shift():
+    table = means(trpo=(6.0, 1, 1), cpo=(3.0, 1, 1), ppo=(-90.0, 1, 1))
+    assert normalize(table, table)["reward"].tolist()[:2] == [1.0, 0.5]
+
+
+@pytest.mark.parametrize("table", [means(trpo=(5.0, 0.0, 0.0), cpo=(5.0, 1.0, 1.0)),
+                                   means(cpo=(5.0, 1.0, 1.0))])  # fmt: skip
+def test_without_a_denominator_there_is_no_score(table):
+    assert normalize(table, table)[["cost", "cost_rate"]].isna().all(axis=None)
+
+
+def test_score_of_a_family_is_the_mean_of_its_algorithms():
+    table = means(
+        trpo=(10.0, 10.0, 1.0), trpo_lag=(6.0, 1.0, 0.1), trpo_fac=(8.0, 2.0, 0.2),
+        trpo_ipo=(10.0, 6.0, 0.6), cpo=(5.0, 5.0, 0.5),
+    )  # fmt: skip
+    scores = by_family(normalize(table, table)).set_index("family")
+    assert scores.loc["Lagrangian"].tolist() == pytest.approx([HAZARDS, 3, 0.8, 0.3, 0.3])
+    assert scores.loc["CPO-based", "algorithms"] == 1 and len(scores) == 2
+
+
+def test_suites_without_a_score_are_left_out_and_counted(tmp_path):
+    for env, cost in ((HAZARDS, 4.0), (GHOSTS, 0.0)):
+        for seed in (0, 1):
+            fake_run(tmp_path, "trpo", f"{env}-v0", seed, cost=cost)
+            fake_run(tmp_path, "cpo", f"{env}-v0", seed, cost=1.0, returns=10.0)
+    runs = with_safety(read_results([tmp_path]).runs)
+    table = overall(runs, aggregate(runs)).set_index("algo")
+    assert table.index.tolist() == ["trpo", "cpo"]
+    assert table.loc["cpo", ["cost", "cost_n"]].tolist() == [0.25, 1]
+    assert table.loc["cpo", ["reward", "reward_n", "reward_iqm"]].tolist() == [0.5, 2, 0.5]
+    assert "0.25 (1)" in terminal(tables(runs)["All suites, relative to TRPO"])
+
+
+# Files
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for algo, factor in (("trpo", 1.0), ("cpo", 0.5)):
+        for seed in (0, 1):
+            fake_run(
+                tmp_path / "logs", algo, seed=seed, returns=20 * factor + seed, cost=5 * factor
+            )
+    return with_safety(read_results([tmp_path / "logs"]).runs)
+
+
+def test_csv_is_the_table(tmp_path, runs):
+    write_table(tmp_path / "a" / "runs.csv", runs)
+    again = pd.read_csv(tmp_path / "a" / "runs.csv")
+    same = ["algo", "seed", "J_r"]
+    pd.testing.assert_frame_equal(again[same], runs[same], check_dtype=False)
+    assert list(again.columns) == [*COLUMNS, *SAFETY]
+
+
+def test_markdown_and_latex(tmp_path, runs):
+    for name in ("r.md", "r.tex"):
+        write_table(tmp_path / name, runs, ["runs differ in <b>"])
+    text, tex = ((tmp_path / name).read_text() for name in ("r.md", "r.tex"))
+    # TRPO's mean is 20.5, CPO's 10.5; no line breaks before or after ±.
+    assert "20.50\xa0±\xa00.71 [20.00, 21.00]" in text and "| 0.51 " in text
+    assert "| 100.0 " in text and r"- runs differ in \<b>" in text
+    assert r"20.50~$\pm$~0.71 [20.00, 21.00]" in tex and r"Goal\_Point\_8Hazards" in tex
+    assert "return $J_r$" in tex and r"cost rate $\rho_c$" in tex and r"above limit, \%" in tex
+    lines = [line for line in text.splitlines() if line.startswith("|")][:4]
+    assert len({len(line) for line in lines}) == 1
+
+
+@pytest.mark.parametrize("cell", ["_", "%", "&", "#", "ρ", "−3", "\\"])
+def test_latex_escapes(cell):
+    assert (
+        cell not in latex(pd.DataFrame({"a": [cell]})).splitlines()[4].removesuffix(r" \\").split()
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "page"),
+    [("a|b", r"a\|b"), ("<img>", r"\<img>"), ("*a*", r"\*a\*"), ("_a_", r"\_a\_"), ("a`b", r"a\`b"),
+     ("[a](b)", r"[a]\(b)"), ("Goal_Point", "Goal_Point"), ("5 [4, 6]", "5 [4, 6]")],
+)  # fmt: skip
+def test_markdown_shows_cells_as_they_are(text, page):
+    assert markdown(pd.DataFrame({"x": [text]})).splitlines()[2].strip("| ") == page
+    assert "|" in text or escaped(text) == page
+
+
+def test_formats(tmp_path, runs):
+    for name in ("r.xlsx", "r", "r.cvs"):
+        with pytest.raises(UsageError, match=r"unknown format .*.md, .tex, .csv"):
+            write_table(tmp_path / name, runs)
+        assert not (tmp_path / name).exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match=r"can't write to"):
+        write_table(tmp_path / "file" / "r.csv", runs)

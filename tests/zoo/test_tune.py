@@ -1,0 +1,825 @@
+"""Tuning: what is searched, what counts as best, and that nothing is lost on the way."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pandas as pd
+import pytest
+import yaml
+from cost_envs import CostPoint
+from kills import campaign, faults, work
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState, create_trial
+from processes import fresh, wait_for
+from typed import refused
+
+from sb3_guard import cli, train, tune
+from sb3_guard.algorithms import ALGORITHMS, TRPO
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.run.algos import algorithm, baselines
+from sb3_guard.zoo.run.hyperparams import build, check, parameters, read_hyperparams
+from sb3_guard.zoo.tuning import studies, trials
+from sb3_guard.zoo.tuning.report import Report, best
+from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space, set_dotted, space_of
+
+pytestmark = pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
+
+TOY = (
+    "--algo trpo_lag --gym-packages registered_envs --env CostPoint-v0 --env-kwargs "
+    "episode_length:20 --eval-episodes 2 --device cpu --num-threads 1 -n 240"
+).split()
+SMALL = "-params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:2".split()
+SUPPORT = Path(__file__).parents[1] / "support"
+OURS = [*sorted(ALGORITHMS), "crossq"]
+OFF_POLICY = ("crossq", "sac_lag", "td3_lag", "tqc_lag")
+SHIPPED_KL = 0.02
+
+
+def draw(search: Search, seed: int = 0) -> dict:
+    """What a random trial tries."""
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=seed))
+    return search.draw(study.ask())
+
+
+def shipped(algo: str) -> dict:
+    return check(algo, algorithm(algo), read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
+
+
+# What is searched
+
+
+def test_every_algorithm_has_a_space():
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+
+    assert all(space_of(algo) for algo in ALGORITHMS)
+    for algo in baselines():
+        assert space_of(algo) or algo in HYPERPARAMS_SAMPLER, algo
+
+
+@pytest.mark.parametrize("algo", OURS)
+def test_spaces_hold_what_algorithms_accept(algo):
+    search = Search(algo, shipped(algo))
+    for corner in search.corners():
+        check(algo, algorithm(algo), corner)
+    values = {**draw(search), "buffer_size" if algo in OFF_POLICY else "n_steps": 30}
+    algorithm(algo)(env=CostPoint(), **build(check(algo, algorithm(algo), values)).model)
+
+
+def test_the_decay_of_cost_advantages_is_searched_where_it_matters():
+    """With the values of the files, and not where nothing depends on it."""
+    for algo in set(OURS) - {"trpo", "trpo_sl", "rcpo", *OFF_POLICY}:
+        assert {0.5, 0.97, shipped(algo).get("cost_gae_lambda")} <= {
+            *space_of(algo)["cost_gae_lambda"]
+        }, algo
+    assert not any("cost_gae_lambda" in space_of(algo) for algo in ("trpo", "trpo_sl"))
+
+
+@pytest.mark.parametrize("algo", OURS)
+def test_the_first_trial_is_the_shipped_one(algo):
+    base = shipped(algo)
+    search = Search(algo, base)
+    study = optuna.create_study()
+    study.enqueue_trial(search.first())
+    drawn = search.draw(study.ask())
+    # What the file leaves to the constructor is that one's default.
+    cls = algorithm(algo)
+    expected = {name: parameters(cls)[name].default for name in drawn.keys() - base.keys()} | base
+    if hasattr(cls, "policy_defaults"):
+        expected["policy_kwargs"] = {
+            **{name: value for name, value in cls.policy_defaults.items() if "std" in name},
+            **expected["policy_kwargs"],
+        }
+    assert drawn == expected
+
+
+def test_an_algorithm_of_a_user_tunes(tmp_path, monkeypatch):
+    """In the space of its class and those of its bases, and from no file."""
+
+    class Mine(TRPO):
+        search_space = {"gamma": [0.5, 0.6], "cg_damping": {"low": 0.1, "high": 1.0}}  # noqa: RUF012
+
+    monkeypatch.setitem(ALGORITHMS, "mine", Mine)
+    space = space_of("mine")
+    assert space["gamma"] == [0.5, 0.6]
+    assert space["target_kl"] == space_of("trpo")["target_kl"]
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--algo", "mine", "--n-trials", "2") == 0
+    (folder,) = (tmp_path / "mine").iterdir()
+    values = read_hyperparams("mine", "CostPoint-v0", str(folder / "best.yml"))
+    assert values["gamma"] in (0.5, 0.6) and 0.1 <= values["cg_damping"] <= 1.0
+
+
+@pytest.mark.parametrize("algo", ["trpo", "trpo_lag", "crossq"])
+def test_a_space_serves_rl_zoo(algo):
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
+
+    from sb3_guard.zoo.rl_zoo3 import key_in_rl_zoo, register
+
+    register()
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    extra = {"using_her_replay_buffer": False, "her_kwargs": {}}
+    drawn = HYPERPARAMS_SAMPLER[key_in_rl_zoo(algo)](study.ask(), 2, 4, extra)
+    assert drawn.keys() == {name.partition(".")[0] for name in space_of(algo)} - {"n_envs"}
+    assert shipped(algo)["policy_kwargs"].keys() <= drawn["policy_kwargs"].keys()
+    assert HYPERPARAMS_SAMPLER["trpo"].__module__ == "rl_zoo3.hyperparams_opt"
+
+
+def test_what_is_fixed_is_not_searched():
+    base = {"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}
+    search = Search("trpo", base, fixed=base)
+    assert not {"gamma", "policy_kwargs.net_arch", "policy_kwargs.log_std_init"} & {*search.space}
+    values = draw(search)
+    assert (values["gamma"], values["policy_kwargs"]) == (0.9, {"net_arch": [8]})
+    with pytest.raises(UsageError, match="nothing is left to search"):
+        Search("trpo", base, {"gamma": [0.5, 0.9]}, base)
+
+
+def test_what_a_space_draws():
+    options = [{"pi": [8]}, [1, 2], "text", 3, None, True]
+    space = {
+        "linear": {"low": 0.0, "high": 2.0, "log": False},
+        "log": {"low": 1e-4, "high": 1.0, "log": True},
+        "whole": {"low": 1, "high": 1000, "log": True},
+        "option": options,
+    }
+    search = Search("trpo", {}, space)
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    drawn = [search.draw(study.ask()) for _ in range(200)]
+    for name, middle in {"linear": 1.0, "log": 1e-2, "whole": 1000**0.5}.items():
+        values = np.array([one[name] for one in drawn])
+        assert space[name]["low"] <= values.min() and values.max() <= space[name]["high"]
+        assert 0.4 < (values < middle).mean() < 0.6
+    assert isinstance(drawn[0]["whole"], int)
+    assert all(any(one["option"] is option or one["option"] == option for one in drawn)
+               for option in options)  # fmt: skip
+
+
+@pytest.mark.parametrize("algo", ["ppo", "sac", "td3", "dqn"])
+def test_rl_zoos_spaces_become_plain_data(algo):
+    base = check(algo, algorithm(algo), {"n_timesteps": 100, "policy_kwargs": "dict(n_critics=1)"})
+    for seed in range(3):
+        values = draw(Search(algo, base), seed)
+        assert yaml.safe_load(yaml.safe_dump(values)) == values
+        setup = build(check(algo, algorithm(algo), values))
+        assert setup.model["policy_kwargs"]["n_critics"] == 1
+        assert "net_arch" in setup.model["policy_kwargs"]
+        assert "action_noise" not in values
+
+
+def test_rl_zoos_noise_is_what_was_drawn():
+    """None, too, although the shipped file has some; what is fixed stays."""
+    base = shipped("td3")
+    assert base["noise_type"] == "normal"
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for kind in ("normal", "ornstein-uhlenbeck", None):
+        for fixed in ({}, {"noise_type": "normal"}):
+            study.enqueue_trial({"noise_type": kind, "noise_std": 0.25}, skip_if_exists=False)
+            values = Search("td3", base, fixed=fixed).draw(study.ask())
+            expected = (fixed or {"noise_type": kind})["noise_type"]
+            assert values["noise_type"] == expected
+            assert values.get("noise_std") == (0.25 if expected else None)
+            noise = build(check("td3", algorithm("td3"), values)).action_noise(2)
+            assert (noise is None) == (expected is None)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("dict(a=nn.ReLU, b=dict(c=[1]))", "dict(a=nn.ReLU, b=2)"),
+        (" {'a': th.optim.Adam}", "dict(a=torch.optim.adam.Adam, b=2)"),
+        ("dict()", "dict(b=2)"),
+        ("dict(**x)", None),
+        ("print(1)", None),
+    ],
+)
+def test_an_entry_of_a_mapping_that_is_text_changes(text, expected):
+    if expected is None:
+        with pytest.raises(UsageError, match="can't be evaluated"):
+            set_dotted({"x": text}, "x.b", 2)
+    else:
+        assert set_dotted({"x": text}, "x.b", 2) == {"x": expected}
+
+
+def test_a_space_from_a_file(tmp_path):
+    path = tmp_path / "space.yml"
+    path.write_text(
+        "target_kl: {low: 1e-3, high: 0.05, log: true}\n"
+        "n_envs: [1, 2]\n"
+        "policy_kwargs.net_arch: [[8], [16]]\n"
+    )
+    space = read_space(str(path))
+    assert space["target_kl"] == {"low": 0.001, "high": 0.05, "log": True}
+    assert space["policy_kwargs.net_arch"] == [[8], [16]]
+    assert draw(Search("cpo", {}, space)).keys() == {"target_kl", "n_envs", "policy_kwargs"}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("[1, 2", "as YAML"),
+        ("- a", "must map names"),
+        ("x: [1, 2]\nx: [3, 4]", "'x' again"),
+        ("x: 3", "x: 3 .*list of at least two options"),
+        ("x: [1]", "two options"),
+        ("x: {low: 1}", "'high'"),
+        ("x: {low: 1, high: 2, lgo: true}", "'lgo'"),
+        ("x: {low: 2, high: 1}", "'low': 2"),
+        ("x: {low: 0, high: 1, log: true}", "low"),
+        ("x: {low: .nan, high: 1}", "finite"),
+        ("x: {low: true, high: 2}", "'low': True"),
+        ("x: {low: a, high: 1}", "'a'"),
+    ],
+)
+def test_spaces_that_are_none(tmp_path, content, message):
+    path = tmp_path / "space.yml"
+    path.write_text(content)
+    with pytest.raises(UsageError, match=f"(?s)search.space.*{message}"):
+        read_space(str(path))
+
+
+@pytest.mark.parametrize("sampler", sorted(SAMPLERS))
+def test_samplers_take_constraints_or_several_directions(sampler):
+    for pareto in (False, True):
+        study = optuna.create_study(
+            directions=["maximize", "minimize"] if pareto else ["maximize"],
+            sampler=SAMPLERS[sampler](0, 4),
+        )
+        for _ in range(6):
+            trial = study.ask()
+            x = trial.suggest_float("x", 0.0, 1.0)
+            if not pareto:
+                trial.set_constraint("cost", 2 * x - 1)
+            study.tell(trial, [x, 2 * x] if pareto else x)
+        assert len(study.trials) == 6
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "number"),
+    [
+        ([(5.0, 0.0), (9.0, 0.1), (7.0, 0.0)], 2),  # feasible by return
+        ([(5.0, 2.0), (1.0, 1.0), (9.0, 8.0)], 1),  # least violation
+        ([(5.0, 2.0), (6.0, 2.0)], 1),  # of two alike, by return
+        ([(-5.0, 0.0), (100.0, 0.01)], 0),
+    ],
+)
+def test_the_best_is_feasible_first(outcomes, number):
+    trials = [
+        create_trial(value=value, user_attrs={"result": {"return": value, "violation": over}})
+        for value, over in outcomes
+    ]
+    result = {"return": 99.0, "violation": 0.0}
+    pruned = create_trial(state=TrialState.PRUNED, user_attrs={"result": result})
+    assert best([*trials, pruned]) is trials[number]
+    assert best([pruned]) is None
+
+
+# The command
+
+
+def pretend(monkeypatch, outcome):
+    """Let a training come to ``outcome(values, seed)`` in a moment, rising to it evenly."""
+
+    def train(self, trial, values, seed, after):
+        history = []
+        for k in range(1, self.settings.n_evaluations + 1):
+            if self.stopped():
+                raise trials.Stopped
+            value, *costs = outcome(values, seed)
+            history.append([value * k / self.settings.n_evaluations, *costs])
+            if not after(history):
+                return history, False
+        return history, True
+
+    monkeypatch.setattr(trials.Objective, "_train", train)
+
+
+def by_kl(values, seed):
+    """Return rises with target_kl, and so does cost; 0.0245 is feasible at a limit of 1."""
+    return 100 * values["target_kl"], 40 * values["target_kl"] + 0.01 * seed
+
+
+def study_in(folder, name="trpo_lag_CostPoint-v0") -> optuna.Study:
+    storage = JournalStorage(JournalFileBackend(str(folder / "study.journal")))
+    return optuna.load_study(study_name=name, storage=storage)
+
+
+def states(folder) -> dict:
+    return dict(Counter(one.state.name for one in study_in(folder).trials))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "trpo_lag" / "CostPoint-v0_tune"
+
+
+@pytest.fixture
+def drawn():
+    """For tests that want the plots."""
+
+
+@pytest.fixture(autouse=True)
+def _plots(request, monkeypatch):
+    """Drawing takes most of the time of a study as small as these."""
+    if "drawn" not in request.fixturenames:
+        monkeypatch.setattr(Report, "plot", lambda self, study: None)
+
+
+def run(tmp_path, *more: str) -> int:
+    return tune.main([*TOY, *SMALL, "-f", str(tmp_path), "--pruner", "none", *more])
+
+
+def test_best_is_feasible_and_train_reads_it(tmp_path, folder, drawn, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--n-trials", "12", "--cost-limit", "1", "--seed", "0") == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    table = pd.read_csv(folder / "trials.csv")
+    assert len(table) == 12 and table["feasible"].any() and not table["feasible"].all()
+    top = table[table["feasible"]].sort_values("return").iloc[-1]
+    assert f"trial {top['trial']}: " in out.split("best         ")[1]
+    assert table["return"].max() > top["return"]
+    assert table["gamma"].between(0.9, 1).all()
+    values = read_hyperparams("trpo_lag", "CostPoint-v0", str(folder / "best.yml"))
+    assert values["target_kl"] == top["target_kl"]
+    # The file's own length of training, which is said; the limit also chooses models.
+    assert (values["n_timesteps"], values["selection_limit"]) == (1_000_000, 1.0)
+    assert "1,000,000" in out and "-n 240" in out
+    assert values["env_kwargs"] == {"episode_length": 20}
+    for name in ("history", "importances", "pareto"):
+        assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    shown = out.split("train with   python -m sb3_guard.train ")[1].splitlines()[0].split()
+    assert train.main([*shown, "-n", "60", "-f", str(tmp_path), "--verbose", "0"]) == 0
+
+
+def test_no_feasible_trial_is_said(tmp_path, folder, drawn, monkeypatch, capsys):
+    pretend(monkeypatch, lambda values, seed: (values["target_kl"], 2 + values["target_kl"]))
+    assert run(tmp_path, "--n-trials", "3") == 0  # the limit is cost_limit
+    out = capsys.readouterr().out
+    assert "0 of 3 kept" in out and "No trial kept the cost limit 2" in out
+    top = pd.read_csv(folder / "trials.csv").sort_values("violation").iloc[0]
+    assert f"trial {top['trial']}: " in out.split("best         ")[1]
+
+
+def test_constraints_are_in_the_study(tmp_path, folder, monkeypatch):
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--n-trials", "3", "--cost-limit", "0.5", "--seeds", "2", "5") == 0
+    for trial in study_in(folder).trials:
+        cost = 40 * trial.params["target_kl"] + 0.035  # mean of the seeds
+        over = max(cost - 0.5, 0.0)
+        assert trial.constraints == {"cost": pytest.approx(cost - 0.5)}
+        assert trial.user_attrs["result"] == pytest.approx(
+            {"return": trial.value, "cost": cost, "violation": over}
+        )
+        assert min(trial.intermediate_values) == 1 and trial.last_step == 8
+        expected = -1e9 - over if over else trial.value
+        assert trial.intermediate_values[8] == pytest.approx(expected, abs=1e-6)
+        assert {"seed 2", "seed 5"} <= trial.user_attrs.keys()
+
+
+@pytest.mark.parametrize("pruner", ["median", "halving"])
+def test_pruning_is_feasible_first(tmp_path, folder, monkeypatch, capsys, pruner):
+    """At last, a trial of the highest return that breaks the limit."""
+    seen = []
+
+    def outcome(values, seed):
+        number = len(study_in(folder).trials) - 1
+        seen.append(number)
+        return (99.0, 5.0) if number == 5 else (float(number), 0.0)
+
+    pretend(monkeypatch, outcome)
+    more = ["--n-trials", "6", "--pruner", pruner, "--n-startup-trials", "3", "--cost-limit", "1"]
+    assert run(tmp_path, *more, "--n-evaluations", "6") == 0
+    *_, top, last = study = study_in(folder).trials
+    assert study[0].state == TrialState.COMPLETE  # the file's own, however bad
+    assert top.state == TrialState.COMPLETE
+    assert last.state == TrialState.PRUNED and last.constraints == {"cost": 4.0}
+    assert last.last_step == (3 if pruner == "median" else 1)
+    assert f"pruned after {last.last_step} of 6" in capsys.readouterr().out
+
+
+def test_pareto_front(tmp_path, folder, drawn, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    assert tune.main([*TOY, *SMALL, "-f", str(tmp_path), "--pareto", "--n-trials", "4"]) == 0
+    study = study_in(folder)
+    assert [one.name for one in study.directions] == ["MAXIMIZE", "MINIMIZE"]
+    assert all(not one.constraints for one in study.trials)
+    names = {path.stem for path in (folder / "pareto").iterdir()}
+    assert names == {f"trial_{one.number}" for one in study.best_trials}
+    assert "front" in capsys.readouterr().out
+    for path in (folder / "pareto").iterdir():
+        read_hyperparams("trpo_lag", "CostPoint-v0", str(path))
+
+
+def test_algorithms_without_a_limit(tmp_path, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--algo", "trpo", "--n-trials", "2") == 0
+    out = capsys.readouterr().out
+    assert "trpo has no cost limit; --cost-limit sets one" in out and "kept" not in out
+    table = pd.read_csv(tmp_path / "trpo" / "CostPoint-v0_tune" / "trials.csv")
+    assert (table["violation"] == 0).all()
+
+
+def test_several_costs(tmp_path, folder, drawn, monkeypatch, capsys):
+    pretend(monkeypatch, lambda values, seed: (1.0, 0.2, 50 * values["target_kl"]))
+    costs = ["--env-kwargs", "cost_keys:('cost','heat')", "-params", "cost_keys:['cost','heat']"]
+    assert run(tmp_path, *costs, "--n-trials", "2", "--cost-limit", "1", "0.5") == 0
+    for one in study_in(folder).trials:
+        heat = 50 * one.params["target_kl"]
+        assert one.constraints == pytest.approx({"cost": -0.8, "heat": heat - 0.5})
+    assert "cost heat" in capsys.readouterr().out
+
+
+def test_trains_for_real(tmp_path, folder, monkeypatch, capsys):
+    monkeypatch.setattr(trials, "PROGRESS", 0.0)
+    more = ["--seeds", "0", "1", "-params", "normalize:True"]
+    assert run(tmp_path, *more, "--n-trials", "2") == 0
+    assert "Trial 1: 180 of 240 steps of seed 1, return " in capsys.readouterr().out
+    table = pd.read_csv(folder / "trials.csv")
+    assert table["state"].tolist() == ["complete"] * 2
+    assert np.isfinite(table[["return", "cost"]].to_numpy()).all()
+    assert np.shape([one.user_attrs["seed 1"] for one in study_in(folder).trials]) == (2, 4, 2)
+    # The first trial is of the shipped hyper-parameters, again the same.
+    assert run(tmp_path, *more, "--n-trials", "1", "--study-name", "again") == 0
+    again = pd.read_csv(folder.with_name("CostPoint-v0_tune_again") / "trials.csv")
+    assert table.loc[0, "target_kl"] == SHIPPED_KL
+    assert table.loc[0, "return":"cost"].equals(again.loc[0, "return":"cost"])
+
+
+def test_a_seeded_search_is_the_same_again(tmp_path, monkeypatch):
+    pretend(monkeypatch, by_kl)
+    tables, search = [], "--n-trials 5 --n-startup-trials 3 --seed 4".split()
+    for name in ("one", "other"):
+        assert run(tmp_path, *search, "--study-name", name) == 0
+        path = tmp_path / "trpo_lag" / f"CostPoint-v0_tune_{name}" / "trials.csv"
+        tables.append(pd.read_csv(path).drop(columns=["seconds", "worker"]))
+    pd.testing.assert_frame_equal(*tables)
+
+
+# Nothing is lost
+
+
+@pytest.mark.slow
+def test_no_trial_is_lost_whatever_is_killed(tmp_path):
+    """`python scripts/chaos.py tune` does the same for longer."""
+    study = campaign(str(tmp_path / "journal"), tmp_path, n_trials=12, n_workers=3, kills=6)
+    assert faults(study, 12, n_workers=3) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_trial_is_done_later(tmp_path, folder, monkeypatch, capsys, number):
+    whole, done = trials.Evaluations._on_step, []
+
+    def step(self):
+        if self.num_timesteps >= 100 and self.training.flags.seed == 1 and not done:
+            done.append(True)
+            os.kill(os.getpid(), number)
+        return whole(self)
+
+    monkeypatch.setattr(trials.Evaluations, "_on_step", step)
+    command = ["--n-trials", "2", "--seeds", "0", "1"]
+    assert run(tmp_path, *command) == 128 + number
+    out, err = capsys.readouterr()
+    again = out.split("continue with python -m sb3_guard.tune ")[1].splitlines()[0].split()
+    assert "Stopping" in err
+    assert "Traceback" not in out + err
+    assert states(folder) == {"FAIL": 1, "WAITING": 1}
+    trained = []
+    pretend(monkeypatch, lambda values, seed: trained.append(seed) or (1.0, 0.0))
+    assert tune.main(again) == 0
+    assert states(folder) == {"FAIL": 1, "COMPLETE": 2}
+    before, again, _ = study_in(folder).trials
+    assert again.params == before.params
+    assert trained == [1] * 4 + [0] * 4 + [1] * 4  # seed 0 of the first trial was done before
+
+
+def test_n_trials_counts_those_of_the_study(tmp_path, folder, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    for _ in range(2):
+        assert run(tmp_path, "--n-trials", "3") == 0
+        assert states(folder) == {"COMPLETE": 3}
+    assert run(tmp_path, "--max-total-trials", "5", "--sampler", "random") == 0
+    assert states(folder) == {"COMPLETE": 5}
+    assert "3 of 5 trials are finished" in capsys.readouterr().out
+
+
+def states_or_none(folder) -> dict:
+    try:
+        return states(folder)
+    except (OSError, KeyError):  # the study is not yet written
+        return {}
+
+
+def test_a_killed_workers_trial_is_done_at_the_next_start(tmp_path, folder, monkeypatch):
+    command = ["-n", "1e8", "--n-trials", "1"]
+    arguments = [*TOY, *SMALL, "-f", str(tmp_path), "--pruner", "none", *command]
+    worker = fresh(work, arguments, tmp_path / "0.txt")
+    wait_for(lambda: "RUNNING" in states_or_none(folder) or not worker.is_alive(), 300)
+    worker.kill()
+    worker.join()
+    assert states(folder) == {"RUNNING": 1}, (tmp_path / "0.txt").read_text()
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, *command) == 0
+    assert states(folder) == {"FAIL": 1, "COMPLETE": 1}
+    assert study_in(folder).trials[1].params["target_kl"] == SHIPPED_KL
+
+
+def begun(tmp_path, worker: str | None, **attributes) -> optuna.Study:
+    """A study of which a worker has begun a trial, whose hyperparameters are drawn."""
+    storage, _ = studies.open_storage(None, tmp_path / "study.journal")
+    study = optuna.create_study(storage=storage)
+    trial = study.ask()
+    trial.suggest_float("x", 0.0, 1.0)
+    for name, value in attributes.items():
+        trial.set_user_attr(name, value)
+    if worker:
+        trial.set_user_attr("worker", worker)
+    studies.repeat_lost_trials(study, storage)
+    return study
+
+
+def gone() -> int:
+    """The number of a process that has ended."""
+    process = subprocess.Popen(["true"])
+    process.wait()
+    return process.pid
+
+
+def test_the_trial_of_a_dead_worker_is_queued_with_what_is_done(tmp_path):
+    study = begun(tmp_path, f"{socket.gethostname()}-{gone()}", seed_0=[1.0])
+    lost, again = study.trials
+    assert (lost.state, again.state) == (TrialState.FAIL, TrialState.WAITING)
+    assert again.params == lost.params and again.user_attrs == {"seed_0": [1.0]}
+
+
+def test_other_trials_are_left_to_their_workers(tmp_path):
+    alive = f"{socket.gethostname()}-{os.getppid()}"
+    for number, worker in enumerate([alive, f"elsewhere-{gone()}", None]):
+        (trial,) = begun(tmp_path / str(number), worker).trials
+        assert trial.state == TrialState.RUNNING
+
+
+def test_a_worker_that_never_said_who_it_is_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(studies, "GRACE", -1)
+    assert [trial.state.name for trial in begun(tmp_path, None).trials] == ["FAIL", "WAITING"]
+
+
+def test_a_trial_is_not_lost_between_failing_and_queueing(tmp_path, monkeypatch):
+    """Whoever noticed that its worker is gone was killed before it queued the trial again."""
+    monkeypatch.setattr(studies, "repeat", lambda *_: None)
+    study = begun(tmp_path, f"{socket.gethostname()}-{gone()}")
+    monkeypatch.undo()
+    storage, _ = studies.open_storage(None, tmp_path / "study.journal")
+    studies.repeat_lost_trials(study, storage)
+    assert [trial.state.name for trial in study.trials] == ["FAIL"]  # somebody may be about to
+    monkeypatch.setattr(studies, "GRACE", -1)
+    for _ in range(2):
+        studies.repeat_lost_trials(study, storage)
+    assert [trial.state.name for trial in study.trials] == ["FAIL", "WAITING"]
+
+
+def test_trials_that_kill_their_workers_are_given_up(tmp_path):
+    study, worker = None, f"{socket.gethostname()}-{gone()}"
+    storage, _ = studies.open_storage(None, tmp_path / "study.journal")
+    study = optuna.create_study(storage=storage)
+    for _ in range(studies.MOST_REPEATS + 2):
+        study.ask().set_user_attr("worker", worker)
+        studies.repeat_lost_trials(study, storage)
+    histories = [trial.system_attrs.get("retry_history", []) for trial in study.trials]
+    assert histories == [[], [0], [0, 1], [0, 1, 2], [], [4]]
+
+
+def test_a_cut_line_of_the_journal_is_mended(tmp_path, folder, monkeypatch):
+    """As a full disk leaves it."""
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--n-trials", "1") == 0
+    journal = folder / "study.journal"
+    content = journal.read_bytes()
+    journal.write_bytes(content + b'{"op_code":8,"wor')
+    assert run(tmp_path, "--n-trials", "2") == 0
+    assert states(folder) == {"COMPLETE": 2}
+    assert journal.read_bytes().startswith(content)
+
+
+def test_a_full_disk_is_a_clear_error(tmp_path, folder, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--n-trials", "1") == 0
+    table = (folder / "trials.csv").read_bytes()
+
+    def full(self, logs):
+        raise OSError(28, "No space left on device")
+
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr(JournalFileBackend, "append_logs", full)
+        refused(lambda argv: run(tmp_path, *argv), ["--n-trials", "2"], capsys, "No space left")
+    assert (folder / "trials.csv").read_bytes() == table
+    assert run(tmp_path, "--n-trials", "2") == 0
+    assert states(folder)["COMPLETE"] == 2
+
+
+def test_a_trial_given_to_another_is_left_to_it(tmp_path, folder, monkeypatch, capsys):
+    """As after a long pause of this process: another worker has failed and repeated its trial."""
+    taken = []
+
+    def outcome(values, seed):
+        if not taken:
+            taken.append(True)
+            study_in(folder).tell(0, state=TrialState.FAIL)
+        return by_kl(values, seed)
+
+    pretend(monkeypatch, outcome)
+    refused(
+        lambda argv: run(tmp_path, *argv), ["--n-trials", "2"], capsys,
+        "was given to another; the same command joins the study again",
+    )  # fmt: skip
+    assert run(tmp_path, "--n-trials", "2") == 0
+    assert states(folder) == {"FAIL": 1, "COMPLETE": 2}
+
+
+# Trials that fail
+
+
+def test_a_failing_trial_is_the_worst(tmp_path, folder, monkeypatch, capsys):
+    seen = []
+
+    def outcome(values, seed):
+        seen.append(1)
+        if len(seen) == 1:
+            raise ValueError("the policy is NaN")
+        return by_kl(values, seed)
+
+    pretend(monkeypatch, outcome)
+    assert run(tmp_path, "--n-trials", "3", "--cost-limit", "0") == 0
+    assert "Trial 0: failed: the policy is NaN" in capsys.readouterr().out
+    assert states(folder) == {"PRUNED": 1, "COMPLETE": 2}
+    first, *others = study_in(folder).trials
+    assert first.constraints["cost"] > max(one.constraints["cost"] for one in others)
+    assert pd.read_csv(folder / "trials.csv")["error"][0] == "the policy is NaN"
+
+
+def test_nothing_but_failures_ends_it(tmp_path, capsys):
+    """Here, for costs that are not finite."""
+    more = ["--env", "Flickering-v0", "--env-kwargs", "episode_length:50", "--n-trials", "9"]
+    refused(
+        lambda argv: run(tmp_path, *argv), more, capsys, "3 trials in a row failed", "nan"
+    )  # fmt: skip
+
+
+# What is typed wrongly
+
+WRONG = [
+    (["--sampler", "tpu"], ["--sampler", "'tpu'", "nsgaii"]),
+    (["--pruner", "medium"], ["--pruner", "'medium'", "halving"]),
+    (["--cost-limit", "-1"], ["--cost-limit", "-1", "at least 0"]),
+    (["--cost-limit", "nan"], ["--cost-limit", "nan", "at least 0"]),
+    (["--cost-limit", "1", "2"], ["selection_limit=[1.0, 2.0]"]),
+    (["--pareto", "--pruner", "median"], ["no pruning with --pareto"]),
+    (["--algo", "trpo_lga"], ["'trpo_lga'", "did you mean 'trpo_lag'?"]),
+    (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),
+    (["-params", "lambda_rl:1"], ["'lambda_rl'", "did you mean 'lambda_lr'?"]),
+    (["-params", "lambda_lr:fast"], ["lambda_lr", "'fast'", "a number"]),
+    (["--n-trials", "0"], ["--n-trials", "at least 1"]),
+    (["--seeds", "0", "0"], ["--seeds 0 0", "twice"]),
+    (["--seeds", "-3"], ["--seeds", "-3", "at least 0"]),
+    (["--seeds", "1", "--n-seeds", "2"], ["--n-seeds", "--seeds"]),
+    (["--n-evaluations", "500"], ["--n-evaluations 500", "240 steps"]),
+    (["--storage", "redis://here"], ["--storage redis://here", "must be postgresql://"]),
+    (["--num-threads", "0"], ["--num-threads", "at least 1"]),
+    (["--search-space", "absent.yml"], ["--search-space", "absent.yml"]),
+    (["--trials", "3"], ["unknown flag --trials", "did you mean"]),
+    (["-f", "/proc/nowhere"], ["-f", "'/proc/nowhere"]),
+]
+
+
+@pytest.mark.parametrize(("wrong", "parts"), WRONG, ids=lambda v: " ".join(v)[:40])
+def test_wrong_flags_change_nothing(empty, capsys, wrong, parts):
+    refused(tune.main, [*TOY, *SMALL, *wrong], capsys, *parts)
+
+
+@pytest.mark.parametrize("name", ["target", "gamma"])
+def test_spaces_are_checked_with_the_algorithm(tmp_path, capsys, name):
+    path = tmp_path / "space.yml"
+    path.write_text(f"{name}: [x, y]")
+    command = [*TOY, *SMALL, "-f", str(tmp_path / "logs"), "--search-space", str(path)]
+    refused(tune.main, command, capsys, name)
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_study_is_continued_as_it_was_begun(tmp_path, folder, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--n-trials", "1") == 0
+    capsys.readouterr()
+    for other, part in (
+        (["--cost-limit", "5"], "begun with"),
+        (["-n", "120"], "n_timesteps 240, not 120"),
+        (["-params", "n_steps:60"], "hyperparams n_steps 30, not 60"),
+    ):
+        refused(lambda argv: run(tmp_path, *argv), other, capsys, part, "--study-name")
+    assert states(folder) == {"COMPLETE": 1}
+
+
+def test_a_study_is_continued_from_its_folder(tmp_path, folder, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    assert run(tmp_path, "--n-trials", "1", "--seeds", "2", "5", "--cost-limit", "1") == 0
+    moved = (tmp_path / "logs").mkdir() or (tmp_path / "trpo_lag").rename(
+        tmp_path / "logs/trpo_lag"
+    )
+    more = ["--gym-packages", "registered_envs", "--n-trials", "3"]
+    assert tune.main(["-i", str(moved / folder.name), *more]) == 0
+    assert states(moved / folder.name) == {"COMPLETE": 3}
+    for trial in study_in(moved / folder.name).trials:
+        assert {"seed 2", "seed 5"} <= trial.user_attrs.keys()
+    refused(tune.main, ["-i", str(tmp_path)], capsys, "no study.yml", str(tmp_path))
+
+
+JOURNAL = b'{"op_code":0,"worker_id":"a","study_name":"x","directions":[2]}\n'
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"PK\x03\x04 a model\nthat ends without a line break",
+        b"one line of text",
+        b"{}\n",
+        JOURNAL + b'{"op_code":4,\n' + JOURNAL,
+    ],
+)
+def test_files_that_are_no_studies_are_left_alone(tmp_path, content):
+    path = tmp_path / "file"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match="not a study"):
+        studies.open_storage(str(path), tmp_path)
+    assert path.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_study_of_somebody_else(tmp_path, folder, capsys):
+    folder.mkdir(parents=True)
+    storage = JournalStorage(JournalFileBackend(str(folder / "study.journal")))
+    study = optuna.create_study(
+        storage=storage, study_name="trpo_lag_CostPoint-v0", direction="maximize"
+    )
+    study.add_trial(create_trial(value=1.0))
+    refused(lambda argv: run(tmp_path, *argv), [], capsys, "not one of sb3_guard's")
+
+
+@pytest.mark.parametrize("method", ["set_user_attr", "enqueue_trial"])
+def test_a_study_whose_beginner_died_is_begun(tmp_path, folder, monkeypatch, method):
+    def die(self, *_, **__):
+        raise KeyboardInterrupt
+
+    pretend(monkeypatch, by_kl)
+    with monkeypatch.context() as patch:
+        patch.setattr(optuna.Study, method, die)
+        assert run(tmp_path, "--n-trials", "2") == 130
+    assert run(tmp_path, "--n-trials", "2") == 0
+    assert states(folder) == {"COMPLETE": 2}
+    assert study_in(folder).trials[0].params["target_kl"] == SHIPPED_KL
+
+
+def test_help_and_dispatcher(capsys, tmp_path):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["tune", "--help"])
+    assert end.value.code == 0
+    assert "python -m sb3_guard.tune --algo trpo_lag" in capsys.readouterr().out
+    assert cli.main(["tune", "--sampler", "no", "-f", str(tmp_path)]) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_several_processes_stop_together(tmp_path, folder, number):
+    """One command, two workers; when the first is stopped or killed, both end."""
+    command = [sys.executable, "-m", "sb3_guard.tune", *TOY, *SMALL, "-f", str(tmp_path)]
+    command += ["-n", "1e6", "--n-jobs", "2"]
+    with subprocess.Popen(
+        command,
+        cwd=SUPPORT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as first:
+        wait_for(lambda: states_or_none(folder).get("RUNNING") == 2, 300)
+        wait_for(lambda: all("worker" in t.user_attrs for t in study_in(folder).trials))
+        workers = [t.user_attrs["worker"].rsplit("-", 1)[1] for t in study_in(folder).trials]
+        assert str(first.pid) in workers and len(set(workers)) == 2
+        if number == signal.SIGINT:
+            os.killpg(first.pid, number)  # as the terminal does
+        else:
+            first.send_signal(number)
+        out, err = first.communicate(timeout=300)
+    assert "Traceback" not in out + err
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
+    if number == signal.SIGKILL:
+        assert first.returncode == -number
+    else:
+        assert first.returncode == 128 + number
+        assert states(folder) == {"FAIL": 2, "WAITING": 2}

@@ -231,6 +231,27 @@ def beside(python: str, env_id: str, threads: int = 1, turns: int = 5) -> None:
     print(f"times as many {ours / theirs:>6.1f} {own / whole:>7.1f}")
 
 
+def print_table(suites: list[str], args: argparse.Namespace) -> None:
+    """Print the marks of several suites, the best of each over the rounds."""
+    full, bare = dict.fromkeys(suites, 0.0), dict.fromkeys(suites, 0.0)
+    reset = dict.fromkeys(suites, math.inf)
+    try:
+        for turn in range(args.rounds):
+            for i, env_id in enumerate(suites, 1):
+                print(f"\rround {turn + 1}, {i} of {len(suites)} ", end="", file=sys.stderr)
+                rates = batch_rates(env_id, 30, args.seconds / 6, args.slices, args.threads)
+                full[env_id] = max(full[env_id], rates["full"])
+                bare[env_id] = max(bare[env_id], rates["bare"])
+                reset[env_id] = min(reset[env_id], 1e3 * reset_seconds(env_id))
+        print(file=sys.stderr)
+    except KeyboardInterrupt:
+        print("\ninterrupted; so far:", file=sys.stderr)
+        suites = [i for i in suites if reset[i] < math.inf]
+    print("| suite | env-steps/s | of bare physics | reset, ms |\n|---|---|---|---|")
+    for i in suites:
+        print(f"| {i} | {full[i]:,.0f} | {full[i] / bare[i]:.2f} | {reset[i]:.2f} |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="Goal_Point_8Hazards-v0", help="the suite to measure")
@@ -270,23 +291,7 @@ def main() -> None:
         parser.error(f"no id matches {' '.join(patterns)}; ids look like {args.env}")
     print(f"mujoco {mujoco.__version__}, stage {ACC}, {FRAME_SKIP} physics steps per control step")
     if suites:
-        full, bare = dict.fromkeys(suites, 0.0), dict.fromkeys(suites, 0.0)
-        reset = dict.fromkeys(suites, math.inf)
-        try:
-            for turn in range(args.rounds):
-                for i, env_id in enumerate(suites, 1):
-                    print(f"\rround {turn + 1}, {i} of {len(suites)} ", end="", file=sys.stderr)
-                    rates = batch_rates(env_id, 30, args.seconds / 6, args.slices, args.threads)
-                    full[env_id] = max(full[env_id], rates["full"])
-                    bare[env_id] = max(bare[env_id], rates["bare"])
-                    reset[env_id] = min(reset[env_id], 1e3 * reset_seconds(env_id))
-            print(file=sys.stderr)
-        except KeyboardInterrupt:
-            print("\ninterrupted; so far:", file=sys.stderr)
-            suites = [i for i in suites if reset[i] < math.inf]
-        print("| suite | env-steps/s | of bare physics | reset, ms |\n|---|---|---|---|")
-        for i in suites:
-            print(f"| {i} | {full[i]:,.0f} | {full[i] / bare[i]:.2f} | {reset[i]:.2f} |")
+        print_table(suites, args)
         return
     print(f"{args.env}: env-steps/s, full step and bare loop, and their ratio")
     rates = single_rates(args.env, args.seconds, args.slices)

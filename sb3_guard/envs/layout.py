@@ -255,17 +255,14 @@ def arrange(
         xy[:, k, 0] = draws[:, best]
     if queue:
         crowded = max(failures, key=lambda name: failures[name])
-        f = next(f for f in footprints if f.name == crowded)
-        near = ""
-        if math.isfinite(f.reach):
-            near = f" within the robot's reach, {f.reach} m around its base at {f.base},"
-        what = "1 object" if f.num == 1 else f"{f.num} objects"
-        less = " or ".join(["num"] * (f.num > 1) + ["keepout"] + ["height"] * bool(near))
-        raise LayoutError(
-            f"{crowded} cannot be placed: {what} with keepout {f.keepout} m find no room "
-            f"in {list(f.placements)}{near} beside the other parts; reduce {less}, its "
-            f"own or another's{'' if near else ', or widen placements'}"
-        )
+        raise _no_room(next(f for f in footprints if f.name == crowded))
+    return _centres(footprints, xy, rng)
+
+
+def _centres(
+    footprints: Sequence[Footprint], xy: Array, rng: np.random.Generator
+) -> dict[str, Array]:
+    """The centres of a layout by footprint name, [num, 3] m, with heights and last places drawn."""
     out, k = {}, 0
     for f in footprints:
         centres = xy[:, k : k + f.num, 0].T
@@ -278,6 +275,20 @@ def arrange(
                 raise LayoutError(f"{f.name} finds no room once everything else has its place")
             out[f.name][0] = drawn
     return out
+
+
+def _no_room(f: Footprint) -> LayoutError:
+    """What to raise where a part found no room most often."""
+    near = ""
+    if math.isfinite(f.reach):
+        near = f" within the robot's reach, {f.reach} m around its base at {f.base},"
+    what = "1 object" if f.num == 1 else f"{f.num} objects"
+    less = " or ".join(["num"] * (f.num > 1) + ["keepout"] + ["height"] * bool(near))
+    return LayoutError(
+        f"{f.name} cannot be placed: {what} with keepout {f.keepout} m find no room "
+        f"in {list(f.placements)}{near} beside the other parts; reduce {less}, its "
+        f"own or another's{'' if near else ', or widen placements'}"
+    )
 
 
 def square_distance(draws: Array, xy: Array) -> Array:

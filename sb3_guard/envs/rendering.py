@@ -140,24 +140,7 @@ class Renderer:
                     f"{os.environ.get('DISPLAY') or 'not set'}); use render_mode='rgb_array', or "
                     "record a video"
                 )
-            from mujoco import viewer
-
-            # Forces of contacts (F) are seen: an arrow of 1 m is the weight of all there is.
-            model, shown = engine.model, engine.model.vis
-            shown.map.force = model.stat.meanmass / (9.81 * model.body_mass.sum())
-            shown.rgba.contactforce = [0.8, 0.1, 0.4, 1.0]
-            shown.scale.forcewidth = 0.03 / model.stat.meansize
-            self._paused, self._pace = False, (0.0, 0.0)
-            others = set(threading.enumerate())
-            self._viewer = viewer.launch_passive(
-                engine.model,
-                self._data,
-                key_callback=self._key,
-                show_left_ui=False,
-                show_right_ui=False,
-            )
-            self._threads = set(threading.enumerate()) - others
-            self._look_at(self._viewer.cam, self._data)  # at first; the mouse moves it
+            self._open_window()
             return
         # What MUJOCO_GL says is read when MuJoCo is imported, and need not work.
         gl_context.GLContext = importlib.import_module(f"mujoco.{gl_backend()}").GLContext
@@ -166,6 +149,28 @@ class Renderer:
         visual.offwidth, visual.offheight = width, height  # no larger buffers than these are needed
         self._screen = mujoco.Renderer(engine.model, height, width, max_geom=4000)
         visual.offwidth, visual.offheight = largest
+
+    def _open_window(self) -> None:
+        """Open MuJoCo's viewer, in which the mouse moves the camera."""
+        from mujoco import viewer
+
+        # Forces of contacts (F) are seen: an arrow of 1 m is the weight of all there is.
+        model = self._engine.model
+        shown = model.vis
+        shown.map.force = model.stat.meanmass / (9.81 * model.body_mass.sum())
+        shown.rgba.contactforce = [0.8, 0.1, 0.4, 1.0]
+        shown.scale.forcewidth = 0.03 / model.stat.meansize
+        self._paused, self._pace = False, (0.0, 0.0)
+        others = set(threading.enumerate())
+        self._viewer = viewer.launch_passive(
+            model,
+            self._data,
+            key_callback=self._key,
+            show_left_ui=False,
+            show_right_ui=False,
+        )
+        self._threads = set(threading.enumerate()) - others
+        self._look_at(self._viewer.cam, self._data)  # at first; the mouse moves it
 
     def render(self, row: int, words: Mapping[str, str] | None = None) -> Array | None:
         """Draw one row: a frame [height, width, 3] uint8, or None when shown in a window.

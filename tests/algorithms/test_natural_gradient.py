@@ -8,15 +8,8 @@ import pytest
 import torch as th
 from scipy.optimize import minimize
 
-from sb3_guard.algorithms.common.natural_gradient import (
-    Case,
-    Step,
-    assign,
-    conjugate_gradient,
-    constrained_step,
-    flatten,
-    unflatten,
-)
+from sb3_guard.algorithms.common.natural_gradient import Case, Step, constrained_step
+from sb3_guard.algorithms.common.vectors import assign, conjugate_gradient, flatten, unflatten
 
 FEW_OR_MANY = [50, pytest.param(500, marks=pytest.mark.slow)]  # random problems
 

@@ -17,9 +17,9 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_guard.algorithms import CPO, PCPO, SCPO
 from sb3_guard.algorithms.common.advantage import gae
-from sb3_guard.algorithms.common.natural_gradient import assign, flatten
 from sb3_guard.algorithms.common.reuse import PooledSurrogates, importance
 from sb3_guard.algorithms.common.trust_region import CostSurrogates, Region
+from sb3_guard.algorithms.common.vectors import assign, flatten
 from sb3_guard.algorithms.fast.actor import actor_of
 
 

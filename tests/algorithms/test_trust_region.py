@@ -30,7 +30,7 @@ from sb3_guard.algorithms.common.actor import (
 )
 from sb3_guard.algorithms.common.batches import CHUNK, chunks
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
-from sb3_guard.algorithms.common.natural_gradient import assign, flatten
+from sb3_guard.algorithms.common.vectors import assign, flatten
 from sb3_guard.algorithms.fast.actor import TanhActor, actor_of, distribution_of, tanh_actor
 from sb3_guard.algorithms.fast.mlp import TanhMlp
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
-from sb3_guard.algorithms.common.natural_gradient import flatten, unflatten
+from sb3_guard.algorithms.common.vectors import flatten, unflatten
 
 
 def kl(old: Distribution, new: Distribution) -> th.Tensor:

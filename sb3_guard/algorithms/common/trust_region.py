@@ -27,8 +27,8 @@ from sb3_guard.algorithms.common.actor import Actor, actor_modules
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.critics import Regression
-from sb3_guard.algorithms.common.natural_gradient import assign, conjugate_gradient, flatten
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
+from sb3_guard.algorithms.common.vectors import assign, conjugate_gradient, flatten
 from sb3_guard.algorithms.fast.actor import actor_of
 from sb3_guard.checks import check_integer, check_learning_rate, check_number
 

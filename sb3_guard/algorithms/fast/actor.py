@@ -27,7 +27,7 @@ from torch import nn
 
 from sb3_guard.algorithms.common.actor import Actor
 from sb3_guard.algorithms.common.batches import rows
-from sb3_guard.algorithms.common.natural_gradient import flatten, unflatten
+from sb3_guard.algorithms.common.vectors import flatten, unflatten
 from sb3_guard.algorithms.fast.mlp import TanhMlp, Written
 from sb3_guard.algorithms.fast.threads import accumulate
 

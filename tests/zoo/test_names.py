@@ -10,6 +10,7 @@ from cost_envs import CostPoint
 from typed import SMALL, TOY, refused, trained
 
 from sb3_guard import CPO, benchmark, enjoy, train
+from sb3_guard.zoo.cli.names import as_data
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.cli.values import parse_value
 from sb3_guard.zoo.grids import grid
@@ -140,7 +141,8 @@ def test_printed_commands_name_the_modules(tmp_path, capsys):
 )
 def test_only_classes_of_their_kind(name, value):
     with pytest.raises(UsageError, match=name):
-        build({"n_envs": 1, "n_timesteps": 1, name: value}).callbacks()
+        values = {"n_envs": 1, "n_timesteps": 1, name: as_data(name, value)}
+        build(values).callbacks()
 
 
 def test_events_go_where_the_run_has_some_or_the_command_line_says(tmp_path, run, capsys):

@@ -35,6 +35,7 @@ from sb3_guard.zoo.run import training as experiment
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
 from sb3_guard.zoo.run.folder import RunFolder
 from sb3_guard.zoo.run.progress import Epochs
+from sb3_guard.zoo.run.start import differences
 
 
 @pytest.fixture(scope="module")
@@ -324,3 +325,9 @@ def test_processes_of_environments_die(forked, tmp_path, monkeypatch, capsys):
     assert "--vec-env subproc has died" in err and "memory" in err
     assert f"continue with -i {run} --gym-packages registered_envs" in err
     assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 60
+
+
+def test_an_expression_in_the_files_of_an_older_run_is_the_mapping_that_it_stands_for():
+    old, new = {"policy_kwargs": "dict(net_arch=(8, 8))"}, {"policy_kwargs": {"net_arch": [8, 8]}}
+    assert not differences(old, new)
+    assert differences(old, {}) == [("policy_kwargs", {"net_arch": [8, 8]}, "none")]

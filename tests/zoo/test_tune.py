@@ -28,7 +28,7 @@ from sb3_guard.zoo.run.algos import algorithm, baselines
 from sb3_guard.zoo.run.hyperparams import build, check, parameters, read_hyperparams
 from sb3_guard.zoo.tuning import studies, trials
 from sb3_guard.zoo.tuning.report import Report, best
-from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space, set_dotted, space_of
+from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space, space_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
 
@@ -190,22 +190,9 @@ def test_rl_zoos_noise_is_what_was_drawn():
             assert (noise is None) == (expected is None)
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("dict(a=nn.ReLU, b=dict(c=[1]))", "dict(a=nn.ReLU, b=2)"),
-        (" {'a': th.optim.Adam}", "dict(a=torch.optim.adam.Adam, b=2)"),
-        ("dict()", "dict(b=2)"),
-        ("dict(**x)", None),
-        ("print(1)", None),
-    ],
-)
-def test_an_entry_of_a_mapping_that_is_text_changes(text, expected):
-    if expected is None:
-        with pytest.raises(UsageError, match="can't be evaluated"):
-            set_dotted({"x": text}, "x.b", 2)
-    else:
-        assert set_dotted({"x": text}, "x.b", 2) == {"x": expected}
+def test_an_entry_of_a_mapping_changes():
+    search = Search("cpo", {"x": "dict(a=nn.ReLU, b=dict(c=[1]))"}, {"x.b": [2, 3]})
+    assert search.corners()[0] == {"x": {"a": "nn.ReLU", "b": 2}}
 
 
 def test_a_space_from_a_file(tmp_path):

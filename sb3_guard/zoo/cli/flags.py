@@ -37,7 +37,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import KeyValues, Parser, UsageError, parse_pairs, run
-from sb3_guard.zoo.cli.values import kind_of
+from sb3_guard.zoo.cli.values import typed, words
 
 # Roles of a flag: it says what a run is, how it is started, or how it is hosted and watched,
 # which may change when the run is resumed.
@@ -256,7 +256,7 @@ def _typed(hint: Any, kind: Callable[[Any], Any] | None, value: Any) -> Any:
         return dict(value) if isinstance(value, Mapping) else parse_pairs(_several(value))
     if origin is list:
         return [_typed(arguments[0], kind, one) for one in _several(value)]
-    made = kind_of(bare)[1](value)
+    made = typed(value, bare)
     return kind(value) if kind else made
 
 
@@ -272,4 +272,4 @@ def _words(hint: Any) -> str:
         return "a mapping or a list of key:value"
     if typing.get_origin(bare) is list:
         return "one value or a list of them"
-    return kind_of(bare)[0]
+    return words(bare)

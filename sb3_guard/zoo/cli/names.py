@@ -9,6 +9,7 @@ import importlib
 import operator
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -111,16 +112,44 @@ def torch_class(path: str) -> Any:
     return value
 
 
-def evaluate(name: str, text: str) -> Any:
-    """
-    The value of a hyper-parameter such as ``dict(activation_fn=nn.ReLU)``.
+def _torch_name(path: str) -> str:
+    torch_class(path)
+    return path
 
-    :raises UsageError: it is more than literals and classes of torch
-    """
-    what = f"hyper-parameter {name}: {text!r} can't be evaluated"
+
+def _evaluating(name: str, value: Any) -> AbstractContextManager[None]:
+    what = f"hyper-parameter {name}: {value!r} can't be evaluated"
     allowed = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
-    with explained(what, ValueError, fix=allowed):
-        return read_expression(text, torch_class)
+    return explained(what, ValueError, fix=allowed)
+
+
+def as_data(name: str, value: Any) -> Any:
+    """
+    A hyper-parameter as data, of text such as ``dict(activation_fn=nn.ReLU)`` too.
+
+    :return: mappings, lists and literals; classes stay text, see :func:`with_classes`
+    :raises UsageError: it is more than literals and names of torch's classes
+    """
+    if isinstance(value, str) and value.lstrip().startswith(("dict(", "{")):
+        with _evaluating(name, value):
+            return read_expression(value, _torch_name)
+    return value
+
+
+def with_classes(name: str, value: Any) -> Any:
+    """
+    A hyper-parameter with the classes of torch that it names, such as ``nn.ReLU``.
+
+    :raises UsageError: torch has no class of a name that begins with ``nn.``, ``th.``, ``torch.``
+    """
+    if isinstance(value, Mapping):
+        return {key: with_classes(name, one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(with_classes(name, one) for one in value)
+    if isinstance(value, str) and value.startswith(("nn.", "th.", "torch.")):
+        with _evaluating(name, value):
+            return torch_class(value)
+    return value
 
 
 def require_named(where: Path, named: Sequence[str], modules: Sequence[str]) -> None:

@@ -10,7 +10,6 @@ import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 
@@ -58,8 +57,8 @@ def parse_value(text: str) -> Any:
     The value of ``key:value``: a literal or ``dict(a=1)``; anything else is text as it is.
 
     So ``cost_limit:25``, ``policy:MlpPolicy``, ``hazards:{num:4}`` and ``learning_rate:lin_1e-3``
-    need no further quotes, and ``policy_kwargs:dict(activation_fn=nn.ReLU)`` stays text until the
-    model is made, as it does in a YAML file.
+    need no further quotes; ``policy_kwargs:dict(activation_fn=nn.ReLU)`` is text here, and is read
+    with the other hyper-parameters.
     """
     try:
         return read_expression(text)
@@ -67,69 +66,63 @@ def parse_value(text: str) -> Any:
         return text
 
 
-def kind_of(hint: Any) -> tuple[str, Callable[[Any], Any]]:
+def typed(value: Any, hint: Any) -> Any:
     """
-    What an annotation allows: in words, and what makes it of a value, or raises TypeError.
+    A value of a file as an annotation allows it.
 
     Numbers that YAML reads as text (``1e-3``) and whole floats fit; objects that a file can't hold
     are named by text.
+
+    :raises TypeError: it is not allowed
     """
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    kind = origin or hint
-    names = {bool: "True or False", str: "text", None: "None", types.NoneType: "None"}
+    kind, args = typing.get_origin(hint) or hint, typing.get_args(hint)
     if kind in (typing.Union, types.UnionType):
-        return _any_of({arm: kind_of(arm) for arm in args})
-    if kind in (int, float):
-        return "a whole number" if kind is int else "a number", partial(_number, kind=kind)
-    if kind is tuple and args and args[-1] is not ...:
-        words, makes = zip(*map(kind_of, args), strict=True)
-        is_tuple = _only(lambda value: isinstance(value, list | tuple) and len(value) == len(args))
-        made = lambda value: [make(v) for make, v in zip(makes, is_tuple(value), strict=True)]  # noqa: E731
-        return f"a list of {' and '.join(words)}", made
-    if kind in (list, tuple, Sequence):
-        words, make = kind_of(args[0] if args else Any)
-        each = f" ({words} each)" if args and args[0] is not ... else ""
-        is_list = _only(lambda value: isinstance(value, list | tuple))
-        return f"a list{each}", lambda value: [make(one) for one in is_list(value)]
-    if kind is typing.Literal:
-        return " or ".join(map(repr, args)), _only(lambda value: value in args)
-    if kind in names:
-        return names[kind], _only(lambda value: isinstance(value, hint or types.NoneType))
-    if isinstance(kind, type) and issubclass(kind, Mapping):
-        # Text is evaluated when the model is made: `dict(activation_fn=nn.ReLU)`.
-        dicts = lambda value: isinstance(value, str) and value.startswith("dict(")  # noqa: E731
-        return "a mapping", _only(lambda value: isinstance(value, Mapping) or dicts(value))
-    if kind in (type, Callable):
-        words = "the dotted name of a class" if kind is type else "a schedule such as lin_0.001"
-        named = lambda value: "." in value or value.startswith("lin_")  # noqa: E731
-        return words, _only(lambda value: isinstance(value, str) and named(value))
-    free = hint is Any or not isinstance(hint, type)
-    data = str | bool | int | float
-    return getattr(hint, "__name__", str(hint)), _only(lambda v: free or not isinstance(v, data))
-
-
-def _only(fits: Callable[[Any], bool]) -> Callable[[Any], Any]:
-    """What returns values that fit as they are."""
-
-    def make(value: Any) -> Any:
-        if not fits(value):
-            raise TypeError
-        return value
-
-    return make
-
-
-def _any_of(arms: Mapping[Any, tuple[str, Callable[[Any], Any]]]) -> tuple[str, Callable]:
-    """The kind of a union of others."""
-
-    def make(value: Any) -> Any:
         # The arm that fits without change wins: 1 stays an int where int and float are allowed.
-        for arm in sorted(arms, key=lambda arm: type(value) is not arm):
+        for arm in sorted(args, key=lambda arm: type(value) is not arm):
             with suppress(TypeError):
-                return arms[arm][1](value)
-        raise TypeError
+                return typed(value, arm)
+    elif kind in (int, float):
+        return _number(value, kind)
+    elif kind in (list, tuple, Sequence):
+        fixed = kind is tuple and args and args[-1] is not ...  # one annotation for each item
+        if isinstance(value, list | tuple) and (not fixed or len(value) == len(args)):
+            hints = args if fixed else [args[0] if args else Any] * len(value)
+            return [typed(item, of) for item, of in zip(value, hints, strict=True)]
+    elif _fits(value, kind, args):
+        return value
+    raise TypeError
 
-    return " or ".join(dict.fromkeys(words for words, _ in arms.values())), make
+
+def _fits(value: Any, kind: Any, args: Sequence[Any]) -> bool:
+    if kind is typing.Literal:
+        return value in args
+    if kind in (type, Callable):
+        return isinstance(value, str) and ("." in value or value.startswith("lin_"))
+    if kind in (None, bool, str) or (isinstance(kind, type) and issubclass(kind, Mapping)):
+        return isinstance(value, kind or types.NoneType)
+    free = kind is Any or not isinstance(kind, type)
+    return free or not isinstance(value, str | bool | int | float)
+
+
+_WORDS: dict[Any, str] = {
+    bool: "True or False", str: "text", int: "a whole number", float: "a number", None: "None",
+    types.NoneType: "None", dict: "a mapping", type: "the dotted name of a class",
+    Callable: "a schedule such as lin_0.001",
+}  # fmt: skip
+
+
+def words(hint: Any) -> str:
+    """What an annotation allows, in words."""
+    kind, args = typing.get_origin(hint) or hint, typing.get_args(hint)
+    if kind in (typing.Union, types.UnionType):
+        return " or ".join(dict.fromkeys(map(words, args)))
+    if kind is typing.Literal:
+        return " or ".join(map(repr, args))
+    if kind is tuple and args and args[-1] is not ...:
+        return f"a list of {' and '.join(map(words, args))}"
+    if kind in (list, tuple, Sequence):
+        return f"a list ({words(args[0])} each)" if args else "a list"
+    return _WORDS.get(kind) or str(getattr(hint, "__name__", hint))
 
 
 def _number(value: Any, kind: type) -> int | float:

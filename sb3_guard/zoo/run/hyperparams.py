@@ -28,22 +28,22 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.cli.names import PRESETS, classes, evaluate, import_class
+from sb3_guard.zoo.cli.names import PRESETS, as_data, classes, import_class, with_classes
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
-from sb3_guard.zoo.cli.values import kind_of
+from sb3_guard.zoo.cli.values import typed, words
 
 # What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
 RUN_KEYS: dict[str, Any] = {
     "n_timesteps": int,
     "n_envs": int,
-    "normalize": bool | str | dict,
+    "normalize": bool | dict,
     "frame_stack": int | None,
     "env_kwargs": dict | None,
     "env_wrapper": str | list | dict | None,
     "vec_env_wrapper": str | list | dict | None,
     "callback": str | list | dict | None,
-    "monitor_kwargs": dict | str,
+    "monitor_kwargs": dict,
     "selection_limit": float | list[float] | None,
 }
 N_TIMESTEPS = 1_000_000  # the length of training where neither a file nor a flag says
@@ -175,7 +175,8 @@ def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
 
 def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:
     """
-    The same hyper-parameters with numbers in their proper type, or an error that says what to mend.
+    The same hyper-parameters as data, numbers in their proper type, or an error that says what to
+    mend.
 
     :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, a
         NaN, or a count below 1
@@ -189,15 +190,12 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
             raise UsageError(
                 f"{algo} has no hyper-parameter {name!r}; {did_you_mean(name, sorted(known))}"
             )
-        words, make = kind_of(known[name])
         try:
-            checked[name] = make(value)
+            checked[name] = typed(as_data(name, value), known[name])
         except TypeError:
             raise UsageError(
-                f"hyper-parameter {name}: {value!r} is not allowed; it must be {words}"
+                f"hyper-parameter {name}: {value!r} is not allowed; it must be {words(known[name])}"
             ) from None
-    if isinstance(checked.get("env_kwargs"), str):
-        checked["env_kwargs"] = evaluate("env_kwargs", checked["env_kwargs"])
     checked.setdefault("n_envs", 1)
     checked.setdefault("n_timesteps", N_TIMESTEPS)
     aliases = algorithm.policy_aliases
@@ -288,16 +286,13 @@ def build(values: Mapping[str, Any]) -> Setup:
                 model[name] = import_class(name, value, BasePolicy)
         elif isinstance(value, str) and value.startswith("lin_") and name != "cost_limit":
             model[name] = _schedule(name, value)
-        elif isinstance(value, str) and value.startswith("dict("):
-            model[name] = evaluate(name, value)
+        elif isinstance(value, Mapping):
+            model[name] = with_classes(name, value)
         elif name == "train_freq" and isinstance(value, list):
             model[name] = tuple(value)
         elif isinstance(value, str) and name.endswith("_class"):
             model[name] = import_class(name, value, BaseBuffer)
     run = {n: value for n, value in values.items() if n in not_models and value is not None}
-    for name in ("normalize", "monitor_kwargs"):
-        if isinstance(run.get(name), str):
-            run[name] = evaluate(name, run[name])
     if run.get("normalize"):
         # Returns are scaled by the discount they are learned with.
         learned = {"gamma": values["gamma"]} if "gamma" in values else {}

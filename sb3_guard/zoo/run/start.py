@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_guard.zoo.cli.flags import HOST, IDENTITY
-from sb3_guard.zoo.cli.names import require_named
+from sb3_guard.zoo.cli.names import as_data, require_named
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
 from sb3_guard.zoo.cli.values import is_data
 from sb3_guard.zoo.run.algos import algorithm
@@ -139,11 +139,12 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple
     def shown(value: Any) -> Any:
         return "none" if value in ("", None) else value
 
-    return [
-        (name, shown(there.get(name)), shown(here.get(name)))
+    # As data: files of older runs have expressions as text.
+    pairs = [
+        (name, plain(as_data(name, there.get(name))), plain(as_data(name, here.get(name))))
         for name in sorted({*there, *here})
-        if there.get(name) != here.get(name)
     ]
+    return [(name, shown(a), shown(b)) for name, a, b in pairs if a != b]
 
 
 def continues_run(agent: str) -> bool:

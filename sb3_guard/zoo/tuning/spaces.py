@@ -21,7 +21,7 @@ import optuna
 from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 from optuna.samplers import BaseSampler, GPSampler, NSGAIISampler, RandomSampler, TPESampler
 
-from sb3_guard.zoo.cli.names import evaluate
+from sb3_guard.zoo.cli.names import as_data, with_classes
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.hyperparams import NOISE_KEYS, RUN_KEYS, parameters
@@ -123,10 +123,7 @@ def set_dotted(values: Mapping[str, Any], name: str, value: Any) -> dict[str, An
     outer, dot, inner = name.partition(".")
     if not dot:
         return {**values, outer: value}
-    mapping = values.get(outer) or {}
-    if isinstance(mapping, str):  # an expression, such as dict(activation_fn=nn.ReLU)
-        return {**values, outer: as_text(set_dotted(evaluate(outer, mapping), inner, value))}
-    return {**values, outer: set_dotted(mapping, inner, value)}
+    return {**values, outer: set_dotted(values.get(outer) or {}, inner, value)}
 
 
 def get_dotted(values: Mapping[str, Any], name: str) -> Any:
@@ -135,21 +132,16 @@ def get_dotted(values: Mapping[str, Any], name: str) -> Any:
     value = values.get(outer)
     if not dot:
         return value
-    if isinstance(value, str):
-        value = evaluate(outer, value)
     return get_dotted(value, inner) if isinstance(value, Mapping) else None
 
 
-def as_text(value: Any) -> str:
-    """An expression whose value this is; classes and types of torch may be in it."""
-    import torch as th
-
+def _named(value: Any) -> Any:
+    """Data that :func:`~sb3_guard.zoo.cli.names.with_classes` makes these objects of."""
     if isinstance(value, Mapping):
-        return f"dict({', '.join(f'{name}={as_text(one)}' for name, one in value.items())})"
+        return {name: _named(one) for name, one in value.items()}
     if isinstance(value, type):
-        short = getattr(th.nn, value.__name__, None) is value
-        return f"nn.{value.__name__}" if short else f"{value.__module__}.{value.__qualname__}"
-    return repr(value)
+        return f"{value.__module__}.{value.__qualname__}"
+    return value
 
 
 class Search:
@@ -173,7 +165,7 @@ class Search:
         from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
 
         self.algo = algo
-        self.base = dict(base)
+        self.base = {name: as_data(name, value) for name, value in base.items()}
         self._fixed = dict(fixed or {})
         space = space_of(algo) if space is None else space
         self._rl_zoo = None if space else HYPERPARAMS_SAMPLER.get(algo)
@@ -224,9 +216,7 @@ class Search:
             if name in self._fixed:
                 continue
             if name == "policy_kwargs":
-                own = values.get(name) or {}
-                own = evaluate(name, own) if isinstance(own, str) else own
-                value = as_text({**own, **value})
+                value = {**(values.get(name) or {}), **_named(value)}
             values[name] = value
         if values.get("noise_type") is None:
             values.pop("noise_std", None)
@@ -265,7 +255,7 @@ def rl_zoo_sampler(algo: str, base: Mapping[str, Any]) -> Callable[..., dict[str
         trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Mapping[str, Any]
     ) -> dict[str, Any]:
         values = search.draw(trial)
-        return {name: values[name] for name in names}
+        return {name: with_classes(name, values[name]) for name in names}
 
     return sample
 

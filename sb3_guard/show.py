@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from sb3_guard.envs import GuardVectorEnv, env_spec
-from sb3_guard.envs.check_part import exploded
+from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
@@ -120,37 +120,6 @@ def drawn_table(env: GuardVectorEnv) -> str:
     return table(["drawn in each episode", "range", "in the picture"], rows)
 
 
-def unsteady(env: GuardVectorEnv) -> str | None:
-    """What is wrong with a robot after a second alone, or of random actions: it falls, explodes."""
-    return _watch(env, alone=True) or _watch(env, alone=False)
-
-
-def _watch(env: GuardVectorEnv, alone: bool) -> str | None:
-    engine, rng = env.engine, np.random.default_rng(0)
-    how = "left alone" if alone else "given random actions"
-    low, high = engine.robot.action_range
-    shape = env.num_envs, engine.robot.action_size
-    rest = np.broadcast_to((np.asarray(low) + high) / 2, shape)
-    env.reset(seed=0)
-    for step in range(1, round(1 / engine.control_step) + 1):
-        outcome = engine.step(rest if alone else rng.uniform(low, high, shape))
-        seconds = f"{step * engine.control_step:.2g} s"
-        if exploded(engine, outcome):
-            return (
-                f"the robot, {how}, explodes within {seconds}: reduce its timestep (now "
-                f"{engine.model.opt.timestep:g} s), or the stiffness of its joints and the gears "
-                "and gains of its actuators, or move apart geoms that overlap"
-            )
-        if alone and engine.robot.position[0, 2] < -0.1:
-            return (
-                f"the robot, left alone, falls through the floor within {seconds}: its geoms need "
-                "contype and conaffinity of 1, and its class floor=True"
-            )
-        if outcome.terminated[0]:
-            break
-    return None
-
-
 @dataclass
 class Flags(Command):
     """
@@ -234,7 +203,7 @@ def show(flags: Flags) -> int:
 
         image.imsave(path, np.ascontiguousarray(env.frame(0)))
     print(f"\nwrote {path}")
-    warning = unsteady(env)
+    warning = unsteady(env.engine)
     if warning is not None:
         print(f"warning: {warning}", file=sys.stderr)
     return 0

@@ -96,3 +96,36 @@ def _check_reading(engine: Engine, name: str) -> None:
             f"{name}: observations(), cost() or measure() changes what it reads: change things in "
             "before_step(), reset() or advance()"
         )
+
+
+def unsteady(engine: Engine) -> str | None:
+    """What is wrong with a robot after a second alone, or of random actions: it falls, explodes."""
+    return _watch(engine, alone=True) or _watch(engine, alone=False)
+
+
+def _watch(engine: Engine, alone: bool) -> str | None:
+    rng = np.random.default_rng(0)
+    how = "left alone" if alone else "given random actions"
+    low, high = engine.robot.action_range
+    shape = engine.num_envs, engine.robot.action_size
+    rest = np.broadcast_to((np.asarray(low) + high) / 2, shape)
+    for row in range(engine.num_envs):
+        engine.seed(row, np.random.default_rng(row))
+    engine.reset(np.arange(engine.num_envs))
+    for step in range(1, round(1 / engine.control_step) + 1):
+        outcome = engine.step(rest if alone else rng.uniform(low, high, shape))
+        seconds = f"{step * engine.control_step:.2g} s"
+        if exploded(engine, outcome):
+            return (
+                f"the robot, {how}, explodes within {seconds}: reduce its timestep (now "
+                f"{engine.model.opt.timestep:g} s), or the stiffness of its joints and the gears "
+                "and gains of its actuators, or move apart geoms that overlap"
+            )
+        if alone and engine.robot.position[0, 2] < -0.1:
+            return (
+                f"the robot, left alone, falls through the floor within {seconds}: its geoms need "
+                "contype and conaffinity of 1, and its class floor=True"
+            )
+        if outcome.terminated[0]:
+            break
+    return None

@@ -8,9 +8,9 @@ import pytest
 from worlds import own_parts, world
 
 from sb3_guard.envs import GuardVectorEnv, Scenario, register_constraint, register_robot
+from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.part import Constraint
 from sb3_guard.envs.registry import ROBOTS
-from sb3_guard.show import unsteady
 
 CART = """
 <mujoco>
@@ -142,14 +142,14 @@ def test_show_warns_of_robots_that_fall_or_explode(cart, joint, attributes, word
     change = lambda text: text.replace("<freejoint/>", f"<joint {joint}/>")  # noqa: E731
     env = GuardVectorEnv(1, cart(change, **attributes))
     env.begin([0])
-    found = unsteady(env)
+    found = unsteady(env.engine)
     assert found is None if words is None else words in found
 
 
 def test_show_warns_of_actuators_that_are_too_strong(cart):
     """At rest such a robot stands still."""
     env = GuardVectorEnv(1, cart(lambda text: text.replace("<actuator>", BLAST)))
-    assert "given random actions, explodes within" in str(unsteady(env))
+    assert "given random actions, explodes within" in str(unsteady(env.engine))
 
 
 def test_a_robot_that_explodes_is_not_told_to_mend_its_state(cart):

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -187,3 +188,9 @@ def test_every_public_name_exists():
 
 def test_a_test_has_an_empty_working_folder_of_its_own():
     assert list(Path.cwd().iterdir()) == []
+
+
+def test_the_page_of_the_architecture_names_files_that_are_there():
+    page = (ROOT.parent / "docs" / "architecture.md").read_text()
+    for name in re.findall(r"`([\w/]+\.py)`", page):
+        assert any(ROOT.rglob(name)) or (ROOT.parent / name).is_file(), name

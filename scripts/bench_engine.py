@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import itertools
 import json
 import math
 import subprocess
@@ -64,30 +65,39 @@ def best(
     return rates
 
 
+def stepper(env: GuardVecEnv) -> Callable[[], int]:
+    """Four steps of an environment whose episodes are staggered, as in a long training."""
+    env.seed(0)
+    env.reset()
+    env.envs.engine.steps[:] = np.arange(env.num_envs) * (
+        env.envs.max_episode_steps // env.num_envs
+    )
+    shape = (64, env.num_envs, *env.action_space.shape)
+    low, high = env.action_space.low, env.action_space.high
+    actions = itertools.cycle(np.random.default_rng(0).uniform(low, high, shape).astype("f4"))
+
+    def step() -> int:
+        for _ in range(4):
+            env.step(next(actions))
+        return 4 * env.num_envs
+
+    return step
+
+
 def batch_rates(
     env_id: str, n: int, seconds: float, slices: int, threads: int | None = None
 ) -> dict[str, float]:
     """Full vector step against a bare loop of the same Batch, N = n."""
     scenario = env_spec(env_id).kwargs["scenario"]
     full = GuardVecEnv(scenario, n, num_threads=threads)
-    full.seed(0)
-    full.reset()
+    step_full = stepper(full)
     engine = full.envs.engine
     bare = Batch(engine.model, nsim=n, nthread=engine.num_threads, persistent=True)
     bare.state[:] = engine.batch.state
-    rng = np.random.default_rng(0)
-    lowest, highest = engine.robot.action_range
-    shape = (64, n, engine.robot.action_size)
-    actions = rng.uniform(lowest, highest, shape).astype(np.float32)
     low, high = engine.model.actuator_ctrlrange.T
-    ctrls = low + (actions - lowest) / np.subtract(highest, lowest) * (high - low)
+    ctrls = np.random.default_rng(0).uniform(low, high, (64, n, engine.model.nu))
     ctrl = bare.bind("ctrl")
     turn = iter(range(10**12))
-
-    def step_full() -> int:
-        for _ in range(4):
-            full.step(actions[next(turn) % 64])
-        return 4 * n
 
     def step_bare() -> int:
         for _ in range(4):
@@ -95,8 +105,6 @@ def batch_rates(
             bare.step(nstep=engine.batch.frame_skip)
         return 4 * n
 
-    # staggered episodes, as in a long training
-    engine.steps[:] = np.arange(n) * (full.envs.max_episode_steps // n)
     clock = time.process_time if threads == 1 else time.perf_counter
     return best({"full": step_full, "bare": step_bare}, seconds, slices, clock)
 
@@ -110,25 +118,12 @@ def param_rates(
     threads: int | None = None,
 ) -> dict[str, float]:
     """Full vector steps of a suite as it is and with other parameters, N = n."""
-
-    def stepper(**changes: Any) -> Callable[[], int]:
-        env = GuardVecEnv(env_spec(env_id).kwargs["scenario"], n, num_threads=threads, **changes)
-        env.seed(0)
-        env.reset()
-        env.envs.engine.steps[:] = np.arange(n) * (env.envs.max_episode_steps // n)
-        shape = (64, n, *env.action_space.shape)
-        actions = np.random.default_rng(0).uniform(-1, 1, shape).astype(np.float32)
-        turn = iter(range(10**12))
-
-        def step() -> int:
-            for _ in range(4):
-                env.step(actions[next(turn) % 64])
-            return 4 * n
-
-        return step
-
+    scenario = env_spec(env_id).kwargs["scenario"]
+    usual, changed = (
+        stepper(GuardVecEnv(scenario, n, num_threads=threads, **kwargs)) for kwargs in ({}, params)
+    )
     clock = time.process_time if threads == 1 else time.perf_counter
-    return best({"as it is": stepper(), "changed": stepper(**params)}, seconds, slices, clock)
+    return best({"as it is": usual, "changed": changed}, seconds, slices, clock)
 
 
 def single_rates(env_id: str, seconds: float, slices: int) -> dict[str, float]:

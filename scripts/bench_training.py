@@ -21,6 +21,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the commands do; read by torch's import
 
+import bench_engine
 import numpy as np
 import torch
 from mujoco.batch import Batch
@@ -30,7 +31,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_guard import ALGORITHMS, make_vec_env
-from sb3_guard.envs.mujoco_gaps import profiling_clock
 from sb3_guard.zoo.run.hyperparams import build, check, read_hyperparams
 
 N_ENVS, N_STEPS = 30, 1000
@@ -44,28 +44,20 @@ BESIDE: dict[type[BaseAlgorithm], dict[str, float | None]] = {
 ON_POLICY = [key for key, cls in ALGORITHMS.items() if issubclass(cls, OnPolicyAlgorithm)]
 # Seconds an update may take on two free cores.
 MARKS = {"trpo": 2.5, "cpo": 3.5}
-CLOCK = profiling_clock()
-SHIPPED = CLOCK.value if CLOCK is not None else None
 
 
-def bare_rate(engine: object, seconds: float = 2.0) -> float:
+def bare_rate(engine: Any, seconds: float = 2.0) -> float:
     """Env-steps/s of a bare physics loop on the engine's model, with MuJoCo's clock as shipped."""
-    model, threads = engine.model, engine.num_threads  # type: ignore[attr-defined]
-    batch = Batch(model, nsim=N_ENVS, nthread=threads, persistent=True)
-    frame_skip = engine.batch.frame_skip  # type: ignore[attr-defined]
-    batch.bind("ctrl")[:] = np.random.default_rng(0).uniform(-1, 1, (N_ENVS, model.nu))
-    if CLOCK is not None:
-        CLOCK.value = SHIPPED
-    best = 0.0
-    for _ in range(10):
-        start, steps = time.perf_counter(), 0
-        while time.perf_counter() - start < seconds / 10:
-            batch.step(nstep=frame_skip)
-            steps += N_ENVS
-        best = max(best, steps / (time.perf_counter() - start))
-    if CLOCK is not None:
-        CLOCK.value = None
-    return best
+    batch = Batch(engine.model, nsim=N_ENVS, nthread=engine.num_threads, persistent=True)
+    batch.bind("ctrl")[:] = np.random.default_rng(0).uniform(-1, 1, (N_ENVS, engine.model.nu))
+
+    def step() -> int:
+        batch.step(nstep=engine.batch.frame_skip)
+        return N_ENVS
+
+    rate = bench_engine.best({"bare": step}, seconds, slices=10)["bare"]
+    bench_engine.as_shipped(False)
+    return rate
 
 
 def start_seconds(*arguments: str) -> float:

@@ -1,6 +1,6 @@
 """Layouts and random episodes of ours beside those recorded of Safety-Gymnasium 1.0.0.
 
-``scripts/safety_gymnasium/record_distributions.py`` records them.
+``scripts/safety_gymnasium/record_more.py`` records them.
 """
 
 from __future__ import annotations

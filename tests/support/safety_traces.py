@@ -1,6 +1,6 @@
 """Traces of Safety-Gymnasium 1.0.0, and our simulations in the states that they hold.
 
-``scripts/safety_gymnasium/record.py`` and ``record_velocity.py`` say what is recorded.
+``scripts/safety_gymnasium/record.py`` and ``record_more.py`` say what is recorded.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class Trace:
 def velocity_steps(name: str) -> tuple[dict[str, Any], Any, Outcome]:
     """One step of ours from each recorded state of ``Safety<name>Velocity-v1``.
 
-    :return: what was recorded (``scripts/safety_gymnasium/record_velocity.py``), our qpos after the
+    :return: what was recorded (``scripts/safety_gymnasium/record_more.py``), our qpos after the
         step, [n, nq], and our outcomes
     """
     recorded = {

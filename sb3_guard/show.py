@@ -1,4 +1,7 @@
-"""One environment in full: ``sb3-guard show Goal_Ant_8Ghosts`` prints it and writes a picture."""
+"""One environment in full: ``sb3-guard show Goal_Ant_8Ghosts`` prints it and writes a picture.
+
+Or a robot's file, before it is registered: ``sb3-guard show go1.xml``.
+"""
 
 import inspect
 import re
@@ -14,9 +17,12 @@ import mujoco
 import numpy as np
 import yaml
 
-from sb3_guard.envs import GuardVectorEnv, env_spec
+from sb3_guard.envs import GuardVectorEnv, env_spec, register_robot
 from sb3_guard.envs.check_part import unsteady
+from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
+from sb3_guard.envs.robots.file_robot import FileRobot
+from sb3_guard.envs.robots.robot import MJCFRobot
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
@@ -74,16 +80,54 @@ def observation_table(env: GuardVectorEnv) -> str:
 
 
 def action_table(env: GuardVectorEnv) -> str:
-    """Index, actuator and control range of every action."""
-    model = env.engine.model
+    """Index and actuator of every action, and which controls its least and greatest value set."""
+    model, robot = env.engine.model, env.engine.robot
+    limits = np.array(
+        robot.controls if isinstance(robot, MJCFRobot) else model.actuator_ctrlrange.T
+    )
     rows = []
-    for i in range(model.nu):
-        low, high = model.actuator_ctrlrange[i]
+    for i, (low, high) in enumerate(limits.T):
         name = model.actuator(i).name or model.joint(model.actuator_trnid[i, 0]).name
         name = name.removeprefix("robot/")
-        least, most = (np.broadcast_to(b, model.nu)[i] for b in env.engine.robot.action_range)
+        least, most = (np.broadcast_to(b, model.nu)[i] for b in robot.action_range)
         rows.append([str(i), name, f"[{least:g}, {most:g}]", f"[{low:g}, {high:g}]"])
     return table(["action", "actuator", "range", "control"], rows)
+
+
+def register_file(path: Path, stated: dict[str, Any]) -> tuple[str, type[FileRobot]]:
+    """Register the robot of a file for this process.
+
+    :param stated: what the file does not say, by argument of :func:`register_robot`
+    :return: its name and its class
+    """
+    name = re.sub(r"[^A-Za-z0-9]|^[0-9]+", "", path.stem).capitalize() or "Robot"
+    if name.lower() in map(str.lower, ROBOTS):
+        name += "File"
+    register_robot(name, xml=path, **stated)
+    robot: Any = ROBOTS[name]
+    return name, robot
+
+
+def file_table(robot: type[FileRobot]) -> str:
+    """What was taken from a robot's file: how it is placed, and each joint's range and start."""
+    model = robot.file.standing()[0]
+    base = ", ".join(joint.name for joint in robot.file.base) or "none, it stands on a fixed base"
+    about = [
+        ["outermost body", robot.file.root],
+        ["joints of its place", base],
+        ["position", robot.tip or robot.center],
+        ["keepout, arena", f"{robot.keepout:g} m, {robot.defaults['arena']['size']:g} m"]
+        if robot.file.base
+        else ["reach", f"{robot.reach:g} m"],
+        ["left out of the file", ", ".join(robot.file.left_out) or "nothing"],
+    ]
+    rows = []
+    for i in range(model.njnt):
+        joint = model.joint(i)
+        low, high = joint.range if model.jnt_limited[i] else (-np.inf, np.inf)
+        start = " ".join(f"{value:.3g}" for value in robot.file.start[joint.name])
+        rows.append([joint.name, f"[{low:.3g}, {high:.3g}]", start])
+    return table(["robot", ""], about) + "\n\n" + table(["joint", "range", "start"], rows)
 
 
 def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
@@ -125,8 +169,9 @@ class Flags(Command):
     """
     Print an environment's scenario, costs, observations and actions; write a picture.
 
-    :param env: an id of ours, or a scenario file (.yml)
+    :param env: an id of ours, a scenario file (.yml), or a robot's MJCF file (.xml)
     :param env_kwargs: change parameters
+    :param robot_kwargs: what a robot's file does not say: arguments of register_robot
     :param output: picture to write (default: <env>.png)
     :param camera: fixed, track or top (default: fixed, or track where the robot runs far away)
     :param window: watch the robot act at random in MuJoCo's viewer instead: Space pauses, Tab opens
@@ -140,9 +185,11 @@ class Flags(Command):
   sb3-guard show Goal_Ant_8Ghosts
   sb3-guard show my_scenario.yml -o mine.png
   sb3-guard show Goal_Drone_8Hazards --env-kwargs "ghosts:{'num': 4}" --camera track
+  sb3-guard show go1.xml --robot-kwargs "actuators:{'kp': 35, 'kd': 1}" "action:'offset'"
 """
     env: str = flag(positional=True)
     env_kwargs: dict[str, Any] | None = flag()
+    robot_kwargs: dict[str, Any] | None = flag()
     output: str | None = flag("-o", metavar="FILE.png")
     camera: str | None = flag(choices=CAMERAS)
     window: bool = flag(default=False)
@@ -172,9 +219,19 @@ def watch(flags: Flags) -> int:
 def show(flags: Flags) -> int:
     """Print and draw an environment."""
     import_packages(flags.gym_packages)
+    file = Path(flags.env)
+    if file.suffix in (".xml", ".urdf"):
+        stated = flags.robot_kwargs or {}
+        with explained("can't show it", ValueError, TypeError, OSError):
+            name, robot = register_file(file, stated)
+        flags.env = f"Goal_{name}_0Hazards"
+        arguments = "".join(f", {key}={value!r}" for key, value in stated.items())
+        print(f"sb3_guard.register_robot({name!r}, xml={str(file)!r}{arguments})\n")
+        print(file_table(robot) + "\n")
+    elif flags.robot_kwargs:
+        raise UsageError("--robot-kwargs goes with a robot's file: sb3-guard show go1.xml ...")
     if flags.window:
         return watch(flags)
-    file = Path(flags.env)
     with explained("can't show it", ValueError, TypeError, RuntimeError):
         spec = env_spec(flags.env)
         if "scenario" not in spec.kwargs:

@@ -1,6 +1,7 @@
 """What a misspelt name may have meant; every error message about a name ends with it."""
 
 import difflib
+import fnmatch
 from collections.abc import Iterable
 
 
@@ -27,3 +28,17 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     close = nearest(name, known)
     hint = "" if close is None else f"did you mean {close!r}? "
     return f"{hint}allowed: {', '.join(known)}"
+
+
+def matching(label: str, pattern: str, known: Iterable[str]) -> list[str]:
+    """The names that a pattern matches, such as ``*_knee`` (``*``: any text, ``?``: a character).
+
+    :param label: what an error message calls the place of the pattern
+    :param known: allowed names
+    :raises ValueError: there is none
+    """
+    known = list(known)
+    names = fnmatch.filter(known, pattern) or [name for name in known if name == pattern]
+    if not names:
+        raise ValueError(f"{label} matches no name {pattern!r}: {did_you_mean(pattern, known)}")
+    return names

@@ -74,12 +74,13 @@ class WorldSpec:
             gap=geom.gap + floor.gap,
         )
 
-    def feel(self, name: str, body: str, force: bool = False) -> None:
+    def feel(self, name: str, body: str, force: bool = False, by: str | None = None) -> None:
         """Count contacts between any part of the robot and ``body``; 0 if there are none.
 
         :param name: name of the sensor
         :param body: name of a body in the world; the floor's and the walls' is ``"world"``
         :param force: whether their net force is felt instead, [N, 3] N along the world's axes
+        :param by: the body of the robot that feels them, without those on it; None: the robot
         """
         found = [mujoco.mjtConDataField.mjCONDATA_FOUND, 0]  # no reduction
         net = [mujoco.mjtConDataField.mjCONDATA_FORCE, 3]
@@ -87,8 +88,9 @@ class WorldSpec:
         self.spec.add_sensor(
             name=name,
             type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_XBODY,  # in contact sensors: the body's whole subtree
-            objname=self.robot.root,
+            # in contact sensors, mjOBJ_XBODY is the body's whole subtree
+            objtype=mujoco.mjtObj.mjOBJ_BODY if by else mujoco.mjtObj.mjOBJ_XBODY,
+            objname=by or self.robot.root,
             reftype=mujoco.mjtObj.mjOBJ_BODY,
             refname=body,
             intprm=[1 << int(data), int(reduction), 1],  # one slot

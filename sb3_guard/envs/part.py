@@ -60,9 +60,10 @@ class World(Protocol):
         friction may differ between simulations. Returns how many there can be.
         """
 
-    def feel(self, name: str, body: str, force: bool = False) -> None:
-        """Add a sensor ``name`` of the robot's contacts with ``body``: how many there are, 0 or 1,
-        or their net ``force``, [N, 3] N. :meth:`Simulation.sensor` reads it.
+    def feel(self, name: str, body: str, force: bool = False, by: str | None = None) -> None:
+        """Add a sensor ``name`` of the contacts of the robot, or of its body ``by`` alone, with
+        ``body``: how many there are, 0 or 1, or their net ``force``, [N, 3] N.
+        :meth:`Simulation.sensor` reads it.
         """
 
 
@@ -144,6 +145,7 @@ class Part(Parameters):
     every: str = "control"  # before which steps before_step is called: "control" or "physics"
     solid: bool = False  # whether its objects are bodies that the robot bumps into
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
+    tried_with: ClassVar[str | None] = None  # the robot with which a new part is tried; None: any
     family: ClassVar[str] = "guard"  # of suites; a part of GUARD's has a page of its own
 
     @classmethod
@@ -268,6 +270,9 @@ class Robot(Part):
     stage: ClassVar[mujoco.mjtStage] = mujoco.mjtStage.mjSTAGE_ACC
     root: ClassVar[str]  # name of the outermost body in the compiled world
     reach: ClassVar[float] = math.inf  # m from its base: where goals and hazards make sense
+    # parameters of tasks, constraints and the arena that suit its size, by keyword; a scenario's
+    # come first
+    defaults: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     altitude: float = 0.0  # m, z of its position when an episode begins
     action_size: int
     action_range: tuple[Array | float, Array | float] = (-1.0, 1.0)  # lowest and highest actions
@@ -282,6 +287,14 @@ class Robot(Part):
     @property
     def roots(self) -> tuple[str, ...]:
         return (self.root,)
+
+    def bodies(self, model: mujoco.MjModel) -> list[int]:
+        """Its bodies in a compiled world: the outermost and all that hangs on it."""
+        below = [model.body(self.root).id]
+        for body in range(below[0] + 1, model.nbody):  # parents come before their children
+            if model.body_parentid[body] in below:
+                below.append(body)
+        return below
 
     @property
     def base(self) -> tuple[float, float]:

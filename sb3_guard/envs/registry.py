@@ -13,14 +13,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sb3_guard.envs.arena import INTEGRATORS
+from sb3_guard.envs.arena import INTEGRATORS, Arena
 from sb3_guard.envs.check_part import check_part
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.parameters import PartError, check_count
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.robots import gym_mujoco, safety_gymnasium
+from sb3_guard.envs.robots.from_file import robot_class
 from sb3_guard.envs.robots.robot import MJCFRobot
-from sb3_guard.spelling import did_you_mean
 
 P = TypeVar("P", bound=Part)
 
@@ -86,6 +86,13 @@ CONSTRAINTS: dict[str, type[Constraint]] = _parts(
     "Gremlins",
     "Speed",
     "Boundary",
+    "JointLimits",
+    "JointSpeed",
+    "JointTorque",
+    "BaseTilt",
+    "BaseHeight",
+    "FloorContact",
+    "SelfCollision",
 )
 
 # What else sets parameters, in the fields of a scenario that these name.
@@ -108,21 +115,35 @@ def register_robot(
 ) -> None:
     """Make a robot known under ``name``.
 
+    A file may be as its maker wrote it: the arena takes the place of its floor and lights, its
+    options and sensors stay, and what the joints do is observed unless sensors cover it
+    (:mod:`sb3_guard.envs.robots.file_robot`).
+
     :param name: what ids and scenarios call it
     :param robot: a :class:`~sb3_guard.envs.part.Robot` class
-    :param xml: or the robot's MJCF file, by the conventions of
-        :class:`~sb3_guard.envs.robots.robot.MJCFRobot`
-    :param attributes: with ``xml``, class attributes: ``timestep`` (s, of one physics step; the
-        file's), ``frame_skip`` (physics steps in a control step; 10), ``integrator`` (``"Euler"``,
-        ``"RK4"``, ``"implicit"`` or ``"implicitfast"``), ``workspace`` (``"planar"``),
-        ``lidar_bodies`` (``("robot",)``), ``center`` (the body whose origin is the robot's
-        position; ``"robot"``), ``reach`` (m; infinite), ``eye`` (where its camera sits and looks:
-        body, place in m and direction there; ``("robot/robot", (0, 0, 0.1), (1, 0, 0))``),
-        ``scaled`` (whether actions in [−1, 1] are scaled to the control ranges; True), ``floor``
-        (whether it meets the floor; True), ``complete`` (whether the file is a whole world, whose
-        floor and options hold, and ``root`` its outermost body; False)
+    :param xml: or the robot's MJCF file
+    :param attributes: with ``xml``, what the file does not say.
+        The robot: ``root`` (its outermost body; the only one with joints), ``complete`` (whether
+        the file's world is kept, with floor and options; False), ``workspace`` (``"planar"``; on a
+        fixed base ``"spatial"``), ``center`` (the body or site whose place is the robot's position,
+        of an arm its end effector; the outermost body), ``lidar_bodies`` (the body of ``center``),
+        ``reach`` (m; of an arm as measured), ``keepout`` (m; what covers it), ``eye`` (where its
+        camera sits and looks: body, place in m and direction there), ``floor`` (whether it meets
+        the floor; True), ``defaults`` (parameters of tasks and constraints with this robot, such as
+        ``{"goal": {"size": 0.05}}``).
+        Its start: ``keyframe`` (``start``, ``home`` or the only one), ``pose`` (rad or m, by names
+        or patterns of joints, such as ``{"*_thigh_joint": 0.9}``).
+        Its actions: ``actuators`` (gains of position servos where the file has no actuators,
+        ``{"kp": 35, "kd": 1}``, with ``"force"`` for a limit in N m, or a mapping of joints to
+        gains), ``action`` (``"range"``: [−1, 1] is the control range; ``"offset"``: from the first
+        pose), ``action_scale`` (rad of offset at 1; 0.25), ``scaled`` (False: actions are the
+        controls themselves).
+        What it observes: ``observe`` (names of sensors and of what is computed).
+        Its physics: ``timestep`` (s, of one physics step; the file's), ``frame_skip`` (physics
+        steps in a control step; 10), ``integrator`` (``"Euler"``, ``"RK4"``, ``"implicit"`` or
+        ``"implicitfast"``)
     :raises ValueError: neither or both of ``robot`` and ``xml`` are given, an attribute is unknown
-        or bad, or the name is not usable
+        or bad, the file has no robot that can act, or the name is not usable
     """
     _check_name(name)
     if (robot is None) == (xml is None):
@@ -134,13 +155,7 @@ def register_robot(
         file = Path(str(xml)).resolve()
         if not file.is_file():
             raise ValueError(f"robot {name!r}: there is no file {str(xml)!r}")
-        known = ["timestep", "frame_skip", "integrator", "workspace", "lidar_bodies", "center"]
-        known += ["reach", "eye", "scaled", "floor", "complete", "root"]
-        for key in attributes:
-            if key not in known:
-                raise ValueError(f"robot {name!r} has no {key!r}: {did_you_mean(key, known)}")
-        body = {"asset": "", **attributes, "path": classmethod(lambda cls: file)}
-        robot = type(name, (MJCFRobot,), body)
+        robot = robot_class(name, file, attributes)
     elif attributes:
         raise ValueError(f"robot {name!r}: {sorted(attributes)} go with xml, not with a class")
     _check_class(name, robot, Robot)
@@ -265,8 +280,10 @@ def _check_contract(name: str, part: type[Part]) -> None:
     def make(rows: int) -> Engine:
         one: Any = part.from_params({}, name.lower() if not issubclass(part, Robot) else None)
         if isinstance(one, Robot):
-            return Engine(one, TASKS["Goal"](), num_envs=rows, num_threads=1)
-        robot = ROBOTS["Point" if "planar" in part.spaces else "Drone"]()
+            goal = TASKS["Goal"].from_params(one.defaults.get("goal", {}))
+            arena = Arena.from_params(one.defaults.get("arena", {}))
+            return Engine(one, goal, num_envs=rows, num_threads=1, arena=arena)
+        robot = ROBOTS[part.tried_with or ("Point" if "planar" in part.spaces else "Drone")]()
         if isinstance(one, Task):
             return Engine(robot, one, num_envs=rows, num_threads=1)
         return Engine(robot, TASKS["Goal"](), [one], num_envs=rows, num_threads=1)
@@ -276,8 +293,11 @@ def _check_contract(name: str, part: type[Part]) -> None:
     except PartError:
         raise
     except Exception as error:  # it may need other company
+        if isinstance(error, ValueError) and issubclass(part, MJCFRobot):
+            raise  # its file is at fault
         warnings.warn(
-            f"{name} was not tried: a small world with it raised {type(error).__name__}: {error}",
+            f"{name} was not tried: a small world with it raised {type(error).__name__}: {error}; "
+            "it is registered, but may not work",
             stacklevel=4,
         )
 

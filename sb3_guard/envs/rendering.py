@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 
-from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, geoms_below, has_arena
+from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, has_arena, robot_geoms
 from sb3_guard.envs.types import Array
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class Renderer:
         self._line = LINE / height
         self._middle, self._half = arena(engine)
         self._has_arena = has_arena(engine)
-        self._geoms = geoms_below(engine.model, engine.robot.root)
+        self._geoms = robot_geoms(engine.model, engine.robot)
         if self._explain:
             self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
             low = self._follows and not self._has_arena

@@ -280,17 +280,27 @@ class Scenario:
                     f"itself: to have {kind} instead, write {name}=None and {kind}={{...}}; to "
                     f"have both, {kind}={{...}}"
                 )
-            constraints.append(by_name[kind].from_params(params, name))
+            constraints.append(by_name[kind].from_params(self._suited(kind, params), name))
+        task = self.task.lower()
         return {
             "robot": ROBOTS[self.robot].from_params(self.robot_params, "robot"),
-            "task": TASKS[self.task].from_params(self.task_params, self.task.lower()),
+            "task": TASKS[self.task].from_params(self._suited(task, self.task_params), task),
             "constraints": constraints,
             "lidar": Lidar.from_params(self.lidar),
             "layout": Layout.from_params(self.layout),
             "extras": Extras.from_params(self.observe),
-            "arena": Arena.from_params(self.arena),
+            "arena": Arena.from_params(self._suited("arena", self.arena)),
             "cost": self.cost,
         }
+
+    def _suited(self, kind: str, params: Params) -> Params:
+        """Parameters of a part, and those that the robot's size suggests where none is stated."""
+        defaults = ROBOTS[self.robot].defaults.get(kind)
+        if not defaults or not isinstance(params, Mapping):
+            return params
+        planar = params.get("space") == "planar"  # where there is no height
+        usual = {key: v for key, v in defaults.items() if not (planar and key == "height")}
+        return {**usual, **params}
 
     def build(self, num_envs: int = 1, num_threads: int | None = None) -> Engine:
         """Run ``num_envs`` simulations of this scenario."""

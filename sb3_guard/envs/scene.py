@@ -17,6 +17,7 @@ from sb3_guard.envs.types import Array
 
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine
+    from sb3_guard.envs.part import Robot
 
 COST_COLOR = (0.85, 0.1, 0.1)
 SHADOW = (0.58, 0.60, 0.63)
@@ -83,7 +84,7 @@ class ScenePainter:
         # above robots on the floor, where it can be seen
         lift = [0.0, 0.0, 0.25 if robot.workspace == "planar" else 0.0]
         centers = origin[self._row] + lift + self._shift
-        thick = _thickness(model, self._data, geoms_below(model, robot.root), centers)
+        thick = _thickness(model, self._data, robot_geoms(model, robot), centers)
         return centers, rotation[self._row], np.maximum(RING, thick + 1.5 * BEAD)
 
     def ring(self, closeness: Array, azimuth: int, color: tuple[float, ...]) -> None:
@@ -229,13 +230,10 @@ def frame_all(points: Array, elevation: float, aspect: float, fovy: float) -> tu
     return at, float(distance)
 
 
-def geoms_below(model: mujoco.MjModel, body: str) -> list[int]:
-    """The geoms of a body and of all that hangs on it."""
-    below = {model.body(body).id}
-    for child in range(model.nbody):  # parents come before their children
-        if int(model.body_parentid[child]) in below:
-            below.add(child)
-    return [geom for geom in range(model.ngeom) if int(model.geom_bodyid[geom]) in below]
+def robot_geoms(model: mujoco.MjModel, robot: Robot) -> list[int]:
+    """The geoms of a robot."""
+    bodies = robot.bodies(model)
+    return [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] in bodies]
 
 
 def _thickness(

@@ -103,7 +103,7 @@ def test_what_the_recipes_add_works_together(copy):
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[0])
     assert Path(found["file"]).is_relative_to(copy)
-    assert found["observed"] == ["mines_lidar"]
+    assert found["observed"] == ["base_angvel", "base_linvel", "last_action", "mines_lidar"]
     assert found["gained"] > 5.0
     assert found["costs"] == [0.0, 1.0]
     assert (copy / "logs" / "trpo_price" / "Leave_Puck_8Mines-v0_1" / "result.json").is_file()

@@ -105,10 +105,11 @@ def test_a_physics_step_that_is_none_is_refused(step, cart):
         cart(options=f'<option timestep="{step}"/>').build()
 
 
-def test_a_floor_in_the_file_is_answered_or_kept(cart):
+def test_a_floor_in_the_file_gives_way_to_the_arenas_or_is_kept(cart):
     ground = '<geom name="ground" type="plane" size="5 5 1"/>'
-    with pytest.raises(ValueError, match=r"has a floor, geom 'ground', .* complete=True"):
-        cart(ground=ground).build()
+    model = cart(ground=ground).build().model
+    planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    assert [model.geom(i).name for i in planes] == ["floor"]
     with own_parts():
         del ROBOTS["Cart"]
         cart(ground=ground, complete=True, root="robot")

@@ -345,9 +345,8 @@ def test_misspelt_names_in_a_robot_file_are_not_dropped(actuator, site, what, tm
       <actuator><motor joint="{actuator}" ctrlrange="-1 1"/></actuator>
       <sensor><gyro name="gyro" site="{site}"/></sensor></mujoco>""")
     with own_parts():
-        register_robot("Dial", xml=tmp_path / "dial.xml")
         with pytest.raises(ValueError, match=f"dial.xml: .*{what}"):
-            world("Dial")
+            register_robot("Dial", xml=tmp_path / "dial.xml")
 
 
 def test_a_robot_module_shows_its_robot(tmp_path: Path) -> None:

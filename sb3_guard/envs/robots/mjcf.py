@@ -13,6 +13,21 @@ _PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _FREE, _SLIDE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE
 
 
+def load(path: Path) -> mujoco.MjSpec:
+    """An MJCF file that compiles: attach() silently drops what refers to something missing.
+
+    :raises ValueError: it cannot be read, or is URDF
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        if spec.compiler.settotalmass > 0:
+            _state_masses(spec)
+        spec.compile()
+    except ValueError as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+    return spec
+
+
 def read(path: Path, root: str, complete: bool) -> mujoco.MjSpec:
     """A robot's file.
 
@@ -20,13 +35,7 @@ def read(path: Path, root: str, complete: bool) -> mujoco.MjSpec:
     :param complete: whether the file is a whole world
     :raises ValueError: it cannot be read, has no such body, or has a floor that it must not have
     """
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        if spec.compiler.settotalmass > 0:
-            _state_masses(spec)
-        spec.compile()  # attach() silently drops what refers to something missing
-    except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+    spec = load(path)
     if spec.body(root) is None:
         raise ValueError(f"{path} has no body called {root!r}: give its outermost body this name")
     floors = [geom.name for geom in spec.worldbody.geoms if geom.type == _PLANE]
@@ -59,6 +68,18 @@ def honour_options(option: mujoco.MjOption, world: mujoco.MjOption) -> None:
             own = getattr(option, name)
             if not np.array_equal(own, value):
                 setattr(world, name, own)
+
+
+def agree(spec: mujoco.MjSpec, world: mujoco.MjSpec) -> None:
+    """State the sizes and looks that a world states: it keeps its own, and MuJoCo would warn."""
+    for name in dir(world):
+        if name.startswith(("nuser", "njmax", "nconmax", "memory")):
+            setattr(spec, name, getattr(world, name))
+    for group in ("global_", "quality", "headlight", "map", "scale", "rgba"):
+        ours, theirs = getattr(world.visual, group), getattr(spec.visual, group)
+        for name in dir(ours):
+            if not name.startswith("_"):
+                setattr(theirs, name, getattr(ours, name))
 
 
 def set_contact_bits(spec: mujoco.MjSpec, floor: bool, label: str) -> None:

@@ -6,8 +6,9 @@ Its conventions:
 * the outermost body is called ``robot``; it either begins with a free joint or, for robots that
   move at a fixed height or not at all, with its own slides and hinges; these then hang under a
   mocap body that carries the place and heading of an episode's start;
-* every sensor in the file is observed under its own name; ``jointpos`` as (sin θ, cos θ), ball
-  joints as a rotation matrix; sensors whose names begin with ``_`` are not observed;
+* every sensor in the file is observed under its own name; ``jointpos`` of a hinge as
+  (sin θ, cos θ), ball joints as a rotation matrix; sensors whose names begin with ``_`` are not
+  observed;
 * actions in [−1, 1] are scaled linearly to the control range of the actuators, in their order; of
   a class with ``scaled = False`` they are the controls themselves;
 * a keyframe named ``start`` holds the pose in which an episode begins;
@@ -57,6 +58,14 @@ def as_slice(ids: list[int]) -> slice | list[int]:
     step = ids[1] - ids[0] if len(ids) > 1 else 1
     even = step > 0 and len(ids) > 0 and ids == list(range(ids[0], ids[-1] + 1, step))
     return slice(ids[0], ids[-1] + 1, step) if even else ids
+
+
+def _is_angle(model: mujoco.MjModel, sensor: str) -> bool:
+    """Whether a sensor gives the position of a hinge, not of a slide, nor anything else."""
+    i = model.sensor(sensor).id
+    hinge = mujoco.mjtJoint.mjJNT_HINGE
+    is_position = model.sensor_type[i] == _SENSOR.mjSENS_JOINTPOS
+    return bool(is_position and model.jnt_type[model.sensor_objid[i]] == hinge)
 
 
 @dataclass
@@ -130,12 +139,23 @@ class MJCFRobot(Robot):
         places = self.locations or ((self.base,) if stands else ())
         return (Footprint("robot", 1, self.keepout, self.placements, places, self.margin),)
 
+    def read(self) -> mujoco.MjSpec:
+        """The robot, or the whole world of a robot with ``complete = True``; a new one."""
+        return mjcf.read(self.path(), self.root.removeprefix(PREFIX), self.complete)
+
+    def first_pose(self, model: mujoco.MjModel) -> Array:
+        """qpos in which an episode begins, of the robot at least."""
+        prefix = "" if self.complete else PREFIX
+        start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, prefix + "start")
+        pose: Array = model.key_qpos[start] if start >= 0 else model.qpos0
+        return pose
+
     def world(self) -> mujoco.MjSpec | None:
-        return mjcf.read(self.path(), self.root, True) if self.complete else None
+        return self.read() if self.complete else None
 
     def build(self, world: World) -> None:
         super().build(world)
-        robot = world.spec if self.complete else mjcf.read(self.path(), "robot", False)
+        robot = world.spec if self.complete else self.read()
         self._own = {sensor.name for sensor in robot.sensors if sensor.name}
         known = [body.name for body in robot.bodies if body.name and body is not robot.worldbody]
         named = {
@@ -149,11 +169,12 @@ class MJCFRobot(Robot):
                     raise ValueError(
                         f"{where} names no body {name!r} of the robot: {did_you_mean(name, known)}"
                     )
-        joints = robot.body(self.root if self.complete else "robot").joints
+        joints = robot.body(self.root.removeprefix(PREFIX)).joints
         self._free = bool(joints) and joints[0].type == mujoco.mjtJoint.mjJNT_FREE
         if self.complete:
             return
         mjcf.honour_options(robot.option, world.spec.option)
+        mjcf.agree(robot, world.spec)
         mjcf.set_contact_bits(robot, self.floor, str(self.path()))
         if self._free:
             frame = world.spec.worldbody.add_frame()
@@ -183,8 +204,7 @@ class MJCFRobot(Robot):
             self._actions = sim.array("robot/actions", (self.delay + 1, model.nu))
             self._delays = self.current("delay")
         self._qpos = batch.bind("qpos")
-        start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, prefix + "start")
-        self._start = model.key_qpos[start] if start >= 0 else model.qpos0
+        self._start = self.first_pose(model)
         center = model.body(prefix + self.center).id
         self._position = batch.bind("xpos")[:, center]
         root = model.body_rootid[center]  # spatial velocities are at its subtree's centre of mass
@@ -202,7 +222,7 @@ class MJCFRobot(Robot):
         self._sensors = list(self._read_sensors(model))
         self._data = batch.bind("sensordata")
         self._balls = [(n, w) for n, kind, w in self._sensors if kind == _SENSOR.mjSENS_BALLQUAT]
-        hinges = [(n, w.start) for n, kind, w in self._sensors if kind == _SENSOR.mjSENS_JOINTPOS]
+        hinges = [(n, w.start) for n, _, w in self._sensors if _is_angle(model, prefix + n)]
         self._hinges, self._angles = [n for n, _ in hinges], as_slice([i for _, i in hinges])
         self._live = {  # in the order of the file
             name: Values(self._data[:, where], *_BOUNDS.get(kind, ()))
@@ -231,14 +251,6 @@ class MJCFRobot(Robot):
             name = model.sensor(i).name.removeprefix(prefix)
             if name not in self._own or name.startswith("_"):
                 continue
-            joint = int(model.sensor_objid[i])
-            kind = int(model.sensor_type[i])
-            slide = int(mujoco.mjtJoint.mjJNT_SLIDE)
-            if kind == int(_SENSOR.mjSENS_JOINTPOS) and int(model.jnt_type[joint]) == slide:
-                raise ValueError(
-                    f"sensor {name!r} observes a slide's position as an "
-                    "angle: leave it out, or begin its name with '_'"
-                )
             first = int(model.sensor_adr[i])
             where = slice(first, first + int(model.sensor_dim[i]))
             yield name, _SENSOR(int(model.sensor_type[i])), where
@@ -255,6 +267,13 @@ class MJCFRobot(Robot):
     @property
     def frames(self) -> tuple[Array, Array]:
         return self._xpos[:, self._bodies], self._xmat[:, self._bodies]
+
+    @property
+    def controls(self) -> tuple[Array, Array]:
+        """The controls that the lowest and the highest actions set, [action_size] each."""
+        low, high = (self._center + self._half * action for action in self.action_range)
+        least, most = self.sim.model.actuator_ctrlrange.T  # MuJoCo keeps controls within
+        return np.maximum(low, least), np.minimum(high, most)
 
     def positions(self, footprint: str) -> Array:
         # an arm is where its base is, whatever the hand does

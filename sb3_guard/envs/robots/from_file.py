@@ -1,0 +1,140 @@
+"""The class of a robot that is made of a file and what its user states of it."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs.parameters import param
+from sb3_guard.envs.robots.file_robot import FileRobot
+from sb3_guard.envs.robots.measure import radius, reached
+from sb3_guard.envs.robots.model_file import ModelFile, settle
+from sb3_guard.envs.robots.robot import PREFIX
+from sb3_guard.spelling import did_you_mean
+
+OF_FILE = ("root", "complete", "keyframe", "pose", "actuators")  # what settle() is told
+ATTRIBUTES = (
+    *OF_FILE, "timestep", "frame_skip", "integrator", "workspace", "lidar_bodies", "center",
+    "reach", "eye", "scaled", "floor", "action", "action_scale", "observe", "keepout", "defaults",
+)  # fmt: skip
+_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "root": (lambda v: v is None or isinstance(v, str), "the name of an outermost body"),
+    "center": (lambda v: v is None or isinstance(v, str), "the name of a body or site"),
+    "keyframe": (lambda v: v is None or isinstance(v, str), "the name of a keyframe"),
+    "complete": (lambda v: isinstance(v, bool), "True or False"),
+    "action": (lambda v: v in ("range", "offset"), "'range' or 'offset'"),
+    "action_scale": (
+        lambda v: isinstance(v, (int, float)) and not isinstance(v, bool) and 0 < v < math.inf,
+        "a positive number, of rad or m",
+    ),
+    "observe": (
+        lambda v: (
+            v is None
+            or (isinstance(v, (list, tuple)) and bool(v) and all(isinstance(n, str) for n in v))
+        ),
+        "a list of names, such as ['joint_pos', 'gravity']",
+    ),
+    "keepout": (
+        lambda v: isinstance(v, (int, float)) and not isinstance(v, bool) and 0 <= v < math.inf,
+        "a number of metres, at least 0",
+    ),
+    "defaults": (
+        lambda v: isinstance(v, Mapping) and all(isinstance(p, Mapping) for p in v.values()),
+        "a mapping such as {'goal': {'size': 0.05}}",
+    ),
+}
+
+
+def robot_class(name: str, path: Path, stated: Mapping[str, Any]) -> type[FileRobot]:
+    """A robot from an MJCF file; what is not stated follows from the file.
+
+    :param name: of the class
+    :param path: the file
+    :param stated: attributes, by name
+    :raises ValueError: an attribute is unknown or bad, or the file has no such robot
+    """
+    for key, value in stated.items():
+        if key not in ATTRIBUTES:
+            raise ValueError(f"robot {name!r} has no {key!r}: {did_you_mean(key, ATTRIBUTES)}")
+        if key in _RULES and not _RULES[key][0](value):
+            raise ValueError(f"robot {name!r}: {key} = {value!r} must be {_RULES[key][1]}")
+    grounded = stated.get("workspace", "planar") == "planar"
+    file = settle(path, grounded=grounded, **{k: stated[k] for k in OF_FILE if k in stated})
+    model, data = file.standing()
+    prefix = "" if stated.get("complete") else PREFIX
+    center = stated.get("center") or file.root
+    body, tip = _center(model, file, center)
+    size = radius(model, data, file.root)
+    worked_out: dict[str, Any] = {
+        "asset": "",
+        "path": classmethod(lambda cls: path),
+        "file": file,
+        "lidar_bodies": (body,),
+        "eye": (prefix + body, (0.0, 0.0, 0.1), (1.0, 0.0, 0.0)),
+        "keepout": math.ceil(100 * size) / 100,
+        "defaults": {"arena": {"size": max(2.0, round(5 * size, 1))}},
+    }
+    if not file.base and not stated.get("complete"):
+        worked_out |= _arm(model, file, center, tip is not None)
+    attributes = {k: v for k, v in stated.items() if k not in OF_FILE or k == "complete"}
+    defaults = {
+        part: {**worked_out["defaults"].get(part, {}), **stated.get("defaults", {}).get(part, {})}
+        for part in {**worked_out["defaults"], **stated.get("defaults", {})}
+    }
+    named = {"root": prefix + file.root, "center": body, "tip": tip, "defaults": defaults}
+    attributes = {**worked_out, **attributes, **named}
+    keepout = param(
+        attributes["keepout"], "radius kept clear around the robot at the start, m", low=0
+    )
+    attributes |= {"keepout": keepout, "__annotations__": {"keepout": float}}
+    return dataclass(type(name, (FileRobot,), attributes))
+
+
+def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, str | None]:
+    """The body at the robot's position, and the site on it if it is a site.
+
+    :raises ValueError: there is none of this name, or it cannot move
+    """
+    bodies = [model.body(i).name for i in range(1, model.nbody)]
+    sites = [model.site(i).name for i in range(model.nsite)]
+    names = [name for name in (*bodies, *sites) if name]
+    if center not in names:
+        raise ValueError(
+            f"center names no body or site {center!r} of {file.path.name}: "
+            f"{did_you_mean(center, names)}"
+        )
+    tip = None if center in bodies else center
+    body = model.body(center).id if tip is None else int(model.site(center).bodyid[0])
+    if model.body_weldid[body] == 0:
+        moving = [n for n in sites if n and model.body_weldid[model.site(n).bodyid[0]]]
+        moving += [n for n in bodies[::-1] if n and model.body_weldid[model.body(n).id]]
+        raise ValueError(
+            f"{file.path} stands on a fixed base, and {center!r}, whose place is the robot's "
+            f"position, cannot move: name its end effector, a body or site, center={moving[0]!r}; "
+            f"others are {', '.join(moving[1:9])}"
+        )
+    return str(model.body(body).name), tip
+
+
+def _arm(model: mujoco.MjModel, file: ModelFile, center: str, site: bool) -> dict[str, Any]:
+    """What follows from the reach of a robot on a fixed base."""
+    places = reached(model, center, site)
+    reach = 0.9 * float(np.sqrt((places**2).sum(axis=1)).max())
+    low, high = np.quantile(places[places[:, 2] > 0, 2], [0.2, 0.8]).tolist()
+    size = round(0.1 * reach, 3)
+    square = [[-reach, -reach, reach, reach]]
+    near = {"size": size, "keepout": size, "height": [round(low, 3), round(high, 3)]}
+    return {
+        "workspace": "spatial",
+        "reach": round(reach, 3),
+        "keepout": size,
+        "defaults": {
+            "goal": near | {"placements": square},
+            "hazards": near | {"placements": square},
+            "ghosts": near | {"placements": square},
+        },
+    }

@@ -1,0 +1,61 @@
+"""How large a robot is, how low it stands and how far it reaches, from its compiled file."""
+
+import math
+
+import mujoco
+import numpy as np
+
+from sb3_guard.envs.types import Array
+
+SAMPLES = 1000  # random poses of an arm, from which its reach is measured
+
+
+def radius(model: mujoco.MjModel, data: mujoco.MjData, root: str) -> float:
+    """Of the upright cylinder around body ``root`` that the robot is in, m."""
+    solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
+    away = data.geom_xpos[solid, :2] - data.body(root).xpos[:2]
+    return float((np.hypot(*away.T) + model.geom_rbound[solid]).max(initial=0.0))
+
+
+def reached(model: mujoco.MjModel, center: str, site: bool) -> Array:
+    """Where an arm's end effector is in random poses, [SAMPLES, 3] m.
+
+    :param center: name of the end effector
+    :param site: whether it is a site, not a body
+    """
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    low, high = np.where(model.jnt_limited, model.jnt_range.T, [[-math.pi], [math.pi]])
+    single = np.isin(model.jnt_type, [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
+    where = model.jnt_qposadr[single]
+    places = np.empty((SAMPLES, 3))
+    for place in places:
+        data.qpos[where] = rng.uniform(low, high)[single]
+        mujoco.mj_kinematics(model, data)
+        place[:] = data.site(center).xpos if site else data.body(center).xpos
+    return places
+
+
+def lowest(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    """Height of the lowest point of the geoms that meet something, m."""
+    kinds, lowest = mujoco.mjtGeom, math.inf
+    meets = (model.geom_contype | model.geom_conaffinity) != 0
+    for i in np.flatnonzero(meets).tolist():
+        up, size = data.geom_xmat[i].reshape(3, 3)[2], model.geom_size[i]
+        match int(model.geom_type[i]):
+            case kinds.mjGEOM_SPHERE:
+                sunk = size[0]
+            case kinds.mjGEOM_CAPSULE:
+                sunk = size[0] + size[1] * abs(up[2])
+            case kinds.mjGEOM_CYLINDER:
+                sunk = size[0] * math.hypot(up[0], up[1]) + size[1] * abs(up[2])
+            case kinds.mjGEOM_ELLIPSOID:
+                sunk = float(np.linalg.norm(up * size))
+            case kinds.mjGEOM_MESH:
+                mesh = int(model.geom_dataid[i])
+                first = int(model.mesh_vertadr[mesh])
+                points = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+                sunk = -float((points * up).sum(axis=1).min())
+            case _:
+                sunk = float(np.abs(up) @ size)
+        lowest = min(lowest, float(data.geom_xpos[i, 2] - sunk))
+    return 0.0 if lowest == math.inf else lowest

@@ -1,0 +1,312 @@
+"""An MJCF file is a robot as its maker wrote it: pose, servos, observations, place."""
+
+import mujoco
+import numpy as np
+import pytest
+from worlds import assert_rows_are_lone_environments, own_parts
+
+from sb3_guard.envs import Scenario, register_robot
+from sb3_guard.envs.registry import ROBOTS
+
+ROW = np.zeros(1, dtype=int)
+GAINS = {"kp": 40.0, "kd": 2.0}
+# a dog of two legs whose file is in degrees, beside a ball on a floor of its own
+DOG = """
+<mujoco>
+  <option timestep="0.004"/>
+  <default><geom density="200"/><general dyntype="filter" gainprm="3"/></default>
+  <worldbody>
+    <light pos="0 0 5"/>
+    <geom name="ground" type="plane" size="5 5 1"/>
+    <body name="ball" pos="2 0 1"><freejoint name="ball"/><geom name="ball" size="0.1"/></body>
+    <body name="trunk" pos="3 1 2">
+      <freejoint/>
+      <light pos="0 0 1"/>
+      <geom name="trunk" type="box" size="0.3 0.2 0.05"/>
+      <site name="imu"/>
+      <body name="front" pos="0.25 0 0">
+        <joint name="front_thigh" axis="0 1 0" range="-45 90" limited="true"/>
+        <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.2"/>
+        <body name="front_calf" pos="0 0 -0.2">
+          <joint name="front_calf" axis="0 1 0" range="-150 -30" limited="true"/>
+          <geom name="front_foot" type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2"/>
+        </body>
+      </body>
+      <body name="back" pos="-0.25 0 0">
+        <joint name="back_thigh" axis="0 1 0" range="-45 90" limited="true"/>
+        <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.2"/>
+      </body>
+      <body name="fan" pos="0 0 0.06">
+        <joint name="fan"/>
+        <geom type="box" size="0.1 0.01 0.01" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <sensor>
+    <gyro name="imu_gyro" site="imu"/>
+    <jointpos name="fan_angle" joint="fan"/>
+    <framepos name="to_ball" objtype="body" objname="trunk" reftype="body" refname="ball"/>
+  </sensor>
+  <keyframe>{keys}</keyframe>
+</mujoco>
+"""
+# qpos of the ball and of the dog, whose file lists them in this order
+KEY = '<key name="{name}" qpos="2 0 1 1 0 0 0  3 1 {z} 1 0 0 0  {thigh} -1 0.2 0"/>'
+
+
+@pytest.fixture
+def dog(tmp_path):
+    def write(change=lambda text: text, keys="", **attributes):
+        path = tmp_path / "dog.xml"
+        path.write_text(change(DOG.format(keys=keys)))
+        attributes = {"root": "trunk", "actuators": GAINS} | attributes
+        register_robot("Dog", xml=path, **attributes)
+        engine = Scenario.parse("Goal_Dog_2Hazards").override(robot={"heading": 0.0}).build(2)
+        for row in range(2):
+            engine.seed(row, np.random.default_rng(row))
+        engine.reset(np.arange(2))
+        return engine
+
+    with own_parts():
+        yield write
+
+
+def qpos(engine, joint):
+    return engine.batch.bind("qpos")[0, engine.model.joint(f"robot/{joint}").qposadr[0]]
+
+
+def test_a_joint_starts_at_0_or_in_the_middle_of_its_range_and_feet_on_the_floor(dog):
+    engine = dog()
+    assert qpos(engine, "front_thigh") == 0.0
+    assert qpos(engine, "front_calf") == pytest.approx(np.deg2rad(-90))
+    data = engine.batch.get_data(0)
+    # the thigh hangs down, the calf is level behind it: the knee is lowest
+    assert data.body("robot/front_calf").xpos[2] == pytest.approx(0.03, abs=1e-3)
+    assert engine.robot.altitude == pytest.approx(0.23, abs=1e-3)
+
+
+def test_a_pose_sets_joints_by_patterns_and_the_height_follows(dog):
+    engine = dog(pose={"*_thigh": 0.5, "back_thigh": 0.0, "front_calf": -0.6})
+    values = [qpos(engine, name) for name in ("front_thigh", "back_thigh", "front_calf")]
+    assert values == [0.5, 0.0, -0.6]
+    data = engine.batch.get_data(0)
+    # by hand: the ends of the two legs' capsules
+    foot = data.body("robot/front_calf").xpos[2] - 0.2 * np.cos(0.1) - 0.02
+    knee = data.body("robot/back").xpos[2] - 0.2 - 0.03
+    assert min(foot, knee) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("names", "stated", "start"),
+    [
+        (["crouch"], {}, "crouch"),
+        (["crouch", "home"], {}, "home"),
+        (["home", "crouch", "start"], {}, "start"),
+        (["home", "crouch"], {"keyframe": "crouch"}, "crouch"),
+        (["a", "b"], {}, None),
+    ],
+)
+def test_a_keyframe_is_where_it_starts(dog, names, stated, start):
+    thighs = {name: 0.1 + 0.1 * i for i, name in enumerate(names)}
+    keys = "".join(KEY.format(name=n, z=0.7, thigh=thigh) for n, thigh in thighs.items())
+    engine = dog(keys=keys, **stated)
+    assert qpos(engine, "front_thigh") == pytest.approx(thighs.get(start, 0.0))
+    assert qpos(engine, "back_thigh") == pytest.approx(0.2 if start else 0.0)
+    height = engine.robot.position[0, 2]
+    assert (height == pytest.approx(0.7)) == (start is not None)
+
+
+def test_a_pose_changes_joints_of_a_keyframe(dog):
+    engine = dog(keys=KEY.format(name="home", z=0.7, thigh=0.3), pose={"front_thigh": 0.4})
+    assert (qpos(engine, "front_thigh"), qpos(engine, "back_thigh")) == (0.4, 0.2)
+
+
+def test_only_the_robot_is_taken_from_a_world(dog):
+    engine = dog()
+    model = engine.model
+    names = [model.body(i).name for i in range(model.nbody)]
+    assert "robot/trunk" in names and not any("ball" in name for name in names)
+    planes = np.count_nonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    assert (planes, model.nlight) == (1, 1)  # the arena's
+    assert model.opt.timestep == 0.004
+    assert "to_ball" not in engine.observation_layout
+    left_out = ROBOTS["Dog"].file.left_out
+    assert left_out == ("body ball", "geom ground", "sensor to_ball")
+
+
+def test_gains_make_position_servos_within_range_and_force_limit(dog):
+    gains = {"*_thigh": GAINS, "front_calf": GAINS | {"force": 7.0}, "fan": GAINS}
+    engine = dog(actuators=gains, pose={"fan": 0.5})
+    model = engine.model
+    names = [model.actuator(i).name for i in range(model.nu)]
+    assert names == [f"robot/{n}" for n in ("front_thigh", "front_calf", "back_thigh", "fan")]
+    expected = np.deg2rad([[-45, 90], [-150, -30], [-45, 90], [-180, 180]])
+    expected[3] += 0.5  # half a turn either way of the pose
+    np.testing.assert_allclose(model.actuator_ctrlrange, expected)
+    np.testing.assert_array_equal(model.actuator_forcelimited, [0, 1, 0, 0])
+    np.testing.assert_array_equal(model.actuator_forcerange[1], [-7, 7])
+    # the file's defaults for actuators are not the servos'
+    assert (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE).all()
+    data = engine.batch.get_data(0)
+    data.qpos[model.joint("robot/front_thigh").qposadr] = 0.3
+    data.qvel[model.joint("robot/front_thigh").dofadr] = -0.7
+    data.ctrl[0] = 0.2
+    mujoco.mj_forward(model, data)
+    assert data.actuator_force[0] == pytest.approx(40 * (0.2 - 0.3) - 2 * -0.7)
+
+
+def test_an_offset_is_added_to_the_pose(dog):
+    pose = {"front_thigh": 0.4, "front_calf": -1.0}
+    engine = dog(action="offset", action_scale=0.1, pose=pose)
+    engine.step(np.array([[0, 1, -0.5, 0.0]] * 2))
+    ctrl = engine.batch.bind("ctrl")
+    np.testing.assert_allclose(ctrl[0], [0.4, -1.0 + 0.1, -0.05, 0.0])
+    np.testing.assert_allclose(engine.observe()[:, engine.observation_layout["last_action"]],
+                               [[0, 1, -0.5, 0.0]] * 2)  # fmt: skip
+    engine.reset(np.array([1]))
+    last = engine.observe()[:, engine.observation_layout["last_action"]]
+    assert last[0, 1] == 1.0 and not last[1].any()
+
+
+def test_what_no_sensor_covers_is_observed_as_a_scalar_computation_says(dog):
+    pose = {"front_calf": -1.0}
+    engine = dog(pose=pose)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        engine.step(rng.uniform(-1, 1, (2, 4)))
+    obs, layout, model = engine.observe(np.float64)[1], engine.observation_layout, engine.model
+    data = engine.batch.get_data(1)
+    joints = ["front_thigh", "front_calf", "back_thigh"]
+    rest = {"front_calf": -1.0}
+    turn = data.body("robot/trunk").xmat.reshape(3, 3)
+    expected = {
+        "joint_pos": [data.joint(f"robot/{j}").qpos[0] - rest.get(j, 0.0) for j in joints],
+        "joint_vel": [data.joint(f"robot/{j}").qvel[0] for j in [*joints, "fan"]],
+        "gravity": turn.T @ [0, 0, -1],
+        "base_linvel": turn.T @ data.qvel[:3],
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(obs[layout[name]], values, atol=1e-9, err_msg=name)
+    covered = {"base_angvel", "joint_turn"}  # by the gyro and by the sensor of the fan
+    assert not covered & set(layout) and {"imu_gyro", "fan_angle"} <= set(layout)
+    np.testing.assert_allclose(obs[layout["imu_gyro"]], data.qvel[3:6], atol=1e-6)
+    assert model.nsensor == 2
+
+
+def test_a_hinge_without_a_range_is_observed_as_a_direction(dog):
+    def change(text):
+        return text.replace('<jointpos name="fan_angle" joint="fan"/>', "")
+
+    engine = dog(change, pose={"fan": 0.3})
+    engine.batch.bind("qpos")[:, engine.model.joint("robot/fan").qposadr[0]] = 0.8
+    obs = engine.observe(np.float64)[0, engine.observation_layout["joint_turn"]]
+    np.testing.assert_allclose(obs, [np.sin(0.5), np.cos(0.5)])
+
+
+def test_observe_chooses(dog):
+    engine = dog(observe=("joint_pos", "imu_gyro", "base_angvel"))
+    seen = set(engine.observation_layout) - {"goal_compass", "hazards_lidar"}
+    assert seen == {"joint_pos", "imu_gyro", "base_angvel"}
+    engine.batch.bind("qvel")[:] = np.random.default_rng(0).normal(size=engine.batch.qvel.shape)
+    engine.batch.forward()
+    obs, layout = engine.observe(np.float64), engine.observation_layout
+    np.testing.assert_allclose(obs[:, layout["base_angvel"]], obs[:, layout["imu_gyro"]], atol=1e-9)
+
+
+def test_keepout_and_arena_follow_the_size(dog):
+    engine = dog()
+    assert engine.robot.keepout == pytest.approx(0.45, abs=0.05)
+    assert engine.arena.size == pytest.approx(5 * engine.robot.keepout, rel=0.1)
+    with own_parts():
+        stated = Scenario(robot="Dog", arena={"size": 7.0}, robot_params={"keepout": 0.1})
+        assert (stated.build().arena.size, stated.build().robot.keepout) == (7.0, 0.1)
+
+
+ARM = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos="4 5 0">
+      <geom type="cylinder" size="0.05 0.05" pos="0 0 0.05"/>
+      <body name="upper" pos="0 0 0.1">
+        <joint name="turn" axis="0 0 1"/>
+        <joint name="lift" axis="0 1 0" range="-90 90" limited="true"/>
+        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.3" density="500"/>
+        <body name="lower" pos="0 0 0.3">
+          <joint name="elbow" axis="0 1 0" range="-120 120" limited="true"/>
+          <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.2" density="500"/>
+          <site name="hand" pos="0 0 0.2"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def arm(tmp_path):
+    def write(suite="Goal_Crane_3Hazards", **attributes):
+        (tmp_path / "crane.xml").write_text(ARM)
+        attributes = {"actuators": GAINS, "center": "hand"} | attributes
+        register_robot("Crane", xml=tmp_path / "crane.xml", **attributes)
+        return Scenario.parse(suite)
+
+    with own_parts():
+        yield write
+
+
+def test_the_end_effector_of_an_arm_may_be_a_site(arm):
+    engine = arm(pose={"lift": 0.5}).build(2)
+    engine.seed(0, np.random.default_rng(0))
+    engine.seed(1, np.random.default_rng(1))
+    engine.reset(np.arange(2))
+    np.testing.assert_allclose(engine.robot.position[0, 2], 0.1 + 0.5 * np.cos(0.5), atol=1e-9)
+    np.testing.assert_allclose(np.hypot(*engine.robot.position[1, :2]), 0.5 * np.sin(0.5))
+    before = engine.robot.position.copy()
+    rewards = [engine.step(np.ones((2, 3))).reward for _ in range(10)]
+    assert np.abs(rewards).max() > 0  # the hand moves to or from the goal
+    engine.batch.bind("qvel")[:] = [1.0, 0.5, -0.5]
+    engine.batch.forward()
+    small = 1e-6
+    before, speed = engine.robot.position.copy(), engine.robot.velocity.copy()
+    engine.batch.bind("qpos")[:] += small * engine.batch.bind("qvel")
+    engine.batch.forward()
+    np.testing.assert_allclose((engine.robot.position - before) / small, speed, atol=1e-4)
+
+
+def test_reach_and_goals_follow_an_arms_length(arm):
+    scenario = arm()
+    engine = scenario.build(20)
+    reach = engine.robot.reach
+    assert 0.9 * 0.5 < reach < 0.6  # 0.6 m when stretched, of which 90 % counts
+    engine.reset(np.arange(20))
+    goals = engine.places("goal")[:, 0]
+    assert np.linalg.norm(goals, axis=1).max() <= reach
+    assert engine.task.size == pytest.approx(reach / 10, rel=0.02)
+    assert scenario.override(goal={"size": 0.2}).build().task.size == 0.2
+    planar = scenario.override(hazards={"space": "planar"}).build()
+    assert planar.constraints[0].planar
+
+
+def test_clearance_of_an_arm_is_that_of_its_nearest_link(arm):
+    engine = arm(pose={"lift": 0.7, "elbow": -1.0}).build()
+    engine.reset(ROW)
+    data, rng = engine.batch.get_data(0), np.random.default_rng(0)
+    points = rng.uniform([-0.5, -0.5, -0.1], [0.5, 0.5, 0.9], (1, 20, 3))
+    gaps = engine.robot.clearance(points, False)[0]
+    hand = data.site("robot/hand").xpos
+    joints = [data.body(f"robot/{b}").xpos for b in ("upper", "lower")] + [hand]
+    for point, gap in zip(points[0], gaps, strict=True):
+        links = []
+        for start, end in ((joints[0], joints[1]), (joints[1], joints[2])):
+            share = np.clip((point - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
+            links.append(np.linalg.norm(point - start - share * (end - start)) - 0.02)
+        base = np.linalg.norm(point - [0, 0, 0.05]) - 0.05  # a cylinder as wide as high
+        assert gap == pytest.approx(min(*links, base), abs=1e-9)
+
+
+@pytest.mark.parametrize("robot", ["dog", "arm"])
+def test_rows_are_lone_environments(robot, request):
+    request.getfixturevalue(robot)()
+    name = {"dog": "Dog", "arm": "Crane"}[robot]
+    assert_rows_are_lone_environments(f"Goal_{name}_2Hazards")

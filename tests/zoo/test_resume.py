@@ -167,7 +167,7 @@ def test_our_own_environments(vec_env, tmp_path, monkeypatch):
                  "--eval-episodes", "1", "--n-eval-envs", "1"]  # fmt: skip
     assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
     crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], 150)
-    assert train.main(["-i", str(runs_of(tmp_path / "cut")), *TOY[:2]]) == 0
+    assert train.main(["-i", str(runs_of(tmp_path / "cut"))]) == 0
     one, other = runs_of(tmp_path / "whole"), runs_of(tmp_path / "cut")
     for name in ("checkpoint.zip", "Goal_Point_3Hazards-v0.zip", "best_model.zip"):
         if (one / name).exists():

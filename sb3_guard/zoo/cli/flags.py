@@ -32,7 +32,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from sb3_guard.spelling import did_you_mean
@@ -166,6 +166,21 @@ class Command:
     def values(self, *roles: str) -> dict[str, Any]:
         """The flags by name, of these roles only if any are named."""
         return {name: getattr(self, name) for name in sorted(self.names(*roles))}
+
+    def words(self, names: Collection[str]) -> list[str]:
+        """What :meth:`parse` reads as these flags; those that have their default are left out."""
+        words = []
+        for field, _ in self._flags():
+            value, name = getattr(self, field.name), _names(field)[-1]
+            if field.name not in names or value == _default(field):
+                continue
+            if isinstance(value, bool):
+                words.append(name if value else name.replace("--", "--no-", 1))
+            elif isinstance(value, Mapping):
+                words += [name, *(f"{key}:{item}" for key, item in value.items())]
+            else:
+                words += [name, *map(str, value if isinstance(value, list) else [value])]
+        return words
 
     @classmethod
     def names(cls, *roles: str) -> set[str]:

@@ -98,21 +98,11 @@ class Experiment:
 
         :raises UsageError: the environment refuses a value, or a limit does not fit the costs
         """
-        flags, number, kwargs = self.flags, self.flags.n_eval_envs, self.flags.eval_env_kwargs
-        if number is None:
-            # All episodes at once where that is cheap; a process each would not be.
-            number = flags.eval_episodes if flags.vec_env == "native" else 1
-        seed = evaluation_seed(flags.seed)
-        env = self.make_envs(
-            number,
-            seed,
-            evaluation=True,
-            env_kwargs=self.setup.env_kwargs if kwargs is None else kwargs,
-        )
+        flags = self.flags
         evaluation = CostEvalCallback(
-            env,
+            self.make_evaluation_envs(flags.eval_episodes),
             selection_limit=self.setup.selection_limit,
-            seed=seed,
+            seed=evaluation_seed(flags.seed),
             n_eval_episodes=flags.eval_episodes,
             eval_freq=max(flags.eval_freq // self.setup.n_envs, 1),
             verbose=int(flags.verbose > 0 and self.prints_tables),
@@ -121,6 +111,20 @@ class Experiment:
         with explained("hyper-parameter", ValueError):
             evaluation.limits()
         return evaluation
+
+    def make_evaluation_envs(self, episodes: int) -> VecEnv:
+        """
+        Environments to play so many episodes in, with costs and observations as in training.
+
+        :raises UsageError: the environment refuses a value
+        """
+        flags, number, kwargs = self.flags, self.flags.n_eval_envs, self.flags.eval_env_kwargs
+        if number is None:
+            # All episodes at once where that is cheap; a process each would not be.
+            number = episodes if flags.vec_env == "native" else 1
+        kwargs = self.setup.env_kwargs if kwargs is None else kwargs
+        seed = evaluation_seed(flags.seed)
+        return self.make_envs(number, seed, evaluation=True, env_kwargs=kwargs)
 
     @property
     def prints_tables(self) -> bool:

@@ -1,5 +1,6 @@
 """The flags of a run, as ``args.yml`` in its folder keeps them; other commands share some."""
 
+import shlex
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
@@ -12,6 +13,10 @@ from sb3_guard.zoo.cli.usage import (
     seed_or_random,
     steps,
 )
+
+# Flags beside those of role IDENTITY that a run is trained again with: hyperparameters are stated
+# by its folder, and threads change the order of sums.
+AGAIN = ("n_timesteps", "hyperparams", "conf_file", "env_kwargs", "gym_packages", "num_threads")
 
 
 @dataclass
@@ -125,6 +130,12 @@ class RunFlags(EvaluationFlags, TrainingFlags):
         """
         common = {name: value for name, value in other.values().items() if name in cls.names()}
         return cls.of({**common, **own})
+
+    def command(self) -> str:
+        """The command line that trains the same run again, wherever its files go."""
+        names = {*self.names(IDENTITY), *AGAIN} - {"algo", "env"}
+        words = ["--algo", self.algo, "--env", self.env, *self.words(names)]
+        return shlex.join(["sb3-guard", "train", *words])
 
     def check(self) -> None:
         """

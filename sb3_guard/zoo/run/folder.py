@@ -1,10 +1,13 @@
 """One training run on disk, laid out as RL-Zoo lays it out, and owned by one process at a time."""
 
+import csv
 import errno
 import glob
+import hashlib
 import json
 import math
 import os
+import re
 import shlex
 import socket
 import sys
@@ -239,10 +242,23 @@ class RunFolder:
         """Replace what :meth:`create` wrote, e.g. to make a finished run longer."""
         _write(self.params, _dump(args, hyperparams))
 
+    def curve_hash(self) -> str:
+        """SHA-256 of step, return and cost of all training episodes: runs alike have the same."""
+        digest, step = hashlib.sha256(), 0
+        with self.monitor.open(newline="") as file:
+            next(file)  # SB3's header, which has the time
+            for episode in csv.DictReader(file):
+                step += int(episode["l"])
+                digest.update(f"{step},{episode['r']},{episode['c']}\n".encode())
+        return digest.hexdigest()
+
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Mark the run as complete."""
+        text = json.dumps(result, indent=2)
+        # Numbers of one list go on one line.
+        text = re.sub(r'\[[^][{}"]+\]', lambda numbers: " ".join(numbers[0].split()), text)
         with replacing(self.result) as file:
-            file.write(json.dumps(result, indent=2).encode())
+            file.write(text.encode())
 
     def checked_result(self) -> dict[str, Any]:
         """

@@ -62,9 +62,13 @@ def seed_rows(env: VecEnv, seed: int, *key: int) -> None:
     env.unwrapped._seeds = list(row_seeds(seed, env.num_envs, *key))
 
 
-def evaluation_seed(seed: int) -> int:
-    """The seed that a run of this seed evaluates with; row i plays ``evaluation_seed + i``."""
-    return row_seeds(seed, 1, 1)[0] // 2
+def evaluation_seed(seed: int, *key: int) -> int:
+    """
+    The seed that a run of this seed evaluates with; row i plays ``evaluation_seed + i``.
+
+    :param key: 1 for the episodes after training, which are not those that chose the best model
+    """
+    return row_seeds(seed, 1, 1, *key)[0] // 2
 
 
 def source_of(env_id: str) -> Source:

@@ -13,12 +13,13 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
-from sb3_guard.common.evaluation import bounded_name
+from sb3_guard.common.evaluation import bounded_name, estimate, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.cli.usage import (
@@ -43,9 +44,14 @@ from sb3_guard.zoo.run.logger import RunLogger
 from sb3_guard.zoo.run.make_envs import (
     BAD_NUMBERS,
     PROCESS_DIED,
+    evaluation_seed,
 )
 from sb3_guard.zoo.run.progress import Epochs
 from sb3_guard.zoo.run.tracking import Tracker
+
+FINAL_EPISODES = 100  # of each policy, after training
+#: what is played after training: the policy that was trained, and its most likely actions
+SPLITS = ("stochastic", "greedy")
 
 
 class Training:
@@ -190,18 +196,66 @@ class Training:
         with interrupts(stop) as received, ExitStack() as last:
             last.callback(epochs.on_training_end)  # leaves the terminal tidy
             finished = self._learn(callbacks)
+            logger.close()
+            result = self._finish(folder, epochs.result(), finished)
+        if verbose:
+            print(summary(folder, self.flags, result, time.monotonic() - began, finished))
+        return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
+
+    def _finish(
+        self, folder: RunFolder, result: Mapping[str, Any], finished: bool
+    ) -> dict[str, Any]:
+        """Save the agent; if training is finished, play it and write the result."""
         with replacing(folder.model) as file:
             self.model.save(file)
         normalizer = self.model.get_vec_normalize_env()
         if normalizer is not None:
             normalizer.save(str(folder.normalizer))
-        logger.close()
-        result = epochs.result()
+        final = self._play_final() if finished else {}
+        result = {"algo": self.flags.algo, "env": self.flags.env, **result, "final": final}
         if finished:
-            folder.write_result({"algo": self.flags.algo, "env": self.flags.env, **result})
-        if verbose:
-            print(summary(folder, self.flags, result, time.monotonic() - began, finished))
-        return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
+            made = {"command": folder.flags().command(), "curve": folder.curve_hash()}
+            folder.write_result(result | made)
+        return result
+
+    def _play_final(self) -> dict[str, dict[str, Any]]:
+        """
+        Play 100 episodes of the final policy twice: with sampled actions, and with its mean.
+
+        :return: ``returns``, ``costs`` and ``lengths``, a number an episode, of ``stochastic`` and
+            ``greedy`` actions, and ``bounded``, what the limits bound by cost key, where that is
+            something else than the cost. Empty after a training of less than eight episodes: an
+            eighth of its episodes is the most that each policy plays
+        """
+        episodes = min(FINAL_EPISODES, find_monitor(self.env).episode_count // 8)
+        if not episodes:
+            return {}
+        env = self.experiment.make_evaluation_envs(episodes)
+        final: dict[str, dict[str, Any]] = {}
+        try:
+            if self.model.get_vec_normalize_env() is not None:
+                sync_envs_normalization(self.env, env)
+            for name in SPLITS:
+                played = evaluate_policy(
+                    self.model,
+                    env,
+                    episodes,
+                    deterministic=name == "greedy",
+                    seed=evaluation_seed(self.flags.seed, 1),
+                    # Nothing says that an episode of the greedy policy ends.
+                    max_steps=self.model.num_timesteps // env.num_envs,
+                )
+                final[name] = {
+                    "returns": _rounded(played.returns),
+                    "costs": _rounded(played.costs),
+                    "lengths": played.lengths.tolist(),
+                }
+                if len(played.cost_keys) > 1 or played.limit_on == "max":
+                    bounded = zip(played.cost_keys, played.limited.T, strict=True)
+                    final[name]["bounded"] = {key: _rounded(costs) for key, costs in bounded}
+        finally:
+            env.close()
+        return final
 
     def _learn(self, callbacks: list[BaseCallback]) -> bool:
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
@@ -223,6 +277,11 @@ class Training:
                 "(--verbose 2 shows where)"
             ) from error
         return True
+
+
+def _rounded(values: np.ndarray) -> list[float]:
+    """Numbers of six significant digits, for a file."""
+    return [float(f"{value:.6g}") for value in values]
 
 
 def summary(
@@ -254,6 +313,11 @@ def summary(
             for key, cost in ({} if alone else costs).items()
         ),
         f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
+        *(
+            f"  final, {name:<12}return {np.mean(played['returns']):.3f}, cost "
+            f"{estimate(np.array(played['costs']))}"
+            for name, played in result["final"].items()
+        ),
     ]
     packages = packages_flag(flags.gym_packages)
     if not finished:

@@ -1,0 +1,1 @@
+project/test_layering.py

@@ -1,1 +1,0 @@
-project/test_layering.py

@@ -5,6 +5,7 @@ colour-blind readers; line styles and markers tell algorithms apart without them
 """
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from functools import cached_property
 from itertools import cycle
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ import pandas as pd
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.results.curves import read_curve
 from sb3_guard.zoo.results.runs import REFERENCE, described
+from sb3_guard.zoo.results.splits import FINAL, judge, read_splits
 from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize
 
 # Text, axes and the reference; a grey that is readable on white and on black. No other colour is
@@ -67,6 +69,25 @@ class Data:
         scores = normalize(self.means, self.means)
         families = by_family(scores).rename(columns={"family": "algo"})
         return pd.concat([scores, families]).set_index(["suite", "algo"])
+
+    @cached_property
+    def splits(self) -> pd.DataFrame:
+        """How limits are kept, see :func:`~sb3_guard.zoo.results.splits.judge`."""
+        return judge(self.runs)
+
+    def final_splits(self, suite: str) -> list[str]:
+        """The splits of a suite that say most of its agents: the final ones, if there are any."""
+        have = {*self.splits.loc[self.splits["suite"] == suite, "split"]}
+        return [split for split in FINAL if split in have] or sorted(have)
+
+    def costs_of(self, suite: str, algo: str, split: str) -> np.ndarray:
+        """The costs of all seeds' episodes of a split, in their order; none: there are none."""
+        own = self.runs[(self.runs["suite"] == suite) & (self.runs["algo"] == algo)]
+        costs: list[Any] = [np.zeros(0)]
+        for path, epoch in zip(own["path"], own["epoch"], strict=True):
+            with suppress(UsageError):
+                costs += [read_splits(path, epoch).get(split, pd.DataFrame({"M_c": []}))["M_c"]]
+        return np.sort(np.concatenate(costs))
 
     @cached_property
     def looks(self) -> dict[str, Look]:

@@ -17,7 +17,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_guard.zoo.results.figure_data import INK, Data
+from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
+from sb3_guard.zoo.results.splits import SPLITS
 from sb3_guard.zoo.results.statistics import SCORES, interval, mean_curve, normalize, overall
 from sb3_guard.zoo.results.tables import written
 
@@ -48,6 +49,15 @@ STYLE: dict[Any, Any] = {
                     "grid.color")
     },
 }  # fmt: skip
+
+
+# Colour and marker
+TIER_STYLES = {
+    "certified": (COLORS[2], "o"),
+    "undecided": (COLORS[4], "D"),
+    "violating": (COLORS[1], "X"),
+    "": (INK, "s"),
+}
 
 
 class Drawing(NamedTuple):
@@ -215,6 +225,57 @@ def pareto(data: Data, suite: str) -> Figure | None:
     figure = Figure(figsize=(width, 0.6 * WIDTH), layout="constrained")
     for axis, cost in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
         draw_pareto(axis, data, suite, cost)
+    return figure
+
+
+def _split_axes(data: Data, suite: str, height: float) -> tuple[Figure | None, dict[str, Axes]]:
+    """A figure with a panel for each split that tells most of a suite's agents, if any does."""
+    splits = data.final_splits(suite)
+    if not splits:
+        return None, {}
+    size = WIDTH * (0.6 if len(splits) == 1 else 1), height
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(1, len(splits), sharex=True, sharey=True, squeeze=False)[0]
+    for split, axis in zip(splits, panels, strict=True):
+        axis.set(title=f"{suite}, {SPLITS[split]}", xlabel="episode cost")
+    return figure, dict(zip(splits, panels, strict=True))
+
+
+def cdf(data: Data, suite: str) -> Figure | None:
+    """Share of the episodes that cost at most x, of the final policies, a figure per suite."""
+    figure, panels = _split_axes(data, suite, height=3.4)
+    for split, axis in panels.items():
+        drawn = []
+        for algo in data.algos(suite):
+            costs = data.costs_of(suite, algo, split)
+            if len(costs):
+                share = np.arange(1, len(costs) + 1) / len(costs)
+                # From a share of 0 on, and on to the end of the axis.
+                x, y = [0.0, *costs, 1e9], [0.0, *share, 1.0]
+                axis.step(x, y, where="post", linewidth=1.5, **data.looks[algo].line)
+                drawn.append(costs[: -len(costs) // 50 or None])
+        axis.set_xlim(0, max(map(np.max, drawn), default=0.0) or 1.0)
+        draw_limit(axis.axvline, data, suite, "M_c")
+        axis.set(ylim=(-0.02, 1.02), ylabel="share of episodes")
+        axis.label_outer()
+    return figure
+
+
+def tiers(data: Data, suite: str) -> Figure | None:
+    """Mean costs with 95 % intervals beside the limit: certified or not, a figure per suite."""
+    algos = data.algos(suite)[::-1]
+    figure, panels = _split_axes(data, suite, height=1.4 + 0.28 * len(algos))
+    for split, axis in panels.items():
+        rows = data.splits[(data.splits["suite"] == suite) & (data.splits["split"] == split)]
+        for row in rows.to_dict("records"):
+            y, style = algos.index(row["algo"]), TIER_STYLES[row["tier"]]
+            color, marker = style
+            axis.plot([row["low"], row["high"]], [y, y], color=color, linewidth=4, alpha=0.5)
+            name = row["tier"] or "no limit"
+            axis.scatter(row["cost"], y, s=36, color=color, marker=marker, label=name, zorder=3)
+        axis.set_yticks(range(len(algos)), [data.looks[algo].label for algo in algos])
+        limit = draw_limit(axis.axvline, data, suite, "M_c")
+        fit_costs(axis, [rows["high"], rows["cost"], limit], "x")
     return figure
 
 

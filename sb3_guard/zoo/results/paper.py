@@ -16,6 +16,7 @@ from sb3_guard.zoo.results.figures import (
     STYLE,
     WIDTH,
     Drawing,
+    cdf,
     curves,
     curves_of,
     finish,
@@ -23,6 +24,7 @@ from sb3_guard.zoo.results.figures import (
     iqm,
     pareto,
     profiles,
+    tiers,
 )
 from sb3_guard.zoo.results.runs import REFERENCE
 from sb3_guard.zoo.results.statistics import SCORES
@@ -194,7 +196,7 @@ def q8(data: Data) -> Figure | None:
     return draw_spiders(spiders, spokes, POLYGONS) if spiders else None
 
 
-PER_SUITE = (curves, pareto)
+PER_SUITE = (curves, pareto, cdf, tiers)
 FIGURES: dict[str, Callable[..., Figure | None]] = {
     function.__name__: function
     for function in (*PER_SUITE, profiles, iqm, q1, q2, q3, q4, q5, q6, q7, q8)

@@ -62,12 +62,37 @@ def interval(
 # One run
 
 
+def last_epochs(episodes: pd.DataFrame, epoch: float) -> pd.DataFrame:
+    """
+    The episodes of the last ten epochs of a run, with their ``epoch``'s number.
+
+    :param episodes: see :func:`~sb3_guard.zoo.results.curves.read_episodes`
+    :param epoch: steps; NaN: 30,000, or a twentieth of a shorter run
+    """
+    size = epoch if epoch > 0 else min(EPOCH, episodes["step"].iloc[-1] / 20)
+    numbered = episodes.assign(epoch=np.ceil(episodes["step"] / size))
+    return numbered[numbered["epoch"] > numbered["epoch"].iloc[-1] - EPOCHS]
+
+
+def judging_limits(runs: pd.DataFrame) -> "pd.Series[float]":
+    """
+    The limit that each run is judged by, NaN: none.
+
+    That of an unconstrained run is the limit of the others on its suite, if it is the same for all.
+    """
+    limits = runs.groupby("suite")["cost_limit"].unique().map(lambda all_: all_[~np.isnan(all_)])
+    common = runs["suite"].map(
+        lambda suite: limits[suite][0] if len(limits[suite]) == 1 else math.nan
+    )
+    return runs["cost_limit"].where(runs["limits"].notna(), common).astype(float)
+
+
 def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, float]:
     """
     What users ask about the safety of a run; all but ``cost_total`` of its last ten epochs.
 
     :param episodes: see :func:`~sb3_guard.zoo.results.curves.read_episodes`
-    :param epoch: steps; NaN: 30,000, or a twentieth of a shorter run
+    :param epoch: steps, see :func:`last_epochs`
     :param limit: of an episode's cost; NaN: there is none
     :return: ``return_last`` and ``cost_last``, means over epochs of their episodes' means;
         ``above_limit``, the part of the episodes whose cost exceeds the limit; ``cost_p95`` and
@@ -75,11 +100,8 @@ def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, floa
         of all training; ``feasible_iqm``, the interquartile mean of the returns of the episodes
         within the limit (NaN: none is)
     """
-    total = episodes["step"].iloc[-1]
-    size = epoch if epoch > 0 else min(EPOCH, total / 20)
-    number: Any = np.ceil(episodes["step"] / size)
-    last = episodes[number > number.iloc[-1] - EPOCHS]
-    means = last.groupby(number)[["J_r", "M_c"]].mean().mean()
+    last = last_epochs(episodes, epoch)
+    means = last.groupby("epoch")[["J_r", "M_c"]].mean().mean()
     within = last.loc[last["M_c"] <= limit, "J_r"]
     return {
         "return_last": means["J_r"],
@@ -96,21 +118,17 @@ def with_safety(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The table of runs with the columns of :func:`safety`; NaN where episodes can't be read.
 
-    Unconstrained runs are judged by the limit of the others on their suite, if that is the same for
-    all of them.
+    They are judged by :func:`judging_limits`.
     """
-    limits = runs.groupby("suite")["cost_limit"].unique().map(lambda all_: all_[~np.isnan(all_)])
 
     def row(run: Any) -> dict[str, float]:
-        others = limits[run["suite"]]
-        common = others[0] if len(others) == 1 else math.nan
-        limit = common if pd.isna(run["limits"]) else run["cost_limit"]
         try:
-            return safety(read_episodes(run["path"]), run["epoch"], limit)
+            return safety(read_episodes(run["path"]), run["epoch"], run["judged_by"])
         except UsageError:
             return dict.fromkeys(SAFETY, math.nan)
 
-    rows = [row(run) for run in runs.to_dict("records")]
+    limited = runs.assign(judged_by=judging_limits(runs))
+    rows = [row(run) for run in limited.to_dict("records")]
     return runs.assign(**pd.DataFrame(rows, columns=list(SAFETY), index=runs.index, dtype=float))
 
 

@@ -149,6 +149,26 @@ SAFETY_HEADINGS: Columns = {
 }
 
 
+def _splits(runs: pd.DataFrame) -> pd.DataFrame:
+    """Whether the policies of training and those after it keep their limits."""
+    from sb3_guard.zoo.results.splits import SPLITS, judge
+
+    def cost(row: Any) -> str:
+        ends = f"[{number(row['low'], 1)}, {number(row['high'], 1)}]"
+        return f"{spread(row['cost'], row['cost_std'], 1)} {ends}"
+
+    columns: Columns = {
+        "suite": "suite", "algorithm": "label", "episodes": lambda row: SPLITS[row["split"]],
+        "seeds": whole("seeds"),
+        "return": lambda row: spread(row["return"], row["return_std"]),
+        "cost": cost,
+        "limit": lambda row: "–" if pd.isna(row["limit"]) else f"{row['limit']:g}: {row['tier']}",
+        "above limit, %": lambda row: number(100 * row["above"], 1),
+        "D⁺": "excess",
+    }  # fmt: skip
+    return spelled(judge(runs), columns)
+
+
 def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """
     The tables of a report as text, by title.
@@ -170,6 +190,7 @@ def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
         ),
         "Limits": _limits(means),
         "Safety": spelled(means, {**who, **SAFETY_HEADINGS}),
+        "Tiers": _splits(runs),
     }
     result = {title: table for title, table in result.items() if len(table)}
     if scores[["reward", "cost"]].isna().all(axis=None):

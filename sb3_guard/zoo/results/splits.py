@@ -1,0 +1,134 @@
+"""The three kinds of episodes that agents are judged by, and what their costs say of a limit.
+
+Share of violations, D⁺ and tiers follow SafeRLEval (arXiv 2609.15315).
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.results.curves import read_episodes
+from sb3_guard.zoo.results.statistics import RESAMPLES, judging_limits, last_epochs
+
+#: by key what was played; the final ones are in ``result.json``, see ``Training``
+SPLITS = {
+    "training": "training episodes",
+    "stochastic": "final stochastic",
+    "greedy": "final greedy",
+}
+FINAL = ("stochastic", "greedy")
+TIERS = ("certified", "undecided", "violating")
+
+
+def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataFrame]:
+    """
+    The episodes of a run by split.
+
+    :param path: the run folder
+    :param epoch: steps, as for :func:`~sb3_guard.zoo.results.statistics.last_epochs`
+    :return: for each of :data:`SPLITS` that the run has, its episodes' ``J_r`` and ``M_c``: of
+        training those of the last ten epochs. Runs of older versions have no final ones
+    :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
+    """
+    splits = {"training": last_epochs(read_episodes(path), epoch)[["J_r", "M_c"]]}
+    played = json.loads((Path(path) / "result.json").read_bytes()).get("final", {})
+    for split, episodes in played.items():
+        splits[split] = pd.DataFrame({"J_r": episodes["returns"], "M_c": episodes["costs"]})
+    return splits
+
+
+def violations(costs: np.ndarray, limit: float) -> tuple[float, float]:
+    """
+    How often and how far single episodes exceed a limit.
+
+    :param costs: of episodes, [E]
+    :param limit: d
+    :return: the share of the episodes with C > d; and D⁺, the mean of (C − d)/|d| over those, or of
+        C − d where d = 0; NaN if there are none
+    """
+    excess = costs[costs > limit] - limit
+    if not len(excess):
+        return 0.0, math.nan
+    return len(excess) / len(costs), float(excess.mean()) / (abs(limit) or 1.0)
+
+
+def nested_interval(seeds: Sequence[np.ndarray]) -> tuple[float, float]:
+    """
+    A 95 % percentile bootstrap interval of the mean over seeds and episodes.
+
+    Seeds are drawn with replacement, then episodes of each drawn seed; every seed weighs the same.
+    Of a single seed the interval tells nothing about another.
+
+    :param seeds: costs of the episodes of each seed, [E_s] each, at least one seed
+    """
+    rng = np.random.default_rng(0)
+    drawn = rng.integers(len(seeds), size=(RESAMPLES, len(seeds)))
+    means = np.zeros(drawn.shape)
+    for number, costs in enumerate(seeds):
+        here = drawn == number
+        rows = rng.integers(len(costs), size=(np.count_nonzero(here), len(costs)))
+        means[here] = costs[rows].mean(axis=1)
+    low, high = np.quantile(means.mean(axis=1), [0.025, 0.975])
+    return float(low), float(high)
+
+
+def tier(low: float, high: float, limit: float) -> str:
+    """Of :data:`TIERS`, by the interval of the mean cost and the limit; empty without a limit."""
+    if math.isnan(limit):
+        return ""
+    return "certified" if high <= limit else "violating" if low > limit else "undecided"
+
+
+def judge(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    How agents of an algorithm keep their limit, a row per suite, algorithm and split.
+
+    :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
+    :return: ``suite``, ``algo``, ``label``, ``split``, ``seeds``, ``limit`` (of unconstrained
+        algorithms that of the others; NaN: none), ``return`` and ``cost``, means over seeds of
+        their episodes' means, with ``_std`` (over seeds; NaN for one), ``low`` and ``high`` of
+        the cost (:func:`nested_interval`), ``tier``, ``above`` and ``excess``
+        (:func:`violations`, of all seeds' episodes)
+    """
+    rows = []
+    limited = runs.assign(judged_by=judging_limits(runs))
+    for (suite, algo), own in limited.groupby(["suite", "algo"], sort=False):
+        found: dict[str, list[pd.DataFrame]] = {split: [] for split in SPLITS}
+        for path, epoch in zip(own["path"], own["epoch"], strict=True):
+            try:
+                splits = read_splits(path, epoch)
+            except UsageError:
+                continue
+            for split, episodes in splits.items():
+                found[split].append(episodes)
+        names = {"suite": suite, "algo": algo, "label": own["label"].iloc[0]}
+        for split, seeds in found.items():
+            if seeds:
+                rows.append({**names, "split": split, **_row(seeds, own["judged_by"].iloc[0])})
+    return pd.DataFrame(rows)
+
+
+def _row(seeds: Sequence[pd.DataFrame], limit: float) -> dict[str, object]:
+    """The statistics of a split."""
+    means = pd.DataFrame([episodes.mean() for episodes in seeds])
+    costs = [episodes["M_c"].to_numpy(float) for episodes in seeds]
+    low, high = nested_interval(costs)
+    above, excess = violations(np.concatenate(costs), limit)
+    return {
+        "seeds": len(seeds),
+        "limit": limit,
+        "return": means["J_r"].mean(),
+        "return_std": means["J_r"].std(),
+        "cost": means["M_c"].mean(),
+        "cost_std": means["M_c"].std(),
+        "low": low,
+        "high": high,
+        "tier": tier(low, high, limit),
+        "above": math.nan if math.isnan(limit) else above,
+        "excess": excess,
+    }

@@ -1,0 +1,127 @@
+"""Whether limits are kept, by split: each statistic against one worked out by hand."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from fake_runs import fake_run
+
+from sb3_guard.zoo.results.figure_data import Data
+from sb3_guard.zoo.results.figures import TIER_STYLES
+from sb3_guard.zoo.results.paper import draw
+from sb3_guard.zoo.results.runs import read_results
+from sb3_guard.zoo.results.splits import judge, nested_interval, read_splits, tier, violations
+from sb3_guard.zoo.results.statistics import with_safety
+from sb3_guard.zoo.results.tables import tables
+
+NONE = pytest.approx(math.nan, nan_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("costs", "limit", "share", "excess"),
+    [
+        ([1, 2, 3, 6], 2, 2 / 4, (1 / 2 + 4 / 2) / 2),
+        ([0, 0, 1, 3], 0, 2 / 4, (1 + 3) / 2),  # in units of cost
+        ([-1, -3], -2, 1 / 2, 1 / 2),  # a limit from below
+        ([1, 2], 2, 0, NONE),
+    ],
+)
+def test_violations(costs, limit, share, excess):
+    assert violations(np.array(costs, float), limit) == (share, excess)
+
+
+def test_the_interval_is_over_seeds_and_episodes():
+    seeds = [np.array([0.0, 2.0, 10.0]), np.array([20.0, 30.0])]
+    means = [
+        ((np.mean(a) + np.mean(b)) / 2, 1 / 4 / len(s) ** len(s) / len(t) ** len(t))
+        for s, t in itertools.product(seeds, repeat=2)
+        for a in itertools.product(s, repeat=len(s))
+        for b in itertools.product(t, repeat=len(t))
+    ]
+    values, weights = np.array(sorted(means)).T
+    assert weights.sum() == pytest.approx(1)
+    ends = [values[np.searchsorted(weights.cumsum(), part)] for part in (0.025, 0.975)]
+    assert nested_interval(seeds) == pytest.approx(ends, abs=0.7)
+    assert ends == [2.0, 27.5]
+
+
+def test_the_interval_of_a_single_seed_is_over_its_episodes():
+    costs = np.random.default_rng(1).exponential(10, size=400)
+    low, high = nested_interval([costs])
+    half = 1.96 * costs.std() / 20
+    assert (low, high) == pytest.approx((costs.mean() - half, costs.mean() + half), abs=0.15)
+
+
+def test_tiers():
+    assert tier(1, 2, 2) == "certified"
+    assert tier(2, 3, 2) == tier(1, 3, 2) == "undecided"
+    assert tier(2.1, 3, 2) == "violating"
+    assert tier(1, 2, math.nan) == ""
+
+
+def final(stochastic, greedy) -> dict:
+    return {
+        name: {"returns": [10.0 + k for k in range(len(costs))], "costs": costs}
+        for name, costs in (("stochastic", stochastic), ("greedy", greedy))
+    }
+
+
+@pytest.fixture
+def runs(tmp_path):
+    limit = {"config": {"cost_limit": 5.0}, "cost_limit": 5.0}
+    fake_run(tmp_path, "cpo", seed=0, **limit, final=final([1.0, 3.0], [4.0, 4.0]))
+    fake_run(tmp_path, "cpo", seed=1, **limit, final=final([2.0, 4.0], [9.0, 9.0]))
+    fake_run(tmp_path, "trpo", seed=0, final=final([6.0, 16.0], [7.0, 8.0]))
+    return with_safety(read_results([tmp_path]).runs)
+
+
+def test_a_row_for_each_split(runs):
+    table = judge(runs).set_index(["algo", "split"])
+    row = table.loc["cpo", "stochastic"]
+    assert (row["seeds"], row["limit"], row["tier"]) == (2, 5, "certified")
+    assert (row["return"], row["return_std"]) == (10.5, 0)
+    assert (row["cost"], row["cost_std"]) == (2.5, pytest.approx(0.5**0.5))  # seeds: 2 and 3
+    assert (row["above"], row["excess"]) == (0, NONE)
+    row = table.loc["cpo", "greedy"]
+    # Both seeds are drawn twice in a quarter of the samples each.
+    assert (row["low"], row["high"], row["tier"]) == (4, 9, "undecided")
+    assert (row["above"], row["excess"]) == (0.5, (9 - 5) / 5)
+    row = table.loc["trpo", "stochastic"]  # judged by the limit of the others
+    assert (row["tier"], row["above"], row["excess"]) == (
+        "violating",
+        1,
+        pytest.approx((0.2 + 2.2) / 2),
+    )
+    # fake_run's last ten epochs are whole: 60 episodes of cost 5 ± a noise whose mean is 0.
+    assert table.loc["cpo", "training"]["cost"] == pytest.approx(5)
+    text = tables(runs)["Tiers"]
+    cells = text[text["episodes"] == "final greedy"].set_index("algorithm").loc["CPO"]
+    assert cells["limit"] == "5: undecided" and cells["cost"] == "6.5\xa0±\xa03.5 [4.0, 9.0]"
+    assert cells["above limit, %"] == "50.0" and cells["D⁺"] == "0.80"
+
+
+def test_runs_of_older_versions_have_the_training_only(tmp_path):
+    path = fake_run(tmp_path)
+    assert [*read_splits(path)] == ["training"]
+    (table,) = (judge(with_safety(read_results([tmp_path]).runs)),)
+    assert table["split"].tolist() == ["training"]
+
+
+def test_the_distribution_of_costs_is_drawn(runs):
+    (drawing,) = draw("cdf", Data(runs))
+    greedy = drawing.figure.axes[1]
+    assert "final greedy" in greedy.get_title()
+    line = {line.get_label(): line for line in greedy.lines}["CPO"]
+    x, y = line.get_data()
+    below = [y[np.flatnonzero(x <= cost)[-1]] for cost in (3.9, 4, 8.9, 9)]
+    assert below == [0, 0.5, 0.5, 1]
+
+
+def test_tiers_are_drawn(runs):
+    (drawing,) = draw("tiers", Data(runs))
+    stochastic, greedy = drawing.figure.axes
+    assert [label.get_text() for label in stochastic.get_yticklabels()] == ["CPO", "TRPO"]
+    (cpo,) = (line for line in greedy.lines if [*line.get_ydata()] == [0, 0])
+    assert [*cpo.get_xdata()] == [4, 9] and cpo.get_color() == TIER_STYLES["undecided"][0]
+    assert stochastic.collections[0].get_label() in ("certified", "violating")

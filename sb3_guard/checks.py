@@ -9,6 +9,10 @@ class NumberError(FloatingPointError, ValueError):
     """A reward, cost, observation, action or loss is a number that nothing can be learnt from."""
 
 
+class WorldError(Exception):
+    """One of our environments can't be: it has no layout, no picture, or a part that is wrong."""
+
+
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number; booleans are not."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)

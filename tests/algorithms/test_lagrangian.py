@@ -67,6 +67,37 @@ def test_pid_by_hand() -> None:
     )
 
 
+def test_relative_violations_by_hand() -> None:
+    """η = 0.5, K_P = 2, d = 4: violations 0.25, 1 (of 2.5), -1 (of -1), 0."""
+    multiplier = Multiplier(1, 0.5, proportional=2.0, relative=True)
+    values = follow(multiplier, [5.0, 14.0, 0.0, 4.0], 4.0)
+    np.testing.assert_allclose(values, [0.125 + 0.5, 0.625 + 2.0, 0.0, 0.125])
+
+
+@pytest.mark.parametrize("scale", [0.01, 100.0])
+def test_relative_multipliers_do_not_know_the_unit(scale: float) -> None:
+    costs = [5.0, 14.0, 3.0, 4.5]
+    kwargs: dict[str, Any] = {
+        "rate": 0.5, "proportional": 2.0, "derivative": 1.0, "smoothing": 0.5, "relative": True
+    }  # fmt: skip
+    for limit in (4.0, 0.0):
+        a = follow(Multiplier(1, **kwargs), costs, limit)
+        b = follow(Multiplier(1, **kwargs), [scale * cost for cost in costs], scale * limit)
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+        assert a[1] > 0.0
+
+
+def test_without_cost_and_limit_nothing_is_violated() -> None:
+    assert follow(Multiplier(1, 0.5, proportional=1.0, relative=True), [0.0, 0.0], 0.0) == [0, 0]
+
+
+def test_smoothing_and_delay_by_hand() -> None:
+    """Averages of J_C: 4, 6, 7; of the violation 0, 2, 3. The rise over two updates is 3."""
+    kwargs: dict[str, Any] = {"proportional": 0.5, "derivative": 2.0, "smoothing": 0.5, "delay": 2}
+    values = follow(Multiplier(1, 0.0, **kwargs), [4.0, 8.0, 8.0], 4.0)
+    np.testing.assert_allclose(values, [0.0, 1.0, 1.5 + 6.0])
+
+
 @pytest.mark.parametrize("limit", [1.0, 0.1, 1e-6])
 def test_a_rise_far_above_a_small_limit_is_no_more_than_it_is(limit: float) -> None:
     """J_C of 50 ± 5, whose rises are a tenth of it and many limits."""

@@ -413,11 +413,10 @@ def test_saved_and_loaded(cls: Any, tmp_path: Path) -> None:
     assert result.lengths.tolist() == [30, 30] and (result.costs > 0.0).all()
 
 
-@every
-def test_evaluated_and_logged_while_training(cls: Any) -> None:
+def test_evaluated_and_logged_while_training() -> None:
     judge = CostEvalCallback(points(1), n_eval_episodes=2, eval_freq=50, verbose=0)
     train = CostMonitor(points())
-    model = cls("MlpPolicy", train, cost_limit=0.1, **settings())
+    model = SACLag("MlpPolicy", train, cost_limit=0.1, **settings())
     model.learn(150, [judge, LogCosts()])
     assert judge.evaluations_timesteps == [100] and np.min(judge.evaluations_costs) > 0.0
     rate = model.logger.name_to_value["rollout/cost_rate"]
@@ -459,7 +458,6 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
     assert CostReplayBufferSamples._fields[:6] == ReplayBufferSamples._fields
 
 
-@every
 @pytest.mark.parametrize(
     ("more", "error"),
     [
@@ -484,9 +482,9 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
         ({"env": gymnasium.make("CartPole-v1")}, r"needs continuous actions \(Box\), not Discrete"),
     ],
 )
-def test_bad_input(cls: Any, more: Any, error: str) -> None:
+def test_bad_input(more: Any, error: str) -> None:
     with pytest.raises(ValueError, match=error):
-        cls("MlpPolicy", **{"env": points(1), **settings(), **more})
+        SACLag("MlpPolicy", **{"env": points(1), **settings(), **more})
 
 
 @pytest.mark.parametrize(
@@ -529,7 +527,7 @@ def test_a_cost_that_nothing_changes_has_no_price(cls: Any, cut: bool) -> None:
     assert (prices[0] == 0.0) == cut and prices[1] > 0.0
 
 
-@every
+@pytest.mark.parametrize("cls", [SACLag, TD3Lag])
 def test_it_finds_a_known_optimum(cls: Any) -> None:
     """Defaults but for a small network and a high rate, which spare time."""
     problem, steps = problems()["bandit"], 8_000

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from typed import require_rendering
 
 import sb3_guard
 from sb3_guard.envs import GuardEnv, rendering
@@ -15,10 +16,7 @@ ROW = np.zeros(1, dtype=np.int32)
 
 @pytest.fixture(autouse=True, scope="module")
 def _needs_opengl():
-    try:
-        rendering.gl_backend()
-    except rendering.RenderingError as error:
-        pytest.skip(str(error))
+    require_rendering()
 
 
 @pytest.mark.parametrize("robot", ["Swimmer", "Walker", "Arm3", "Arm6"])

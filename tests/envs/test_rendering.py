@@ -9,6 +9,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from typed import require_rendering
 
 import sb3_guard
 from sb3_guard import make_vec_env
@@ -32,10 +33,7 @@ def amount(frame, colour):
 
 @pytest.fixture(autouse=True, scope="module")
 def _needs_opengl():
-    try:
-        rendering.gl_backend()
-    except rendering.RenderingError as error:
-        pytest.skip(str(error))
+    require_rendering()
 
 
 @pytest.mark.parametrize("camera", rendering.CAMERAS)

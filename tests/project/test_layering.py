@@ -118,11 +118,12 @@ def test_the_pure_modules_know_only_numpy(name):
     module = f"sb3_guard.envs.{name}"
     names = ("geometry", "layout", "observation", "parameters", "types")
     pure = {f"sb3_guard.envs.{n}" for n in names}
-    pure.add("sb3_guard.spelling")
+    pure |= {"sb3_guard.spelling", "sb3_guard.checks"}
     assert touches(module, "sb3_guard") <= {
         i for i in imports(module) if any(i.startswith(p) for p in pure)
     }
     assert not touches(module, "mujoco", "gymnasium")
+    assert not touches("sb3_guard.checks", "sb3_guard", "mujoco", "gymnasium", "torch")
 
 
 def test_parts_do_not_know_each_other_nor_the_engine():

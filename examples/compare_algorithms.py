@@ -1,6 +1,6 @@
 """Train three algorithms and draw their returns and costs.
 
-`sb3-guard benchmark` and `sb3-guard plot` do this for many suites, algorithms and seeds.
+`sb3-guard benchmark` and `sb3-guard plot` do this for many environments, algorithms and seeds.
 """
 
 import matplotlib.pyplot as plt

@@ -1,6 +1,6 @@
 """An algorithm of your own, which the commands can train, tune and plot.
 
-python -m sb3_guard.train --gym-packages custom_algorithm --algo trpo_price \
+sb3-guard train --gym-packages custom_algorithm --algo trpo_price \
     -conf custom_algorithm.py --env Goal_Point_8Hazards -n 1e6
 """
 

@@ -10,10 +10,10 @@ class PPOLagrangian(Lagrangian, CostRollouts, PPO):
     """PPO on A - Σ λ_i A_Ci, where λ follows J_C - d."""
 
     def train(self):
-        price = self.price()  # [m], float32: it has followed this rollout's J_C
+        weight = self.cost_weight()  # [m], float32: it has followed this rollout's J_C
         buffer = self.rollout_buffer
-        buffer.advantages = buffer.advantages - buffer.cost_advantages @ price
-        super().train()  # SB3's own: at price 0 the run equals SB3's PPO bit for bit
+        buffer.advantages = buffer.advantages - buffer.cost_advantages @ weight
+        super().train()  # SB3's own: at weight 0 the run equals SB3's PPO bit for bit
         self.fit_cost_critic()
 
 

@@ -7,7 +7,7 @@ from sb3_guard.common.vec_budgets import VecRemainingBudget
 
 
 def make():
-    """The share of the budget that is left joins the observation; overspending earns -1 a step."""
+    """Add the remaining budget to the observation; overspending has a reward of -1 per step."""
     env = make_vec_env("Goal_Point_8Hazards", 10, seed=0)
     return VecRemainingBudget(env, budget=5.0, unsafe_reward=-1.0)
 

@@ -10,4 +10,6 @@ model.save("cpo_point")
 
 env = model.get_env()
 model = CPO.load("cpo_point")
-print(evaluate_policy(model, env, n_eval_episodes=10, seed=1))  # with the limit beside the cost
+print(
+    evaluate_policy(model, env, n_eval_episodes=10, seed=1)
+)  # with the limit in addition to the cost

@@ -1,4 +1,4 @@
-"""Search for the hyper-parameters with the highest return within a cost limit.
+"""Search for the hyperparameters with the highest return within a cost limit.
 
 `sb3-guard tune` does this for several seeds, processes and machines, with pruning and a report.
 """

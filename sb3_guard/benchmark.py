@@ -1,4 +1,4 @@
-"""Train a grid, suites × algorithms × seeds: ``python -m sb3_guard.benchmark --preset main8``."""
+"""Train a grid, environments × algorithms × seeds: ``sb3-guard benchmark --preset main8``."""
 
 import shlex
 import sys
@@ -38,42 +38,42 @@ HOW = ("grid", "log_folder", "dry_run", "scheduler", "verbose")
 @dataclass
 class Flags(EvaluationFlags, TrainingFlags):
     """
-    Train a grid of suites, algorithms and seeds. Runs that are done are skipped, runs that were
-    interrupted are resumed.
+    Train a grid of environments, algorithms and seeds. Finished runs are skipped, and interrupted
+    runs are resumed.
 
     The grid:
 
-    :param suites: environment ids
-    :param preset: one of the paper's grids instead: paper45, main8, q1 … q8, ladder
-    :param algos: algorithms; 'all' is the eight of the paper (default: all, or the preset's)
-    :param seeds: a run each (default: 0 1)
-    :param scale: factor of every run's length, e.g. 0.1
-    :param grid: YAML file with these flags, e.g. 'suites: [a, b]'
+    :param envs: environment ids
+    :param preset: grid of the GUARD paper: paper45, main8, q1 … q8, or ladder; replaces --envs
+    :param algos: algorithms; all: the paper's eight (default: all, or those of the preset)
+    :param seeds: random seeds, one run per seed (default: 0 1)
+    :param scale: factor for the length of every run, e.g. 0.1 (default: 1)
+    :param grid: YAML file with these flags, e.g. 'envs: [a, b]'
 
     Files:
 
-    :param log_folder: the grid's folder (default: logs/benchmark)
+    :param log_folder: folder of the grid (default: logs/benchmark)
 
     Running:
 
-    :param dry_run: list the runs and do nothing
-    :param jobs: runs at once, a process with one thread each (default: as many as there are cores)
-    :param scheduler: address of a Dask cluster, e.g. tcp://node1:8786 (default: run on this
+    :param dry_run: list the runs and train nothing
+    :param jobs: number of runs at once, one process with one thread each (default: number of cores)
+    :param scheduler: address of a Dask scheduler, e.g. tcp://node1:8786 (default: run on this
         machine); needs the extra sb3-guard[cluster]
-    :param verbose: 0: errors only (default: 1)
+    :param verbose: output: 0 errors only, 1 progress (default: 1)
     """
 
     prog: ClassVar[str] = "sb3-guard benchmark"
     examples: ClassVar[str] = """examples:
-  python -m sb3_guard.benchmark --suites Goal_Point_8Hazards --algos cpo trpo_lag -n 1e6 --jobs 2
-  python -m sb3_guard.benchmark --preset main8 --scale 0.1 --dry-run
-  python -m sb3_guard.benchmark --preset q5 -params cost_limit:25 -f logs/q5
-  python -m sb3_guard.benchmark --grid my_grid.yml -f logs/mine
-  python -m sb3_guard.benchmark -f logs/mine                     continue what is not done
-  python -m sb3_guard.benchmark --preset paper45 --scheduler tcp://node1:8786
+  sb3-guard benchmark --envs Goal_Point_8Hazards --algos cpo trpo_lag -n 1e6 --jobs 2
+  sb3-guard benchmark --preset main8 --scale 0.1 --dry-run
+  sb3-guard benchmark --preset q5 -params cost_limit:25 -f logs/q5
+  sb3-guard benchmark --grid my_grid.yml -f logs/mine
+  sb3-guard benchmark -f logs/mine                           continue unfinished runs
+  sb3-guard benchmark --preset paper45 --scheduler tcp://node1:8786
 """
 
-    suites: list[str] | None = flag(metavar="ENV", role=IDENTITY)
+    envs: list[str] | None = flag(metavar="ENV", role=IDENTITY, former=("suites",))
     preset: str | None = flag(metavar="NAME", role=IDENTITY)
     algos: list[str] | None = flag(metavar="ALGO", role=IDENTITY)
     seeds: list[int] = flag(default=[0, 1], kind=seed_number, metavar="K", role=IDENTITY)
@@ -101,22 +101,24 @@ class Flags(EvaluationFlags, TrainingFlags):
         if self.algos is not None:
             algos = [one for algo in self.algos for one in (ALGOS if algo == "all" else [algo])]
         if self.preset is not None:
-            if self.suites is not None:
-                raise UsageError("--preset names suites itself; leave out --suites or --preset")
+            if self.envs is not None:
+                raise UsageError(
+                    "--preset has environments of its own; leave out --envs or --preset"
+                )
             return preset(self.preset, algos)
-        if self.suites is None:
+        if self.envs is None:
             raise UsageError(
-                "which grid? Give --suites, --preset or --grid, or the folder of a grid to "
+                "which grid? Give --envs, --preset or --grid, or the folder of a grid to "
                 f"continue: -f FOLDER (there is no {Path(self.log_folder) / RECORD})"
             )
-        return [(suite, algo) for suite in self.suites for algo in algos or ALGOS]
+        return [(env, algo) for env in self.envs for algo in algos or ALGOS]
 
 
 def with_file(flags: Flags) -> Flags:
     """
     The flags completed by a grid file, or by the record of the folder to continue.
 
-    What the command line says wins; of hyper-parameters and the like, entry by entry.
+    What the command line says wins; of hyperparameters and the like, entry by entry.
 
     :raises UsageError: the file can't be read, has an unknown entry, or names modules that the
         command line does not name
@@ -124,9 +126,9 @@ def with_file(flags: Flags) -> Flags:
     from sb3_guard.zoo.cli.names import is_program, require_named
 
     path = Path(flags.grid or Path(flags.log_folder) / RECORD)
-    if not flags.grid and (flags.given & {"suites", "preset"} or not path.is_file()):
+    if not flags.grid and (flags.given & {"envs", "preset"} or not path.is_file()):
         return flags
-    form = "flags to values, such as 'suites: [Goal_Point_8Ghosts]'"
+    form = "flags to values, such as 'envs: [Goal_Point_8Ghosts]'"
     content = read_mapping(path, "grid file", form)
     filed = Flags.read(content, path, HOW)
     given = {name: getattr(filed, name) for name in filed.given}

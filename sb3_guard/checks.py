@@ -1,4 +1,4 @@
-"""Refusing bad hyper-parameters in one way: the name, the value, what is allowed."""
+"""Refusing bad hyperparameters in one way: the name, the value, what is allowed."""
 
 from typing import Any
 

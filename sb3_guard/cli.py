@@ -8,19 +8,19 @@ from sb3_guard.spelling import did_you_mean
 
 COMMANDS = {
     "train": "train an agent",
-    "tune": "search hyper-parameters under a cost limit",
-    "benchmark": "train a grid of suites, algorithms and seeds",
+    "tune": "search hyperparameters under a cost limit",
+    "benchmark": "train a grid of environments, algorithms and seeds",
     "enjoy": "play a trained agent, print return and cost, record a video",
-    "plot": "tables, figures and a page of trained runs",
+    "plot": "make tables, figures and a page of trained runs",
     "hub": "upload a trained agent to the Hugging Face hub, or download one",
-    "list": "print suites, robots, tasks and constraints",
-    "show": "print an environment's scenario, observations and actions, write a picture",
+    "list": "print environments, robots, tasks, constraints and pretrained agents",
+    "show": "describe an environment and draw it",
 }
 
 
 def _usage() -> str:
     rows = "\n".join(f"  {name:<10} {text}" for name, text in COMMANDS.items())
-    return f"usage: sb3-guard <command> ...\n\n{rows}\n\nsb3-guard <command> --help says more"
+    return f"usage: sb3-guard <command> ...\n\n{rows}\n\nsb3-guard <command> --help lists its flags"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Play a trained agent: ``python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards``."""
+"""Play a trained agent: ``sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards``."""
 
 import os
 import sys

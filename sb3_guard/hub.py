@@ -1,4 +1,4 @@
-"""Share trained agents on the Hugging Face hub: ``python -m sb3_guard.hub push --algo cpo …``."""
+"""Share trained agents on the Hugging Face hub: ``sb3-guard hub push --algo cpo …``."""
 
 import sys
 

@@ -14,7 +14,7 @@ class UnknownId(ValueError):
 def with_version(name: str, others: Iterable[str] = ()) -> str:
     """An id in full: without a version, the latest that is registered with Gymnasium, else v0.
 
-    :param others: ids that count beside the registered ones
+    :param others: ids that count in addition to the registered ones
     """
     if re.search(r"-v\d+$", name) or name in gymnasium.registry:
         return name

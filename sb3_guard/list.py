@@ -1,4 +1,4 @@
-"""What there is: ``sb3-guard list`` prints suites, parts and pretrained agents."""
+"""What there is: ``sb3-guard list`` prints environments, parts and pretrained agents."""
 
 import re
 import sys
@@ -36,7 +36,7 @@ def yes(part: type, name: str) -> str:
 
 
 def _of_one(suite: Suite) -> str:
-    """The ids of a suite, a row for each name up to its last part."""
+    """The ids of an environment, a row for each name up to its last part."""
     stems: dict[str, list[str]] = {}
     for env_id in suite.scenarios:
         name = env_id.removesuffix("-v0")
@@ -48,7 +48,7 @@ def _of_one(suite: Suite) -> str:
 
 
 def suites() -> str:
-    """The named suites of every family."""
+    """The named environments of every family."""
     return "\n\n".join(_of_one(suite) for suite in SUITES.values())
 
 
@@ -100,7 +100,7 @@ def agents() -> str:
 
 
 KINDS = {
-    "suites": suites,
+    "environments": suites,
     "robots": robots,
     "tasks": tasks,
     "constraints": constraints,
@@ -108,14 +108,20 @@ KINDS = {
 }
 
 
+def _kind(text: str) -> str:
+    """The name of a list; ``suites`` is the former name of ``environments``."""
+    return "environments" if text == "suites" else text
+
+
 @dataclass
 class Flags(Command):
     """
-    Print suites, robots, tasks, constraints and pretrained agents.
+    Print environments, robots, tasks, constraints and pretrained agents.
 
-    :param kind: only these
-    :param ladder: ids of growing difficulty: more and more of a constraint
-    :param gym_packages: modules that add parts
+    :param kind: print only this list
+    :param ladder: print ids of growing difficulty, with 1 to 16 objects of a constraint, e.g.
+        Goal_Point Hazards
+    :param gym_packages: modules to import first, which register parts
     """
 
     prog: ClassVar[str] = "sb3-guard list"
@@ -124,8 +130,8 @@ class Flags(Command):
   sb3-guard list robots
   sb3-guard list --ladder Goal_Point Hazards
 """
-    kind: Literal["suites", "robots", "tasks", "constraints", "agents"] | None = flag(
-        positional=True, nargs="?"
+    kind: Literal["environments", "robots", "tasks", "constraints", "agents"] | None = flag(
+        positional=True, nargs="?", type=_kind
     )
     ladder: list[str] | None = flag(nargs="*", metavar="TASK_ROBOT CONSTRAINT")
     gym_packages: list[str] = flag(default=[], metavar="MODULE")

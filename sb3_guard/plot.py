@@ -1,4 +1,4 @@
-"""Tables and figures of trained runs: ``python -m sb3_guard.plot logs``."""
+"""Tables and figures of trained runs: ``sb3-guard plot logs``."""
 
 import sys
 from collections.abc import Sequence
@@ -23,18 +23,19 @@ TITLES = "\n".join(f"  {name:<10} {one.__doc__}" for name, one in FIGURES.items(
 @dataclass
 class Flags(Command):
     """
-    Make tables, figures and a page of the runs in log folders.
+    Make tables, figures and an HTML page of the runs in log folders.
 
     :param folders: log folders (default: logs)
-    :param figure: figures to draw, see below; all: all that there are runs for
-    :param output: for figures (default: figures)
-    :param format: of figures (default: png)
-    :param table: tables to write: .csv a row per run, .md and .tex means and scores
-    :param report: one page with everything
-    :param env: only these suites
-    :param cost_limit: only runs of this limit (several costs: of these limits), and unconstrained
-        ones
-    :param steps: where an algorithm has runs of several lengths on a suite, those of N steps
+    :param figure: figures to draw, see below; all: every figure that has runs
+    :param output: folder for figures (default: figures)
+    :param format: file formats of figures (default: png)
+    :param table: table files: .csv has a row per run, .md and .tex have means and scores
+    :param report: HTML page with all tables and figures
+    :param env: only runs on these environments
+    :param cost_limit: only runs with this cost limit (one value per cost); unconstrained runs are
+        always included
+    :param steps: only runs of N steps, where an algorithm has runs of several lengths on an
+        environment
     """
 
     prog: ClassVar[str] = "sb3-guard plot"

@@ -39,7 +39,7 @@ _COORDINATES: dict[str, list[list[tuple[str, str]]]] = {
         [(f"ω{axis}", "rad/s") for axis in "xyz"], [("", "m/s")], [("", "rad/s")],
     ],
 }  # fmt: skip
-# What Gymnasium's Humanoid observes beside its joints
+# What Gymnasium's Humanoid observes in addition to its joints
 _UNITS = {
     "cinert": "kg m², kg m, kg", "cvel": "rad/s, m/s", "qfrc_actuator": "N m", "cfrc_ext": "N m, N"
 }  # fmt: skip
@@ -169,15 +169,15 @@ class Flags(Command):
     """
     Print an environment's scenario, costs, observations and actions; write a picture.
 
-    :param env: an id of ours, a scenario file (.yml), or a robot's MJCF file (.xml)
-    :param env_kwargs: change parameters
-    :param robot_kwargs: what a robot's file does not say: arguments of register_robot
-    :param output: picture to write (default: <env>.png)
-    :param camera: fixed, track or top (default: fixed, or track where the robot runs far away)
-    :param window: watch the robot act at random in MuJoCo's viewer instead: Space pauses, Tab opens
-        menus, F shows contact forces
-    :param seed: of the episode in the picture
-    :param gym_packages: modules that add parts
+    :param env: environment id, scenario file (.yml) or MJCF file of a robot (.xml)
+    :param env_kwargs: arguments of the environment, e.g. "ghosts:{'num': 4}"
+    :param robot_kwargs: arguments of register_robot, for a robot's MJCF file
+    :param output: PNG file for the picture (default: <env>.png)
+    :param camera: camera of the picture (default: fixed, or track where the robot runs far away)
+    :param window: open MuJoCo's viewer with random actions instead: Space pauses, Tab opens menus,
+        F shows contact forces
+    :param seed: random seed of the episode in the picture (default: 0)
+    :param gym_packages: modules to import first, which register parts
     """
 
     prog: ClassVar[str] = "sb3-guard show"

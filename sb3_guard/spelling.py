@@ -1,4 +1,4 @@
-"""What a misspelt name may have meant; every error message about a name ends with it."""
+"""What a misspelled name may have meant; every error message about a name ends with it."""
 
 import difflib
 import fnmatch

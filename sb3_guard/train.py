@@ -1,4 +1,4 @@
-"""Train an agent: ``python -m sb3_guard.train --algo cpo --env Goal_Point_8Hazards``."""
+"""Train an agent: ``sb3-guard train --algo cpo --env Goal_Point_8Hazards``."""
 
 import sys
 from dataclasses import dataclass
@@ -13,26 +13,26 @@ from sb3_guard.zoo.run.flags import RunFlags
 @dataclass
 class Flags(RunFlags):
     """
-    Train an agent, log costs beside returns, and keep the best safe model.
+    Train an agent, log returns and costs, and keep the best model within the cost limit.
 
     What is trained:
 
-    :param seeds: a run for each of these seeds, <env>_<seed + 1>, several at once; the same command
-        continues with what is not done
+    :param seeds: train one run for each of these seeds, in <env>_<seed + 1>, several at once; the
+        same command continues with the runs that are not finished
 
     Running:
 
-    :param jobs: runs at once, a process with one thread each (default: as many as there are cores)
+    :param jobs: number of runs at once, one process with one thread each (default: number of cores)
     """
 
     prog: ClassVar[str] = "sb3-guard train"
     examples: ClassVar[str] = """examples:
-  python -m sb3_guard.train --algo cpo --env Goal_Point_8Hazards -n 1e6 --seed 0
-  python -m sb3_guard.train --algo cpo --env Goal_Point_8Hazards -params cost_limit:5 n_envs:10
-  python -m sb3_guard.train --env Goal_Point_8Hazards --env-kwargs "hazards:{'num': 4}"
-  python -m sb3_guard.train --algo cpo --env Goal_Point_8Hazards --seeds 0 1 2 --jobs 2
-  python -m sb3_guard.train -i logs/cpo/Goal_Point_8Hazards-v0_1             continue a killed run
-  python -m sb3_guard.train -i logs/cpo/Goal_Point_8Hazards-v0_1 -n 2e6      and for longer
+  sb3-guard train --algo cpo --env Goal_Point_8Hazards -n 1e6 --seed 0
+  sb3-guard train --algo cpo --env Goal_Point_8Hazards -params cost_limit:5 n_envs:10
+  sb3-guard train --env Goal_Point_8Hazards --env-kwargs "hazards:{'num': 4}"
+  sb3-guard train --algo cpo --env Goal_Point_8Hazards --seeds 0 1 2 --jobs 2
+  sb3-guard train -i logs/cpo/Goal_Point_8Hazards-v0_1                   continue a killed run
+  sb3-guard train -i logs/cpo/Goal_Point_8Hazards-v0_1 -n 2e6            continue it to 2e6 steps
 """
     seeds: list[int] | None = flag(kind=seed_number, metavar="K", exclusive="seeds")
     jobs: int | None = flag(kind=positive, metavar="N")

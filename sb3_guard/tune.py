@@ -1,13 +1,13 @@
-"""Tune hyper-parameters: ``python -m sb3_guard.tune --algo trpo_lag --env Goal_Point_8Hazards``."""
+"""Tune hyperparameters: ``sb3-guard tune --algo trpo_lag --env Goal_Point_8Hazards``."""
 
 import os
 import sys
 
 from sb3_guard.zoo.cli.flags import command
-from sb3_guard.zoo.tuning.flags import TuneFlags
+from sb3_guard.zoo.tuning.flags import TuneFlags as Flags
 
 
-def _tune(flags: TuneFlags) -> int:
+def _tune(flags: Flags) -> int:
     flags = flags.completed()
     flags.check()
     # Read when torch is imported, below.
@@ -18,7 +18,7 @@ def _tune(flags: TuneFlags) -> int:
     return tune(flags)
 
 
-main = command(TuneFlags, _tune)
+main = command(Flags, _tune)
 
 if __name__ == "__main__":
     sys.exit(main(None))

@@ -3,7 +3,8 @@
 ``python scripts/known_optima.py --algos cpo trpo_lag --seeds 11 12`` uses the defaults of every
 algorithm: nothing is set but the limit, and the problem's number of steps and environments. Every
 run becomes a line of ``docs/data/known_optima.csv`` as soon as it has ended, is not repeated, and
-goes into the tables of ``docs/known_optima.md``; ``--seeds`` without a number only writes the page.
+goes into the tables of ``docs/notes/known_optima.md``. ``--seeds`` without a number only writes
+that page.
 
 Return is a share of the constrained optimum and costs are shares of their limits, over the last
 fifth of the training, by the policy that explores; ± is the standard error over seeds.
@@ -35,7 +36,7 @@ from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 
 Run = tuple[str, str, float, int]  # problem, algorithm, scale, seed
 DOCS = Path(__file__).parents[1] / "docs"
-RESULTS, PAGE = DOCS / "data" / "known_optima.csv", DOCS / "known_optima.md"
+RESULTS, PAGE = DOCS / "data" / "known_optima.csv", DOCS / "notes" / "known_optima.md"
 MARKS = "<!-- known optima: begin -->", "<!-- known optima: end -->"
 #: A limit that is not one of an episode's mean cost, and whose it is.
 STATEWISE = {

@@ -1,8 +1,9 @@
-"""Write a page for every robot, task and constraint from its code: ``python scripts/make_docs.py``.
+"""Write the reference pages from the code: ``python scripts/make_docs.py``.
 
-The pages hold what the code says of itself: the docstring, the place in the paper's taxonomy, the
-parameters with defaults and limits, and the tables of actions and observations. Tasks and
-constraints have a page each that lists them all, and there is one of the files in ``examples/``.
+Robots, tasks and constraints have a page each: the docstring, the place in the paper's taxonomy,
+the parameters with defaults and limits, and tables of actions and observations. Further pages list
+all tasks and all constraints, the files in ``examples/``, the flags of the commands and the default
+hyperparameters.
 """
 
 from __future__ import annotations
@@ -10,18 +11,22 @@ from __future__ import annotations
 import argparse
 import ast
 import dataclasses
+import importlib
 import inspect
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from sb3_guard.cli import COMMANDS
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.part import Part
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.list import KINDS, summary, yes
 from sb3_guard.show import action_table, observation_table
-from sb3_guard.zoo.cli.markdown import table
+from sb3_guard.zoo.cli.flags import Command
+from sb3_guard.zoo.cli.markdown import escaped, table
+from sb3_guard.zoo.run.hyperparams import hyperparams_folder, read_file
 
 ROOT = Path(__file__).parents[1]
 # Robots that tell the sizes of an observation apart: in the plane, in space, with several lidars.
@@ -203,6 +208,86 @@ def examples() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def flags_of(command: type[Command]) -> str:
+    """A table per heading of a command's help: flag, values, meaning."""
+    headings: dict[str, list[list[str]]] = {}
+    groups = command.parser()._action_groups
+    for group in groups:
+        for action in group._group_actions:
+            if action.help == argparse.SUPPRESS or action.dest == "help":
+                continue
+            names = ", ".join(f"`{name}`" for name in action.option_strings) or f"`{action.dest}`"
+            values = action.metavar or (action.choices and " ".join(map(str, action.choices))) or ""
+            values = f"`{values}`" if values and action.nargs != 0 else ""
+            meaning = escaped(str(action.help).replace("%%", "%"))
+            headings.setdefault(str(group.title), []).append([names, values, meaning])
+    parts = []
+    for title, rows in headings.items():
+        parts += [f"{title.capitalize()}:", table(["flag", "value", "meaning"], rows)]
+    return "\n\n".join(parts)
+
+
+def command_line() -> str:
+    """The page of the commands and their flags."""
+    parts = [
+        "# Command line",
+        "`sb3-guard <command>` and `python -m sb3_guard.<command>` are the same. `--help` prints "
+        "these tables, and a misspelled flag or value is an error that names the nearest one. "
+        "Flags that take KEY:VALUE take Python literals: `-params n_envs:10 normalize:True`.",
+        table(
+            ["command", "what it does"],
+            [[f"[`{name}`](#{name})", text] for name, text in COMMANDS.items()],
+        ),
+    ]
+    for name in COMMANDS:
+        flags = importlib.import_module(f"sb3_guard.{name}").Flags
+        says = " ".join(flags.parser().description.split())
+        examples = inspect.cleandoc(flags.examples).partition("\n")[2]
+        examples = inspect.cleandoc(examples.partition("\n\n")[0])
+        examples = re.sub(r" {3,}(?=\w)", "  # ", examples)
+        parts += [f"## {name}", says, f"```bash\n{examples}\n```", flags_of(flags)]
+    return "\n\n".join(parts) + "\n"
+
+
+def hyperparameter_tables() -> str:
+    """The page of the default hyperparameters, algorithm by algorithm."""
+    parts = [
+        "# Default hyperparameters",
+        "The entries of `hyperparams/<algo>.yml`, which [Hyperparameter "
+        "files](hyperparameter_files.md) explains. A hyperparameter that is not in a table has the "
+        "default of its class, which the page of the algorithm states.",
+    ]
+    for path in sorted(hyperparams_folder().glob("*.yml")):
+        if (
+            path.stem in ("paper", "omnisafe")
+            or not (ROOT / "docs" / "algorithms" / path.name).with_suffix(".md").is_file()
+        ):
+            continue
+        entries: dict[str, list[str]] = {}
+        for pattern, values in read_file(path).items():
+            entries.setdefault(repr(values), []).append(f"`{pattern}`")
+        content = read_file(path)
+        rows = []
+        for patterns in entries.values():
+            values = content[patterns[0].strip("`")]
+            shown = ", ".join(f"`{key}` {_plain(value)}" for key, value in values.items())
+            rows.append([", ".join(patterns), shown])
+        parts += [
+            f"## [{path.stem}](algorithms/{path.stem}.md)",
+            table(["environments", "hyperparameters"], rows),
+        ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _plain(value: object) -> str:
+    """A value as YAML has it, on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_plain(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, float) and value.is_integer() and abs(value) >= 1e4:
+        return f"{value:,.0f}".replace(",", "_")
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def pages() -> dict[str, str]:
     """Every page by its path below docs/."""
     singles = {
@@ -211,7 +296,8 @@ def pages() -> dict[str, str]:
         for name, part in parts.items()
     }
     overviews = {f"{kind}s.md": overview(kind, GROUPS[kind]) for kind in ABOUT}
-    return {**singles, **overviews, "gallery.md": gallery(), "examples.md": examples()}
+    others = (gallery, examples, command_line, hyperparameter_tables)
+    return {**singles, **overviews, **{f"{page.__name__}.md": page() for page in others}}
 
 
 def main() -> None:

@@ -53,7 +53,7 @@ class Agent(NamedTuple):
 
     @property
     def settings(self) -> dict[str, float]:
-        """Hyper-parameters that ``hyperparams/`` does not say."""
+        """Hyperparameters that ``hyperparams/`` does not say."""
         return {"cost_limit": self.trained_at} if self.trained_at else {}
 
     @property

@@ -3,11 +3,11 @@
 ``docs/data/NAME.tar.xz`` holds the logs of a grid of runs, as ``benchmark`` writes them, without
 models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
 a page stands the table of its runs, or of one environment in short, ``<!-- runs: NAME SUITE -->``.
-Instead of ``runs`` there are ``learnt: NAME``, returns in the end beside the untrained agents of
-``docs/data/untrained.csv``; ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep: NAME
-SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; ``agents: pretrained``, how the
-package's agents keep their limits; and, within a line, ``beside: NAME SUITE ALGO``. ``--pack
-FOLDER NAME`` packs the logs of a folder.
+Instead of ``runs`` there are ``learnt: NAME``, returns in the end and those of the untrained agents
+of ``docs/data/untrained.csv``; ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep:
+NAME SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; and ``agents: pretrained``,
+the costs of the package's agents and their limits. A row of a single run is in italics, which the
+site shows in grey. ``--pack FOLDER NAME`` packs the logs of a folder.
 
 ``--curves`` draws the learning curves: of each algorithm's page, beside an unconstrained algorithm,
 from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of all algorithms of
@@ -34,6 +34,7 @@ from matplotlib.ticker import EngFormatter
 
 import sb3_guard
 from sb3_guard.costs import verdict
+from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish, save
@@ -45,8 +46,7 @@ from sb3_guard.zoo.results.tables import markdown, number, spelled, spread, whol
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
 BLOCK = re.compile(
-    r"(<!-- (runs|learnt|scores|sweep|agents|beside): (\S+)(?: (\S+))?(?: (\S+))? -->\n?).*?"
-    r"(<!-- end -->)",
+    r"(<!-- (runs|learnt|scores|sweep|agents): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)",
     re.DOTALL,
 )
 PUBLISHED_STEPS = 1_000_000
@@ -61,7 +61,7 @@ GRIDS = (
     (("off_policy",), "SafetyPointGoal1-v0", None),
 )
 
-# Of docs/benchmark.md, with the paper's settings: archive and suites.
+# Of docs/notes/paper_settings.md, with the paper's settings: archive and suites.
 PAPER = {
     "guard_paper": [f"Goal_{robot}_8Hazards" for robot in ("Point", "Drone", "Arm3", "Walker")],
     "goal_point_1m_limit0": ["Goal_Point_8Ghosts"],
@@ -107,9 +107,7 @@ def runs(name: str) -> pd.DataFrame:
 
 def tables(name: str, only: str | None) -> str:
     """A table for each suite of a grid, with the published values where there are some."""
-    found = runs(name)
-    means = aggregate(found)
-    speeds = (found["steps"] / found["seconds"]).groupby([found["suite"], found["algo"]]).max()
+    means = aggregate(runs(name))
     published = pd.read_csv(DATA / "published.csv", index_col=["suite", "algo"])
     parts = []
     for suite, rows in means.groupby("suite", sort=False):
@@ -117,19 +115,19 @@ def tables(name: str, only: str | None) -> str:
             continue
         compared = suite in published.index and (rows["steps"] == PUBLISHED_STEPS).all()
         known = published.loc[suite] if compared else published.iloc[:0]
-        digits = 2 if rows["return_last"].abs().max() < 100 else 0
+        highest = rows["return_last"].abs().max()
+        digits = 2 if highest < 10 else 1 if highest < 100 else 0
         columns: dict[str, Any] = {
             "algorithm": "label",
             "seeds": whole("seeds"),
-            "return": lambda row, n=digits: spread(row["return_last"], row["return_last_se"], n),
-            "episode cost": lambda row: spread(row["cost_last"], row["cost_last_se"], 1),
+            "return": lambda row, n=digits: deviation(row, "return_last", n),
+            "episode cost": lambda row: deviation(row, "cost_last", 1),
             "episodes above the limit": lambda row: number(100 * row["above_limit"], 0) + "\xa0%",
-            "95 % of costs below": lambda row: number(row["cost_p95"], 0),
-            "cost of training": whole("cost_total"),
-            "steps/s": lambda row, of=speeds[suite]: number(of[row["algo"]], 0),
+            "95 % of episode costs below": lambda row: number(row["cost_p95"], 0),
+            "cost of the whole training": whole("cost_total"),
         }
         if only:
-            for heading in ("seeds", "95 % of costs below", "cost of training", "steps/s"):
+            for heading in (*columns,)[-2:]:
                 del columns[heading]
         if len(known):
             columns["published return"] = lambda row, of=known: _published(of, row["algo"])
@@ -137,8 +135,23 @@ def tables(name: str, only: str | None) -> str:
                 number(of.loc[row["algo"], "cost"], 0) if row["algo"] in of.index else "–"
             )
         heading = "" if only else f"**{suite}**\n\n"
-        parts.append(heading + markdown(spelled(rows, columns)))
+        parts.append(heading + grey(rows, columns))
     return "\n\n".join(parts)
+
+
+def deviation(row: Any, name: str, digits: int) -> str:
+    """A mean over seeds ± their standard deviation; of a single one the number alone."""
+    return spread(row[name], row[f"{name}_se"] * row["seeds"] ** 0.5, digits)
+
+
+def grey(rows: pd.DataFrame, columns: dict[str, Any]) -> str:
+    """A table in Markdown whose rows of a single seed are in italics."""
+    texts = spelled(rows, columns).map(escaped)
+    lines = [
+        [f"*{cell}*" if seeds == 1 else cell for cell in line]
+        for line, seeds in zip(texts.to_numpy().tolist(), rows["seeds"], strict=True)
+    ]
+    return table(list(columns), lines)
 
 
 def learnt(name: str) -> str:
@@ -149,7 +162,7 @@ def learnt(name: str) -> str:
     rows = rows.loc[[suite for suite in untrained.index if suite in rows.index]].reset_index()
     error = (rows["trained_se"] ** 2 + rows["random_se"] ** 2) ** 0.5
     columns: dict[str, Any] = {
-        "suite": "suite",
+        "environment": "suite",
         "random": lambda row: spread(row["random"], row["random_se"]),
         "zero": lambda row: spread(row["zero"], row["zero_se"]),
         "trained": lambda row: spread(row["trained"], row["trained_se"]),
@@ -190,24 +203,15 @@ def sweep(name: str, suite: str) -> str:
     shared = [label for label in found[limits[0]].index if label in common]
     rows = pd.DataFrame({"limit": limits})
 
-    def cell(row: Any, label: str) -> str:
-        of = found[row["limit"]].loc[label]
-        earned = spread(of["return_last"], of["return_last_se"], 1)
-        return f"{earned} at {spread(of['cost_last'], of['cost_last_se'], 1)}"
+    def cell(row: Any, label: str, name: str) -> str:
+        return deviation(found[row["limit"]].loc[label], name, 1)
 
-    columns = {label: lambda row, label=label: cell(row, label) for label in shared}
+    columns = {
+        f"{label}, {what}": lambda row, label=label, name=name: cell(row, label, name)
+        for label in shared
+        for what, name in (("return", "return_last"), ("cost", "cost_last"))
+    }
     return markdown(spelled(rows, {"limit": whole("limit"), **columns}))
-
-
-def beside(name: str, suite: str, algo: str) -> str:
-    """An algorithm's return and cost on a suite of a grid, beside the published ones."""
-    rows = aggregate(runs(name)).set_index(["suite", "algo"])
-    known = pd.read_csv(DATA / "published.csv", index_col=["suite", "algo"])
-    ours, theirs = rows.loc[(suite, algo)], known.loc[(suite, algo)]
-    return (
-        f"{ours['return_last']:.1f} at a cost of {ours['cost_last']:.0f}, published "
-        f"{theirs['return']:.1f} at {theirs['cost']:.0f}"
-    )
 
 
 def agents(folder: str) -> str:
@@ -246,10 +250,8 @@ def _published(known: pd.DataFrame, algo: str) -> str:
 def filled(page: str) -> str:
     """A page with its tables remade."""
 
-    def table(match: re.Match[str]) -> str:
-        begin, kind, name, only, algo, end = match.groups()
-        if kind == "beside":
-            return f"{begin}{beside(name, only, algo)}{end}"
+    def remade(match: re.Match[str]) -> str:
+        begin, kind, name, only, end = match.groups()
         made = {"learnt": learnt, "scores": scores, "agents": agents}
         if kind == "sweep":
             text = sweep(name, only)
@@ -257,12 +259,16 @@ def filled(page: str) -> str:
             text = made[kind](name) if kind in made else tables(name, only)
         return f"{begin}\n{text}\n\n{end}"
 
-    return BLOCK.sub(table, page)
+    return BLOCK.sub(remade, page)
 
 
 def pages() -> dict[Path, str]:
     """Every page that has such a table, as it should be."""
-    files = [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))]
+    files = [
+        DOCS.parent / "README.md",
+        *sorted(DOCS.glob("*.md")),
+        *sorted(DOCS.glob("notes/*.md")),
+    ]
     texts = {path: path.read_text() for path in files}
     return {path: filled(text) for path, text in texts.items() if BLOCK.search(text)}
 
@@ -305,8 +311,9 @@ def draw_healthy(algo: str) -> Figure:
                     label=f"{name}, promised",
                 )  # fmt: skip
             else:
-                # In units of cost, as the paper has them, λ is the price.
-                lines["price"] = log["price" if "price" in log else "multiplier"]
+                # Older logs call the weight "price". In the paper's units λ itself is the weight.
+                name = next(n for n in ("cost_weight", "price", "multiplier") if n in log)
+                lines["weight of the cost"] = log[name]
             for axis, (label, line) in zip(axes, lines.items(), strict=True):
                 axis.plot(line, color=color, linewidth=1.5, label=name)
                 axis.set(xlabel="steps", ylabel=label, xlim=(0, line.index[-1]))
@@ -356,7 +363,7 @@ def main() -> None:
     for path, text in pages().items():
         path.write_text(text)
         print(path)
-        for _, kind, name, only, *_ in BLOCK.findall(text):
+        for _, kind, name, only, _ in BLOCK.findall(text):
             if only or kind != "runs":
                 continue
             # Drawn is what the tables have: the last ten epochs, not the last one.

@@ -2,7 +2,7 @@
 
 Writes ``docs/data/untrained.csv``: for each suite with hazards the mean return and episode cost of
 20 episodes of uniformly random actions and of actions of zero, with standard errors. With the runs
-of ``docs/data/learnable.yml`` it makes a table of docs/numbers.md (``scripts/results.py``).
+of ``docs/data/learnable.yml`` it makes a table of docs/notes/learnable.md (``scripts/results.py``).
 """
 
 from pathlib import Path

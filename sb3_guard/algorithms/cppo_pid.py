@@ -1,4 +1,4 @@
-"""CPPO-PID: PPO whose price of the cost is a PID controller's."""
+"""CPPO-PID: PPO-Lagrangian with a multiplier that a PID controller sets."""
 
 from typing import Any, ClassVar
 
@@ -6,7 +6,7 @@ from sb3_guard.algorithms.ppo_lag import PPOLag
 
 
 class CPPOPID(PPOLag):
-    """PPO on the Lagrangian, priced by a controller (Stooke et al., 2020, arXiv 2007.03964).
+    """PPO on the Lagrangian, weighted by a controller (Stooke et al., 2020, arXiv 2007.03964).
 
     ::
 

@@ -64,9 +64,9 @@ class CUP(Lagrangian, FirstOrder):
         return (1.0 - gamma * gae_lambda) / (1.0 - gamma)
 
     def train(self) -> None:
-        self._price = th.as_tensor(self.price(self.centre_costs()), device=self.device)
+        self._weight = th.as_tensor(self.cost_weight(self.centre_costs()), device=self.device)
         super().train()  # PPO's, on the rewards
-        if bool(self._price.any()):
+        if bool(self._weight.any()):
             self._improved = self.snapshot()
             self.descend(self.projection, values=False, start=self._improved)
 
@@ -76,8 +76,8 @@ class CUP(Lagrangian, FirstOrder):
         """What the second step descends on a minibatch: a scalar."""
         pair = self._improved.at(batch.places), distribution
         divergence = kl(*(pair if self.projection_kl == "forward" else pair[::-1]))
-        cost = ratio * (batch.cost_advantages @ self._price)
+        cost = ratio * (batch.cost_advantages @ self._weight)
         return (divergence + self.factor * cost).mean()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_improved", "_price"]
+        return [*super()._excluded_save_params(), "_improved", "_weight"]

@@ -46,8 +46,8 @@ class FOCOPS(Lagrangian, FirstOrder):
     trust_region: float = hyperparameter(0.02, ends="()")
 
     def train(self) -> None:
-        price = self.price(self.advantage_unit() * self.centre_costs())
-        self._price = th.as_tensor(price, device=self.device)
+        weight = self.cost_weight(self.advantage_unit() * self.centre_costs())
+        self._weight = th.as_tensor(weight, device=self.device)
         self._old = self.snapshot()
         super().train()
 
@@ -56,8 +56,8 @@ class FOCOPS(Lagrangian, FirstOrder):
     ) -> th.Tensor:
         divergence = kl(distribution, self._old.at(batch.places))
         near = (divergence.detach() <= self.trust_region).to(divergence)
-        advantages = batch.advantages - batch.cost_advantages @ self._price
+        advantages = batch.advantages - batch.cost_advantages @ self._weight
         return (near * (divergence - ratio * advantages / self.temperature)).mean()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_old", "_price"]
+        return [*super()._excluded_save_params(), "_old", "_weight"]

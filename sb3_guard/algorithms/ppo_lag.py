@@ -1,4 +1,4 @@
-"""PPO-Lagrangian: the cost joins PPO's objective at a price that follows the violation."""
+"""PPO-Lagrangian: PPO with a multiplier for each cost, which follows the violation."""
 
 from typing import Any, ClassVar, Literal
 
@@ -46,8 +46,8 @@ class PPOLag(Lagrangian, CostRollouts, PPO):
         check_ppo(self)
 
     def train(self) -> None:
-        """SB3's update on priced advantages, then the cost critic."""
-        self.reprice()
+        """SB3's update on weighted advantages, then the cost critic."""
+        self.reweigh()
         try:
             if self.kl_stop == "epoch" and self.target_kl is not None:
                 self._take_passes(self.n_epochs, self.target_kl)
@@ -61,18 +61,18 @@ class PPOLag(Lagrangian, CostRollouts, PPO):
             self._check_finite(name, self.logger.name_to_value[f"train/{name}"])
         self.fit_cost_critic()
 
-    def reprice(self) -> None:
-        """Take the priced cost advantages off the rollout's advantages.
+    def reweigh(self) -> None:
+        """Take the weighted cost advantages off the rollout's advantages.
 
         PPO standardises the result by minibatch, so a division by 1 + Σ λ would change nothing.
         """
         buffer = self.rollout_buffer
         # Where the reward's advantages are all alike, their unit is 1.
         spread = float(buffer.advantages.std()) or 1.0
-        price = self.price(spread * self.centre_costs())
+        weight = self.cost_weight(spread * self.centre_costs())
         if self.lambda_units == "cost" and self.normalize_advantage:
-            price *= np.float32(spread)  # as published: λ weighs A_C against the standardised A
-        buffer.advantages = buffer.advantages - buffer.cost_advantages @ price
+            weight *= np.float32(spread)  # as published: λ weighs A_C against the standardised A
+        buffer.advantages = buffer.advantages - buffer.cost_advantages @ weight
 
     def _take_passes(self, n_epochs: int, target_kl: float) -> None:
         """SB3's update, one pass at a time, until the mean KL over the rollout is too large."""

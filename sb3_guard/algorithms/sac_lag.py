@@ -1,4 +1,4 @@
-"""SAC-Lagrangian: a cost critic joins SAC's actor at a price that follows the violation."""
+"""SAC-Lagrangian: SAC with cost critics and a multiplier that follows the violation."""
 
 import torch as th
 from stable_baselines3 import SAC

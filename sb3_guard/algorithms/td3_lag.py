@@ -1,4 +1,4 @@
-"""TD3-Lagrangian: a cost critic joins TD3's actor at a price that follows the violation."""
+"""TD3-Lagrangian: TD3 with cost critics and a multiplier that follows the violation."""
 
 import torch as th
 from stable_baselines3 import TD3

@@ -1,4 +1,4 @@
-"""TQC-Lagrangian: critics of the distributions of costs join TQC's actor at a price."""
+"""TQC-Lagrangian: TQC with critics of the costs' distributions, and multipliers."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ class CostQuantiles(CostQ):
 
     TQC drops the highest quantiles of the return-to-go from its targets, since an actor that
     climbs a critic seeks out what the critic overrates. What it underrates of a cost is sought out
-    likewise, so that the lowest quantiles are dropped here.
+    in the same way, so the lowest quantiles are dropped here.
 
     :param policy: TQC's
     :param n_costs: number m of costs

@@ -1,4 +1,4 @@
-"""TRPO-FAC: a Lagrangian whose price of the cost depends on the state."""
+"""TRPO-FAC: TRPO with multipliers that depend on the state."""
 
 from typing import Any, ClassVar, Literal
 
@@ -101,10 +101,10 @@ class TRPOFAC(TrustRegion):
     ``d_γ = (d/T) (1 - γᵀ)/(1 - γ)``, or ``(d/T) / (1 - γ)`` where a time limit cuts episodes, whose
     cost is bootstrapped. The policy takes a TRPO step on
     ``E[ratio · (A - Σ p_i A_Ci)]``; then Adam raises λ(s) where the returns of the batch exceed
-    d_γ and lowers it elsewhere. The price p of an action begins with
+    d_γ and lowers it elsewhere. The weight p of an action begins with
     ``λ(s) + K_P (V_C(s) - d_γ) / d_γ``, from 0 to 5, the fraction between -1 and 1, which keeps λ
     from circling the optimum. As the action changes the cost to come of all states before it, its
-    price is the highest of theirs, discounted. A and A_C are both standardised, so λ weighs a
+    weight is the highest of theirs, discounted. A and A_C are both standardised, so λ weighs a
     standard deviation of the one against one of the other, and the unit of the costs does not
     matter.
 
@@ -119,8 +119,8 @@ class TRPOFAC(TrustRegion):
     :param lambda_ascent: ``"output"`` moves the argument of the softplus by the violation itself,
         down to -4, where λ is 0.018; ``"value"`` by the gradient of λ as in the papers, which
         vanishes as λ does, so that a λ that has fallen stays there
-    :param trace: whether the prices of earlier states apply to an action too; in the papers its
-        price is that of its own state
+    :param trace: whether the weights of earlier states apply to an action too; in the papers its
+        weight is that of its own state
     """
 
     label, family, paper = "TRPO-FAC", "Lagrangian", "Ma et al. 2021"
@@ -156,22 +156,22 @@ class TRPOFAC(TrustRegion):
         return [*state_dicts, "multiplier", "multiplier.optimizer"], tensors
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
-        price = self.price(batch)
-        self._record_per_cost("train/price", price.mean(dim=0).cpu().numpy())
-        return (ratio * (batch.advantages - (price * batch.cost_advantages).sum(dim=1))).mean()
+        weight = self.cost_weight(batch)
+        self._record_per_cost("train/cost_weight", weight.mean(dim=0).cpu().numpy())
+        return (ratio * (batch.advantages - (weight * batch.cost_advantages).sum(dim=1))).mean()
 
-    def price(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+    def cost_weight(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         """What a unit of each cost's advantage is worth at each step of the rollout, [N, m]."""
-        price = self.multiplier.predict(batch.observations)
+        weight = self.multiplier.predict(batch.observations)
         if self.proportional_gain:
             excess = self.proportional_gain * self._excess(batch)
-            price = (price + excess).clamp(0.0, self.multiplier.maximum)
+            weight = (weight + excess).clamp(0.0, self.multiplier.maximum)
         if self.trace:
-            price = self._trace(price)
+            weight = self._trace(weight)
         if self.units == "relative":
             deviation = batch.cost_advantages.std(dim=0)
-            price = self.advantage_unit() * price / (deviation + TINY)
-        return price
+            weight = self.advantage_unit() * weight / (deviation + TINY)
+        return weight
 
     def _excess(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         """By what part of its limit the cost to come exceeds it, between -1 and 1, [N, m]."""
@@ -183,18 +183,18 @@ class TRPOFAC(TrustRegion):
         unit = th.where(limit == 0.0, batch.cost_returns.mean(dim=0), limit).abs()
         return (excess / (unit + TINY)).clamp(-1.0, 1.0)
 
-    def _trace(self, price: th.Tensor) -> th.Tensor:
-        """The highest price of the steps up to each of its episode, discounted, [N, m].
+    def _trace(self, weight: th.Tensor) -> th.Tensor:
+        """The highest weight of the steps up to each of its episode, discounted, [N, m].
 
         An action changes the costs to come of all states before it. A rollout that begins within an
         episode knows of no step before its first.
         """
         buffer = self.rollout_buffer
-        steps = price.reshape(buffer.n_envs, buffer.buffer_size, -1).clone()
+        steps = weight.reshape(buffer.n_envs, buffer.buffer_size, -1).clone()
         kept = th.as_tensor(buffer.cost_gamma * (1.0 - buffer.episode_starts)).to(steps)  # [T, n]
         for t in range(1, buffer.buffer_size):
             th.maximum(steps[:, t], kept[t, :, None] * steps[:, t - 1], out=steps[:, t])
-        return steps.reshape(price.shape)
+        return steps.reshape(weight.shape)
 
     def _violation(self, to_come: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """By how much costs exceed their limit, [N, m], and the limit, [m].
@@ -215,6 +215,6 @@ class TRPOFAC(TrustRegion):
         update_learning_rate(self.multiplier.optimizer, self.lambda_lr)
         for _ in range(self.lambda_epochs):
             self.multiplier.ascend(batch.observations, excess)
-        price = self.multiplier.predict(batch.observations).cpu().numpy()
-        self._record_per_cost("train/multiplier", price.mean(axis=0))
-        self._record_per_cost("train/multiplier_std", price.std(axis=0))
+        weight = self.multiplier.predict(batch.observations).cpu().numpy()
+        self._record_per_cost("train/multiplier", weight.mean(axis=0))
+        self._record_per_cost("train/multiplier_std", weight.std(axis=0))

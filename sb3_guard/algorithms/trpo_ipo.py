@@ -38,8 +38,8 @@ class TRPOIPO(TrustRegion):
         maximise   E[ratio · A] + Σ s_i φ((J_Ci + T E[ratio · A_Ci] - d_i) / d_i)
                    φ(x) = log(-x) / (m t),   s_i = d_i / (T σ(A_Ci))
 
-    so that in the gradient the standardised cost advantage weighs ``d / (m t (d - J_C))`` beside
-    the standardised reward advantage: 1 / (m t) far inside the limit, more near it, and
+    so that in the gradient the standardised cost advantage weighs ``d / (m t (d - J_C))``,
+    relative to the standardised reward advantage: 1 / (m t) far inside the limit, more near it, and
     ``max_multiplier`` at most. With m costs each barrier is m times as sharp, so that all of them
     together cost as much return as one. Where it would be steeper, φ continues as a straight line,
     which also leads back where the limit is broken. The unit of the costs does not matter. While a
@@ -97,4 +97,4 @@ class TRPOIPO(TrustRegion):
         t, most = self._sharpness, self.max_multiplier
         weight = 1.0 / (t * np.maximum(slack, 1.0 / (t * most)))
         self._record_per_cost("train/multiplier", weight)
-        self._record_per_cost("train/price", weight * self._spread(batch).cpu().numpy())
+        self._record_per_cost("train/cost_weight", weight * self._spread(batch).cpu().numpy())

@@ -1,4 +1,4 @@
-"""TRPO-Lagrangian: the cost joins the objective at a price that follows the violation."""
+"""TRPO-Lagrangian: TRPO with a multiplier for each cost, which follows the violation."""
 
 from typing import Any, ClassVar
 

@@ -217,7 +217,7 @@ class CostFromFunction(gym.Wrapper, RecordConstructorArgs):
     :param cost: ``cost(obs, action, next_obs, info)``, called after each step with the observation
         before it, the action, the observation after it and the step's ``info``. It returns a
         number, or several in a dictionary or list, which are reported as in :class:`CostFromInfo`.
-        Its name, ``"package.module:function"``, will do, so that a hyper-parameter file can say it
+        Its name, ``"package.module:function"``, will do, so that a hyperparameter file can say it
     :raises ValueError: nothing of that name can be imported, or it can't be called
     """
 

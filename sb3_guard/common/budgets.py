@@ -184,7 +184,7 @@ class _Observing(_Counting, gym.Wrapper, RecordConstructorArgs):
 
 
 class RemainingBudget(Remaining, _Observing):
-    """Show the agent what is left of its cost budget, so that it can spend it wisely.
+    """Show the agent what is left of its cost budget, so that it can use it wisely.
 
     A limit on the episode's cost depends on the past, which a policy of the observation alone does
     not know. Sauté RL (Sootla et al., ICML 2022) adds the remaining share z of the budget to it:
@@ -207,12 +207,12 @@ class RemainingBudget(Remaining, _Observing):
 
 
 class EarlyTermination(Spending, gym.Wrapper, RecordConstructorArgs):
-    """End an episode that costs more than its budget, so that nothing is earned by overspending.
+    """End an episode that costs more than its budget, so that overspending gives no reward.
 
     The early-terminated MDP of Sun et al. (2021): with it an algorithm for rewards alone respects
     a limit, if rewards are positive. Where they are not, ending early is tempting, and
     ``final_reward`` must make up for it. The step that overspends is ``terminated`` and has
-    ``info["budget_exceeded"]``; to spend the budget exactly is allowed.
+    ``info["budget_exceeded"]``; using up the budget exactly is allowed.
 
     It goes inside SB3's ``Monitor``, which otherwise never sees the episodes that are ended here:
     a warning says so.

@@ -67,7 +67,7 @@ class CostEvalCallback(EvalCallback):
     of which that is the total, ``eval/mean_ep_cost/<key>``; and ``eval/mean_max_cost`` of an
     algorithm that limits the worst step, whose highest costs are what must keep its limit.
     ``evaluations.npz`` has ``timesteps`` [K], ``results``, ``ep_lengths`` and ``costs`` [K, E], and
-    for several costs ``key_costs`` [K, E, m]. Beside ``best_model.zip`` of an agent that was
+    for several costs ``key_costs`` [K, E, m]. Next to ``best_model.zip`` of an agent that was
     trained on normalised observations lies ``best_model_vecnormalize.pkl``.
 
     SB3's ``StopTrainingOnNoModelImprovement`` and ``StopTrainingOnRewardThreshold`` may be among

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class GuardVecEnv(VecEnv):
-    """N environments of ours on one batch of simulations, for Stable-Baselines3.
+    """N environments of sb3_guard on one batch of simulations, for Stable-Baselines3.
 
     Equals, bit for bit, a ``DummyVecEnv`` of N single environments with seeds s, s + 1, …, and is
     many times faster.

@@ -48,7 +48,7 @@ def find(
 ) -> Source:
     """The environments that an id stands for.
 
-    :param env_id: an id of ours or of Safety-Gymnasium, with or without its version, any id
+    :param env_id: an id of sb3_guard or of Safety-Gymnasium, with or without its version, any id
         registered with Gymnasium, a scenario, its plain data or its YAML file, or a class or
         function that makes an environment
     :raises ValueError: nothing of that name exists, with the nearest match

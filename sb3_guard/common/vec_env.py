@@ -1,6 +1,6 @@
 """What training, evaluation and notebooks call to make environments for Stable-Baselines3.
 
-For an environment of ours, :func:`make_vec_env` makes a
+For an environment of sb3_guard, :func:`make_vec_env` makes a
 :class:`~sb3_guard.common.native.GuardVecEnv`.
 """
 
@@ -43,9 +43,9 @@ def make_vec_env(
 ) -> VecEnv:
     """Make environments for Stable-Baselines3, with episode statistics that include the cost.
 
-    :param env_id: an id of ours (the version may be left out), a scenario, its plain data or its
-        YAML file, any id registered with Gymnasium, one of Safety-Gymnasium where that package is
-        installed, a class or function that makes an environment, or what
+    :param env_id: an id of sb3_guard (the version may be left out), a scenario, its plain data or
+        its YAML file, any id registered with Gymnasium, one of Safety-Gymnasium where that package
+        is installed, a class or function that makes an environment, or what
         :func:`~sb3_guard.common.sources.find` returns
     :param n_envs: how many; 30 is a good number for training
     :param seed: the environments get seed, seed + 1, …

@@ -1,6 +1,6 @@
 """GUARD's environments: robots, tasks and constraints as batched parts on MuJoCo.
 
-Importing this package registers the named suites with Gymnasium.
+Importing this package registers the named environments with Gymnasium.
 """
 
 import os
@@ -54,7 +54,7 @@ ENTRY_POINT = "sb3_guard.envs.gym_env:GuardEnv"
 def env_spec(name: str | Path | Mapping[str, Any] | Scenario) -> EnvSpec:
     """Gymnasium's description of an environment, registered or not.
 
-    :param name: an id of ours, with or without its version, a scenario, its plain data, or its
+    :param name: an id of sb3_guard, with or without its version, a scenario, its plain data, or its
         YAML file
     :raises ValueError: the id cannot be read, or it is none of these
     """
@@ -114,7 +114,7 @@ def register(name: str, scenario: str | Path | Mapping[str, Any] | Scenario | No
 
 
 def make(name: str | Path | Mapping[str, Any] | Scenario, **kwargs: Any) -> gymnasium.Env:
-    """:func:`gymnasium.make` for any id of ours, registered or not, with or without its version.
+    """:func:`gymnasium.make` for any id of sb3_guard; it needs no registration and no version.
 
     :param name: as for :func:`env_spec`
     :raises ValueError: unknown names, bad values, or ``observe={"remaining": ...}`` is not the

@@ -68,7 +68,7 @@ def segment_distance(start: Array, end: Array, points: Array) -> Array:
     """Distance of points to segments, all by coordinate, in the plane or in space.
 
     :param start: one end of each segment, [2 or 3, L, N] m
-    :param end: the other end, likewise
+    :param end: the other ends, in the same form
     :param points: [2 or 3, K, N] m
     :return: [L, K, N] m
     """

@@ -287,7 +287,7 @@ def _no_room(f: Footprint) -> LayoutError:
     less = " or ".join(["num"] * (f.num > 1) + ["keepout"] + ["height"] * bool(near))
     return LayoutError(
         f"{f.name} cannot be placed: {what} with keepout {f.keepout} m find no room "
-        f"in {list(f.placements)}{near} beside the other parts; reduce {less}, its "
+        f"in {list(f.placements)}{near} in addition to the other parts; reduce {less}, its "
         f"own or another's{'' if near else ', or widen placements'}"
     )
 

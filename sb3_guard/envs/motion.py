@@ -156,7 +156,7 @@ class MoverGroup:
 
         :param move: what to add to, by coordinate, [2 or 3, K, N] m
         :param offset: to robots, to origins and within pairs, [2 or 3, 2 K + pairs, N] m
-        :param distance: likewise, [2 K + pairs, N] m, not 0
+        :param distance: the same for distances, [2 K + pairs, N] m, not 0
         :param close: which are closer than the gap: flat indices of [pairs, N], rising
         """
         _, k, n = move.shape

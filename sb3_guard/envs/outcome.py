@@ -35,7 +35,7 @@ class Outcome:
 
     @property
     def details(self) -> dict[str, Array]:
-        """What info says of every row beside the cost, by key, [N] each."""
+        """What info says of every row in addition to the cost, by key, [N] each."""
         return {**self.costs, **self.drawn}
 
     @property

@@ -371,7 +371,7 @@ class Task(Part):
 
 
 class Constraint(Part):
-    """What the robot pays for."""
+    """Base class of constraints: assigns the cost of each step."""
 
     trespassable: bool  # the taxonomy of the paper's constraint table
     movable: str  # "no", "passive" or "active"

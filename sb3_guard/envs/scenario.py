@@ -123,7 +123,7 @@ class Scenario:
     def parse(cls, name: str) -> Scenario:
         """The scenario of an id such as ``Goal_Point_8Hazards-v0``; the version may be left out.
 
-        :raises ValueError: it is in no suite, nor does it follow
+        :raises ValueError: it is in no environment, nor does it follow
             ``{Task}_{Robot}_{N}{Constraint}[_noconti]``
         """
         return cls(**suites.fields(name))

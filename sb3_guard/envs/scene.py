@@ -1,4 +1,4 @@
-"""What a picture shows beside the bodies: zones, lidars, shadows, the border, and from where.
+"""What a picture shows in addition to the bodies: zones, lidars, shadows, border and cameras.
 
 All of it is added to the abstract scene of one frame, so the physics model has none of it.
 """
@@ -166,7 +166,7 @@ class ScenePainter:
             )
 
     def glow(self, center: Array) -> None:
-        """The tint of a robot that pays a cost."""
+        """The tint of a robot while it has a cost."""
         self._add(_SPHERE, (0.3,) * 3, center, (*COST_COLOR, 0.5))
 
     def say(self, words: Mapping[str, str], aspect: float, line: float) -> None:

@@ -1,1 +1,1 @@
-"""The harness: run folders, hyper-parameters, checkpoints, and what the commands are made of."""
+"""The harness: run folders, hyperparameters, checkpoints, and what the commands are made of."""

@@ -3,7 +3,7 @@
 ``python -m sb3_guard.zoo.rl_zoo3 --algo cpo --env Goal_Point_8Hazards-v0 -conf
 hyperparams/cpo.yml`` is ``python -m rl_zoo3.train`` with them. In RL-Zoo's table ``trpo`` stays
 sb3-contrib's and ours is ``guard_trpo``. RL-Zoo evaluates and searches by return alone;
-``python -m sb3_guard.train`` and ``python -m sb3_guard.tune`` know the cost limit.
+``sb3-guard train`` and ``sb3-guard tune`` know the cost limit.
 """
 
 from sb3_guard.algorithms import ALGORITHMS

@@ -854,13 +854,13 @@ OWN_KEYS: dict[str, set[str]] = {
     "TRPO": set(),
     "CPO": {"train/cpo_case", "train/nu", "train/lambda_kl", "train/cost_margin"},
     "PCPO": {"train/projection", "train/cost_margin"},
-    "TRPOLag": {"train/multiplier", "train/price"},
-    "TRPOFAC": {"train/multiplier", "train/multiplier_std", "train/price"},
-    "TRPOIPO": {"train/multiplier", "train/price"},
+    "TRPOLag": {"train/multiplier", "train/cost_weight"},
+    "TRPOFAC": {"train/multiplier", "train/multiplier_std", "train/cost_weight"},
+    "TRPOIPO": {"train/multiplier", "train/cost_weight"},
     "TRPOSL": FILTER_KEYS | {"train/cost_model_error"},
     "TRPOUSL": FILTER_KEYS,
     "CRPO": {"train/rectifies"},
-    "RCPO": {"train/multiplier", "train/price"},
+    "RCPO": {"train/multiplier", "train/cost_weight"},
     "SCPO": {"train/cpo_case", "train/nu", "train/lambda_kl", "train/cost_margin"},
 }
 

@@ -192,7 +192,7 @@ def test_defaults_are_stated_where_only_they_differ() -> None:
 def test_a_users_algorithm_trains_by_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Registered by a module of the user's, with hyper-parameters from there."""
+    """Registered by a module of the user's, with hyperparameters from there."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(ALGORITHMS, "trpo_price", TRPO)  # to be forgotten afterwards

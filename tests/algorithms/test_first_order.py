@@ -91,7 +91,7 @@ def test_a_broken_limit_raises_the_multiplier_and_a_kept_one_lowers_it(cls: Any)
     for cost in (20.0, 20.0, 1.0):
         model.costs = CostEstimate(np.array([cost]), 30.0, np.array([(cost - 10.0) / 30.0]))
         model.costs_are_new = True
-        model.price(np.ones(1))
+        model.cost_weight(np.ones(1))
         seen.append(float(model.multiplier.integral.detach()))
     assert 0.0 < seen[0] < seen[1] > seen[2]
 
@@ -116,7 +116,7 @@ def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
         if filtered:
             assert logged["train/corrected_fraction"] > 0.1
         if cls in (*LAGRANGIAN, TRPOFAC, TRPOIPO):
-            prices.append(scale * logged["train/price"])
+            prices.append(scale * logged["train/cost_weight"])
         runs.append(model)
     assert prices == pytest.approx(prices[:1] * len(prices), rel=1e-2)
     assert np.all(np.array(prices) > 0.0)
@@ -133,17 +133,17 @@ def test_prices_in_units_of_cost_weigh_costs_against_standardised_advantages() -
     """As Ray et al. and OmniSafe do: A standardised over the rollout, A_C only centred."""
     fixed = {"lambda_init": 0.5, "lambda_lr": 0.0, "proportional_gain": 0.0}
     model = make(PPOLag, lambda_units="cost", **fixed)
-    buffer, reprice = model.rollout_buffer, model.reprice
+    buffer, reweigh = model.rollout_buffer, model.reweigh
     seen: list[np.ndarray] = []
 
     def priced() -> None:
         raw, costs = buffer.advantages.copy(), buffer.cost_advantages[..., 0].copy()
-        reprice()
+        reweigh()
         seen.append(buffer.advantages)
         expected = raw - 0.5 * raw.std() * (costs - costs.mean())
         np.testing.assert_allclose(buffer.advantages, expected, rtol=1e-4, atol=1e-5)
 
-    model.reprice = priced
+    model.reweigh = priced
     model.learn(128)
     assert len(seen) == 1
 
@@ -157,7 +157,7 @@ def test_ppo_lagrangians_price_does_not_know_the_unit_of_reward() -> None:
         model.train = lambda: None
         model.learn(128)
         raw = buffer.advantages = scale * buffer.advantages
-        model.reprice()
+        model.reweigh()
         assert np.abs(buffer.advantages - raw).max() > 0.1 * raw.std()
         priced.append(buffer.advantages)
     np.testing.assert_allclose(100.0 * priced[0], priced[1], rtol=1e-3, atol=1e-4)
@@ -187,7 +187,7 @@ def test_the_weight_of_a_cost_does_not_know_the_unit_of_reward(cls: Any) -> None
         with pytest.raises(StopIteration):
             model.learn(128)
         if cls in (FOCOPS, P3O):
-            weight = model._unit if cls is P3O else model._price / model.multiplier.value
+            weight = model._unit if cls is P3O else model._weight / model.multiplier.value
             expected = buffer.advantages.std() / buffer.cost_advantages.std()
             assert float(weight) == pytest.approx(expected, rel=1e-4)
     th.testing.assert_close(100.0 * gradients[0], gradients[1], rtol=1e-3, atol=1e-5)
@@ -232,7 +232,7 @@ def test_focops_loss_by_hand() -> None:
     rows, by states and not by the batch's mean KL, 0.0617, which would leave nothing.
     """
     model = make(FOCOPS, temperature=2.0, trust_region=0.02)
-    model._old, model._price = Given(th.zeros(3, 1)), th.tensor([0.5])
+    model._old, model._weight = Given(th.zeros(3, 1)), th.tensor([0.5])
     new = gaussian(th.tensor([[0.1], [0.6], [0.0]]))
     ratio = th.tensor([1.1, 0.9, 1.5])
     loss = model.loss(batch([1.0, 5.0, 2.0], [[2.0], [1.0], [-1.0]]), ratio, new)
@@ -245,7 +245,7 @@ def test_cup_projection_by_hand(kind: str) -> None:
     given = {"cost_gamma": 0.9, "cost_gae_lambda": 0.5}  # the rewards' are others
     model = make(CUP, gamma=1.0, projection_kl=kind, **given)
     assert model.factor == pytest.approx(5.5)
-    model._improved, model._price = Given(th.zeros(2, 1)), th.tensor([0.5, 0.25])
+    model._improved, model._weight = Given(th.zeros(2, 1)), th.tensor([0.5, 0.25])
     rows = batch([9.0, 9.0], [[1.0, 2.0], [-2.0, -4.0]])
     new = gaussian(th.tensor([[0.2], [0.4]]))
     loss = model.projection(rows, th.tensor([1.2, 0.5]), new)

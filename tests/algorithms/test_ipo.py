@@ -65,7 +65,7 @@ def _weight(model: Any, cost: float, scale: float = 1.0) -> float:
     th.testing.assert_close(found, -weight * shape / 200)
     model.set_logger(Logger(None, []))
     model.fit(Batch)
-    price = model.logger.name_to_value["train/price"]
+    price = model.logger.name_to_value["train/cost_weight"]
     assert price * float(deviation) == pytest.approx(weight, rel=1e-4), "per unit of the advantage"
     return weight
 
@@ -101,7 +101,7 @@ def test_several_barriers_are_sharper() -> None:
     logged = model.logger.name_to_value
     weights = [logged[f"train/multiplier/{key}"] for key in model.cost_keys]
     assert weights == pytest.approx([1 / 4, 9 / 4])
-    prices = [logged[f"train/price/{key}"] for key in model.cost_keys]
+    prices = [logged[f"train/cost_weight/{key}"] for key in model.cost_keys]
     assert prices == pytest.approx([1 / 4, 9 / 40])
 
 

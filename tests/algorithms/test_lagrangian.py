@@ -246,7 +246,7 @@ def test_the_price_of_a_state_has_the_bound_of_other_prices(units: str, highest:
     model = make(TRPOFAC, units=units, trace=False)
     model.multiplier.predict = lambda observations: th.tensor([[4.0], [0.5]])
     model._excess = lambda batch: th.tensor([[1.0], [-1.0]])
-    price = model.price(_batch(th.zeros(2, 4), [0.0, 0.0], [[1.0], [-1.0]]))
+    price = model.cost_weight(_batch(th.zeros(2, 4), [0.0, 0.0], [[1.0], [-1.0]]))
     deviation = 2.0**0.5 if units == "relative" else 1.0
     th.testing.assert_close(price * deviation, th.tensor([[highest], [0.0]]))
 
@@ -303,7 +303,7 @@ def test_the_state_wise_lagrangian_by_hand() -> None:
     batch = _batch(th.zeros(3, 4), [1.0, -1.0, 2.0], [[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]])
     # (1 - 0.5, -1 - 1, 2 + 3) times (1, 2, 0.5), mean of (0.5, -4, 2.5)
     assert float(model.surrogate(batch, th.tensor([1.0, 2.0, 0.5]))) == pytest.approx(-1 / 3)
-    prices = [model.logger.name_to_value[f"train/price/{key}"] for key in model.cost_keys]
+    prices = [model.logger.name_to_value[f"train/cost_weight/{key}"] for key in model.cost_keys]
     assert prices == pytest.approx([2.5 / 3, 4.0 / 3]), "their means over the states"
 
 
@@ -316,7 +316,7 @@ def test_states_price_the_actions_after_them() -> None:
     price = th.tensor([8.0, 1.0, 3.0, 1.0, 0.0, 0.0, 8.0, 0.0, 0.0, 0.0])[:, None]
     expected = [8.0, 4.0, 3.0, 1.0, 0.5, 0.0, 8.0, 4.0, 2.0, 1.0]
     model.multiplier.predict = lambda observations: price
-    assert model.price(_batch(th.zeros(10, 4), [0.0], [0.0]))[:, 0].tolist() == expected
+    assert model.cost_weight(_batch(th.zeros(10, 4), [0.0], [0.0]))[:, 0].tolist() == expected
 
 
 @pytest.mark.parametrize("scale", [1.0, 100.0])

@@ -523,7 +523,7 @@ def test_a_cost_that_nothing_changes_has_no_price(cls: Any, cut: bool) -> None:
     model = cls("MlpPolicy", make_vec_env(lambda: Toll(4, cut), 2), **keys, **settings())
     model.learn(100)
     assert (model.multiplier.value > 0.0).all()
-    prices = [model.logger.name_to_value[f"train/price/{key}"] for key in ("cost", "ten")]
+    prices = [model.logger.name_to_value[f"train/cost_weight/{key}"] for key in ("cost", "ten")]
     assert (prices[0] == 0.0) == cut and prices[1] > 0.0
 
 

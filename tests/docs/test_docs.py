@@ -14,6 +14,7 @@ import pytest
 
 import sb3_guard
 from sb3_guard.algorithms import TrustRegion
+from sb3_guard.cli import COMMANDS
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -71,8 +72,8 @@ def anchors(document):
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.stem)
 def test_the_guides_samples_run_in_order(guide, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    registered = gymnasium.registry["Goal_Point_8Hazards-v0"]
-    monkeypatch.setattr(registered, "max_episode_steps", 20)
+    for env_id in ("Goal_Point_8Hazards-v0", "SafetyPointGoal1-v0"):
+        monkeypatch.setattr(gymnasium.registry[env_id], "max_episode_steps", 20)
     blocks = python_blocks(guide)
     assert blocks
     names = {"gymnasium": gymnasium}
@@ -125,6 +126,16 @@ def test_tables_of_parameters_have_the_defaults_of_the_classes(key):
         assert defaults(cls)[name] == value, name
 
 
+def test_the_page_of_logs_has_every_key_that_an_algorithm_records():
+    code = [path.read_text() for path in (ROOT / "sb3_guard" / "algorithms").rglob("*.py")]
+    record = r"record(?:_per_cost)?\(\s*\"((?:train|rollout)/\w+)\""
+    keys = {key for text in code for key in re.findall(record, text)}
+    keys -= {"train/n_updates"}  # SB3's own
+    assert {"train/cost_weight", "train/kl", "train/multiplier_std"} <= keys
+    page = (DOCS / "logging.md").read_text()
+    assert not {key for key in keys if f"`{key}`" not in page}
+
+
 @pytest.mark.parametrize("path", sorted(generated_pages()))
 def test_generated_pages_match_the_code(path):
     assert (DOCS / path).read_text() == generated_pages()[path], "run `python scripts/make_docs.py`"
@@ -148,7 +159,19 @@ def test_every_page_is_in_the_contents():
             names = [line for line in tree.split() if not line.startswith(":")]
             folder = page.parent.relative_to(DOCS)
             listed |= {(folder / name).as_posix() for name in names}
-    assert listed >= {page.relative_to(DOCS).with_suffix("").as_posix() for page in PAGES}
+    names = {page.relative_to(DOCS).with_suffix("").as_posix() for page in PAGES}
+    notes = {name for name in names if name.startswith("notes/")}
+    assert listed >= names - notes and not listed & notes
+    for name in notes:  # kept for the record, outside of the contents
+        assert (DOCS / f"{name}.md").read_text().startswith("---\norphan: true\n---\n"), name
+
+
+def test_the_pages_for_users_are_short():
+    count = script("count_words")
+    words = {page.relative_to(ROOT).as_posix(): count.words(page) for page in count.for_users()}
+    assert {"README.md", "docs/faq.md", "docs/algorithms/cpo.md"} <= words.keys()
+    assert sum(words.values()) <= count.MOST, "run `python scripts/count_words.py`"
+    assert words["docs/results.md"] <= count.MOST_RESULTS
 
 
 def test_every_public_name_is_in_the_api_reference():
@@ -167,10 +190,16 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert (tmp_path / "html" / "index.html").exists()
 
 
-def test_commands_named_in_the_readme_exist():
-    text = (ROOT / "README.md").read_text()
-    for module in re.findall(r"python -m (sb3_guard\.\w+)", text):
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_commands_named_in_the_pages_exist_and_take_the_flags(document):
+    text = re.sub(r" *\\\n *", " ", document.read_text())
+    for module in re.findall(r"python -m (sb3_guard(?:\.\w+)+)", text):
         assert importlib.util.find_spec(module), module
+    for name, flags in re.findall(r"\bsb3-guard (\w+)\b(?!\|)([^`\n|#]*)", text):
+        assert name in COMMANDS, name
+        parser = importlib.import_module(f"sb3_guard.{name}").Flags.parser()
+        for flag in re.findall(r"(?<= )--?[a-z][-a-z]*", flags):
+            assert flag in parser._option_string_actions, f"{name} {flag}"
 
 
 def test_scripts_exist_where_they_are_named_and_each_is_named_somewhere():

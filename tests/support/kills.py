@@ -34,7 +34,7 @@ RUN = (
 ).split()
 FLAGS = {
     "train": ["--algo", "cpo", "--env", "Goal_Point_8Hazards", "--seed", "3", *RUN],
-    "grid": ["--suites", "Goal_Point_8Hazards", "--algos", "cpo", "trpo", "--seeds", "0", *RUN],
+    "grid": ["--envs", "Goal_Point_8Hazards", "--algos", "cpo", "trpo", "--seeds", "0", *RUN],
 }
 MODULES = {"train": "sb3_guard.train", "grid": "sb3_guard.benchmark"}
 CLOCKS = {"t", "time/fps", "time/time_elapsed"}

@@ -60,8 +60,8 @@ TRAIN = [
     ([*LIMITED, "--env", "NoCost-v0"],
      ["no cost 'cost'", "depth", "cost_keys", "missing_cost:zero"]),
     ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost 'heat'"]),
-    # hyper-parameters
-    (["-params", "n_step:10"], ["no hyper-parameter 'n_step'", "did you mean 'n_steps'?"]),
+    # hyperparameters
+    (["-params", "n_step:10"], ["no hyperparameter 'n_step'", "did you mean 'n_steps'?"]),
     (["-params", "n_steps:ten"], ["n_steps: 'ten'", "a whole number"]),
     (["-params", "n_steps:-5"], ["n_steps: -5", "at least 1"]),
     (["-params", "n_envs:0"], ["n_envs: 0", "at least 1"]),
@@ -91,7 +91,7 @@ TRAIN = [
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
     (["--gym-packages", "../x"], ["'../x' is not a module's name"]),
     (["--gym-packages", ""], ["'' is not a module's name"]),
-    (["-conf", "absent.yml"], ["can't read hyper-parameter file absent.yml", "No such file"]),
+    (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown flag --sede", "--seed"]),
     (["cpo"], ["'cpo' does not belong to a flag", "--help"]),
@@ -282,7 +282,7 @@ def test_corrupt_model(capsys, run, tmp_path):
         (["--algo", "trpo"], ["algo = trpo contradicts cpo"]),
         (["--env", "NoCost-v0"], ["env = NoCost-v0 contradicts CostPoint-v0"]),
         (["-params", "n_steps:31"], ["n_steps = 31 contradicts 30"]),
-        (["-params", "gama:1"], ["no hyper-parameter 'gama'", "'gamma'"]),
+        (["-params", "gama:1"], ["no hyperparameter 'gama'", "'gamma'"]),
         (["-f", "elsewhere"], ["contradicts"]),
         (["-n", "30"], ["-n 30 is less than the 60 steps"]),
     ],

@@ -36,7 +36,7 @@ SMALL = [
     *"-params n_envs:2 n_steps:30 n_critic_updates:3 cost_limit:2 --eval-freq -1".split(),
     *"--env-kwargs episode_length:25 --device cpu --num-threads 1".split(),
 ]
-GRID = ["--suites", "CostPoint-v0", *SMALL, "-n", "120"]
+GRID = ["--envs", "CostPoint-v0", *SMALL, "-n", "120"]
 
 
 class Here(Executor):
@@ -107,7 +107,7 @@ def test_every_run_of_a_preset_is_valid(name, tmp_path):
 
 
 def test_scale_shortens_every_run_alike(tmp_path, capsys):
-    arguments = ["--suites", "Goal_Point_8Hazards", "Goal_Ant_8Ghosts", "--algos", "cpo", "trpo_sl"]
+    arguments = ["--envs", "Goal_Point_8Hazards", "Goal_Ant_8Ghosts", "--algos", "cpo", "trpo_sl"]
     arguments += ["--seeds", "3", "--scale", "0.01", "-f", str(tmp_path / "a"), "--dry-run"]
     arguments += ["-conf", "paper"]
     assert benchmark.main(arguments) == 0
@@ -131,12 +131,12 @@ def test_a_hyperparameter_goes_to_those_that_have_it():
 def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
     file = tmp_path / "my.yml"
     file.write_text(
-        "suites: [CostPoint-v0]\nalgos: [cpo, trpo]\nseeds: [1]\nn_timesteps: 1e3\nscale: 0.06\n"
+        "envs: [CostPoint-v0]\nalgos: [cpo, trpo]\nseeds: [1]\nn_timesteps: 1e3\nscale: 0.06\n"
         "eval_freq: -1\ngym_packages: [registered_envs]\nenv_kwargs: {episode_length: 25}\n"
         "hyperparams: {n_envs: 2, n_steps: 30, n_critic_updates: 3, policy: MlpPolicy}\n"
     )
     folder = tmp_path / "grid"
-    # What is given now wins; hyper-parameters are merged.
+    # What is given now wins; hyperparameters are merged.
     arguments = [*PACKAGE, "--grid", str(file), "-f", str(folder)]
     arguments += ["--algos", "trpo", "-params", "n_envs:1"]
     assert benchmark.main(arguments) == 0
@@ -152,7 +152,7 @@ def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
 
 
 REFUSED = [
-    (["--suites", "Goal_Point_8Hazards", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
+    (["--envs", "Goal_Point_8Hazards", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
     (["--algos", "cpo", "pcpq"], ["unknown algorithm 'pcpq'", "did you mean 'pcpo'?"]),
     (["--preset", "main9"], ["--preset", "leave out"]),
     (["--seeds", "-1"], ["--seeds: '-1'", "at least 0"]),
@@ -167,7 +167,7 @@ REFUSED = [
     (["--jobs", "0"], ["--jobs", "at least 1"]),
     (["--scheduler", "x", "--jobs", "2"], ["--nworkers"]),
     (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
-    (["--suite", "x"], ["unknown flag --suite", "--suites"]),
+    (["--envz", "x"], ["unknown flag --envz", "--envs"]),
     (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
 ]
 
@@ -175,27 +175,27 @@ REFUSED = [
 @pytest.mark.parametrize(("arguments", "parts"), REFUSED, ids=lambda one: " ".join(one)[:40])
 def test_refused_before_anything_starts(arguments, parts, capsys, tmp_path, monkeypatch, here):
     monkeypatch.chdir(tmp_path)
-    start = ["--suites", "Goal_Point_8Hazards", "--algos", "cpo", "trpo", "-n", "100"]
+    start = ["--envs", "Goal_Point_8Hazards", "--algos", "cpo", "trpo", "-n", "100"]
     refused(benchmark.main, [*start, *arguments], capsys, *parts)
     assert (here.runs, list(tmp_path.iterdir())) == ([], [])
 
 
 GRID_FILES = [
-    ("suites: [a", "g.yml as YAML"),
+    ("envs: [a", "g.yml as YAML"),
     ("just text", "must map flags to values"),
-    ("seeds: 1\nsuites: [Goal_Point_8Hazards]\nseeds: 2", "line 3 has the key 'seeds' again"),
-    ("suits: [CostPoint-v0]", "unknown entry 'suits'; did you mean 'suites'?"),
-    ("suites: [Goal_Point_8Hazards]\nscale: 0", "g.yml: scale: 0 is not allowed"),
-    ("suites: []", "suites: [] is not allowed; it must be one value or a"),
-    ("suites: {Goal_Point_8Hazards: 1}", "it must be one value or a list of them"),
+    ("seeds: 1\nenvs: [Goal_Point_8Hazards]\nseeds: 2", "line 3 has the key 'seeds' again"),
+    ("enves: [CostPoint-v0]", "unknown entry 'enves'; did you mean 'envs'?"),
+    ("envs: [Goal_Point_8Hazards]\nscale: 0", "g.yml: scale: 0 is not allowed"),
+    ("envs: []", "envs: [] is not allowed; it must be one value or a"),
+    ("envs: {Goal_Point_8Hazards: 1}", "it must be one value or a list of them"),
     (
-        "suites: [Goal_Point_8Hazards]\nscale: [1, 2]",
+        "envs: [Goal_Point_8Hazards]\nscale: [1, 2]",
         "scale: [1, 2] is not allowed; it must be",
     ),
-    ("suites: [Goal_Point_8Hazards]\ntrack: maybe", "'maybe' is not allowed; it must be True or"),
-    ("suites: [Goal_Point_8Hazards]\nn_timesteps: true", "n_timesteps: True is not allowed"),
-    ("suites: [Goal_Point_8Hazards]\nhyperparams: [a]", "not of the form key:value"),
-    ("suites: [Goal_Point_8Hazards]\nseeds: [zero]", "g.yml: seeds: ['zero'] is not allowed"),
+    ("envs: [Goal_Point_8Hazards]\ntrack: maybe", "'maybe' is not allowed; it must be True or"),
+    ("envs: [Goal_Point_8Hazards]\nn_timesteps: true", "n_timesteps: True is not allowed"),
+    ("envs: [Goal_Point_8Hazards]\nhyperparams: [a]", "not of the form key:value"),
+    ("envs: [Goal_Point_8Hazards]\nseeds: [zero]", "g.yml: seeds: ['zero'] is not allowed"),
     ("seeds: [0]", "which grid?"),
 ]
 
@@ -209,12 +209,21 @@ def test_bad_grid_file(content, part, capsys, tmp_path):
 
 
 def test_a_preset_in_a_grid_file_is_no_program(capsys, tmp_path):
-    grid = "suites: [Goal_Point_8Hazards]\nalgos: [cpo]\nconf_file: omnisafe"
+    grid = "envs: [Goal_Point_8Hazards]\nalgos: [cpo]\nconf_file: omnisafe"
     (tmp_path / "g.yml").write_text(grid)
     assert benchmark.main(["--grid", str(tmp_path / "g.yml"), "--dry-run"]) == 0
 
 
 # what becomes of it
+
+
+def test_the_former_name_of_a_flag_is_read_and_not_shown(tmp_path, capsys):
+    file = tmp_path / "old.yml"
+    file.write_text("suites: [Goal_Ant_8Ghosts]")
+    named = benchmark.Flags.parse(["--suites", "Goal_Ant_8Ghosts"])
+    filed = benchmark.with_file(benchmark.Flags.parse(["--grid", str(file)]))
+    assert named.envs == filed.envs == ["Goal_Ant_8Ghosts"]
+    assert "suites" not in benchmark.Flags.parser().format_help()
 
 
 def test_runs_are_runs_of_train(tmp_path, here, capsys):
@@ -484,7 +493,7 @@ def campaign(tmp_path, what: str, kills: int, *flags: str) -> str:
 def test_a_grid_that_is_killed_is_the_same_grid(tmp_path, here, monkeypatch):
     """A real worker is killed, at a random moment; see ``kills.py``."""
     monkeypatch.setenv("PYTHONPATH", str(SUPPORT))
-    flags = ["--suites", "CostPoint-v0", *SMALL, "-n", "1200", "--algos", "cpo", "--jobs", "1"]
+    flags = ["--envs", "CostPoint-v0", *SMALL, "-n", "1200", "--algos", "cpo", "--jobs", "1"]
     killed = Campaign("grid", flags, tmp_path / "killed", random.Random(0))
     killed.run(["worker"])
     assert killed.kills == {"main": 0, "worker": 1}
@@ -497,7 +506,7 @@ def test_a_grid_that_is_killed_is_the_same_grid(tmp_path, here, monkeypatch):
 @pytest.mark.skipif(sys.platform != "linux", reason="kills processes")
 @pytest.mark.parametrize(("what", "kills"), [("grid", 20), ("train", 20)])
 def test_chaos(what, kills, tmp_path):
-    flags = ["--suites", "CostPoint-v0"] if what == "grid" else ["--env", "CostPoint-v0"]
+    flags = ["--envs", "CostPoint-v0"] if what == "grid" else ["--env", "CostPoint-v0"]
     assert "nothing is lost" in campaign(tmp_path, what, kills, *flags, *SMALL, "-n", "6000")
 
 
@@ -568,7 +577,7 @@ def test_a_cluster_with_a_worker_killed(tmp_path):
         flags = ["--nthreads", "1", "--no-nanny"]
         workers = [begin("distributed.cli.dask_worker", *flags) for _ in range(2)]
         folder = tmp_path / "grid"
-        arguments = ["--suites", "CostPoint-v0", *SMALL, "--algos", "cpo", "trpo", "--seeds", "0"]
+        arguments = ["--envs", "CostPoint-v0", *SMALL, "--algos", "cpo", "trpo", "--seeds", "0"]
         arguments += ["-n", "6000", "--checkpoint-every", "0", "-f", str(folder)]
         where = json.loads(address.read_text())["address"]
         with start([*arguments, "--scheduler", where]) as process:
@@ -600,4 +609,4 @@ def test_the_command_has_its_names(capsys):
     assert cli.main(["benchmark", "--seeds"]) == 2
     with pytest.raises(SystemExit):
         cli.main(["benchmark", "--help"])
-    assert "python -m sb3_guard.benchmark --preset main8" in capsys.readouterr().out
+    assert "sb3-guard benchmark --preset main8" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Hyper-parameters: which entry is read, what is refused, what becomes of the values."""
+"""Hyperparameters: which entry is read, what is refused, what becomes of the values."""
 
 import re
 from typing import Any
@@ -102,9 +102,9 @@ def test_files_that_are_not_hyperparameters(tmp_path, content, message):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("absent.yml", "can't read hyper-parameter file absent.yml .*: No such file"),
-        ("absent.py", "can't read hyper-parameters from absent.py: .*"),
-        ("papr", "can't read hyper-parameters from papr: .*; give a .yml file.* or 'paper'"),
+        ("absent.yml", "can't read hyperparameter file absent.yml .*: No such file"),
+        ("absent.py", "can't read hyperparameters from absent.py: .*"),
+        ("papr", "can't read hyperparameters from papr: .*; give a .yml file.* or 'paper'"),
     ],
 )
 def test_absent_file(name, message):
@@ -187,7 +187,7 @@ def test_values_of_the_wrong_type(name, value, allowed):
 )
 def test_unknown_name_suggests_the_nearest(name, near):
     with pytest.raises(
-        UsageError, match=f"cpo has no hyper-parameter '{name}'; did you mean '{near}'"
+        UsageError, match=f"cpo has no hyperparameter '{name}'; did you mean '{near}'"
     ):
         checked(**{name: 1})
 
@@ -291,7 +291,7 @@ def test_values_on_the_command_line(text, value):
     assert parse_value(text) == value
 
 
-# The paper's table of hyper-parameters, row by row; ... stands for "not used".
+# The paper's table of hyperparameters, row by row; ... stands for "not used".
 PAPER = "paper"
 COLUMNS = "trpo trpo_lag trpo_sl trpo_usl trpo_ipo trpo_fac cpo pcpo".split()
 TABLE = {

@@ -52,13 +52,13 @@ def test_values_are_read_not_evaluated(trap):
         ({"gym_packages": ["unittest.__main__"]}, "then add --gym-packages unittest.__main__"),
         ({"conf_file": "hostile.py"}, "then add -conf hostile.py"),
         ({"conf_file": "hostile"}, "then add -conf hostile"),
-        ({"suites": ["hostile:X-v0"]}, "write --gym-packages hostile --env X-v0"),
+        ({"envs": ["hostile:X-v0"]}, "write --gym-packages hostile --env X-v0"),
         ({"hyperparams": {"env_wrapper": "hostile.Wrapper"}}, "add --gym-packages hostile"),
         ({"hyperparams": {"policy": "hostile.Policy"}}, "add --gym-packages hostile"),
     ],
 )
 def test_a_grid_file_runs_nothing(tmp_path, trap, entry, message, capsys):
-    text = yaml.safe_dump({"suites": ["Goal_Point_8Hazards"], "algos": ["cpo"], **entry})
+    text = yaml.safe_dump({"envs": ["Goal_Point_8Hazards"], "algos": ["cpo"], **entry})
     (tmp_path / "grid.yml").write_text(text.replace("{}", str(trap)))
     refused(benchmark.main, ["--grid", "grid.yml", "-f", "grid"], capsys, message)
     assert not trap.exists() and "unittest.__main__" not in sys.modules
@@ -70,7 +70,7 @@ def test_a_grid_goes_on_by_the_command_it_prints(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = []
     monkeypatch.setattr(grid, "run_grid", lambda runs, folder, again, *_: said.append(again) or 0)
-    start = ["--suites", "CostPoint-v0", "--algos", "cpo", "-f", "a grid", "-conf", "mine.py"]
+    start = ["--envs", "CostPoint-v0", "--algos", "cpo", "-f", "a grid", "-conf", "mine.py"]
     start += ["-params", "cost_limit:2"]
     assert benchmark.main([*start, "--gym-packages", "registered_envs"]) == 0
     assert capsys.readouterr().out == "tables and curves: sb3-guard plot 'a grid'\n"

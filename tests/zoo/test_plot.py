@@ -465,7 +465,7 @@ def test_page_is_complete_and_by_itself(small):
     page = page_of(small)
     assert "A &lt;grid&gt;" in page and "a &amp; b" in page
     assert f"{broken} is left out: result.json is damaged" in page
-    assert "runs: 5, algorithms: 3, suites: 1, steps: 3,000" in page
+    assert "runs: 5, algorithms: 3, environments: 1, steps: 3,000" in page
     # Names of XML namespaces are the only addresses; nothing is loaded.
     addresses = set(re.findall(r"https?://[^\"'\s<)]+", page))
     assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}

@@ -157,7 +157,7 @@ EXTENDED = {"seed": 1, "learned": [300]}
 @pytest.mark.parametrize(
     ("one", "other", "line"),
     [
-        ({}, {"seed": 1, "config": {"a": 0}}, "runs of cpo differ in hyper-parameters"),
+        ({}, {"seed": 1, "config": {"a": 0}}, "runs of cpo differ in hyperparameters"),
         ({}, {"config": {"a": 0}}, "runs of cpo count twice or more for one seed: 0"),
         ({}, {"args": {"trained_agent": "old.zip"}}, "some runs started from a model"),
         ({"commit": "a"}, {"seed": 1}, "runs differ in commit: a, unknown"),

@@ -168,7 +168,7 @@ def test_suites_without_a_score_are_left_out_and_counted(tmp_path):
     assert table.index.tolist() == ["trpo", "cpo"]
     assert table.loc["cpo", ["cost", "cost_n"]].tolist() == [0.25, 1]
     assert table.loc["cpo", ["reward", "reward_n", "reward_iqm"]].tolist() == [0.5, 2, 0.5]
-    assert "0.25 (1)" in terminal(tables(runs)["All suites, relative to TRPO"])
+    assert "0.25 (1)" in terminal(tables(runs)["All environments, relative to TRPO"])
 
 
 # Files

@@ -342,7 +342,7 @@ def test_best_is_feasible_and_train_reads_it(tmp_path, folder, drawn, monkeypatc
     assert values["env_kwargs"] == {"episode_length": 20}
     for name in ("history", "importances", "pareto"):
         assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
-    shown = out.split("train with   python -m sb3_guard.train ")[1].splitlines()[0].split()
+    shown = out.split("train with   sb3-guard train ")[1].splitlines()[0].split()
     assert train.main([*shown, "-n", "60", "-f", str(tmp_path), "--verbose", "0"]) == 0
 
 
@@ -433,7 +433,7 @@ def test_trains_for_real(tmp_path, folder, monkeypatch, capsys):
     assert table["state"].tolist() == ["complete"] * 2
     assert np.isfinite(table[["return", "cost"]].to_numpy()).all()
     assert np.shape([one.user_attrs["seed 1"] for one in study_in(folder).trials]) == (2, 4, 2)
-    # The first trial is of the shipped hyper-parameters, again the same.
+    # The first trial is of the shipped hyperparameters, again the same.
     assert run(tmp_path, *more, "--n-trials", "1", "--study-name", "again") == 0
     again = pd.read_csv(folder.with_name("CostPoint-v0_tune_again") / "trials.csv")
     assert table.loc[0, "target_kl"] == SHIPPED_KL
@@ -474,7 +474,7 @@ def test_an_interrupted_trial_is_done_later(tmp_path, folder, monkeypatch, capsy
     command = ["--n-trials", "2", "--seeds", "0", "1"]
     assert run(tmp_path, *command) == 128 + number
     out, err = capsys.readouterr()
-    again = out.split("continue with python -m sb3_guard.tune ")[1].splitlines()[0].split()
+    again = out.split("continue with sb3-guard tune ")[1].splitlines()[0].split()
     assert "Stopping" in err
     assert "Traceback" not in out + err
     assert states(folder) == {"FAIL": 1, "WAITING": 1}
@@ -776,7 +776,7 @@ def test_help_and_dispatcher(capsys, tmp_path):
     with pytest.raises(SystemExit) as end:
         cli.main(["tune", "--help"])
     assert end.value.code == 0
-    assert "python -m sb3_guard.tune --algo trpo_lag" in capsys.readouterr().out
+    assert "sb3-guard tune --algo trpo_lag" in capsys.readouterr().out
     assert cli.main(["tune", "--sampler", "no", "-f", str(tmp_path)]) == 2
 
 

@@ -1,1 +1,1 @@
-"""What the algorithms share: the trust-region base and the mathematics it stands on."""
+"""What the algorithms share: the trust-region base and the mathematics it uses."""

@@ -1,6 +1,6 @@
 """What a constructor takes, said once: signatures and docstrings are composed along the MRO.
 
-A class states its hyper-parameters as attributes, each once: name, type, default and range::
+A class states its hyperparameters as attributes, each once: name, type, default and range::
 
     temperature: float = hyperparameter(1.5, ends="()")
 
@@ -64,7 +64,7 @@ class Hyperparameter(NamedTuple):
 def hyperparameter(
     default: Any, low: float | None = None, high: float = np.inf, ends: str = "[)"
 ) -> Any:
-    """A hyper-parameter, as an attribute of a class that stands on ``Constrained``.
+    """A hyperparameter, as an attribute of a class that inherits from ``Constrained``.
 
     The constructor takes it by name. Integers, numbers and literals are checked by the annotation
     and the range before the model is built; what else has to be checked is for
@@ -79,7 +79,7 @@ def hyperparameter(
 
 
 def stated(cls: type) -> dict[str, Hyperparameter]:
-    """The hyper-parameters that a class and its bases state as attributes."""
+    """The hyperparameters that a class and its bases state as attributes."""
     return {
         name: one
         for base in reversed(cls.__mro__)

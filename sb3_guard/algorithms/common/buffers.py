@@ -1,4 +1,4 @@
-"""Rollout buffers that carry costs beside rewards."""
+"""Rollout buffers that carry costs in addition to rewards."""
 
 from collections.abc import Generator
 from typing import Any, Literal, NamedTuple
@@ -162,7 +162,7 @@ class CostRolloutBuffer(_Costs, RolloutBuffer):  # type: ignore[misc]
     :param n_costs: number m of cost signals
     :param cost_gamma: discount factor of the costs
     :param cost_gae_lambda: bias-variance trade-off of the cost advantages
-    :param keep_executed: whether there is room for executed actions beside the sampled ones
+    :param keep_executed: whether there is room for executed actions in addition to the sampled ones
     :param returns: what the critics learn, of rewards and costs alike: ``"lambda"`` for SB3's
         λ-returns, ``"discounted"`` for discounted sums to come
 

@@ -51,10 +51,10 @@ def _within(callback: BaseCallback) -> Iterator[BaseCallback]:
 
 
 class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
-    """Cost keys, limits and episode costs beside an algorithm of Stable-Baselines3.
+    """Cost keys, limits and episode costs in addition to an algorithm of Stable-Baselines3.
 
     Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. A subclass states its
-    hyper-parameters as attributes (:func:`~sb3_guard.algorithms.common.arguments.hyperparameter`);
+    hyperparameters as attributes (:func:`~sb3_guard.algorithms.common.arguments.hyperparameter`);
     one that needs a constructor sets its own attributes first and then hands the other arguments
     on: SB3 builds the model at the end of its own. The signature, the docstring and the name under
     which ``learn`` logs are composed for every subclass.

@@ -1,4 +1,4 @@
-"""Networks beside the policy that learn from costs, and the regression that fits them."""
+"""Networks, separate from the policy, that learn from costs, and the regression that fits them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ from sb3_guard.algorithms.fast.optimizers import fuse
 
 
 class StateNetwork(nn.Module):
-    """A function of the observation that learns beside the policy.
+    """A function of the observation that is fitted separately from the policy.
 
     It is built like the policy's own critic (same kind of extractor, same ``net_arch``) but shares
     nothing with it, so any ``ActorCriticPolicy`` can have one.
 
     :param policy: the policy whose extractor, architecture and optimizer class are taken
     :param n_outputs: number of outputs
-    :param n_extra: number of inputs beside the observation
+    :param n_extra: number of inputs in addition to the observation
     """
 
     def __init__(self, policy: ActorCriticPolicy, n_outputs: int, n_extra: int = 0) -> None:
@@ -67,7 +67,7 @@ class StateNetwork(nn.Module):
         """Outputs, shape [B, n_outputs].
 
         :param observations: batch of B observations
-        :param extra: the inputs beside them, shape [B, n_extra]
+        :param extra: the further inputs, shape [B, n_extra]
         """
         features = self.extract_features(observations)
         return self.network(features if extra is None else th.cat([features, extra], dim=1))
@@ -147,7 +147,7 @@ class Regression:
         inputs: Callable[[Any], th.Tensor] | None = None,
         readout: Callable[[th.Tensor, Any], th.Tensor] | None = None,
     ) -> "Regression":
-        """A network beside the policy.
+        """A network that is separate from the policy.
 
         :param inputs: maps a batch to the input of ``network.network``; None: a batch is
             observations

@@ -92,7 +92,7 @@ class FilteredTrustRegion(TrustRegion):
         device: th.device | str = "auto",
     ) -> None:
         super().set_parameters(load_path_or_dict, exact_match, device)
-        # A given threshold is a hyper-parameter, which `load` may change.
+        # A given threshold is a hyperparameter, which `load` may change.
         self._set_threshold(self.policy.action_filter.threshold.cpu().numpy())
 
     def _setup_learn(
@@ -135,7 +135,7 @@ class FilteredTrustRegion(TrustRegion):
         return self._unit(batch.executed_actions.cpu().numpy())
 
     def _sampled(self, batch: CostRolloutBufferSamples) -> th.Tensor:
-        """The sampled actions likewise, clipped to the box, shape [B, k]."""
+        """The sampled actions, clipped to the box, shape [B, k]."""
         return self._unit(self.policy.executable(batch.actions.cpu().numpy()))
 
     def _corrections(self, batch: CostRolloutBufferSamples) -> th.Tensor:

@@ -131,11 +131,11 @@ def _average(before: th.Tensor, now: th.Tensor, keep: float) -> th.Tensor:
 
 
 class Lagrangian(Constrained):
-    """Prices of the costs that follow the violations, for any algorithm that takes them.
+    """Weights of the costs that follow the violations, for any algorithm that takes them.
 
-    The prices of an update come from :meth:`price`. The multipliers take their step, or steps, once
-    for each new estimate of J_C (:meth:`costs_to_follow`), before the policy learns (in
-    :meth:`price`) or after (in :meth:`ascend`, which ``train`` calls at its end).
+    The weights of an update come from :meth:`cost_weight`. The multipliers take their step, or
+    steps, once for each new estimate of J_C (:meth:`costs_to_follow`), before the policy learns (in
+    :meth:`cost_weight`) or after (in :meth:`ascend`, which ``train`` calls at its end).
 
     :param lambda_lr: η, what the multipliers gain per unit of violation and step
     :param lambda_init: multipliers before the first update
@@ -202,19 +202,19 @@ class Lagrangian(Constrained):
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "multiplier", "multiplier.optimizer"], tensors
 
-    def price(self, spread: np.ndarray | float = 1.0) -> np.ndarray:
-        """Advantage per unit of cost at this update's λ, float32 as advantages are, shape (m,).
+    def cost_weight(self, spread: np.ndarray | float = 1.0) -> np.ndarray:
+        """The weight of each cost advantage at this update's λ, float32, shape (m,).
 
         :param spread: what one standard deviation of a cost's advantages is in the reward's, shape
             (m,); multiplies λ if it is relative
         """
         if self.lambda_update == "before":
             self.ascend()
-        price = self.multiplier.value.numpy()
+        weight = self.multiplier.value.numpy()
         if self.lambda_units == "relative":
-            price = price * spread
-            self._record_per_cost("train/price", price)
-        return price.astype(np.float32)
+            weight = weight * spread
+            self._record_per_cost("train/cost_weight", weight)
+        return weight.astype(np.float32)
 
     def ascend(self) -> None:
         """Let the multipliers follow J_C, unless they have followed this estimate already."""

@@ -27,7 +27,7 @@ def replacements(cls: Any, data: dict[str, Any]) -> dict[str, Any]:
     """
     What takes the place of attributes in the file of an algorithm that knows no cost.
 
-    A hyper-parameter that the class states itself has the class's default, since the same name
+    A hyperparameter that the class states itself has the class's default, since the same name
     may mean something else there: sb3-contrib's ``target_kl`` is a mean over the dimensions of an
     action, ours a sum.
 
@@ -69,7 +69,7 @@ class LoadsOthers(BaseAlgorithm):
     ) -> Self:
         """Load an agent as SB3's ``load`` does, also one that an algorithm without costs trained.
 
-        Then actor, critic of the reward, their optimizers and the hyper-parameters that both
+        Then actor, critic of the reward, their optimizers and the hyperparameters that both
         algorithms take from SB3 are those of the file; a warning says what begins anew and what is
         left behind.
 

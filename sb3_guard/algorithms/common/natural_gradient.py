@@ -44,7 +44,7 @@ class Step(NamedTuple):
     :param x: the step, shape (P,)
     :param case: how the constraints lie to the trust region
     :param lambda_kl: multiplier λ of the trust region, 0 for a step that only recovers
-    :param nu: multipliers ν of the constraints, shape (m,), likewise
+    :param nu: multipliers ν of the constraints, shape (m,)
     :param moves: which constraints a step can change, shape (m,) bool; the others are left out, as
         a violation that the policy has no part in would otherwise end all learning
     """
@@ -226,7 +226,7 @@ def _solve(
 
 
 def _closed_form(gram: np.ndarray, c: np.ndarray, moves: np.ndarray, delta: float) -> _Solution:
-    """One binding constraint: walk to its boundary, spend what is left of δ along it."""
+    """One binding constraint: walk to its boundary, use what is left of δ along it."""
     (q, r), (_, s) = gram
     along = q - r**2 / s  # squared length of the reward gradient along the boundary
     if along <= _PARALLEL * q:

@@ -29,7 +29,7 @@ class PenalizedTrustRegion(Lagrangian, TrustRegion):
 
     def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
         deviation = batch.cost_advantages.std(dim=0, correction=0).double().cpu().numpy()
-        price = self.price(self.advantage_unit() * inverse(deviation))
-        priced = batch.cost_advantages @ th.as_tensor(price).to(batch.cost_advantages)
-        advantages = batch.advantages - priced
+        weight = self.cost_weight(self.advantage_unit() * inverse(deviation))
+        weighted = batch.cost_advantages @ th.as_tensor(weight).to(batch.cost_advantages)
+        advantages = batch.advantages - weighted
         return (ratio * advantages).mean() / (1.0 + float(self.multiplier.value.sum()))

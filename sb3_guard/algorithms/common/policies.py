@@ -45,7 +45,7 @@ class FilteredPolicy(ActorCriticPolicy):
         """Make a filter and carry it from now on.
 
         :param kind: its class
-        :param arguments: of the class, beside the policy
+        :param arguments: of the class, in addition to the policy
         """
         self._filter = (kind, arguments)
         self.action_filter = kind(self, **arguments).to(self.device)

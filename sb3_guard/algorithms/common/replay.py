@@ -1,6 +1,6 @@
 """Replay with costs, for any off-policy algorithm of Stable-Baselines3 with continuous actions.
 
-The costs of each step go into the replay buffer. Beside the policy, two networks per cost learn
+The costs of each step go into the replay buffer. Two networks per cost learn
 Q_C(s, a) = c + γ_C Q_C(s', a'); the latest episodes tell J_C.
 """
 
@@ -44,7 +44,7 @@ class CostReplayBufferSamples(NamedTuple):
 
 
 class _CostColumns(ReplayBuffer):
-    """Cost columns beside a replay buffer.
+    """Cost columns in addition to a replay buffer.
 
     :param n_costs: number m of costs
     """
@@ -74,7 +74,7 @@ class CostDictReplayBuffer(_CostColumns, DictReplayBuffer):
 class CostReplay(Constrained, OffPolicyAlgorithm):
     """Costs and cost critics for an off-policy algorithm with continuous actions.
 
-    A class that stands on it says in :meth:`learn_from` what it does with a batch.
+    A class that inherits from it says in :meth:`learn_from` what it does with a batch.
 
     :param cost_gamma: γ_C, discount factor of the costs, below 1; None for ``gamma``
     """
@@ -262,9 +262,9 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
 class LagrangianReplay(Lagrangian, CostReplay):
     """Multipliers for an actor that climbs a critic.
 
-    With ``lambda_units="relative"`` the price of a cost is λ times the standard deviation of Q over
-    that of Q_C, both of the transitions in the batch: replayed actions vary after the policy has
-    ceased to.
+    With ``lambda_units="relative"`` the weight of a cost is λ times the standard deviation of Q
+    over that of Q_C, both of the transitions in the batch: replayed actions vary after the policy
+    has ceased to.
 
     A single episode is a poor estimate of J_C, so each that ends moves the multipliers by the mean
     cost of the latest ones: the same way whether one environment or many have brought them, but
@@ -338,7 +338,7 @@ class LagrangianReplay(Lagrangian, CostReplay):
         actions: th.Tensor,
         values: th.Tensor,
     ) -> th.Tensor:
-        """(loss + Σ price_i Q_Ci(s, a)) / (1 + Σ λ_i); the loss itself while no λ is positive.
+        """(loss + Σ weight_i Q_Ci(s, a)) / (1 + Σ λ_i); the loss itself while no λ is positive.
 
         :param loss: what SB3's actor descends, by row, shape [B, 1]
         :param batch: B transitions
@@ -347,9 +347,9 @@ class LagrangianReplay(Lagrangian, CostReplay):
         :return: shape [B, 1]
         """
         spread = float(values.detach().std(correction=0)) or 1.0
-        price = self.price(spread * inverse(self.cost_deviation.astype(np.float64)))
-        if not price.any():
+        weight = self.cost_weight(spread * inverse(self.cost_deviation.astype(np.float64)))
+        if not weight.any():
             return loss
-        weights = th.as_tensor(price, device=loss.device)
+        weights = th.as_tensor(weight, device=loss.device)
         penalty = (self.cost_critic(batch.observations, actions) * weights).sum(1, keepdim=True)
         return (loss + penalty) / (1.0 + float(self.multiplier.value.sum()))

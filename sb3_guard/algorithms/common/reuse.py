@@ -122,8 +122,8 @@ class Reuse(TrustRegion):
     """Trust-region steps whose cost surrogates also use earlier rollouts.
 
     :param reuse: number of earlier rollouts that the cost gradient and the line search's test of
-        the cost use beside the last one; 0 for none, as in the papers. A loaded model begins
-        without any, a resumed run has them
+        the cost use in addition to the last one; 0 for none, as in the papers. A loaded model
+        begins without any, a resumed run has them
     """
 
     search_space: ClassVar[dict[str, Any]] = {"reuse": [0, 4, 9]}

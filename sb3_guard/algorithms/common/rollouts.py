@@ -227,7 +227,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         last = self.cost_critic(obs_as_tensor(self._last_obs, self.device)).cpu().numpy()
         buffer.compute_cost_returns_and_advantage(units * last, self._last_episode_starts)
         # Where every step costs the same, in episodes that only time has ended, no action matters:
-        # what is left are the critic's errors, all that a policy would follow at a high price.
+        # what is left are the critic's errors, all that a policy would follow at a high weight.
         ended = buffer.episode_starts[1:].sum() + self._last_episode_starts.sum()
         if ended == len(self._timeouts):
             buffer.cost_advantages[..., same_at_every_step(buffer.costs)] = 0.0

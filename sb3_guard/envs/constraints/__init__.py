@@ -1,4 +1,4 @@
-"""Constraints: what the robot pays for, one file each."""
+"""Constraints, which assign costs, one file each."""
 
 from sb3_guard.envs.constraints.buttons import Buttons
 from sb3_guard.envs.constraints.ghosts import Ghosts

@@ -1,4 +1,4 @@
-"""Boundary: lines that the robot can cross, but pays for being beyond."""
+"""Boundary: lines that the robot can cross; being beyond them has a cost."""
 
 from dataclasses import dataclass
 

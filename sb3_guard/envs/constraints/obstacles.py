@@ -1,4 +1,4 @@
-"""What constraints of many like objects have in common: a price for entering or touching them."""
+"""The base of constraints with several alike objects: a cost for entering or touching them."""
 
 from dataclasses import dataclass
 

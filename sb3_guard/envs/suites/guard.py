@@ -1,4 +1,4 @@
-"""GUARD's suites (Zhao et al. 2024): four tasks × nine robots × eight hazards or ghosts.
+"""GUARD's environments (Zhao et al. 2024): four tasks × nine robots × eight hazards or ghosts.
 
 Names say what they mean: any task, robot, number and constraint make an environment.
 """

@@ -27,7 +27,7 @@ class Forward(Task):
 
     speed: float = param(1.0, "reward per m/s along x")
     survival: float = param(0.0, "reward of a step")
-    control: float = param(0.0, "price of the squared controls, summed", low=0)
+    control: float = param(0.0, "weight of the squared controls, summed", low=0)
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)

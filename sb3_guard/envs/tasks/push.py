@@ -67,7 +67,7 @@ class Push(Destination):
         None, "extra distance of the object to every other one, m; null: margin", low=0
     )
     null_distance: float = param(
-        2.0, "distance, in object sizes, within which approaching the object earns nothing", low=0
+        2.0, "distance, in object sizes, within which approaching the object has no reward", low=0
     )
     reward_approach: float = param(1.0, "reward per metre gained on the object")
     object_lidar: bool = param(False, "whether the object is also seen by a lidar")

@@ -1,4 +1,4 @@
-"""A film of an agent: what happens, below what it has earned and what that has cost so far."""
+"""A film of an agent: what happens, below with the return and the cost so far."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -161,7 +161,7 @@ def render(env: VecEnv) -> np.ndarray | None:
 
 
 def _pictures(env: VecEnv) -> list[np.ndarray]:
-    """The pictures of one step: several where a control step of ours is long."""
+    """The pictures of one step: several where a control step of sb3_guard is long."""
     native = env.unwrapped
     return native.film() if isinstance(native, GuardVecEnv) else [render(env)]  # type: ignore[list-item]
 

@@ -17,25 +17,27 @@ class AgentFlags(Command):
     :param algo: algorithm (default: cpo)
     :param env: environment id (default: Goal_Point_8Hazards)
     :param folder: log folder (default: logs)
-    :param exp_id: number of the run; 0: the latest, -1: the folder itself (default: 0)
-    :param load_best: the best model, safe first
-    :param pretrained: an agent that comes with the package
-    :param load_checkpoint: the model kept at so many steps
-    :param load_last_checkpoint: the last model that was kept
+    :param exp_id: number of the run; 0: the latest, -1: the log folder itself is the run (default:
+        0)
+    :param load_best: take the best checkpoint (highest return among those within the limit) instead
+        of the last one
+    :param pretrained: take an agent that comes with the package
+    :param load_checkpoint: take the model that was kept after this number of steps
+    :param load_last_checkpoint: take the last model that was kept
 
     What is played:
 
-    :param n_episodes: episodes (default: 30 at once; 5 in a window or of an environment that is not
-        this package's, 1 to record, 10 for the hub)
-    :param stochastic: sampled actions
-    :param seed: seed of the episodes (default: 0)
-    :param env_kwargs: arguments of the environment, over those of training
+    :param n_episodes: number of episodes (default: 30; 5 in a window or in an environment of
+        another package, 1 to record, 10 for the hub)
+    :param stochastic: sample actions instead of taking the most likely ones
+    :param seed: random seed of the episodes (default: 0)
+    :param env_kwargs: arguments of the environment, which replace those of training
     :param gym_packages: modules to import first, such as those that training imported
 
     Output:
 
     :param device: torch device (default: auto)
-    :param num_threads: threads of torch
+    :param num_threads: threads of torch; -1: chosen by torch (default: -1)
     """
 
     algo: str = flag(default="cpo")
@@ -62,26 +64,26 @@ class EnjoyFlags(AgentFlags):
 
     What is played:
 
-    :param n_timesteps: steps instead
-    :param deterministic: the most likely actions (the default)
+    :param n_timesteps: number of steps to play, instead of --n-episodes
+    :param deterministic: take the most likely actions (default)
 
     Output:
 
-    :param record: write a video, with return, cost and limit above the pictures; no display is
-        needed (default: beside the model; of a pretrained agent in the current folder)
-    :param json: write the statistics there as JSON
-    :param window: MuJoCo's viewer, the default where there is a display: Space pauses, Tab opens
+    :param record: write a video with return, cost and limit in the frame; needs no display (default
+        file: next to the model, for a pretrained agent in the current folder)
+    :param json: write the statistics to this JSON file
+    :param window: open MuJoCo's viewer (default where there is a display): Space pauses, Tab opens
         menus, F shows contact forces
     :param no_render: open no window
-    :param verbose: 0: the means only
+    :param verbose: output: 0 means only, 1 every episode (default: 1)
     """
 
     prog: ClassVar[str] = "sb3-guard enjoy"
     examples: ClassVar[str] = """examples:
-  python -m sb3_guard.enjoy --pretrained
-  python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards -f logs
-  python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards --load-best --n-episodes 20
-  python -m sb3_guard.enjoy --algo cpo --env Goal_Point_8Hazards --pretrained --record agent.mp4
+  sb3-guard enjoy --pretrained
+  sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards -f logs
+  sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards --load-best --n-episodes 20
+  sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards --pretrained --record agent.mp4
 """
     n_timesteps: int | None = flag("-n", kind=positive, metavar="N", exclusive="length")
     deterministic: bool = flag(default=False, exclusive="actions")
@@ -100,18 +102,18 @@ class HubFlags(AgentFlags):
 
     Which agent:
 
-    :param direction: upload or download
-    :param organization: user or organization
-    :param repo_name: repository (default: <algo>-<env>)
-    :param repo_id: both in one
+    :param direction: push: upload an agent; load: download one
+    :param organization: user or organization that owns the repository
+    :param repo_name: name of the repository (default: <algo>-<env>)
+    :param repo_id: user/name; replaces --organization and --repo-name
 
     Push:
 
-    :param commit_message: of the upload
+    :param commit_message: message of the upload (default: 'Upload a trained agent')
     :param private: make the repository private
-    :param no_video: do not film an episode
-    :param dry_run: write all files, upload nothing
-    :param to: where the files are written first
+    :param no_video: record no video of an episode
+    :param dry_run: write all files and upload nothing
+    :param to: local folder in which the upload is prepared (default: a temporary one)
     """
 
     prog: ClassVar[str] = "sb3-guard hub"

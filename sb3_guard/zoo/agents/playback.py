@@ -58,14 +58,14 @@ def find_run(
     number = number or latest_run(parent, name)
     if number:
         return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
-    algorithm(algo), full_id(env_id)  # a misspelt name has a message of its own
+    algorithm(algo), full_id(env_id)  # a misspelled name has a message of its own
     where = "" if folder == PRETRAINED else f" -f {folder}"
     ships = where and latest_run(PRETRAINED / algo, name)
     runs = [one for one in sorted(Path(folder).glob("*/*_*")) if is_run(one)]
     there = dict.fromkeys(f"{one.parent.name} on {one.name.rpartition('_')[0]}" for one in runs)
     raise UsageError(
         f"there is no run of {algo} on {env_id} in {str(folder)!r}; train one with: "
-        f"python -m sb3_guard.train --algo {algo} --env {env_id}{where}{packages_flag(packages)}"
+        f"sb3-guard train --algo {algo} --env {env_id}{where}{packages_flag(packages)}"
         + (f"; or play one of those there: {', '.join(there)}" if there else "")
         + ("; or play the package's own with --pretrained" if ships else "")
     )
@@ -132,7 +132,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
 
     :param flags: of the command
     :param render_mode: None, ``"human"``, or ``"rgb_array"``
-    :param n_envs: environments of ours, which are one batch; of others there is one
+    :param n_envs: environments of sb3_guard, which are one batch; of others there is one
     :raises UsageError: there is no such agent, or it does not fit the environment
     """
     import_packages(flags.gym_packages)

@@ -1,6 +1,6 @@
 """The classes that data names: looked up, and checked before anyone calls them.
 
-Hyper-parameters name wrappers, callbacks and policies. A module runs code when it is imported, so a
+Hyperparameters name wrappers, callbacks and policies. A module runs code when it is imported, so a
 file may name classes of :data:`KNOWN` packages only, and of modules that the command line names
 (``--gym-packages``), which are imported by then.
 """
@@ -24,7 +24,7 @@ from sb3_guard.zoo.cli.values import read_expression
 KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
 # Files of what differs from an algorithm's own file, which `-conf NAME` reads; not code.
 PRESETS = {"paper": "the paper", "omnisafe": "the settings that OmniSafe has published"}
-# Hyper-parameters that name classes, one or several, perhaps with arguments; and of what kind.
+# Hyperparameters that name classes, one or several, perhaps with arguments; and of what kind.
 BASES: dict[str, type] = {
     "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
 }  # fmt: skip
@@ -45,7 +45,7 @@ def entries(name: str, value: Any) -> list[tuple[str, dict[str, Any]]]:
             path, kwargs = next(iter(one.items()))
         if not isinstance(path, str) or not isinstance(kwargs or {}, Mapping):
             raise UsageError(
-                f"hyper-parameter {name}: {one!r} is not allowed; it must be module.Class, or "
+                f"hyperparameter {name}: {one!r} is not allowed; it must be module.Class, or "
                 "{module.Class: {argument: value}}"
             )
         found.append((path, dict(kwargs or {})))
@@ -56,7 +56,7 @@ def import_class(name: str, path: str, base: type) -> Any:
     """
     The class of a dotted name, which is checked before anyone calls it.
 
-    :param name: the hyper-parameter, for the message
+    :param name: the hyperparameter, for the message
     :param base: what it must be a subclass of
     :raises UsageError: there is no such class, it is another kind of thing, or its module is not
         imported yet and of none of the :data:`KNOWN` packages
@@ -118,14 +118,14 @@ def _torch_name(path: str) -> str:
 
 
 def _evaluating(name: str, value: Any) -> AbstractContextManager[None]:
-    what = f"hyper-parameter {name}: {value!r} can't be evaluated"
+    what = f"hyperparameter {name}: {value!r} can't be evaluated"
     allowed = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
     return explained(what, ValueError, fix=allowed)
 
 
 def as_data(name: str, value: Any) -> Any:
     """
-    A hyper-parameter as data, of text such as ``dict(activation_fn=nn.ReLU)`` too.
+    A hyperparameter as data, of text such as ``dict(activation_fn=nn.ReLU)`` too.
 
     :return: mappings, lists and literals; classes stay text, see :func:`with_classes`
     :raises UsageError: it is more than literals and names of torch's classes
@@ -138,7 +138,7 @@ def as_data(name: str, value: Any) -> Any:
 
 def with_classes(name: str, value: Any) -> Any:
     """
-    A hyper-parameter with the classes of torch that it names, such as ``nn.ReLU``.
+    A hyperparameter with the classes of torch that it names, such as ``nn.ReLU``.
 
     :raises UsageError: torch has no class of a name that begins with ``nn.``, ``th.``, ``torch.``
     """

@@ -69,7 +69,7 @@ def read_mapping(path: str | Path, what: str, form: str) -> dict[Any, Any]:
     The plain data of a YAML file.
 
     :param what: what the file is, for the message
-    :param form: what it must be, likewise
+    :param form: what it must be, for the message
     :raises UsageError: it can't be read, or is not a mapping
     """
     errors = OSError, ValueError, yaml.YAMLError

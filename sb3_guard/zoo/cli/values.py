@@ -58,7 +58,7 @@ def parse_value(text: str) -> Any:
 
     So ``cost_limit:25``, ``policy:MlpPolicy``, ``hazards:{num:4}`` and ``learning_rate:lin_1e-3``
     need no further quotes; ``policy_kwargs:dict(activation_fn=nn.ReLU)`` is text here, and is read
-    with the other hyper-parameters.
+    with the other hyperparameters.
     """
     try:
         return read_expression(text)

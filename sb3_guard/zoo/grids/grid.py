@@ -1,4 +1,4 @@
-"""A grid of training runs, suites × algorithms × seeds: checked in full, then carried out.
+"""A grid of training runs, environments × algorithms × seeds: checked in full, then carried out.
 
 A run of a grid is a training run like any other, in ``<folder>/<algo>/<env>_<seed + 1>/``, so it is
 played, plotted and resumed like any other. An executor of :mod:`concurrent.futures` carries the
@@ -41,7 +41,7 @@ class Run:
     One run of a grid.
 
     :param flags: all flags, as its folder states them
-    :param values: all hyper-parameters, likewise
+    :param values: all hyperparameters, in the same form
     :param ignored: those given for the grid that its algorithm does not have
     """
 
@@ -76,7 +76,7 @@ def expand(
     """
     The runs of a grid, checked, and how far they are; those of the first seed come first.
 
-    A hyper-parameter given for the whole grid is passed to the algorithms that have it.
+    A hyperparameter given for the whole grid is passed to the algorithms that have it.
 
     :param pairs: environments and algorithms
     :param seeds: at least 0
@@ -92,7 +92,7 @@ def expand(
     every = sorted(set[str]().union(*known.values()))
     for name in given.keys() - every:
         hint = did_you_mean(name, every)
-        raise UsageError(f"none of the algorithms has a hyper-parameter {name!r}; {hint}")
+        raise UsageError(f"none of the algorithms has a hyperparameter {name!r}; {hint}")
     first = {}
     flags = replace(flags, progress=False, num_threads=max(flags.num_threads, 1))
     for env_id, algo in pairs:
@@ -111,8 +111,8 @@ def expand(
 
 def try_out(runs: Sequence[Run]) -> None:
     """
-    Make each suite and each algorithm once, so that a value that is refused only there ends the
-    grid before it begins.
+    Make each environment and each algorithm once, so that a bad value ends the grid before it
+    begins.
 
     :raises UsageError: one is refused
     """

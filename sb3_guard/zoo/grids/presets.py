@@ -1,4 +1,4 @@
-"""The questions of the GUARD paper (arXiv 2305.13681): which suites and algorithms each needs.
+"""The questions of the GUARD paper (arXiv 2305.13681), with the environments and algorithms.
 
 ``benchmark --preset`` trains them, and :mod:`sb3_guard.zoo.results.paper` draws what came of it.
 """
@@ -33,7 +33,7 @@ MAIN8 = (
 RADAR4 = ("Goal_Point_8Hazards", "Goal_Point_8Ghosts", "Goal_Ant_8Hazards", "Goal_Ant_8Ghosts")
 RUNGS = [f"Goal_Point_{number}{kind}" for kind in ("Hazards", "Ghosts") for number in LADDER]
 
-# Blocks of suites × algorithms. Scores are relative to TRPO's, so it is part of each.
+# Blocks of environments × algorithms. Scores are relative to TRPO's, so it is part of each.
 PRESETS: dict[str, tuple[tuple[Sequence[str], Sequence[str]], ...]] = {
     "paper45": ((PAPER45, ALGOS),),
     "main8": ((MAIN8, ALGOS),),
@@ -51,9 +51,9 @@ PRESETS: dict[str, tuple[tuple[Sequence[str], Sequence[str]], ...]] = {
 
 def preset(name: str, algos: Sequence[str] | None = None) -> list[tuple[str, str]]:
     """
-    The pairs of suite and algorithm of a preset.
+    The pairs of environment and algorithm of a preset.
 
-    :param algos: take these on all of its suites; None: what its question needs
+    :param algos: take these on all of its environments; None: what its question needs
     :raises UsageError: there is no preset of that name
     """
     if name not in PRESETS:

@@ -65,7 +65,7 @@ class Data:
 
     @cached_property
     def scores(self) -> pd.DataFrame:
-        """Means with scores, of algorithms and of families; index suite and either's key."""
+        """Means with scores, of algorithms and of families; index environment and either's key."""
         scores = normalize(self.means, self.means)
         families = by_family(scores).rename(columns={"family": "algo"})
         return pd.concat([scores, families]).set_index(["suite", "algo"])
@@ -116,7 +116,7 @@ class Data:
 
     @property
     def suites(self) -> list[str]:
-        """The suites that there are runs of."""
+        """The environments that there are runs of."""
         return list(dict.fromkeys(self.runs["suite"]))
 
     def algos(self, suite: str) -> list[str]:
@@ -152,7 +152,7 @@ class Data:
         return self.looks[algo].label if algo in self.looks else described(algo)["label"]
 
     def missing(self, suites: Iterable[str], algos: Sequence[str]) -> str:
-        """Which algorithms lack runs on which suites, in words."""
+        """Which algorithms lack runs on which environments, in words."""
         have = {*zip(self.runs["suite"], self.runs["algo"], strict=True)}
         groups: dict[tuple[str, ...], list[str]] = {}
         for suite in suites:

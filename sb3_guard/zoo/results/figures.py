@@ -193,7 +193,7 @@ def finish(figure: Figure, missing: str) -> None:
 
 
 def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
-    """One row of panels per suite that has runs: return, episode costs, cost rate."""
+    """One row of panels per environment that has runs: return, episode costs, cost rate."""
     drawn = [suite for suite in suites if any(data.curves(suite, a) for a in data.algos(suite))]
     if not drawn:
         return None
@@ -315,7 +315,7 @@ def profiles(data: Data) -> Figure | None:
 
 
 def iqm(data: Data) -> Figure | None:
-    """Interquartile means of the scores over runs and suites, with 95 % intervals."""
+    """Interquartile means of the scores over runs and environments, with 95 % intervals."""
     table = overall(data.runs, data.means).set_index("algo")
     table = table.dropna(subset=[f"{score}_iqm" for score in SCORES.values()], how="all")
     if not len(table):

@@ -77,7 +77,7 @@ def mark_trpo(axis: Axes) -> None:
 
 
 def q3(data: Data) -> Figure | None:
-    """Families of algorithms: reward, cost and cost rate on four suites, a polygon per family."""
+    """Families of algorithms: scores on four environments, a polygon per family."""
     spiders = {
         suite: {
             family: [data.score(suite, family, score) for score in SCORES.values()]
@@ -210,7 +210,7 @@ def draw(kind: str, data: Data) -> list[Drawing]:
     :param kind: a key of :data:`FIGURES`
     """
     function, drawings = FIGURES[kind], []
-    # Which algorithms to run on a suite of their own is the user's choice: no others are missing.
+    # In figures of one environment the user chooses the algorithms: no others are missing.
     blocks = () if function in PER_SUITE else PRESETS.get(kind, ((data.suites, [REFERENCE]),))
     with mpl.rc_context(STYLE):
         for suite in data.suites if function in PER_SUITE else [""]:

@@ -1,6 +1,6 @@
 """What trained runs reached: run folders in, a table with a row per run out.
 
-``docs/results.md`` states the rules: which runs are read, which may be averaged, and what a reader
+``docs/plotting.md`` states the rules: which runs are read, which may be averaged, and what a reader
 of the averages is told.
 """
 
@@ -110,7 +110,7 @@ def read_run(path: Path) -> dict[str, Any]:
         missing: unconstrained), ``verdict`` on them (of several the worst), ``seconds`` of
         training, ``epoch`` (steps of a rollout), ``world`` (``env_kwargs``), ``started_from`` (the
         model that training started from), ``settings`` (:data:`SETTINGS`) and ``config`` (the same
-        for the same hyper-parameters). If the limits are on other costs than the total, there are
+        for the same hyperparameters). If the limits are on other costs than the total, there are
         ``M_c/<key>``, ``cost_limit/<key>`` and ``verdict/<key>`` of each. What runs of older
         versions did not write is missing
     :raises UsageError: the run is not finished, or damaged
@@ -240,9 +240,9 @@ def choose(
     :param suites: None: all. The version may be left out
     :param cost_limit: runs of this limit, or of these limits on several costs, and the
         unconstrained ones; None: all
-    :param steps: where an algorithm has runs of several lengths on a suite, those of this one;
+    :param steps: only runs of this length, where an algorithm has several on an environment;
         None: all
-    :raises UsageError: a suite, limit or length without runs
+    :raises UsageError: an environment, limit or length without runs
     """
     if suites is not None:
         wanted = [name.removesuffix("-v0") for name in suites]
@@ -274,8 +274,8 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
     """
     The runs that may be averaged: of runs that are the same, seed included, the last one counts.
 
-    :raises UsageError: a suite has several cost limits or ``env_kwargs``, or an algorithm on it
-        several lengths
+    :raises UsageError: an environment has several cost limits or ``env_kwargs``, or an algorithm
+        on it several lengths
     """
     for suite, group in runs.groupby("suite"):
         limits = _limits_of(group)
@@ -333,7 +333,7 @@ def notices(runs: pd.DataFrame, selected: pd.DataFrame) -> list[str]:
 
 
 def _differences(group: pd.DataFrame) -> Iterable[str]:
-    """In what the runs of one suite differ."""
+    """In what the runs of one environment differ."""
     if group["steps"].nunique() > 1:
         yield f"runs differ in length: {_joined(sorted(group['steps'].unique()))} steps"
     if group["started_from"].nunique(dropna=False) > 1:
@@ -346,7 +346,7 @@ def _differences(group: pd.DataFrame) -> Iterable[str]:
     for algo, own in group.groupby("algo"):
         if own["config"].nunique() > 1:
             paths = _joined(own.drop_duplicates("config")["path"])
-            yield f"runs of {algo} differ in hyper-parameters or in how they were extended: {paths}"
+            yield f"runs of {algo} differ in hyperparameters or in how they were extended: {paths}"
         twice = sorted(own.loc[own.duplicated("seed"), "seed"].unique())
         if twice:
             yield f"runs of {algo} count twice or more for one seed: {_joined(twice)}"

@@ -2,7 +2,7 @@
 
 Scores are relative to TRPO's (arXiv 2305.13681). Intervals and interquartile means follow Agarwal
 et al. 2021 (arXiv 2108.13264). Their library, rliable, saw its last release in 2024 and does not
-import beside pandas 3 (through ``arch``), so the stratified bootstrap, the one piece needed, is
+import with pandas 3 (through ``arch``), so the stratified bootstrap, the one piece needed, is
 :func:`interval`.
 """
 
@@ -137,7 +137,7 @@ def with_safety(runs: pd.DataFrame) -> pd.DataFrame:
 
 def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
     """
-    Means over seeds, a row per suite and algorithm.
+    Means over seeds, a row per environment and algorithm.
 
     :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
     :return: ``suite``, ``algo``, ``label``, ``family``, limits, verdicts (of a single seed),
@@ -183,9 +183,9 @@ def normalize(rows: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
     Scores relative to TRPO's, by the paper's three equations and its rule for negative returns.
 
     ``reward`` is min(J_r / J_r(TRPO), 1), ``cost`` is M_c / M_c(TRPO), ``cost_rate`` is
-    ρ_c / ρ_c(TRPO), not capped. If any mean return of a suite is negative, the least one less 1 %
-    of their range (if all are equal: less their size) is first subtracted from all returns of the
-    suite.
+    ρ_c / ρ_c(TRPO), not capped. If any mean return of an environment is negative, the least one
+    less 1 % of their range (if all are equal: less their size) is first subtracted from all of its
+    returns.
 
     :param rows: a table with ``suite``, ``algo`` and the metrics, of means or of runs
     :param means: the means, of :func:`aggregate`, that TRPO's values and the shift come from;
@@ -222,11 +222,11 @@ def by_family(scores: pd.DataFrame) -> pd.DataFrame:
 
 def overall(runs: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
     """
-    Scores of each algorithm over all suites.
+    Scores of each algorithm over all environments.
 
-    :return: ``algo``, ``label``; for each score its mean over suites, ``_n`` (suites that have
-        one), ``_iqm`` (interquartile mean over runs and suites) with ``_low`` and ``_high`` (95 %
-        stratified bootstrap interval)
+    :return: ``algo``, ``label``; for each score its mean over environments, ``_n`` (number of
+        environments that have one), ``_iqm`` (interquartile mean over runs and environments) with
+        ``_low`` and ``_high`` (95 % stratified bootstrap interval)
     """
     scores, single = normalize(means, means), normalize(runs, means)
     order = means.sort_values("algo", key=lambda a: a != REFERENCE, kind="stable")

@@ -35,7 +35,7 @@ def terminal(data: pd.DataFrame) -> str:
     console = Console(width=shutil.get_terminal_size((120, 0)).columns, file=io.StringIO())
     grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in map(str, data):
-        grid.add_column(name, no_wrap=name in ("suite", "algorithm"))
+        grid.add_column(name, no_wrap=name in ("environment", "algorithm"))
     for row in data.astype(str).to_numpy():
         grid.add_row(*(Text(cell.replace(" [", "\n[")) for cell in row))
     with console.capture() as captured:
@@ -130,12 +130,12 @@ def _limits(means: pd.DataFrame) -> pd.DataFrame:
     for name in map(str, means.filter(regex="^cost_limit/")):
         end = name.removeprefix("cost_limit")
         columns: Columns = {
-            "suite": "suite", "algorithm": "label", "cost": lambda row, end=end: end[1:],  # type: ignore[misc]
+            "environment": "suite", "algorithm": "label", "cost": lambda row, end=end: end[1:],  # type: ignore[misc]
             "mean of an episode": _with_interval(f"M_c{end}"),
             "limit": lambda row, end=end: _limit(row, end),  # type: ignore[misc]
         }  # fmt: skip
         parts.append(spelled(means.dropna(subset=[name]), columns))
-    return pd.concat(parts).sort_values("suite", kind="stable") if parts else pd.DataFrame()
+    return pd.concat(parts).sort_values("environment", kind="stable") if parts else pd.DataFrame()
 
 
 SAFETY_HEADINGS: Columns = {
@@ -180,7 +180,7 @@ def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
     means = aggregate(runs)
     scores = normalize(means, means)
-    who: Columns = {"suite": "suite", "algorithm": "label"}
+    who: Columns = {"environment": "suite", "algorithm": "label"}
     shown: Columns = {heading: score for score, heading in SCORE_HEADINGS.items()}
     result = {
         "Results": spelled(
@@ -198,19 +198,23 @@ def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     result["Relative to TRPO"] = spelled(scores, who | shown)
     families = by_family(scores)
     if len(families):
-        columns: Columns = {"suite": "suite", "family": "family", "algorithms": whole("algorithms")}
+        columns: Columns = {
+            "environment": "suite",
+            "family": "family",
+            "algorithms": whole("algorithms"),
+        }
         result["Families, relative to TRPO"] = spelled(families, columns | shown)
     if scores["suite"].nunique() > 1:
         columns = {"algorithm": "label"}
         for score, heading in SCORE_HEADINGS.items():
             columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"  # type: ignore[misc]
             columns[f"{heading}, IQM"] = _with_interval(score, "_iqm")
-        result["All suites, relative to TRPO"] = spelled(overall(runs, means), columns)
+        result["All environments, relative to TRPO"] = spelled(overall(runs, means), columns)
     return result
 
 
 RUNS: Columns = {
-    "suite": "suite", "algorithm": "label", "seed": whole("seed"), "limit": _limit,
+    "environment": "suite", "algorithm": "label", "seed": whole("seed"), "limit": _limit,
     "steps": whole("steps"), **{heading: name for name, heading in HEADINGS.items()},
     "physics errors": whole("physics_errors"), "seconds": whole("seconds"),
     "commit": lambda row: "–" if pd.isna(row["commit"])

@@ -35,7 +35,7 @@ from sb3_guard.zoo.run.resumable import capture, restore
 MEMBER = "run_state.pkl"
 NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
-EARLIER = "earlier"  # folder beside the checkpoint: earlier rollouts, each written once
+EARLIER = "earlier"  # folder in addition to the checkpoint: earlier rollouts, each written once
 # Checkpoints take at most this share of the time: those with a replay buffer are large.
 LARGEST_SHARE = 0.05
 # The tensors with gSDE's noise, of all environments and of one each.
@@ -227,7 +227,7 @@ class Checkpoints(BaseCallback):
 
 
 def _write_earlier(model: BaseAlgorithm, folder: Path) -> list[str]:
-    """Write what is not yet there of the rollouts that an update uses beside its own.
+    """Write what is not yet there of the rollouts that an update uses in addition to its own.
 
     :return: the names of the files, the latest last
     """

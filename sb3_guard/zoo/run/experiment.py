@@ -108,7 +108,7 @@ class Experiment:
             verbose=int(flags.verbose > 0 and self.prints_tables),
         )
         evaluation.model = model
-        with explained("hyper-parameter", ValueError):
+        with explained("hyperparameter", ValueError):
             evaluation.limits()
         return evaluation
 
@@ -185,7 +185,7 @@ class Experiment:
                 arguments.pop(name, None)
             path = Path(flags.trained_agent)
             if self.setup.normalize is not None and self._statistics_beside() is None:
-                print(f"no vecnormalize.pkl beside {path}: observation statistics begin anew")
+                print(f"no vecnormalize.pkl next to {path}: observation statistics begin anew")
             return load_model(self.algorithm, path, env, flags.device, **arguments)
         space = env.action_space
         noise = self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
@@ -204,7 +204,7 @@ class Experiment:
         return read_normalizer(file) if file else None
 
     def _statistics_beside(self) -> Path | None:
-        """The file of observation statistics that a run or an evaluation wrote beside its model."""
+        """Observation statistics that a run or an evaluation wrote next to its model."""
         agent = Path(self.flags.trained_agent)
         if self.folder is not None or not agent.name or self.setup.normalize is None:
             return None

@@ -26,15 +26,18 @@ class TrainingFlags(Command):
 
     What is trained:
 
-    :param n_timesteps: length of training, e.g. 1e6 (default: as in the hyper-parameter file)
-    :param hyperparams: hyper-parameters that differ from the file, e.g. n_steps:500 cost_limit:25
-    :param conf_file: hyper-parameters: 'paper' for the paper's table to the letter, 'omnisafe' for
-        that library's published settings, a YAML file, or a Python file or module with a dict
+    :param n_timesteps: number of training steps, e.g. 1e6 (default: n_timesteps of the
+        hyperparameter file, else 1e6)
+    :param hyperparams: hyperparameters that replace the defaults, e.g. n_steps:500 cost_limit:25
+    :param conf_file: hyperparameters: 'paper' for the GUARD paper's table, 'omnisafe' for
+        OmniSafe's published settings, a YAML file, or a Python file or module with a dictionary
         'hyperparams' (default: hyperparams/<algo>.yml)
     :param env_kwargs: arguments of the environment, e.g. "hazards:{'num': 4}"
-    :param vec_env: one batch, one by one, or a process each (default: native where it is possible)
+    :param vec_env: how environments are stepped: native (one batch), dummy (one after another) or
+        subproc (one process each); default: native if the environment supports it, else dummy
     :param device: torch device (default: auto)
-    :param gym_packages: modules to import first, since they register environments
+    :param gym_packages: modules to import before training, which register environments, parts or
+        algorithms
     """
 
     n_timesteps: int = flag("-n", default=-1, kind=positive, metavar="N")
@@ -53,22 +56,28 @@ class EvaluationFlags(Command):
 
     Evaluation:
 
-    :param eval_freq: evaluate every N steps; -1 never (default: 100000)
-    :param eval_episodes: episodes each time, of the stochastic policy and of its mean (default: 30)
-    :param n_eval_envs: environments to evaluate in (default: one per episode if native, else 1)
-    :param eval_env_kwargs: arguments of the evaluation environment (default: as in training)
+    :param eval_freq: steps between evaluations; -1: no evaluation (default: 100000)
+    :param eval_episodes: episodes per evaluation, with sampled actions and again with the most
+        likely ones (default: 30)
+    :param n_eval_envs: number of environments to evaluate in (default: one per episode if native,
+        else 1)
+    :param eval_env_kwargs: arguments of the evaluation environment (default: those of training)
 
     Files:
 
-    :param save_freq: keep a model every N steps, rl_model_<N>_steps.zip; -1 none (default: -1)
-    :param checkpoint_every: least seconds between checkpoints to resume from (default: 10)
-    :param tensorboard_log: write TensorBoard events there
+    :param save_freq: steps between models that are kept as rl_model_<N>_steps.zip; -1: keep none
+        (default: -1)
+    :param checkpoint_every: least number of seconds between checkpoints to resume from (default:
+        10)
+    :param tensorboard_log: folder for TensorBoard events (default: none)
     :param track: send the run to Weights & Biases (needs wandb)
 
     Running:
 
-    :param log_interval: log every N rollouts; -2 never (default: 1)
-    :param num_threads: threads of torch and of the native engine (default: -1, their own choice)
+    :param log_interval: updates between lines of the log; -1: every update, -2: no log (default:
+        -1)
+    :param num_threads: threads of torch and of the native engine; -1: chosen by each of them
+        (default: -1)
     """
 
     eval_freq: int = flag(default=100_000, kind=steps, metavar="N", role=IDENTITY)
@@ -94,22 +103,22 @@ class RunFlags(EvaluationFlags, TrainingFlags):
 
     What is trained:
 
-    :param algo: algorithm, e.g. cpo or trpo
+    :param algo: algorithm, e.g. cpo or trpo (default: cpo)
     :param env: environment id; the version may be left out (default: Goal_Point_8Hazards)
-    :param seed: random seed (default: -1, a random one)
-    :param trained_agent: a run folder or checkpoint.zip: continue that run in place, exactly; any
-        other model.zip: begin a new run from that agent, with the observation statistics in
-        <model>_vecnormalize.pkl or */vecnormalize.pkl beside it
+    :param seed: random seed; -1: a random one (default: -1)
+    :param trained_agent: run folder or checkpoint.zip: continue that run in place, bit for bit; any
+        other model.zip: start a new run from that agent, with the observation statistics in
+        <model>_vecnormalize.pkl or */vecnormalize.pkl next to it
 
     Files:
 
-    :param log_folder: where runs go (default: logs)
-    :param uuid: make the run folder's name unique
+    :param log_folder: folder for runs (default: logs)
+    :param uuid: add a unique suffix to the run folder's name
 
     Running:
 
-    :param progress: progress bar (default: if stderr is a terminal)
-    :param verbose: 0 nothing, 1 progress, 2 all (default: 1)
+    :param progress: show a progress bar (default: if stderr is a terminal)
+    :param verbose: output: 0 nothing, 1 progress, 2 everything (default: 1)
     """
 
     algo: str = flag(default="cpo", role=IDENTITY)

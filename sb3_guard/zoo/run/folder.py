@@ -130,7 +130,7 @@ class RunFolder:
     """
     The files of one run.
 
-    ``<log folder>/<algo>/<env>_<k>/`` holds ``<env>/config.yml`` (hyper-parameters),
+    ``<log folder>/<algo>/<env>_<k>/`` holds ``<env>/config.yml`` (hyperparameters),
     ``<env>/args.yml`` (flags), ``<env>/command.txt``, ``0.monitor.csv``, ``progress.csv``,
     ``evaluations.npz``, ``best_model.zip``, ``rl_model_<steps>_steps.zip`` if asked for, the final
     model ``<env>.zip``, ``checkpoint.zip`` to resume from, and, once the run is complete,
@@ -167,7 +167,7 @@ class RunFolder:
         Take a folder and write down what the run is.
 
         :param flags: all flags
-        :param hyperparams: all hyper-parameters, plain data
+        :param hyperparams: all hyperparameters, plain data
         :param command: the command line
         :param path: its folder, on which the caller has :func:`lock`; None: the next free number
         :raises UsageError: the folder can't be written to, or there is more than plain data
@@ -221,12 +221,12 @@ class RunFolder:
             ) from error
 
     def what(self) -> dict[str, Any]:
-        """What makes the run the run it is: flags of that role, and hyper-parameters."""
+        """What makes the run the run it is: flags of that role, and hyperparameters."""
         args = self.args()
         return {**{name: args.get(name) for name in RunFlags.names(IDENTITY)}, **self.hyperparams()}
 
     def hyperparams(self) -> dict[str, Any]:
-        """The hyper-parameters the run was started with."""
+        """The hyperparameters the run was started with."""
         return read_data(self.params / "config.yml")
 
     def events(self, flags: RunFlags) -> Path:

@@ -1,4 +1,4 @@
-"""Hyper-parameters as data: found, merged, checked, and turned into what constructors take.
+"""Hyperparameters as data: found, merged, checked, and turned into what constructors take.
 
 They are RL-Zoo's files: ``hyperparams/<algo>.yml`` with a ``default`` entry, entries for single
 environments or patterns of them (``Safety*``), and YAML anchors. What is read stays plain data, so
@@ -32,7 +32,7 @@ from sb3_guard.zoo.cli.names import PRESETS, as_data, classes, import_class, wit
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
 from sb3_guard.zoo.cli.values import typed, words
 
-# What a hyper-parameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
+# What a hyperparameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
 RUN_KEYS: dict[str, Any] = {
     "n_timesteps": int,
@@ -58,7 +58,7 @@ NOT_HYPERPARAMETERS = {*FLAGS, "self", "tensorboard_log", "_init_setup_model", "
 
 
 def hyperparams_folder() -> Path:
-    """Where the shipped files are: inside an installed package, beside it in a checkout."""
+    """Where the shipped files are: inside an installed package, next to it in a checkout."""
     package = Path(__file__).parents[2]
     inside = package / "hyperparams"
     return inside if inside.is_dir() else package.parent / "hyperparams"
@@ -66,21 +66,21 @@ def hyperparams_folder() -> Path:
 
 def read_file(path: str | Path) -> dict[str, Any]:
     """
-    The content of a hyper-parameter file: environment (or ``default``) to hyper-parameters.
+    The content of a hyperparameter file: environment (or ``default``) to hyperparameters.
 
     :param path: a YAML file, or a Python file or module that has a dictionary ``hyperparams``
     :raises UsageError: it is absent, not readable or not of that form
     """
     name = str(path)
     form = (
-        "environments, or 'default', to hyper-parameters ('default:' and below it lines such as "
+        "environments, or 'default', to hyperparameters ('default:' and below it lines such as "
         "'  n_steps: 1000')"
     )
     if name.endswith((".yml", ".yaml")):
-        content = read_mapping(name, "hyper-parameter file", form)
+        content = read_mapping(name, "hyperparameter file", form)
     else:
         fix = f"give a .yml file, a Python file or module, or {' or '.join(map(repr, PRESETS))}"
-        with explained(f"can't read hyper-parameters from {name}", fix=fix):
+        with explained(f"can't read hyperparameters from {name}", fix=fix):
             python = name.endswith(".py")
             module = runpy.run_path(name) if python else vars(importlib.import_module(name))
         content = module.get("hyperparams", {None: None})
@@ -94,7 +94,7 @@ def read_file(path: str | Path) -> dict[str, Any]:
 
 
 def shipped_file(algo: str) -> Path:
-    """The hyper-parameter file of an algorithm: ours, else RL-Zoo's."""
+    """The hyperparameter file of an algorithm: ours, else RL-Zoo's."""
     ours = hyperparams_folder() / f"{algo}.yml"
     if ours.is_file():
         return ours
@@ -125,7 +125,7 @@ def read_hyperparams(
     algo: str, env_id: str, conf_file: str | None = None, overrides: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """
-    The hyper-parameters of an algorithm on an environment, sorted by name, not yet checked.
+    The hyperparameters of an algorithm on an environment, sorted by name, not yet checked.
 
     :param algo: key of the algorithm, names the shipped file
     :param env_id: its own entry is taken, with or without a version, else the first pattern that
@@ -159,13 +159,13 @@ def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] 
 
 
 def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
-    """The hyper-parameters an algorithm takes, from its constructor and those it hands on to."""
+    """The hyperparameters an algorithm takes, from its constructor and those it hands on to."""
     found = signature(algorithm, getattr(algorithm, "fixed_arguments", frozenset())).parameters
     return {name: one for name, one in found.items() if name not in NOT_HYPERPARAMETERS}
 
 
 def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
-    """The hyper-parameters that runs of an algorithm may have: name to type annotation."""
+    """The hyperparameters that runs of an algorithm may have: name to type annotation."""
     known = {
         name: Any if one.annotation is one.empty else one.annotation
         for name, one in parameters(algorithm).items()
@@ -175,7 +175,7 @@ def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
 
 def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:
     """
-    The same hyper-parameters as data, numbers in their proper type, or an error that says what to
+    The same hyperparameters as data, numbers in their proper type, or an error that says what to
     mend.
 
     :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, a
@@ -185,16 +185,16 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     checked = {}
     for name, value in values.items():
         if name in FLAGS:
-            raise UsageError(f"{name!r} is not a hyper-parameter; use the flag {FLAGS[name]}")
+            raise UsageError(f"{name!r} is not a hyperparameter; use the flag {FLAGS[name]}")
         if name not in known:
             raise UsageError(
-                f"{algo} has no hyper-parameter {name!r}; {did_you_mean(name, sorted(known))}"
+                f"{algo} has no hyperparameter {name!r}; {did_you_mean(name, sorted(known))}"
             )
         try:
             checked[name] = typed(as_data(name, value), known[name])
         except TypeError:
             raise UsageError(
-                f"hyper-parameter {name}: {value!r} is not allowed; it must be {words(known[name])}"
+                f"hyperparameter {name}: {value!r} is not allowed; it must be {words(known[name])}"
             ) from None
     checked.setdefault("n_envs", 1)
     checked.setdefault("n_timesteps", N_TIMESTEPS)
@@ -209,7 +209,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
         value = checked.get(name)
         if isinstance(value, int) and value < 1:
             raise UsageError(
-                f"hyper-parameter {name}: {value} is not allowed; it must be at least 1"
+                f"hyperparameter {name}: {value} is not allowed; it must be at least 1"
             )
     return dict(sorted(checked.items()))
 
@@ -217,7 +217,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
 @dataclass
 class Setup:
     """
-    Hyper-parameters as objects, ready for the constructors.
+    Hyperparameters as objects, ready for the constructors.
 
     :param model: arguments of the algorithm
     :param n_envs: number of parallel environments
@@ -260,7 +260,7 @@ class Setup:
 
     def action_noise(self, actions: int) -> ActionNoise | None:
         """
-        Exploration noise, as the hyper-parameters ``noise_type`` and ``noise_std`` say.
+        Exploration noise, as the hyperparameters ``noise_type`` and ``noise_std`` say.
 
         :param actions: number of action dimensions
         """
@@ -274,7 +274,7 @@ class Setup:
 
 def build(values: Mapping[str, Any]) -> Setup:
     """
-    Make objects of checked hyper-parameters: schedules, classes, wrappers.
+    Make objects of checked hyperparameters: schedules, classes, wrappers.
 
     :raises UsageError: text that should name a class or be an expression does not
     """
@@ -307,6 +307,6 @@ def build(values: Mapping[str, Any]) -> Setup:
 def _schedule(name: str, value: str) -> Callable[[float], float]:
     from rl_zoo3 import linear_schedule
 
-    what = f"hyper-parameter {name}: {value!r} is not a schedule"
+    what = f"hyperparameter {name}: {value!r} is not a schedule"
     with explained(what, ValueError, fix="write e.g. lin_0.001"):
         return linear_schedule(value.removeprefix("lin_"))

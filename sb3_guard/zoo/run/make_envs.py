@@ -1,4 +1,4 @@
-"""Environments for the commands: found, made, and wrapped as a run's hyper-parameters say."""
+"""Environments for the commands: found, made, and wrapped as a run's hyperparameters say."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -101,7 +101,7 @@ def make_envs(
     Make environments and wrap them: monitor, ``vec_env_wrapper``, VecNormalize, frame stack.
 
     :param env_id: full id
-    :param setup: the run's hyper-parameters
+    :param setup: the run's hyperparameters
     :param n_envs: how many
     :param seed: the environments get seed, seed + 1, …
     :param vec_env: native, dummy or subproc; native is refused where it is not possible

@@ -25,9 +25,9 @@ from sb3_guard.zoo.run.training import Training
 
 def prepare(flags: RunFlags) -> tuple[RunFlags, dict[str, Any]]:
     """
-    What a new run is: all its flags and hyper-parameters, as its folder will state them.
+    What a new run is: all its flags and hyperparameters, as its folder will state them.
 
-    :return: flags and hyper-parameters, checked as far as that goes without making anything
+    :return: flags and hyperparameters, checked as far as that goes without making anything
     :raises UsageError: anything is wrong with them
     """
     flags = dataclasses.replace(flags)
@@ -85,7 +85,7 @@ def standing(flags: RunFlags, values: Mapping[str, Any]) -> str:
     How far a run of a grid is: ``new``, ``done``, or to ``resume``.
 
     :param flags: as :func:`prepare` returns them
-    :param values: its hyper-parameters, likewise
+    :param values: its hyperparameters
     :raises UsageError: its folder holds another run, or is damaged
     """
     path = path_of(flags)
@@ -111,7 +111,7 @@ def complete(
     Bring a run of a grid to its end: start it, or continue it from where it was cut.
 
     :param flags: as :func:`prepare` returns them
-    :param values: its hyper-parameters, likewise
+    :param values: its hyperparameters
     :param command: the command line it is part of
     :param asked_to_stop: when it says so, training ends after the rollout under way
     :return: exit status, 0 if it is complete, now or already before
@@ -208,7 +208,7 @@ def resume(given: RunFlags) -> int:
 def _compared(
     given: RunFlags, saved: RunFlags, values: Mapping[str, Any], folder: RunFolder
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What the run was begun with, and what is given now instead, as far as it may not change."""
+    """The settings that differ between the start of the run and now, and must not."""
     hosted = {*RunFlags.names(HOST), "trained_agent", "n_timesteps", "hyperparams"}
     now = {name: getattr(given, name) for name in given.given & RunFlags.names() - hosted}
     if "env" in now:

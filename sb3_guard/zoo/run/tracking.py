@@ -17,7 +17,7 @@ class Tracker:
     not be seen, and before a new run has a folder, so that a refusal leaves nothing behind.
 
     :param flags: all flags of the run
-    :param hyperparams: its hyper-parameters
+    :param hyperparams: its hyperparameters
     :param folder: the folder of a run that is resumed, which remembers the id
     :raises UsageError: Weights & Biases refuses, e.g. for want of a key or a network
     """

@@ -1,6 +1,6 @@
 """A training run from flags to result: checked in full first, then made and trained.
 
-RL-Zoo's ``ExperimentManager`` makes the run folder before it has looked at the hyper-parameters,
+RL-Zoo's ``ExperimentManager`` makes the run folder before it has looked at the hyperparameters,
 and resets counters, seeds and environments when it continues; so its pieces are used here
 (schedules, run numbers, file layout, flags) and its class is not.
 """
@@ -119,7 +119,7 @@ class Training:
 
         :param folder: the run's folder, owned by this process
         :param asked_to_stop: training ends after the rollout under way when this says so
-        :param restate: state flags and hyper-parameters again once training can continue
+        :param restate: state flags and hyperparameters again once training can continue
         :return: exit status: 0, or 128 + the signal's number when interrupted
         :raises UsageError: training can't continue, or the disk is full or read-only
         """

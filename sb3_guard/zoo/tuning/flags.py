@@ -17,16 +17,16 @@ from sb3_guard.zoo.cli.usage import (
 from sb3_guard.zoo.run.flags import TrainingFlags
 
 EXAMPLES = """examples:
-  python -m sb3_guard.tune --algo trpo_lag --env Goal_Point_8Hazards --n-trials 50 -n 1e6
-  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards -params cost_limit:5 --n-jobs 2
-  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards --seeds 0 1 2 --pruner halving
-  python -m sb3_guard.tune --algo cpo --env Goal_Point_8Hazards --pareto --study-name trade-off
-  python -m sb3_guard.tune ... --storage postgresql://me:secret@server/studies
+  sb3-guard tune --algo trpo_lag --env Goal_Point_8Hazards --n-trials 50 -n 1e6
+  sb3-guard tune --algo cpo --env Goal_Point_8Hazards -params cost_limit:5 --n-jobs 2
+  sb3-guard tune --algo cpo --env Goal_Point_8Hazards --seeds 0 1 2 --pruner halving
+  sb3-guard tune --algo cpo --env Goal_Point_8Hazards --pareto --study-name trade-off
+  sb3-guard tune ... --storage postgresql://me:secret@server/studies
 
-The same command continues a study that was stopped, and joins one that runs: --n-trials counts the
-trials of the study, not of the process. So does its folder:
+The same command continues a study that was stopped, and joins a study that is running: --n-trials
+counts the trials of the study, not of the process. The folder of the study is enough, too:
 
-  python -m sb3_guard.tune -i logs/cpo/Goal_Point_8Hazards-v0_tune --n-trials 100
+  sb3-guard tune -i logs/cpo/Goal_Point_8Hazards-v0_tune --n-trials 100
 """
 # The file of a study's folder that `-i` reads; flags that it does not state.
 RECORD = "study.yml"
@@ -36,39 +36,42 @@ HOW = ("resume", "log_folder", "gym_packages", "verbose")
 @dataclass
 class TuneFlags(TrainingFlags):
     """
-    Find the hyper-parameters with the highest return under a cost limit.
+    Find the hyperparameters with the highest return under a cost limit.
 
     What is trained:
 
     :param algo: algorithm, e.g. cpo or ppo (default: cpo)
     :param env: environment id; the version may be left out (default: Goal_Point_8Hazards)
-    :param cost_limit: highest episode cost of a feasible trial, one for all or one per cost
-        (default: selection_limit, else the algorithm's cost_limit, but at least 1)
-    :param pareto: search the trade-off of return and cost instead; the limit is only drawn
-    :param search_space: YAML file of ranges and lists to search (default: that of the algorithm)
+    :param cost_limit: highest episode cost of a feasible trial, one for all costs or one per cost
+        (default: selection_limit of the hyperparameters, else their cost_limit, but at least 1)
+    :param pareto: search for the best return at every cost; the limit is only drawn
+    :param search_space: YAML file of ranges and lists to search (default: the algorithm's search
+        space)
 
     Search:
 
-    :param n_trials: finished trials of the study in all, pruned ones included (default: 50)
-    :param seeds: seeds that every trial trains with (default: 0)
-    :param n_seeds: the first so many seeds: 0 1 2 …
-    :param seed: seed of the sampler (default: -1, a random one)
-    :param sampler: what chooses hyper-parameters (default: tpe)
-    :param pruner: what ends bad trials early (default: median)
-    :param n_startup_trials: trials before the sampler learns and the pruner prunes (default: 10)
-    :param n_evaluations: evaluations per training (default: one per 100,000 steps, but at least 4)
-    :param eval_episodes: episodes each time (default: 5)
+    :param n_trials: number of finished trials of the study, pruned ones included (default: 50)
+    :param seeds: random seeds that every trial trains with (default: 0)
+    :param n_seeds: train every trial with the seeds 0 to N - 1
+    :param seed: random seed of the sampler; -1: a random one (default: -1)
+    :param sampler: Optuna sampler (default: tpe)
+    :param pruner: Optuna pruner, which stops bad trials early (default: median)
+    :param n_startup_trials: number of random trials before sampler and pruner start to work
+        (default: 10)
+    :param n_evaluations: number of evaluations per training (default: one per 100,000 steps, but at
+        least 4)
+    :param eval_episodes: episodes per evaluation (default: 5)
 
     Storage and workers:
 
-    :param resume: folder of a study to continue or to join, with the flags that it was begun with
-    :param log_folder: where studies go (default: logs)
-    :param study_name: to have several studies (default: <algo>_<env>)
-    :param storage: postgresql://… for workers on many machines, or a journal file (default: a
-        journal file in the study's folder, for one machine)
-    :param n_jobs: processes that work on it (default: 1)
+    :param resume: folder of a study to continue or join, with the flags that it was started with
+    :param log_folder: folder for studies (default: logs)
+    :param study_name: name of the study, to have several (default: <algo>_<env>)
+    :param storage: postgresql://… to share a study between machines, or a journal file (default: a
+        journal file in the study's folder)
+    :param n_jobs: number of processes that work on the study (default: 1)
     :param num_threads: threads of torch and of the native engine in each process (default: 1)
-    :param verbose: 0 nothing, 1 progress, 2 with tracebacks (default: 1)
+    :param verbose: output: 0 nothing, 1 progress, 2 with tracebacks (default: 1)
     """
 
     prog: ClassVar[str] = "sb3-guard tune"

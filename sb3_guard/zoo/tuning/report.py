@@ -124,7 +124,7 @@ class Report:
         return f"{text}, {f'{short(over)} over' if over else 'within'} the limit"
 
     def hyperparams(self, trial: FrozenTrial, name: str) -> str:
-        """A trial's hyper-parameters as a file for ``train -conf``."""
+        """A trial's hyperparameters as a file for ``train -conf``."""
         settings = self.settings
         seeds = ", ".join(map(str, settings["seeds"]))
         steps = f"{settings['n_timesteps']:,} steps, seed{'s' if ',' in seeds else ''} {seeds}"
@@ -144,7 +144,7 @@ class Report:
         flags = ["--algo", settings["algo"], "--env", settings["env"]]
         flags += ["--gym-packages", *packages] if packages else []
         conf = str(self.folder / name)
-        return shlex.join(["python", "-m", "sb3_guard.train", *flags, "-conf", conf])
+        return shlex.join(["sb3-guard", "train", *flags, "-conf", conf])
 
     @property
     def _again(self) -> str:
@@ -152,7 +152,7 @@ class Report:
         if not self.resumable:
             return "  The same command continues the study."
         flags = ["--gym-packages", *self.packages] if self.packages else []
-        command = ["python", "-m", "sb3_guard.tune", "-i", str(self.folder), *flags]
+        command = ["sb3-guard", "tune", "-i", str(self.folder), *flags]
         return f"  continue with {shlex.join(command)}"
 
     def length(self, trial: FrozenTrial) -> str:

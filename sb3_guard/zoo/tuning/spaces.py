@@ -1,6 +1,6 @@
-"""What tuning searches: a space of hyper-parameters per algorithm, as plain data.
+"""What tuning searches: a space of hyperparameters per algorithm, as plain data.
 
-A space maps names of hyper-parameters to a range or to a list of options, as in the file of a user
+A space maps names of hyperparameters to a range or to a list of options, as in the file of a user
 (``--search-space``)::
 
     target_kl: {low: 0.002, high: 0.05, log: true}
@@ -63,7 +63,7 @@ def read_space(path: str) -> dict[str, Any]:
     :raises UsageError: it can't be read, or an entry is neither a range nor a list
     """
     form = (
-        "names of hyper-parameters to ranges or lists, such as "
+        "names of hyperparameters to ranges or lists, such as "
         "'target_kl: {low: 0.002, high: 0.05, log: true}'"
     )
     content = read_mapping(path, "--search-space", form)
@@ -119,7 +119,7 @@ def _contains(entry: Any, value: Any) -> bool:
 
 
 def set_dotted(values: Mapping[str, Any], name: str, value: Any) -> dict[str, Any]:
-    """A copy of hyper-parameters with one changed, which may lie in a mapping: ``a.b``."""
+    """A copy of hyperparameters with one changed, which may lie in a mapping: ``a.b``."""
     outer, dot, inner = name.partition(".")
     if not dot:
         return {**values, outer: value}
@@ -127,7 +127,7 @@ def set_dotted(values: Mapping[str, Any], name: str, value: Any) -> dict[str, An
 
 
 def get_dotted(values: Mapping[str, Any], name: str) -> Any:
-    """One of the hyper-parameters, which may lie in a mapping; None if there is none."""
+    """One of the hyperparameters, which may lie in a mapping; None if there is none."""
     outer, dot, inner = name.partition(".")
     value = values.get(outer)
     if not dot:
@@ -149,7 +149,7 @@ class Search:
     The search of one algorithm: what a trial tries, and with what it begins.
 
     :param algo: key of the algorithm
-    :param base: hyper-parameters of the trials where the space says nothing
+    :param base: hyperparameters of the trials where the space says nothing
     :param space: what to search; None: that of the algorithm
     :param fixed: names that are not searched, since the user has fixed them
     :raises UsageError: there is no space for the algorithm, or nothing is left of it
@@ -195,7 +195,7 @@ class Search:
         ]
 
     def draw(self, trial: optuna.Trial) -> dict[str, Any]:
-        """All hyper-parameters of a trial, plain data."""
+        """All hyperparameters of a trial, plain data."""
         if self._rl_zoo is not None:
             return self._draw_rl_zoo(trial)
         values = self.base
@@ -246,7 +246,7 @@ def rl_zoo_sampler(algo: str, base: Mapping[str, Any]) -> Callable[..., dict[str
     RL-Zoo replaces ``policy_kwargs`` as a whole, so what is not drawn of it comes from ``base``;
     how many environments there are is not for its samplers to say.
 
-    :param base: hyper-parameters of the trials where the space says nothing
+    :param base: hyperparameters of the trials where the space says nothing
     """
     search = Search(algo, base, fixed={name: base.get(name) for name in RUN_KEYS})
     names = {name.partition(".")[0] for name in search.space}

@@ -1,4 +1,4 @@
-"""A trial of a tuner: an agent trained for each seed with the same hyper-parameters.
+"""A trial of a tuner: an agent trained for each seed with the same hyperparameters.
 
 Each is evaluated a few times on the way and once at the end; the means over the seeds count. Each
 cost is a constraint of the study, ``J_C - limit <= 0``, so samplers know which trials are feasible.
@@ -32,12 +32,12 @@ from sb3_guard.zoo.tuning.report import short
 from sb3_guard.zoo.tuning.spaces import Search
 from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
 
-# What the hyper-parameters of a trial may lead to; anything else is a mistake in the code.
+# What the hyperparameters of a trial may lead to; anything else is a mistake in the code.
 FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError)
 FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
 INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
 PROGRESS = 15.0  # seconds between two lines about a trial under way
-GIVEN = "given"  # its hyper-parameters are those of the file
+GIVEN = "given"  # its hyperparameters are those of the file
 
 
 @dataclass(frozen=True)
@@ -150,12 +150,12 @@ class Evaluations(BaseCallback):
 
 class Objective:
     """
-    What Optuna optimises: a trial's hyper-parameters to its return, or return and costs.
+    What Optuna optimises: a trial's hyperparameters to its return, or return and costs.
 
     :param flags: of the command
     :param training: of each training but for its seed
     :param settings: of the study
-    :param search: where hyper-parameters come from
+    :param search: where hyperparameters come from
     """
 
     def __init__(self, flags: TuneFlags, training: RunFlags, settings: Settings, search: Search):
@@ -176,7 +176,7 @@ class Objective:
         Train an agent for each seed.
 
         :return: means over the seeds: return, and with ``pareto`` each episode cost
-        :raises optuna.TrialPruned: it compares badly, or its hyper-parameters fail
+        :raises optuna.TrialPruned: it compares badly, or its hyperparameters fail
         :raises Stopped: it is to be done again
         """
         self._said = time.monotonic()
@@ -217,7 +217,7 @@ class Objective:
         trial.set_user_attr("hyperparams", values)
         settings, finished = self.settings, list[list[list[float]]]()
         last = settings.n_evaluations * len(settings.seeds)
-        # The best is to be compared with the file's hyper-parameters: they are never pruned.
+        # The best is to be compared with the file's hyperparameters: they are never pruned.
         given = trial.user_attrs.get(GIVEN, False)
         mean: list[float] = []
 

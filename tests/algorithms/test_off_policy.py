@@ -39,6 +39,10 @@ def settings() -> dict[str, Any]:
 
 
 every = pytest.mark.parametrize("cls", [SACLag, TD3Lag, TQCLag])
+# Of what they share: the quickest of them, the others with the slow tests.
+shared = pytest.mark.parametrize(
+    "cls", [TD3Lag, *(pytest.param(cls, marks=pytest.mark.slow) for cls in (SACLag, TQCLag))]
+)
 
 
 def points(n_envs: int = 2, **kwargs: Any) -> Any:
@@ -222,7 +226,7 @@ def test_the_actors_loss_by_hand() -> None:
     th.testing.assert_close(model.penalized(loss, batch, actions, values), expected)
 
 
-@every
+@shared
 def test_multipliers_follow_ended_episodes_once_and_not_before_their_time(cls: Any) -> None:
     """Episodes of 30 steps: λ moves at their ends alone, by η and K_P, once ``lambda_starts``."""
     more = {"cost_limit": 0.01, "lambda_lr": 0.1, "proportional_gain": 0.0, "train_freq": 10}
@@ -255,7 +259,7 @@ def given(costs: Iterable[float], n_envs: int, length: int) -> Any:
     return make_vec_env(lambda: Given(length, cut=True), n_envs)
 
 
-@every
+@shared
 def test_many_environments_move_multipliers_as_one_does(cls: Any) -> None:
     """Sixty episodes, one after the other or six at a time, which end together."""
     costs, ends = np.random.default_rng(0).gamma(0.2, 10.0, 70), []
@@ -268,7 +272,7 @@ def test_many_environments_move_multipliers_as_one_does(cls: Any) -> None:
     assert ends[0] == pytest.approx(ends[1]) and min(ends[0]) > 0.0
 
 
-@every
+@shared
 def test_multipliers_follow_the_mean_of_episodes(cls: Any) -> None:
     """Most episodes cost nothing, each tenth 60: 6 on average, which is what the limit is about."""
     values = []
@@ -279,7 +283,7 @@ def test_multipliers_follow_the_mean_of_episodes(cls: Any) -> None:
     assert values[0] > 0.3 and values[1] == 0.0
 
 
-@every
+@shared
 def test_multipliers_do_not_run_ahead_of_the_policy(cls: Any) -> None:
     """Eight episodes for each gradient step; TD3's actor learns, and pays, in every other one."""
     gains = {"cost_limit": 5.0, "lambda_lr": 0.1, "proportional_gain": 0.0, "lambda_starts": 80}
@@ -289,7 +293,7 @@ def test_multipliers_do_not_run_ahead_of_the_policy(cls: Any) -> None:
     assert model._n_updates == 29 and float(model.multiplier.value) == pytest.approx(2.0)
 
 
-@every
+@shared
 @pytest.mark.parametrize(("n_envs", "total"), [(1, 400), (8, 800), (8, 1600)])
 def test_a_training_moves_multipliers_as_far_however_many_episodes_it_has(
     cls: Any, n_envs: int, total: int
@@ -353,7 +357,7 @@ def test_an_entropy_coefficient_of_another_kind_is_named(value: Any) -> None:
         SACLag("MlpPolicy", points(1), ent_coef=value, cost_limit=1.0, **settings())
 
 
-@every
+@shared
 def test_random_actions_do_not_move_multipliers(cls: Any) -> None:
     """11 steps of 8 environments, whose first action after 81 steps is the policy's."""
     env = given([100.0] * 88 + [0.0] * 40, 8, length=1)
@@ -423,7 +427,7 @@ def test_evaluated_and_logged_while_training() -> None:
     assert rate == pytest.approx(train.total_cost / 150)
 
 
-@every
+@shared
 def test_images(cls: Any) -> None:
     image, move = spaces.Box(0, 255, (36, 36, 1), np.uint8), spaces.Box(-1.0, 1.0, (2,))
     env = make_vec_env(lambda: RandomCostEnv(image, move), 2)
@@ -509,7 +513,7 @@ def test_an_interval_of_zero_is_refused_before_training(cls: Any, name: str) -> 
         cls("MlpPolicy", points(1), **settings(), **{name: 0})
 
 
-@every
+@shared
 @pytest.mark.parametrize("cut", [True, False])
 def test_a_cost_that_nothing_changes_has_no_price(cls: Any, cut: bool) -> None:
     """Every step costs 1: no action matters, unless one may end the episode before its time."""
@@ -527,7 +531,7 @@ def test_a_cost_that_nothing_changes_has_no_price(cls: Any, cut: bool) -> None:
     assert (prices[0] == 0.0) == cut and prices[1] > 0.0
 
 
-@pytest.mark.parametrize("cls", [SACLag, TD3Lag])
+@shared
 def test_it_finds_a_known_optimum(cls: Any) -> None:
     """Defaults but for a small network and a high rate, which spare time."""
     problem, steps = problems()["bandit"], 8_000

@@ -190,6 +190,17 @@ def test_limits_that_a_robot_cannot_have_are_answered_in_a_line(robot, limits, m
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["baseheight", "basetilt"])
+def test_an_episode_may_end_beyond_the_limit(name):
+    engine = limited("Ant", 2, **{name: {"ends": True}})
+    assert not engine.step(np.zeros((2, 8))).terminated.any()
+    engine.batch.bind("qpos")[1, :7] = [0, 0, 0.04, 0, 1, 0, 0]  # on its back, in the floor
+    outcome = engine.step(np.zeros((2, 8)))
+    assert outcome.terminated.tolist() == [False, True]
+    assert outcome.ended_by[name].tolist() == [False, True]
+    assert outcome.costs[f"cost_{name}"].tolist() == [0.0, 1.0]
+
+
 def test_a_picture_says_how_near_the_limit_is():
     engine = limited("Ant", 1, **{name.lower(): {} for name in LIMITS})
     words = {k: v for part in engine.constraints for k, v in part.words(0).items()}

@@ -27,6 +27,7 @@ class BaseHeight(Constraint):
     )
     high: float | None = param(None, "greatest height that is free, m; null: any")
     weight: float = param(1.0, "cost of a step beyond them", low=0)
+    ends: bool = param(False, "whether the episode ends beyond them")
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
@@ -37,9 +38,16 @@ class BaseHeight(Constraint):
                 f"{self.name}.low = {self._low:g} must be less than high = {self._high:g}, m"
             )
 
-    def cost(self) -> Array:
+    def _beyond(self) -> Array:
         height = self.sim.robot.position[:, 2]
-        return self.weight * ((height < self._low) | (height > self._high))
+        beyond: Array = (height < self._low) | (height > self._high)
+        return beyond
+
+    def cost(self) -> Array:
+        return self.weight * self._beyond()
+
+    def terminated(self) -> Array:
+        return self._beyond() if self.ends else super().terminated()
 
     def words(self, row: int) -> dict[str, str]:
         height = self.sim.robot.position[row, 2]

@@ -30,13 +30,21 @@ class RobotLimit(Constraint):
 
     limit: float
     weight: float = param(1.0, "cost of a step beyond the limit", low=0)
+    ends: bool = param(False, "whether the episode ends beyond the limit")
 
     def amount(self) -> Array:
         """What is limited, [N]."""
         raise NotImplementedError
 
+    def beyond(self) -> Array:
+        """Whether it is above the limit, [N] bool."""
+        return self.amount() > self.limit
+
     def cost(self) -> Array:
-        return self.weight * (self.amount() > self.limit)
+        return self.weight * self.beyond()
+
+    def terminated(self) -> Array:
+        return self.beyond() if self.ends else super().terminated()
 
     def words(self, row: int) -> dict[str, str]:
         amount = f"{self.amount()[row]:.2f} {self.unit}".rstrip()

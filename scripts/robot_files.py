@@ -1,0 +1,147 @@
+"""Write the table of other packages' robots into docs/robot_files.md.
+
+Each file comes from a wheel on PyPI, downloaded without its dependencies into a cache, and is
+registered as it is. The last column is measured here: steps per second of a goal among eight
+hazards with 30 rows on one thread, by the time that the thread had, as a share of Point's.
+"""
+
+import contextlib
+import io
+import re
+import runpy
+import time
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_guard.envs import Scenario, register_robot
+from sb3_guard.envs.engine import Engine
+from sb3_guard.envs.registry import ROBOTS
+from sb3_guard.zoo.cli.markdown import table
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "robot_files.md"
+BLOCK = re.compile(r"(<!-- robots -->\n).*?(<!-- end -->)", re.DOTALL)
+MJLAB, CONTROL, ROBOTICS = "mjlab==1.6.0", "dm_control==1.0.50", "gymnasium-robotics==1.4.2"
+ZOO = "mjlab/asset_zoo/robots"
+KINOVA = "dm_control/third_party/kinova"
+HAND = "gymnasium_robotics/envs/assets/hand"
+ANYWHERE, ARMS = "Goal, Push, Chase, Defense", "Goal"
+LINE = "Forward, with `robot={'heading': 0.0}`"
+GAINS = {"kp": 35, "kd": 1}
+
+
+class Source(NamedTuple):
+    """A robot that somebody else made."""
+
+    wheel: str | None  # what pip downloads; None: Gymnasium is installed
+    file: str  # in the wheel
+    needed: Mapping[str, Any]  # what register_robot is told
+    tasks: str  # which make sense
+
+
+LEGS = {"*_thigh_joint": 0.9, "*_calf_joint": -1.8}
+ARM = {"kp": 40, "kd": 10}
+SOURCES = {
+    "Go1": Source(
+        MJLAB, f"{ZOO}/unitree_go1/xmls/go1.xml",
+        {"actuators": GAINS, "pose": LEGS, "action": "offset"}, ANYWHERE,
+    ),
+    "G1": Source(
+        MJLAB, f"{ZOO}/unitree_g1/xmls/g1.xml",
+        {"actuators": {"kp": 75, "kd": 2}, "action": "offset"}, ANYWHERE,
+    ),
+    "Yam": Source(
+        MJLAB, f"{ZOO}/i2rt_yam/xmls/yam.xml", {"actuators": ARM, "center": "grasp_site"}, ARMS
+    ),
+    "Quadruped": Source(CONTROL, "dm_control/suite/quadruped.xml", {"root": "torso"}, ANYWHERE),
+    "Jaco": Source(
+        CONTROL, f"{KINOVA}/jaco_arm.xml",
+        {"actuators": {"kp": 200, "kd": 40}, "center": "wristsite"}, ARMS,
+    ),
+    "ShadowHand": Source(
+        ROBOTICS, f"{HAND}/reach.xml", {"center": "robot0:S_fftip"}, ARMS
+    ),
+    "GymAnt": Source(None, "ant.xml", {}, ANYWHERE),
+    "GymHalfCheetah": Source(None, "half_cheetah.xml", {}, LINE),
+    "GymHopper": Source(None, "hopper.xml", {}, LINE),
+    "GymWalker2d": Source(None, "walker2d.xml", {}, LINE),
+    "GymSwimmer": Source(None, "swimmer.xml", {}, ANYWHERE),
+    "GymHumanoid": Source(
+        None, "humanoid.xml", {"pose": {"*_knee": -0.04}}, ANYWHERE
+    ),
+}  # fmt: skip
+
+
+def path(source: Source) -> Path:
+    """The file, downloaded if need be.
+
+    :raises subprocess.CalledProcessError: there is no index
+    """
+    if source.wheel is None:
+        return Path(str(files("gymnasium.envs.mujoco") / "assets" / source.file))
+    with contextlib.redirect_stdout(io.StringIO()):
+        fetch = runpy.run_path(str(ROOT / "examples" / "robots.py"))["fetch"]
+    folder: Path = fetch(source.wheel)
+    return folder / source.file
+
+
+def rates(engines: Mapping[str, Engine], slices: int = 5, steps: int = 40) -> dict[str, float]:
+    """Steps per second of each engine: the best of alternating slices."""
+    best = dict.fromkeys(engines, 0.0)
+    rng = np.random.default_rng(0)
+    for engine in engines.values():
+        engine.reset(np.arange(engine.num_envs))
+    for _ in range(slices):
+        for name, engine in engines.items():
+            low, high = engine.robot.action_range
+            actions = rng.uniform(low, high, (engine.num_envs, engine.robot.action_size))
+            began = time.thread_time()
+            for _ in range(steps):
+                engine.step(actions)
+            rate = steps * engine.num_envs / (time.thread_time() - began)
+            best[name] = max(best[name], rate)
+    return best
+
+
+def observed(engine: Engine, name: str) -> str:
+    """The robot's observations in words, those of many sensors by their number."""
+    names = [n for n in engine.observation_layout if n not in ("goal_compass", "hazards_lidar")]
+    computed = ("base_", "gravity", "joint_", "last_action")
+    of_sensors = [n for n in names if not n.startswith(computed)]
+    words = [f"`{n}`" for n in names if n not in of_sensors]
+    if 0 < len(of_sensors) <= 5:
+        words += [f"`{n}`" for n in of_sensors]
+    elif of_sensors:
+        words.append(f"{len(of_sensors)} sensors")
+    size = sum(engine.channels[n].size for n in names)
+    return f"{', '.join(words)}: {size} numbers"
+
+
+def main() -> None:
+    """Write the table."""
+    rows = []
+    for name, source in SOURCES.items():
+        register_robot(name, xml=path(source), **source.needed)
+        suite = Scenario.parse(f"Goal_{name}_8Hazards")
+        point = Scenario.parse("Goal_Point_8Hazards").build(30, 1)
+        engine = suite.build(30, 1)
+        speed = rates({"Point": point, name: engine})
+        stated = ", ".join(f"`{key}={value!r}`" for key, value in source.needed.items())
+        where = (source.wheel or "gymnasium").partition("==")[0]
+        rows.append(
+            [f"`{Path(source.file).name}` of {where}", stated or "nothing", source.tasks,
+             str(engine.robot.action_size), observed(engine, name),
+             f"{speed[name] / speed['Point']:.2f}"]
+        )  # fmt: skip
+        ROBOTS.pop(name)
+    head = ["file", "what was needed", "tasks that make sense", "actions", "observes", "speed"]
+    text = PAGE.read_text()
+    PAGE.write_text(BLOCK.sub(lambda m: m[1] + table(head, rows) + "\n" + m[2], text))
+
+
+if __name__ == "__main__":
+    main()

@@ -123,8 +123,7 @@ def test_each_earlier_rollout_is_written_once(tmp_path, monkeypatch, capsys):
     assert f"can't read the earlier rollouts in {run / 'earlier'}" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("at", [50, 120])
-def test_killed_and_resumed_off_policy(at, tmp_path, monkeypatch):
+def test_killed_and_resumed_off_policy(tmp_path, monkeypatch):
     """While random actions fill the buffer, and after."""
     off = ["--algo", "sac_lag", "--save-freq", "-1", "--checkpoint-every", "0", "--eval-freq", "-1"]
     small = [
@@ -137,9 +136,11 @@ def test_killed_and_resumed_off_policy(at, tmp_path, monkeypatch):
     more = ["--seed", "3", "--verbose", "0", "-n", "150", "-params", *small, "cost_limit:0.1"]
     arguments = [*TOY, *SHORT, *off, *more]
     assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
-    crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], at)
-    assert train.main(["-i", str(runs_of(tmp_path / "cut")), *TOY[:2]]) == 0
-    assert_same_run(tmp_path / "whole", tmp_path / "cut")
+    for at in (50, 120):
+        cut = tmp_path / f"cut at {at}"
+        crash(monkeypatch, [*arguments, "-f", str(cut)], at)
+        assert train.main(["-i", str(runs_of(cut)), *TOY[:2]]) == 0
+        assert_same_run(tmp_path / "whole", cut)
 
 
 @pytest.mark.parametrize(

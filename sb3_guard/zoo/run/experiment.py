@@ -12,7 +12,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.callbacks import CostEvalCallback
 from sb3_guard.zoo.cli.usage import UsageError, explained
@@ -138,6 +138,7 @@ class Experiment:
         """
         flags = self.flags
         kwargs = {"vec_env": str(flags.vec_env), "env_kwargs": self.setup.env_kwargs, **kwargs}
+        statistics = self._statistics_beside()
         return make_envs(
             flags.env,
             self.setup,
@@ -145,7 +146,7 @@ class Experiment:
             seed=seed,
             cost_keys=self.cost_keys,
             num_threads=flags.num_threads if flags.num_threads > 0 else None,
-            normalizer=self._warm_start_normalizer(),
+            normalizer=read_normalizer(statistics) if statistics else None,
             **kwargs,
         )
 
@@ -197,11 +198,6 @@ class Experiment:
                 # The sizes of a file are on purpose, a last minibatch that is smaller included.
                 warnings.filterwarnings("ignore", "You have specified a mini-batch size")
             return self.algorithm(env=env, device=flags.device, **arguments)
-
-    def _warm_start_normalizer(self) -> VecNormalize | None:
-        """Observation statistics that belong to the agent given by ``-i model.zip``."""
-        file = self._statistics_beside()
-        return read_normalizer(file) if file else None
 
     def _statistics_beside(self) -> Path | None:
         """Observation statistics that a run or an evaluation wrote next to its model."""

@@ -10,6 +10,7 @@ COMMANDS = {
     "train": "train an agent",
     "tune": "search hyperparameters under a cost limit",
     "benchmark": "train a grid of environments, algorithms and seeds",
+    "reproduce": "train a published run again and compare",
     "enjoy": "play a trained agent, print return and cost, record a video",
     "plot": "make tables, figures and a page of trained runs",
     "hub": "upload a trained agent to the Hugging Face hub, or download one",

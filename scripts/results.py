@@ -52,6 +52,7 @@ BLOCK = re.compile(
 PUBLISHED_STEPS = 1_000_000
 LAST = 90  # episodes: three rollouts of 30 environments
 APART = 3.0  # standard errors: what counts as learnt
+FRACTION = re.compile(rb"-?\d+\.\d+(?:e[-+]?\d+)?")
 LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml")
 
 # Archives, the suite, and whom an algorithm is beside.
@@ -274,13 +275,19 @@ def pages() -> dict[Path, str]:
 
 
 def pack(folder: Path, name: str) -> None:
-    """Pack the logs of finished runs, the same bytes for the same logs wherever they were."""
+    """
+    Pack the logs of finished runs, the same bytes for the same logs wherever they were.
+
+    Logs keep four significant digits of fractions: a run takes a third of the room.
+    """
     done = sorted(path.parent for path in folder.rglob("result.json"))
     with tarfile.open(DATA / f"{name}.tar.xz", "w:xz", preset=9) as archive:
         for path in (path for run in done for path in sorted(run.rglob("*"))):
             if path.name not in LOGS:
                 continue
             text = path.read_bytes()
+            if path.suffix == ".csv":
+                text = FRACTION.sub(lambda digits: b"%.4g" % float(digits[0]), text)
             if path.name == "args.yml":
                 text = re.sub(rb"(?m)^log_folder: .*", f"log_folder: logs/{name}".encode(), text)
             info = tarfile.TarInfo(str(Path(name) / path.relative_to(folder)))

@@ -1,0 +1,111 @@
+"""Train a published run again and compare: ``sb3-guard reproduce ROW``."""
+
+import csv
+import shlex
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.cli.flags import Command, command, flag
+from sb3_guard.zoo.cli.usage import UsageError
+
+# A row for each run of the grand table, written by scripts/leaderboard.py
+ROWS = Path(__file__).parent / "zoo" / "results" / "rows.csv"
+
+
+@dataclass
+class Flags(Command):
+    """
+    Train a run of the published table, or of a folder, again from its command and seed, and say
+    whether it went the same way. The exit status is 0 if all training episodes are the same.
+
+    :param run: row of the leaderboard, e.g. grand_table/cpo/SafetyPointGoal1-v0_1, or a run folder
+    :param log_folder: log folder of the new run (default: logs/reproduced)
+    :param gym_packages: modules that the run needs
+    """
+
+    prog: ClassVar[str] = "sb3-guard reproduce"
+    examples: ClassVar[str] = """examples:
+  sb3-guard reproduce grand_table/cpo/SafetyPointGoal1-v0_1
+  sb3-guard reproduce logs/cpo/Goal_Point_8Hazards-v0_1
+"""
+
+    run: str = flag(default="", positional=True, metavar="ROW|FOLDER")
+    log_folder: str = flag("-f", default="logs/reproduced", metavar="DIR")
+    gym_packages: list[str] = flag(default=[], metavar="MODULE")
+
+
+def published(name: str) -> dict[str, Any]:
+    """
+    What is known of a run: ``command``, ``curve``, ``return`` and ``cost``, ``commit``.
+
+    :param name: of a row of the package's table, or of a run folder
+    :raises UsageError: there is neither
+    """
+    from sb3_guard.zoo.run.folder import RunFolder, is_run
+
+    if is_run(Path(name)):
+        run = RunFolder(Path(name))
+        result = run.checked_result()
+        return {"command": run.flags().command(), "curve": run.curve_hash(), **result}
+    with ROWS.open(newline="", encoding="utf-8") as file:
+        rows = {row["row"]: row for row in csv.DictReader(file)}
+    if name not in rows:
+        raise UsageError(
+            f"{name!r} is no run folder and no row of the table; {did_you_mean(name, rows)}"
+            if rows
+            else f"{name!r} is no run folder, and the table has no rows yet"
+        )
+    return dict(rows[name])
+
+
+def compared(row: Mapping[str, Any], result: Mapping[str, Any]) -> Iterator[str]:
+    """How a run that was trained again differs from the published one, in lines."""
+    if row["curve"] == result["curve"]:
+        yield f"The same: all training episodes agree (curve {result['curve'][:12]}…)."
+    else:
+        yield "Not the same: the training episodes differ."
+        for name in ("return", "cost"):
+            was, new = (float(of[name] or "nan") for of in (row, result))
+            yield f"  {name} of the final epoch: {was:.6g} there, {new:.6g} here ({new - was:+.6g})"
+    if (row.get("commit") or None) != result["commit"]:
+        yield (
+            f"The run there is of commit {row.get('commit') or 'unknown'}, the one here of "
+            f"{result['commit'] or 'an installed package'}: defaults may differ, too."
+        )
+
+
+def reproduce(flags: Flags) -> int:
+    """Train the run again and compare."""
+    from sb3_guard.zoo.cli.names import is_program, require_named
+    from sb3_guard.zoo.run.flags import RunFlags
+    from sb3_guard.zoo.run.folder import RunFolder
+    from sb3_guard.zoo.run.start import complete, path_of, prepare
+
+    if not flags.run:
+        raise UsageError("which run? Give a row of the leaderboard, or a run folder")
+    row = published(flags.run)
+    run = RunFlags.parse(shlex.split(row["command"])[2:])
+    run.log_folder, run.verbose = flags.log_folder, 0
+    # Who wrote the command is a stranger: what it would import, the user has to name.
+    require_named(Path(flags.run), flags.gym_packages, run.gym_packages)
+    run.gym_packages = flags.gym_packages
+    if is_program(run.conf_file):
+        raise UsageError(f"the run has its hyperparameters from a program, {run.conf_file}")
+    run, values = prepare(run)
+    print(f"{row['command']}\n{values['n_timesteps']:,} steps in {path_of(run)} …", flush=True)
+    if status := complete(run, values, row["command"], lambda: False):
+        print("The same command continues it.")
+        return status
+    result = RunFolder(path_of(run)).checked_result()
+    print(*compared(row, result), sep="\n")
+    return int(row["curve"] != result["curve"])
+
+
+main = command(Flags, reproduce)
+
+if __name__ == "__main__":
+    sys.exit(main(None))

@@ -1,0 +1,244 @@
+"""Write the leaderboard, docs/leaderboard.md, and check what is sent in for it.
+
+``python scripts/leaderboard.py`` makes the tables of the page, and ``rows.csv`` in
+``sb3_guard/zoo/results`` for ``sb3-guard reproduce``, from the packed logs of the grand table
+(``scripts/grand_table.py``) and from those that were sent in, ``docs/data/sent_*.tar.xz``.
+``--check FOLDER`` says what is wrong with a folder of runs to be sent in; with ``--pack NAME`` the
+folder is packed as ``sent_NAME`` if nothing is.
+"""
+
+import argparse
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+import yaml
+from grand_table import GRIDS
+from results import DATA, DOCS, pack, unpacked
+
+from sb3_guard.zoo.cli.markdown import table
+from sb3_guard.zoo.cli.usage import UsageError, one_line
+from sb3_guard.zoo.grids.presets import ALGOS
+from sb3_guard.zoo.results.curves import read_episodes
+from sb3_guard.zoo.results.runs import described, find_runs, select
+from sb3_guard.zoo.results.splits import judge
+from sb3_guard.zoo.results.statistics import with_safety
+from sb3_guard.zoo.results.tables import number, spread
+from sb3_guard.zoo.run.folder import RunFolder
+from sb3_guard.zoo.run.make_envs import full_id
+from sb3_guard.zoo.run.training import FINAL_EPISODES
+
+PAGE = DOCS / "leaderboard.md"
+ROWS = DOCS.parent / "sb3_guard" / "zoo" / "results" / "rows.csv"
+BLOCK = re.compile(r"(<!-- (leaderboard|untrained) -->\n).*?(<!-- end -->)", re.DOTALL)
+MILLION = 1_000_000
+PLANNED = GRIDS[:5]  # a row of these that is missing is shown, with the command that fills it
+# What a run that is sent in may not change: the task, or which code is run.
+REFUSED = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback")
+
+
+def planned() -> pd.DataFrame:
+    """The rows that the grand table is to have: ``suite``, ``algo``, ``budget``, ``command``."""
+    rows = []
+    for name, _ in PLANNED:
+        grid = yaml.safe_load((DATA / f"{name}.yml").read_text())
+        algos = ALGOS if grid["algos"] == ["all"] else grid["algos"]
+        seeds = " ".join(map(str, grid["seeds"]))
+        steps = int(float(grid["n_timesteps"]))
+        for env_id in map(full_id, grid.get("envs") or grid["suites"]):
+            for algo in algos:
+                command = f"sb3-guard train --algo {algo} --env {env_id} --seeds {seeds} -n {steps}"
+                row = {"suite": env_id.removesuffix("-v0") if "_" in env_id else env_id}
+                rows.append({**row, "algo": algo, "budget": steps // MILLION, "command": command})
+    return pd.DataFrame(rows).drop_duplicates(["suite", "algo", "budget"])
+
+
+def archives() -> list[str]:
+    """Names of the packed logs that the page is made from."""
+    names = [*dict.fromkeys(name for _, name in GRIDS)]
+    names += sorted(path.name.removesuffix(".tar.xz") for path in DATA.glob("sent_*.tar.xz"))
+    return [name for name in names if (DATA / f"{name}.tar.xz").exists()]
+
+
+def read() -> tuple[pd.DataFrame, pd.DataFrame]:
+    """
+    What the packed logs say.
+
+    :return: the rows of the page, as :func:`~sb3_guard.zoo.results.splits.judge` has them, with
+        ``budget`` (millions of steps), ``cost_total`` and ``row``, the first run's; and those of
+        the package, a row per run
+    """
+    pages, runs = [], []
+    for name in archives():
+        with unpacked(name) as found:
+            all_ = with_safety(found.runs)
+            all_["row"] = [f"{Path(path).parents[1].name}/{Path(path).parent.name}/"
+                            f"{Path(path).name}" for path in all_["path"]]  # fmt: skip
+            for run in all_.to_dict("records"):
+                result = RunFolder(Path(run["path"])).checked_result()
+                if "curve" in result:
+                    kept = {key: result[key] for key in ("command", "curve", "return", "cost")}
+                    runs.append({"row": run["row"], **kept, "commit": result.get("commit")})
+            all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)
+            for budget, group in all_.groupby("budget"):
+                own = select(group)
+                extra = own.groupby(["suite", "algo"]).agg(
+                    cost_total=("cost_total", "mean"), row=("row", "first")
+                )
+                judged = judge(own).merge(extra.reset_index(), on=["suite", "algo"])
+                pages.append(judged.assign(budget=budget))
+    return pd.concat(pages) if pages else pd.DataFrame(), pd.DataFrame(runs)
+
+
+def leaderboard(rows: pd.DataFrame) -> str:
+    """The tables, a heading for each environment and budget."""
+    wanted = planned()
+    places = wanted[["suite", "budget"]]
+    if len(rows):
+        places = pd.concat([places, rows[["suite", "budget"]]])
+    untrained = pd.read_csv(DATA / "untrained.csv", index_col="suite")
+    untrained.index = untrained.index.str.replace(r"(_.*)-v0$", r"\1", regex=True)
+    parts = []
+    for suite, budget in places.drop_duplicates().itertuples(index=False):
+        here = rows.query("suite == @suite and budget == @budget") if len(rows) else rows
+        lines = [*_ranked(here)] if len(here) else []
+        done = {*here["algo"]} if len(here) else set()
+        for row in wanted.query("suite == @suite and budget == @budget").to_dict("records"):
+            if row["algo"] not in done:
+                lines.append(_line("–", described(row["algo"])["label"], row["command"], grey=True))
+        if suite in untrained.index:
+            for key, label in (("random", "random actions"), ("zero", "idle")):
+                of = untrained.loc[suite]
+                values = {"return": spread(of[key], of[f"{key}_se"]),
+                          "cost": number(of[f"{key}_cost"], 1)}  # fmt: skip
+                lines.append(_line("–", label, "", grey=True, **values))
+        parts.append(f"### {suite}, {budget}e6 steps\n\n{_table(lines)}")
+    return "\n\n".join(parts)
+
+
+def _ranked(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
+    """The rows of a table: those whose policy is certified first, by return."""
+    final = rows[rows["split"] == "stochastic"].assign(certified=lambda t: t["tier"] == "certified")
+    greedy = rows[rows["split"] == "greedy"].set_index("algo")
+    order = final.sort_values(["certified", "return"], ascending=False).to_dict("records")
+    for place, row in enumerate(order, 1):
+        other = greedy.loc[row["algo"]]
+        digits = 0 if abs(row["return"]) >= 100 else 1
+        yield _line(
+            str(place) if row["certified"] else "–",
+            row["label"],
+            f"sb3-guard reproduce {row['row']}",
+            grey=not row["certified"],
+            seeds=str(row["seeds"]),
+            **{"return": spread(row["return"], row["return_std"], digits)},
+            cost=f"{number(row['cost'], 1)} [{number(row['low'], 1)}, {number(row['high'], 1)}]",
+            tier=row["tier"],
+            above=f"{100 * row['above']:.0f} %",
+            greedy=f"{number(other['return'], digits)}; {number(other['cost'], 1)}, "
+            f"{other['tier']}",
+            total=number(row["cost_total"], 0),
+        )
+
+
+def _line(place: str, label: str, command: str, *, grey: bool, **values: str) -> dict[str, str]:
+    """A line of a table; a grey one is in italics."""
+    cells = {
+        "place": place,
+        "algorithm": label,
+        "seeds": values.get("seeds", ""),
+        "return": values.get("return", ""),
+        "cost [95 % interval]": values.get("cost", ""),
+        "tier": values.get("tier", ""),
+        "episodes above the limit": values.get("above", ""),
+        "greedy: return; cost, tier": values.get("greedy", ""),
+        "cost of training": values.get("total", ""),
+    }
+    if grey:
+        cells = {key: f"*{cell}*" if cell and cell != "–" else cell for key, cell in cells.items()}
+    return {**cells, "run it again": f"`{command}`" if command else ""}
+
+
+def _table(lines: list[dict[str, str]]) -> str:
+    """Lines of the same headings as a table."""
+    return table([*lines[0]], [[*line.values()] for line in lines])
+
+
+def untrained() -> str:
+    """A table of the agents that learn nothing, with their goals where there are some."""
+    lines = []
+    for of in pd.read_csv(DATA / "untrained.csv").to_dict("records"):
+        line = {"environment": of["suite"]}
+        for key, label in (("random", "random"), ("zero", "idle")):
+            line[f"{label}: return"] = spread(of[key], of[f"{key}_se"])
+            line[f"{label}: cost"] = number(of[f"{key}_cost"], 1)
+        for name, heading in (("goals", "goals per episode"), ("cost_per_goal", "cost per goal")):
+            line[f"random: {heading}"] = number(of[f"random_{name}"], 2)
+        lines.append(line)
+    return _table(lines)
+
+
+def page(rows: pd.DataFrame) -> str:
+    """The page with its tables remade."""
+    made = {"leaderboard": lambda: leaderboard(rows), "untrained": untrained}
+    return BLOCK.sub(lambda m: f"{m[1]}\n{made[m[2]]()}\n\n{m[3]}", PAGE.read_text())
+
+
+def problems(path: Path) -> Iterator[str]:
+    """What is wrong with a run that is sent in."""
+    run = RunFolder(path)
+    result, config, args = run.checked_result(), run.hyperparams(), run.args()
+    for name in ("command", "curve", "final", "versions"):
+        if not result.get(name):
+            yield f"result.json has no {name}: train it with this version"
+    if result.get("curve") != run.curve_hash():
+        yield "curve in result.json is not the hash of 0.monitor.csv"
+    if "command" in result and result["command"] != run.flags().command():
+        yield "command in result.json is not that of args.yml"
+    for name in REFUSED:
+        if config.get(name):
+            yield f"config.yml has {name}: {config[name]}, which changes the task"
+    if args.get("gym_packages"):
+        yield f"args.yml has gym_packages: {args['gym_packages']}, code that is not the package's"
+    episodes = read_episodes(path)
+    steps, longest = int(episodes["step"].iloc[-1]), int(episodes["step"].diff().max())
+    missing = result["n_timesteps"] - steps
+    if not 0 <= missing <= config["n_envs"] * longest:
+        yield f"0.monitor.csv has {steps:,} steps of {result['n_timesteps']:,}"
+    for split, played in (result.get("final") or {}).items():
+        counts = {len(played[key]) for key in ("returns", "costs", "lengths")}
+        if counts != {FINAL_EPISODES}:
+            yield f"final {split} has {counts} episodes, not {FINAL_EPISODES}"
+
+
+def check(folder: Path) -> bool:
+    """Print what is wrong with the runs of a folder, and what they say; whether nothing is."""
+    paths, fine = find_runs(folder), True
+    for path in paths:
+        try:
+            found = [*problems(path)]
+        except (UsageError, OSError, KeyError, ValueError) as error:
+            found = [one_line(error)]
+        fine = fine and not found
+        print(f"{path}: {'; '.join(found) or 'fine'}")
+    return fine and bool(paths)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--check", type=Path, metavar="FOLDER", help="check runs to be sent in")
+    parser.add_argument("--pack", metavar="NAME", help="pack them if nothing is wrong")
+    args = parser.parse_args()
+    if args.check:
+        if not check(args.check):
+            raise SystemExit(1)
+        if args.pack:
+            pack(args.check, f"sent_{args.pack}")
+        return
+    rows, runs = read()
+    PAGE.write_text(page(rows))
+    runs.to_csv(ROWS, index=False)
+
+
+if __name__ == "__main__":
+    main()

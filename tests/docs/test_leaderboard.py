@@ -1,0 +1,106 @@
+"""The leaderboard is made of packed logs, and what is sent in for it is checked."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from fake_runs import fake_run
+
+from sb3_guard import train
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def scripts(monkeypatch, tmp_path):
+    """The scripts, with a folder of data of their own."""
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    import grand_table
+    import leaderboard
+    import results
+
+    data = tmp_path / "data"
+    data.mkdir()
+    for path in (ROOT / "docs" / "data").glob("*table*.yml"):
+        shutil.copy(path, data)
+    shutil.copy(ROOT / "docs" / "data" / "untrained.csv", data)
+    for module in (results, leaderboard, grand_table):
+        monkeypatch.setattr(module, "DATA", data)
+    yield leaderboard, results
+    for name in ("grand_table", "leaderboard", "results"):
+        sys.modules.pop(name)
+
+
+def rows_of(text: str, heading: str) -> list[list[str]]:
+    table = text.partition(f"### {heading}\n")[2].partition("###")[0]
+    lines = [line for line in table.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
+
+
+def test_certified_rows_come_first_by_return(scripts, tmp_path):
+    board, results = scripts
+    for algo, mean, cost in (("cpo", 10.0, 20.0), ("pcpo", 12.0, 24.0), ("trpo_lag", 20.0, 30.0)):
+        limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
+        for seed in (0, 1):
+            played = {"returns": [mean] * 4, "costs": [cost] * 4, "lengths": [1000] * 4}
+            made = {"command": "sb3-guard train", "curve": "12"}
+            final = {"stochastic": played, "greedy": played}
+            fake_run(tmp_path / "logs", algo, "SafetyPointGoal1-v0", seed, **limit, final=final,
+                     **made, **{"n_timesteps": 1_000_000})  # fmt: skip
+    results.pack(tmp_path / "logs", "grand_table")
+    rows, runs = board.read()
+    assert len(runs) == 6 and "grand_table/cpo/SafetyPointGoal1-v0_1" in {*runs["row"]}
+    table = rows_of(board.leaderboard(rows), "SafetyPointGoal1-v0, 1e6 steps")
+    assert [row[:2] for row in table[:3]] == [
+        ["1", "PCPO"], ["2", "CPO"], ["–", "*TRPO-Lagrangian*"],
+    ]  # fmt: skip
+    assert table[0][-1] == "`sb3-guard reproduce grand_table/pcpo/SafetyPointGoal1-v0_1`"
+    assert table[0][4] == "24.0 [24.0, 24.0]" and table[2][6] == "*100 %*"
+    missing = next(row for row in table if row[1] == "*PPO*")
+    assert missing[-1].startswith("`sb3-guard train --algo ppo --env SafetyPointGoal1-v0 --seeds")
+    assert [row[1] for row in table[-2:]] == ["*random actions*", "*idle*"]
+
+
+def test_packed_logs_are_small(scripts, tmp_path):
+    _, results = scripts
+    path = fake_run(tmp_path / "logs", returns=1 / 3)
+    results.pack(tmp_path / "logs", "small")
+    with results.unpacked("small") as found:
+        (copy,) = found.runs["path"]
+        text = Path(copy, "0.monitor.csv").read_text()
+        assert max(map(len, text.splitlines())) < 30
+        assert Path(copy, "result.json").read_text() == (path / "result.json").read_text()
+
+
+def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
+    board, _ = scripts
+    toy = (
+        "--env Goal_Point_1Hazards --seed 0 --eval-freq -1 --verbose 0 --num-threads 1 -n 8000 "
+        "-params n_envs:2 n_steps:2000 n_critic_updates:1 cost_limit:2"
+    ).split()
+    assert train.main([*toy, "-f", str(tmp_path / "logs")]) == 0
+    (run,) = (tmp_path / "logs" / "cpo").iterdir()
+    assert not board.check(tmp_path / "logs")
+    said = capsys.readouterr().out
+    assert said.count(";") == 1 and "final greedy has {1} episodes, not 100" in said
+    result = json.loads((run / "result.json").read_text())
+    (run / "result.json").write_text(
+        json.dumps(result | {"curve": "0", "command": "x", "final": {}})
+    )
+    (run / "0.monitor.csv").write_text(
+        "\n".join((run / "0.monitor.csv").read_text().splitlines()[:-3]) + "\n"
+    )
+    assert not board.check(tmp_path / "logs")
+    said = capsys.readouterr().out
+    for text in ("no final", "not the hash", "not that of args.yml", "5,000 steps of 8,000"):
+        assert text in said
+
+
+def test_the_page_is_made_of_its_logs(scripts, monkeypatch):
+    board, _ = scripts
+    for module in scripts:
+        monkeypatch.setattr(module, "DATA", ROOT / "docs" / "data")
+    rows, _ = board.read()
+    assert board.page(rows) == board.PAGE.read_text(), "run `python scripts/leaderboard.py`"

@@ -1,0 +1,60 @@
+"""A published run is trained again from its command, and compared episode by episode."""
+
+import json
+
+import pytest
+
+from sb3_guard import reproduce, train
+
+PACKAGES = ["--gym-packages", "registered_envs"]
+TOY = (
+    "--env CostPoint-v0 --env-kwargs episode_length:20 --seed 3 --eval-freq -1 --verbose 0 "
+    "--device cpu -n 400 --num-threads 1 -params n_envs:2 n_steps:100 n_critic_updates:3 "
+    "cost_limit:2"
+).split()
+
+
+@pytest.fixture
+def run(tmp_path):
+    assert train.main([*TOY, *PACKAGES, "-f", str(tmp_path / "logs")]) == 0
+    return tmp_path / "logs" / "cpo" / "CostPoint-v0_1"
+
+
+def again(tmp_path, *arguments: str) -> int:
+    return reproduce.main([*arguments, "-f", str(tmp_path / "again")])
+
+
+def test_a_run_goes_the_same_way(run, tmp_path, capsys):
+    assert again(tmp_path, str(run), *PACKAGES) == 0
+    out = capsys.readouterr().out
+    result = json.loads((run / "result.json").read_text())
+    assert result["command"] in out and "The same: all training episodes agree" in out
+    new = json.loads((tmp_path / "again" / "cpo" / "CostPoint-v0_4" / "result.json").read_text())
+    assert new["final"] == result["final"]
+
+
+def test_a_row_that_went_another_way(run, tmp_path, capsys, monkeypatch):
+    result = json.loads((run / "result.json").read_text())
+    cost = result["cost"] + 1
+    rows = tmp_path / "rows.csv"
+    rows.write_text(
+        "row,command,curve,return,cost,commit\n"
+        f'table/cpo/A_1,"{result["command"]}",0123,{result["return"]},{cost},abc\n'
+    )
+    monkeypatch.setattr(reproduce, "ROWS", rows)
+    assert again(tmp_path, "table/cpo/A_1", *PACKAGES) == 1
+    out = capsys.readouterr().out
+    assert "Not the same" in out and "(-1)" in out and "there is of commit abc" in out
+    assert again(tmp_path, "table/cpo/A_2") == 2
+    assert "did you mean 'table/cpo/A_1'" in capsys.readouterr().err
+
+
+def test_a_command_imports_what_the_user_names_only(run, tmp_path, capsys):
+    assert again(tmp_path, str(run)) == 2
+    assert "only the command line may name" in capsys.readouterr().err
+    assert not (tmp_path / "again").exists()
+
+
+def test_the_packages_own_table_can_be_read(tmp_path, capsys):
+    assert again(tmp_path, "nothing/of/that_1") == 2
+    assert "is no run folder" in capsys.readouterr().err

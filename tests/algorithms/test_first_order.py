@@ -422,7 +422,13 @@ def test_focops_takes_no_clip_range() -> None:
 # Known optima
 
 
-@pytest.mark.parametrize("key", [key for key in KEYS if key != "cppo_pid"])
+@pytest.mark.parametrize(
+    "key",
+    [
+        *("ppo_lag", "p3o", "crpo", "rcpo"),
+        *(pytest.param(key, marks=pytest.mark.slow) for key in ("cppo_pid", "focops", "cup")),
+    ],
+)
 def test_a_known_optimum(key: str) -> None:
     """The five-step table under three quarters of its optimum's cost.
 

@@ -224,6 +224,9 @@ class EarlyTermination(Spending, gym.Wrapper, RecordConstructorArgs):
     :raises ValueError: an argument is out of its range
     """
 
+    #: Commands evaluate without it: no episode would cost more than its budget, whatever the agent.
+    training_only = True
+
     def _wrap(self, env: gym.Env, arguments: dict[str, Any]) -> None:
         RecordConstructorArgs.__init__(self, **arguments)
         gym.Wrapper.__init__(self, env)

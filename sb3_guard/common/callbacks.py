@@ -3,6 +3,7 @@
 import copy
 import os
 import pickle
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -138,7 +139,10 @@ class CostEvalCallback(EvalCallback):
         :raises ValueError: ``selection_limit`` does not fit the cost keys, or the evaluation would
             be played in the training environment
         """
-        super()._init_callback()
+        with warnings.catch_warnings():
+            # Wrappers that are for training alone make another type.
+            warnings.filterwarnings("ignore", "Training and eval env are not of the same type")
+            super()._init_callback()
         self.limits()
         if share_environment(self.training_env, self.eval_env):
             raise ValueError(

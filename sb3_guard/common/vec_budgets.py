@@ -115,6 +115,8 @@ class VecEarlyTermination(Spending, VecEnvWrapper):
     :raises ValueError: an argument is out of its range
     """
 
+    training_only = True  # as EarlyTermination
+
     def _wrap(self, env: VecEnv, arguments: dict[str, Any]) -> None:
         VecEnvWrapper.__init__(self, env)
         self.episode_costs = np.zeros(env.num_envs)

@@ -108,14 +108,15 @@ def make_envs(
     :param env_kwargs: arguments of the environment
     :param cost_keys: entries of info that are costs
     :param num_threads: threads of the native engine; None: its own choice
-    :param evaluation: observations are normalised with given statistics, rewards not at all
+    :param evaluation: observations are normalised with given statistics, rewards not at all, and
+        wrappers that are ``training_only`` are left out
     :param normalizer: statistics to begin with; it is given the environment
     :param render_mode: as for :func:`gymnasium.make`
     :raises UsageError: the environment refuses an argument, or can't be made
     """
 
     def wrap(env: gym.Env) -> gym.Env:
-        for cls, arguments in setup.env_wrapper:
+        for cls, arguments in _wrappers(setup.env_wrapper, evaluation):
             env = cls(env, **arguments)
         return ResumableEnv(env)
 
@@ -141,8 +142,15 @@ def make_envs(
     return wrapped
 
 
+def _wrappers(
+    wrappers: list[tuple[Any, dict[str, Any]]], evaluation: bool
+) -> list[tuple[Any, dict[str, Any]]]:
+    """Those that are for evaluation, too: what ends episodes early would hide what they cost."""
+    return [w for w in wrappers if not (evaluation and getattr(w[0], "training_only", False))]
+
+
 def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: VecNormalize | None) -> VecEnv:
-    for cls, arguments in setup.vec_env_wrapper:
+    for cls, arguments in _wrappers(setup.vec_env_wrapper, evaluation):
         env = cls(env, **arguments)
     if normalizer is not None:
         normalizer.set_venv(env)

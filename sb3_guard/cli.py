@@ -1,4 +1,4 @@
-"""``sb3-guard <command>``: the same commands as ``python -m sb3_guard.<command>``."""
+"""``sb3-guard <command>``: the same commands as ``python -m`` with the command's module."""
 
 import importlib
 import sys
@@ -12,11 +12,17 @@ COMMANDS = {
     "benchmark": "train a grid of environments, algorithms and seeds",
     "reproduce": "train a published run again and compare",
     "enjoy": "play a trained agent, print return and cost, record a video",
+    "export": "write a trained agent as one ONNX file",
     "plot": "make tables, figures and a page of trained runs",
     "hub": "upload a trained agent to the Hugging Face hub, or download one",
     "list": "print environments, robots, tasks, constraints and pretrained agents",
     "show": "describe an environment and draw it",
 }
+
+
+def module_of(command: str) -> str:
+    """The module of a command; that of ``export`` is not called like it, as a function is."""
+    return f"sb3_guard.{'export_agent' if command == 'export' else command}"
 
 
 def _usage() -> str:
@@ -44,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"error: unknown command {name!r}; {did_you_mean(name, COMMANDS)}", file=sys.stderr)
         return 2
-    return importlib.import_module(f"sb3_guard.{name}").main(rest)
+    return importlib.import_module(module_of(name)).main(rest)
 
 
 if __name__ == "__main__":

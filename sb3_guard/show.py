@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium
-import mujoco
 import numpy as np
 import yaml
 
@@ -22,57 +21,18 @@ from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.envs.robots.file_robot import FileRobot
-from sb3_guard.envs.robots.robot import MJCFRobot
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
 from sb3_guard.zoo.run.hyperparams import entry, read_file, shipped_file
 
-# Names and units of what a free joint, a ball, a slide and a hinge add to qpos and to qvel
-_QUATERNION = [(f"q{axis}", "") for axis in "wxyz"]
-_COORDINATES: dict[str, list[list[tuple[str, str]]]] = {
-    "qpos": [
-        [*((axis, "m") for axis in "xyz"), *_QUATERNION], _QUATERNION, [("", "m")], [("", "rad")]
-    ],
-    "qvel": [
-        [*((axis, "m/s") for axis in "xyz"), *((f"ω{axis}", "rad/s") for axis in "xyz")],
-        [(f"ω{axis}", "rad/s") for axis in "xyz"], [("", "m/s")], [("", "rad/s")],
-    ],
-}  # fmt: skip
-# What Gymnasium's Humanoid observes in addition to its joints
-_UNITS = {
-    "cinert": "kg m², kg m, kg", "cvel": "rad/s, m/s", "qfrc_actuator": "N m", "cfrc_ext": "N m, N"
-}  # fmt: skip
-
-
-def joints(model: mujoco.MjModel, which: str, last: int) -> Iterator[tuple[str, str]]:
-    """
-    Names and units of the last numbers of ``qpos`` or ``qvel``.
-
-    :param which: ``"qpos"`` or ``"qvel"``
-    :param last: number of them
-    """
-    found = [
-        (f"{which} {model.joint(i).name.removeprefix('robot/')} {part}".strip(), unit)
-        for i in range(model.njnt)
-        for part, unit in _COORDINATES[which][model.jnt_type[i]]
-    ]
-    yield from found[len(found) - last :]
-
 
 def observation_table(env: GuardVectorEnv) -> str:
     """Name, slice, bounds and unit of every component of the observation; joints one by one."""
     rows = []
-    for name, where in env.observation_layout.items():
-        channel = env.engine.channels[name]
-        bounds = f"[{channel.low:g}, {channel.high:g}]"
-        if name in ("qpos", "qvel"):
-            parts = joints(env.engine.model, name, where.stop - where.start)
-            for i, (part, unit) in enumerate(parts, where.start):
-                rows.append([part, str(i), bounds, unit])
-            continue
-        unit = channel.unit or _UNITS.get(name, "")
-        rows.append([name, f"{where.start}:{where.stop}", bounds, unit])
+    for name, start, stop, low, high, unit in env.components:
+        where = str(start) if name.startswith(("qpos ", "qvel ")) else f"{start}:{stop}"
+        rows.append([name, where, f"[{low:g}, {high:g}]", unit])
     if env.engine.extras.camera is not None:
         width, height = env.engine.extras.camera
         rows.append(["camera", f"image {height} × {width} × 3", "[0, 255]", "red, green, blue"])
@@ -81,16 +41,15 @@ def observation_table(env: GuardVectorEnv) -> str:
 
 def action_table(env: GuardVectorEnv) -> str:
     """Index and actuator of every action, and which controls its least and greatest value set."""
-    model, robot = env.engine.model, env.engine.robot
-    limits = np.array(
-        robot.controls if isinstance(robot, MJCFRobot) else model.actuator_ctrlrange.T
-    )
-    rows = []
-    for i, (low, high) in enumerate(limits.T):
-        name = model.actuator(i).name or model.joint(model.actuator_trnid[i, 0]).name
-        name = name.removeprefix("robot/")
-        least, most = (np.broadcast_to(b, model.nu)[i] for b in robot.action_range)
-        rows.append([str(i), name, f"[{least:g}, {most:g}]", f"[{low:g}, {high:g}]"])
+    rows = [
+        [
+            str(i),
+            actuator.name,
+            f"[{actuator.low:g}, {actuator.high:g}]",
+            "[{:g}, {:g}]".format(*actuator.control),
+        ]
+        for i, actuator in enumerate(env.actuators)
+    ]
     return table(["action", "actuator", "range", "control"], rows)
 
 

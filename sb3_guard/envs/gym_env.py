@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from sb3_guard.envs.components import Actuator, Component, actuators, components
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import EYE
 from sb3_guard.envs.outcome import Outcome
@@ -124,6 +125,16 @@ class Simulated:
     def observation_layout(self) -> dict[str, slice]:
         """Where each named component lies in the flat observation."""
         return self.engine.observation_layout
+
+    @property
+    def components(self) -> list[Component]:
+        """What each number of the flat observation is: name, place, bounds and unit."""
+        return list(components(self.engine))
+
+    @property
+    def actuators(self) -> list[Actuator]:
+        """What each number of an action moves: name, range, and range of the actuator."""
+        return list(actuators(self.engine))
 
     def look(self) -> Array | None:
         """What the robots' cameras see, [N, H, W, 3] uint8, or None if that is not observed."""

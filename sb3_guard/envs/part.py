@@ -328,6 +328,15 @@ class Robot(Part):
         """Apply [N, action_size] actions within ``action_range`` for the next control step."""
         raise NotImplementedError
 
+    def to_controls(self, actions: Array | float) -> Array | None:
+        """The controls that actions set, linear in each, without noise and delay.
+
+        None: they are not linear. Exported policies give controls, too.
+
+        :param actions: [N, action_size], or one number for all
+        """
+        return None
+
 
 class Task(Part):
     """What the robot is rewarded for."""

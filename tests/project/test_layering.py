@@ -135,9 +135,9 @@ def test_parts_do_not_know_each_other_nor_the_engine():
 
 
 def test_only_the_bridge_imports_both_worlds():
-    from sb3_guard.cli import COMMANDS
+    from sb3_guard.cli import COMMANDS, module_of
 
-    commands = tuple(f"sb3_guard.{command}" for command in COMMANDS)
+    commands = tuple(module_of(command) for command in COMMANDS)
     both = [
         m
         for m in MODULES
@@ -149,9 +149,9 @@ def test_only_the_bridge_imports_both_worlds():
 
 
 def test_nothing_imports_the_zoo_but_the_commands():
-    from sb3_guard.cli import COMMANDS
+    from sb3_guard.cli import COMMANDS, module_of
 
-    commands = {"sb3_guard.cli", *(f"sb3_guard.{command}" for command in COMMANDS)}
+    commands = {"sb3_guard.cli", *(module_of(command) for command in COMMANDS)}
     for module in MODULES:
         if module.startswith("sb3_guard.zoo") or module in commands:
             continue

@@ -271,7 +271,7 @@ class MJCFRobot(Robot):
     @property
     def controls(self) -> tuple[Array, Array]:
         """The controls that the lowest and the highest actions set, [action_size] each."""
-        low, high = (self._center + self._half * action for action in self.action_range)
+        low, high = map(self.to_controls, self.action_range)
         least, most = self.sim.model.actuator_ctrlrange.T  # MuJoCo keeps controls within
         return np.maximum(low, least), np.minimum(high, most)
 
@@ -305,7 +305,10 @@ class MJCFRobot(Robot):
             actions = actions + self.action_noise * np.array(noise)
         if self.delay:
             actions = self._delayed(actions)
-        self._ctrl[:] = self._center + self._half * actions
+        self._ctrl[:] = self.to_controls(actions)
+
+    def to_controls(self, actions: Array | float) -> Array:
+        return self._center + self._half * actions
 
     def _delayed(self, actions: Array) -> Array:
         """The actions of ``delay`` steps ago, [N, action_size], keeping those of now for later."""

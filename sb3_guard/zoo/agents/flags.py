@@ -1,4 +1,4 @@
-"""The flags of the commands that take a trained agent: ``enjoy`` and ``hub``."""
+"""The flags of the commands that take a trained agent: ``enjoy``, ``export`` and ``hub``."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -92,6 +92,28 @@ class EnjoyFlags(AgentFlags):
     window: bool = flag(default=False, exclusive="window")
     no_render: bool = flag(default=False, exclusive="window")
     verbose: Literal[0, 1] = flag(default=1)
+
+
+@dataclass
+class ExportFlags(AgentFlags):
+    """
+    Write a trained agent as one ONNX file, which runs without torch and without this package.
+
+    The file has the observation's normalisation, the policy, squashing or clipping, and the safety
+    filter; contract.json beside it says what goes in and what comes out. Sampled actions take their
+    random numbers as an input.
+
+    Output:
+
+    :param output: the file (default: policy.onnx)
+    """
+
+    prog: ClassVar[str] = "sb3-guard export"
+    examples: ClassVar[str] = """examples:
+  sb3-guard export --pretrained
+  sb3-guard export --algo cpo --env Goal_Point_8Hazards -f logs --load-best -o robot/policy.onnx
+"""
+    output: str = flag("-o", default="policy.onnx", metavar="FILE.onnx")
 
 
 @dataclass

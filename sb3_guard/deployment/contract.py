@@ -1,0 +1,199 @@
+"""``contract.json``: inputs, outputs and rate of an exported policy, for the loop around it."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import stable_baselines3
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.common.budgets import Highest, Remaining
+from sb3_guard.deployment.deployed import Deployed
+from sb3_guard.deployment.environment import (
+    all_wrappers,
+    changing,
+    drive,
+    frames_of,
+    lone_of,
+    ours_of,
+)
+from sb3_guard.deployment.observations import OBSERVATION, inputs_of
+
+FORMAT = 1  # increased when the content changes
+_RANDOM = {
+    "noise": "independent standard normal numbers, drawn anew in each step",
+    "uniform": "one number from [0, 1), drawn anew in each step",
+}
+_LAST_COST = "cost of the step before, 0 when an episode begins, NaN if it is not known"
+
+
+def contract(
+    model: BaseAlgorithm, env: VecEnv, deployed: Deployed, trained: Mapping[str, Any]
+) -> dict[str, Any]:
+    """
+    The contract of an exported agent, as plain data without infinities.
+
+    :param model: the agent
+    :param env: environments with the wrappers of training
+    :param deployed: what is exported
+    :param trained: what else there is to say of the training
+    """
+    from sb3_guard import __version__
+
+    ours = ours_of(env)
+    inner = lone_of(env)
+    step = ours.engine.control_step if ours else getattr(inner and inner.unwrapped, "dt", None)
+    spec = getattr(inner, "spec", None) or getattr(env.unwrapped, "spec", None)
+    versions = {
+        "sb3_guard": __version__, "stable_baselines3": stable_baselines3.__version__,
+        "torch": th.__version__,
+    }  # fmt: skip
+    return {
+        "format": FORMAT,
+        "inputs": [_input(name, model, env, deployed) for name in deployed.inputs],
+        "outputs": [_output(name, model, env) for name in deployed.outputs],
+        "actions": "sampled" if deployed.acting.actor.sampled else "mean",
+        "control_step": step,
+        "control_rate": None if step is None else round(1.0 / step, 6),
+        "costs": list(_costs(model)),
+        "filter": _filter(deployed),
+        "frame_stack": _stack(env, deployed),
+        "wrappers": [type(wrapper).__name__ for wrapper in changing(env)],
+        "trained": {
+            "algorithm": type(model).__name__,
+            "env": None if spec is None else spec.id,
+            "timesteps": model.num_timesteps,
+            "versions": versions,
+            **trained,
+        },
+    }
+
+
+def _input(name: str, model: BaseAlgorithm, env: VecEnv, deployed: Deployed) -> dict[str, Any]:
+    observed = inputs_of(model.observation_space)
+    if name not in observed:
+        size = int(np.prod(deployed.shape)) if name == "noise" else 1
+        meaning = _RANDOM.get(name, _LAST_COST)
+        return {"name": name, "dtype": "float32", "shape": ["batch", size], "meaning": meaning}
+    space = observed[name]
+    described = {**_space(name, space), "normalized": name in deployed.normalizer.names}
+    if isinstance(space, spaces.Box) and len(space.shape) == 1:
+        described["components"] = list(_components(name, space, env))
+        if "low" in described["components"][0]:  # those of the whole say no more
+            del described["low"], described["high"]
+    return described
+
+
+def _output(name: str, model: BaseAlgorithm, env: VecEnv) -> dict[str, Any]:
+    driven = drive(env)
+    if name == "control":
+        assert driven is not None
+        ranges = [(part.name, *part.control) for part in driven.actuators]
+        described: dict[str, Any] = {
+            "name": name, "dtype": "float32", "shape": ["batch", len(ranges)],
+            "low": [low for _, low, _ in ranges], "high": [high for _, _, high in ranges],
+        }  # fmt: skip
+    else:
+        described = {**_space(name, model.action_space), "dtype": _dtype(model.action_space)}
+        ranges = [] if driven is None else [(part.name,) for part in driven.actuators]
+    if ranges:
+        described["actuators"] = [names[0] for names in ranges]
+    return described
+
+
+def _dtype(space: spaces.Space) -> str:
+    """Of exported actions, which are float32 whatever the space says."""
+    return "float32" if isinstance(space, spaces.Box) else "int64"
+
+
+def _space(name: str, space: spaces.Space) -> dict[str, Any]:
+    """Name, type, shape and bounds of an observation or action; a bound is null if infinite."""
+    shape = ["batch", *(space.shape or ())]
+    described: dict[str, Any] = {"name": name, "dtype": str(space.dtype), "shape": shape}
+    if isinstance(space, spaces.Box):
+        described |= {"low": _bounds(space.low), "high": _bounds(space.high)}
+    elif isinstance(space, spaces.Discrete):
+        described |= {"low": int(space.start), "high": int(space.start + space.n) - 1}
+    return described
+
+
+def _bounds(values: np.ndarray) -> Any:
+    """Bounds, or one number where all are equal."""
+    numbers = [_finite(value) for value in values.ravel().tolist()]
+    return numbers[0] if len(set(numbers)) == 1 else numbers
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _components(name: str, space: spaces.Box, env: VecEnv) -> Iterator[dict[str, Any]]:
+    """What the numbers of one frame are, in their order; of a frame nobody describes, nothing."""
+    size = space.shape[0] // frames_of(env)
+    ours = ours_of(env)
+    counted = {w.name: w for w in all_wrappers(env) if isinstance(w, Remaining | Highest)}
+    counted = {k: w for k, w in counted.items() if name in (OBSERVATION, k)}
+    parts = [part for part in (ours.components if ours else ())]
+    if name != OBSERVATION:
+        parts = [part for part in parts if part.name.split(" ")[0] == name]
+    first = parts[0].start if parts else 0
+    rest = size - sum(wrapper.numbers.shape[1] for wrapper in counted.values())
+    if parts and parts[-1].stop - first != rest:  # a wrapper has changed them
+        parts = []
+    for part in parts:
+        bounds = {"low": _finite(part.low), "high": _finite(part.high), "unit": part.unit}
+        yield {"name": part.name, "start": part.start - first, "stop": part.stop - first, **bounds}
+    if not parts and rest:
+        yield {"name": name, "start": 0, "stop": rest}
+    for wrapper in counted.values():
+        stop = rest + wrapper.numbers.shape[1]
+        yield {"name": wrapper.name, "start": rest, "stop": stop, **_rule(wrapper)}
+        rest = stop
+
+
+def _rule(wrapper: Any) -> dict[str, Any]:
+    """What the caller counts, as a wrapper did in training."""
+    if isinstance(wrapper, Highest):
+        rule = f"the highest {', '.join(wrapper.cost_keys)} of a step so far in the episode"
+    else:
+        rule = (
+            f"(its value before - {wrapper.cost_key} / {wrapper.budget:g}) / {wrapper.discount:g}"
+        )
+    return {"first": wrapper.first, "computed": rule}
+
+
+def _stack(env: VecEnv, deployed: Deployed) -> dict[str, Any] | None:
+    """How frames are stacked: the oldest first; before the first they are the padding."""
+    if frames_of(env) == 1:
+        return None
+    padding = {}
+    for name, space in inputs_of(deployed.space).items():
+        mean = deployed.normalizer.mean(name)  # a normalised zero
+        padding[name] = _bounds(np.zeros(space.shape or ()) if mean is None else mean)
+    return {"frames": frames_of(env), "order": "oldest first", "padding": padding}
+
+
+def _costs(model: BaseAlgorithm) -> Iterator[dict[str, Any]]:
+    """The costs that were limited in training, and their limits."""
+    if not isinstance(model, Constrained):
+        return
+    per = "step" if model.limit_on == "max" else "episode"
+    for i, key in enumerate(model.cost_keys):
+        limit = float(model.final_cost_limits[i]) if model.constrained else None
+        yield {"name": key, "limit": limit, "per": per}
+
+
+def _filter(deployed: Deployed) -> dict[str, Any] | None:
+    """The safety filter that is part of the file."""
+    corrected = deployed.acting.corrected
+    if corrected is None:
+        return None
+    layer: Any = deployed.acting.layer
+    described = {"kind": type(layer).__name__, "thresholds": layer.threshold.tolist()}
+    steps = getattr(layer, "steps", None)
+    return described if steps is None else {**described, "steps": steps, "rate": layer.rate}

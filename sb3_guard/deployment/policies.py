@@ -1,0 +1,228 @@
+"""How a policy of Stable-Baselines3 acts, as a module of tensor operators without ``predict``.
+
+An exporter sees operators alone, but ``predict`` uses NumPy for what comes after the network:
+noise, squashing, clipping and safety filters. The modules here repeat it in operators.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from sb3_contrib.tqc.policies import Actor as TQCActor
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.sac.policies import Actor as SACActor
+from stable_baselines3.td3.policies import Actor as TD3Actor
+from torch import nn
+
+from sb3_guard.algorithms.common.policies import FilteredPolicy
+from sb3_guard.deployment.filters import Filter, filter_of
+
+
+class Actor(nn.Module):
+    """A policy, as a function of preprocessed observations and, if it samples, a random input."""
+
+    #: name of the random input: ``"noise"`` for standard normal numbers, ``"uniform"`` for one
+    #: number in [0, 1), or None
+    random: str | None = None
+
+    policy: Any
+
+    def __init__(self, policy: Any, sampled: bool) -> None:
+        """
+        :param policy: the policy or actor whose networks it uses
+        :param sampled: whether it samples
+        """
+        super().__init__()
+        self.policy, self.sampled = policy, sampled
+
+    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
+        """Actions of the environment, a Box's in float32 and flat, [B, k]; a Discrete's, [B].
+
+        :param observations: batch of B observations, as the policy knows them
+        :param random: the random input, [B, k] or [B, 1]; None if the policy does not sample
+        """
+        raise NotImplementedError
+
+
+class Box(nn.Module):
+    """The bounds of actions.
+
+    :param space: the action space
+    """
+
+    low: th.Tensor
+    high: th.Tensor
+
+    def __init__(self, space: spaces.Box) -> None:
+        super().__init__()
+        self.register_buffer("low", th.as_tensor(space.low.flatten()).float())
+        self.register_buffer("high", th.as_tensor(space.high.flatten()).float())
+
+    def clip(self, actions: th.Tensor) -> th.Tensor:
+        """Actions inside the bounds, [B, k]."""
+        return th.minimum(th.maximum(actions, self.low), self.high)
+
+    def scale(self, unit: th.Tensor) -> th.Tensor:
+        """Actions of the environment from those in [-1, 1], [B, k]."""
+        return self.low + 0.5 * (unit + 1.0) * (self.high - self.low)
+
+    def to_unit(self, actions: th.Tensor) -> th.Tensor:
+        """Actions in [-1, 1] from those of the environment, [B, k]."""
+        half = ((self.high - self.low) / 2.0).clamp(min=float(np.finfo(np.float32).tiny))
+        return (actions - self.low) / half - 1.0
+
+
+class Gaussian(Actor):
+    """Actor of PPO, TRPO and their like for a Box: clipped mean, or mean plus scaled noise."""
+
+    def __init__(self, policy: ActorCriticPolicy, sampled: bool) -> None:
+        super().__init__(policy, sampled)
+        assert isinstance(policy.action_space, spaces.Box)
+        self.box = Box(policy.action_space)
+        self.random = "noise" if sampled else None
+
+    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
+        actions = _output(self.policy, observations)
+        if random is not None:
+            actions = actions + th.exp(self.policy.log_std) * random
+        return self.box.clip(actions)
+
+
+class Categorical(Actor):
+    """The same for a Discrete space: the likeliest action, or the inverse of the distribution."""
+
+    def __init__(self, policy: ActorCriticPolicy, sampled: bool) -> None:
+        super().__init__(policy, sampled)
+        assert isinstance(policy.action_space, spaces.Discrete)
+        self.random = "uniform" if sampled else None
+
+    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
+        logits = _output(self.policy, observations)
+        if random is None:
+            return logits.argmax(dim=1)
+        below = th.softmax(logits, dim=1).cumsum(dim=1)[:, :-1]
+        return (below <= random).long().sum(dim=1)
+
+
+class Squashed(Actor):
+    """Actor of SAC and TQC: the hyperbolic tangent of a Gaussian, scaled to the box."""
+
+    def __init__(self, policy: Any, sampled: bool) -> None:
+        super().__init__(policy.actor, sampled)
+        assert isinstance(policy.action_space, spaces.Box)
+        self.box = Box(policy.action_space)
+        self.random = "noise" if sampled else None
+
+    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
+        actions, log_std, _ = self.policy.get_action_dist_params(observations)
+        if random is not None:
+            actions = actions + th.exp(log_std) * random
+        return self.box.scale(th.tanh(actions))
+
+
+class Deterministic(Actor):
+    """Actor of TD3 and DDPG, whose network ends in a hyperbolic tangent."""
+
+    def __init__(self, policy: Any, sampled: bool) -> None:
+        super().__init__(policy.actor, sampled)
+        assert isinstance(policy.action_space, spaces.Box)
+        self.box = Box(policy.action_space)
+
+    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
+        return self.box.scale(self.policy(observations))
+
+
+class Corrected(nn.Module):
+    """An actor behind the safety filter that its policy carries.
+
+    :param actor: it acts in a Box
+    :param action_filter: of actions in units of the action space
+    """
+
+    def __init__(self, actor: Actor, action_filter: Filter) -> None:
+        super().__init__()
+        self.actor, self.filter = actor, action_filter
+        self.box = Box(actor.policy.action_space)
+
+    def forward(
+        self, observations: PyTorchObs, random: th.Tensor | None, last_cost: th.Tensor | None
+    ) -> th.Tensor:
+        actions = self.actor(observations, random)
+        box: Any = self.box
+        unit = box.to_unit(actions)
+        corrected = self.filter(observations, unit, last_cost)
+        # What is not corrected stays as it is, to the last bit.
+        moved = (corrected - unit).abs().amax(dim=1, keepdim=True) > 1e-6
+        return box.clip(th.where(moved, box.scale(corrected).float(), actions))
+
+
+def _output(policy: Any, observations: PyTorchObs) -> th.Tensor:
+    """Means or logits, [B, k]."""
+    features = policy.extract_features(observations, policy.pi_features_extractor)
+    return policy.action_net(policy.mlp_extractor.forward_actor(features))
+
+
+def actor_of(model: BaseAlgorithm, sampled: bool) -> Actor:
+    """How a model acts, without its safety filter.
+
+    :param model: the model
+    :param sampled: whether it samples its actions
+    :raises ValueError: the model is of a kind that can't be exported
+    """
+    policy, space, name = model.policy, model.action_space, type(model).__name__
+    can = "can't be exported"
+    if not isinstance(space, spaces.Box | spaces.Discrete):
+        raise ValueError(f"{name} {can}: its actions are {space}; Box and Discrete can be")
+    if getattr(model, "use_sde", False):
+        raise ValueError(f"{name} {can}: its noise is gSDE's; train it with use_sde=False")
+    if hasattr(policy, "lstm_actor"):
+        raise ValueError(f"{name} {can}: its policy is recurrent; use frame_stack instead")
+    actor: Any = getattr(policy, "actor", None)
+    if isinstance(policy, ActorCriticPolicy):
+        return (Gaussian if isinstance(space, spaces.Box) else Categorical)(policy, sampled)
+    if isinstance(actor, SACActor | TQCActor):
+        return Squashed(policy, sampled)
+    if isinstance(actor, TD3Actor):
+        if sampled:
+            raise ValueError(f"{name} {can} with sampled actions: its policy is deterministic")
+        return Deterministic(policy, sampled)
+    raise ValueError(
+        f"{name} {can}: its policy is a {type(policy).__name__}; those of PPO, TRPO, A2C, SAC, "
+        "TQC, TD3, DDPG and of all algorithms of sb3_guard can be"
+    )
+
+
+class Acting(nn.Module):
+    """An actor with or without a filter, called in the same way.
+
+    :param model: the model
+    :param sampled: whether it samples its actions
+    :raises ValueError: the model is of a kind that can't be exported
+    """
+
+    def __init__(self, model: BaseAlgorithm, sampled: bool) -> None:
+        super().__init__()
+        self.actor = actor_of(model, sampled)
+        policy = model.policy
+        corrects = isinstance(policy, FilteredPolicy) and policy.corrects
+        #: the policy's own filter, if it is switched on
+        layer: Any = policy.action_filter if corrects else None
+        self.layer = layer
+        self.corrected = None if layer is None else Corrected(self.actor, filter_of(layer))
+        #: whether what the last step cost is an input
+        self.acts_on_cost = layer is not None and layer.acts_on_cost
+
+    def forward(
+        self, observations: PyTorchObs, random: th.Tensor | None, last_cost: th.Tensor | None
+    ) -> th.Tensor:
+        """Actions of the environment; see :class:`Actor`.
+
+        :param last_cost: what the last step cost, [B, 1], NaN where that is not known; None if the
+            policy does not act on it
+        """
+        if self.corrected is None:
+            return self.actor(observations, random)
+        return self.corrected(observations, random, last_cost)

@@ -1,0 +1,64 @@
+"""A trained agent of a run folder as an ONNX file, with what it was trained at and measured."""
+
+import hashlib
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from sb3_guard.common.evaluation import evaluate_policy
+from sb3_guard.deployment import onnx_file
+from sb3_guard.zoo.agents.flags import AgentFlags, ExportFlags
+from sb3_guard.zoo.agents.playback import BATCH, Agent, open_agent, summary
+from sb3_guard.zoo.cli.usage import UsageError, explained
+from sb3_guard.zoo.run.folder import require_writable
+
+
+def export(flags: ExportFlags) -> int:
+    """Write the file and its contract, and say what they are."""
+    path = Path(flags.output)
+    if path.suffix != ".onnx":
+        raise UsageError(f"--output {flags.output!r} must end in .onnx")
+    require_writable(path.parent, "--output")
+    agent = open_agent(flags, None, min(flags.n_episodes or BATCH, BATCH))
+    with closing(agent.env):
+        episodes = flags.n_episodes or max(agent.env.num_envs, 5)
+        contract = write(agent, flags, path, episodes)
+    measured = contract["trained"]["measured"]
+    print(
+        f"{path}: {', '.join(contract['file']['operators'])}\n"
+        f"{path.with_name(onnx_file.CONTRACT)}: "
+        f"return {measured['return']['mean']:.2f}, cost {measured['cost']['mean']:.2f} "
+        f"in {measured['episodes']} episodes"
+    )
+    return 0
+
+
+def write(agent: Agent, flags: AgentFlags, path: Path, episodes: int) -> dict[str, Any]:
+    """
+    Export an agent, and measure it for the contract.
+
+    :param agent: the agent and its environment
+    :param flags: how it acts
+    :param path: of the ONNX file
+    :param episodes: that it plays
+    :return: the contract
+    :raises UsageError: the agent can't be exported
+    """
+    how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
+    with explained(f"can't export {agent.path}", ValueError, ImportError):
+        onnx_file.check(agent.model, flags.stochastic)
+    measured = summary(evaluate_policy(agent.model, agent.env, episodes, **how))
+    for values in measured.values():
+        if isinstance(values, dict):
+            del values["values"]
+    trained = {
+        "algo": flags.algo,
+        "env": agent.env_id,
+        "env_kwargs": agent.run.hyperparams().get("env_kwargs") or {},
+        "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
+        "measured": measured,
+    }
+    with explained(f"can't export {agent.path}", ValueError):
+        return onnx_file.export(
+            agent.model, path, env=agent.env, sampled=flags.stochastic, trained=trained
+        )

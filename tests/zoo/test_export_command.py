@@ -1,0 +1,56 @@
+"""``sb3-guard export``: an agent of a run folder as an ONNX file, with what it was measured at."""
+
+import hashlib
+import json
+
+import onnxruntime
+import pytest
+from typed import refused, trained
+
+from sb3_guard import cli, export_agent
+from sb3_guard.zoo.agents.playback import find_run
+
+WHICH = ["--env", "CostPoint-v0", "--gym-packages", "registered_envs", "--n-episodes", "2"]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    trained(folder, "-params", "normalize:True", "cost_limit:2")
+    return folder
+
+
+def test_an_exported_run_says_what_it_was_trained_at(logs, tmp_path, capsys):
+    path = tmp_path / "robot" / "policy.onnx"
+    assert cli.main(["export", *WHICH, "-f", str(logs), "--load-best", "-o", str(path)]) == 0
+    assert str(path) in capsys.readouterr().out
+    session = onnxruntime.InferenceSession(path)
+    assert [(each.name, each.shape) for each in session.get_inputs()] == [
+        ("observation", ["batch", 4])
+    ]
+    contract = json.loads((tmp_path / "robot" / "contract.json").read_text())
+    run = find_run(logs, "cpo", "CostPoint-v0")
+    trained_at = contract["trained"]
+    digest = hashlib.sha256((run.path / "best_model.zip").read_bytes()).hexdigest()
+    assert trained_at["model_sha256"] == digest
+    assert (trained_at["algo"], trained_at["env"]) == ("cpo", "CostPoint-v0")
+    assert trained_at["env_kwargs"] == {"episode_length": 20}
+    assert (
+        trained_at["measured"]["episodes"] == 2 and trained_at["measured"]["length"]["mean"] == 20
+    )
+    assert contract["costs"] == [{"name": "cost", "limit": 2.0, "per": "episode"}]
+    assert contract["inputs"][0]["normalized"] is True
+
+
+def test_what_can_not_be_exported_is_said_before_it_is_played(logs, tmp_path, capsys):
+    here = [*WHICH, "-f", str(logs)]
+    refused(export_agent.main, [*here, "-o", "policy.pt"], capsys, "'policy.pt' must end in .onnx")
+    refused(export_agent.main, [*here, "--algo", "pcpo"], capsys, "there is no run of pcpo")
+    run = find_run(logs, "cpo", "CostPoint-v0")
+    statistics = run.normalizer.read_bytes()
+    run.normalizer.unlink()
+    refused(export_agent.main, here, capsys, "observation statistics", "No such file")
+    run.normalizer.write_bytes(statistics)
+    sde = ["-params", "cost_limit:2", "use_sde:True", "--eval-freq", "-1"]
+    trained(tmp_path, *sde)
+    refused(export_agent.main, [*WHICH, "-f", str(tmp_path)], capsys, "can't export", "gSDE's")

@@ -17,7 +17,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from sb3_guard.cli import COMMANDS
+from sb3_guard.cli import COMMANDS, module_of
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.part import Part
@@ -240,7 +240,7 @@ def command_line() -> str:
         ),
     ]
     for name in COMMANDS:
-        flags = importlib.import_module(f"sb3_guard.{name}").Flags
+        flags = importlib.import_module(module_of(name)).Flags
         says = " ".join(flags.parser().description.split())
         examples = inspect.cleandoc(flags.examples).partition("\n")[2]
         examples = inspect.cleandoc(examples.partition("\n\n")[0])

@@ -14,7 +14,7 @@ import pytest
 
 import sb3_guard
 from sb3_guard.algorithms import TrustRegion
-from sb3_guard.cli import COMMANDS
+from sb3_guard.cli import COMMANDS, module_of
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -197,7 +197,7 @@ def test_commands_named_in_the_pages_exist_and_take_the_flags(document):
         assert importlib.util.find_spec(module), module
     for name, flags in re.findall(r"\bsb3-guard (\w+)\b(?!\|)([^`\n|#]*)", text):
         assert name in COMMANDS, name
-        parser = importlib.import_module(f"sb3_guard.{name}").Flags.parser()
+        parser = importlib.import_module(module_of(name)).Flags.parser()
         for flag in re.findall(r"(?<= )--?[a-z][-a-z]*", flags):
             assert flag in parser._option_string_actions, f"{name} {flag}"
 

@@ -155,6 +155,7 @@ def gallery() -> str:
         "`sb3-guard enjoy --pretrained --record` films an agent. The pictures are made by "
         "`python scripts/render_gallery.py`.",
     ]
+    parts.append("![Robots, tasks and constraints](images/poster.png)")
     for kind in GROUPS:
         parts += [f"## {kind.title()}s", CAPTIONS[kind], thumbnails(kind)]
     parts += ["## Other looks", table([f"![{one}](images/{one}.png)" for one in LOOKS],

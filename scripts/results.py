@@ -59,24 +59,22 @@ LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml"
 GRIDS = (
     (("safety_gymnasium", "safety_gymnasium_others"), "SafetyPointGoal1-v0", "ppo"),
     (("guard_limit2",), "Goal_Point_8Hazards", "trpo"),
-    (("off_policy",), "SafetyPointGoal1-v0", None),
 )
 
 # Of docs/notes/paper_settings.md, with the paper's settings: archive and suites.
 PAPER = {
-    "guard_paper": [f"Goal_{robot}_8Hazards" for robot in ("Point", "Drone", "Arm3", "Walker")],
-    "goal_point_1m_limit0": ["Goal_Point_8Ghosts"],
+    "guard_paper": [f"Goal_{robot}_8Hazards" for robot in ("Point", "Drone", "Arm3")],
 }
 HAZARDS = "Goal_Point_8Hazards-v0"
 # Of docs/healthy.md, a good run and a bad one: label, limit, archive and folder.
 HEALTHY = {
     "pcpo": (
-        ("seed 23", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_24"),
-        ("seed 22", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_23"),
+        ("healthy: seed 23", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_24"),
+        ("stuck: seed 22", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_23"),
     ),
     "trpo_lag": (
-        ("default", 2.0, "guard_limit2", f"guard_limit2/trpo_lag/{HAZARDS}_23"),
-        ("-conf paper", 0.0, "guard_paper", f"guard_paper/trpo_lag/{HAZARDS}_1"),
+        ("healthy: default, limit 5", 5.0, "guard_limit5", f"guard_limit5/trpo_lag/{HAZARDS}_22"),
+        ("stuck: -conf paper, limit 0", 0.0, "guard_paper", f"guard_paper/trpo_lag/{HAZARDS}_1"),
     ),
 }
 
@@ -301,7 +299,9 @@ def draw_healthy(algo: str) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 0.7 + 2.1 * rows), layout="constrained")
         axes = figure.subplots(rows, columns).ravel()
-        for (name, limit, archive, folder), color in zip(HEALTHY[algo], COLORS, strict=False):
+        for (name, limit, archive, folder), color in zip(
+            HEALTHY[algo], (COLORS[2], COLORS[1]), strict=True
+        ):
             with tarfile.open(DATA / f"{archive}.tar.xz") as packed:
                 file = packed.extractfile(f"{folder}/progress.csv")
                 assert file is not None
@@ -311,16 +311,16 @@ def draw_healthy(algo: str) -> Figure:
             lines = {"return": log["ep_rew_mean"]}
             lines["episode cost"] = means["constraint_violation"] + limit
             if algo == "pcpo":
-                lines["cost_margin"] = log["cost_margin"]
-                lines["cost_change"] = means["cost_change"]
+                lines["margin below the limit"] = log["cost_margin"]
+                lines["change by an update"] = means["cost_change"]
                 axes[3].plot(
                     means["cost_change_promised"], color=color, linestyle=(0, (5, 1.5)),
-                    label=f"{name}, promised",
+                    label=f"{name}, predicted",
                 )  # fmt: skip
             else:
                 # Older logs call the weight "price". In the paper's units λ itself is the weight.
-                name = next(n for n in ("cost_weight", "price", "multiplier") if n in log)
-                lines["weight of the cost"] = log[name]
+                column = next(c for c in ("cost_weight", "price", "multiplier") if c in log)
+                lines["weight of the cost"] = log[column]
             for axis, (label, line) in zip(axes, lines.items(), strict=True):
                 axis.plot(line, color=color, linewidth=1.5, label=name)
                 axis.set(xlabel="steps", ylabel=label, xlim=(0, line.index[-1]))

@@ -19,7 +19,7 @@ from sb3_guard.envs.suites.guard import SUITE_ROBOTS
 from sb3_guard.zoo.grids.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.results import figures
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
-from sb3_guard.zoo.results.figures import fit_costs, inline_svg, pareto_front, save
+from sb3_guard.zoo.results.figures import fit_costs, inline_svg, save
 from sb3_guard.zoo.results.paper import FIGURES, draw
 from sb3_guard.zoo.results.report import report
 from sb3_guard.zoo.results.runs import read_results, select
@@ -136,26 +136,17 @@ def test_robots_are_in_the_order_of_their_actions():
     assert actual == ROBOTS and list(ROBOTS.values()) == sorted(ROBOTS.values())
 
 
-@pytest.mark.parametrize(
-    ("points", "front"),
-    [
-        ([(1, 1), (2, 2), (3, 3)], [0, 1, 2]),
-        ([(3, 1), (2, 2), (1, 3)], [2]),
-        ([(1, 1), (1, 2), (2, 2)], [1]),  # the last is no better and costs more
-        ([(2, 5), (1, 0), (3, 4)], [1, 0]),
-    ],
-)
-def test_pareto_front(points, front):
-    costs, returns = np.array(points, float).T
-    assert pareto_front(costs, returns).tolist() == front
-
-
-def test_pareto_marks_front_and_limit(small):
+def test_pareto_names_the_points_and_shades_the_infeasible_side(small):
     (drawing,) = draw("pareto", read(small))
     (axis,) = drawing.figure.axes
     assert drawing.name == f"pareto_{POINT}"
-    assert lines(axis)["Pareto front"].tolist() == [5.0, 10.0]
     assert "cost limit, 0" in lines(axis)
+    found = read(small)
+    labels = {found.looks[algo].label for algo in found.runs["algo"]}
+    assert {text.get_text() for text in axis.texts} == labels
+    (shade,) = axis.patches
+    assert shade.get_x() == 0.0 and shade.get_width() == axis.get_xlim()[1]
+    assert POINT in axis.get_title() and "seed" in axis.get_title() and "steps" in axis.get_title()
 
 
 def test_pareto_shows_an_outlier_at_the_edge(small):

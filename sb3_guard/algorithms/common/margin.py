@@ -27,7 +27,7 @@ class Margin(Reuse):
     that the next step does not lead out again.
 
     :param recover_to: share of the limit that J_C has to come down to once it has exceeded it:
-        d - (1 - recover_to) |d| is the limit until it is kept; 1 for d itself, as in the papers
+        d - (1 - recover_to) abs(d) is the limit until it is kept; 1 for d itself, as in the papers
     :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the papers
     :param recovery: share of the largest possible decrease of a cost that a step asks for where the
         limit is out of reach; 1 for all of it, as in the papers

@@ -26,9 +26,19 @@ COLORS = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#C08A00", "#3D9BD6", "#8F6FD1", "#8A8A00",
     "#A65E3A", "#4FA38F",
 )  # fmt: skip
-MARKERS = "Ddsv^P*Xph<>"
+OTHERS = "*^pXPvhD"  # markers of algorithms that are not in PLACES
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1)))
 LOOSE = (0, (4, 2.5))  # baselines, which are of no family
+# An algorithm has its colour and marker in every figure, and a family its line style. Algorithms
+# that share a colour are rarely in one figure.
+PLACES = {
+    "cpo": (0, "D"), "pcpo": (1, "d"), "trpo_lag": (2, "s"), "ppo_lag": (3, "v"),
+    "focops": (4, "^"), "cup": (5, "P"), "cppo_pid": (6, "*"), "p3o": (7, "X"), "crpo": (8, "p"),
+    "ppo": (9, "h"), "trpo_fac": (4, "<"), "trpo_ipo": (5, ">"), "trpo_sl": (6, "H"),
+    "trpo_usl": (7, "8"), "rcpo": (8, "s"), "scpo": (9, "D"), "sac_lag": (0, "v"),
+    "td3_lag": (1, "^"), "tqc_lag": (2, "P"), "sac": (3, "X"), "td3": (4, "d"), "tqc": (5, "D"),
+}  # fmt: skip
+FAMILIES = ("CPO-based", "Lagrangian", "hierarchical", "First-order", "Primal", "State-wise")
 
 
 class Look(NamedTuple):
@@ -94,15 +104,21 @@ class Data:
         """By key of an algorithm, the reference first and family by family, then by family."""
         table = self.runs.drop_duplicates("algo").fillna({"family": ""})
         table = table.assign(first=table["algo"] != REFERENCE)
-        looks, colors, markers = {}, cycle(COLORS), cycle(MARKERS)
-        families = [one for one in sorted({*table["family"]}) if one]
-        dashes = dict(zip(families, cycle(DASHES), strict=False)) | {"": LOOSE}
+        looks: dict[str, Look] = {}
+        families = [family for family in sorted({*table["family"]}) if family]
+        styled = [*FAMILIES, *(family for family in families if family not in FAMILIES)]
+        dashes = dict(zip(styled, cycle(DASHES), strict=False)) | {"": LOOSE}
+        others = sorted({*table["algo"]} - {*PLACES, REFERENCE})
+        places = PLACES | {
+            algo: ((8 + 5 * n) % len(COLORS), OTHERS[n % len(OTHERS)])
+            for n, algo in enumerate(others)
+        }
         for row in table.sort_values(["first", "family", "label"]).to_dict("records"):
             if row["algo"] == REFERENCE:
                 looks[REFERENCE] = Look(row["label"], INK, "-", "o")
                 continue
-            style = next(colors), dashes[row["family"]], next(markers)
-            looks[row["algo"]] = Look(row["label"], *style)
+            color, marker = places[row["algo"]]
+            looks[row["algo"]] = Look(row["label"], COLORS[color], dashes[row["family"]], marker)
         for family in families:
             own = table.loc[(table["family"] == family) & table["first"], "algo"].sort_values()
             if len(own):

@@ -99,7 +99,7 @@ def cost_name(column: str) -> str:
 
 
 def draw_limit(line: Callable[..., Any], data: Data, suite: str, cost: str) -> float:
-    """Mark a cost's limit of a suite's constrained runs with an axis's axhline or axvline."""
+    """Mark the cost limit of an environment's runs with an axis's axhline or axvline."""
     column = cost.replace("M_c", "cost_limit", 1)
     limits = data.runs.loc[data.runs["suite"] == suite, column].dropna()
     if not len(limits):
@@ -133,41 +133,63 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
 
 
 def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
-    """Return against an episode cost: means large, seeds small, and the front of the means."""
+    """Return against an episode cost: means ± deviations, and the seeds as small marks."""
     means = data.means[(data.means["suite"] == suite)].dropna(subset=[cost, "J_r"])
     runs = data.runs[data.runs["suite"] == suite]
-    front = means.iloc[pareto_front(means[cost].to_numpy(), means["J_r"].to_numpy())]
-    axis.plot(
-        front[cost], front["J_r"], color=INK, alpha=0.35, linewidth=5, solid_capstyle="round",
-        drawstyle="steps-post", label="Pareto front", zorder=1,
-    )  # fmt: skip
     limit = draw_limit(axis.axvline, data, suite, cost)
     for row in means.to_dict("records"):
         look = data.looks[row["algo"]]
         own = runs[runs["algo"] == row["algo"]]
         style: dict[str, Any] = {"color": look.color, "marker": look.marker}
         axis.scatter(own[cost], own["J_r"], s=14, alpha=0.6, **style)
-        axis.scatter(row[cost], row["J_r"], s=80, label=look.label, zorder=3, **style)
-    axis.set(xlabel=cost_name(cost), ylabel="return", title=suite)
+        axis.errorbar(
+            row[cost], row["J_r"], row["J_r_std"], row[f"{cost}_std"], markersize=8.5,
+            elinewidth=0.9, capsize=2, zorder=3, **style,
+        )  # fmt: skip
+    seeds, steps = means["seeds"].astype(int), means["steps"].max()
+    number = f"{seeds.min()}" if seeds.nunique() == 1 else f"{seeds.min()} to {seeds.max()}"
+    plural = "" if seeds.max() == 1 else "s"
+    title = f"{suite}: {number} seed{plural}, {EngFormatter(sep='')(steps)} steps"
+    axis.set(xlabel=cost_name(cost), ylabel="return", title=title)
     axis.margins(0.08)
     fit_costs(axis, [means[cost], limit], "x")
     end = axis.get_xlim()[1]
-    for row in means[means[cost] > end].to_dict("records"):
+    axis.set_xlim(-0.03 * end, end)
+    if not np.isnan(limit) and limit < end:
+        axis.axvspan(limit, end, color=INK, alpha=0.1, linewidth=0, label="above the limit")
+    name_points(axis, data, means, cost)
+
+
+def name_points(axis: Axes, data: Data, means: Any, cost: str) -> None:
+    """Write each algorithm's name next to its mean, where it covers no other name or mean."""
+    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
+    figure = axis.get_figure()
+    assert figure is not None
+    # Points of a panel, less what labels and margins take.
+    size = 0.86 * 72 * np.array([figure.bbox.width, figure.bbox.height]) / figure.dpi
+    inside = means[cost].where(means[cost] <= right, right - 0.03 * (right - left))
+    at = np.stack([(inside - left) / (right - left), (means["J_r"] - low) / (high - low)], axis=1)
+    at *= size
+    taken = np.concatenate([at - 5, at + 5], axis=1)  # boxes, [n, 4]: left, low, right, high
+    for row, x, place in zip(means.to_dict("records"), inside, at, strict=True):
         look = data.looks[row["algo"]]
-        at = 0.97 * end, row["J_r"]
-        axis.scatter(*at, s=80, color=look.color, marker=look.marker, zorder=3)
+        text = f"{look.label}, {row[cost]:.3g} →" if row[cost] > x else look.label
+        width = 4.6 * len(text)
+        tried: list[Any] = []
+        for side, up in ((8, 9), (8, -9), (-8 - width, 9), (-8 - width, -9), (8, 20), (8, -20),
+                         (-8 - width, 20), (-8 - width, -20), (8, 0), (-8 - width, 0)):  # fmt: skip
+            box = np.tile(place, 2) + np.array([side, up - 5, side + width, up + 5])
+            covers = (box[:2] < taken[:, 2:]).all(axis=1) & (taken[:, :2] < box[2:]).all(axis=1)
+            outside = (box[:2] < 0).any() or (box[2:] > size).any()
+            tried.append((covers.sum() + 3 * outside, len(tried), (side, up), box))
+        _, _, offset, box = min(tried, key=lambda one: one[:2])
+        taken = np.vstack([taken, box])
+        if row[cost] > x:
+            axis.scatter(x, row["J_r"], s=80, color=look.color, marker=look.marker, zorder=3)
         axis.annotate(
-            f"{row[cost]:.3g} →", at, (-8, 0), textcoords="offset points", color=look.color,
-            ha="right", va="center",
+            text, (x, row["J_r"]), offset, textcoords="offset points", color=look.color,
+            fontsize=8, va="center", zorder=4,
         )  # fmt: skip
-    axis.set_xlim(left=-0.03 * end)
-
-
-def pareto_front(costs: np.ndarray, returns: np.ndarray) -> np.ndarray:
-    """The points that no other beats in both cost and return: their indices, by cost."""
-    order = np.lexsort((-returns, costs))
-    best = np.maximum.accumulate(np.concatenate([[-np.inf], returns[order]]))
-    return order[returns[order] > best[:-1]]
 
 
 def finish(figure: Figure, missing: str) -> None:
@@ -212,12 +234,12 @@ def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
 
 
 def curves(data: Data, suite: str) -> Figure | None:
-    """Return, episode cost and cost rate against steps, a figure per suite."""
+    """Return, episode cost and cost rate against steps, a figure per environment."""
     return curves_of(data, [suite])
 
 
 def pareto(data: Data, suite: str) -> Figure | None:
-    """Return against each cost with the Pareto front and the limit, a figure per suite."""
+    """Return against each cost and the limit, a figure per environment."""
     if not len(data.means[data.means["suite"] == suite].dropna(subset=["M_c", "J_r"])):
         return None
     costs = data.costs(suite)

@@ -1,0 +1,199 @@
+"""Draw the diagrams of the pages into docs/images: ``python scripts/draw_diagrams.py``.
+
+``limits`` shows return and cost at each limit of a training, from the logs in docs/data; ``speed``
+steps per second, from the tables of docs/speed.md; ``which_algorithm`` is a flow chart;
+``reward_and_cost`` an annotated picture; ``poster`` has robots, tasks and constraints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from results import DATA, runs
+
+from sb3_guard.envs import GuardVectorEnv
+from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
+from sb3_guard.zoo.results.figures import STYLE, WIDTH, save
+from sb3_guard.zoo.results.statistics import aggregate
+
+DOCS = Path(__file__).parents[1] / "docs"
+IMAGES = DOCS / "images"
+SUITE = "Goal_Point_8Hazards"
+# Questions of the flow chart, with the answer to yes; REST is the answer to the last no.
+QUESTIONS = (
+    ("Is there no limit yet?", "trpo, ppo"),
+    ("Are steps slow and\nactions continuous?", "sac_lag, tqc_lag"),
+    ("Must the worst step\nbe bounded?", "scpo"),
+    ("Shall a filter stay on\nafter training?", "trpo_usl, trpo_sl"),
+    ("Do you know PPO, or\ntrain for 1e7 steps?", "ppo_lag, cppo_pid"),
+)
+REST = "cpo, trpo_lag"
+# Parts of the annotated picture: text, and where text and object are, as shares of the picture.
+NOTES: tuple[tuple[str, tuple[float, float], tuple[float, float]], ...] = (
+    (
+        "goal: reward for each metre closer,\nand a bonus when it is reached",
+        (0.46, 0.9),
+        (0.19, 0.8),
+    ),
+    ("hazard: cost for each step inside,\nthe depth in metres", (0.68, 0.36), (0.64, 0.46)),
+    ("robot: the beads are its lidar,\nthe dart shows where it faces", (0.22, 0.14), (0.2, 0.29)),
+)
+
+
+def limits() -> Figure:
+    """Return and cost against the limit, with TRPO, which has none."""
+    means = {}
+    for path in DATA.glob("guard_limit*.tar.xz"):
+        name = path.name.removesuffix(".tar.xz")
+        table = aggregate(runs(name))
+        means[int(name.rpartition("limit")[2])] = table[table["suite"] == SUITE].set_index("algo")
+    order = sorted(means)
+    looks = Data(runs("guard_limit2")).looks
+    figure = Figure(figsize=(WIDTH, 3.3), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for algo in ("cpo", "trpo_lag", "ppo_lag"):
+        for axis, name in ((left, "return_last"), (right, "cost_last")):
+            rows = [means[limit].loc[algo] for limit in order]
+            spread = np.nan_to_num([row[f"{name}_se"] * row["seeds"] ** 0.5 for row in rows])
+            axis.errorbar(
+                order, [row[name] for row in rows], spread, capsize=2, marker=looks[algo].marker,
+                **looks[algo].line,
+            )  # fmt: skip
+    trpo = means[2].loc["trpo"]
+    left.axhline(trpo["return_last"], color=INK, label="TRPO, no limit")
+    right.axhline(trpo["cost_last"], color=INK, label="TRPO, no limit")
+    right.plot([0, 10], [0, 10], color=INK, linestyle=(0, (1, 2)), label="cost = limit")
+    right.fill_between([0, 10], [0, 10], 10.5, color=INK, alpha=0.1, linewidth=0)
+    right.text(0.3, 9.6, "above the limit", fontsize=8)
+    left.set(xlabel="cost limit of the training", ylabel="return", ylim=(0, None))
+    right.set(xlabel="cost limit of the training", ylabel="episode cost", ylim=(0, 10.5))
+    handles, labels = right.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=5)
+    left.set_title(f"{SUITE}, 1M steps")
+    right.set_title("CPO, TRPO-Lagrangian: three seeds at 2 and 5; else one")
+    return figure
+
+
+def speed() -> Figure:
+    """Steps per second of Safety-Gymnasium's tasks, here and in the original package."""
+    text = (DOCS / "speed.md").read_text()
+    row = r"^\| (Safety\w+), (Safety-Gymnasium 1\.0\.0|sb3_guard) \| [\d,]+ \| ([\d,]+) \|"
+    steps: dict[str, dict[str, float]] = {}
+    for task, package, number in re.findall(row, text, flags=re.MULTILINE):
+        steps.setdefault(task, {})[package] = float(number.replace(",", ""))
+    figure = Figure(figsize=(WIDTH, 2.6), layout="constrained")
+    axis = figure.subplots()
+    rows = np.arange(len(steps))[::-1]
+    for offset, package, color in (
+        (0.2, "sb3_guard", COLORS[0]), (-0.2, "Safety-Gymnasium 1.0.0", INK),
+    ):  # fmt: skip
+        values = np.array([steps[task][package] for task in steps])
+        axis.barh(rows + offset, values, 0.38, color=color, label=package)
+        for y, value in zip(rows + offset, values, strict=True):
+            axis.text(value * 1.06, y, f"{float(f'{value:.2g}'):,.0f}", va="center", fontsize=8)
+    axis.set_yticks(rows, [*steps])
+    axis.set(
+        xscale="log", xlabel="steps per second on one core (log), resets included", xlim=(100, 2e5)
+    )
+    axis.grid(axis="y", visible=False)
+    figure.legend(loc="outside upper center", ncols=2)
+    return figure
+
+
+def which_algorithm() -> Figure:
+    """A column of questions: yes leads to the right, no down."""
+    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
+    axis = figure.subplots()
+    axis.set(xlim=(0, 10), ylim=(0, len(QUESTIONS) + 1))
+    axis.set_axis_off()
+    box = {"boxstyle": "round,pad=0.5", "facecolor": "none", "edgecolor": INK}
+    answer = box | {"edgecolor": COLORS[0], "linewidth": 1.5}
+    arrow = {"arrowstyle": "-|>", "color": INK, "shrinkA": 0, "shrinkB": 0}
+    for number, (question, algorithms) in enumerate(QUESTIONS):
+        y = len(QUESTIONS) + 0.5 - number
+        axis.text(3, y, question, ha="center", va="center", bbox=box)
+        axis.text(8, y, algorithms, ha="center", va="center", bbox=answer, color=COLORS[0])
+        axis.annotate("", (6.7, y), (4.5, y), arrowprops=arrow)
+        axis.text(5.6, y + 0.1, "yes", ha="center")
+        axis.annotate("", (3, y - 0.66), (3, y - 0.34), arrowprops=arrow)
+        axis.text(3.15, y - 0.5, "no", va="center")
+    axis.text(3, 0.5, REST, ha="center", va="center", bbox=answer, color=COLORS[0])
+    axis.text(4.4, 0.5, "start here if unsure, and compare the two", va="center", fontsize=8)
+    return figure
+
+
+def reward_and_cost() -> Figure:
+    """A robot among hazards from above, with what gives reward and what gives cost."""
+    size = 900
+    env = GuardVectorEnv(1, SUITE, render_mode="rgb_array", width=size, height=size, camera="top")
+    env.reset(seed=3)
+    (frame,) = env.render() or ()
+    env.close()
+    figure = Figure(figsize=(6, 6), layout="constrained")
+    axis = figure.subplots()
+    axis.imshow(frame, extent=(0, 1, 0, 1))
+    axis.set_axis_off()
+    for text, at, where in NOTES:
+        axis.annotate(
+            text, where, at, ha="center", va="center", color="#202020", fontsize=9,
+            bbox={"boxstyle": "round", "facecolor": "white", "edgecolor": INK},
+            arrowprops={"arrowstyle": "-|>", "color": "#202020"},
+        )  # fmt: skip
+    return figure
+
+
+def poster() -> Figure:
+    """Robots, tasks and constraints, a block of pictures each."""
+    blocks = [
+        (kind, [path for path in sorted(IMAGES.glob(f"{kind}_*.png")) if path.stem.count("_") == 1])
+        for kind in ("robot", "task", "constraint")
+    ]
+    columns = 6
+    heights = [-(-len(paths) // columns) for _, paths in blocks]
+    figure = Figure(figsize=(10, 1.75 * sum(heights) + 0.2), layout="constrained")
+    grid = figure.subplots(sum(heights), columns)
+    for axis in grid.flat:
+        axis.set_axis_off()
+    first = 0
+    for (kind, paths), rows in zip(blocks, heights, strict=True):
+        for number, path in enumerate(paths):
+            axis = grid[first + number // columns, number % columns]
+            axis.imshow(np.asarray(Image.open(path).convert("RGB")))
+            axis.set_title(path.stem.partition("_")[2].capitalize(), fontsize=10)
+        grid[first, 0].text(
+            -0.04, 0.5, f"{kind}s", rotation=90, fontsize=11, ha="right", va="center",
+            transform=grid[first, 0].transAxes,
+        )  # fmt: skip
+        first += rows
+    return figure
+
+
+DIAGRAMS: dict[str, Callable[[], Figure]] = {
+    function.__name__: function
+    for function in (limits, speed, which_algorithm, reward_and_cost, poster)
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", choices=[*DIAGRAMS], help="draw only this diagram")
+    only = parser.parse_args().only
+    for name in [only] if only else DIAGRAMS:
+        with mpl.rc_context(STYLE):
+            save(DIAGRAMS[name](), IMAGES / f"{name}.png")
+        print(name)
+
+
+if __name__ == "__main__":
+    main()

@@ -310,3 +310,109 @@ def test_rows_are_lone_environments(robot, request):
     request.getfixturevalue(robot)()
     name = {"dog": "Dog", "arm": "Crane"}[robot]
     assert_rows_are_lone_environments(f"Goal_{name}_2Hazards")
+
+
+def nothing(text):
+    return text
+
+
+def without_joints(text):
+    return "<mujoco><worldbody><body name='box'><geom size='1'/></body></worldbody></mujoco>"
+
+
+def moved_by_weld(text):
+    mocap = (
+        '<body name="hand" mocap="true"/></worldbody><equality><weld body1="hand" body2="trunk"/>'
+    )
+    return text.replace("</worldbody>", mocap + "</equality>")
+
+
+def with_slide(text):
+    return text.replace('<joint name="fan"/>', '<joint name="fan" type="slide"/>')
+
+
+def with_motor(text):
+    return text.replace("<sensor>", '<actuator><motor joint="fan"/></actuator><sensor>')
+
+
+def with_motor_in_range(text):
+    motor = '<actuator><motor name="fan" joint="fan" ctrlrange="-1 1"/></actuator><sensor>'
+    return text.replace("<sensor>", motor)
+
+
+@pytest.mark.parametrize(
+    ("change", "stated", "message"),
+    [
+        (nothing, {"root": None}, "2 outermost bodies .* 'trunk', 'ball': .* root='trunk'"),
+        (nothing, {"root": "trunc"}, "no body 'trunc': did you mean 'trunk'"),
+        (nothing, {"root": "front"}, r"'front' is not an outermost one: root may be \['ball', 'tr"),
+        (nothing, {"root": 3}, "root = 3 must be the name of an outermost body"),
+        (without_joints, {"root": None}, "no body with joints: a robot needs joints to move by"),
+        (nothing, {"keyframe": "home"}, r"no keyframe 'home': it has none; pose={...} sets joints"),
+        (
+            nothing,
+            {"pose": {"*_knee": 0.1}},
+            r"'\*_knee': did you mean 'front_calf'|allowed: front",
+        ),
+        (nothing, {"pose": {"front_calf": 0.1}}, "out of the range of joint 'front_calf': allowed"),
+        (nothing, {"pose": {"fan": "up"}}, r"pose\['fan'\] = 'up' must be a number, rad or m"),
+        (nothing, {"pose": [0.1]}, r"pose = \[0.1\] must be a mapping of joints to rad or m"),
+        (nothing, {"actuators": None}, "dog.xml has no actuators: give its joints position servos"),
+        (nothing, {"actuators": {}}, "actuators = {} must be gains such as {'kp': 35, 'kd': 1}"),
+        (nothing, {"actuators": 35}, "actuators = 35 must be gains such as"),
+        (nothing, {"actuators": {"kp": 35}}, "lacks 'kd': gains are {'kp': 35, 'kd': 1}"),
+        (nothing, {"actuators": {**GAINS, "ki": 1}}, "no gain 'ki': did you mean 'kp'"),
+        (
+            nothing,
+            {"actuators": {"kp": -1, "kd": 1}},
+            r"\['kp'\] = -1 must be a number greater than",
+        ),
+        (
+            nothing,
+            {"actuators": {"tail": GAINS}},
+            "actuators of dog.xml matches no name 'tail': .*fan",
+        ),
+        (
+            nothing,
+            {"actuators": {"*": GAINS, "fan": 3}},
+            r"actuators\['fan'\] = 3 must be gains such as",
+        ),
+        (with_slide, {}, "slide 'fan' has no range, which a position servo needs"),
+        (with_motor, {}, "dog.xml has 1 actuators of its own: leave out actuators="),
+        (with_motor, {"actuators": None}, "actuator 'fan' of the robot has no ctrlrange"),
+        (with_motor_in_range, {"actuators": None, "action": "offset"}, "actuator 'fan' is none"),
+        (nothing, {"action": "torque"}, "action = 'torque' must be 'range' or 'offset'"),
+        (nothing, {"action_scale": 0}, "action_scale = 0 must be a positive number, of rad or m"),
+        (
+            nothing,
+            {"observe": ["joint_po"]},
+            "observe names no .* 'joint_po': did you mean 'joint_pos'",
+        ),
+        (
+            nothing,
+            {"observe": "joint_pos"},
+            r"must be a list of names, such as \['joint_pos', 'gra",
+        ),
+        (nothing, {"center": "hed"}, "center names no body or site 'hed' of dog.xml: "),
+        (nothing, {"keepout": -1}, "keepout = -1 must be a number of metres, at least 0"),
+        (nothing, {"defaults": {"goal": 3}}, r"must be a mapping such as {'goal': {'size': 0.05}}"),
+        (
+            moved_by_weld,
+            {"actuators": None},
+            "moves the robot by a weld to mocap body 'hand', which",
+        ),
+    ],
+)
+def test_what_is_no_robot_is_answered_in_a_line(dog, change, stated, message):
+    stated = {"actuators": GAINS, **stated}
+    with pytest.raises(ValueError, match=message) as caught:
+        dog(change, **stated)
+    assert "\n" not in str(caught.value) and "Dog" not in ROBOTS
+
+
+@pytest.mark.parametrize("center", [None, "base"])
+def test_an_arm_without_an_end_effector_is_answered_in_a_line(arm, center):
+    with pytest.raises(
+        ValueError, match=r"'base', .*, cannot move: .* center='hand'; others are lo"
+    ):
+        arm(center=center)

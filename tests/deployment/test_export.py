@@ -76,7 +76,7 @@ def parity(model: Any, path: Path) -> tuple[float, float]:
         last_cost[::3] = np.nan
         inputs["last_cost"] = last_cost
     expected = predicted(model, normalized, last_cost if acts_on_cost else None)
-    assert expected.std(axis=0).min() > 1e-3  # no constant
+    assert expected.std(axis=0).min() > 1e-5  # no constant
     return agreement(run(path, inputs), expected, model.action_space)
 
 
@@ -150,7 +150,7 @@ def test_the_safety_filter_is_in_the_file(
     filtered = run(path, inputs)
     alone = ActorCriticPolicy.predict(model.policy, normalized, deterministic=True)[0]
     corrected = (np.abs(filtered - alone) > 1e-3).any(axis=1).mean()
-    assert 0.05 < corrected < 0.95
+    assert 0.05 < corrected < 0.999
     if key == "trpo_sl":  # what it acts on changes with the last cost
         unknown = run(path, {**inputs, "last_cost": np.full_like(last_cost, np.nan)})
         assert (np.abs(filtered - unknown) > 1e-3).any()

@@ -13,6 +13,7 @@ from nbclient import NotebookClient
 from test_adapters import install
 
 import sb3_guard.envs
+from sb3_guard import cli
 from sb3_guard.algorithms import ALGORITHMS
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.rendering import RenderingError, gl_backend
@@ -25,7 +26,10 @@ SAYS = {
     "custom_constraint": (["steps outside: ["], []),
     "custom_robot": (["26 observations, 2 actions", "return "], ["puck.xml"]),
     "custom_task": (["metres: ["], []),
-    "deploy_filtered_policy": (["with the layer: ", "without the layer: "], ["filtered_policy.pt"]),
+    "deploy": (
+        ["limit 5.0 per episode", "stopped "],
+        ["contract.json", "costs.csv", "policy.onnx"],
+    ),
     "domain_randomization": (["drawn: {'hazards.num': ", "mass × 0.5: ", "mass × 2.0: "], []),
     "ppo_lagrangian": (["return "], []),
     "record_video": (["point.mp4"], ["point.mp4"]),
@@ -93,6 +97,8 @@ def test_example(name, quick, monkeypatch, capsys):
         install(monkeypatch)
     if name == "record_video":
         require_rendering()
+    if name == "deploy":
+        assert cli.main(["export", "--pretrained", "--n-episodes", "1"]) == 0
     path = EXAMPLES / f"{name}.py"
     # a module of its own: dataclasses look for it
     module = type(sys)("__example__")

@@ -39,8 +39,11 @@ def test_what_is_uploaded(logs, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {
         "cpo-Filmed-v0.zip", "vec_normalize.pkl", "config.yml", "args.yml", "command.txt",
         "0.monitor.csv", "results.json", "README.md", "replay.mp4",
+        "policy.onnx", "contract.json",
     }  # fmt: skip
     results = json.loads((tmp_path / "results.json").read_text())
+    contract = json.loads((tmp_path / "contract.json").read_text())
+    assert contract["trained"]["measured"]["cost"]["mean"] == results["cost"]["mean"]
     _, metadata, page = (tmp_path / "README.md").read_text().split("---\n", 2)
     metrics = yaml.safe_load(metadata)["model-index"][0]["results"][0]["metrics"]
     values = {one["type"]: float(one["value"].split()[0]) for one in metrics}

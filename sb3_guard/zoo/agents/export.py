@@ -1,6 +1,7 @@
 """A trained agent of a run folder as an ONNX file, with what it was trained at and measured."""
 
 import hashlib
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,12 @@ def export(flags: ExportFlags) -> int:
     require_writable(path.parent, "--output")
     agent = open_agent(flags, None, min(flags.n_episodes or BATCH, BATCH))
     with closing(agent.env):
+        with explained(f"can't export {agent.path}", ValueError, ImportError):
+            onnx_file.check(agent.model, flags.stochastic)
+        how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
         episodes = flags.n_episodes or max(agent.env.num_envs, 5)
-        contract = write(agent, flags, path, episodes)
-    measured = contract["trained"]["measured"]
+        measured = summary(evaluate_policy(agent.model, agent.env, episodes, **how))
+        contract = write(agent, flags, path, measured)
     print(
         f"{path}: {', '.join(contract['file']['operators'])}\n"
         f"{path.with_name(onnx_file.CONTRACT)}: "
@@ -33,32 +37,32 @@ def export(flags: ExportFlags) -> int:
     return 0
 
 
-def write(agent: Agent, flags: AgentFlags, path: Path, episodes: int) -> dict[str, Any]:
+def write(
+    agent: Agent, flags: AgentFlags, path: Path, measured: Mapping[str, Any]
+) -> dict[str, Any]:
     """
-    Export an agent, and measure it for the contract.
+    Export an agent.
 
     :param agent: the agent and its environment
     :param flags: how it acts
     :param path: of the ONNX file
-    :param episodes: that it plays
+    :param measured: return and cost of episodes, see :func:`summary`
     :return: the contract
     :raises UsageError: the agent can't be exported
     """
-    how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
-    with explained(f"can't export {agent.path}", ValueError, ImportError):
-        onnx_file.check(agent.model, flags.stochastic)
-    measured = summary(evaluate_policy(agent.model, agent.env, episodes, **how))
-    for values in measured.values():
-        if isinstance(values, dict):
-            del values["values"]
+    means = {
+        name: {key: value for key, value in values.items() if key != "values"}
+        for name, values in measured.items()
+        if isinstance(values, dict)
+    }
     trained = {
         "algo": flags.algo,
         "env": agent.env_id,
         "env_kwargs": agent.run.hyperparams().get("env_kwargs") or {},
         "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
-        "measured": measured,
+        "measured": {"episodes": measured["episodes"], **means},
     }
-    with explained(f"can't export {agent.path}", ValueError):
+    with explained(f"can't export {agent.path}", ValueError, ImportError):
         return onnx_file.export(
             agent.model, path, env=agent.env, sampled=flags.stochastic, trained=trained
         )

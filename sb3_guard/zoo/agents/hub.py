@@ -13,6 +13,7 @@ import yaml
 
 from sb3_guard.algorithms.common.limits import limits_at
 from sb3_guard.common.evaluation import evaluate_policy
+from sb3_guard.zoo.agents import export
 from sb3_guard.zoo.agents.film import filming
 from sb3_guard.zoo.agents.flags import HubFlags
 from sb3_guard.zoo.agents.playback import Agent, open_agent, summary
@@ -116,6 +117,10 @@ def stage(agent: Agent, flags: HubFlags, repo_id: str, folder: Path) -> None:
     if not flags.no_video:
         with filming(agent.env, agent.model, folder / "replay.mp4") as env:
             evaluate_policy(agent.model, env, 1, **how)
+    try:
+        export.write(agent, flags, folder / "policy.onnx", results)
+    except UsageError as error:
+        print(f"There is no policy.onnx: {error}")
     results["is_deterministic"] = not flags.stochastic
     (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
     (folder / "README.md").write_text(card(agent, flags, repo_id, results), encoding="utf-8")

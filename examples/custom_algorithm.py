@@ -11,12 +11,12 @@ from sb3_guard.algorithms import TrustRegion, hyperparameter
 
 
 class TRPOPrice(TrustRegion):
-    """Cost at a fixed price p: maximise E[ratio · (A - p Σ A_Ci)] within the trust region.
+    """Cost with a fixed weight p: maximise E[ratio · (A - p Σ A_Ci)] within the trust region.
 
-    :param price: p, what a unit of cost is worth in standard deviations of the advantage
+    :param price: p, weight of a unit of cost, in standard deviations of the advantage
     """
 
-    label, family = "TRPO at a price", "Lagrangian"
+    label, family = "TRPO with a fixed weight", "Lagrangian"
 
     price: float = hyperparameter(1.0)
 

@@ -1,4 +1,4 @@
-"""``sb3_guard.export``: an agent as one ONNX file, with its contract beside it."""
+"""``sb3_guard.export``: an agent as one ONNX file, with its contract next to it."""
 
 import hashlib
 import importlib.util
@@ -50,7 +50,7 @@ def export(
         model.learn(1_000_000)
         sb3_guard.export(model, "policy.onnx")
 
-    ``contract.json`` beside it holds what the file expects and gives: names, shapes, units and
+    ``contract.json`` next to it holds what the file expects and gives: names, shapes, units and
     order of observations and actions, the control rate, cost limits. onnxruntime and most robots'
     software run the file without torch and without this package. It is compared with ``predict``
     before it is written.

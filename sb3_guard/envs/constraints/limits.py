@@ -94,7 +94,7 @@ class JointLimit(RobotLimit):
             ranged = " with a range" if self.ranged else ""
             of_base = f": {', '.join(names)}" if names else " either"
             raise ValueError(
-                f"{self.name}: the robot has no hinges{ranged} beside those of its outermost body"
+                f"{self.name}: the robot has no hinges{ranged} except those of its outermost body"
                 f"; joints may name others{of_base}"
             )
         return sorted(set(chosen))

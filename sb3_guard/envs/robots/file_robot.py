@@ -2,7 +2,7 @@
 
 :class:`MJCFRobot` reads files that were written for it, this one a file as its maker wrote it.
 :func:`sb3_guard.envs.registry.register_robot` lists what may be stated, and
-:mod:`sb3_guard.envs.robots.model_file` finds the robot in the file. Beside the file's sensors it
+:mod:`sb3_guard.envs.robots.model_file` finds the robot in the file. Besides the file's sensors it
 observes what they do not cover:
 
 * ``joint_pos``: positions of slides and of hinges with a range, relative to the first pose, rad, m;

@@ -20,7 +20,7 @@ SUITES: dict[str, Suite] = {
 
 
 def env_ids(suite: str | None = None) -> list[str]:
-    """The ids of the named suites.
+    """The ids of the named environments.
 
     :param suite: of one family, such as ``"guard"``; None: of all
     :raises ValueError: there is no such family

@@ -100,7 +100,7 @@ class ExportFlags(AgentFlags):
     Write a trained agent as one ONNX file, which runs without torch and without this package.
 
     The file has the observation's normalisation, the policy, squashing or clipping, and the safety
-    filter; contract.json beside it says what goes in and what comes out. Sampled actions take their
+    filter; contract.json next to it describes input and output. Sampled actions take their
     random numbers as an input.
 
     Output:

@@ -284,7 +284,7 @@ def cdf(data: Data, suite: str) -> Figure | None:
 
 
 def tiers(data: Data, suite: str) -> Figure | None:
-    """Mean costs with 95 % intervals beside the limit: certified or not, a figure per suite."""
+    """Mean costs with 95 % intervals and the limit: certified or not, a figure per environment."""
     algos = data.algos(suite)[::-1]
     figure, panels = _split_axes(data, suite, height=1.4 + 0.28 * len(algos))
     for split, axis in panels.items():

@@ -37,7 +37,7 @@ POLYGONS = {
 
 
 def q1(data: Data) -> Figure | None:
-    """Overall results: learning curves of the paper's eight main suites."""
+    """Overall results: learning curves of the paper's eight main environments."""
     return curves_of(data, MAIN8)
 
 

@@ -175,7 +175,7 @@ def test_rows_are_lone_environments(name):
 @pytest.mark.parametrize(
     ("robot", "limits", "message"),
     [
-        ("Point", {"jointspeed": {}}, r"no hinges beside those .* others: x, y, z"),
+        ("Point", {"jointspeed": {}}, r"no hinges except those .* others: x, y, z"),
         ("Point", {"jointlimits": {}}, r"no hinges with a range .* joints may name others either"),
         ("Ant", {"jointspeed": {"joints": ["hop_1"]}}, r"'hop_1': did you mean 'hip_1'"),
         ("Ant", {"jointspeed": {"limit": -1}}, "jointspeed.limit = -1 must be at least 0"),

@@ -121,7 +121,7 @@ def test_train(arguments, parts, capsys, empty):
 ENJOY = [
     (["--algo", "cpp"], ["unknown algorithm 'cpp'"]),
     (["--env", "Goal_Pint_8Hazards"], ["'Pint'"]),
-    ([], ["there is no run of cpo on Goal_Point_8Hazards-v0 in 'logs'", "sb3_guard.train"]),
+    ([], ["there is no run of cpo on Goal_Point_8Hazards-v0 in 'logs'", "sb3-guard train"]),
     (["--exp-id", "7"], ["there is no run folder", "_7"]),
     (["-f", "nowhere"], ["'nowhere'"]),
     (["--n-episodes", "0"], ["--n-episodes", "at least 1"]),

@@ -8,7 +8,7 @@ STEPS ?= 1000000
 LIMIT ?= $(if $(filter cpo_Goal_Point_8Hazards,$(ALGO)_$(ENV)),5)
 ARGS ?=
 
-.PHONY: train test test-slow test-lowest check format type docs gallery bench fingerprint clean
+.PHONY: train test test-slow test-lowest check format type docs docs-browser gallery bench fingerprint clean
 
 # torch goes first and alone: a requirement that another package leaves open would fetch CUDA builds
 $(VENV)/ready: pyproject.toml constraints.txt
@@ -63,6 +63,12 @@ $(VENV)/docs-ready: $(VENV)/ready
 docs: $(VENV)/docs-ready
 	$(BIN)/python scripts/make_docs.py
 	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
+	@if command -v npm > /dev/null; then $(MAKE) docs-browser; else \
+		echo "npm is not installed: the page in which agents drive is left out"; fi
+
+# Agents that drive in a page, docs/_build/html/browser. npm fetches MuJoCo for browsers.
+docs-browser: $(VENV)/ready
+	$(BIN)/python scripts/make_browser.py
 
 # The pictures of the pages, which need a display or EGL.
 gallery: $(VENV)/ready

@@ -19,7 +19,7 @@ copyright = f"{author}. MIT license"
 version = release = sb3_guard.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "browser"]  # the page in a browser has its own script
 needs_sphinx = "8.1"
 
 myst_enable_extensions = ["dollarmath"]

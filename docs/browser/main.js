@@ -1,0 +1,266 @@
+// The page: an agent or the reader drives; what an episode brought is shown beside it.
+
+import loadMujoco from "./mujoco.js";
+import { Picture } from "./draw.js";
+import { generator } from "./layout.js";
+import { Policy } from "./policy.js";
+import { World } from "./world.js";
+
+const MOST = 5; // control steps in a frame, on slow devices
+const REST = 4000; // ms that a verdict is shown
+const KEYS = {
+  ArrowUp: "up", ArrowDown: "down", ArrowLeft: "left", ArrowRight: "right",
+  KeyW: "up", KeyS: "down", KeyA: "left", KeyD: "right",
+};
+const $ = (id) => document.getElementById(id);
+const read = async (file) => {
+  const answer = await fetch(file);
+  if (!answer.ok) throw new Error(`${file}: ${answer.status} ${answer.statusText}`);
+  return answer;
+};
+
+const picture = new Picture($("canvas"));
+const keys = new Set();
+let mujoco, entries, entry, world, agent, seed = 1;
+let driving = false, paused = false, ended = 0;
+let total, last, poses, held = null, target = null;
+let records = new Map();
+
+const limitOf = (a) => (a.limit === null ? "none" : String(a.limit));
+const driver = () => (driving ? "you" : `agent, limit ${limitOf(agent)}`);
+
+/** Position and heading of the robot: [x, y, yaw]. */
+function pose() {
+  const { position: [x, y], rotation } = world.robot;
+  return [x, y, Math.atan2(rotation[3], rotation[0])];
+}
+
+function begin() {
+  world.reset(generator(seed));
+  picture.clear(world.spec.arena);
+  total = { return: 0, cost: 0 };
+  last = { cost: 0 };
+  poses = [pose(), pose()];
+  ended = 0;
+  held = target = null;
+  $("verdict").hidden = true;
+  show();
+}
+
+/** The reader's action: keys, or towards the place that is held on the floor. */
+function steering() {
+  if (target) {
+    const [x, y, yaw] = poses[1];
+    let turn = Math.atan2(target[1] - y, target[0] - x) - yaw;
+    turn = Math.atan2(Math.sin(turn), Math.cos(turn));
+    return [Math.cos(turn), Math.max(-1, Math.min(1, 2 * turn))];
+  }
+  const pull = (more, less) => Number(keys.has(more)) - Number(keys.has(less));
+  return [pull("up", "down"), pull("left", "right")];
+}
+
+function step() {
+  const action = driving ? steering() : agent.policy.act(world.observe());
+  last = world.step(action);
+  total.return += last.reward;
+  total.cost += last.cost;
+  poses = [poses[1], pose()];
+  picture.note(poses[1], last.cost);
+  if (world.steps >= world.spec.steps) finish();
+}
+
+/** An episode is over: say whether its cost was within the limit. */
+function finish() {
+  ended = performance.now();
+  const record = records.get(driver()) ?? { episodes: 0, return: 0, cost: 0 };
+  record.episodes += 1;
+  record.return += total.return;
+  record.cost += total.cost;
+  records.set(driver(), record);
+  const { limit } = agent, kept = limit === null || total.cost <= limit;
+  const verdict = limit === null ? "No limit" : kept ? "Limit kept" : "Limit exceeded";
+  $("verdict").className = limit === null ? "" : kept ? "kept" : "exceeded";
+  $("verdict").innerHTML = "<b></b><span></span>";
+  $("verdict").firstChild.textContent = verdict;
+  $("verdict").lastChild.textContent =
+    `return ${total.return.toFixed(1)}, cost ${total.cost.toFixed(1)}` +
+    (limit === null ? "" : ` of at most ${limit}`);
+  $("verdict").hidden = false;
+  list();
+}
+
+function list() {
+  $("records").replaceChildren(...[...records].map(([name, { episodes, return: sum, cost }]) => {
+    const row = document.createElement("tr");
+    for (const value of [name, episodes, (sum / episodes).toFixed(1), (cost / episodes).toFixed(1)]) {
+      row.insertCell().textContent = value;
+    }
+    return row;
+  }));
+}
+
+function show() {
+  const { limit } = agent, exceeded = limit !== null && total.cost > limit;
+  $("return").textContent = total.return.toFixed(1);
+  $("cost").textContent = total.cost.toFixed(1);
+  $("cost").className = $("fill").className = exceeded ? "exceeded" : "";
+  $("step").textContent = world.steps;
+  $("bound").textContent = limitOf(agent);
+  const most = Math.max(1.6 * (limit ?? 0), total.cost, 1);
+  $("fill").style.width = `${limit === null ? 0 : 100 * total.cost / most}%`;
+  $("mark").hidden = limit === null;
+  $("mark").style.left = `${100 * (limit ?? 0) / most}%`;
+}
+
+/** Read an agent's file, once. */
+async function load(chosen) {
+  chosen.policy ??= new Policy(await (await read(chosen.file)).arrayBuffer());
+}
+
+/** Choose the agent that was trained with the limit at an index of the slider. */
+async function choose(index) {
+  const chosen = entry.agents[index];
+  await load(chosen);
+  if (entry.agents.includes(chosen)) seat(chosen);
+}
+
+/** Let a loaded agent begin an episode. */
+function seat(chosen) {
+  agent = chosen;
+  $("limit").value = entry.agents.indexOf(agent);
+  $("chosen").textContent = limitOf(agent);
+  $("limit").setAttribute("aria-valuetext", limitOf(agent));
+  $("agent").textContent =
+    `The agent: ${agent.algorithm}, ${agent.steps.toLocaleString("en")} training steps. ` +
+    "Its episodes begin again from the same start when you move the slider.";
+  begin();
+}
+
+async function enter(chosen) {
+  const spec = await (await read(`${chosen.env}.json`)).json();
+  const first = chosen.agents.at(-1);
+  await load(first);
+  world?.delete(); // from here on nothing waits: the next frame sees the new world as a whole
+  world = new World(mujoco, spec);
+  entry = chosen;
+  records = new Map();
+  list();
+  for (const button of $("envs").children) {
+    button.setAttribute("aria-pressed", button.textContent === chosen.env);
+  }
+  $("limit").max = chosen.agents.length - 1;
+  $("limit").disabled = chosen.agents.length < 2;
+  $("ticks").replaceChildren(...chosen.agents.map((a) => {
+    const tick = document.createElement("span");
+    tick.textContent = limitOf(a);
+    return tick;
+  }));
+  seat(first);
+}
+
+function drive(on) {
+  driving = on;
+  $("drive").setAttribute("aria-pressed", on);
+  $("drive").textContent = on ? "Let the agent drive" : "Drive yourself";
+  $("help").textContent = on
+    ? "Arrow keys or W A S D, or hold a place on the floor: the robot drives there."
+    : "Drag a hazard or the goal: the agent reacts.";
+  if (world) begin();
+}
+
+/** The hazard or goal under a place; hazards first, as they are drawn above the goal. */
+function under(place) {
+  const { zones, goal } = world.spec;
+  for (const { name, size } of [...zones, { name: "goal", size: goal.size }]) {
+    const index = world.places[name].findIndex(
+      ([x, y]) => Math.hypot(x - place[0], y - place[1]) < size);
+    if (index >= 0) return { name, index };
+  }
+  return null;
+}
+
+function listen() {
+  const canvas = $("canvas");
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    const place = picture.point(event);
+    if (driving) { target = place; return; }
+    held = under(place);
+    if (held) {
+      const [x, y] = world.places[held.name][held.index];
+      held.offset = [x - place[0], y - place[1]];
+    }
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const place = picture.point(event), { arena } = world.spec;
+    if (target) target = place;
+    if (held) {
+      world.move(held.name, held.index, place.map(
+        (value, i) => Math.max(-arena, Math.min(arena, value + held.offset[i]))));
+    }
+    canvas.style.cursor = driving ? "crosshair" : held ? "grabbing" : under(place) ? "grab" : "";
+  });
+  for (const name of ["pointerup", "pointercancel"]) {
+    canvas.addEventListener(name, () => { held = target = null; });
+  }
+  addEventListener("keydown", (event) => {
+    if (!KEYS[event.code] || event.target === $("limit")) return;
+    event.preventDefault();
+    keys.add(KEYS[event.code]);
+    if (!driving) drive(true);
+  });
+  addEventListener("keyup", (event) => keys.delete(KEYS[event.code]));
+  addEventListener("blur", () => keys.clear());
+  $("limit").addEventListener("change", (event) => choose(Number(event.target.value)).catch(fail));
+  $("drive").addEventListener("click", () => drive(!driving));
+  $("again").addEventListener("click", begin);
+  $("next").addEventListener("click", () => { seed += 1; begin(); });
+  $("pause").addEventListener("click", () => {
+    paused = !paused;
+    $("pause").setAttribute("aria-pressed", paused);
+  });
+}
+
+/** Real time: as many control steps as have passed, and the robot drawn between two of them. */
+function animate() {
+  let before = performance.now(), due = 0;
+  const frame = (now) => {
+    due += Math.max(0, now - before) / 1000;
+    before = now;
+    const { control_step: length } = world.spec;
+    if (paused || ended) due = 0;
+    if (ended && now - ended > REST && !paused) { seed += 1; begin(); }
+    due = Math.min(due, MOST * length);
+    for (; due >= length && !ended; due -= length) step();
+    const share = ended ? 1 : due / length, [from, to] = poses;
+    const turn = Math.atan2(Math.sin(to[2] - from[2]), Math.cos(to[2] - from[2]));
+    const between = from.map((value, i) => value + share * (i === 2 ? turn : to[i] - value));
+    picture.draw(world, between, last.cost, held, now);
+    show();
+    requestAnimationFrame(frame);
+  };
+  requestAnimationFrame(frame);
+}
+
+function fail(error) {
+  $("loading").hidden = false;
+  $("loading").textContent = `The page can't run: ${error.message ?? error}`;
+  throw error;
+}
+
+async function start() {
+  [mujoco, entries] = await Promise.all([loadMujoco(), read("agents.json").then((a) => a.json())]);
+  $("envs").replaceChildren(...entries.map((chosen) => {
+    const button = document.createElement("button");
+    button.textContent = chosen.env;
+    button.addEventListener("click", () => enter(chosen).catch(fail));
+    return button;
+  }));
+  drive(false);
+  await enter(entries[0]);
+  $("loading").hidden = true;
+  listen();
+  animate();
+}
+
+start().catch(fail);

@@ -27,7 +27,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     known = list(known)
     close = nearest(name, known)
     hint = "" if close is None else f"did you mean {close!r}? "
-    return f"{hint}allowed: {', '.join(known)}"
+    return f"{hint}allowed: {', '.join(known) or 'none'}"
 
 
 def matching(label: str, pattern: str, known: Iterable[str]) -> list[str]:

@@ -121,6 +121,28 @@ def test_a_pose_changes_joints_of_a_keyframe(dog):
     assert (qpos(engine, "front_thigh"), qpos(engine, "back_thigh")) == (0.4, 0.2)
 
 
+def test_the_only_keyframe_needs_no_name(dog):
+    engine = dog(keys=KEY.format(name="", z=0.7, thigh=0.3))
+    assert qpos(engine, "front_thigh") == 0.3
+
+
+def test_keyframes_that_are_not_taken_are_left_out(dog):
+    dog(keys="".join(KEY.format(name=name, z=0.7, thigh=0.3) for name in ("a", "b")))
+    assert ROBOTS["Dog"].file.left_out[:2] == ("keyframe a", "keyframe b")
+
+
+def test_what_refers_to_the_world_is_left_out(dog):
+    referring = """<site name="mark"/></worldbody>
+      <contact><pair geom1="ground" geom2="front_foot"/></contact>
+      <equality><connect name="leash" site1="mark" site2="imu"/></equality>
+      <sensor><distance name="gap" geom1="ground" geom2="front_foot" cutoff="1"/></sensor>"""
+    engine = dog(lambda text: text.replace("</worldbody>", referring))
+    assert "gap" not in engine.observation_layout
+    assert (engine.model.neq, engine.model.npair) == (0, 0)
+    left_out = {"geom ground", "site mark", "sensor gap", "equality leash"}
+    assert left_out <= {*ROBOTS["Dog"].file.left_out}
+
+
 def test_only_the_robot_is_taken_from_a_world(dog):
     engine = dog()
     model = engine.model
@@ -416,3 +438,21 @@ def test_an_arm_without_an_end_effector_is_answered_in_a_line(arm, center):
         ValueError, match=r"'base', .*, cannot move: .* center='hand'; others are lo"
     ):
         arm(center=center)
+
+
+def test_an_arm_below_the_floor_is_answered_in_a_line(tmp_path):
+    path = tmp_path / "lamp.xml"
+    path.write_text("""
+    <mujoco>
+      <worldbody>
+        <body name="base">
+          <body name="lamp" pos="0 0 -1"><joint name="swing"/><geom size="0.1"/></body>
+        </body>
+      </worldbody>
+    </mujoco>
+    """)
+    with own_parts():
+        with pytest.raises(ValueError, match=r"never gets above the floor.* raise body 'base'"):
+            register_robot("Lamp", xml=path, actuators=GAINS, center="lamp")
+        with pytest.raises(ValueError, match=r"center='lamp'$"):
+            register_robot("Lamp", xml=path, actuators=GAINS)

@@ -112,17 +112,25 @@ def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, s
     if model.body_weldid[body] == 0:
         moving = [n for n in sites if n and model.body_weldid[model.site(n).bodyid[0]]]
         moving += [n for n in bodies[::-1] if n and model.body_weldid[model.body(n).id]]
+        others = f"; others are {', '.join(moving[1:9])}" if moving[1:] else ""
         raise ValueError(
             f"{file.path} stands on a fixed base, and {center!r}, whose place is the robot's "
-            f"position, cannot move: name its end effector, a body or site, center={moving[0]!r}; "
-            f"others are {', '.join(moving[1:9])}"
+            f"position, cannot move: name its end effector, a body or site, center={moving[0]!r}"
+            + others
         )
     return str(model.body(body).name), tip
 
 
 def _arm(model: mujoco.MjModel, file: ModelFile, center: str, site: bool) -> dict[str, Any]:
-    """What follows from the reach of a robot on a fixed base."""
+    """What follows from the reach of a robot on a fixed base.
+
+    :raises ValueError: it only reaches places below the floor
+    """
     places = reached(model, center, site)
+    if places[:, 2].max() <= 0:
+        raise ValueError(
+            f"{file.path}: {center!r} never gets above the floor, z = 0 m: raise body {file.root!r}"
+        )
     reach = 0.9 * float(np.sqrt((places**2).sum(axis=1)).max())
     low, high = np.quantile(places[places[:, 2] > 0, 2], [0.2, 0.8]).tolist()
     size = round(0.1 * reach, 3)

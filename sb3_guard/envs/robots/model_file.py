@@ -97,14 +97,15 @@ def settle(
     root = _find_root(spec, path, root)
     if actuators is None:
         _check_commanded(spec, path, root)
-    model, names = spec.compile(), [joint.name for joint in spec.body(root).find_all("joint")]
     key = _keyframe(spec, path, keyframe)
+    model, names = spec.compile(), [joint.name for joint in spec.body(root).find_all("joint")]
     limits = _limits(model, names)
     start = _start(model, names, limits, path, key, {} if pose is None else pose)
+    left_out = tuple(f"keyframe {frame.name}" for frame in spec.keys if frame.name != key)
     for frame in spec.keys:
         spec.delete(frame)
     spec.nkey = 0  # MuJoCo would fill up to it
-    left_out = () if complete else _take_out(spec, path, root)
+    left_out += () if complete else _take_out(spec, path, root)
     if complete:
         for i in range(model.njnt):
             joint = model.joint(i)
@@ -257,6 +258,7 @@ def _take_out(spec: mujoco.MjSpec, path: Path, root: str) -> tuple[str, ...]:
         return {f"{kind} {element.name}" for kind, of in kinds.items() for element in of}
 
     before, world, left_out = names(), spec.worldbody, []
+    _drop_references(spec)
     for body in world.bodies:
         if body.name != root:
             left_out.append(f"body {body.name}")
@@ -275,6 +277,23 @@ def _take_out(spec: mujoco.MjSpec, path: Path, root: str) -> tuple[str, ...]:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path} needs more than body {root!r}: {reason}") from None
     return (*left_out, *sorted(before - names()))
+
+
+def _drop_references(spec: mujoco.MjSpec) -> None:
+    """Delete what refers to geoms, sites and cameras of the world, as MuJoCo does for bodies."""
+    kinds, world = mujoco.mjtObj, spec.worldbody
+    of_world = {(kinds.mjOBJ_GEOM, geom.name) for geom in world.geoms}
+    of_world |= {(kinds.mjOBJ_SITE, site.name) for site in world.sites}
+    of_world |= {(kinds.mjOBJ_CAMERA, camera.name) for camera in world.cameras}
+    for sensor in spec.sensors:
+        if of_world & {(sensor.objtype, sensor.objname), (sensor.reftype, sensor.refname)}:
+            spec.delete(sensor)
+    for pair in spec.pairs:
+        if of_world & {(kinds.mjOBJ_GEOM, name) for name in (pair.geomname1, pair.geomname2)}:
+            spec.delete(pair)
+    for equality in spec.equalities:
+        if of_world & {(equality.objtype, name) for name in (equality.name1, equality.name2)}:
+            spec.delete(equality)
 
 
 def _add_servos(

@@ -35,7 +35,7 @@ QUESTIONS = (
     ("Is there no limit yet?", "trpo, ppo"),
     ("Are steps slow and\nactions continuous?", "sac_lag, tqc_lag"),
     ("Must the worst step\nbe bounded?", "scpo"),
-    ("Shall a filter stay on\nafter training?", "trpo_usl, trpo_sl"),
+    ("Shall a filter stay on\nafter training?", "trpo_usl"),
     ("Do you know PPO, or\ntrain for 1e7 steps?", "ppo_lag, cppo_pid"),
 )
 REST = "cpo, trpo_lag"
@@ -81,7 +81,7 @@ def limits() -> Figure:
     handles, labels = right.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=5)
     left.set_title(f"{SUITE}, 1M steps")
-    right.set_title("CPO, TRPO-Lagrangian: three seeds at 2 and 5; else one")
+    right.set_title("bars: three seeds; points without: one seed")
     return figure
 
 

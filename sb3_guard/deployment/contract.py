@@ -145,9 +145,16 @@ def _components(name: str, space: spaces.Box, env: VecEnv) -> Iterator[dict[str,
     rest = size - sum(wrapper.numbers.shape[1] for wrapper in counted.values())
     if parts and parts[-1].stop - first != rest:  # a wrapper has changed them
         parts = []
+    robot = ours.engine.robot if parts else None
+    joints_of: Any = getattr(robot, "joints_of", None)
     for part in parts:
         bounds = {"low": _finite(part.low), "high": _finite(part.high), "unit": part.unit}
-        yield {"name": part.name, "start": part.start - first, "stop": part.stop - first, **bounds}
+        yield {
+            "name": part.name,
+            "start": part.start - first,
+            "stop": part.stop - first,
+            **bounds,
+        } | (joints_of(part.name) if joints_of else {})
     if not parts and rest:
         yield {"name": name, "start": 0, "stop": rest}
     for wrapper in counted.values():

@@ -225,6 +225,17 @@ def test_a_hinge_without_a_range_is_observed_as_a_direction(dog):
     np.testing.assert_allclose(obs, [np.sin(0.5), np.cos(0.5)])
 
 
+def test_joints_of_an_observation_are_named_in_their_order(dog):
+    engine = dog(pose={"*_thigh": 0.5}, observe=["joint_pos", "joint_turn", "joint_vel"])
+    robot = engine.robot
+    names = ["front_thigh", "front_calf", "back_thigh"]
+    pose = [0.5, pytest.approx(np.deg2rad(-90)), 0.5]
+    assert robot.joints_of("joint_pos") == {"joints": names, "first_pose": pose}
+    assert robot.joints_of("joint_turn") == {"joints": ["fan"], "first_pose": [0.0]}
+    assert robot.joints_of("joint_vel") == {"joints": [*names, "fan"]}
+    assert robot.joints_of("gravity") == {}
+
+
 def test_observe_chooses(dog):
     engine = dog(observe=("joint_pos", "imu_gyro", "base_angvel"))
     seen = set(engine.observation_layout) - {"goal_compass", "hazards_lidar"}

@@ -222,6 +222,30 @@ class FileRobot(MJCFRobot):
                 out[name] = getattr(self, f"_{name}")()
         return {name: out[name] for name in self._wanted}
 
+    def joints_of(self, name: str) -> dict[str, list[Any]]:
+        """The joints of a computed observation in its order, for the loop around a policy.
+
+        :param name: of the observation
+        :return: ``joints``, and of positions ``first_pose``, qpos that they are relative to, rad or
+            m; empty of other observations
+        """
+        if name in {sensor for sensor, _, _ in self._sensors}:
+            return {}
+        model = self.sim.model
+        if name == "joint_vel":
+            ids = [int(model.dof_jntid[dof]) for dof in self._speeds]
+        elif name in ("joint_pos", "joint_turn"):
+            first = self._places if name == "joint_pos" else [*self._hinged, *self._round]
+            ids = [model.jnt_qposadr.tolist().index(place) for place in first]
+        else:
+            return {}
+        names = [model.joint(i).name.removeprefix(self._prefix) for i in ids]
+        if name == "joint_vel":
+            return {"joints": names}
+        if name == "joint_turn" and self._round:  # a ball's rotation is as it is
+            return {"joints": names}
+        return {"joints": names, "first_pose": self._start[first].tolist()}
+
     def _joint_pos(self) -> Values:
         return Values(self._qpos[:, self._places] - self._start[self._places], unit="rad, m")
 

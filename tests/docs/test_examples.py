@@ -10,7 +10,7 @@ import gymnasium
 import nbformat
 import pytest
 from nbclient import NotebookClient
-from test_adapters import install
+from safety_stub import install
 
 import sb3_guard.envs
 from sb3_guard import cli

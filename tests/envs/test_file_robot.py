@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from robot_models import ARM, DOG
 from worlds import assert_rows_are_lone_environments, own_parts
 
 from sb3_guard.envs import Scenario, register_robot
@@ -10,46 +11,6 @@ from sb3_guard.envs.registry import ROBOTS
 
 ROW = np.zeros(1, dtype=int)
 GAINS = {"kp": 40.0, "kd": 2.0}
-# a dog of two legs whose file is in degrees, beside a ball on a floor of its own
-DOG = """
-<mujoco>
-  <option timestep="0.004"/>
-  <default><geom density="200"/><general dyntype="filter" gainprm="3"/></default>
-  <worldbody>
-    <light pos="0 0 5"/>
-    <geom name="ground" type="plane" size="5 5 1"/>
-    <body name="ball" pos="2 0 1"><freejoint name="ball"/><geom name="ball" size="0.1"/></body>
-    <body name="trunk" pos="3 1 2">
-      <freejoint/>
-      <light pos="0 0 1"/>
-      <geom name="trunk" type="box" size="0.3 0.2 0.05"/>
-      <site name="imu"/>
-      <body name="front" pos="0.25 0 0">
-        <joint name="front_thigh" axis="0 1 0" range="-45 90" limited="true"/>
-        <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.2"/>
-        <body name="front_calf" pos="0 0 -0.2">
-          <joint name="front_calf" axis="0 1 0" range="-150 -30" limited="true"/>
-          <geom name="front_foot" type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2"/>
-        </body>
-      </body>
-      <body name="back" pos="-0.25 0 0">
-        <joint name="back_thigh" axis="0 1 0" range="-45 90" limited="true"/>
-        <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.2"/>
-      </body>
-      <body name="fan" pos="0 0 0.06">
-        <joint name="fan"/>
-        <geom type="box" size="0.1 0.01 0.01" contype="0" conaffinity="0"/>
-      </body>
-    </body>
-  </worldbody>
-  <sensor>
-    <gyro name="imu_gyro" site="imu"/>
-    <jointpos name="fan_angle" joint="fan"/>
-    <framepos name="to_ball" objtype="body" objname="trunk" reftype="body" refname="ball"/>
-  </sensor>
-  <keyframe>{keys}</keyframe>
-</mujoco>
-"""
 # qpos of the ball and of the dog, whose file lists them in this order
 KEY = '<key name="{name}" qpos="2 0 1 1 0 0 0  3 1 {z} 1 0 0 0  {thigh} -1 0.2 0"/>'
 
@@ -253,27 +214,6 @@ def test_keepout_and_arena_follow_the_size(dog):
     with own_parts():
         stated = Scenario(robot="Dog", arena={"size": 7.0}, robot_params={"keepout": 0.1})
         assert (stated.build().arena.size, stated.build().robot.keepout) == (7.0, 0.1)
-
-
-ARM = """
-<mujoco>
-  <worldbody>
-    <body name="base" pos="4 5 0">
-      <geom type="cylinder" size="0.05 0.05" pos="0 0 0.05"/>
-      <body name="upper" pos="0 0 0.1">
-        <joint name="turn" axis="0 0 1"/>
-        <joint name="lift" axis="0 1 0" range="-90 90" limited="true"/>
-        <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.3" density="500"/>
-        <body name="lower" pos="0 0 0.3">
-          <joint name="elbow" axis="0 1 0" range="-120 120" limited="true"/>
-          <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.2" density="500"/>
-          <site name="hand" pos="0 0 0.2"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 
 
 @pytest.fixture

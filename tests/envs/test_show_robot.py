@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from test_file_robot import ARM, DOG
+from robot_models import ARM, DOG
 from worlds import own_parts
 
 from sb3_guard import show

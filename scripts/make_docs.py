@@ -1,9 +1,9 @@
 """Write the reference pages from the code: ``python scripts/make_docs.py``.
 
 Robots, tasks and constraints have a page each: the docstring, the place in the paper's taxonomy,
-the parameters with defaults and limits, and tables of actions and observations. Further pages list
-all tasks and all constraints, the files in ``examples/``, the flags of the commands and the default
-hyperparameters.
+the parameters with defaults and limits, and tables of actions, joints and observations. Further
+pages list all tasks and all constraints, the parameters that belong to no part, the files in
+``examples/``, the flags of the commands and the default hyperparameters.
 """
 
 from __future__ import annotations
@@ -17,11 +17,20 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+import mujoco
+import numpy as np
+
 from sb3_guard.cli import COMMANDS, module_of
 from sb3_guard.envs import GuardVectorEnv
+from sb3_guard.envs.arena import Arena
+from sb3_guard.envs.extras import Extras
+from sb3_guard.envs.layout import Layout
 from sb3_guard.envs.movers import Movers
-from sb3_guard.envs.part import Part
+from sb3_guard.envs.observation import Lidar
+from sb3_guard.envs.parameters import Parameters
+from sb3_guard.envs.part import Part, Robot
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
+from sb3_guard.envs.robots.from_file import ATTRIBUTES
 from sb3_guard.list import KINDS, summary, yes
 from sb3_guard.show import action_table, observation_table
 from sb3_guard.zoo.cli.flags import Command
@@ -63,7 +72,16 @@ ABOUT = {
 }
 
 
-def parameters(part: type[Part]) -> str:
+#: What belongs to no part, by its argument of ``gymnasium.make``.
+OF_NO_PART: dict[str, tuple[type[Parameters], str]] = {
+    "lidar": (Lidar, "The pseudo-lidar that detects constraints and targets:"),
+    "observe": (Extras, "Observations that belong to no part:"),
+    "layout": (Layout, "Where things are:"),
+    "arena": (Arena, "The place and its physics:"),
+}
+
+
+def parameters(part: type[Parameters]) -> str:
     """A row per parameter: name, default, what it is and what is allowed."""
     rows = []
     for field in dataclasses.fields(part):  # type: ignore[arg-type]
@@ -78,6 +96,58 @@ def parameters(part: type[Part]) -> str:
         meaning = field.metadata.get("doc", "")
         rows.append([f"`{field.name}`", f"`{field.default}`", meaning, "; ".join(limits)])
     return table(["parameter", "default", "what it is", "allowed"], rows)
+
+
+def parameters_of_environments() -> str:
+    """The page of the parameters that belong to no part, and of those that can be drawn."""
+    parts = [
+        "# Parameters",
+        "Robots, tasks and constraints have their parameters on their own pages. "
+        "[Customizing](customizing.md) shows how to set them.",
+    ]
+    for name, (kind, about) in OF_NO_PART.items():
+        parts += [f"## `{name}={{...}}`", about, parameters(kind)]
+    drawn: dict[tuple[str, str], list[str]] = {}
+    for kinds in GROUPS.values():
+        for name, part in kinds.items():
+            for field in dataclasses.fields(part):  # type: ignore[arg-type]
+                if field.metadata.get("drawn"):
+                    drawn.setdefault((field.name, field.metadata["doc"]), []).append(name)
+    rows = [[f"`{name}`", ", ".join(of), doc] for (name, doc), of in drawn.items()]
+    parts += ["## Drawn anew in each episode", table(["parameter", "of", "what it is"], rows)]
+    rows = [[f"`{name}`", escaped(default), escaped(meaning)]
+            for name, (default, meaning) in ATTRIBUTES.items()]  # fmt: skip
+    parts += ["## `register_robot`", "Arguments beside `xml`: what the robot's file does not say."]
+    parts += [table(["argument", "default", "what it is"], rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def joints(robot: type[Robot]) -> str:
+    """A row per joint of a robot's file, with the gear of its actuator, and its touch sensors."""
+    model = mujoco.MjModel.from_xml_path(str(robot.path()))
+    gears = {
+        model.actuator(i).trnid[0]: f"{model.actuator(i).gear[0]:g}"
+        for i in range(model.nu)
+        if model.actuator(i).trntype[0] == mujoco.mjtTrn.mjTRN_JOINT
+    }
+    rows = []
+    for i in range(model.njnt):
+        joint = model.joint(i)
+        kind = mujoco.mjtJoint(joint.type[0]).name.removeprefix("mjJNT_").lower()
+        axis = " ".join(f"{x:g}" for x in np.round(joint.axis, 3)) if kind in "hinge slide" else ""
+        low, high = np.rad2deg(joint.range) if kind == "hinge" else joint.range
+        span = f"{low:.0f}° … {high:.0f}°" if kind == "hinge" else f"{low:g} … {high:g} m"
+        rest = [f"{getattr(joint, what)[0]:g}" for what in ("stiffness", "damping", "armature")]
+        span = span if joint.limited[0] else ""
+        rows.append([joint.name or "(free)", kind, axis, span, gears.get(i, ""), *rest])
+    header = ["joint", "kind", "axis", "range", "gear", "stiffness", "damping", "armature"]
+    touch = [
+        f"`{model.sensor(i).name}` {100 * model.site(model.sensor(i).objid[0]).size[0]:g} cm"
+        for i in range(model.nsensor)
+        if model.sensor(i).type[0] == mujoco.mjtSensor.mjSENS_TOUCH
+    ]
+    felt = f"\n\nRadii of the touch sensors: {', '.join(touch)}." if touch else ""
+    return "Joints, in SI units:\n\n" + table(header, rows) + felt
 
 
 def taxonomy(part: type[Part]) -> str:
@@ -187,7 +257,8 @@ def page(kind: str, name: str, part: type[Part]) -> str:
         parts.append(speeds(part))
     if kind == "robot":
         env = GuardVectorEnv(1, f"Goal_{name}_8Hazards")
-        parts += [action_table(env), f"In `Goal_{name}_8Hazards`:", observation_table(env)]
+        parts += [action_table(env), joints(GROUPS["robot"][name])]  # type: ignore[arg-type]
+        parts += [f"In `Goal_{name}_8Hazards`:", observation_table(env)]
     else:
         parts += ["What it adds to the observation, with its size for some robots:"]
         parts += [perceived(kind, name)]
@@ -298,7 +369,8 @@ def pages() -> dict[str, str]:
     }
     overviews = {f"{kind}s.md": overview(kind, GROUPS[kind]) for kind in ABOUT}
     others = (gallery, examples, command_line, hyperparameter_tables)
-    return {**singles, **overviews, **{f"{page.__name__}.md": page() for page in others}}
+    rest = {f"{page.__name__}.md": page() for page in others}
+    return {**singles, **overviews, **rest, "parameters.md": parameters_of_environments()}
 
 
 def main() -> None:

@@ -39,7 +39,9 @@ class Extras(Part):
         "whether info has the parameters that were drawn for the episode, such as 'hazards.size'",
     )
     components: tuple[str, ...] | None = param(
-        None, "names of what is observed, in this order; null: everything, in alphabetical order"
+        None,
+        "names of what is observed, in this order, as sb3-guard show prints them; null: "
+        "everything, in alphabetical order; constraints that are added or removed join or leave it",
     )
     camera: tuple[int, int] | None = param(
         None, "width and height, pixels, of an image from the robot; needs flatten=False", low=1

@@ -46,11 +46,12 @@ class Layout(Parameters):
     )
     restarts: int = param(
         0,
-        "layouts begun anew where an object finds no room, before others make room for it",
+        "layouts begun anew where an object finds no room, before others make room for it; the "
+        "distribution is then that of blind draws, object by object",
         low=0,
     )
     overlap: bool = param(False, "whether keep-outs may let solid objects begin inside each other")
-    randomize: bool = param(True, "false: all episodes of a row are the same")
+    randomize: bool = param(True, "false: all episodes of an environment are the same")
 
 
 class LayoutError(WorldError, RuntimeError):

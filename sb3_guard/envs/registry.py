@@ -122,26 +122,8 @@ def register_robot(
     :param name: what ids and scenarios call it
     :param robot: a :class:`~sb3_guard.envs.part.Robot` class
     :param xml: or the robot's MJCF file
-    :param attributes: with ``xml``, what the file does not say.
-        The robot: ``root`` (its outermost body; the only one with joints), ``complete`` (whether
-        the file's world is kept, with floor and options; False), ``workspace`` (``"planar"``; on a
-        fixed base ``"spatial"``), ``center`` (the body or site whose place is the robot's position,
-        of an arm its end effector; the outermost body), ``lidar_bodies`` (the body of ``center``),
-        ``reach`` (m; of an arm as measured), ``keepout`` (m; what covers it), ``eye`` (where its
-        camera sits and looks: body, place in m and direction there), ``floor`` (whether it meets
-        the floor; True), ``defaults`` (parameters of tasks and constraints with this robot, such as
-        ``{"goal": {"size": 0.05}}``).
-        Its start: ``keyframe`` (``start``, ``home`` or the only one), ``pose`` (rad or m, by names
-        or patterns of joints, such as ``{"*_thigh_joint": 0.9}``).
-        Its actions: ``actuators`` (gains of position servos where the file has no actuators,
-        ``{"kp": 35, "kd": 1}``, with ``"force"`` for a limit in N m, or a mapping of joints to
-        gains), ``action`` (``"range"``: [−1, 1] is the control range; ``"offset"``: from the first
-        pose), ``action_scale`` (rad of offset at 1; 0.25), ``scaled`` (False: actions are the
-        controls themselves).
-        What it observes: ``observe`` (names of sensors and of what is computed).
-        Its physics: ``timestep`` (s, of one physics step; the file's), ``frame_skip`` (physics
-        steps in a control step; 10), ``integrator`` (``"Euler"``, ``"RK4"``, ``"implicit"`` or
-        ``"implicitfast"``)
+    :param attributes: with ``xml``, what the file does not say, such as ``pose`` or ``actuators``;
+        the page *Parameters* lists them with their units and defaults
     :raises ValueError: neither or both of ``robot`` and ``xml`` are given, an attribute is unknown
         or bad, the file has no robot that can act, or the name is not usable
     """

@@ -10,7 +10,9 @@ from sb3_guard.envs.robots.robot import PREFIX
 class Arm6(Arm):
     """An arm that reaches 3 m from its shoulder, with an elbow and a wrist.
 
-    Actions: the speeds of joints 1 to 6 (turn, shoulder, elbow, roll, wrist, roll), ±0.4 rad/s.
+    Actions: the speeds of joints 1 to 6 (turn, shoulder, elbow, roll, wrist, roll), ±0.4 rad/s. The
+    end effector starts at (0, 1.5, 1.8) m before the heading turns it. Lidar and compass are in the
+    frames of links 1, 3, 5 and 7. All else is as in Arm3.
     """
 
     asset = "arm6.xml"

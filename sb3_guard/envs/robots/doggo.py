@@ -11,7 +11,8 @@ class Doggo(MJCFRobot):
 
     Actions: the hips' turn (z) of legs 1 to 4, the hips' swing (y), then the ankles. Legs are
     numbered front left, rear left, rear right, front right. The waist is neither driven nor
-    observed.
+    observed. Springs pull the front hips to −10°, the ankles to −20° and the rest to 0°. They do
+    not bear the weight: it starts, and ends when undriven, with its ankles folded.
     """
 
     asset = "doggo.xml"

@@ -11,6 +11,7 @@ class Drone(MJCFRobot):
 
     Actions: the lift of propellers 1 to 4 (at +x, +y, −x, −y), a quarter of the weight ± 0.1 N
     each, along the body's z axis. Drag limits the climb to 2 m/s and tilting to 0.3 rad/s.
+    Nothing turns it about its own axis and nothing rights it.
     """
 
     asset = "drone.xml"

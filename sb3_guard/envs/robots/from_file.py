@@ -17,10 +17,40 @@ from sb3_guard.envs.robots.robot import PREFIX
 from sb3_guard.spelling import did_you_mean
 
 OF_FILE = ("root", "complete", "keyframe", "pose", "actuators")  # what settle() is told
-ATTRIBUTES = (
-    *OF_FILE, "timestep", "frame_skip", "integrator", "workspace", "lidar_bodies", "center",
-    "reach", "eye", "scaled", "floor", "action", "action_scale", "observe", "keepout", "defaults",
-)  # fmt: skip
+#: What a user may state: what holds if it is not stated, and what it is.
+ATTRIBUTES: dict[str, tuple[str, str]] = {
+    "root": ("the only one with joints", "the robot's outermost body"),
+    "complete": ("False", "True: the file's world is kept: its floor, options and names are used, "
+        "and the robot begins where the file puts it"),
+    "keyframe": ("start, home or the only one", "the keyframe in which it starts"),
+    "pose": ("0, or the middle of a range without 0", "positions of hinges (rad) and slides (m) at "
+        'the start, by names or patterns of joints: {"*_thigh_joint": 0.9}'),
+    "actuators": ("the file's", 'gains of position servos, {"kp": 35, "kd": 1} (N·m/rad, '
+        'N·m·s/rad), with "force" for a limit (N·m), or a mapping of joints to gains'),
+    "action": ('"range"', 'what [−1, 1] means: "range", the control range; "offset", an offset '
+        "from the first pose, for position servos"),
+    "action_scale": ("0.25", "the offset at 1, rad or m"),
+    "scaled": ("True", "False: actions are the controls themselves"),
+    "observe": ("the sensors, and what they do not cover", "names of what is observed: sensors, "
+        "joint_pos, joint_turn, joint_vel, base_linvel, base_angvel, gravity, last_action"),
+    "center": ("the outermost body", "the body or site whose place is the robot's position: of an "
+        "arm, its end effector"),
+    "reach": ("infinite; of an arm, measured", "how far an arm reaches from its base, m; goals are "
+        "drawn within"),
+    "keepout": ("what covers the robot", "radius kept clear around it at the start, m"),
+    "defaults": ("for arms, sizes that suit their reach; for large robots, a larger arena",
+        'parameters of tasks, constraints and arena with this robot: {"goal": {"size": 0.05}}'),
+    "workspace": ('"planar"; of an arm "spatial"', '"spatial" for robots that leave the plane: '
+        "tasks and constraints are then in the air"),
+    "lidar_bodies": ("the body of center", "bodies that carry lidar and compass"),
+    "eye": ("on that body or the outermost, ahead", "the body that carries the observed camera, "
+        "where on it (m) and which way it looks"),
+    "timestep": ("the file's, 0.002", "of one physics step, s"),
+    "frame_skip": ("10", "physics steps in a control step"),
+    "integrator": ('the file\'s, "implicitfast"', '"Euler", "RK4", "implicit" or "implicitfast"'),
+    "floor": ("True", "False: it slides at a fixed height and never meets the floor, which saves "
+        "time"),
+}  # fmt: skip
 _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "root": (lambda v: v is None or isinstance(v, str), "the name of an outermost body"),
     "center": (lambda v: v is None or isinstance(v, str), "the name of a body or site"),

@@ -10,7 +10,7 @@ class Hopper(MJCFRobot):
     """A one-legged robot of 12 kg that cannot fall; its leg pushes it along the floor.
 
     Actions: hip x and z (±20°, actuators ±0.4), thigh, knee and foot: the five torques of the
-    paper.
+    paper, with hip y and thigh as one hinge. It starts with the knee bent by 18°.
     """
 
     asset = "hopper.xml"

@@ -10,7 +10,8 @@ class Humanoid(MJCFRobot):
     """A person of 42 kg at a fixed height, whose legs push it along the floor.
 
     Actions: hip z, hip y and knee of the right leg, then of the left one. Hip x, waist and arms are
-    rigid, which gives the six torques of the paper.
+    rigid, which gives the six torques of the paper. It starts with knees bent by 16°, feet on the
+    floor.
     """
 
     asset = "humanoid.xml"

@@ -9,7 +9,8 @@ from sb3_guard.envs.robots.robot import MJCFRobot
 class Walker(MJCFRobot):
     """A two-legged robot that cannot fall; the legs push it along the floor.
 
-    Actions: hip x, z and y, knee and ankle of the right leg, then of the left one.
+    Actions: hip x, z and y, knee and ankle of the right leg (at +y), then of the left one. The legs
+    are mirror images of each other.
     """
 
     asset = "walker.xml"

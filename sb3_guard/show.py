@@ -132,6 +132,8 @@ class Flags(Command):
     :param env_kwargs: arguments of the environment, e.g. "ghosts:{'num': 4}"
     :param robot_kwargs: arguments of register_robot, for a robot's MJCF file
     :param output: PNG file for the picture (default: <env>.png)
+    :param mjcf: MJCF file for the model: robot and objects before an episode places them; zones
+        without bodies, such as hazards, are not in it
     :param camera: camera of the picture (default: fixed, or track where the robot runs far away)
     :param window: open MuJoCo's viewer with random actions instead: Space pauses, Tab opens menus,
         F shows contact forces
@@ -143,6 +145,7 @@ class Flags(Command):
     examples: ClassVar[str] = """examples:
   sb3-guard show Goal_Ant_8Ghosts
   sb3-guard show my_scenario.yml -o mine.png
+  sb3-guard show SafetyPointGoal1-v0 --mjcf point.xml
   sb3-guard show Goal_Drone_8Hazards --env-kwargs "ghosts:{'num': 4}" --camera track
   sb3-guard show go1.xml --robot-kwargs "actuators:{'kp': 35, 'kd': 1}" "action:'offset'"
 """
@@ -150,6 +153,7 @@ class Flags(Command):
     env_kwargs: dict[str, Any] | None = flag()
     robot_kwargs: dict[str, Any] | None = flag()
     output: str | None = flag("-o", metavar="FILE.png")
+    mjcf: str | None = flag(metavar="FILE")
     camera: str | None = flag(choices=CAMERAS)
     window: bool = flag(default=False)
     seed: int = flag(default=0)
@@ -213,6 +217,10 @@ def show(flags: Flags) -> int:
     print(observation_table(env), action_table(env), sep="\n\n")
     if env.engine.drawn.ranges:
         print("\n" + drawn_table(env))
+    if flags.mjcf:
+        with explained(f"can't write {flags.mjcf}", OSError):
+            Path(flags.mjcf).write_text(env.engine.spec.to_xml())
+        print(f"\nwrote {flags.mjcf}")
     path = Path(flags.output) if flags.output else Path(f"{file.stem}.png")
     with explained("no picture", RenderingError, OSError, ValueError):
         from matplotlib import image

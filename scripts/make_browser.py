@@ -55,14 +55,10 @@ def trainings() -> Iterator[str]:
             )
 
 
-def mjcf(env_id: str) -> str:
-    """The world as MJCF that MuJoCo 3.14 reads: a velocity actuator does not state its input."""
-    engine = GuardEnv(**env_spec(env_id).kwargs).engine  # its parts build a second time
-    world = engine.arena.world(engine.robot)
-    for part in engine.parts:
-        part.build(world)
-    world.spec.compile()
-    return str(world.spec.to_xml()).replace(' input="vel"', "")
+def mjcf(engine: Engine) -> str:
+    """The model as ``sb3-guard show --mjcf`` writes it, as MuJoCo 3.14 reads it: a velocity
+    actuator does not state its input."""
+    return str(engine.spec.to_xml()).replace(' input="vel"', "")
 
 
 def observation(engine: Engine, model: mujoco.MjModel) -> Iterator[dict[str, Any]]:
@@ -97,7 +93,7 @@ def world(env_id: str) -> dict[str, Any]:
     robot, task, lidar = engine.robot, engine.task, Lidar(**env.scenario.lidar)
     if not isinstance(robot, MJCFRobot) or not isinstance(task, Goal):
         raise ValueError(f"{env_id}: the page knows robots from MJCF files and the task Goal")
-    text = mjcf(env_id)
+    text = mjcf(engine)
     model = mujoco.MjModel.from_xml_string(text)
     low, high = (np.broadcast_to(bound, model.nu) for bound in robot.action_range)
     least, most = robot.controls

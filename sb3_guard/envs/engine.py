@@ -101,7 +101,8 @@ class Engine:
         for part in self.parts:
             part.build(world)
         self.drawn = Drawn(self.parts, world, self, self.extras.drawn)
-        self.model = world.spec.compile()
+        self.spec = world.spec  # its to_xml() is the world as MJCF
+        self.model = self.spec.compile()
         frame_skip = self.arena.frame_skip or self.robot.frame_skip
         self.control_step = frame_skip * float(self.model.opt.timestep)
         self.batch = Physics(

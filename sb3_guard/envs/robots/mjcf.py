@@ -25,6 +25,11 @@ def load(path: Path) -> mujoco.MjSpec:
         spec.compile()
     except ValueError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+    shapes = (*spec.meshes, *spec.hfields, *spec.skins)
+    for asset in (*shapes, *spec.textures):  # a world forgets the folder of a file it takes in
+        if asset.file:
+            folder = spec.texturedir if isinstance(asset, mujoco.MjsTexture) else spec.meshdir
+            asset.file = str(path.parent.resolve() / folder / asset.file)
     return spec
 
 

@@ -2,14 +2,12 @@
 
 import torch as th
 from stable_baselines3 import SAC
-from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.replay import CostReplayBufferSamples, LagrangianReplay
-from sb3_guard.algorithms.common.temperature import Temperature
+from sb3_guard.algorithms.common.soft import SoftActorCritic
 
 
-class SACLag(Temperature, LagrangianReplay, SAC):
+class SACLag(SoftActorCritic, SAC):
     """SAC on the Lagrangian (Ha et al., 2020, arXiv 2002.08550).
 
     ::
@@ -24,38 +22,14 @@ class SACLag(Temperature, LagrangianReplay, SAC):
 
     label, family, paper = "SAC-Lagrangian", "Lagrangian", "Ha et al. 2020"
 
-    def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
-        """SAC's step: temperature, critics, actor, targets."""
-        if self.use_sde:
-            self.actor.reset_noise()
-        actions, log_prob = self.actor.action_log_prob(batch.observations)
-        log_prob = log_prob.reshape(-1, 1)
-        logs, alpha = self.fit_temperature(log_prob.detach())
+    def next_values(self, values: tuple[th.Tensor, ...]) -> th.Tensor:
+        return th.cat(values, dim=1).amin(dim=1, keepdim=True)
 
-        with th.no_grad():
-            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
-            after = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1)
-            after = after.amin(dim=1, keepdim=True) - alpha * next_log_prob.reshape(-1, 1)
-            target = batch.rewards + (1 - batch.dones) * self.gamma * after
-        values = self.critic(batch.observations, batch.actions)
-        critic_loss = 0.5 * sum(F.mse_loss(value, target) for value in values)
-        self.critic.optimizer.zero_grad()
-        critic_loss.backward()  # type: ignore[union-attr]
-        self.critic.optimizer.step()
-        logs["critic_loss"] = critic_loss.item()  # type: ignore[union-attr]
-        logs["cost_critic_loss"] = self.fit_cost_critic(batch, next_actions)
+    def critic_loss(self, values: tuple[th.Tensor, ...], target: th.Tensor) -> th.Tensor:
+        return 0.5 * sum(F.mse_loss(value, target) for value in values)  # type: ignore[return-value]
 
-        self.actor.optimizer.zero_grad()
-        with self.critics_constant():
-            chosen = th.cat(self.critic(batch.observations, actions), dim=1)
-            chosen, _ = th.min(chosen, dim=1, keepdim=True)
-            loss = self.penalized(alpha * log_prob - chosen, batch, actions, values[0]).mean()
-            loss.backward()
-        self.actor.optimizer.step()
-        logs["actor_loss"] = loss.item()
+    def estimate(self, values: tuple[th.Tensor, ...]) -> th.Tensor:
+        return th.min(th.cat(values, dim=1), dim=1, keepdim=True)[0]
 
-        if step % self.target_update_interval == 0:
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-            self.cost_critic.follow(self.tau)
-        return logs
+    def expected(self, values: tuple[th.Tensor, ...]) -> th.Tensor:
+        return values[0]

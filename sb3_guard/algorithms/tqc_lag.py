@@ -6,12 +6,10 @@ import torch as th
 from sb3_contrib import TQC
 from sb3_contrib.common.utils import quantile_huber_loss
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.utils import polyak_update
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.cost_critics import CostQ
-from sb3_guard.algorithms.common.replay import CostReplayBufferSamples, LagrangianReplay
-from sb3_guard.algorithms.common.temperature import Temperature
+from sb3_guard.algorithms.common.soft import SoftActorCritic
 
 
 class CostQuantiles(CostQ):
@@ -64,7 +62,7 @@ class CostQuantiles(CostQ):
         )
 
 
-class TQCLag(Temperature, LagrangianReplay, TQC):
+class TQCLag(SoftActorCritic, TQC):
     """TQC on the Lagrangian (Kuznetsov et al., 2020, arXiv 2005.04269, with multipliers).
 
     ::
@@ -88,41 +86,13 @@ class TQCLag(Temperature, LagrangianReplay, TQC):
         rate, drop = self.lr_schedule(1), self.top_quantiles_to_drop_per_net
         return CostQuantiles(self.policy, len(self.cost_keys), rate, drop, self.cost_quantile)
 
-    def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
-        """TQC's step: temperature, critics, actor, targets."""
-        if self.use_sde:
-            self.actor.reset_noise()
-        actions, log_prob = self.actor.action_log_prob(batch.observations)
-        log_prob = log_prob.reshape(-1, 1)
-        logs, alpha = self.fit_temperature(log_prob.detach())
+    def next_values(self, values: th.Tensor) -> th.Tensor:
+        dropped = self.top_quantiles_to_drop_per_net * self.critic.n_critics
+        kept = self.critic.quantiles_total - dropped
+        return values.flatten(1).sort().values[:, :kept]
 
-        with th.no_grad():
-            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
-            after = self.critic_target(batch.next_observations, next_actions).flatten(1)
-            dropped = self.top_quantiles_to_drop_per_net * self.critic.n_critics
-            after = after.sort().values[:, : self.critic.quantiles_total - dropped]
-            after = after - alpha * next_log_prob.reshape(-1, 1)
-            target = batch.rewards + (1 - batch.dones) * self.gamma * after
-        values = self.critic(batch.observations, batch.actions)  # [B, networks, quantiles]
-        critic_loss = quantile_huber_loss(values, target[:, None], sum_over_quantiles=False)
-        self.critic.optimizer.zero_grad()
-        critic_loss.backward()
-        self.critic.optimizer.step()
-        logs["critic_loss"] = critic_loss.item()
-        logs["cost_critic_loss"] = self.fit_cost_critic(batch, next_actions)
+    def critic_loss(self, values: th.Tensor, target: th.Tensor) -> th.Tensor:
+        return quantile_huber_loss(values, target[:, None], sum_over_quantiles=False)
 
-        self.actor.optimizer.zero_grad()
-        with self.critics_constant():
-            chosen = self.critic(batch.observations, actions)
-            chosen = chosen.mean(dim=2).mean(dim=1, keepdim=True)
-            expected = values.mean(dim=2).mean(dim=1, keepdim=True)
-            loss = self.penalized(alpha * log_prob - chosen, batch, actions, expected).mean()
-            loss.backward()
-        self.actor.optimizer.step()
-        logs["actor_loss"] = loss.item()
-
-        if step % self.target_update_interval == 0:
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-            self.cost_critic.follow(self.tau)
-        return logs
+    def estimate(self, values: th.Tensor) -> th.Tensor:
+        return values.mean(dim=2).mean(dim=1, keepdim=True)

@@ -7,16 +7,12 @@ import numpy as np
 import pytest
 import torch as th
 from scipy.optimize import minimize
+from step_problems import StepProblem, definite
 
 from sb3_guard.algorithms.common.natural_gradient import Case, Step, constrained_step
 from sb3_guard.algorithms.common.vectors import assign, conjugate_gradient, flatten, unflatten
 
 FEW_OR_MANY = [50, pytest.param(500, marks=pytest.mark.slow)]  # random problems
-
-
-def _definite(rng: np.random.Generator, size: int) -> np.ndarray:
-    root = rng.normal(size=(size, size))
-    return root @ root.T + 0.3 * np.eye(size)
 
 
 def test_flat_round_trip() -> None:
@@ -33,14 +29,14 @@ def test_flat_round_trip() -> None:
 @pytest.mark.parametrize("size", [1, 5, 40])
 def test_conjugate_gradient_equals_direct_solve(size: int) -> None:
     rng = np.random.default_rng(size)
-    F, b = th.as_tensor(_definite(rng, size)), th.as_tensor(rng.normal(size=size))
+    F, b = th.as_tensor(definite(rng, size)), th.as_tensor(rng.normal(size=size))
     x = conjugate_gradient(lambda vector: F @ vector, b, max_steps=10 * size, tolerance=1e-24)
     th.testing.assert_close(x, th.linalg.solve(F, b), rtol=1e-8, atol=1e-8)
 
 
 def test_conjugate_gradient_stopped_early_still_knows_its_length() -> None:
     rng = np.random.default_rng(0)
-    F, b = th.as_tensor(_definite(rng, 30)), th.as_tensor(rng.normal(size=30))
+    F, b = th.as_tensor(definite(rng, 30)), th.as_tensor(rng.normal(size=30))
     x = conjugate_gradient(lambda vector: F @ vector, b, max_steps=4)
     assert float(x @ F @ x) == pytest.approx(float(b @ x), rel=1e-10)
     again = conjugate_gradient(lambda vector: F @ vector, b, max_steps=4)
@@ -57,33 +53,11 @@ def test_conjugate_gradient_of_nothing() -> None:
     assert not conjugate_gradient(product, th.zeros(3), 10).any() and not calls
 
 
-class Problem:
-    """A random step problem, and what an optimiser that knows none of our algebra says of it.
-
-    :param ratios: violation of each constraint as a share of what the trust region can change
-    :param scales: the units of each cost; none: all the same
-    """
-
-    def __init__(
-        self,
-        rng: np.random.Generator,
-        ratios: np.ndarray,
-        size: int = 6,
-        scales: np.ndarray | None = None,
-    ) -> None:
-        self.F = _definite(rng, size)
-        self.g = rng.normal(size=size)
-        self.B = rng.normal(size=(len(ratios), size))
-        if scales is not None:
-            self.B *= scales[:, None]
-        self.delta = 10 ** rng.uniform(-3, -1)
-        self.inverse = np.linalg.inv(self.F)
-        reach = np.sqrt(2 * self.delta * np.einsum("ij,jk,ik->i", self.B, self.inverse, self.B))
-        self.c = reach * ratios
+class Problem(StepProblem):
+    """A step problem, and what an optimiser that knows none of our algebra says of it."""
 
     def solve(self, dtype: th.dtype = th.float64, recovery: float = 1.0) -> Step:
-        tensors = (self.g, self.B, self.inverse @ self.g, self.B @ self.inverse)
-        g, B, v, W = (th.as_tensor(each, dtype=dtype) for each in tensors)
+        g, B, v, W = self.tensors(dtype)
         return constrained_step(g, B, self.c, v, W, self.delta, recovery)
 
     def scale(self, lost: bool) -> np.ndarray:

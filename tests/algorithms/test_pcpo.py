@@ -8,6 +8,7 @@ import torch as th
 from cost_envs import CostPoint
 from scipy.optimize import minimize
 from stable_baselines3.common.env_util import make_vec_env
+from step_problems import StepProblem
 
 from sb3_guard.algorithms import PCPO
 from sb3_guard.algorithms.common.natural_gradient import projected_step
@@ -16,26 +17,8 @@ from sb3_guard.algorithms.common.trust_region import Trial
 SIZE = 6
 
 
-class Problem:
-    """A random projection problem.
-
-    :param ratios: violation of each constraint as a share of what the trust region can change
-    :param scales: the units of each cost; none: all the same
-    """
-
-    def __init__(
-        self, rng: np.random.Generator, ratios: np.ndarray, scales: np.ndarray | None = None
-    ) -> None:
-        root = rng.normal(size=(SIZE, SIZE))
-        self.F = root @ root.T + 0.3 * np.eye(SIZE)
-        self.g = rng.normal(size=SIZE)
-        self.B = rng.normal(size=(len(ratios), SIZE))
-        if scales is not None:
-            self.B *= scales[:, None]
-        self.delta = 10 ** rng.uniform(-3, -1)
-        self.inverse = np.linalg.inv(self.F)
-        reach = np.sqrt(2 * self.delta * np.einsum("ij,jk,ik->i", self.B, self.inverse, self.B))
-        self.c = reach * ratios
+class Problem(StepProblem):
+    """A projection problem, and the distance that an independent optimiser finds."""
 
     @property
     def natural(self) -> np.ndarray:
@@ -45,8 +28,7 @@ class Problem:
     def solve(
         self, euclidean: bool, dtype: th.dtype = th.float64, recovery: float = 1.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        tensors = (self.g, self.B, self.inverse @ self.g, self.B @ self.inverse)
-        g, B, v, W = (th.as_tensor(each, dtype=dtype) for each in tensors)
+        g, B, v, W = self.tensors(dtype)
         x, pull = projected_step(g, B, self.c, v, W, self.delta, euclidean, recovery)
         return x.numpy(), pull
 
@@ -54,11 +36,6 @@ class Problem:
         """From the natural step, in radii of the trust region."""
         gap = x - self.natural
         return float(np.sqrt(gap @ gap if euclidean else gap @ self.F @ gap) / self.radius)
-
-    @property
-    def reach(self) -> np.ndarray:
-        """What the trust region can change of each cost, shape (m,)."""
-        return self.radius * np.sqrt(np.diag(self.B @ self.inverse @ self.B.T))
 
     @property
     def radius(self) -> float:

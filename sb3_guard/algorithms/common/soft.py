@@ -1,16 +1,19 @@
-"""The entropy coefficient of SAC's kind of algorithm, with a start that fits the rewards."""
+"""What SAC and TQC share: a gradient step, and an entropy coefficient that fits the rewards."""
 
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.utils import polyak_update
 
-from sb3_guard.algorithms.common.replay import LagrangianReplay
+from sb3_guard.algorithms.common.replay import CostReplayBufferSamples, LagrangianReplay
 
 
-class Temperature(LagrangianReplay):
-    """α for the classes that maximise E[Σ r + α H(π)].
+class SoftActorCritic(LagrangianReplay):
+    """For the classes that maximise E[Σ r + α H(π)].
+
+    A leaf says what its critics are: one estimate a network (SAC), or quantiles (TQC).
 
     SB3 learns log α from 0, at ``learning_rate``: where a step's reward is 0.02, the policy stays
     random for the 14,000 gradient steps in which α falls from 1. With ``"auto_reward"`` α begins at
@@ -26,6 +29,12 @@ class Temperature(LagrangianReplay):
 
     ent_coef: str | float
     target_entropy: str | float
+    batch_norm_stats: list[th.Tensor]
+    batch_norm_stats_target: list[th.Tensor]
+    target_update_interval: int
+    actor: Any
+    critic: Any
+    critic_target: Any
     log_ent_coef: th.Tensor | None
     ent_coef_optimizer: th.optim.Adam | None
     ent_coef_tensor: th.Tensor
@@ -82,3 +91,58 @@ class Temperature(LagrangianReplay):
         loss.backward()
         self.ent_coef_optimizer.step()
         return {"ent_coef": alpha.item(), "ent_coef_loss": loss.item()}, alpha
+
+    def next_values(self, values: Any) -> th.Tensor:
+        """Estimates of the next state's value that the critics learn from, shape [B, K].
+
+        :param values: what the target critics say
+        """
+        raise NotImplementedError
+
+    def critic_loss(self, values: Any, target: th.Tensor) -> th.Tensor:
+        """The loss of the critics' ``values`` against targets of shape [B, K]."""
+        raise NotImplementedError
+
+    def estimate(self, values: Any) -> th.Tensor:
+        """What the actor climbs of the critics' ``values``, shape [B, 1]."""
+        raise NotImplementedError
+
+    def expected(self, values: Any) -> th.Tensor:
+        """An estimate of Q that the unit of rewards is measured by, shape [B, 1]."""
+        return self.estimate(values)
+
+    def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
+        """SB3's order: entropy coefficient, critics, actor, targets."""
+        if self.use_sde:
+            self.actor.reset_noise()
+        actions, log_prob = self.actor.action_log_prob(batch.observations)
+        log_prob = log_prob.reshape(-1, 1)
+        logs, alpha = self.fit_temperature(log_prob.detach())
+
+        with th.no_grad():
+            next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
+            after = self.next_values(self.critic_target(batch.next_observations, next_actions))
+            after = after - alpha * next_log_prob.reshape(-1, 1)
+            target = batch.rewards + (1 - batch.dones) * self.gamma * after
+        values = self.critic(batch.observations, batch.actions)
+        critic_loss = self.critic_loss(values, target)
+        self.critic.optimizer.zero_grad()
+        critic_loss.backward()
+        self.critic.optimizer.step()
+        logs["critic_loss"] = critic_loss.item()
+        logs["cost_critic_loss"] = self.fit_cost_critic(batch, next_actions)
+
+        self.actor.optimizer.zero_grad()
+        with self.critics_constant():
+            chosen = self.estimate(self.critic(batch.observations, actions))
+            loss = alpha * log_prob - chosen
+            loss = self.penalized(loss, batch, actions, self.expected(values)).mean()
+            loss.backward()
+        self.actor.optimizer.step()
+        logs["actor_loss"] = loss.item()
+
+        if step % self.target_update_interval == 0:
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+            self.cost_critic.follow(self.tau)
+        return logs

@@ -3,38 +3,37 @@
 import json
 import time
 
-import gymnasium
 import numpy as np
 import onnxruntime
 
-import sb3_guard.envs  # noqa: F401  # the simulation that stands in for the robot
+import sb3_guard  # the simulation that stands in for the robot
 
-with open("contract.json") as file:  # sb3-guard export --pretrained writes both files
-    contract = json.load(file)
-options = onnxruntime.SessionOptions()
-options.intra_op_num_threads = 1
-policy = onnxruntime.InferenceSession("policy.onnx", options)
-period, limits = contract["control_step"], contract["outputs"][0]
-robot, rng = gymnasium.make(contract["trained"]["env"]), np.random.default_rng(0)
-
-latest, _ = robot.reset(seed=0)
-observation, missing, stops, late, costs = latest, 0, 0, 0, []
+contract = json.load(open("contract.json"))  # sb3-guard export --pretrained writes both files
+policy = onnxruntime.InferenceSession("policy.onnx")
+period, bounds, trained = contract["control_step"], contract["outputs"][0], contract["trained"]
+inputs = {part["name"]: part["shape"][1:] for part in contract["inputs"]}
+if other := inputs.keys() - {"observation", "last_cost"} | {*contract["wrappers"]}:
+    raise SystemExit(f"this loop does not compute {', '.join(other)}, which contract.json names")
+padding = contract["frame_stack"]["padding"]["observation"] if contract["frame_stack"] else 0
+first = np.full(inputs["observation"], padding, np.float32)  # frames when an episode begins
+robot = sb3_guard.make(trained["env"], **trained.get("env_kwargs", {}))
+(latest, _), rng = robot.reset(seed=0), np.random.default_rng(0)
+observation, frames, missing, stops, cost, costs = latest, first, 0, 0, 0.0, []
 for _ in range(500):
-    began = time.perf_counter()
-    lost = rng.random() < 0.05  # a sensor that loses one message in twenty
-    missing = missing + 1 if lost else 0
-    observation = observation if lost else latest  # the last one that has arrived
-    action = policy.run(["action"], {"observation": observation[None]})[0][0]
-    late += time.perf_counter() - began > period
-    if missing > 2 or time.perf_counter() - began > period or not np.isfinite(action).all():
+    began, lost = time.perf_counter(), rng.random() < 0.05  # one message in twenty is lost
+    missing, observation = (missing + 1, observation) if lost else (0, latest)
+    frames = np.append(frames[len(latest) :], np.float32(observation))
+    values = {"observation": frames[None], "last_cost": np.float32([[cost]])}
+    action = policy.run(["action"], {name: values[name] for name in inputs})[0][0]
+    late = time.perf_counter() - began > period
+    if missing > 2 or late or not np.isfinite(action).all():
         action, stops = np.zeros_like(action), stops + 1  # the watchdog stops the robot
-    action = np.clip(action, limits["low"], limits["high"])
+    action = np.clip(action, bounds["low"], bounds["high"])
     latest, _, terminated, truncated, info = robot.step(action)
-    costs.append(info["cost"])
+    costs.append(cost := info["cost"])
     if terminated or truncated:
-        latest, _ = robot.reset()
+        (latest, _), frames, cost = robot.reset(), first, 0.0
     time.sleep(max(0.0, began + period - time.perf_counter()))
 np.savetxt("costs.csv", costs)
-limit = contract["costs"][0]
-print(f"cost {sum(costs):.2f} in {len(costs)} steps, limit {limit['limit']} per {limit['per']}")
-print(f"stopped {stops} times, {late} steps were late")
+per = "limit {limit} per {per}".format(**contract["costs"][0])
+print(f"cost {sum(costs):.2f} in {len(costs)} steps, {per}; stopped {stops} times")

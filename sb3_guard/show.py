@@ -21,6 +21,7 @@ from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.rendering import CAMERAS, RenderingError
 from sb3_guard.envs.robots.file_robot import FileRobot
+from sb3_guard.envs.robots.model_file import GAINS, NoActuators
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
@@ -184,9 +185,15 @@ def show(flags: Flags) -> int:
     import_packages(flags.gym_packages)
     file = Path(flags.env)
     if file.suffix in (".xml", ".urdf"):
-        stated = flags.robot_kwargs or {}
+        stated = {**(flags.robot_kwargs or {})}
         with explained("can't show it", ValueError, TypeError, OSError):
-            name, robot = register_file(file, stated)
+            try:
+                name, robot = register_file(file, stated)
+            except NoActuators:
+                stated["actuators"] = GAINS
+                name, robot = register_file(file, stated)
+                print(f"{file} has no actuators, so these position servos stand in; state those of "
+                      f"your robot with --robot-kwargs \"actuators:{GAINS}\"\n")  # fmt: skip
         flags.env = f"Goal_{name}_0Hazards"
         arguments = "".join(f", {key}={value!r}" for key, value in stated.items())
         print(f"sb3_guard.register_robot({name!r}, xml={str(file)!r}{arguments})\n")

@@ -60,6 +60,7 @@ def contract(
         "actions": "sampled" if deployed.acting.actor.sampled else "mean",
         "control_step": step,
         "control_rate": None if step is None else round(1.0 / step, 6),
+        "delay": None if ours is None else _delay(ours.engine.robot),
         "costs": list(_costs(model)),
         "filter": _filter(deployed),
         "frame_stack": _stack(env, deployed),
@@ -67,11 +68,18 @@ def contract(
         "trained": {
             "algorithm": type(model).__name__,
             "env": None if spec is None else spec.id,
+            **({} if ours is None else {"env_kwargs": {"scenario": ours.scenario.to_dict()}}),
             "timesteps": model.num_timesteps,
             "versions": versions,
             **trained,
         },
     }
+
+
+def _delay(robot: Any) -> Any:
+    """Control steps that pass until an action has effect, or the range that they are drawn from."""
+    low, high = robot.ranges.get("delay", 2 * (getattr(robot, "delay", 0),))
+    return low if low == high else [low, high]
 
 
 def _input(name: str, model: BaseAlgorithm, env: VecEnv, deployed: Deployed) -> dict[str, Any]:

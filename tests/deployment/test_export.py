@@ -14,11 +14,13 @@ import pytest
 import torch as th
 from cost_envs import CostPoint, RandomCostEnv
 from gymnasium import spaces
+from robot_models import DOG
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 from torch import nn
+from worlds import own_parts
 
 import sb3_guard
 from sb3_guard import CPO, PPOLag, SACLag, TD3Lag, TQCLag
@@ -315,6 +317,32 @@ def test_the_contract_of_a_robot(tmp_path: Path) -> None:
     )
     model.get_env().step(actions)
     np.testing.assert_allclose(control, engine.batch.bind("ctrl"), atol=1e-6)
+
+
+def test_the_contract_of_a_file_names_joints_units_and_delay(tmp_path: Path) -> None:
+    (tmp_path / "dog.xml").write_text(
+        DOG.format(keys="").replace('<joint name="fan"/>', '<joint name="fan" type="slide"/>')
+    )
+    servos = {"*_thigh": {"kp": 40, "kd": 2}, "front_calf": {"kp": 40, "kd": 2}}
+    stated = {"root": "trunk", "actuators": servos, "pose": {"*_thigh": 0.5, "front_calf": -1}}
+    with own_parts():
+        sb3_guard.register_robot("Dog", xml=tmp_path / "dog.xml", **stated)
+        kwargs = {"robot": {"delay": 2}, "hazards": None}
+        model = sb3_guard.make_model("cpo", "Goal_Dog_1Hazards", env_kwargs=kwargs, n_envs=2)
+        contract = sb3_guard.export(model, tmp_path / "policy.onnx")
+        drawn = {"robot": {"delay": {"low": 0, "high": 3}}, "hazards": None}
+        model = sb3_guard.make_model("cpo", "Goal_Dog_1Hazards", env_kwargs=drawn, n_envs=2)
+        assert sb3_guard.export(model, tmp_path / "policy.onnx")["delay"] == [0, 3]
+        trained_in = contract["trained"]
+        env = sb3_guard.make(trained_in["env"], **trained_in["env_kwargs"])
+        assert env.unwrapped.scenario.robot_params == {"delay": 2}
+    assert contract["delay"] == 2
+    parts = {part["name"]: part for part in contract["inputs"][0]["components"]}
+    joints = ["front_thigh", "front_calf", "back_thigh"]
+    assert parts["joint_pos"]["joints"] == joints
+    assert (parts["joint_pos"]["first_pose"], parts["joint_pos"]["unit"]) == ([0.5, -1, 0.5], "rad")
+    assert parts["joint_vel"]["joints"] == [*joints, "fan"]
+    assert parts["joint_vel"]["unit"] == ["rad/s", "rad/s", "rad/s", "m/s"]
 
 
 def test_operators_of_a_plain_policy_are_few(plain: tuple[Any, Path]) -> None:

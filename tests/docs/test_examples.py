@@ -8,6 +8,8 @@ from pathlib import Path
 
 import gymnasium
 import nbformat
+import numpy as np
+import onnxruntime
 import pytest
 from nbclient import NotebookClient
 from safety_stub import install
@@ -27,7 +29,7 @@ SAYS = {
     "custom_robot": (["26 observations, 2 actions", "return "], ["puck.xml"]),
     "custom_task": (["metres: ["], []),
     "deploy": (
-        ["limit 5.0 per episode", "stopped "],
+        ["limit 5.0 per episode; stopped "],
         ["contract.json", "costs.csv", "policy.onnx"],
     ),
     "domain_randomization": (["drawn: {'hazards.num': ", "mass × 0.5: ", "mass × 2.0: "], []),
@@ -112,6 +114,73 @@ def test_example(name, quick, monkeypatch, capsys):
         while text not in lines.pop(0):
             assert lines, f"{name} does not say {text!r}"
     assert sorted(one.name for one in quick.iterdir()) == leaves
+
+
+DEPLOY = (EXAMPLES / "deploy.py").read_text()
+CONTRACT = {
+    "control_step": 10.0,
+    "wrappers": [],
+    "costs": [{"limit": 2.0, "per": "episode"}],
+    "frame_stack": {"frames": 3, "padding": {"observation": 0.5}},
+    "trained": {
+        "env": "Goal_Point_8Hazards-v0",
+        "env_kwargs": {"hazards": None, "speed": {"limit": 0.01}},
+    },
+}
+
+
+class Recorded:
+    """A session that notes what it is given."""
+
+    def __init__(self, path):
+        self.seen = []
+
+    def run(self, names, values):
+        self.seen.append(values)
+        return [np.ones((1, 2), np.float32)]
+
+
+def test_the_loop_around_a_policy_stacks_frames_and_knows_the_last_cost(quick, monkeypatch):
+    env = gymnasium.make("Goal_Point_8Hazards-v0", hazards=None, speed={"limit": 0.01})
+    observation, _ = env.reset(seed=0)
+    size = len(observation)
+    shapes = {"observation": 3 * size, "last_cost": 1}
+    inputs = [{"name": name, "shape": ["batch", n]} for name, n in shapes.items()]
+    outputs = [{"name": "action", "low": [-1.0, -1.0], "high": [1.0, 0.5]}]
+    (quick / "contract.json").write_text(
+        json.dumps({**CONTRACT, "inputs": inputs, "outputs": outputs})
+    )
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Recorded)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    code = DEPLOY.replace("range(500)", "range(12)").replace("rng.random() < 0.05", "False")
+    exec(compile(code, "deploy.py", "exec"), names := {})
+    frames, cost = np.full(3 * size, 0.5, np.float32), 0.0
+    for step, values in enumerate(names["policy"].seen):
+        frames = np.append(frames[size:], observation)
+        np.testing.assert_array_equal(values["observation"], frames[None])
+        np.testing.assert_array_equal(values["last_cost"], np.float32([[cost]]))
+        observation, _, _, truncated, info = env.step(np.array([1.0, 0.5]))
+        cost = info["cost"]
+        assert truncated == (step == 9)
+        if truncated:
+            (observation, _), frames, cost = env.reset(), np.full(3 * size, 0.5, np.float32), 0.0
+    assert step == 11 and any(names["costs"])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"inputs": [{"name": "noise", "shape": ["batch", 2]}]}, "does not compute noise, which"),
+        ({"wrappers": ["MaxCost"]}, "does not compute MaxCost, which contract.json names"),
+    ],
+)
+def test_it_says_what_it_does_not_compute(change, words, quick, monkeypatch):
+    inputs = [{"name": "observation", "shape": ["batch", 3]}]
+    contract = {**CONTRACT, "inputs": inputs, "outputs": [{}], **change}
+    (quick / "contract.json").write_text(json.dumps(contract))
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Recorded)
+    with pytest.raises(SystemExit, match=words):
+        exec(compile(DEPLOY, "deploy.py", "exec"), {})
 
 
 NOTEBOOK = EXAMPLES / "quickstart.ipynb"

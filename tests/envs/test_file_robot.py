@@ -7,6 +7,7 @@ from robot_models import ARM, DOG
 from worlds import assert_rows_are_lone_environments, own_parts
 
 from sb3_guard.envs import Scenario, register_robot
+from sb3_guard.envs.components import components
 from sb3_guard.envs.registry import ROBOTS
 
 ROW = np.zeros(1, dtype=int)
@@ -104,6 +105,42 @@ def test_what_refers_to_the_world_is_left_out(dog):
     assert left_out <= {*ROBOTS["Dog"].file.left_out}
 
 
+def test_tendons_and_actuators_to_places_of_the_world_are_left_out(dog):
+    referring = """<site name="mark"/></worldbody>
+      <tendon>
+        <spatial name="leash" limited="true" range="0 9">
+          <site site="mark"/><site site="imu"/>
+        </spatial>
+        <fixed name="thighs"><joint joint="front_thigh" coef="1"/></fixed>
+      </tendon>
+      <equality><tendon name="taut" tendon1="leash"/></equality>
+      <actuator>
+        <motor name="winch" tendon="leash" ctrlrange="0 1"/>
+        <motor name="crane" site="imu" refsite="mark" ctrlrange="0 1"/>
+        <motor name="thrust" site="imu" ctrlrange="0 1"/>
+        <motor name="both" tendon="thighs" ctrlrange="0 1"/>
+      </actuator>
+      <sensor>
+        <tendonpos name="length" tendon="leash"/><actuatorfrc name="pull" actuator="winch"/>
+      </sensor>"""
+    engine = dog(lambda text: text.replace("</worldbody>", referring), actuators=None)
+    model = engine.model
+    actuators = [model.actuator(i).name.removeprefix("robot/") for i in range(model.nu)]
+    assert (actuators, model.ntendon, model.neq) == (["thrust", "both"], 1, 0)
+    assert not {"length", "pull"} & {*engine.observation_layout}
+    left_out = {"tendon leash", "equality taut", "actuator winch", "actuator crane"}
+    assert left_out | {"sensor length", "sensor pull"} <= {*ROBOTS["Dog"].file.left_out}
+
+
+def test_a_keyframe_that_tilts_the_robot_counts_as_tilt(dog):
+    tilted = KEY.format(name="home", z=0.7, thigh=0.3).replace("0.7 1 0 0 0", "0.7 0.96 0.28 0 0")
+    dog(keys=tilted)
+    engine = Scenario(robot="Dog", constraints={"basetilt": {"limit": 1.0}}).build(2)
+    engine.reset(np.arange(2))
+    (tilt,) = engine.constraints
+    np.testing.assert_allclose(tilt.amount(), 2 * np.arctan2(0.28, 0.96))
+
+
 def test_only_the_robot_is_taken_from_a_world(dog):
     engine = dog()
     model = engine.model
@@ -195,6 +232,26 @@ def test_joints_of_an_observation_are_named_in_their_order(dog):
     assert robot.joints_of("joint_turn") == {"joints": ["fan"], "first_pose": [0.0]}
     assert robot.joints_of("joint_vel") == {"joints": [*names, "fan"]}
     assert robot.joints_of("gravity") == {}
+
+
+def test_each_number_of_hinges_and_slides_has_its_unit(dog):
+    def change(text):
+        slide = '<joint name="back_thigh" type="slide" axis="0 0 1" range="-1 1"'
+        return text.replace('<joint name="back_thigh" axis="0 1 0" range="-45 90"', slide)
+
+    sensors = """<sensor>
+      <jointpos name="low" joint="back_thigh"/><jointvel name="sinks" joint="back_thigh"/>
+      <framezaxis name="up" objtype="site" objname="imu"/>"""
+    engine = dog(lambda text: change(text).replace("<sensor>", sensors))
+    units = {part.name: part.unit for part in components(engine)}
+    assert (units["low"], units["sinks"], units["up"]) == ("m", "m/s", "direction")
+    assert (units["joint_pos"], units["joint_vel"]) == ("rad", "rad/s")  # the slide has sensors
+    engine = dog(change, observe=["joint_pos", "joint_vel"])
+    units = {part.name: part.unit for part in components(engine)}
+    assert (units["joint_pos"], units["joint_vel"]) == ("rad, m", "rad/s, m/s")
+    robot = engine.robot
+    assert robot.joints_of("joint_pos")["unit"] == ["rad", "rad", "m"]
+    assert robot.joints_of("joint_vel")["unit"] == ["rad/s", "rad/s", "m/s", "rad/s"]
 
 
 def test_observe_chooses(dog):
@@ -304,6 +361,11 @@ def with_slide(text):
     return text.replace('<joint name="fan"/>', '<joint name="fan" type="slide"/>')
 
 
+def with_keyframe(text):
+    key = KEY.format(name="home", z=0.7, thigh=0.3).replace("-1 0.2 0", "-1 -1 0")
+    return text.replace("<keyframe>", f"<keyframe>{key}")
+
+
 def with_motor(text):
     return text.replace("<sensor>", '<actuator><motor joint="fan"/></actuator><sensor>')
 
@@ -322,6 +384,11 @@ def with_motor_in_range(text):
         (nothing, {"root": 3}, "root = 3 must be the name of an outermost body"),
         (without_joints, {"root": None}, "no body with joints: a robot needs joints to move by"),
         (nothing, {"keyframe": "home"}, r"no keyframe 'home': it has none; pose={...} sets joints"),
+        (
+            with_keyframe,
+            {},
+            r"keyframe 'home' of .* 'back_thigh' at -1, .* -0.785398 to 1.5708: .*pose={'back_thi",
+        ),
         (
             nothing,
             {"pose": {"*_knee": 0.1}},

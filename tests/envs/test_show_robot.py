@@ -52,10 +52,20 @@ def test_an_arm_says_how_far_it_reaches(run):
     assert "none, it stands on a fixed base" in out
 
 
+def test_a_file_without_actuators_is_shown_with_servos_that_stand_in(run, tmp_path):
+    status, out, _ = run("my_dog.xml", "--robot-kwargs", "root:'trunk'")
+    assert status == 0 and (tmp_path / "picture.png").is_file()
+    assert out.startswith(
+        "my_dog.xml has no actuators, so these position servos stand in; state those of your robot "
+        "with --robot-kwargs \"actuators:{'kp': 35, 'kd': 1}\"\n"
+    )
+    assert "xml='my_dog.xml', root='trunk', actuators={'kp': 35, 'kd': 1})" in out
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["crane.xml"], "crane.xml has no actuators: give its joints position servos, actuators="),
+        (["crane.xml"], "crane.xml stands on a fixed base, .* name its end effector, .*='hand'"),
         (["dog.urdf"], "dog.urdf is URDF, not MJCF: convert it once with"),
         (["none.xml"], "there is no file 'none.xml'"),
         (["my_dog.xml"], "2 outermost bodies with joints, 'trunk', 'ball': .* root='trunk'"),

@@ -84,6 +84,9 @@ class FileRobot(MJCFRobot):
         self._axes = self._xmat[:, root]  # [N, 3, 3], body to world
         self._spin = batch.bind("cvel")[:, root, :3]
         self._wanted = self._choose(model)
+        self._unit_of = {
+            name: ", ".join(dict.fromkeys(self._units(name))) for name in ("joint_pos", "joint_vel")
+        }
         if not self.file.base:
             self._bind_links(model)
 
@@ -226,28 +229,40 @@ class FileRobot(MJCFRobot):
         """The joints of a computed observation in its order, for the loop around a policy.
 
         :param name: of the observation
-        :return: ``joints``, and of positions ``first_pose``, qpos that they are relative to, rad or
-            m; empty of other observations
+        :return: ``joints``, of positions ``first_pose``, qpos that they are relative to, rad or m,
+            and of hinges with slides ``unit``, that of each number; empty of other observations
         """
-        if name in {sensor for sensor, _, _ in self._sensors}:
+        first = {"joint_pos": self._places, "joint_turn": [*self._hinged, *self._round]}
+        if name not in (*first, "joint_vel") or name in {sensor for sensor, _, _ in self._sensors}:
             return {}
+        model, ids = self.sim.model, self._joints(name)
+        joints = {"joints": [model.joint(i).name.removeprefix(self._prefix) for i in ids]}
+        units = self._units(name)
+        if len(set(units)) > 1:
+            joints["unit"] = units
+        # a ball's rotation is as it is
+        relative = name in first and not (name == "joint_turn" and self._round)
+        return joints | ({"first_pose": self._start[first[name]].tolist()} if relative else {})
+
+    def _joints(self, name: str) -> list[int]:
+        """The joint of each number of ``joint_pos`` or ``joint_vel``; those of ``joint_turn``."""
         model = self.sim.model
         if name == "joint_vel":
-            ids = [int(model.dof_jntid[dof]) for dof in self._speeds]
-        elif name in ("joint_pos", "joint_turn"):
-            first = self._places if name == "joint_pos" else [*self._hinged, *self._round]
-            ids = [model.jnt_qposadr.tolist().index(place) for place in first]
-        else:
-            return {}
-        names = [model.joint(i).name.removeprefix(self._prefix) for i in ids]
-        if name == "joint_vel":
-            return {"joints": names}
-        if name == "joint_turn" and self._round:  # a ball's rotation is as it is
-            return {"joints": names}
-        return {"joints": names, "first_pose": self._start[first].tolist()}
+            return [int(model.dof_jntid[dof]) for dof in self._speeds]
+        first = self._places if name == "joint_pos" else [*self._hinged, *self._round]
+        return [model.jnt_qposadr.tolist().index(place) for place in first]
+
+    def _units(self, name: str) -> list[str]:
+        """Of each number of ``joint_pos`` or ``joint_vel``."""
+        if name == "joint_turn":
+            return []
+        slides = [self.sim.model.jnt_type[joint] == SLIDE for joint in self._joints(name)]
+        over = "/s" if name == "joint_vel" else ""
+        return [("m" if slide else "rad") + over for slide in slides]
 
     def _joint_pos(self) -> Values:
-        return Values(self._qpos[:, self._places] - self._start[self._places], unit="rad, m")
+        positions = self._qpos[:, self._places] - self._start[self._places]
+        return Values(positions, unit=self._unit_of["joint_pos"])
 
     def _joint_turn(self) -> Values:
         turns = self._qpos[:, self._hinged] - self._start[self._hinged]
@@ -257,7 +272,7 @@ class FileRobot(MJCFRobot):
         return Values(np.concatenate(columns, axis=1), -1.0, 1.0, "sin, cos")
 
     def _joint_vel(self) -> Values:
-        return Values(self._qvel[:, self._speeds], unit="rad/s, m/s")
+        return Values(self._qvel[:, self._speeds], unit=self._unit_of["joint_vel"])
 
     def _base_linvel(self) -> Values:
         return Values(np.einsum("nij,ni->nj", self._axes, self.velocity), unit="m/s")

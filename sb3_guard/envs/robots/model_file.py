@@ -15,12 +15,18 @@ import mujoco
 
 from sb3_guard.envs.robots import mjcf
 from sb3_guard.envs.robots.measure import lowest
+from sb3_guard.envs.robots.references import drop_references
 from sb3_guard.envs.types import Array
 from sb3_guard.spelling import did_you_mean, matching
 
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+ROUNDED = 1e-3  # rad or m by which a keyframe may be out of a joint's range
 GAINS = {"kp": 35, "kd": 1}  # of the examples in messages, N m / rad and N m s / rad
+
+
+class NoActuators(ValueError):
+    """Nothing in a file moves the robot, and no gains were given."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +180,7 @@ def _check_commanded(spec: mujoco.MjSpec, path: Path, root: str) -> None:
                 f"no action commands: take the weld out and {servos}"
             )
     if not spec.actuators:
-        raise ValueError(f"{path} has no actuators: {servos}")
+        raise NoActuators(f"{path} has no actuators: {servos}")
 
 
 def _keyframe(spec: mujoco.MjSpec, path: Path, keyframe: str | None) -> str | None:
@@ -225,7 +231,7 @@ def _start(
 ) -> dict[str, Array]:
     """qpos of the robot's joints when an episode begins.
 
-    :raises ValueError: the pose names no joint, or is out of a joint's range
+    :raises ValueError: the pose names no joint, or it or the keyframe is out of a joint's range
     """
     start = {name: _slice(model, model.joint(name).id, _qpos(model, key)) for name in names}
     for name, (low, high) in limits.items() if key is None else ():
@@ -244,6 +250,12 @@ def _start(
                     f"are {low:g} to {high:g}"
                 )
             start[name][0] = value
+    for name, (low, high) in limits.items():
+        if not low - ROUNDED <= start[name][0] <= high + ROUNDED:
+            raise ValueError(
+                f"keyframe {key!r} of {path} puts joint {name!r} at {start[name][0]:g}, out of its "
+                f"range, {low:g} to {high:g}: set it with pose={{{name!r}: ...}}"
+            )
     return start
 
 
@@ -254,11 +266,14 @@ def _take_out(spec: mujoco.MjSpec, path: Path, root: str) -> tuple[str, ...]:
     """
 
     def names() -> set[str]:
-        kinds = {"actuator": spec.actuators, "sensor": spec.sensors, "equality": spec.equalities}
+        kinds: dict[str, Any] = {
+            "actuator": spec.actuators, "sensor": spec.sensors, "equality": spec.equalities,
+            "tendon": spec.tendons,
+        }  # fmt: skip
         return {f"{kind} {element.name}" for kind, of in kinds.items() for element in of}
 
     before, world, left_out = names(), spec.worldbody, []
-    _drop_references(spec)
+    drop_references(spec)
     for body in world.bodies:
         if body.name != root:
             left_out.append(f"body {body.name}")
@@ -277,23 +292,6 @@ def _take_out(spec: mujoco.MjSpec, path: Path, root: str) -> tuple[str, ...]:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path} needs more than body {root!r}: {reason}") from None
     return (*left_out, *sorted(before - names()))
-
-
-def _drop_references(spec: mujoco.MjSpec) -> None:
-    """Delete what refers to geoms, sites and cameras of the world, as MuJoCo does for bodies."""
-    kinds, world = mujoco.mjtObj, spec.worldbody
-    of_world = {(kinds.mjOBJ_GEOM, geom.name) for geom in world.geoms}
-    of_world |= {(kinds.mjOBJ_SITE, site.name) for site in world.sites}
-    of_world |= {(kinds.mjOBJ_CAMERA, camera.name) for camera in world.cameras}
-    for sensor in spec.sensors:
-        if of_world & {(sensor.objtype, sensor.objname), (sensor.reftype, sensor.refname)}:
-            spec.delete(sensor)
-    for pair in spec.pairs:
-        if of_world & {(kinds.mjOBJ_GEOM, name) for name in (pair.geomname1, pair.geomname2)}:
-            spec.delete(pair)
-    for equality in spec.equalities:
-        if of_world & {(equality.objtype, name) for name in (equality.name1, equality.name2)}:
-            spec.delete(equality)
 
 
 def _add_servos(

@@ -33,7 +33,7 @@ from sb3_guard.envs.layout import Footprint, Rectangle
 from sb3_guard.envs.observation import Observations, Values
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import FRICTION, MASS, Robot, Simulation, World
-from sb3_guard.envs.robots import mjcf
+from sb3_guard.envs.robots import mjcf, sensors
 from sb3_guard.envs.types import Array, Generators
 from sb3_guard.spelling import did_you_mean
 
@@ -41,31 +41,12 @@ Vector = tuple[float, float, float]
 PREFIX = "robot/"
 _SENSOR = mujoco.mjtSensor
 
-# unit and bounds of the sensors that a robot may carry
-_BOUNDS = {
-    _SENSOR.mjSENS_ACCELEROMETER: (-math.inf, math.inf, "m/s²"),
-    _SENSOR.mjSENS_VELOCIMETER: (-math.inf, math.inf, "m/s"),
-    _SENSOR.mjSENS_GYRO: (-math.inf, math.inf, "rad/s"),
-    _SENSOR.mjSENS_MAGNETOMETER: (-math.inf, math.inf, "T"),
-    _SENSOR.mjSENS_TOUCH: (0.0, math.inf, "N"),
-    _SENSOR.mjSENS_JOINTVEL: (-math.inf, math.inf, "rad/s"),
-    _SENSOR.mjSENS_BALLANGVEL: (-math.inf, math.inf, "rad/s"),
-}
-
 
 def as_slice(ids: list[int]) -> slice | list[int]:
     """Evenly spaced rising indices as a slice, which takes a view; other ones as they are."""
     step = ids[1] - ids[0] if len(ids) > 1 else 1
     even = step > 0 and len(ids) > 0 and ids == list(range(ids[0], ids[-1] + 1, step))
     return slice(ids[0], ids[-1] + 1, step) if even else ids
-
-
-def _is_angle(model: mujoco.MjModel, sensor: str) -> bool:
-    """Whether a sensor gives the position of a hinge, not of a slide, nor anything else."""
-    i = model.sensor(sensor).id
-    hinge = mujoco.mjtJoint.mjJNT_HINGE
-    is_position = model.sensor_type[i] == _SENSOR.mjSENS_JOINTPOS
-    return bool(is_position and model.jnt_type[model.sensor_objid[i]] == hinge)
 
 
 @dataclass
@@ -222,11 +203,11 @@ class MJCFRobot(Robot):
         self._sensors = list(self._read_sensors(model))
         self._data = batch.bind("sensordata")
         self._balls = [(n, w) for n, kind, w in self._sensors if kind == _SENSOR.mjSENS_BALLQUAT]
-        hinges = [(n, w.start) for n, _, w in self._sensors if _is_angle(model, prefix + n)]
+        hinges = [(n, w.start) for n, _, w in self._sensors if sensors.is_angle(model, prefix + n)]
         self._hinges, self._angles = [n for n, _ in hinges], as_slice([i for _, i in hinges])
         self._live = {  # in the order of the file
-            name: Values(self._data[:, where], *_BOUNDS.get(kind, ()))
-            for name, kind, where in self._sensors
+            name: Values(self._data[:, where], *sensors.bounds(model, prefix + name))
+            for name, _, where in self._sensors
         }
 
     def _bind_place(self, sim: Simulation) -> None:

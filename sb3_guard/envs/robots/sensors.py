@@ -1,0 +1,60 @@
+"""Bounds and units of sensors, by type and by what they are on."""
+
+import math
+
+import mujoco
+
+_SENSOR = mujoco.mjtSensor
+_UNITS = {
+    _SENSOR.mjSENS_TOUCH: "N",
+    _SENSOR.mjSENS_ACCELEROMETER: "m/s²",
+    _SENSOR.mjSENS_VELOCIMETER: "m/s",
+    _SENSOR.mjSENS_GYRO: "rad/s",
+    _SENSOR.mjSENS_FORCE: "N",
+    _SENSOR.mjSENS_TORQUE: "N·m",
+    _SENSOR.mjSENS_MAGNETOMETER: "T",
+    _SENSOR.mjSENS_RANGEFINDER: "m",
+    _SENSOR.mjSENS_BALLANGVEL: "rad/s",
+    _SENSOR.mjSENS_FRAMEPOS: "m",
+    _SENSOR.mjSENS_FRAMEQUAT: "quaternion",
+    _SENSOR.mjSENS_FRAMEXAXIS: "direction",
+    _SENSOR.mjSENS_FRAMEYAXIS: "direction",
+    _SENSOR.mjSENS_FRAMEZAXIS: "direction",
+    _SENSOR.mjSENS_FRAMELINVEL: "m/s",
+    _SENSOR.mjSENS_FRAMEANGVEL: "rad/s",
+    _SENSOR.mjSENS_FRAMELINACC: "m/s²",
+    _SENSOR.mjSENS_FRAMEANGACC: "rad/s²",
+    _SENSOR.mjSENS_SUBTREECOM: "m",
+    _SENSOR.mjSENS_SUBTREELINVEL: "m/s",
+    _SENSOR.mjSENS_SUBTREEANGMOM: "kg·m²/s",
+    _SENSOR.mjSENS_GEOMDIST: "m",
+    _SENSOR.mjSENS_CLOCK: "s",
+}
+# of a hinge, of a slide
+_OF_JOINTS = {
+    _SENSOR.mjSENS_JOINTPOS: ("rad", "m"),
+    _SENSOR.mjSENS_JOINTVEL: ("rad/s", "m/s"),
+    _SENSOR.mjSENS_JOINTACTFRC: ("N·m", "N"),
+}
+
+
+def _on_slide(model: mujoco.MjModel, sensor: int) -> bool:
+    return bool(model.jnt_type[model.sensor_objid[sensor]] == mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def is_angle(model: mujoco.MjModel, name: str) -> bool:
+    """Whether a sensor gives the position of a hinge, not of a slide, nor anything else."""
+    sensor = model.sensor(name).id
+    is_position = model.sensor_type[sensor] == _SENSOR.mjSENS_JOINTPOS
+    return bool(is_position and not _on_slide(model, sensor))
+
+
+def bounds(model: mujoco.MjModel, name: str) -> tuple[float, float, str]:
+    """Least and greatest value of a sensor and their unit; "" if it depends on the mechanism."""
+    sensor = model.sensor(name).id
+    kind = _SENSOR(int(model.sensor_type[sensor]))
+    if kind in _OF_JOINTS:
+        unit = _OF_JOINTS[kind][_on_slide(model, sensor)]
+    else:
+        unit = _UNITS.get(kind, "")
+    return 0.0 if kind == _SENSOR.mjSENS_TOUCH else -math.inf, math.inf, unit

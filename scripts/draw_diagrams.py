@@ -1,8 +1,9 @@
 """Draw the diagrams of the pages into docs/images: ``python scripts/draw_diagrams.py``.
 
-``limits`` shows return and cost at each limit of a training, from the logs in docs/data; ``speed``
-steps per second, from the tables of docs/speed.md; ``which_algorithm`` is a flow chart;
-``reward_and_cost`` an annotated picture; ``poster`` has robots, tasks and constraints.
+``limits`` shows return and cost at each limit of a training, and ``costs`` the costs of single
+episodes, from the logs in docs/data; ``speed`` steps per second, from the tables of docs/speed.md;
+``which_algorithm`` is a flow chart; ``reward_and_cost`` an annotated picture; ``poster`` has
+robots, tasks and constraints.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from results import DATA, runs
+from results import DATA, runs, unpacked
 
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
@@ -33,7 +34,7 @@ SUITE = "Goal_Point_8Hazards"
 # Questions of the flow chart, with the answer to yes; REST is the answer to the last no.
 QUESTIONS = (
     ("Is there no limit yet?", "trpo, ppo"),
-    ("Are steps slow and\nactions continuous?", "sac_lag, tqc_lag"),
+    ("Are steps slow and\nactions continuous?", "sac_lag, td3_lag, tqc_lag"),
     ("Must the worst step\nbe bounded?", "scpo"),
     ("Shall a filter stay on\nafter training?", "trpo_usl"),
     ("Do you know PPO, or\ntrain for 1e7 steps?", "ppo_lag, cppo_pid"),
@@ -111,6 +112,30 @@ def speed() -> Figure:
     return figure
 
 
+def costs() -> Figure:
+    """Histograms of the costs of single episodes, with their mean and the limit."""
+    suite, limit, width = "SafetyPointGoal1-v0", 25.0, 5.0
+    figure = Figure(figsize=(WIDTH, 2.8), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    with unpacked("safety_gymnasium") as found:
+        data = Data(found.runs)
+        of = {algo: data.costs_of(suite, algo, "training") for algo in ("ppo", "cpo")}
+    last = width * np.ceil(max(np.percentile(values, 98) for values in of.values()) / width)
+    bins = np.arange(0, last + 1, width)
+    for axis, (algo, values) in zip(panels, of.items(), strict=True):
+        look, share = data.looks[algo], (values > limit).mean()
+        weights = np.full(len(values), 100 / len(values))
+        axis.hist(values.clip(max=last), bins, weights=weights, color=look.color, alpha=0.8)
+        axis.axvline(limit, color=INK, linestyle=(0, (1, 2)), label=f"cost limit, {limit:g}")
+        axis.axvline(values.mean(), color=INK, label="mean")
+        title = f"{look.label}: mean {values.mean():.0f}, {share:.0%} above the limit"
+        axis.set(title=title, xlabel=f"episode cost (last bar: {last - width:g} and more)")
+    panels[0].set_ylabel("% of the episodes")
+    handles, labels = panels[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2)
+    return figure
+
+
 def which_algorithm() -> Figure:
     """A column of questions: yes leads to the right, no down."""
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
@@ -181,7 +206,7 @@ def poster() -> Figure:
 
 DIAGRAMS: dict[str, Callable[[], Figure]] = {
     function.__name__: function
-    for function in (limits, speed, which_algorithm, reward_and_cost, poster)
+    for function in (limits, speed, costs, which_algorithm, reward_and_cost, poster)
 }
 
 

@@ -149,6 +149,13 @@ def test_pareto_names_the_points_and_shades_the_infeasible_side(small):
     assert POINT in axis.get_title() and "seed" in axis.get_title() and "steps" in axis.get_title()
 
 
+def test_curves_and_pareto_say_seeds_and_steps(small):
+    for kind in ("curves", "pareto"):
+        (drawing,) = draw(kind, read(small))
+        titles = [axis.get_title() for axis in drawing.figure.axes]
+        assert f"{POINT}: 2 seeds, 600 steps" in titles
+
+
 def test_pareto_shows_an_outlier_at_the_edge(small):
     fake_run(small, "pcpo", cost=1000.0, returns=7.0)
     (drawing,) = draw("pareto", read(small))

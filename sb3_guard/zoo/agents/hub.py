@@ -43,7 +43,7 @@ Cost is the undiscounted sum of `info["cost"]` over an episode{limit}.
 ## Play it
 
 ```bash
-pip install sb3-guard   # or, in a clone of its repository: pip install .
+pip install .   # in a clone of sb3_guard's repository
 sb3-guard hub load --repo-id {repo_id} --algo {algo} --env {env} -f logs
 sb3-guard enjoy --algo {algo} --env {env} -f logs{packages}
 ```

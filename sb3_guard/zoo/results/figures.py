@@ -146,11 +146,7 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
             row[cost], row["J_r"], row["J_r_std"], row[f"{cost}_std"], markersize=8.5,
             elinewidth=0.9, capsize=2, zorder=3, **style,
         )  # fmt: skip
-    seeds, steps = means["seeds"].astype(int), means["steps"].max()
-    number = f"{seeds.min()}" if seeds.nunique() == 1 else f"{seeds.min()} to {seeds.max()}"
-    plural = "" if seeds.max() == 1 else "s"
-    title = f"{suite}: {number} seed{plural}, {EngFormatter(sep='')(steps)} steps"
-    axis.set(xlabel=cost_name(cost), ylabel="return", title=title)
+    axis.set(xlabel=cost_name(cost), ylabel="return", title=title_of(data, suite))
     axis.margins(0.08)
     fit_costs(axis, [means[cost], limit], "x")
     end = axis.get_xlim()[1]
@@ -211,7 +207,12 @@ def finish(figure: Figure, missing: str) -> None:
         figure.supxlabel(text, x=0.01, ha="left", fontsize=7, alpha=0.8)
 
 
-# Figures
+def title_of(data: Data, suite: str) -> str:
+    """An environment, with the number of seeds and the longest training of its runs."""
+    means = data.means[data.means["suite"] == suite]
+    few, many = int(means["seeds"].min()), int(means["seeds"].max())
+    seeds = f"{many} seed{'s' * (many > 1)}" if few == many else f"{few} to {many} seeds"
+    return f"{suite}: {seeds}, {EngFormatter(sep='')(means['steps'].max())} steps"
 
 
 def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
@@ -229,7 +230,7 @@ def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
                 axis.set_axis_off()
             else:
                 draw_curves(axis, data, suite, metric)
-        row[1].set_title(suite, fontweight="bold")
+        row[1].set_title(title_of(data, suite), fontweight="bold")
     return figure
 
 

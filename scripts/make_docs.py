@@ -117,7 +117,7 @@ def parameters_of_environments() -> str:
     parts += ["## Drawn anew in each episode", table(["parameter", "of", "what it is"], rows)]
     rows = [[f"`{name}`", escaped(default), escaped(meaning)]
             for name, (default, meaning) in ATTRIBUTES.items()]  # fmt: skip
-    parts += ["## `register_robot`", "Arguments beside `xml`: what the robot's file does not say."]
+    parts += ["## `register_robot`", "Further arguments: what the file of the robot does not say."]
     parts += [table(["argument", "default", "what it is"], rows)]
     return "\n\n".join(parts) + "\n"
 

@@ -192,7 +192,9 @@ def test_the_bandit_ends_at_its_constrained_optimum(cls: type[TrustRegion], seed
     assert 1 - np.sum((action - bandit.target) ** 2) >= 0.95 * best
 
 
-@pytest.mark.parametrize("cls", [CPO, PCPO, TRPOLag])
+@pytest.mark.parametrize(
+    "cls", [CPO, *(pytest.param(cls, marks=pytest.mark.slow) for cls in (PCPO, TRPOLag))]
+)
 def test_at_least_so_much_is_a_negative_limit(cls: type[TrustRegion]) -> None:
     """At least 1 of a₁ + a₂, reported as its negative, where the reward alone leads to 0.4."""
 

@@ -284,17 +284,15 @@ class Toll(CostPoint):
         return observation, reward, terminated, truncated, {"cost": 1.0}
 
 
-@pytest.mark.parametrize(
-    ("cls", "least"),
-    [(CPO, 1.5), (PCPO, 1.5), (TRPOLag, 1.5), (TRPOFAC, 1.5), (TRPOIPO, 1.5), (PPOLag, 1.5)],
-)
-def test_a_violation_that_nothing_changes_does_not_end_learning(
-    cls: type[CostRollouts], least: float
-) -> None:
+SLOW = [pytest.param(cls, marks=pytest.mark.slow) for cls in (PCPO, TRPOLag, TRPOFAC, TRPOIPO)]
+
+
+@pytest.mark.parametrize("cls", [CPO, PPOLag, *SLOW])
+def test_a_violation_that_nothing_changes_does_not_end_learning(cls: type[CostRollouts]) -> None:
     """TRPO's return is 1.8 here; following the critic of cost alone it stays at 0."""
     model = cls("MlpPolicy", make_vec_env(Toll, 8, seed=0), n_steps=100, cost_limit=5.0, seed=0)
     model.learn(12_000)
-    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > least
+    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 1.5
 
 
 class Lottery(Toll):

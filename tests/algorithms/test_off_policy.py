@@ -531,7 +531,8 @@ def test_a_cost_that_nothing_changes_has_no_price(cls: Any, cut: bool) -> None:
     assert (prices[0] == 0.0) == cut and prices[1] > 0.0
 
 
-@shared
+@pytest.mark.slow
+@pytest.mark.parametrize("cls", [TD3Lag, SACLag, TQCLag])
 def test_it_finds_a_known_optimum(cls: Any) -> None:
     """Defaults but for a small network and a high rate, which spare time."""
     problem, steps = problems()["bandit"], 8_000

@@ -179,7 +179,7 @@ def test_layouts_are_distributed_alike(name):
     assert max(gaps.values()) < 0.13, gaps  # chance passes one of them once in 10,000
 
 
-@pytest.mark.parametrize("name", ["PointButton1", "PointButton2"])
+@pytest.mark.parametrize("name", ["PointButton1", pytest.param("PointButton2", marks=SLOW)])
 def test_the_robot_of_button_begins_as_far_from_the_middle(name):
     """Of 1,000 new episodes, against 1,000; it is drawn first, and few layouts succeed."""
     *layouts_of_both, kinds = layouts(name, 1000)

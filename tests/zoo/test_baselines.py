@@ -18,6 +18,9 @@ TOY = "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_le
 SMALL = "--seed 3 --checkpoint-every 0 --verbose 0 --device cpu --eval-episodes 2".split()
 ON_POLICY = ["n_envs:2", "n_steps:30"]
 OFF_POLICY = ["n_envs:2", "buffer_size:500", "learning_starts:40", "batch_size:16"]
+OFF_POLICY += ["policy_kwargs:{'net_arch':[16]}"]
+NOISY = ["gradient_steps:2", "noise_type:ornstein-uhlenbeck"]
+SLOW = pytest.mark.slow
 PARAMS = {
     "a2c": ON_POLICY,
     "ppo": [*ON_POLICY, "batch_size:20", "n_epochs:2"],
@@ -39,10 +42,7 @@ def arguments(algo: str, folder: Path, *more: str) -> list[str]:
 
 @pytest.mark.parametrize(
     "algo",
-    [
-        algo if algo in ("ppo_lstm", "sac") else pytest.param(algo, marks=pytest.mark.slow)
-        for algo in PARAMS
-    ],
+    [algo if algo in ("ppo_lstm", "sac") else pytest.param(algo, marks=SLOW) for algo in PARAMS],
 )
 def test_trains_with_costs_logged(algo, tmp_path):
     extra = ["--eval-freq", "60", "--log-interval", "1"]
@@ -62,11 +62,11 @@ def test_trains_with_costs_logged(algo, tmp_path):
     ("algo", "more"),
     [
         ("ppo", []),
-        ("sac", ["use_sde:True"]),
-        pytest.param("td3", [], marks=pytest.mark.slow),
+        pytest.param("sac", ["use_sde:True"], marks=SLOW),
+        pytest.param("td3", [], marks=SLOW),
         ("sac_lag", ["use_sde:True", *COSTLY]),
-        ("td3_lag", ["gradient_steps:2", "noise_type:ornstein-uhlenbeck", *COSTLY]),
-        ("tqc_lag", COSTLY),
+        pytest.param("td3_lag", [*NOISY, *COSTLY], marks=SLOW),
+        pytest.param("tqc_lag", COSTLY, marks=SLOW),
     ],
 )
 def test_killed_and_resumed(algo, more, tmp_path, monkeypatch):

@@ -50,7 +50,7 @@ def test_entries_hold_only_what_depends_on_the_environment(algo: str, env_id: st
 def shortened(algo: str) -> dict[str, Any]:
     """What makes an update short."""
     if issubclass(ALGORITHMS[algo], CostReplay):
-        return {"n_envs": N_ENVS, "learning_starts": 200, "buffer_size": 10_000}
+        return {"n_envs": N_ENVS, "learning_starts": 360, "buffer_size": 10_000}
     return {"n_envs": N_ENVS, "n_steps": ROLLOUT}
 
 

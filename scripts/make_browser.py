@@ -11,6 +11,8 @@ import argparse
 import json
 import shutil
 import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,18 +20,19 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from sb3_guard.costs import verdict
 from sb3_guard.envs import GuardEnv, env_spec
 from sb3_guard.envs.constraints.obstacles import Obstacles
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.observation import Compass, Lidar, Scan
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
 from sb3_guard.envs.tasks.goal import Goal
+from sb3_guard.zoo.results.statistics import interval
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "docs" / "browser"
 OUTPUT = ROOT / "docs" / "_build" / "html" / "browser"
 MODULES = ROOT / "docs" / "_build" / "npm"  # outside of the sources
-ENVS = ("Goal_Point_8Hazards-v0", "SafetyPointGoal1-v0")
 #: Trainings of the agents at each cost limit of an episode; None: without a limit.
 LIMITS: dict[str, tuple[float | None, ...]] = {
     "Goal_Point_8Hazards-v0": (None, 10, 5, 2),
@@ -41,18 +44,70 @@ LIDAR = ("bins", "falloff", "gain", "range", "alias")
 APART = 3  # control steps between two recorded ones
 
 
+def stem(env: str, limit: float | None) -> str:
+    """Name of the folder of a training, and of its agent's file."""
+    return f"{env}_{'none' if limit is None else limit}"
+
+
 def trainings() -> Iterator[str]:
-    """The commands that train an agent for each environment and limit, and export it."""
+    """The commands that train an agent for each environment and limit."""
     for env, limits in LIMITS.items():
         for limit in limits:
             algo = "trpo" if limit is None else "cpo"
-            name = f"{env}_{'none' if limit is None else limit}"
             bound = "" if limit is None else f" -params cost_limit:{limit}"
-            yield f"sb3-guard train --algo {algo} --env {env} -n 1e6 --seed 0 -f logs/{name}{bound}"
-            yield (
-                f"sb3-guard export --algo {algo} --env {env} -f logs/{name} "
-                f"-o docs/browser/agents/{name}.onnx"
-            )
+            folder = f"logs/{stem(env, limit)}"
+            yield f"sb3-guard train --algo {algo} --env {env} -n 1e6 --seed 0 -f {folder}{bound}"
+
+
+def measured(episodes: dict[str, list[float]], limit: float | None) -> dict[str, Any]:
+    """Mean return and cost of a policy's final episodes, and whether its limit was kept."""
+    low, high = interval([np.array(episodes["costs"])])
+    return {
+        "episodes": len(episodes["costs"]),
+        "return": round(float(np.mean(episodes["returns"])), 2),
+        "cost": round(float(np.mean(episodes["costs"])), 2),
+        "low": round(low, 2),
+        "high": round(high, 2),
+        "verdict": "" if limit is None else verdict(low, high, limit),
+    }
+
+
+def pack(logs: Path, source: Path = SOURCE) -> None:
+    """Export the agents of finished trainings, and list them with their measured episodes.
+
+    :param logs: the trainings' folders
+    :param source: folder of the page's sources, whose agents are replaced
+    """
+    shutil.rmtree(source / "agents", ignore_errors=True)
+    (source / "agents").mkdir(parents=True)
+    entries = []
+    for env, limits in LIMITS.items():
+        agents = []
+        for limit in limits:
+            name = stem(env, limit)
+            file = next((logs / name).glob("*/*/result.json"), None)
+            if file is None:
+                print(f"{logs / name}: no finished training, left out")
+                continue
+            result = json.loads(file.read_text())
+            with tempfile.TemporaryDirectory() as folder:  # contract.json goes there too
+                exported = Path(folder) / f"{name}.onnx"
+                flags = [
+                    *("--env", env, "--algo", result["algo"], "--folder", str(logs / name)),
+                    *("--n-episodes", "1", "--output", str(exported)),
+                ]
+                subprocess.run([sys.executable, "-m", "sb3_guard.export_agent", *flags], check=True)
+                shutil.copy(exported, source / "agents")
+            agents.append({
+                "limit": limit,
+                "file": f"agents/{name}.onnx",
+                "algorithm": result["label"],
+                "steps": result["n_timesteps"],
+                "sampled": measured(result["final"]["stochastic"], limit),
+                "greedy": measured(result["final"]["greedy"], limit),
+            })  # fmt: skip
+        entries.append({"env": env, "agents": agents})
+    (source / "agents.json").write_text(json.dumps(entries, indent=1) + "\n")
 
 
 def mjcf(engine: Engine) -> str:
@@ -188,7 +243,7 @@ def build(output: Path, number: int = 0) -> None:
     package = MODULES / "node_modules" / "@mujoco" / "mujoco"
     for name in ("mujoco.js", "mujoco.wasm"):
         shutil.copy(package / name, output)
-    for env_id in ENVS:
+    for env_id in LIMITS:
         (output / f"{env_id}.json").write_text(json.dumps(world(env_id)))
         if number:
             (output / f"{env_id}.states.json").write_text(json.dumps(states(env_id, number)))
@@ -198,10 +253,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=OUTPUT, help="folder of the page")
     parser.add_argument("--states", type=int, default=0, help="recorded control steps to add")
-    parser.add_argument("--trainings", action="store_true", help="print commands that make agents")
+    parser.add_argument("--trainings", action="store_true", help="print commands that train agents")
+    parser.add_argument(
+        "--agents", type=Path, help="logs of these trainings, to pack the agents of"
+    )
     args = parser.parse_args()
     if args.trainings:
         print(*trainings(), sep="\n")
+    elif args.agents:
+        pack(args.agents)
     else:
         build(args.output, args.states)
         print(f"wrote {args.output}: python -m http.server -d {args.output}")

@@ -8,6 +8,7 @@ import { World } from "./world.js";
 
 const MOST = 5; // control steps in a frame, on slow devices
 const REST = 4000; // ms that a verdict is shown
+const FINGER = 0.1; // m beside an object at which a finger takes it
 const KEYS = {
   ArrowUp: "up", ArrowDown: "down", ArrowLeft: "left", ArrowRight: "right",
   KeyW: "up", KeyS: "down", KeyA: "left", KeyD: "right",
@@ -22,12 +23,14 @@ const read = async (file) => {
 const picture = new Picture($("canvas"));
 const keys = new Set();
 let mujoco, entries, entry, world, agent, seed = 1;
-let driving = false, paused = false, ended = 0;
-let total, last, poses, held = null, target = null;
+let driving = false, paused = false, ended = 0, asked = 0;
+let total, last, poses, held = null, target = null, moved = false;
+let rival, rivals; // while the reader drives: the agent's world from the same start, and its totals
 let records = new Map();
 
 const limitOf = (a) => (a.limit === null ? "none" : String(a.limit));
-const driver = () => (driving ? "you" : `agent, limit ${limitOf(agent)}`);
+const driver = () =>
+  (driving ? "you" : `agent, limit ${limitOf(agent)}`) + (moved ? ", moved objects" : "");
 
 /** Position and heading of the robot: [x, y, yaw]. */
 function pose() {
@@ -37,12 +40,15 @@ function pose() {
 
 function begin() {
   world.reset(generator(seed));
+  rival.reset(generator(seed));
   picture.clear(world.spec.arena);
   total = { return: 0, cost: 0 };
+  rivals = { return: 0, cost: 0 };
   last = { cost: 0 };
   poses = [pose(), pose()];
   ended = 0;
   held = target = null;
+  moved = false;
   $("verdict").hidden = true;
   show();
 }
@@ -53,30 +59,44 @@ function steering() {
     const [x, y, yaw] = poses[1];
     let turn = Math.atan2(target[1] - y, target[0] - x) - yaw;
     turn = Math.atan2(Math.sin(turn), Math.cos(turn));
-    return [Math.cos(turn), Math.max(-1, Math.min(1, 2 * turn))];
+    const near = Math.min(1, 3 * Math.hypot(target[0] - x, target[1] - y));
+    return [near * Math.cos(turn), near * Math.max(-1, Math.min(1, 2 * turn))];
   }
   const pull = (more, less) => Number(keys.has(more)) - Number(keys.has(less));
   return [pull("up", "down"), pull("left", "right")];
 }
 
+/** Take a control step and add its reward and cost to an episode's. */
+function advance(place, action, sum) {
+  const result = place.step(action);
+  sum.return += result.reward;
+  sum.cost += result.cost;
+  return result;
+}
+
 function step() {
-  const action = driving ? steering() : agent.policy.act(world.observe());
-  last = world.step(action);
-  total.return += last.reward;
-  total.cost += last.cost;
+  last = advance(world, driving ? steering() : agent.policy.act(world.observe()), total);
+  if (driving) advance(rival, agent.policy.act(rival.observe()), rivals);
+  if (last.met && held?.name === "goal") held = null; // the next goal is not in the hand
   poses = [poses[1], pose()];
   picture.note(poses[1], last.cost);
   if (world.steps >= world.spec.steps) finish();
 }
 
+/** Add an episode to those of its driver. */
+function keep(name, sum) {
+  const record = records.get(name) ?? { episodes: 0, return: 0, cost: 0 };
+  record.episodes += 1;
+  record.return += sum.return;
+  record.cost += sum.cost;
+  records.set(name, record);
+}
+
 /** An episode is over: say whether its cost was within the limit. */
 function finish() {
   ended = performance.now();
-  const record = records.get(driver()) ?? { episodes: 0, return: 0, cost: 0 };
-  record.episodes += 1;
-  record.return += total.return;
-  record.cost += total.cost;
-  records.set(driver(), record);
+  keep(driver(), total);
+  if (driving) keep(`agent, limit ${limitOf(agent)}`, rivals);
   const { limit } = agent, kept = limit === null || total.cost <= limit;
   const verdict = limit === null ? "No limit" : kept ? "Limit kept" : "Limit exceeded";
   $("verdict").className = limit === null ? "" : kept ? "kept" : "exceeded";
@@ -89,14 +109,18 @@ function finish() {
   list();
 }
 
-function list() {
-  $("records").replaceChildren(...[...records].map(([name, { episodes, return: sum, cost }]) => {
+/** Put rows of texts into a table. */
+function fill(body, rows) {
+  body.replaceChildren(...rows.map((values) => {
     const row = document.createElement("tr");
-    for (const value of [name, episodes, (sum / episodes).toFixed(1), (cost / episodes).toFixed(1)]) {
-      row.insertCell().textContent = value;
-    }
+    for (const value of values) row.insertCell().textContent = value;
     return row;
   }));
+}
+
+function list() {
+  fill($("records"), [...records].map(([name, { episodes, return: sum, cost }]) =>
+    [name, episodes, (sum / episodes).toFixed(1), (cost / episodes).toFixed(1)]));
 }
 
 function show() {
@@ -104,6 +128,9 @@ function show() {
   $("return").textContent = total.return.toFixed(1);
   $("cost").textContent = total.cost.toFixed(1);
   $("cost").className = $("fill").className = exceeded ? "exceeded" : "";
+  for (const name of ["return", "cost"]) {
+    $(`${name}-agent`).textContent = driving ? `agent ${rivals[name].toFixed(1)}` : "";
+  }
   $("step").textContent = world.steps;
   $("bound").textContent = limitOf(agent);
   const most = Math.max(1.6 * (limit ?? 0), total.cost, 1);
@@ -119,9 +146,27 @@ async function load(chosen) {
 
 /** Choose the agent that was trained with the limit at an index of the slider. */
 async function choose(index) {
-  const chosen = entry.agents[index];
+  const request = ++asked, chosen = entry.agents[index];
   await load(chosen);
-  if (entry.agents.includes(chosen)) seat(chosen);
+  if (request === asked) seat(chosen);
+}
+
+/** What was measured of an agent after its training, which need not keep its limit. */
+function describe({ limit, algorithm, steps, sampled, greedy }) {
+  const cost = ({ cost, low, high }) => `${cost.toFixed(1)} [${low.toFixed(1)}, ${high.toFixed(1)}]`;
+  const says = {
+    kept: "it keeps the limit.",
+    exceeded: "it exceeds the limit.",
+    undecided: "the interval has the limit in it, so whether it keeps the limit is undecided.",
+  }[sampled.verdict];
+  $("agent").textContent = `${algorithm}, ${steps.toLocaleString("en")} training steps. ` +
+    `Trained ${limit === null ? "without a limit" : `at ${limit}`}, its mean cost is ${cost(sampled)}` +
+    `${says ? `: ${says}` : "."}`;
+  const rows = [["sampled", sampled], ["most likely", greedy]];
+  $("measured").caption.textContent = `After training: ${sampled.episodes} episodes each`;
+  fill($("measured").tBodies[0],
+    rows.map(([name, result]) =>
+      [name, result.return.toFixed(1), cost(result), result.verdict || "–"]));
 }
 
 /** Let a loaded agent begin an episode. */
@@ -130,18 +175,18 @@ function seat(chosen) {
   $("limit").value = entry.agents.indexOf(agent);
   $("chosen").textContent = limitOf(agent);
   $("limit").setAttribute("aria-valuetext", limitOf(agent));
-  $("agent").textContent =
-    `The agent: ${agent.algorithm}, ${agent.steps.toLocaleString("en")} training steps. ` +
-    "Its episodes begin again from the same start when you move the slider.";
+  describe(agent);
   begin();
 }
 
 async function enter(chosen) {
-  const spec = await (await read(`${chosen.env}.json`)).json();
-  const first = chosen.agents.at(-1);
-  await load(first);
-  world?.delete(); // from here on nothing waits: the next frame sees the new world as a whole
-  world = new World(mujoco, spec);
+  const request = ++asked, first = chosen.agents.at(-1);
+  const [spec] = await Promise.all([read(`${chosen.env}.json`).then((a) => a.json()), load(first)]);
+  if (request !== asked) return;
+  // from here on nothing waits: the next frame sees the new world as a whole
+  const former = [world, rival];
+  [world, rival] = [new World(mujoco, spec), new World(mujoco, spec)];
+  for (const place of former) place?.delete();
   entry = chosen;
   records = new Map();
   list();
@@ -163,55 +208,65 @@ function drive(on) {
   $("drive").setAttribute("aria-pressed", on);
   $("drive").textContent = on ? "Let the agent drive" : "Drive yourself";
   $("help").textContent = on
-    ? "Arrow keys or W A S D, or hold a place on the floor: the robot drives there."
-    : "Drag a hazard or the goal: the agent reacts.";
+    ? "Arrow keys or W A S D, or hold a place on the floor: the robot drives there. " +
+      "The agent drives from the same start, unseen: its return and cost are below yours."
+    : "Drag a hazard or the goal: the agent reacts. Arrow keys or W A S D: you drive.";
   if (world) begin();
 }
 
-/** The hazard or goal under a place; hazards first, as they are drawn above the goal. */
-function under(place) {
+/** The hazard or goal nearest to a place, if that is inside or, for a finger, beside it. */
+function under([u, v], { pointerType }) {
   const { zones, goal } = world.spec;
+  let nearest = null, least = pointerType === "touch" ? FINGER : 0;
   for (const { name, size } of [...zones, { name: "goal", size: goal.size }]) {
-    const index = world.places[name].findIndex(
-      ([x, y]) => Math.hypot(x - place[0], y - place[1]) < size);
-    if (index >= 0) return { name, index };
+    world.places[name].forEach(([x, y], index) => {
+      const gap = Math.hypot(x - u, y - v) - size;
+      if (gap < least) [nearest, least] = [{ name, index }, gap];
+    });
   }
-  return null;
+  return nearest;
 }
 
 function listen() {
   const canvas = $("canvas");
+  let pointer = null; // the finger or mouse that drags or leads; others are ignored meanwhile
   canvas.addEventListener("pointerdown", (event) => {
-    canvas.setPointerCapture(event.pointerId);
+    if (pointer !== null || event.button !== 0) return;
+    pointer = event.pointerId;
+    canvas.setPointerCapture(pointer);
     const place = picture.point(event);
     if (driving) { target = place; return; }
-    held = under(place);
+    held = under(place, event);
     if (held) {
       const [x, y] = world.places[held.name][held.index];
       held.offset = [x - place[0], y - place[1]];
     }
   });
   canvas.addEventListener("pointermove", (event) => {
+    if (pointer !== null && event.pointerId !== pointer) return;
     const place = picture.point(event), { arena } = world.spec;
     if (target) target = place;
     if (held) {
+      moved = true;
       world.move(held.name, held.index, place.map(
         (value, i) => Math.max(-arena, Math.min(arena, value + held.offset[i]))));
     }
-    canvas.style.cursor = driving ? "crosshair" : held ? "grabbing" : under(place) ? "grab" : "";
+    canvas.style.cursor =
+      driving ? "crosshair" : held ? "grabbing" : under(place, event) ? "grab" : "";
   });
-  for (const name of ["pointerup", "pointercancel"]) {
-    canvas.addEventListener(name, () => { held = target = null; });
-  }
+  canvas.addEventListener("lostpointercapture", (event) => {
+    if (event.pointerId === pointer) pointer = held = target = null;
+  });
   addEventListener("keydown", (event) => {
-    if (!KEYS[event.code] || event.target === $("limit")) return;
+    if (!KEYS[event.code] || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target === $("limit") && event.code.startsWith("Arrow")) return; // they move it
     event.preventDefault();
     keys.add(KEYS[event.code]);
     if (!driving) drive(true);
   });
   addEventListener("keyup", (event) => keys.delete(KEYS[event.code]));
   addEventListener("blur", () => keys.clear());
-  $("limit").addEventListener("change", (event) => choose(Number(event.target.value)).catch(fail));
+  $("limit").addEventListener("input", (event) => choose(Number(event.target.value)).catch(fail));
   $("drive").addEventListener("click", () => drive(!driving));
   $("again").addEventListener("click", begin);
   $("next").addEventListener("click", () => { seed += 1; begin(); });

@@ -8,6 +8,7 @@ filmed is an agent of the package's where there is one, else TRPO from a run in 
 from __future__ import annotations
 
 import argparse
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard import ALGORITHMS, make_vec_env, train
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.envs.suites.velocity import TABLE
-from sb3_guard.zoo.agents.playback import find_pretrained, find_run
+from sb3_guard.zoo.agents.flags import AgentFlags
+from sb3_guard.zoo.agents.playback import find_pretrained, find_run, open_agent
 from sb3_guard.zoo.cli.usage import UsageError
 
 TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
@@ -42,6 +45,8 @@ SAFETY = {
     for task in ("Goal1", "Button1", "Push1", "Circle1", "Run0")
 }
 SAFETY |= {f"velocity_{robot.lower()}": f"Safety{robot}Velocity-v1" for robot in TABLE}
+# Robots of other packages, of examples/robots.py: filmed with CPO's runs in the log folder
+FILES = {"file_go1": "WalkingGo1-v0", "file_yam": "ReachingYam-v0"}
 # Small robots are shown nearer: the middle of a picture that is so many times as large
 ZOOM = {"Arm3": 1.0, "Arm6": 1.0, "Humanoid": 1.3, "Hopper": 1.4}
 
@@ -138,6 +143,11 @@ def clip(env_id: str, path: Path, camera: str, folder: str, seed: int, zoom: flo
     model, deterministic = agent(env_id, folder)
     window = {"width": round(600 * zoom), "height": round(500 * zoom), "camera": camera}
     env = make_vec_env(env_id, seed=seed, env_kwargs=window, render_mode="rgb_array")
+    write_clip(model, env, path, deterministic)
+
+
+def write_clip(model: BaseAlgorithm, env: VecEnv, path: Path, deterministic: bool = True) -> None:
+    """Write a small film of an agent in its environment, which is closed afterwards."""
     rate, smooth = env.envs.metadata["render_fps"], env.envs.film_fps
     every = max(1, round(rate / CLIP_FPS))
     frames: list[np.ndarray] = []
@@ -172,6 +182,17 @@ def clips(output: Path, folder: str, seed: int) -> None:
         clip(f"Goal_Point_8{constraint}-v0", path, "fixed", folder, seed)
 
 
+def file_clips(output: Path, folder: str, seed: int) -> None:
+    """A clip of each robot of another package that examples/robots.py has a task for."""
+    sys.path.append(str(Path(__file__).parents[1] / "examples"))
+    for stem, env_id in FILES.items():
+        window = {"width": 960, "height": 800, "camera": "track"}
+        flags = AgentFlags(env=env_id, folder=folder, seed=seed, env_kwargs=window,
+                           gym_packages=["robots"])  # fmt: skip
+        chosen = open_agent(flags, "rgb_array")
+        write_clip(chosen.model, chosen.env, output / f"{stem}.webp")
+
+
 def save(frames: list[Image.Image], path: Path) -> None:
     """Write a film with one palette for all frames, so that only what moves is written again."""
     palette = Image.fromarray(np.vstack([np.asarray(f) for f in frames[::12]])).quantize(
@@ -188,7 +209,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=3, help="of the pictures")
     parser.add_argument("--film-seed", type=int, help="of the film (default: a typical one)")
     parser.add_argument("--agents", default="logs/gallery", help="log folder")
-    parser.add_argument("--only", choices=["pictures", "clips", "trained"], help="draw these only")
+    parser.add_argument(
+        "--only", choices=["pictures", "clips", "files", "trained"], help="draw these only"
+    )
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
     if args.only in (None, "trained"):
@@ -196,7 +219,9 @@ def main() -> None:
         animation(args.output / "trained.gif", seed)
     if args.only in (None, "clips"):
         clips(args.output, args.agents, args.seed)
-    if args.only in ("clips", "trained"):
+    if args.only in (None, "files"):
+        file_clips(args.output, args.agents, args.seed)
+    if args.only in ("clips", "files", "trained"):
         return
     for robot in guard(ROBOTS):
         path = args.output / f"robot_{robot.lower()}.png"

@@ -23,7 +23,8 @@ def dog(tmp_path):
         path.write_text(change(DOG.format(keys=keys)))
         attributes = {"root": "trunk", "actuators": GAINS} | attributes
         register_robot("Dog", xml=path, **attributes)
-        engine = Scenario.parse("Goal_Dog_2Hazards").override(robot={"heading": 0.0}).build(2)
+        heading = {} if attributes.get("complete") else {"heading": 0.0}
+        engine = Scenario.parse("Goal_Dog_2Hazards").override(robot=heading).build(2)
         for row in range(2):
             engine.seed(row, np.random.default_rng(row))
         engine.reset(np.arange(2))
@@ -254,6 +255,13 @@ def test_each_number_of_hinges_and_slides_has_its_unit(dog):
     assert robot.joints_of("joint_vel")["unit"] == ["rad/s", "rad/s", "m/s", "rad/s"]
 
 
+def test_joints_of_other_bodies_are_not_the_robots(dog):
+    sensed = '<jointpos name="fan_angle" joint="fan"/>'
+    engine = dog(lambda text: text.replace(sensed, ""), complete=True)
+    sizes = {name: channel.size for name, channel in engine.channels.items()}
+    assert (sizes["joint_pos"], sizes["joint_turn"], sizes["joint_vel"]) == (3, 2, 4)
+
+
 def test_observe_chooses(dog):
     engine = dog(observe=("joint_pos", "imu_gyro", "base_angvel"))
     seen = set(engine.observation_layout) - {"goal_compass", "hazards_lidar"}
@@ -366,6 +374,16 @@ def with_keyframe(text):
     return text.replace("<keyframe>", f"<keyframe>{key}")
 
 
+def with_rate(text):
+    servo = '<intvelocity name="fan" joint="fan" kp="3" ctrlrange="-1 1" actrange="-1 1"/>'
+    return text.replace("<sensor>", f"<actuator>{servo}</actuator><sensor>")
+
+
+def of_balls(text):
+    return """<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint/><geom size="0.1"/>
+        <body><joint type="ball"/><geom size="0.05"/></body></body></worldbody></mujoco>"""
+
+
 def with_motor(text):
     return text.replace("<sensor>", '<actuator><motor joint="fan"/></actuator><sensor>')
 
@@ -421,6 +439,9 @@ def with_motor_in_range(text):
         (with_motor, {}, "dog.xml has 1 actuators of its own: leave out actuators="),
         (with_motor, {"actuators": None}, "actuator 'fan' of the robot has no ctrlrange"),
         (with_motor_in_range, {"actuators": None, "action": "offset"}, "actuator 'fan' is none"),
+        (with_rate, {"actuators": None, "action": "offset"}, "actuator 'fan' is none: use"),
+        (of_balls, {}, "has no hinges or slides, which position servos need"),
+        (nothing, {"actuators": {"fan": [3, 1]}}, r"actuators\['fan'\] = \[3, 1\] must be gains"),
         (nothing, {"action": "torque"}, "action = 'torque' must be 'range' or 'offset'"),
         (nothing, {"action_scale": 0}, "action_scale = 0 must be a positive number, of rad or m"),
         (

@@ -37,6 +37,9 @@ _COVERING = {
     "base_angvel": (_SENSOR.mjSENS_GYRO, _SENSOR.mjSENS_FRAMEANGVEL),
     "gravity": (_SENSOR.mjSENS_FRAMEQUAT, _SENSOR.mjSENS_FRAMEZAXIS),
 }
+# controls that are the servo's target itself, not its rate
+_DYN = mujoco.mjtDyn
+_DIRECT = [int(kind) for kind in (_DYN.mjDYN_NONE, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT)]
 _OF_JOINTS = {
     "pos": (_SENSOR.mjSENS_JOINTPOS, _SENSOR.mjSENS_BALLQUAT),
     "vel": (_SENSOR.mjSENS_JOINTVEL, _SENSOR.mjSENS_BALLANGVEL),
@@ -96,7 +99,7 @@ class FileRobot(MJCFRobot):
         """
         for i in range(model.nu):
             gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 1]
-            if not (gain > 0 and bias == -gain):
+            if not (gain > 0 and bias == -gain) or int(model.actuator_dyntype[i]) not in _DIRECT:
                 raise ValueError(
                     "action = 'offset' needs position servos, and actuator "
                     f"{model.actuator(i).name.removeprefix(self._prefix)!r} is none: use "
@@ -110,10 +113,9 @@ class FileRobot(MJCFRobot):
         """
         sensors = [name for name, _, _ in self._sensors]
         covered = self.observe is None
-        base = {joint.name for joint in self.file.base}
         seen = {key: self._sensed(model, kinds) if covered else set()
                 for key, kinds in _OF_JOINTS.items()}  # fmt: skip
-        posing = [model.joint(self._prefix + name) for name in self.file.start if name not in base]
+        posing = [model.joint(self._prefix + name) for name in self.file.posing]
         self._places: list[int] = []
         self._hinged: list[int] = []
         self._round: list[int] = []

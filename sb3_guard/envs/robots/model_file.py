@@ -51,6 +51,13 @@ class ModelFile:
         """The joints that move the outermost body; none if it is fixed."""
         return list(self.spec.body(self.root).joints)
 
+    @property
+    def posing(self) -> list[str]:
+        """The robot's joints but those of the outermost body."""
+        base = {joint.name for joint in self.base}
+        joints = self.spec.body(self.root).find_all("joint")
+        return [joint.name for joint in joints if joint.name not in base]
+
     def pose(self, model: mujoco.MjModel, prefix: str = "") -> Array:
         """qpos of a model with this robot when an episode begins, [nq].
 
@@ -312,7 +319,9 @@ def _add_servos(
         )
     if not isinstance(gains, Mapping) or not gains:
         raise ValueError(f"actuators = {gains!r} must be gains such as {GAINS}")
-    common = not any(isinstance(value, Mapping) for value in gains.values())
+    if not limits:
+        raise ValueError(f"{path} has no hinges or slides, which position servos need")
+    common = any(key in gains for key in ("kp", "kd", "force"))
     chosen: dict[str, Mapping[str, float]] = {}
     for pattern, values in ({"*": gains} if common else gains).items():
         label = "actuators" if common else f"actuators[{pattern!r}]"

@@ -17,7 +17,7 @@ class Fence(Constraint):
     name = "fence"
     trespassable, movable = True, "no"
 
-    radius: float = param(1.5, "distance from the origin that costs nothing, m", above=0)
+    radius: float = param(1.5, "distance from the origin without cost, m", above=0)
 
     def _room(self):  # [N] m, for all simulations at once; negative outside
         return self.radius - np.linalg.norm(self.sim.robot.position[:, :2], axis=1)
@@ -25,7 +25,7 @@ class Fence(Constraint):
     def cost(self):
         return (self._room() < 0).astype(float)
 
-    def observations(self):  # what cannot be seen cannot be learnt
+    def observations(self):  # the agent must observe what gives it cost
         return {"fence": Values(self._room()[:, None], unit="m")}
 
 

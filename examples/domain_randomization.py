@@ -17,7 +17,7 @@ env.reset()
 info = env.step(env.action_space.sample()[None].repeat(10, axis=0))[3][0]
 print("drawn:", {name: info[name] for name in ("hazards.num", "hazards.size", "robot.mass")})
 
-# the same agent where one parameter has either end of its range
+# the same agent at both ends of the range of one parameter
 for mass in (0.5, 2.0):
     kwargs = {**varied, "robot": {**varied["robot"], "mass": mass}}
     test = make_vec_env("Goal_Point_8Hazards", n_envs=10, seed=1, env_kwargs=kwargs)

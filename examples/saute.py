@@ -1,4 +1,4 @@
-"""Sauté RL: PPO and SAC, which know nothing of costs, learn to keep a budget that they observe."""
+"""Sauté RL: PPO and SAC, which ignore costs, learn to keep a budget that they observe."""
 
 from stable_baselines3 import PPO, SAC
 

@@ -90,7 +90,7 @@ def reproduce(flags: Flags) -> int:
     row = published(flags.run)
     run = RunFlags.parse(shlex.split(row["command"])[2:])
     run.log_folder, run.verbose = flags.log_folder, 0
-    # Who wrote the command is a stranger: what it would import, the user has to name.
+    # The command may come from anyone, so the user has to name the modules that it would import.
     require_named(Path(flags.run), flags.gym_packages, run.gym_packages)
     run.gym_packages = flags.gym_packages
     if is_program(run.conf_file):

@@ -1,6 +1,7 @@
-"""The pages, help, docstrings and messages use the field's words: docs/glossary.md has them."""
+"""Pages, help, docstrings, messages, notebook and comments use the words of docs/glossary.md."""
 
 import ast
+import json
 import re
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 # Words that have another meaning here than elsewhere, or that the field does not use.
 AVOIDED = re.compile(
-    r"\b(suites|beside|likewise|hyper-parameters?|prices?|priced|earns?|earned|misspelt|of ours)\b",
+    r"\b(suites|beside|likewise|hyper-parameters?|prices?|priced|earns?|earned|pays?|paid|misspelt|"
+    r"of ours)\b",
     re.IGNORECASE,
 )
 NOT_PROSE = r"```.*?```|<!--.*?-->|``.*?``|`[^`]*`|\]\([^)]*\)|:param \w+:"
@@ -47,6 +49,16 @@ def test_docstrings_help_and_messages_use_the_words_of_the_field():
         if words := set().union(*map(avoided, texts)):
             found[module.relative_to(ROOT).as_posix()] = words
     assert not found
+
+
+def test_the_notebook_uses_the_words_of_the_field():
+    cells = json.loads((ROOT / "examples" / "quickstart.ipynb").read_text())["cells"]
+    assert not avoided("\n".join("".join(cell["source"]) for cell in cells))
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "hyperparams").glob("*.yml")), ids=lambda p: p.stem)
+def test_comments_of_hyperparameters_use_the_words_of_the_field(file):
+    assert not avoided("\n".join(re.findall(r"#.*", file.read_text())))
 
 
 def test_a_word_to_avoid_is_found_in_prose_alone():

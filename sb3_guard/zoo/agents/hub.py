@@ -193,7 +193,7 @@ def load(flags: HubFlags) -> int:
     try:
         flags.env = full_id(flags.env)
     except UsageError:
-        # A stranger's environment need not be known here: the repository says which it is.
+        # The environment may be unknown to this process: the repository says which it is.
         if not (flags.repo_id or flags.gym_packages):
             raise
     name = model_name(flags.algo, flags.env)

@@ -26,13 +26,15 @@ def fetch(requirement: str) -> Path:
 zoo = fetch("mjlab==1.6.0") / "mjlab" / "asset_zoo" / "robots"
 legs = {"kp": 16, "kd": 1, "force": 23.7}  # N m/rad, N m s/rad, N m
 go1 = {"actuators": {"*": legs, "*_calf_joint": {"kp": 36, "kd": 2.3, "force": 35.6}}}
+go1 |= {"timestep": 0.005, "frame_skip": 8, "action_scale": 0.5}  # 25 actions a second
 go1 |= {"pose": {"*_thigh_joint": 0.9, "*_calf_joint": -1.8}, "action": "offset"}
 register_robot("Go1", xml=zoo / "unitree_go1" / "xmls" / "go1.xml", **go1)
-limits = {"basetilt": {"limit": 0.2}, "floorcontact": {"ends": True}}
+limits = {"basetilt": {"limit": 0.3}, "floorcontact": {"ends": True}}
 register("WalkingGo1-v0", Scenario(robot="Go1", constraints=limits))
 
-joints = {"joint[123]": {"kp": 40, "kd": 10, "force": 28}, "joint[456]": {"kp": 5, "kd": 3}}
+joints = {"joint[123]": {"kp": 40, "kd": 20, "force": 28}, "joint[456]": {"kp": 5, "kd": 5}}
 yam = {"actuators": joints, "pose": {"joint[23]": 1.0}, "center": "grasp_site"}
+yam |= {"timestep": 0.005, "frame_skip": 8}
 register_robot("Yam", xml=zoo / "i2rt_yam" / "xmls" / "yam.xml", **yam)
-register("ReachingYam-v0", Scenario(robot="Yam", constraints={"jointspeed": {"limit": 2.0}}))
+register("ReachingYam-v0", Scenario(robot="Yam", constraints={"jointspeed": {"limit": 3.0}}))
 print("registered WalkingGo1-v0 and ReachingYam-v0")

@@ -79,6 +79,20 @@ def test_a_keyframe_is_where_it_starts(dog, names, stated, start):
     assert (height == pytest.approx(0.7)) == (start is not None)
 
 
+@pytest.mark.parametrize(("z", "bottom"), [(0.7, None), (-3.0, 0.0)])
+def test_a_keyframe_never_puts_a_robot_into_the_floor(dog, z, bottom):
+    engine = dog(keys=KEY.format(name="home", z=z, thigh=0.0))
+    data = engine.batch.get_data(0)
+    # of the legs' capsules the hind one is lower: its thigh leans by 0.2 rad
+    low = min(
+        data.body("robot/back").xpos[2] - 0.2 * np.cos(0.2) - 0.03,
+        data.body("robot/front_calf").xpos[2] - 0.03,
+        data.body("robot/front_calf").xpos[2] - 0.2 * np.cos(1.0) - 0.02,
+    )
+    height = engine.robot.position[0, 2]
+    assert (low if bottom == 0.0 else height - 0.7) == pytest.approx(0.0, abs=1e-3)
+
+
 def test_a_pose_changes_joints_of_a_keyframe(dog):
     engine = dog(keys=KEY.format(name="home", z=0.7, thigh=0.3), pose={"front_thigh": 0.4})
     assert (qpos(engine, "front_thigh"), qpos(engine, "back_thigh")) == (0.4, 0.2)

@@ -92,8 +92,8 @@ def settle(
     :param path: MJCF file
     :param root: its outermost body; None: the only one with joints
     :param complete: whether the world around the robot is kept
-    :param grounded: whether a robot on a free joint is put on the floor where no keyframe says how
-        high it begins
+    :param grounded: whether a robot on a free joint is put on the floor, unless a keyframe has it
+        higher
     :param keyframe: in which it begins; None: ``start``, ``home`` or the only one, if there is one
     :param pose: positions of hinges and slides, rad and m, by names or patterns of joints
     :param actuators: gains ``{"kp": N m / rad, "kd": N m s / rad, "force": N m}`` of position
@@ -127,9 +127,9 @@ def settle(
         _add_servos(spec, path, limits, start, actuators)
     file = ModelFile(path, spec, root, start, left_out)
     base = file.base
-    if grounded and not complete and key is None and base and int(base[0].type) == FREE:
-        alone, data = file.standing()
-        start[base[0].name][2] -= lowest(alone, data)
+    if grounded and not complete and base and int(base[0].type) == FREE:
+        height = lowest(*file.standing())  # a keyframe may hold it above the floor, not in it
+        start[base[0].name][2] -= height if key is None else min(height, 0.0)
     return file
 
 

@@ -60,14 +60,17 @@ class Placing:
             self.footprints.values(),
             key=lambda f: order.index(f.name) if f.name in order else len(order),
         )
-        self._restarts = Restarts(self._ordered, layout.restarts, array)
+        self._restarts = (
+            Restarts(self._ordered, layout.restarts, array) if layout.restarts else None
+        )
         check_locations(list(self.footprints.values()))
         if not layout.overlap:
             check_covers(list(self.footprints.values()))
 
     def forget(self, rows: Array | int) -> None:
         """Forget layouts that are kept for later episodes of these rows."""
-        self._restarts.forget(rows)
+        if self._restarts is not None:
+            self._restarts.forget(rows)
 
     def draw(self, row: int, rng: np.random.Generator) -> None:
         """Draw a layout for the episode that begins in a row.
@@ -75,7 +78,10 @@ class Placing:
         :raises LayoutError: a part finds no room
         """
         present = [self.owners[f.name].present(f, row) for f in self._ordered]
-        layout = arrange(present, rng, partial(self._restarts.draw, row, rng, present))
+        start_over = None
+        if self._restarts is not None:
+            start_over = partial(self._restarts.draw, row, rng, present)
+        layout = arrange(present, rng, start_over)
         for name, places in layout.items():
             self.places[name][row] = AWAY
             self.places[name][row, : len(places)] = places

@@ -22,7 +22,7 @@ class Restarts:
     """Draws layouts until one succeeds.
 
     :param footprints: what to place, in order
-    :param count: layouts begun, in blocks of 256, before it is given up; 0: none
+    :param count: layouts begun, in blocks of 256, before it is given up
     :param array: gives arrays ``[N, *shape]`` by name, which are part of the engine's state
     """
 
@@ -31,7 +31,7 @@ class Restarts:
     ) -> None:
         self._blocks = math.ceil(count / BLOCK)
         objects = sum(f.num for f in footprints)
-        self._kept = array("restarts/kept", (KEPT if count else 0, 2, objects))
+        self._kept = array("restarts/kept", (KEPT, 2, objects))
         self._left = array("restarts/left", dtype=np.int64)  # how many are kept, [N]
 
     def forget(self, rows: Array | int) -> None:

@@ -28,9 +28,10 @@ from killed import (
 )
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_guard import train
+from sb3_guard import make_vec_env, train
 from sb3_guard.common.vec_env import VEC_ENVS
-from sb3_guard.zoo.run import checkpoint
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.run import checkpoint, resumable
 from sb3_guard.zoo.run import training as experiment
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
 from sb3_guard.zoo.run.folder import RunFolder
@@ -332,3 +333,9 @@ def test_an_expression_in_the_files_of_an_older_run_is_the_mapping_that_it_stand
     old, new = {"policy_kwargs": "dict(net_arch=(8, 8))"}, {"policy_kwargs": {"net_arch": [8, 8]}}
     assert not differences(old, new)
     assert differences(old, {}) == [("policy_kwargs", {"net_arch": [8, 8]}, "none")]
+
+
+def test_a_state_of_another_environment_is_refused_in_a_line():
+    envs = [make_vec_env(name, 2) for name in ("Goal_Point_8Hazards", "Goal_Point_4Hazards")]
+    with pytest.raises(UsageError, match=r"checkpoint belongs to another environment: the state"):
+        resumable.restore(envs[0], resumable.capture(envs[1]))

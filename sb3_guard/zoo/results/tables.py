@@ -158,7 +158,7 @@ def _splits(runs: pd.DataFrame) -> pd.DataFrame:
         return f"{spread(row['cost'], row['cost_std'], 1)} {ends}"
 
     columns: Columns = {
-        "suite": "suite", "algorithm": "label", "episodes": lambda row: SPLITS[row["split"]],
+        "environment": "suite", "algorithm": "label", "episodes": lambda row: SPLITS[row["split"]],
         "seeds": whole("seeds"),
         "return": lambda row: spread(row["return"], row["return_std"]),
         "cost": cost,

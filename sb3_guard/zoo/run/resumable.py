@@ -7,6 +7,8 @@ import cloudpickle  # type: ignore[import-untyped]
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from sb3_guard.zoo.cli.usage import explained
+
 # What a new environment brings itself and what need not be picklable.
 _OWN = {"env", "venv", "class_attributes", "spec", "_cached_spec", "metadata", "render_mode"}
 
@@ -74,10 +76,15 @@ def capture(layer: VecEnv) -> list[Any]:
 
 
 def restore(layer: Any, parts: list[Any]) -> None:
-    """Put an environment that was made the same way, and reset, into a captured state."""
+    """
+    Put an environment that was made the same way, and reset, into a captured state.
+
+    :raises UsageError: it was made in another way, as by another version
+    """
     part, *rest = parts
     if hasattr(type(layer), "restore") and part is not None:
-        layer.restore(part)
+        with explained("the checkpoint belongs to another environment", ValueError):
+            layer.restore(part)
     elif rest:
         vars(layer).update(part)
     else:

@@ -3,14 +3,13 @@
 import gymnasium
 import imageio_ffmpeg
 
-from sb3_guard import CPO
-from sb3_guard.zoo.agents.playback import find_pretrained
+from sb3_guard import load_pretrained
 
 # camera: "fixed", "track" behind the robot, or "top"
 env = gymnasium.make(
     "Goal_Point_8Hazards-v0", render_mode="rgb_array", width=640, height=480, camera="track"
 )
-model = CPO.load(find_pretrained("cpo", "Goal_Point_8Hazards-v0").model)  # or a file of your own
+model = load_pretrained("Goal_Point_8Hazards")  # or CPO.load, for a file of your own
 
 video = imageio_ffmpeg.write_frames("point.mp4", (640, 480), fps=env.metadata["render_fps"])
 video.send(None)

@@ -20,6 +20,7 @@ _EXPORTS = {
     "sb3_guard.common.native": ("GuardVecEnv",),
     "sb3_guard.common.vec_env": ("make_vec_env",),
     "sb3_guard.deployment.onnx_file": ("export",),
+    "sb3_guard.zoo.agents.pretrained": ("load_pretrained",),
     "sb3_guard.zoo.run.make_model": ("make_model",),
     "sb3_guard.envs": (
         "GuardEnv", "GuardVectorEnv", "Scenario", "env_ids", "make", "register",

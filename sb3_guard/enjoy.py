@@ -21,6 +21,11 @@ def enjoy(flags: Flags) -> int:
             "--pretrained plays an agent that comes with the package: leave out --folder and "
             "--exp-id, or leave out --pretrained to play a run of your own"
         )
+    if flags.pretrained and not flags.given & {"env", "algo"}:
+        from sb3_guard.zoo.agents.pretrained import listed
+
+        print(f"{listed()}\n\nPlay one: sb3-guard enjoy --pretrained --env {flags.env}")
+        return 0
     render_mode = "rgb_array" if flags.record is not None else None
     if render_mode is None and not flags.no_render:
         if flags.window or _has_display():

@@ -84,19 +84,9 @@ def constraints() -> str:
 
 def agents() -> str:
     """The agents that the package ships, for ``enjoy --pretrained``."""
-    from sb3_guard.zoo.agents.playback import PRETRAINED
-    from sb3_guard.zoo.run.folder import RunFolder, is_run
+    from sb3_guard.zoo.agents.pretrained import listed
 
-    rows = []
-    for path in sorted(PRETRAINED.glob("*/*_1")):
-        if is_run(path):
-            run = RunFolder(path)
-            result = run.checked_result()
-            played, limit = result["played"]["stochastic"], result.get("cost_limit")
-            words = [f"{played[name][0]:.1f}" for name in ("return", "cost")]
-            words.append("none" if limit is None else f"{limit:g}")
-            rows.append([path.parent.name, run.name, *words])
-    return table(["pretrained agent", "environment", "return", "cost", "limit"], rows)
+    return listed()
 
 
 KINDS = {

@@ -35,7 +35,8 @@ BLOCK = re.compile(r"(<!-- (leaderboard|untrained) -->\n).*?(<!-- end -->)", re.
 MILLION = 1_000_000
 PLANNED = GRIDS[:5]  # a row of these that is missing is shown, with the command that fills it
 # What a run that is sent in may not change: the task, or which code is run.
-REFUSED = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback")
+REFUSED = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "cost_keys")
+BUDGETS = (1, 2, 10)  # millions of steps
 
 
 def planned() -> pd.DataFrame:
@@ -112,7 +113,7 @@ def leaderboard(rows: pd.DataFrame) -> str:
                 of = untrained.loc[suite]
                 values = {"return": spread(of[key], of[f"{key}_se"]),
                           "cost": number(of[f"{key}_cost"], 1)}  # fmt: skip
-                lines.append(_line("–", label, "", grey=True, **values))
+                lines.append(_line("–", label, "python scripts/untrained.py", grey=True, **values))
         parts.append(f"### {suite}, {budget}e6 steps\n\n{_table(lines)}")
     return "\n\n".join(parts)
 
@@ -120,10 +121,10 @@ def leaderboard(rows: pd.DataFrame) -> str:
 def _ranked(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
     """The rows of a table: those whose policy is certified first, by return."""
     final = rows[rows["split"] == "stochastic"].assign(certified=lambda t: t["tier"] == "certified")
-    greedy = rows[rows["split"] == "greedy"].set_index("algo")
+    greedy = rows[rows["split"] == "greedy"].set_index("row")
     order = final.sort_values(["certified", "return"], ascending=False).to_dict("records")
     for place, row in enumerate(order, 1):
-        other = greedy.loc[row["algo"]]
+        other = greedy.loc[row["row"]]
         digits = 0 if abs(row["return"]) >= 100 else 1
         yield _line(
             str(place) if row["certified"] else "–",
@@ -156,7 +157,7 @@ def _line(place: str, label: str, command: str, *, grey: bool, **values: str) ->
     }
     if grey:
         cells = {key: f"*{cell}*" if cell and cell != "–" else cell for key, cell in cells.items()}
-    return {**cells, "run it again": f"`{command}`" if command else ""}
+    return {**cells, "run it again": f"`{command}`"}
 
 
 def _table(lines: list[dict[str, str]]) -> str:
@@ -198,8 +199,17 @@ def problems(path: Path) -> Iterator[str]:
     for name in REFUSED:
         if config.get(name):
             yield f"config.yml has {name}: {config[name]}, which changes the task"
-    if args.get("gym_packages"):
-        yield f"args.yml has gym_packages: {args['gym_packages']}, code that is not the package's"
+    for name, why in (
+        ("gym_packages", "is not the package's"),
+        ("trained_agent", "was trained before"),
+    ):
+        if args.get(name):
+            yield f"args.yml has {name}: {args[name]}, which {why}"
+    limit = 25 if run.name.startswith("Safety") else 2
+    if result.get("cost_limit", limit) != limit:
+        yield f"cost_limit is {result['cost_limit']}, not {limit}"
+    if config["n_timesteps"] not in [MILLION * budget for budget in BUDGETS]:
+        yield f"n_timesteps is {config['n_timesteps']:,}; allowed: {BUDGETS} million"
     episodes = read_episodes(path)
     steps, longest = int(episodes["step"].iloc[-1]), int(episodes["step"].diff().max())
     missing = result["n_timesteps"] - steps

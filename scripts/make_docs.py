@@ -222,8 +222,8 @@ def gallery() -> str:
         "![TRPO, which ignores cost, and CPO in the same place](images/trained.gif)",
         "Two of the package's agents in the same place: TRPO ignores cost, CPO keeps a limit. "
         "`sb3-guard show Goal_Ant_8Ghosts --window` opens any environment in MuJoCo's viewer, and "
-        "`sb3-guard enjoy --pretrained --record` films an agent. The pictures are made by "
-        "`python scripts/render_gallery.py`.",
+        "`sb3-guard enjoy --pretrained --env Goal_Point_8Hazards --record` films an agent. "
+        "The pictures are made by `python scripts/render_gallery.py`.",
     ]
     parts.append("![Robots, tasks and constraints](images/poster.png)")
     for kind in GROUPS:

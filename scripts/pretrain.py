@@ -1,209 +1,171 @@
-"""Make the trained agents that the package ships: ``python scripts/pretrain.py``.
+"""Ship the best certified agents of the grand table: ``python scripts/pretrain.py logs/grand``.
 
-Trains what is missing with the library's own command, writes a small copy of each agent to
-``sb3_guard/pretrained`` in the layout of a log folder, and plays it for 100 episodes with its noise
-and 100 without; what it got is in its ``result.json``, and ``enjoy --pretrained`` prints it.
-Constrained agents are trained at a lower limit than the one they are shipped with, which their mean
-cost keeps in both. ``--list`` prints how each agent is trained;
-with ``-f`` runs are taken that are there, made by exactly this, such as::
-
-    python -m sb3_guard.train --algo cpo --env Goal_Point_8Hazards -n 1e6 --seed 1 \
-        --eval-freq -1 --num-threads 1 -params cost_limit:3
+Looked at are all runs below the folder, as ``scripts/grand_table.py`` writes them. A run is
+certified if the 95 % interval of the mean cost of its final episodes with sampled actions ends at
+or below the limit; of an environment's certified runs that with the highest return is taken. It is
+played again, 300 episodes of other seeds with sampled actions and 300 with the most likely ones,
+and shipped if it is certified by these, too; else the next one is tried. The package gets its
+settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get some
+observations and actions, ``tests/data/pretrained.npz``.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import shutil
-import zipfile
-from collections.abc import Sequence
-from operator import attrgetter
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard import evaluate_policy, make_vec_env, train
-from sb3_guard.common.evaluation import Estimate
-from sb3_guard.zoo.agents.playback import PRETRAINED
-from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.checkpoint import read_normalizer
-from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, run_path
-from sb3_guard.zoo.run.hyperparams import build, check
-from sb3_guard.zoo.run.make_envs import full_id, make_envs
-
-
-class Agent(NamedTuple):
-    """What is trained."""
-
-    algo: str
-    env: str
-    seed: int
-    trained_at: float | None = None  # cost limit
-    limit: float | None = None  # which it is to keep
-
-    @property
-    def id(self) -> str:
-        """Full id of the environment."""
-        return full_id(self.env)
-
-    @property
-    def settings(self) -> dict[str, float]:
-        """Hyperparameters that ``hyperparams/`` does not say."""
-        return {"cost_limit": self.trained_at} if self.trained_at else {}
-
-    @property
-    def command(self) -> str:
-        """How."""
-        return (
-            f"python -m sb3_guard.train --algo {self.algo} --env {self.env} -n 1e6 "
-            f"--seed {self.seed} --eval-freq -1 --num-threads 1"
-            + (" -params" if self.settings else "")
-            + "".join(f" {key}:{value:g}" for key, value in self.settings.items())
-        )
-
-    @property
-    def flags(self) -> dict[str, Any]:
-        """The same as a run's ``args.yml`` has it."""
-        return {"algo": self.algo, "env": self.id, "n_timesteps": 1_000_000,
-                "seed": self.seed, "eval_freq": -1, "num_threads": 1,
-                "hyperparams": self.settings or None,
-                "env_kwargs": None, "conf_file": None}  # fmt: skip
-
-
-AGENTS = (
-    Agent("cpo", "Goal_Point_8Hazards", 1, trained_at=3, limit=5),
-    Agent("cpo", "Goal_Point_8Ghosts", 0, trained_at=4, limit=5),
-    Agent("trpo_lag", "SafetyPointGoal1-v0", 0, trained_at=15, limit=25),
-    # without its noise the robot is faster, and speed costs
-    Agent("cpo", "SafetyHalfCheetahVelocity-v1", 0, trained_at=8, limit=25),
-    Agent("trpo", "Goal_Point_8Hazards", 0),
+from sb3_guard import evaluate_policy
+from sb3_guard.common.evaluation import estimate
+from sb3_guard.zoo.agents.pretrained import (
+    LIMITS,
+    PLAYED,
+    PRETRAINED,
+    listed,
+    load_pretrained,
+    pretrained,
+    weights,
 )
-# What only training needs: loaded without it, an agent begins a new training where it stands.
+from sb3_guard.zoo.results.runs import find_runs
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
+from sb3_guard.zoo.run.folder import RunFolder, run_path
+from sb3_guard.zoo.run.hyperparams import build
+from sb3_guard.zoo.run.make_envs import make_envs
+
+RECORDED = Path(__file__).parents[1] / "tests" / "data" / "pretrained.npz"
+EPISODES = 300
+SEEDS = {"stochastic": 10_000, "deterministic": 20_000}
+# Parameters of a policy that it acts without: critics and targets.
 TRAINING_ONLY = (
-    "_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer",
-    "ep_success_buffer", "ep_cost_buffer", "episodes", "last_costs",
-    "total_costs", "costs", "timing", "start_time", "_ended_costs", "_ended_lengths", "_warned",
+    "value_net.", "mlp_extractor.value_net.", "vf_features_extractor.", "critic.",
+    "critic_target.", "actor_target.",
 )  # fmt: skip
+DROPPED = ("final", "platform", "seconds")  # of result.json
 
 
-def find(agent: Agent, folders: Sequence[str]) -> RunFolder:
-    """The finished run of an agent in the first folder that has one; else it is trained now."""
-    for folder in folders:
-        for path in sorted(Path(folder, agent.algo).glob(f"{agent.id}_*")):
-            run = RunFolder.open(path)
-            args = run.args()
-            if run.result.exists() and all(args[key] == v for key, v in agent.flags.items()):
-                return run
-    print(agent.command)
-    if train.main([*agent.command.split()[3:], "-f", folders[0]]):
-        raise SystemExit(f"not trained: {agent.command}")
-    return find(agent, folders[:1])
+def candidates(folder: Path, env_id: str) -> Iterator[RunFolder]:
+    """The certified runs on an environment, the highest return first."""
+    found = []
+    for run in map(RunFolder, find_runs(folder)):
+        if run.name != env_id or (result := run.read_result()) is None:
+            continue
+        final = result.get("final", {}).get("stochastic")
+        if final is None or result.get("cost_limit") not in (None, LIMITS[env_id]):
+            continue
+        if estimate(np.array(final["costs"])).high <= LIMITS[env_id]:
+            found.append((float(np.mean(final["returns"])), str(run.path)))
+    for _, path in sorted(found, reverse=True):
+        yield RunFolder(Path(path))
 
 
-def slim(model: BaseAlgorithm, path: Path) -> None:
-    """Save an agent without what only training needs, compressed, the same bytes every time."""
-    for name in model._get_torch_save_params()[0]:
-        if name.endswith("optimizer"):
-            attrgetter(name)(model).state.clear()
-    buffer = io.BytesIO()
-    model.save(buffer, exclude=TRAINING_ONLY)
-    with zipfile.ZipFile(buffer) as full, zipfile.ZipFile(path, "w") as small:
-        for name in full.namelist():
-            if name == "system_info.txt":  # where it was trained is nobody's business
-                continue
-            content = full.read(name)
-            if name == "data":
-                content = json.dumps(_undescribed(json.loads(content))).encode()
-            member = zipfile.ZipInfo(name)  # dated 1980
-            member.external_attr = 0o644 << 16
-            small.writestr(member, content, zipfile.ZIP_DEFLATED, 9)
+def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
+    """The agent of a run as it was saved, with environments to play in."""
+    setup = build(run.hyperparams())
+    env = make_envs(
+        run.name, setup, n_envs=n_envs, seed=seed, vec_env="native", env_kwargs=setup.env_kwargs,
+        evaluation=True,
+        normalizer=read_normalizer(run.normalizer) if setup.normalize else None,
+    )  # fmt: skip
+    return load_model(algorithm(run.args()["algo"]), run.model, env, "cpu")
 
 
-def _undescribed(data: dict[str, Any]) -> dict[str, Any]:
-    """What SB3 saves, without the descriptions of objects, which have addresses in memory."""
-    keep = (":type:", ":serialized:")
-    return {
-        name: {key: value[key] for key in keep}
-        if isinstance(value, dict) and ":serialized:" in value
-        else value
-        for name, value in data.items()
-    }
-
-
-def export(run: RunFolder, agent: Agent) -> RunFolder:
-    """Copy a run to the package, small; the copy plays as the original does."""
-    where = (str(PRETRAINED), agent.algo, agent.id)
-    shutil.rmtree(run_path(*where, 1), ignore_errors=True)
-    flags = RunFlags.of({**run.args(), "log_folder": str(PRETRAINED)})
-    copy = RunFolder.create(flags, run.hyperparams(), agent.command, run_path(*where, 1))
-    for file in copy.path.rglob("args.yml"):  # where the package is installed is nobody's business
-        file.write_text(file.read_text().replace(str(PRETRAINED), "logs"))
-    cls = algorithm(agent.algo)
-    model = cls.load(run.model, device="cpu")
-    if agent.limit is not None:
-        model.cost_limit = agent.limit
-    slim(model, copy.model)
-    if run.normalizer.exists():
-        normalizer = read_normalizer(run.normalizer)
-        normalizer.old_obs = normalizer.old_reward = np.array([])
-        normalizer.set_venv(make_vec_env(agent.id, 1))  # only then it can be saved
-        normalizer.save(str(copy.normalizer))
-    observations = np.random.default_rng(0).normal(size=(100, *model.observation_space.shape))
-    want, got = (one.predict(observations, deterministic=True)[0]
-                 for one in (cls.load(run.model), cls.load(copy.model)))  # fmt: skip
-    np.testing.assert_array_equal(want, got)
-    result = json.loads(run.result.read_text())
-    if agent.limit is not None:
-        result |= {"trained_at": agent.trained_at, "cost_limit": agent.limit}
-    copy.write_result({key: v for key, v in result.items() if key not in ("platform", "seconds")})
-    return copy
-
-
-def played(run: RunFolder, agent: Agent) -> dict[str, dict[str, Estimate]]:
-    """Return and cost of an agent in 100 episodes with its noise and 100 without."""
-    cls = algorithm(agent.algo)
-    model = cls.load(run.model, device="cpu")
-    setup = build(check(agent.algo, cls, run.hyperparams()))
+def played(run: RunFolder) -> dict[str, Any]:
+    """Return and cost of an agent in 300 episodes of each kind of actions."""
     found = {}
-    for seed, mode in ((10_000, "stochastic"), (20_000, "deterministic")):
-        env = make_envs(
-            agent.id, setup, n_envs=100, seed=seed, vec_env="native", env_kwargs=setup.env_kwargs,
-            evaluation=True,
-            normalizer=read_normalizer(run.normalizer) if run.normalizer.exists() else None,
-        )  # fmt: skip
-        one = evaluate_policy(model, env, 100, deterministic=mode == "deterministic")
-        env.close()
-        found[mode] = {"return": one.estimate(one.returns), "cost": one.estimate(one.costs)}
+    for actions, seed in SEEDS.items():
+        model = loaded(run, 100, seed)
+        got = evaluate_policy(
+            model, model.env, EPISODES, deterministic=actions == "deterministic", seed=seed
+        )
+        model.env.close()
+        found[actions] = {"return": estimate(got.returns), "cost": estimate(got.costs)}
     return found
 
 
+def actions_of(model: BaseAlgorithm, raw: np.ndarray, actions: str) -> np.ndarray:
+    """What an agent does where it observes this, before normalisation."""
+    normalizer = model.get_vec_normalize_env()
+    seen = raw if normalizer is None else normalizer.normalize_obs(raw.copy())
+    th.manual_seed(0)
+    return model.predict(seen, deterministic=actions == "deterministic")[0]
+
+
+def write(run: RunFolder, limit: float | None, got: dict[str, Any]) -> RunFolder:
+    """
+    Copy a run to the package; the copy acts as the original does, to the last bit.
+
+    :param limit: that it is to keep
+    :param got: see :func:`played`
+    """
+    algo, result = run.args()["algo"], run.checked_result()
+    original = loaded(run, 10, 0)
+    path = run_path(str(PRETRAINED), algo, run.name, 1)
+    (path / run.name).mkdir(parents=True)
+    for name in ("config.yml", "args.yml"):
+        text = (run.params / name).read_text()
+        (path / run.name / name).write_text(text.replace(run.args()["log_folder"], "logs"))
+    copy = RunFolder(path)
+    policy = original.policy.state_dict()
+    saved: dict[str, Any] = {"policy": {n: t.clone() for n, t in policy.items()
+                                        if not n.startswith(TRAINING_ONLY)}}  # fmt: skip
+    if (normalizer := original.get_vec_normalize_env()) is not None:
+        for name in ("mean", "var"):
+            saved[name] = th.as_tensor(getattr(normalizer.obs_rms, name), dtype=th.float64)
+    th.save(saved, weights(copy))
+    kept = {key: value for key, value in result.items() if key not in DROPPED}
+    if limit is not None:
+        trained_at = kept.get("trained_at", kept.get("cost_limit"))
+        kept |= {"cost_limit": limit, "trained_at": trained_at}
+    copy.write_result({**kept, "played": got, "episodes_played": EPISODES})
+    record(original, load_pretrained(run.name, algo), f"{algo}/{run.name}")
+    return copy
+
+
+def record(original: BaseAlgorithm, copy: BaseAlgorithm, name: str) -> None:
+    """Compare what both do along an episode, and keep some of it for the tests."""
+    observed, obs = [], original.env.reset()
+    while len(observed) < 1000:
+        normalizer = original.get_vec_normalize_env()
+        observed.append(obs if normalizer is None else normalizer.get_original_obs())
+        obs, *_ = original.env.step(original.predict(obs, deterministic=len(observed) % 2 == 0)[0])
+    raw = np.concatenate(observed).astype(np.float32)
+    some = raw[:: len(raw) // 16]
+    content = dict(np.load(RECORDED)) if RECORDED.exists() else {}
+    content[f"{name}/observations"] = some
+    for actions in PLAYED:
+        want, got = (actions_of(model, raw, actions) for model in (original, copy))
+        np.testing.assert_array_equal(want, got)
+        content[f"{name}/{actions}"] = actions_of(original, some, actions)
+    shipped = {f"{run.path.parent.name}/{run.name}" for run in pretrained()}
+    content = {key: array for key, array in content.items() if key.rpartition("/")[0] in shipped}
+    np.savez_compressed(RECORDED, **content)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "-f", "--folders", nargs="+", default=["logs/pretrained"],
-        help="log folders: a run is taken from the first that has it, or trained into the first",
-    )  # fmt: skip
-    parser.add_argument("--list", action="store_true", help="print the commands only")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="folder of the grand table's runs")
     args = parser.parse_args()
-    for agent in AGENTS:
-        at = "" if agent.limit is None else f"  # keeps {agent.limit:g}"
-        if args.list:
-            print(f"{agent.command}{at}")
-            continue
-        copy = export(find(agent, args.folders), agent)
-        found = played(copy, agent)
-        copy.write_result({**(copy.read_result() or {}), "played": found})
-        size = sum(file.stat().st_size for file in copy.path.rglob("*") if file.is_file())
-        print(f"{copy.path.relative_to(PRETRAINED)} {size / 1024:.0f} KiB{at}")
-        for mode, got in found.items():
-            print(f"  {mode:<13} return {got['return']}, cost {got['cost']}", flush=True)
-            if agent.limit is not None and got["cost"].mean > agent.limit:
-                raise SystemExit(f"{agent.algo} on {agent.env} does not keep {agent.limit}")
+    for env_id, limit in LIMITS.items():
+        for run in candidates(args.folder, env_id):
+            got = played(run)
+            costs = [got[actions]["cost"] for actions in PLAYED]
+            print(run.path, got["stochastic"]["return"], *costs, sep="\n  ", flush=True)
+            if costs[0].high > limit:
+                continue
+            for old in PRETRAINED.glob(f"*/{env_id}_1"):
+                if "cost_limit" in json.loads((old / "result.json").read_text()):
+                    shutil.rmtree(old)
+            write(run, limit, got)
+            break
+    print(listed())
 
 
 if __name__ == "__main__":

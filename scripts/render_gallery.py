@@ -23,10 +23,12 @@ from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.envs.suites.velocity import TABLE
 from sb3_guard.zoo.agents.flags import AgentFlags
-from sb3_guard.zoo.agents.playback import find_pretrained, find_run, open_agent
+from sb3_guard.zoo.agents.playback import find_run, open_agent
+from sb3_guard.zoo.agents.pretrained import load_pretrained
 from sb3_guard.zoo.cli.usage import UsageError
 
 TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
+AGENTS = ("trpo", None)  # in it: the one without a limit, and the one with a limit
 PERIOD = 2  # control steps, of 0.02 s, from frame to frame
 FRAMES = 240
 DELAY = 40  # ms that a frame is shown: as fast as it happens
@@ -78,24 +80,25 @@ def picture(
 def typical() -> int:
     """Of 100 seeds the one whose returns and costs are nearest to the means of both agents."""
     distance = np.zeros(100)
-    for key in ("trpo", "cpo"):
+    for key in AGENTS:
         env = make_vec_env(TRAINED, 100, seed=0)  # row i as a lone environment with seed i
-        model = ALGORITHMS[key].load(find_pretrained(key, TRAINED).model, device="cpu")
+        model = load_pretrained(TRAINED, key, device="cpu")
         obs, got = env.reset(), np.zeros((2, 100))
         for _ in range(FRAMES * PERIOD):
             obs, rewards, _, infos = env.step(model.predict(obs, deterministic=True)[0])
             got += rewards, [info["cost"] for info in infos]
         env.close()
-        print(f"{key}: mean return {got[0].mean():.2f}, mean cost {got[1].mean():.2f}")
+        name = type(model).__name__
+        print(f"{name}: mean return {got[0].mean():.2f}, mean cost {got[1].mean():.2f}")
         distance += (((got.T - got.mean(axis=1)) / got.std(axis=1)) ** 2).sum(axis=1)
     return int(distance.argmin())
 
 
-def film(key: str, seed: int) -> list[Image.Image]:
+def film(key: str | None, seed: int) -> list[Image.Image]:
     """Frames of one of the package's own agents, with what it has got and paid so far."""
     window = {"width": 1200, "height": 834, "camera": "fixed"}
     env = make_vec_env(TRAINED, seed=seed, env_kwargs=window, render_mode="rgb_array")
-    model = ALGORITHMS[key].load(find_pretrained(key, TRAINED).model, device="cpu")
+    model = load_pretrained(TRAINED, key, device="cpu")
     font = ImageFont.load_default(15)
     frames, reward, cost = [], 0.0, 0.0
     obs = env.reset()
@@ -106,7 +109,7 @@ def film(key: str, seed: int) -> list[Image.Image]:
             frame.paste(Image.fromarray(pixels).resize((400, 278)), (0, 26))  # drawn large: smooth
             draw = ImageDraw.Draw(frame)
             color = (200, 0, 0) if cost > 0 else (40, 40, 40)
-            draw.text((2, 3), f"{key.upper()}   return {reward:z.1f}", (40, 40, 40), font)
+            draw.text((2, 3), f"{type(model).__name__}   return {reward:z.1f}", (40, 40, 40), font)
             draw.text((398, 3), f"cost {cost:.2f}", color, font, anchor="ra")
             frames.append(frame)
         obs, rewards, _, infos = env.step(model.predict(obs, deterministic=True)[0])
@@ -116,9 +119,9 @@ def film(key: str, seed: int) -> list[Image.Image]:
 
 
 def animation(path: Path, seed: int) -> None:
-    """Write a small film of two of the package's agents in the same place: TRPO, and CPO."""
+    """Write a small film of two of the package's agents in the same place."""
     frames = [Image.new("RGB", (808, 304), "white") for _ in range(FRAMES)]
-    for left, key in ((0, "trpo"), (408, "cpo")):
+    for left, key in zip((0, 408), AGENTS, strict=True):
         for frame, half in zip(frames, film(key, seed), strict=True):
             frame.paste(half, (left, 0))
     save(frames, path)
@@ -127,8 +130,7 @@ def animation(path: Path, seed: int) -> None:
 def agent(env_id: str, folder: str) -> tuple[BaseAlgorithm, bool]:
     """Who is filmed, and whether without noise: a robot that has learnt little needs it."""
     with suppress(UsageError):
-        shipped = find_pretrained("cpo", env_id)
-        return ALGORITHMS["cpo"].load(shipped.model, device="cpu"), True
+        return load_pretrained(env_id, device="cpu"), True
     try:
         run = find_run(folder, "trpo", env_id)
     except UsageError:

@@ -6,8 +6,8 @@ a page stands the table of its runs, or of one environment in short, ``<!-- runs
 Instead of ``runs`` there are ``learnt: NAME``, returns in the end and those of the untrained agents
 of ``docs/data/untrained.csv``; ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep:
 NAME SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; and ``agents: pretrained``,
-the costs of the package's agents and their limits. A row of a single run is in italics, which the
-site shows in grey. ``--pack FOLDER NAME`` packs the logs of a folder.
+those of ``enjoy --pretrained``. A row of a single run is in italics, which the site shows in grey.
+``--pack FOLDER NAME`` packs the logs of a folder.
 
 ``--curves`` draws the learning curves: of each algorithm's page, beside an unconstrained algorithm,
 from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of all algorithms of
@@ -16,7 +16,6 @@ from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of al
 """
 
 import argparse
-import json
 import re
 import tarfile
 import tempfile
@@ -32,8 +31,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-import sb3_guard
-from sb3_guard.costs import verdict
+from sb3_guard.zoo.agents.pretrained import listed
 from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
@@ -213,31 +211,6 @@ def sweep(name: str, suite: str) -> str:
     return markdown(spelled(rows, {"limit": whole("limit"), **columns}))
 
 
-def agents(folder: str) -> str:
-    """A table of the constrained agents in a folder of the package: 100 episodes in each mode."""
-    rows = []
-    for path in sorted((Path(sb3_guard.__file__).parent / folder).glob("*/*/result.json")):
-        result = json.loads(path.read_text())
-        limit = result.get("cost_limit")
-        if limit is None:
-            continue
-        row = {
-            "environment": result["env"],
-            "algorithm": result["label"],
-            "trained at": f"{result.get('trained_at', limit):g}",
-            "limit": f"{limit:g}",
-        }
-        for mode, actions in (("stochastic", "sampled"), ("deterministic", "most likely")):
-            cost, _, low, high = result["played"][mode]["cost"]
-            row[f"return, {actions} actions"] = number(result["played"][mode]["return"][0], 1)
-            row[f"cost, {actions} actions"] = (
-                f"{number(cost, 1)} [{number(low, 1)}, {number(high, 1)}], "
-                f"{verdict(low, high, limit)}"
-            )
-        rows.append(row)
-    return markdown(spelled(pd.DataFrame(rows), {name: name for name in rows[0]}))
-
-
 def _published(known: pd.DataFrame, algo: str) -> str:
     if algo not in known.index:
         return "–"
@@ -251,7 +224,7 @@ def filled(page: str) -> str:
 
     def remade(match: re.Match[str]) -> str:
         begin, kind, name, only, end = match.groups()
-        made = {"learnt": learnt, "scores": scores, "agents": agents}
+        made = {"learnt": learnt, "scores": scores, "agents": lambda _: listed()}
         if kind == "sweep":
             text = sweep(name, only)
         else:

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from fake_runs import fake_run
 
 from sb3_guard import train
@@ -61,6 +62,12 @@ def test_certified_rows_come_first_by_return(scripts, tmp_path):
     missing = next(row for row in table if row[1] == "*PPO*")
     assert missing[-1].startswith("`sb3-guard train --algo ppo --env SafetyPointGoal1-v0 --seeds")
     assert [row[1] for row in table[-2:]] == ["*random actions*", "*idle*"]
+    # The same algorithm, sent in by another.
+    results.pack(tmp_path / "logs", "sent_again")
+    rows, _ = board.read()
+    table = rows_of(board.leaderboard(rows), "SafetyPointGoal1-v0, 1e6 steps")
+    assert [row[1] for row in table[:5]] == ["PCPO", "PCPO", "CPO", "CPO", "*TRPO-Lagrangian*"]
+    assert "sent_again/pcpo" in table[1][-1]
 
 
 def test_packed_logs_are_small(scripts, tmp_path):
@@ -84,7 +91,8 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
     (run,) = (tmp_path / "logs" / "cpo").iterdir()
     assert not board.check(tmp_path / "logs")
     said = capsys.readouterr().out
-    assert said.count(";") == 1 and "final greedy has {1} episodes, not 100" in said
+    assert "final greedy has {1} episodes, not 100" in said
+    assert "n_timesteps is 8,000; allowed" in said and said.count(";") == 3
     result = json.loads((run / "result.json").read_text())
     (run / "result.json").write_text(
         json.dumps(result | {"curve": "0", "command": "x", "final": {}})
@@ -95,6 +103,17 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
     assert not board.check(tmp_path / "logs")
     said = capsys.readouterr().out
     for text in ("no final", "not the hash", "not that of args.yml", "5,000 steps of 8,000"):
+        assert text in said
+    for name, changes in (
+        ("args.yml", {"trained_agent": "ppo.zip", "gym_packages": ["mine"]}),
+        ("config.yml", {"cost_keys": ["cheap"], "env_kwargs": {"hazards": {"num": 1}}}),
+    ):
+        (file,) = run.glob(f"*/{name}")
+        file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | changes))
+    (run / "result.json").write_text(json.dumps(result | {"cost_limit": 100.0}))
+    assert not board.check(tmp_path / "logs")
+    said = capsys.readouterr().out
+    for text in ("trained_agent: ppo.zip", "gym_packages", "cost_keys", "env_kwargs", "100.0, not"):
         assert text in said
 
 

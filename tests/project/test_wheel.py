@@ -43,8 +43,8 @@ def test_a_wheel_installed_elsewhere_trains_and_plays(wheel, tmp_path):
     site = tmp_path / "site"
     wheel.extractall(site)
     agents = [name for name in wheel.namelist() if name.startswith("sb3_guard/pretrained/")]
-    shipped = len([*(ROOT / "sb3_guard" / "pretrained").rglob("*-v0.zip")])
-    assert sum(name.endswith("-v0.zip") for name in agents) == shipped > 0
+    shipped = len([*(ROOT / "sb3_guard" / "pretrained").rglob("*.pth")])
+    assert sum(name.endswith(".pth") for name in agents) == shipped > 0
     env = {**os.environ, "PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"}
 
     which = "--algo cpo --env Goal_Ant_8Hazards -f logs".split()

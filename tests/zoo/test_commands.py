@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import runpy
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -16,19 +15,17 @@ import pytest
 import yaml
 from cost_envs import CostPoint
 from matplotlib import image
-from PIL import Image
 from rl_zoo3.utils import EnvironmentName, get_model_path
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from typed import LENGTH, PLAY, SMALL, TOY, require_rendering, trained
 from worlds import own_parts
 
-from sb3_guard import ALGORITHMS, CPO, cli, enjoy, make_vec_env, train
+from sb3_guard import CPO, cli, enjoy, train
 from sb3_guard.envs import Scenario, register, register_constraint
 from sb3_guard.envs.part import Constraint
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.zoo.agents import playback
-from sb3_guard.zoo.agents.playback import PRETRAINED
 from sb3_guard.zoo.cli import usage
 from sb3_guard.zoo.run.hyperparams import build, check
 from sb3_guard.zoo.run.make_envs import make_envs
@@ -412,120 +409,6 @@ def test_no_backend_no_video(ours, tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
-# the agents that the package ships
-
-SHIPPED = sorted(PRETRAINED.glob("*/*_1"))
-
-
-@pytest.mark.parametrize("run", SHIPPED, ids=lambda run: f"{run.parent.name}-{run.name}")
-def test_a_shipped_agent_is_small_good_and_goes_on_learning(run):
-    algo, env_id = run.parent.name, run.name.removesuffix("_1")
-    files = [path for path in run.rglob("*") if path.is_file()]
-    assert sum(path.stat().st_size for path in files) < 120_000
-    text = "".join(path.read_text() for path in files if path.suffix not in (".zip", ".pkl"))
-    assert "/tmp" not in text and "/work" not in text and f"--env {env_id[:-3]}" in text
-    result = json.loads((run / "result.json").read_text())
-    for played in result["played"].values():  # means of 100 episodes
-        assert played["cost"][0] < result.get("cost_limit", np.inf)
-    env = make_vec_env(env_id, 20, seed=5, max_episode_steps=300)
-    if (statistics := run / env_id / "vecnormalize.pkl").exists():
-        env = VecNormalize.load(str(statistics), env)
-        env.training = env.norm_reward = False
-    model = ALGORITHMS[algo].load(run / f"{env_id}.zip", env=env, device="cpu", n_steps=10)
-    assert model.ep_info_buffer is None and not model.policy.optimizer.state
-    obs, total = env.reset(), np.zeros(20)
-    for _ in range(300):
-        obs, rewards, *_ = env.step(model.predict(obs, deterministic=True)[0])
-        total += rewards
-    # It earns as in whole episodes, but for the start; random actions: about 0.
-    assert total.mean() > 0.6 * 0.3 * result["played"]["deterministic"]["return"][0]
-    model.learn(200)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", ["Goal_Point_8Hazards", "Goal_Point_8Ghosts"])
-@pytest.mark.parametrize("noise", [[], ["--stochastic"]])
-def test_a_shipped_agent_keeps_its_limit(env_id, noise, tmp_path):
-    """On average: 200 episodes with a standard error of 0.3."""
-    file = tmp_path / "played.json"
-    which = ["--pretrained", "--no-render", "--verbose", "0", "--env", env_id, *noise]
-    assert enjoy.main([*which, "--n-episodes", "200", "--json", str(file)]) == 0
-    assert 1 < json.loads(file.read_text())["cost"]["mean"] < 5.3
-
-
-def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):
-    made = []
-    monkeypatch.setattr(
-        playback,
-        "make_envs",
-        lambda *args, **kwargs: made.append(make_envs(*args, **kwargs)) or made[-1],
-    )
-    which = ["--pretrained", "--no-render", "--env-kwargs", "max_episode_steps:5"]
-    file = tmp_path / "played.json"
-    for flags, episodes, at_once in (
-        ([], 30, 30),
-        (["--n-episodes", "3"], 3, 3),
-        (["-n", "10"], 2, 1),
-    ):
-        assert enjoy.main([*which, *flags, "--json", str(file)]) == 0
-        assert json.loads(file.read_text())["episodes"] == episodes
-        assert made[-1].num_envs == at_once
-
-
-def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert enjoy.main(["--pretrained", "-n", "20", "--no-render"]) == 0
-    out = capsys.readouterr().out
-    assert "cpo/Goal_Point_8Hazards-v0_1" in out
-    shown = out.split("100 episodes of other seeds, when it was shipped (--deterministic):")[1]
-    assert shown.rstrip().endswith("limit 5: kept")
-    which = ["--algo", "trpo", "--env", "Goal_Point_8Hazards", "--no-render"]
-    short = ["--n-episodes", "1", "--env-kwargs", "max_episode_steps:30"]
-    assert enjoy.main([*which, "--pretrained", *short, "--json", "played.json"]) == 0
-    assert json.loads((tmp_path / "played.json").read_text())["length"]["values"] == [30]
-    assert enjoy.main(which) == 2
-    assert "or play the package's own with --pretrained" in capsys.readouterr().err
-
-
-def test_a_film_of_a_shipped_agent_is_not_written_into_the_package(tmp_path, monkeypatch):
-    require_rendering()
-    monkeypatch.chdir(tmp_path)
-    assert enjoy.main(["--pretrained", "-n", "3", "--record"]) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ["cpo-Goal_Point_8Hazards-v0.mp4"]
-
-
-def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch):
-    require_rendering()
-    script = runpy.run_path(str(PRETRAINED.parent.parent / "scripts" / "render_gallery.py"))
-    animation = script["animation"]
-    monkeypatch.setitem(animation.__globals__, "FRAMES", 2)
-    animation(tmp_path / "film.gif", 0)
-    with Image.open(tmp_path / "film.gif") as film:
-        assert (film.n_frames, film.size) == (2, (808, 304))
-    clip = script["clip"]
-    monkeypatch.setitem(clip.__globals__, "CLIP", 2)
-    clip("Goal_Point_8Hazards-v0", tmp_path / "clip.webp", "fixed", "no runs", 0)
-    with Image.open(tmp_path / "clip.webp") as film:
-        assert (film.n_frames, film.size) == (2, (300, 250))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ["--algo", "ppo", "--env", "Goal_Ant_8Hazards"],
-            "one of those there: cpo on Goal_Point_8Ghosts-v0, cpo on Goal_Point_8Hazards-v0, ",
-        ),
-        (["-f", "logs"], "leave out --folder and --exp-id"),
-        (["--exp-id", "1"], "leave out --folder and --exp-id"),
-        (["--load-best"], "not allowed with argument"),
-    ],
-)
-def test_what_is_not_shipped_is_not_played(arguments, message, capsys):
-    assert enjoy.main(["--pretrained", "--no-render", *arguments]) == 2
-    assert message in capsys.readouterr().err
-
-
 # list and show
 
 
@@ -550,14 +433,6 @@ def test_list_prints_what_there_is(capsys):
     assert ["Ghosts", "yes; no if solid", "active", "planar, spatial"] in [r[:4] for r in cells]
     assert cli.main(["list", "robots"]) == 0
     assert [row[0] for row in rows(capsys.readouterr().out)] == ["robot", *ROBOTS]
-
-
-def test_list_shows_the_pretrained_agents(capsys):
-    assert cli.main(["list", "agents"]) == 0
-    head, *cells = rows(capsys.readouterr().out)
-    assert head[:2] == ["pretrained agent", "environment"]
-    assert ["cpo", "trpo"] == [r[0] for r in cells if r[1] == "Goal_Point_8Hazards-v0"]
-    assert len(cells) == len([*PRETRAINED.glob("*/*_1")])
 
 
 @pytest.mark.parametrize("name, version", [("SafetyHopperVelocity", 1), ("CostPoint", 0)])

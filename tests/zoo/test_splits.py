@@ -108,6 +108,19 @@ def test_runs_of_older_versions_have_the_training_only(tmp_path):
     assert table["split"].tolist() == ["training"]
 
 
+def test_a_limit_on_the_worst_step_says_nothing_of_the_sum(tmp_path):
+    """SCPO's: no tier by the sum of an episode's costs, and none for TRPO by that limit."""
+    for algo in ("scpo", "trpo"):
+        limit = {"cost_limit": 5.0, "limit_on": "max"} if algo == "scpo" else {}
+        costs = {"cost": {"mean": 0.5, "limit": 5.0, "verdict": "kept"}} if limit else {}
+        fake_run(tmp_path, algo, **limit, costs=costs, final=final([1.0, 2.0], [1.0, 9.0]))
+    runs = with_safety(read_results([tmp_path]).runs)
+    table = judge(runs)
+    assert {*table["tier"]} == {""} and table["above"].isna().all()
+    assert runs["above_limit"].isna().all() and runs["limits"].dropna().tolist() == ["5"]
+    assert {*tables(runs)["Tiers"]["limit"]} == {"–"}
+
+
 def test_the_distribution_of_costs_is_drawn(runs):
     (drawing,) = draw("cdf", Data(runs))
     greedy = drawing.figure.axes[1]

@@ -21,7 +21,8 @@ class AgentFlags(Command):
         0)
     :param load_best: take the best checkpoint (highest return among those within the limit) instead
         of the last one
-    :param pretrained: take an agent that comes with the package
+    :param pretrained: take the agent that comes with the package for --env; enjoy without --env
+        lists them
     :param load_checkpoint: take the model that was kept after this number of steps
     :param load_last_checkpoint: take the last model that was kept
 
@@ -80,10 +81,10 @@ class EnjoyFlags(AgentFlags):
 
     prog: ClassVar[str] = "sb3-guard enjoy"
     examples: ClassVar[str] = """examples:
-  sb3-guard enjoy --pretrained
+  sb3-guard enjoy --pretrained                   # lists them
   sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards -f logs
   sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards --load-best --n-episodes 20
-  sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards --pretrained --record agent.mp4
+  sb3-guard enjoy --pretrained --env Goal_Point_8Hazards --record agent.mp4
 """
     n_timesteps: int | None = flag("-n", kind=positive, metavar="N", exclusive="length")
     deterministic: bool = flag(default=False, exclusive="actions")
@@ -160,6 +161,8 @@ class HubFlags(AgentFlags):
 
         :raises UsageError: the repository's owner is missing, or its name has another form
         """
+        if self.pretrained:
+            raise UsageError("hub takes agents of your runs, not those of --pretrained")
         if self.repo_id is not None:
             organization, slash, name = self.repo_id.partition("/")
             if not (organization and slash and name) or "/" in name:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_guard.checks import WorldError
 from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
@@ -18,6 +18,13 @@ from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
+from sb3_guard.zoo.agents.pretrained import (
+    PLAYED,
+    PRETRAINED,
+    find_pretrained,
+    load_pretrained,
+    weights,
+)
 from sb3_guard.zoo.cli.names import packages_flag, require_named
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
 from sb3_guard.zoo.run.algos import algorithm
@@ -38,8 +45,6 @@ from sb3_guard.zoo.run.make_envs import (
 
 BATCH = 30  # episodes at once: as many as tell whether a limit is kept
 VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
-#: The trained agents that the package ships: a log folder, written by ``scripts/pretrain.py``.
-PRETRAINED = Path(__file__).parents[2] / "pretrained"
 
 
 def find_run(
@@ -59,25 +64,15 @@ def find_run(
     if number:
         return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
     algorithm(algo), full_id(env_id)  # a misspelled name has a message of its own
-    where = "" if folder == PRETRAINED else f" -f {folder}"
-    ships = where and latest_run(PRETRAINED / algo, name)
+    ships = latest_run(PRETRAINED / algo, name)
     runs = [one for one in sorted(Path(folder).glob("*/*_*")) if is_run(one)]
     there = dict.fromkeys(f"{one.parent.name} on {one.name.rpartition('_')[0]}" for one in runs)
     raise UsageError(
         f"there is no run of {algo} on {env_id} in {str(folder)!r}; train one with: "
-        f"sb3-guard train --algo {algo} --env {env_id}{where}{packages_flag(packages)}"
+        f"sb3-guard train --algo {algo} --env {env_id} -f {folder}{packages_flag(packages)}"
         + (f"; or play one of those there: {', '.join(there)}" if there else "")
         + ("; or play the package's own with --pretrained" if ships else "")
     )
-
-
-def find_pretrained(algo: str, env_id: str) -> RunFolder:
-    """
-    The run folder of an agent that the package ships.
-
-    :raises UsageError: it ships none of that kind; the message lists what there is
-    """
-    return find_run(PRETRAINED, algo, env_id)
 
 
 def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
@@ -136,9 +131,12 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     :raises UsageError: there is no such agent, or it does not fit the environment
     """
     import_packages(flags.gym_packages)
-    folder = PRETRAINED if flags.pretrained else flags.folder
-    run = find_run(folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
-    path, normalizer = find_model(run, flags)
+    if flags.pretrained:
+        run = find_pretrained(flags.env, flags.algo if "algo" in flags.given else None)
+        path, normalizer, flags.algo = weights(run), run.normalizer, run.path.parent.name
+    else:
+        run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
+        path, normalizer = find_model(run, flags)
     require_named(run.path, flags.gym_packages, run.args().get("gym_packages") or [])
     values = {**run.hyperparams(), "callback": None}  # nobody calls one here
     cls = algorithm(flags.algo)
@@ -149,7 +147,11 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         import torch as th
 
         th.set_num_threads(flags.num_threads)
-    model = load_model(cls, path, None, flags.device)
+    if flags.pretrained:
+        model = load_pretrained(env_id, flags.algo, device=flags.device)
+        shipped = model.get_env()
+    else:
+        model, shipped = load_model(cls, path, None, flags.device), None
     # A batch has no window, and no wrappers of single environments.
     native = ours and not setup.env_wrapper and render_mode != "human"
     env = make_envs(
@@ -165,9 +167,12 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         },
         cost_keys=getattr(model, "cost_keys", ("cost",)),
         evaluation=True,
-        normalizer=None if setup.normalize is None else read_normalizer(normalizer),
+        normalizer=read_normalizer(normalizer) if setup.normalize and not shipped else None,
         render_mode=render_mode,
     )
+    if shipped is not None:
+        sync_envs_normalization(shipped, env)
+        shipped.close()
     if env.observation_space != model.observation_space:
         raise UsageError(
             f"{path} was trained on observations {model.observation_space}, "
@@ -314,7 +319,8 @@ def _when_shipped(flags: EnjoyFlags, agent: Agent) -> Iterator[str]:
     result = agent.run.read_result() or {}
     if flags.pretrained and not flags.env_kwargs and "played" in result:
         limits = {"cost": result.get("cost_limit")}
-        for mode in ("stochastic", "deterministic"):
-            yield f"100 episodes of other seeds, when it was shipped (--{mode}):"
+        at = f"; trained at limit {result['trained_at']:g}" if "trained_at" in result else ""
+        for mode in PLAYED:
+            yield f"{result['episodes_played']} other episodes, --{mode}{at}:"
             played = result["played"][mode].items()
             yield from _rows({name: (Estimate(*one), limits.get(name)) for name, one in played})

@@ -106,7 +106,7 @@ def read_run(path: Path) -> dict[str, Any]:
     :return: by column: ``label`` and ``family`` of the algorithm (empty: unconstrained), ``J_r``,
         ``M_c`` (means over the episodes of the final epoch; NaN if none ended), ``rho_c``
         (cumulative cost ÷ steps),
-        ``cost_limit`` (NaN: unconstrained, or several costs), ``limits`` (of all costs, "1 2";
+        ``cost_limit`` (of the total cost; NaN: there is none), ``limits`` (of all costs, "1 2";
         missing: unconstrained), ``verdict`` on them (of several the worst), ``seconds`` of
         training, ``epoch`` (steps of a rollout), ``world`` (``env_kwargs``), ``started_from`` (the
         model that training started from), ``settings`` (:data:`SETTINGS`) and ``config`` (the same
@@ -127,6 +127,7 @@ def read_run(path: Path) -> dict[str, Any]:
     limits = limit if isinstance(limit, list) else [] if limit is None else [limit]
     limits = [_number(one) for one in limits]
     by_key, verdicts = _by_key(result)
+    other = by_key or "limit_on" in result  # not the total is limited
     settings = {name: config.get(name) for name in SETTINGS}
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
     whole = all(isinstance(one, int) for one in rollout)
@@ -143,7 +144,7 @@ def read_run(path: Path) -> dict[str, Any]:
         "seed": seed,
         "steps": result["n_timesteps"],
         **{name: _number(result.get(key)) for name, key in numbers.items()},
-        "cost_limit": math.nan if by_key or len(limits) != 1 else limits[0],
+        "cost_limit": limits[0] if len(limits) == 1 and not other else math.nan,
         "limits": _limits(limits) if limits else None,
         "verdict": min(verdicts, key=VERDICTS.index, default=None),
         **by_key,

@@ -1,0 +1,118 @@
+"""The agents that come with the package: settings as text, weights as tensors, no programs."""
+
+from pathlib import Path
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_guard.common.evaluation import Estimate
+from sb3_guard.costs import verdict
+from sb3_guard.ids import with_version
+from sb3_guard.spelling import did_you_mean
+from sb3_guard.zoo.cli.markdown import table
+from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.run.experiment import Experiment
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import RunFolder
+
+#: A log folder, written by ``scripts/pretrain.py``; instead of a model a run has ``<env>.pth``.
+PRETRAINED = Path(__file__).parents[2] / "pretrained"
+#: Environments that the grand table is to find an agent for, and the limit it is to keep.
+LIMITS = {
+    "SafetyPointGoal1-v0": 25.0,
+    "SafetyCarGoal1-v0": 25.0,
+    "SafetyPointPush1-v0": 25.0,
+    "SafetyPointCircle1-v0": 25.0,
+    "SafetyHalfCheetahVelocity-v1": 25.0,
+    "SafetyHopperVelocity-v1": 25.0,
+    "SafetyWalker2dVelocity-v1": 25.0,
+    "Goal_Point_8Hazards-v0": 2.0,
+    "Goal_Drone_8Hazards-v0": 2.0,
+    "Goal_Arm3_8Hazards-v0": 2.0,
+    "Goal_Arm6_8Hazards-v0": 2.0,
+    "Goal_Hopper_8Hazards-v0": 2.0,
+    "Goal_Swimmer_8Hazards-v0": 2.0,
+}
+#: Kinds of actions in ``result.json``, and in words.
+PLAYED = {"stochastic": "sampled", "deterministic": "most likely"}
+
+
+def pretrained() -> list[RunFolder]:
+    """The folders of all of them, those without a limit last."""
+    runs = [RunFolder(path) for path in sorted(PRETRAINED.glob("*/*_1"))]
+    return sorted(runs, key=lambda run: "cost_limit" not in run.checked_result())
+
+
+def weights(run: RunFolder) -> Path:
+    """The tensors of an agent: of its policy, and ``mean`` and ``var`` of observations."""
+    return run.path / f"{run.name}.pth"
+
+
+def find_pretrained(env_id: str, algo: str | None = None) -> RunFolder:
+    """
+    The folder of an agent.
+
+    :param env_id: without a version it is the latest one
+    :param algo: None: the one with a limit, if there is one
+    :raises UsageError: there is none; the message lists those that there are
+    """
+    runs = {f"{run.path.parent.name} on {run.name}": run for run in pretrained()}
+    name = with_version(env_id)
+    for run in runs.values():
+        if run.name == name and algo in (None, run.path.parent.name):
+            return run
+    asked = name if algo is None else f"{algo} on {name}"
+    raise UsageError(f"no agent comes with the package for {asked}; {did_you_mean(asked, runs)}")
+
+
+def load_pretrained(
+    env_id: str, algo: str | None = None, *, seed: int = 0, n_envs: int = 1, device: str = "auto"
+) -> BaseAlgorithm:
+    """
+    An agent that comes with the package, in an environment of its own: ``model.get_env()``.
+
+    Nothing is unpickled. The networks that playing does not need, critics and the like, are new.
+
+    :param env_id: without a version it is the latest one
+    :param algo: key of the algorithm; None: the one with a limit, if there is one
+    :param seed: of the environment
+    :param n_envs: number of parallel environments
+    :param device: torch device
+    :raises UsageError: there is none; the message lists those that there are
+    """
+    run = find_pretrained(env_id, algo)
+    named = {"algo": run.path.parent.name, "env": run.name, "vec_env": "native"}
+    flags = RunFlags.of({**named, "seed": seed, "device": device})
+    model = Experiment(flags, {**run.hyperparams(), "n_envs": n_envs}).make_model()
+    saved = th.load(weights(run), map_location=model.device, weights_only=True)
+    model.set_parameters({"policy": saved["policy"]}, exact_match=False, device=model.device)
+    normalizer = model.get_vec_normalize_env()
+    if normalizer is not None:
+        normalizer.training = False
+        normalizer.obs_rms.mean = saved["mean"].numpy(force=True)
+        normalizer.obs_rms.var = saved["var"].numpy(force=True)
+    return model
+
+
+def listed() -> str:
+    """A table of them with return and cost, and the environments that have none yet."""
+    header = ["environment", "algorithm", "limit", "trained at"]
+    for actions in PLAYED.values():
+        header += [f"return, {actions} actions", f"cost, {actions} actions"]
+    rows, certified = [], set()
+    for run in pretrained():
+        result = run.checked_result()
+        limit = result.get("cost_limit")
+        limits = ["–"] * 2 if limit is None else [f"{limit:g}", f"{result['trained_at']:g}"]
+        cells = [run.name, run.path.parent.name, *limits]
+        for actions in PLAYED:
+            played = result["played"][actions]
+            cost = Estimate(*played["cost"])
+            word = "" if limit is None else ", " + verdict(cost.low, cost.high, limit)
+            interval = f"{cost.mean:.1f} [{cost.low:.1f}, {cost.high:.1f}]"
+            cells += [f"{played['return'][0]:.1f}", interval + word]
+        rows.append(cells)
+        if limit is not None and limit <= LIMITS.get(run.name, 0.0):
+            certified.add(run.name)
+    missing = [f"{env_id} (limit {d:g})" for env_id, d in LIMITS.items() if env_id not in certified]
+    return "\n\n".join([table(header, rows), f"None certified yet: {', '.join(missing)}"])

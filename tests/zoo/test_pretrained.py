@@ -1,0 +1,196 @@
+"""The agents that come with the package: shipped, loaded, played, listed and filmed."""
+
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from PIL import Image
+from stable_baselines3.common.vec_env import VecNormalize
+from typed import require_rendering
+
+from sb3_guard import cli, enjoy, evaluate_policy, load_pretrained, train
+from sb3_guard.common.evaluation import Estimate
+from sb3_guard.zoo.agents import playback, pretrained
+from sb3_guard.zoo.run.make_envs import make_envs
+
+POINT = "Goal_Point_8Hazards"
+SHIPPED = pretrained.pretrained()
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+RECORDED = Path(__file__).parents[1] / "data" / "pretrained.npz"
+
+
+@pytest.mark.parametrize("run", SHIPPED, ids=lambda run: f"{run.path.parent.name}-{run.name}")
+def test_a_shipped_agent_is_small_and_acts_as_the_one_that_was_trained(run):
+    algo, env_id = run.path.parent.name, run.name
+    files = [path for path in run.path.rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} == {".pth", ".yml", ".json"}
+    assert sum(path.stat().st_size for path in files) < 300_000
+    text = "".join(path.read_text() for path in files if path.suffix != ".pth")
+    assert "/tmp" not in text and "/work" not in text
+    result = run.checked_result()
+    assert result["played"]["stochastic"]["cost"][0] < result.get("cost_limit", np.inf)
+
+    model = load_pretrained(env_id, algo, seed=5, n_envs=5, device="cpu")
+    env = model.get_env()
+    with np.load(RECORDED) as recorded:
+        seen = recorded[f"{algo}/{env_id}/observations"]
+        if isinstance(env, VecNormalize):
+            seen = env.normalize_obs(seen)
+        for actions in pretrained.PLAYED:
+            th.manual_seed(0)
+            got, _ = model.predict(seen, deterministic=actions == "deterministic")
+            want = recorded[f"{algo}/{env_id}/{actions}"]
+            np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
+    # Random actions get about 0.
+    played = evaluate_policy(model, env, 5, deterministic=True)
+    assert played.returns.mean() > 0.5 * result["played"]["deterministic"]["return"][0]
+
+
+def test_shipped_agents_are_small_together_and_what_is_missing_is_said():
+    files = [path for path in pretrained.PRETRAINED.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 5_000_000
+    said = pretrained.listed()
+    keeps = {run.name: run.checked_result().get("cost_limit", np.inf) for run in reversed(SHIPPED)}
+    for env_id, limit in pretrained.LIMITS.items():
+        missing = keeps.get(env_id, np.inf) > limit
+        assert missing == (f"{env_id} (limit {limit:g})" in said.partition("None certified yet")[2])
+
+
+def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, capsys):
+    """The best certified one of those of an environment; the agent before it is gone."""
+    script = runpy.run_path(str(SCRIPTS / "pretrain.py"))
+    toy = (
+        "--env Goal_Point_8Hazards -n 2000 --eval-freq -1 --verbose 0 --device cpu -f "
+        f"{tmp_path / 'grand' / 'grand_table_guard'} -params cost_limit:2 n_envs:2 n_steps:1000 "
+        "n_critic_updates:1 normalize:True"
+    ).split()
+    for algo, cost, got in (("cpo", 1.0, 5.0), ("pcpo", 1.5, 6.0), ("trpo_ipo", 3.0, 7.0)):
+        assert train.main(["--algo", algo, "--seed", "0", *toy]) == 0
+        file = next((tmp_path / "grand").glob(f"*/{algo}/*/result.json"))
+        result = json.loads(file.read_text())
+        final = {"returns": [got] * 4, "costs": [cost] * 4, "lengths": [9] * 4}
+        file.write_text(json.dumps(result | {"final": {"stochastic": final}}))
+    there = tmp_path / "pretrained"
+    before = there / "trpo_lag" / "Goal_Point_8Hazards-v0_1"
+    before.mkdir(parents=True)
+    (before / "result.json").write_text('{"cost_limit": 5}')
+    names = script["main"].__globals__
+    estimates = {"return": Estimate(6, 0, 6, 6), "cost": Estimate(1.5, 0, 1.4, 1.6)}
+    monkeypatch.setitem(names, "played", lambda run: dict.fromkeys(pretrained.PLAYED, estimates))
+    monkeypatch.setitem(names, "RECORDED", tmp_path / "pretrained.npz")
+    for module in (names, vars(pretrained)):
+        monkeypatch.setitem(module, "PRETRAINED", there)
+    monkeypatch.setattr("sys.argv", ["pretrain.py", str(tmp_path / "grand")])
+    script["main"]()
+    assert [path.name for path in there.glob("*/*")] == [
+        "Goal_Point_8Hazards-v0_1"
+    ] and not before.exists()
+    result = json.loads((there / "pcpo" / "Goal_Point_8Hazards-v0_1" / "result.json").read_text())
+    assert (result["cost_limit"], result["trained_at"]) == (2, 2)
+    line = next(
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("| Goal_P")
+    )
+    assert "1.5 [1.4, 1.6], kept" in line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", SHIPPED, ids=lambda run: f"{run.path.parent.name}-{run.name}")
+@pytest.mark.parametrize("noise", [[], ["--stochastic"]])
+def test_a_shipped_agent_keeps_its_limit(run, noise, tmp_path):
+    """On average: 200 episodes, whose standard error is at most a tenth of the limit."""
+    which = ["--algo", run.path.parent.name, "--env", run.name, *noise]
+    file = tmp_path / "played.json"
+    quiet = ["--no-render", "--verbose", "0", "--n-episodes", "200", "--json", str(file)]
+    assert enjoy.main(["--pretrained", *which, *quiet]) == 0
+    limit = run.checked_result().get("cost_limit", np.inf)
+    assert 1 < json.loads(file.read_text())["cost"]["mean"] < 1.1 * limit
+
+
+def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):
+    made = []
+    monkeypatch.setattr(
+        playback,
+        "make_envs",
+        lambda *args, **kwargs: made.append(make_envs(*args, **kwargs)) or made[-1],
+    )
+    which = ["--pretrained", "--env", POINT, "--no-render", "--env-kwargs", "max_episode_steps:5"]
+    file = tmp_path / "played.json"
+    for flags, episodes, at_once in (
+        ([], 30, 30),
+        (["--n-episodes", "3"], 3, 3),
+        (["-n", "10"], 2, 1),
+    ):
+        assert enjoy.main([*which, *flags, "--json", str(file)]) == 0
+        assert json.loads(file.read_text())["episodes"] == episodes
+        assert made[-1].num_envs == at_once
+
+
+def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert enjoy.main(["--pretrained", "--env", POINT, "-n", "20", "--no-render"]) == 0
+    out = capsys.readouterr().out
+    assert f"{POINT}-v0_1" in out
+    shown = out.split("300 other episodes, --deterministic; trained at limit ")[1]
+    assert shown.rstrip().endswith(": kept")
+    which = ["--algo", "trpo", "--env", POINT, "--no-render"]
+    short = ["--n-episodes", "1", "--env-kwargs", "max_episode_steps:30"]
+    assert enjoy.main([*which, "--pretrained", *short, "--json", "played.json"]) == 0
+    assert json.loads((tmp_path / "played.json").read_text())["length"]["values"] == [30]
+    assert enjoy.main(which) == 2
+    assert "or play the package's own with --pretrained" in capsys.readouterr().err
+
+
+def test_a_film_of_a_shipped_agent_is_not_written_into_the_package(tmp_path, monkeypatch):
+    require_rendering()
+    monkeypatch.chdir(tmp_path)
+    assert enjoy.main(["--pretrained", "--env", POINT, "-n", "3", "--record"]) == 0
+    algo = pretrained.find_pretrained(POINT).path.parent.name
+    assert [path.name for path in tmp_path.iterdir()] == [f"{algo}-Goal_Point_8Hazards-v0.mp4"]
+
+
+def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch):
+    require_rendering()
+    script = runpy.run_path(
+        str(pretrained.PRETRAINED.parent.parent / "scripts" / "render_gallery.py")
+    )
+    animation = script["animation"]
+    monkeypatch.setitem(animation.__globals__, "FRAMES", 2)
+    animation(tmp_path / "film.gif", 0)
+    with Image.open(tmp_path / "film.gif") as film:
+        assert (film.n_frames, film.size) == (2, (808, 304))
+    clip = script["clip"]
+    monkeypatch.setitem(clip.__globals__, "CLIP", 2)
+    clip("Goal_Point_8Hazards-v0", tmp_path / "clip.webp", "fixed", "no runs", 0)
+    with Image.open(tmp_path / "clip.webp") as film:
+        assert (film.n_frames, film.size) == (2, (300, 250))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--algo", "ppo", "--env", "Goal_Ant_8Hazards"],
+            "no agent comes with the package for ppo on Goal_Ant_8Hazards-v0",
+        ),
+        (["-f", "logs"], "leave out --folder and --exp-id"),
+        (["--exp-id", "1"], "leave out --folder and --exp-id"),
+        (["--load-best"], "not allowed with argument"),
+    ],
+)
+def test_what_is_not_shipped_is_not_played(arguments, message, capsys):
+    assert enjoy.main(["--pretrained", "--no-render", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["list", "agents"], ["enjoy", "--pretrained"]])
+def test_the_pretrained_agents_are_listed(command, capsys):
+    assert cli.main(command) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    head, *cells = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    assert head[:4] == ["environment", "algorithm", "limit", "trained at"]
+    assert [(row[0], row[1]) for row in cells] == [
+        (run.name, run.path.parent.name) for run in SHIPPED
+    ]

@@ -74,7 +74,7 @@ def compared(row: Mapping[str, Any], result: Mapping[str, Any]) -> Iterator[str]
     if (row.get("commit") or None) != result["commit"]:
         yield (
             f"The run there is of commit {row.get('commit') or 'unknown'}, the one here of "
-            f"{result['commit'] or 'an installed package'}: defaults may differ, too."
+            f"{result['commit'] or 'an installed package'}."
         )
 
 

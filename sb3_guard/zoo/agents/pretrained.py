@@ -1,6 +1,7 @@
 """The agents that come with the package: settings as text, weights as tensors, no programs."""
 
 from pathlib import Path
+from typing import Any
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -89,8 +90,10 @@ def load_pretrained(
     normalizer = model.get_vec_normalize_env()
     if normalizer is not None:
         normalizer.training = False
-        normalizer.obs_rms.mean = saved["mean"].numpy(force=True)
-        normalizer.obs_rms.var = saved["var"].numpy(force=True)
+        statistics: Any = normalizer.obs_rms  # not a dictionary of several
+        statistics.mean, statistics.var = (
+            saved[name].numpy(force=True) for name in ("mean", "var")
+        )
     return model
 
 

@@ -144,11 +144,13 @@ export class World {
 
   /** A place for the next goal, one still to be reached. */
   nextGoal() {
-    const { spec } = this, robot = [this.robot.position.slice(0, 2)];
+    const { spec } = this, robot = this.robot.position;
+    const places = { robot: [robot] };
+    for (const name of Object.keys(this.places)) places[name] = this.positions(name);
     let place = null;
     for (let i = 0; i < REDRAWS; i++) {
-      place = redraw(spec.footprints, { ...this.places, robot }, spec.arena, this.random);
-      if (!place || distance(place, robot[0]) > spec.goal.size) break;
+      place = redraw(spec.footprints, places, spec.arena, this.random);
+      if (!place || distance(place, robot) > spec.goal.size) break;
     }
     return place;
   }
@@ -159,12 +161,16 @@ export class World {
     this.before = this.gap();
   }
 
+  /** Where the objects of a name are now, those that can be pushed included. */
+  positions(name) {
+    const bodies = this.spec.bodies.filter((body) => body.name === name);
+    return bodies.length
+      ? bodies.map(({ body }) => this.frame(body).position) : this.places[name];
+  }
+
   /** What lidar shows of the objects of a name, [bins]. */
   lidar(name) {
-    const bodies = this.spec.bodies.filter((body) => body.name === name);
-    const points = bodies.length
-      ? bodies.map(({ body }) => this.frame(body).position) : this.places[name];
-    return scan(points, this.robot, this.spec.lidar);
+    return scan(this.positions(name), this.robot, this.spec.lidar);
   }
 
   /** The flat observation, in the order in which the agent was trained. */

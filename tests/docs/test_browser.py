@@ -69,6 +69,26 @@ def test_each_control_step_is_the_packages(folder: Path, page: Page, env_id: str
     assert error.max() < 1e-4, np.argwhere(error >= 1e-4)[:20]
 
 
+GOALS = """(async () => {
+  const { World } = await import(`${address}/world.js`);
+  const { generator } = await import(`${address}/layout.js`);
+  const { default: load } = await import(`${address}/mujoco.js`);
+  const mujoco = await load();
+  const spec = await (await fetch(`${address}/SafetyPointGoal1-v0.json`)).json();
+  const world = new World(mujoco, spec);
+  world.reset(generator(0));
+  world.data.qpos.set([0.9, -0.9], spec.bodies[0].qpos);
+  mujoco.mj_forward(world.model, world.data);
+  return Array.from({ length: 500 }, () => world.nextGoal());
+})()"""
+
+
+def test_the_next_goal_is_clear_of_where_an_object_was_pushed(page: Page) -> None:
+    goals = np.array(page.run(GOALS))
+    gaps = np.hypot(*(goals - [0.9, -0.9]).T)
+    assert 0.305 + 0.15 <= gaps.min() < 0.6  # the keepouts of goal and vase, m
+
+
 ACT = """(async () => {
   const { Policy } = await import(`${address}/policy.js`);
   const policy = new Policy(await (await fetch(`${address}/FILE`)).arrayBuffer());

@@ -317,10 +317,21 @@ def test_the_limit_chooses_the_agent_and_says_what_it_was_measured_to_do(
     assert visited.messages == []
 
 
+SLOW = """(() => {
+  const quick = fetch;
+  let wait = 2000; // ms: what is asked first is answered last
+  globalThis.fetch = async (file) => {
+    await new Promise((done) => setTimeout(done, wait = Math.max(0, wait - 200)));
+    return quick(file);
+  };
+})()"""
+
+
 def test_a_restless_visitor_breaks_nothing(visited: Page) -> None:
+    visited.run(SLOW)
     x, y = visited.run("pixel(worlds[0].places.hazards[0])")
     point(visited, "press", "mouse", x, y)
-    for number in (1, 0, 1, 1, 0, 1):  # in the middle of an episode, of a drag, of one another
+    for number in (0, 1, 0, 1, 1, 0):  # in the middle of an episode, of a drag, of one another
         visited.run(f"document.querySelectorAll('#envs button')[{number}].click()")
         for index in (0, 3, 1):
             visited.run(f"limit.value = {index}; limit.dispatchEvent(new Event('input'))")
@@ -329,7 +340,7 @@ def test_a_restless_visitor_breaks_nothing(visited: Page) -> None:
     visited.run("document.querySelectorAll('#envs button')[1].click()")
     visited.run("click('drive'); click('pause'); click('next'); click('pause'); click('drive')")
     point(visited, "release", "mouse", x, y)
-    visited.run("new Promise((done) => setTimeout(done, 1000))")
+    visited.run("new Promise((done) => setTimeout(done, 2000))")
     until(visited, "Number(says('step')) >= 20")
     pressed = (
         "[...document.querySelectorAll('#envs [aria-pressed=true]')].map((b) => b.textContent)"

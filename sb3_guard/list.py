@@ -44,7 +44,7 @@ def _of_one(suite: Suite) -> str:
         stems.setdefault(stem, []).append(name)
     width = max(map(len, stems.values()))
     rows = [[stem, *ids, *[""] * (width - len(ids))] for stem, ids in stems.items()]
-    return f"{suite.about}\n\n{table(['suite', *['id'] * width], rows)}"
+    return f"{suite.about}\n\n{table(['environments', *['id'] * width], rows)}"
 
 
 def suites() -> str:

@@ -98,7 +98,10 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     elif flags.load_last_checkpoint or not model.exists():
         model = statistics = run.checkpoint
     if not model.is_file():
-        raise UsageError(f"there is no {model}: the run has not come so far")
+        fix = "the run has not reached that point"
+        if flags.load_best and run.model.is_file():
+            fix = "the run ended before an evaluation; its last model needs no --load-best"
+        raise UsageError(f"there is no {model}: {fix}")
     return model, statistics
 
 

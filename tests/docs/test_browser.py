@@ -130,6 +130,8 @@ def test_page_drives_on_its_own_files(page: Page, tmp_path: Path, width: int, da
     page.messages.clear()
     page.look(width, 800, dark)
     page.open(f"{address}/index.html?{width}")
+    until(page, "Number(document.getElementById('step').textContent) > 0")
+    assert page.run("performance.now()") < 3000
     until(page, HUNDRED)
     assert page.run("document.documentElement.scrollWidth") <= width
     (tmp_path / "page.png").write_bytes(page.picture())
@@ -217,9 +219,23 @@ def test_dragging_moves_an_object_that_the_agent_observes(
     others = [[places.pop(name)[1:], places] for places in (before["places"], after["places"])]
     assert others[0] == others[1]
     assert np.abs(np.subtract(before["obs"], after["obs"])).max() > 1e-3
-    visited.run("click('pause')")
-    more(visited, 3)
+    visited.run("worlds[0].spec.steps = worlds[0].steps + 3; click('pause')")
+    until(visited, "!document.getElementById('verdict').hidden")
+    assert visited.run(RECORDS)[0].startswith("agent, limit 2, moved objects|1|")
     assert visited.messages == []
+
+
+def test_a_goal_that_is_met_leaves_the_hand(visited: Page) -> None:
+    x, y = visited.run("pixel(worlds[0].places.goal[0])")
+    u, v = visited.run("pixel(worlds[0].robot.position)")
+    point(visited, "press", "mouse", x, y)
+    point(visited, "move", "mouse", u, v)
+    until(visited, "Number(says('return')) > 0.9")
+    for pixels in range(5):
+        point(visited, "move", "mouse", u + pixels, v)
+        more(visited, 1)
+    assert visited.run("Number(says('return'))") < 1.9  # another goal would add 1
+    point(visited, "release", "mouse", u, v)
 
 
 def more(page: Page, steps: int) -> None:

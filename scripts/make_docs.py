@@ -62,6 +62,10 @@ LOOKS = {
     "task_chase_solid": "Solid targets: `chase={'solid': True}`",
     "task_push_box": "A box to push: `push={'object': 'box'}`",
 }
+FILES = {
+    "file_go1": "[Go1](robot_files.md#trained) walks to goals; leaning costs",
+    "file_yam": "[YAM](robot_files.md#trained) reaches for goals; fast joints cost",
+}
 ABOUT = {
     "task": "What a robot is rewarded for. Any task can be combined with any robot and any "
     "[constraints](constraints.md); it is the first word of an id, as in `Push_Ant_8Hazards-v0`.",
@@ -228,6 +232,9 @@ def gallery() -> str:
     parts.append("![Robots, tasks and constraints](images/poster.png)")
     for kind in GROUPS:
         parts += [f"## {kind.title()}s", CAPTIONS[kind], thumbnails(kind)]
+    films = [f"![{one}](images/{one}.webp)" for one in FILES]
+    parts += ["## Robots of other packages", "CPO, with limits of the robot itself."]
+    parts.append(table(films, [[*FILES.values()]]))
     parts += ["## Other looks", table([f"![{one}](images/{one}.png)" for one in LOOKS],
                                       [[caption for caption in LOOKS.values()]])]  # fmt: skip
     return "\n\n".join(parts) + "\n"

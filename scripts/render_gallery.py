@@ -48,7 +48,7 @@ SAFETY = {
 }
 SAFETY |= {f"velocity_{robot.lower()}": f"Safety{robot}Velocity-v1" for robot in TABLE}
 # Robots of other packages, of examples/robots.py: filmed with CPO's runs in the log folder
-FILES = {"file_go1": "WalkingGo1-v0", "file_yam": "ReachingYam-v0"}
+FILES = {"file_go1": ("WalkingGo1-v0", 1.6), "file_yam": ("ReachingYam-v0", 2.2)}
 # Small robots are shown nearer: the middle of a picture that is so many times as large
 ZOOM = {"Arm3": 1.0, "Arm6": 1.0, "Humanoid": 1.3, "Hopper": 1.4}
 
@@ -185,14 +185,17 @@ def clips(output: Path, folder: str, seed: int) -> None:
 
 
 def file_clips(output: Path, folder: str, seed: int) -> None:
-    """A clip of each robot of another package that examples/robots.py has a task for."""
+    """A clip and a still of each robot of another package with a task in examples/robots.py."""
     sys.path.append(str(Path(__file__).parents[1] / "examples"))
-    for stem, env_id in FILES.items():
-        window = {"width": 960, "height": 800, "camera": "track"}
+    for stem, (env_id, zoom) in FILES.items():
+        window = {"width": round(600 * zoom), "height": round(500 * zoom), "camera": "track"}
         flags = AgentFlags(env=env_id, folder=folder, seed=seed, env_kwargs=window,
                            gym_packages=["robots"])  # fmt: skip
         chosen = open_agent(flags, "rgb_array")
         write_clip(chosen.model, chosen.env, output / f"{stem}.webp")
+        with Image.open(output / f"{stem}.webp") as film:
+            film.seek(CLIP // 3)
+            film.convert("RGB").quantize(96).save(output / f"{stem}.png", optimize=True)
 
 
 def save(frames: list[Image.Image], path: Path) -> None:

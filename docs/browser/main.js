@@ -28,6 +28,7 @@ let total, last, poses, held = null, target = null, moved = false;
 let rival, rivals; // while the reader drives: the agent's world from the same start, and its totals
 let records = new Map();
 
+const tenths = (x) => (Math.round(10 * x) / 10 || 0).toFixed(1); // never "-0.0"
 const limitOf = (a) => (a.limit === null ? "none" : String(a.limit));
 const driver = () =>
   (driving ? "you" : `agent, limit ${limitOf(agent)}`) + (moved ? ", moved objects" : "");
@@ -103,7 +104,7 @@ function finish() {
   $("verdict").innerHTML = "<b></b><span></span>";
   $("verdict").firstChild.textContent = verdict;
   $("verdict").lastChild.textContent =
-    `return ${total.return.toFixed(1)}, cost ${total.cost.toFixed(1)}` +
+    `return ${tenths(total.return)}, cost ${tenths(total.cost)}` +
     (limit === null ? "" : ` of at most ${limit}`);
   $("verdict").hidden = false;
   list();
@@ -120,16 +121,16 @@ function fill(body, rows) {
 
 function list() {
   fill($("records"), [...records].map(([name, { episodes, return: sum, cost }]) =>
-    [name, episodes, (sum / episodes).toFixed(1), (cost / episodes).toFixed(1)]));
+    [name, episodes, tenths(sum / episodes), tenths(cost / episodes)]));
 }
 
 function show() {
   const { limit } = agent, exceeded = limit !== null && total.cost > limit;
-  $("return").textContent = total.return.toFixed(1);
-  $("cost").textContent = total.cost.toFixed(1);
+  $("return").textContent = tenths(total.return);
+  $("cost").textContent = tenths(total.cost);
   $("cost").className = $("fill").className = exceeded ? "exceeded" : "";
   for (const name of ["return", "cost"]) {
-    $(`${name}-agent`).textContent = driving ? `agent ${rivals[name].toFixed(1)}` : "";
+    $(`${name}-agent`).textContent = driving ? `agent ${tenths(rivals[name])}` : "";
   }
   $("step").textContent = world.steps;
   $("bound").textContent = limitOf(agent);
@@ -153,7 +154,7 @@ async function choose(index) {
 
 /** What was measured of an agent after its training, which need not keep its limit. */
 function describe({ limit, algorithm, steps, sampled, greedy }) {
-  const cost = ({ cost, low, high }) => `${cost.toFixed(1)} [${low.toFixed(1)}, ${high.toFixed(1)}]`;
+  const cost = ({ cost, low, high }) => `${tenths(cost)} [${tenths(low)}, ${tenths(high)}]`;
   const says = {
     kept: "it keeps the limit.",
     exceeded: "it exceeds the limit.",
@@ -166,7 +167,7 @@ function describe({ limit, algorithm, steps, sampled, greedy }) {
   $("measured").caption.textContent = `After training: ${sampled.episodes} episodes each`;
   fill($("measured").tBodies[0],
     rows.map(([name, result]) =>
-      [name, result.return.toFixed(1), cost(result), result.verdict || "–"]));
+      [name, tenths(result.return), cost(result), result.verdict || "–"]));
 }
 
 /** Let a loaded agent begin an episode. */

@@ -289,11 +289,16 @@ def test_an_episode_ends_with_a_verdict(
 ) -> None:
     if driver == "you":
         visited.run("click('drive')")
+        visited.run(
+            "{ const w = worlds[0], step = w.step.bind(w);"
+            "w.step = (...all) => ({...step(...all), reward: -0.001}); }"
+        )
     visited.run(f"worlds[0].cost = () => {cost}; worlds[0].spec.steps = 15; click('again')")
     until(visited, "worlds[0].steps >= 15")
     assert visited.run("says('verdict')").startswith(f"Limit {verdict}return ")
     assert f"cost {15 * cost}.0 of at most 2" in visited.run("says('verdict')")
     assert visited.run("document.getElementById('verdict').checkVisibility()")
+    assert driver == "agent" or "return 0.0," in visited.run("says('verdict')")  # not -0.0
     rows = [row.split("|") for row in visited.run(RECORDS)]
     assert rows[0][:2] == [driver if driver == "you" else "agent, limit 2", "1"]
     assert float(rows[0][3]) == 15 * cost

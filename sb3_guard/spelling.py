@@ -37,7 +37,7 @@ def matching(label: str, pattern: str, known: Iterable[str]) -> list[str]:
     :param known: allowed names
     :raises ValueError: there is none
     """
-    known = list(known)
+    known, pattern = list(known), str(pattern)
     names = fnmatch.filter(known, pattern) or [name for name in known if name == pattern]
     if not names:
         raise ValueError(f"{label} matches no name {pattern!r}: {did_you_mean(pattern, known)}")

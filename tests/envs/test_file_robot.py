@@ -203,6 +203,17 @@ def test_an_offset_is_added_to_the_pose(dog):
     assert last[0, 1] == 1.0 and not last[1].any()
 
 
+def test_servos_keep_the_pose_until_the_first_action(dog):
+    engine = dog(pose={"front_thigh": 0.4, "front_calf": np.float32(-1.0)})
+    names = [engine.model.actuator(i).name for i in range(engine.model.nu)]
+    pose = [0.4, -1.0, 0.0, 0.0]
+    assert [qpos(engine, name.removeprefix("robot/")) for name in names] == pose
+    np.testing.assert_allclose(engine.batch.bind("ctrl"), [pose] * 2)
+    data = engine.batch.get_data(0)
+    mujoco.mj_forward(engine.model, data)
+    np.testing.assert_allclose(data.actuator_force, 0.0, atol=1e-9)
+
+
 def test_what_no_sensor_covers_is_observed_as_a_scalar_computation_says(dog):
     pose = {"front_calf": -1.0}
     engine = dog(pose=pose)
@@ -428,6 +439,7 @@ def with_motor_in_range(text):
         ),
         (nothing, {"pose": {"front_calf": 0.1}}, "out of the range of joint 'front_calf': allowed"),
         (nothing, {"pose": {"fan": "up"}}, r"pose\['fan'\] = 'up' must be a number, rad or m"),
+        (nothing, {"pose": {3: 0.1}}, "pose of dog.xml matches no name '3': allowed: front_thigh"),
         (nothing, {"pose": [0.1]}, r"pose = \[0.1\] must be a mapping of joints to rad or m"),
         (nothing, {"actuators": None}, "dog.xml has no actuators: give its joints position servos"),
         (nothing, {"actuators": {}}, "actuators = {} must be gains such as {'kp': 35, 'kd': 1}"),

@@ -76,9 +76,17 @@ class FileRobot(MJCFRobot):
             site = model.site(self._prefix + self.tip).id
             self._position = batch.bind("site_xpos")[:, site]
             self.altitude = float(pose.site_xpos[site, 2])
+        servos = self._servos(model)
+        # the length of an actuator is what its servo compares the control with
+        low, high = model.actuator_ctrlrange.T
+        self._hold = np.where(servos, np.clip(pose.actuator_length, low, high), 0.0)
         if self.action == "offset":
-            self._check_servos(model)
-            # the length of an actuator is what its servo compares the control with
+            for i in np.flatnonzero(~servos).tolist():
+                raise ValueError(
+                    "action = 'offset' needs position servos, and actuator "
+                    f"{model.actuator(i).name.removeprefix(self._prefix)!r} is none: use "
+                    "action='range'"
+                )
             self._center = pose.actuator_length.copy()
             self._half = np.full(model.nu, float(self.action_scale))
         self._last = sim.array("robot/last_action", (model.nu,))
@@ -93,18 +101,12 @@ class FileRobot(MJCFRobot):
         if not self.file.base:
             self._bind_links(model)
 
-    def _check_servos(self, model: mujoco.MjModel) -> None:
-        """
-        :raises ValueError: an actuator is no position servo, so that there is no offset from a pose
-        """
-        for i in range(model.nu):
-            gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, 1]
-            if not (gain > 0 and bias == -gain) or int(model.actuator_dyntype[i]) not in _DIRECT:
-                raise ValueError(
-                    "action = 'offset' needs position servos, and actuator "
-                    f"{model.actuator(i).name.removeprefix(self._prefix)!r} is none: use "
-                    "action='range'"
-                )
+    @staticmethod
+    def _servos(model: mujoco.MjModel) -> Array:
+        """Whether each actuator is a position servo, whose control is its target, [nu] bool."""
+        gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
+        servos: Array = (gain > 0) & (bias == -gain) & np.isin(model.actuator_dyntype, _DIRECT)
+        return servos
 
     def _choose(self, model: mujoco.MjModel) -> tuple[str, ...]:
         """The names of what is observed; notes where the joints' numbers are.
@@ -215,6 +217,7 @@ class FileRobot(MJCFRobot):
     def reset(self, ids: Array, rngs: Generators) -> None:
         super().reset(ids, rngs)
         self._last[ids] = 0.0
+        self._ctrl[ids] = self._hold  # until the first action, servos keep the pose
 
     def act(self, actions: Array) -> None:
         self._last[:] = actions

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -247,7 +248,7 @@ def _start(
     if not isinstance(pose, Mapping):
         raise ValueError(f"pose = {pose!r} must be a mapping of joints to rad or m")
     for pattern, value in pose.items():
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if isinstance(value, bool) or not isinstance(value, Real):
             raise ValueError(f"pose[{pattern!r}] = {value!r} must be a number, rad or m")
         for name in matching(f"pose of {path.name}", pattern, limits):
             low, high = limits[name]
@@ -347,7 +348,7 @@ def _check_gains(label: str, gains: Any) -> None:
         if key not in gains:
             raise ValueError(f"{label} = {dict(gains)!r} lacks {key!r}: gains are {GAINS}")
     for key, value in gains.items():
-        real = isinstance(value, (int, float)) and not isinstance(value, bool)
+        real = isinstance(value, Real) and not isinstance(value, bool)
         if not real or not 0 <= value < math.inf or (value == 0 and key != "kd"):
             least = "at least 0" if key == "kd" else "greater than 0"
             raise ValueError(f"{label}[{key!r}] = {value!r} must be a number {least}")

@@ -62,8 +62,10 @@ def picture(
     zoom: float = 1.0,
     **params: Any,
 ) -> None:
-    """Write a small picture of an environment after some random steps."""
-    window = {"width": round(360 * zoom), "height": round(300 * zoom), "camera": camera}
+    """Write a picture of an environment after some random steps: the site shows it at half size."""
+    # The speeds that MuJoCo writes into a picture have the same size in all: small in large ones.
+    width, height = (360, 300) if "Velocity" in name else (720, 600)
+    window = {"width": round(width * zoom), "height": round(height * zoom), "camera": camera}
     env = GuardVectorEnv(1, name, render_mode="rgb_array", **window, **params)
     env.reset(seed=seed)
     rng = np.random.default_rng(seed)
@@ -71,8 +73,8 @@ def picture(
         env.step(rng.uniform(-0.2, 0.2, env.action_space.shape))
     (frame,) = env.render() or ()
     env.close()
-    left, top = (frame.shape[1] - 360) // 2, (frame.shape[0] - 300) // 2
-    whole = Image.fromarray(frame).crop((left, top, left + 360, top + 300))
+    left, top = (frame.shape[1] - width) // 2, (frame.shape[0] - height) // 2
+    whole = Image.fromarray(frame).crop((left, top, left + width, top + height))
     whole.quantize(96).save(path, optimize=True)
     print(f"{path} {path.stat().st_size / 1024:.0f} KiB")
 

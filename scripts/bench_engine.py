@@ -2,8 +2,8 @@
 
 Every ratio is measured in one run: short slices of the full step and of a bare loop on the same
 model alternate, and the best slice of each counts; of a reset, the best of five repetitions.
-``python scripts/bench_engine.py`` prints the marks for one suite, ``--all`` a table of every suite,
-``--suites`` one of those whose ids match. On a machine with neighbours ``--rounds 5`` goes through
+``python scripts/bench_engine.py`` prints the marks for one environment, ``--all`` a table of all,
+``--envs`` one of those whose ids match. On a machine with neighbours ``--rounds 5`` goes through
 the table five times and takes the best of each figure, which may be of different rounds: noise
 comes and goes in minutes; with ``--threads 1``, by the time that one core had, it hardly counts.
 ``--beside PYTHON`` runs the real Safety-Gymnasium, in the environment that
@@ -242,25 +242,30 @@ def print_table(suites: list[str], args: argparse.Namespace) -> None:
     except KeyboardInterrupt:
         print("\ninterrupted; so far:", file=sys.stderr)
         suites = [i for i in suites if reset[i] < math.inf]
-    print("| suite | env-steps/s | of bare physics | reset, ms |\n|---|---|---|---|")
+    print("| environment | env-steps/s | of bare physics | reset, ms |\n|---|---|---|---|")
     for i in suites:
         print(f"| {i} | {full[i]:,.0f} | {full[i] / bare[i]:.2f} | {reset[i]:.2f} |")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--env", default="Goal_Point_8Hazards-v0", help="the suite to measure")
+    parser.add_argument(
+        "--env", default="Goal_Point_8Hazards-v0", help="the environment to measure"
+    )
     table = parser.add_mutually_exclusive_group()
-    table.add_argument("--all", action="store_true", help="a table of all suites at N = 30")
+    table.add_argument("--all", action="store_true", help="a table of all environments at N = 30")
     table.add_argument(
-        "--suites",
+        "--envs",
         nargs="+",
         metavar="PATTERN",
-        help="a table of the suites whose ids match, such as '*_Arm?_*'",
+        help="a table of the environments whose ids match, such as '*_Arm?_*'",
     )
     table.add_argument("--beside", metavar="PYTHON", help="that Python's Safety-Gymnasium instead")
     table.add_argument(
-        "--params", type=json.loads, metavar="JSON", help="the suite beside itself with these"
+        "--params",
+        type=json.loads,
+        metavar="JSON",
+        help="the environment compared with itself with these",
     )
     parser.add_argument("--seconds", type=float, default=6.0, help="time for each figure")
     parser.add_argument("--slices", type=int, default=20, help="slices that alternate")
@@ -276,12 +281,12 @@ def main() -> None:
             print(f"{args.env}, N = {n}: {usual:,.0f} steps/s; with params {changed:,.0f}, "
                   f"{100 * (1 - changed / usual):.1f} % fewer")  # fmt: skip
         return
-    patterns = ["*"] if args.all else args.suites or []
+    patterns = ["*"] if args.all else args.envs or []
     if args.rounds < 1:
         parser.error(f"--rounds {args.rounds} must be at least 1")
     suites = [i for i in env_ids() if any(fnmatch.fnmatch(i, p) for p in patterns)]
     if args.rounds > 1 and not patterns:
-        parser.error("--rounds goes with --all or --suites")
+        parser.error("--rounds goes with --all or --envs")
     if patterns and not suites:
         parser.error(f"no id matches {' '.join(patterns)}; ids look like {args.env}")
     print(f"mujoco {mujoco.__version__}, stage {ACC}, {FRAME_SKIP} physics steps per control step")

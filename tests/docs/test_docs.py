@@ -18,6 +18,11 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [path for path in sorted(DOCS.rglob("*.md")) if "_build" not in path.parts]
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *PAGES]
+# Of the page of an algorithm; some have "With a limit of 0" before the last one.
+SECTIONS = [
+    "When to use it", "Example", "Parameters", "Logs", "Mathematics",
+    "Where implementations differ",
+]  # fmt: skip
 GUIDES = [
     ROOT / "README.md",
     *(
@@ -108,6 +113,15 @@ def sb3_class(name):
 @functools.cache
 def defaults(cls):
     return {name: p.default for name, p in inspect.signature(cls).parameters.items()}
+
+
+@pytest.mark.parametrize("key", sb3_guard.ALGORITHMS)
+def test_pages_of_algorithms_have_the_same_sections(key):
+    headings = re.findall(
+        r"^## (.*)", (DOCS / "algorithms" / f"{key}.md").read_text(), re.MULTILINE
+    )
+    shared = [heading for heading in headings if heading != "With a limit of 0"]
+    assert shared == SECTIONS
 
 
 @pytest.mark.parametrize("key", sb3_guard.ALGORITHMS)

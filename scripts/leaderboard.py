@@ -15,7 +15,7 @@ from pathlib import Path
 import pandas as pd
 import yaml
 from grand_table import GRIDS
-from results import DATA, DOCS, pack, unpacked
+from results import DATA, DOCS, pack, percent, unpacked
 
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError, one_line
@@ -135,7 +135,7 @@ def _ranked(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
             **{"return": spread(row["return"], row["return_std"], digits)},
             cost=f"{number(row['cost'], 1)} [{number(row['low'], 1)}, {number(row['high'], 1)}]",
             tier=row["tier"],
-            above=f"{100 * row['above']:.0f} %",
+            above=percent(row["above"]),
             greedy=f"{number(other['return'], digits)}; {number(other['cost'], 1)}, "
             f"{other['tier']}",
             total=number(row["cost_total"], 0),

@@ -72,7 +72,7 @@ def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
     env = make_envs(
         run.name, setup, n_envs=n_envs, seed=seed, vec_env="native", env_kwargs=setup.env_kwargs,
         evaluation=True,
-        normalizer=read_normalizer(run.normalizer) if setup.normalize else None,
+        normalizer=None if setup.normalize is None else read_normalizer(run.normalizer),
     )  # fmt: skip
     return load_model(algorithm(run.args()["algo"]), run.model, env, "cpu")
 
@@ -122,8 +122,9 @@ def write(run: RunFolder, limit: float | None, got: dict[str, Any]) -> RunFolder
     th.save(saved, weights(copy))
     kept = {key: value for key, value in result.items() if key not in DROPPED}
     if limit is not None:
-        trained_at = kept.get("trained_at", kept.get("cost_limit"))
-        kept |= {"cost_limit": limit, "trained_at": trained_at}
+        if "cost_limit" in kept:
+            kept.setdefault("trained_at", kept["cost_limit"])
+        kept["cost_limit"] = limit
     copy.write_result({**kept, "played": got, "episodes_played": EPISODES})
     record(original, load_pretrained(run.name, algo), f"{algo}/{run.name}")
     return copy

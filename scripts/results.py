@@ -102,12 +102,6 @@ def runs(name: str) -> pd.DataFrame:
         return with_safety(found.runs).assign(**means)
 
 
-def above(row: Any) -> str:
-    """The share of episodes above the limit; a dash for a limit on the worst step."""
-    share = row["above_limit"]
-    return "–" if pd.isna(share) else f"{100 * share:.0f}\xa0%"
-
-
 def tables(name: str, only: str | None) -> str:
     """A table for each suite of a grid, with the published values where there are some."""
     means = aggregate(runs(name))
@@ -125,7 +119,7 @@ def tables(name: str, only: str | None) -> str:
             "seeds": whole("seeds"),
             "return": lambda row, n=digits: deviation(row, "return_last", n),
             "episode cost": lambda row: deviation(row, "cost_last", 1),
-            "episodes above the limit": above,
+            "episodes above the limit": lambda row: percent(row["above_limit"]),
             "95 % of episode costs below": lambda row: number(row["cost_p95"], 0),
             "cost of the whole training": whole("cost_total"),
         }
@@ -140,6 +134,11 @@ def tables(name: str, only: str | None) -> str:
         heading = "" if only else f"**{suite}**\n\n"
         parts.append(heading + grey(rows, columns))
     return "\n\n".join(parts)
+
+
+def percent(share: float) -> str:
+    """A share in percent; a dash where there is none, as for a limit on the worst step."""
+    return "–" if pd.isna(share) else f"{100 * share:.0f}\xa0%"
 
 
 def deviation(row: Any, name: str, digits: int) -> str:

@@ -46,6 +46,7 @@ def test_a_shipped_agent_is_small_and_acts_as_the_one_that_was_trained(run):
             np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
     # Random actions get about 0.
     played = evaluate_policy(model, env, 5, deterministic=True)
+    assert [*played.limits] == [result[key] for key in ("cost_limit",) if key in result]
     assert played.returns.mean() > 0.5 * result["played"]["deterministic"]["return"][0]
 
 

@@ -170,7 +170,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         },
         cost_keys=getattr(model, "cost_keys", ("cost",)),
         evaluation=True,
-        normalizer=read_normalizer(normalizer) if setup.normalize and not shipped else None,
+        normalizer=None if setup.normalize is None or shipped else read_normalizer(normalizer),
         render_mode=render_mode,
     )
     if shipped is not None:

@@ -84,7 +84,10 @@ def load_pretrained(
     run = find_pretrained(env_id, algo)
     named = {"algo": run.path.parent.name, "env": run.name, "vec_env": "native"}
     flags = RunFlags.of({**named, "seed": seed, "device": device})
-    model = Experiment(flags, {**run.hyperparams(), "n_envs": n_envs}).make_model()
+    values = {**run.hyperparams(), "n_envs": n_envs}
+    if "cost_limit" in values:  # that of the training may be lower
+        values["cost_limit"] = run.checked_result()["cost_limit"]
+    model = Experiment(flags, values).make_model()
     saved = th.load(weights(run), map_location=model.device, weights_only=True)
     model.set_parameters({"policy": saved["policy"]}, exact_match=False, device=model.device)
     normalizer = model.get_vec_normalize_env()
@@ -106,8 +109,9 @@ def listed() -> str:
     for run in pretrained():
         result = run.checked_result()
         limit = result.get("cost_limit")
-        limits = ["–"] * 2 if limit is None else [f"{limit:g}", f"{result['trained_at']:g}"]
-        cells = [run.name, run.path.parent.name, *limits]
+        limits = [limit, result.get("trained_at")]
+        words = ["–" if value is None else f"{value:g}" for value in limits]
+        cells = [run.name, run.path.parent.name, *words]
         for actions in PLAYED:
             played = result["played"][actions]
             cost = Estimate(*played["cost"])

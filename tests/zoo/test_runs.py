@@ -130,6 +130,19 @@ def test_suites_are_chosen_by_id(tmp_path):
         choose(found, ["Goal_Pint_8Ghosts"])
 
 
+def test_an_environment_is_chosen_with_or_without_its_version(tmp_path):
+    goal, slow, fast = "SafetyPointGoal1-v0", "SafetyHopperVelocity-v0", "SafetyHopperVelocity-v1"
+    for env in (goal, slow, fast):
+        fake_run(tmp_path, env=env)
+    found = read_results([tmp_path]).runs
+    for name in (goal, "SafetyPointGoal1"):
+        assert choose(found, [name])["suite"].tolist() == [goal]
+    assert choose(found, [fast])["suite"].tolist() == [fast]
+    assert choose(found, ["SafetyHopperVelocity"])["suite"].tolist() == [slow, fast]
+    with pytest.raises(UsageError, match="'SafetyPointGoal1-v1'; did you mean"):
+        choose(found, [goal, "SafetyPointGoal1-v1"])
+
+
 def test_runs_of_several_lengths_are_not_averaged(tmp_path):
     fake_run(tmp_path, "trpo", epochs=4)
     for epochs in (3, 6):

@@ -265,7 +265,7 @@ def _split_axes(data: Data, suite: str, height: float) -> tuple[Figure | None, d
 
 
 def cdf(data: Data, suite: str) -> Figure | None:
-    """Share of the episodes that cost at most x, of the final policies, a figure per suite."""
+    """Share of episodes that cost at most x, of the final policies, a figure per environment."""
     figure, panels = _split_axes(data, suite, height=3.4)
     for split, axis in panels.items():
         drawn = []

@@ -246,11 +246,15 @@ def choose(
     :raises UsageError: an environment, limit or length without runs
     """
     if suites is not None:
-        wanted = [name.removesuffix("-v0") for name in suites]
-        known = sorted({*runs["suite"]})
-        for name in {*wanted} - {*known} - {f"{one}-v0" for one in known}:
-            raise UsageError(f"there is no run of {name!r}; {did_you_mean(name, known)}")
-        runs = runs[runs["suite"].str.removesuffix("-v0").isin(wanted)]
+        names: dict[str, list[str]] = {}  # an environment, with and without its version
+        for suite in sorted({*runs["suite"]}):
+            for name in {suite, f"{suite}-v0", re.sub(r"-v\d+$", "", suite)}:
+                names.setdefault(name, []).append(suite)
+        for name in suites:
+            if name not in names:
+                known = sorted({*runs["suite"]})
+                raise UsageError(f"there is no run of {name!r}; {did_you_mean(name, known)}")
+        runs = runs[runs["suite"].isin({suite for name in suites for suite in names[name]})]
     if cost_limit is not None:
         limit = _limits([cost_limit] if isinstance(cost_limit, (int, float)) else cost_limit)
         known = _limits_of(runs)

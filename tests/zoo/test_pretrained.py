@@ -34,6 +34,7 @@ def test_a_shipped_agent_is_small_and_acts_as_the_one_that_was_trained(run):
     assert result["played"]["stochastic"]["cost"][0] < result.get("cost_limit", np.inf)
 
     model = load_pretrained(env_id, algo, seed=5, n_envs=5, device="cpu")
+    assert model.num_timesteps == result["n_timesteps"] >= 1e6  # contract.json states it
     env = model.get_env()
     with np.load(RECORDED) as recorded:
         seen = recorded[f"{algo}/{env_id}/observations"]

@@ -82,12 +82,14 @@ def load_pretrained(
     :raises UsageError: there is none; the message lists those that there are
     """
     run = find_pretrained(env_id, algo)
+    result = run.checked_result()
     named = {"algo": run.path.parent.name, "env": run.name, "vec_env": "native"}
     flags = RunFlags.of({**named, "seed": seed, "device": device})
     values = {**run.hyperparams(), "n_envs": n_envs}
     if "cost_limit" in values:  # that of the training may be lower
-        values["cost_limit"] = run.checked_result()["cost_limit"]
+        values["cost_limit"] = result["cost_limit"]
     model = Experiment(flags, values).make_model()
+    model.num_timesteps = result["n_timesteps"]
     saved = th.load(weights(run), map_location=model.device, weights_only=True)
     model.set_parameters({"policy": saved["policy"]}, exact_match=False, device=model.device)
     normalizer = model.get_vec_normalize_env()

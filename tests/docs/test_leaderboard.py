@@ -58,7 +58,7 @@ def test_certified_rows_come_first_by_return(scripts, tmp_path):
         ["1", "PCPO"], ["2", "CPO"], ["–", "*TRPO-Lagrangian*"],
     ]  # fmt: skip
     assert table[0][-1] == "`sb3-guard reproduce grand_table/pcpo/SafetyPointGoal1-v0_1`"
-    assert table[0][4] == "24.0 [24.0, 24.0]" and table[2][6] == "*100 %*"
+    assert table[0][4] == "24.0 [24.0, 24.0]" and table[2][6] == "*100\xa0%*"
     missing = next(row for row in table if row[1] == "*PPO*")
     assert missing[-1].startswith("`sb3-guard train --algo ppo --env SafetyPointGoal1-v0 --seeds")
     assert [row[1] for row in table[-2:]] == ["*random actions*", "*idle*"]

@@ -4,7 +4,7 @@ Looked at are all runs below the folder, as ``scripts/grand_table.py`` writes th
 certified if the 95 % interval of the mean cost of its final episodes with sampled actions ends at
 or below the limit; of an environment's certified runs that with the highest return is taken. It is
 played again, 300 episodes of other seeds with sampled actions and 300 with the most likely ones,
-and shipped if it is certified by these, too; else the next one is tried. The package gets its
+and shipped if the former certify it, too; else the next one is tried. The package gets its
 settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get some
 observations and actions, ``tests/data/pretrained.npz``.
 """

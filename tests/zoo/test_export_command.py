@@ -34,7 +34,7 @@ def test_an_exported_run_says_what_it_was_trained_at(logs, tmp_path, capsys):
     digest = hashlib.sha256((run.path / "best_model.zip").read_bytes()).hexdigest()
     assert trained_at["model_sha256"] == digest
     assert (trained_at["algo"], trained_at["env"]) == ("cpo", "CostPoint-v0")
-    assert trained_at["env_kwargs"] == {"episode_length": 20}
+    assert trained_at["env_kwargs"] == {"episode_length": 20} and trained_at["cost_limit"] == 2
     assert (
         trained_at["measured"]["episodes"] == 2 and trained_at["measured"]["length"]["mean"] == 20
     )
@@ -54,3 +54,10 @@ def test_what_can_not_be_exported_is_said_before_it_is_played(logs, tmp_path, ca
     sde = ["-params", "cost_limit:2", "use_sde:True", "--eval-freq", "-1"]
     trained(tmp_path, *sde)
     refused(export_agent.main, [*WHICH, "-f", str(tmp_path)], capsys, "can't export", "gSDE's")
+
+
+def test_a_pretrained_agent_says_which_limit_it_keeps_and_which_it_was_trained_at(tmp_path):
+    which = ["--pretrained", "--env", "Goal_Point_8Hazards", "--n-episodes", "2"]
+    assert export_agent.main([*which, "-o", str(tmp_path / "policy.onnx")]) == 0
+    contract = json.loads((tmp_path / "contract.json").read_text())
+    assert contract["costs"][0]["limit"] == 5.0 and contract["trained"]["cost_limit"] == 3

@@ -55,10 +55,12 @@ def write(
         for name, values in measured.items()
         if isinstance(values, dict)
     }
+    settings = agent.run.hyperparams()
     trained = {
         "algo": flags.algo,
         "env": agent.env_id,
-        "env_kwargs": agent.run.hyperparams().get("env_kwargs") or {},
+        "env_kwargs": settings.get("env_kwargs") or {},
+        "cost_limit": settings.get("cost_limit"),
         "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
         "measured": {"episodes": measured["episodes"], **means},
     }

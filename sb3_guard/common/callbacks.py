@@ -11,10 +11,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.limits import limits_at
-from sb3_guard.common.evaluation import Evaluation, evaluate_policy, share_environment
+from sb3_guard.common.evaluation import (
+    Evaluation,
+    evaluate_policy,
+    share_environment,
+    sync_normalization,
+)
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 
@@ -187,8 +192,7 @@ class CostEvalCallback(EvalCallback):
 
     def evaluate(self, deterministic: bool = True) -> Evaluation:
         """The model's episodes, of its most likely actions or of sampled ones."""
-        if self.model.get_vec_normalize_env() is not None:
-            sync_envs_normalization(self.training_env, self.eval_env)
+        sync_normalization(self.training_env, self.eval_env)
         return evaluate_policy(
             self.model,
             self.eval_env,

@@ -1,5 +1,6 @@
 """How good and how safe a policy is: returns and costs of episodes, with their uncertainty."""
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from stable_baselines3.common.vec_env import (
     VecEnv,
     VecMonitor,
     is_vecenv_wrapped,
+    unwrap_vec_normalize,
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
@@ -126,6 +128,29 @@ class Evaluation:
         return self.max_costs.max(axis=1)
 
     estimate = staticmethod(estimate)
+
+
+def sync_normalization(env: VecEnv, eval_env: VecEnv) -> None:
+    """
+    Give an evaluation the statistics that training normalises with.
+
+    SB3's ``sync_envs_normalization`` asks for the same wrappers around both, and an evaluation
+    leaves out those that are ``training_only``.
+
+    :param env: training environment; nothing happens if it is not normalised
+    :param eval_env: evaluation environment
+    :raises ValueError: the evaluation environment is not normalised, but training is
+    """
+    training, evaluation = unwrap_vec_normalize(env), unwrap_vec_normalize(eval_env)
+    if training is None:
+        return
+    if evaluation is None:
+        raise ValueError(
+            "eval_env has no VecNormalize, and the training environment has: wrap both alike"
+        )
+    for name in ("obs_rms", "ret_rms"):
+        if hasattr(training, name):
+            setattr(evaluation, name, copy.deepcopy(getattr(training, name)))
 
 
 def share_environment(one: VecEnv, other: VecEnv) -> bool:

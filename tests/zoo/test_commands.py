@@ -613,13 +613,17 @@ def test_dispatcher(capsys, tmp_path):
     assert "there is no run of cpo on Goal_Point_8Hazards-v0" in capsys.readouterr().err
 
 
-def test_early_termination_is_for_training_alone(tmp_path):
+@pytest.mark.parametrize("normalize", [False, True])
+def test_early_termination_is_for_training_alone(tmp_path, normalize):
     """With it, no episode costs much more than its budget, whatever the agent does."""
-    early = "{'sb3_guard.common.vec_budgets.VecEarlyTermination': {'budget': 0.5}}"
-    run = trained(tmp_path, "-params", f"vec_env_wrapper:{early}", *SMALL[1:5])
+    early = "{'sb3_guard.common.vec_budgets.VecEarlyTermination': {'budget': 0.2}}"
+    wrapped = f"vec_env_wrapper:{early}", f"normalize:{normalize}"
+    run = trained(tmp_path, "-n", "480", "-params", *wrapped)
     episodes = load_results(str(run))
     assert (episodes["l"] < 20).any()
     result = json.loads((run / "result.json").read_text())
-    assert all(split["length"] == 20 for split in result["final"].values()), result
+    assert [*result["final"]] == ["stochastic", "greedy"]
+    for split in result["final"].values():
+        assert {*split["lengths"]} == {20}
     evaluations = np.load(run / "evaluations.npz")
     assert (evaluations["ep_lengths"] == 20).all()

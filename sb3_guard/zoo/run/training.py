@@ -15,11 +15,16 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
-from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
-from sb3_guard.common.evaluation import bounded_name, estimate, evaluate_policy
+from sb3_guard.common.evaluation import (
+    bounded_name,
+    estimate,
+    evaluate_policy,
+    sync_normalization,
+)
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.cli.usage import (
@@ -233,8 +238,7 @@ class Training:
         env = self.experiment.make_evaluation_envs(episodes)
         final: dict[str, dict[str, Any]] = {}
         try:
-            if self.model.get_vec_normalize_env() is not None:
-                sync_envs_normalization(self.env, env)
+            sync_normalization(self.env, env)
             for name in SPLITS:
                 played = evaluate_policy(
                     self.model,

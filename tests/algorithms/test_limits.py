@@ -43,12 +43,36 @@ def test_bad_schedules_are_named() -> None:
             TRPOIPO("MlpPolicy", points(), cost_limit=limit)
 
 
+def test_a_limit_falls_to_what_is_asked_for_and_stays_there() -> None:
+    model = CPO(
+        "MlpPolicy", points(), cost_limit=[10.0, -4.0, 0.0], cost_keys=("cost", "a", "b"),
+        limit_start=3.0, limit_fall=0.8, missing_cost="zero",
+    )  # fmt: skip
+    seen = []
+    for remaining in (1.0, 0.6, 0.2, 0.1, 0.0):
+        model._current_progress_remaining = remaining
+        seen.append(model.cost_limits.tolist())
+    assert seen[:2] == [[30.0, 4.0, 0.0], pytest.approx([20.0, 0.0, 0.0])]
+    np.testing.assert_allclose(seen[2:], [[10.0, -4.0, 0.0]] * 3, atol=1e-12)
+    assert model.final_cost_limits.tolist() == [10.0, -4.0, 0.0]
+    for name, value in (("limit_start", 0.5), ("limit_fall", 0.0), ("limit_fall", 1.5)):
+        with pytest.raises(ValueError, match=f"{name}={value}"):
+            CPO("MlpPolicy", points(), cost_limit=2.0, **{name: value})
+
+
 @pytest.mark.parametrize("cls", [CPO, PPOLag, SACLag])
-@pytest.mark.parametrize("limit", ["lin_4_2", lambda remaining: 2.0 + 2.0 * remaining])
+@pytest.mark.parametrize(
+    "limit",
+    [
+        {"cost_limit": "lin_4_2"},
+        {"cost_limit": lambda remaining: 2.0 + 2.0 * remaining},
+        {"cost_limit": 2.0, "limit_start": 2.0, "limit_fall": 1.0},
+    ],
+)
 def test_every_update_has_the_limit_of_its_time(cls: Any, limit: Any, tmp_path: Path) -> None:
     arguments = {"learning_starts": 120} if cls is SACLag else {"n_steps": 40}
     env = points(1)
-    model = cls("MlpPolicy", env, cost_limit=limit, seed=0, device="cpu", **arguments)
+    model = cls("MlpPolicy", env, **limit, seed=0, device="cpu", **arguments)
     seen: list[tuple[int, float]] = []
     train = model.train
 
@@ -68,7 +92,8 @@ def test_every_update_has_the_limit_of_its_time(cls: Any, limit: Any, tmp_path: 
     del model.train
     model.save(tmp_path / "model")
     again = cls.load(tmp_path / "model", env=env)
-    assert limits_at(again.cost_limit, 0.5) == 3.0
+    again._current_progress_remaining = 0.5
+    assert again.cost_limits.tolist() == [3.0]
     assert again.final_cost_limits.tolist() == [2.0]
     assert evaluate_policy(again, env, n_eval_episodes=1).limits == (2.0,)
 

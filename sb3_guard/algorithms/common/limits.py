@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.checks import check_per_cost
@@ -45,6 +46,9 @@ class CostLimits:
         number, a function of the remaining progress (from 1 to 0), or text such as ``"lin_50_25"``,
         a line from 50 to 25 over the training
     :param cost_keys: entries of ``info`` that hold the costs of a step
+    :param limit_start: how many times ``cost_limit`` the limit is when the training begins; it
+        falls to ``cost_limit`` along a line. 1 for ``cost_limit`` from the first step on
+    :param limit_fall: share of the training over which it falls
     """
 
     #: Whether costs and limits may be negative: "at least x" of what is reported as -cost.
@@ -52,6 +56,8 @@ class CostLimits:
 
     cost_limit: float | Schedule | Sequence[float | Schedule] = hyperparameter(0.0)
     cost_keys: Sequence[str] = hyperparameter(("cost",))
+    limit_start: float = hyperparameter(1.0, low=1.0)
+    limit_fall: float = hyperparameter(0.6, high=1.0, ends="(]")
 
     _current_progress_remaining: float
 
@@ -70,9 +76,10 @@ class CostLimits:
 
     @property
     def limits_change(self) -> bool:
-        """Whether a limit is a schedule."""
+        """Whether a limit is a schedule, or falls from ``limit_start``."""
         limits = self.cost_limit if isinstance(self.cost_limit, list | tuple) else [self.cost_limit]
-        return any(isinstance(limit, str) or callable(limit) for limit in limits)
+        scheduled = any(isinstance(limit, str) or callable(limit) for limit in limits)
+        return scheduled or self.limit_start > 1.0
 
     def _check_cost_limit(self) -> None:
         for remaining in (1.0, 0.0):
@@ -86,4 +93,6 @@ class CostLimits:
                 f"cost_limit={limit!r}: must be at least 0; a negative limit (cost -x, "
                 "limit -5: at least 5 of x) is for CPO, PCPO and Lagrangian algorithms"
             )
-        return np.broadcast_to(np.asarray(limit, np.float64), (len(self.cost_keys),))
+        limits = np.broadcast_to(np.asarray(limit, np.float64), (len(self.cost_keys),))
+        excess = LinearSchedule(self.limit_start - 1.0, 0.0, self.limit_fall)(remaining)
+        return limits + excess * np.abs(limits)

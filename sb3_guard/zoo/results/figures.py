@@ -3,6 +3,7 @@
 A figure is drawn from the runs there are and says which are missing.
 """
 
+import html
 import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
@@ -365,16 +366,6 @@ def iqm(data: Data) -> Figure | None:
 # Files
 
 
-def panel(draw_on: Callable[[Axes], None], size: tuple[float, float] = (4.4, 3.2)) -> Figure:
-    """One panel by itself, without legend or title."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=size, layout="constrained")
-        axis = figure.subplots()
-        draw_on(axis)
-        axis.set_title("")
-    return figure
-
-
 def save(figure: Figure, path: Path) -> None:
     """
     Write a figure in the format of the file's name, PNG, SVG or PDF, with a transparent background.
@@ -397,4 +388,4 @@ def inline_svg(figure: Figure, title: str) -> str:
         figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(INK, "currentColor")
-    return text.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)
+    return text.replace("<svg ", f'<svg role="img" aria-label="{html.escape(title)}" ', 1)

@@ -110,8 +110,6 @@ def plot(flags: Flags) -> int:
         with written(Path(flags.report)) as handle:
             handle.write(page.encode())
         print(f"wrote {flags.report}")
-    for why in data.unread.values():
-        print(f"left out of the curves: {why}", file=sys.stderr)
     if by_default:
         for title, table in tables(runs).items():
             print(f"\n{title}\n\n{terminal(table)}")

@@ -295,17 +295,17 @@ def test_formats(small, tmp_path, form):
 def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     out = tmp_path / "figures"
-    (small / "cpo" / f"{POINT}-v0_2" / "0.monitor.csv").write_text("#{}\nr,l,t,c\n")
+    (fake_run(small, "cpo", seed=2) / "0.monitor.csv").write_text("#{}\nr,l,t,c\n")
     assert cli.main(["plot", str(small), "-o", str(out)]) == 0
     assert [path.name for path in out.iterdir()] == [f"curves_{POINT}.png"]
     printed, err = capsys.readouterr()
     assert max(map(len, printed.splitlines())) <= 120
     for text in ("return J_r", "5.00\xa0±\xa00.00", "PPO", "0: exceeded"):
         assert text in printed
-    assert "left out of the curves: can't use" in err and "v0_2/0.monitor.csv" in err
+    assert "left out: " in err and "v0_3/0.monitor.csv: it has no episodes" in err
     results = printed.partition("\nSafety")[0].splitlines()
     (row,) = (line.split() for line in results if "CPO  " in line and "0:" in line)
-    assert row[:5] == [POINT, "CPO", "0:", "exceeded", "2"]  # its result counts all the same
+    assert row[:5] == [POINT, "CPO", "0:", "exceeded", "2"]
 
 
 def test_without_folders_it_reads_logs(small, tmp_path, monkeypatch):
@@ -353,12 +353,10 @@ def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
     assert page_of(tmp_path / "logs").count("2: exceeded") == 1
 
 
-def test_what_older_versions_wrote_is_read(tmp_path):
-    fake_run(tmp_path, "cpo", cost_limit=[5.0, 2.0])  # without an entry for each cost
+def test_packed_logs_without_an_entry_for_each_cost_are_read(tmp_path):
     fake_run(tmp_path, "pcpo", cost_limit=25.0)
-    (_, several), (_, alone) = read_results([tmp_path]).runs.iterrows()
-    assert (several["limits"], alone["limits"]) == ("5 2", "25")
-    assert pd.isna(several["verdict"]) and pd.isna(alone["verdict"]) and alone["cost_limit"] == 25
+    (row,) = read_results([tmp_path]).runs.to_dict("records")
+    assert (row["limits"], row["cost_limit"]) == ("25", 25) and pd.isna(row["verdict"])
 
 
 def test_all_of_it(small, tmp_path, capsys):
@@ -395,7 +393,7 @@ def test_a_table_of_runs_has_those_asked_for(small, tmp_path, capsys):
         assert "there is no run" in capsys.readouterr().err
     assert not file.exists()
     means = [str(small), "--table", str(tmp_path / "r.md")]
-    assert plot.main(means) == 2 and "several cost limits, 0, 5" in capsys.readouterr().err
+    assert plot.main(means) == 2 and "differ in cost limit, 0, 5," in capsys.readouterr().err
     assert plot.main([*means, "--cost-limit", "5"]) == 0
 
 
@@ -468,7 +466,15 @@ def test_page_is_complete_and_by_itself(small):
     assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
     assert not re.search(r"<link|<iframe|<script src|@import|url\((?!#)", page)
     assert INK not in page  # dark pages have light ink
-    for name in ("TRPO", "CPO", "PPO", "f" * 10, "profiles", f"pareto_{POINT}", "feasible IQM return"):
+    for name in (
+        "TRPO",
+        "CPO",
+        "PPO",
+        "f" * 10,
+        "profiles",
+        f"pareto_{POINT}",
+        "feasible IQM return",
+    ):
         assert name in page
     assert page.index("Results</h2>") < page.index("page by sb3_guard")
     assert page.count("<table") == 6 and page.count("<svg") > 8

@@ -136,13 +136,12 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
 def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
     """Return against an episode cost: means ± deviations, and the seeds as small marks."""
     means = data.means[(data.means["suite"] == suite)].dropna(subset=[cost, "J_r"])
-    runs = data.runs[data.runs["suite"] == suite]
     limit = draw_limit(axis.axvline, data, suite, cost)
     for row in means.to_dict("records"):
         look = data.looks[row["algo"]]
-        own = runs[runs["algo"] == row["algo"]]
+        seeds = data.runs_of(suite, row["algo"])
         style: dict[str, Any] = {"color": look.color, "marker": look.marker}
-        axis.scatter(own[cost], own["J_r"], s=14, alpha=0.6, **style)
+        axis.scatter(seeds[cost], seeds["J_r"], s=14, alpha=0.6, **style)
         axis.errorbar(
             row[cost], row["J_r"], row["J_r_std"], row[f"{cost}_std"], markersize=8.5,
             elinewidth=0.9, capsize=2, zorder=3, **style,
@@ -218,7 +217,7 @@ def title_of(data: Data, suite: str) -> str:
 
 def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
     """One row of panels per environment that has runs: return, episode costs, cost rate."""
-    drawn = [suite for suite in suites if any(data.curves(suite, a) for a in data.algos(suite))]
+    drawn = [suite for suite in suites if suite in data.suites]
     if not drawn:
         return None
     columns = max(len(data.panels(suite)) for suite in drawn)

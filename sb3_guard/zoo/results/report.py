@@ -36,7 +36,7 @@ def report(data: Data, title: str, left_out: Mapping[str, str], notes: Sequence[
         runs=data.runs,
         made={name: sorted(data.runs[name].dropna().unique()) for name in (*VERSIONS, "commit")},
         version=sb3_guard.__version__,
-        notes=[*notes, *data.unread.values()],
+        notes=notes,
         left_out=left_out,
         tables={heading: _html(table) for heading, table in tables(data.runs).items()},
         figures=figures,

@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 from scipy.stats import trim_mean
 
-from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.runs import METRICS, REFERENCE, compared
 from sb3_guard.zoo.run.folder import EPOCH
@@ -116,19 +115,12 @@ def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, floa
 
 def with_safety(runs: pd.DataFrame) -> pd.DataFrame:
     """
-    The table of runs with the columns of :func:`safety`; NaN where episodes can't be read.
+    The table of runs with the columns of :func:`safety`.
 
     They are judged by :func:`judging_limits`.
     """
-
-    def row(run: Any) -> dict[str, float]:
-        try:
-            return safety(read_episodes(run["path"]), run["epoch"], run["judged_by"])
-        except UsageError:
-            return dict.fromkeys(SAFETY, math.nan)
-
-    limited = runs.assign(judged_by=judging_limits(runs))
-    rows = [row(run) for run in limited.to_dict("records")]
+    judged = runs[["path", "epoch"]].assign(limit=judging_limits(runs)).itertuples(index=False)
+    rows = [safety(read_episodes(path), epoch, limit) for path, epoch, limit in judged]
     return runs.assign(**pd.DataFrame(rows, columns=list(SAFETY), index=runs.index, dtype=float))
 
 

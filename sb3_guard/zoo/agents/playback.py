@@ -221,7 +221,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
             on_step=(lambda: render(env)) if render_mode == "human" else None,
             on_episode=(lambda *one: print(_episode(*one))) if flags.verbose > 0 else None,
         )
-    print(_means(evaluation))
+    print(means(evaluation))
     if flags.verbose > 0:
         for one in evaluation.unfinished:
             print(_episode(*one), "so far: this episode did not end and is not counted")
@@ -292,7 +292,7 @@ def _episode(episode_return: float, cost: float, length: float) -> str:
     return f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length:.0f} steps"
 
 
-def _means(evaluation: Evaluation) -> str:
+def means(evaluation: Evaluation) -> str:
     count = len(evaluation)
     if count == 0:
         return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"

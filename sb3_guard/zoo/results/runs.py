@@ -274,9 +274,10 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
         for key, group in runs.groupby(keys):
             values = _values(group[column])
             if len(values) > 1:
+                where = " of ".join(map(str, key))
                 raise UsageError(
-                    f"runs on {' of '.join(map(str, key))} differ in {name}, {_joined(values)}, and can't be "
-                    f"averaged; {fix.format(values[-1])}"
+                    f"runs on {where} differ in {name}, {_joined(values)}, and can't be averaged; "
+                    + fix.format(values[-1])
                 )
     return runs.drop_duplicates(_SAME, keep="last").reset_index(drop=True)
 

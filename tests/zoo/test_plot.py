@@ -167,14 +167,6 @@ def test_pareto_shows_an_outlier_at_the_edge(small):
     assert "1e+03 →" in texts(drawing.figure)
 
 
-def test_profiles_rise_and_fall(data):
-    (drawing,) = draw("profiles", data)
-    reward, cost, _ = map(lines, drawing.figure.axes)
-    assert (np.diff(reward["CPO"]) <= 0).all() and (np.diff(cost["CPO"]) >= 0).all()
-    assert (reward["CPO"][0], reward["CPO"][-1]) == (1.0, 0.0)
-    assert (cost["CPO"][0], cost["CPO"][-1]) == (0.0, 1.0)
-
-
 @pytest.mark.parametrize(
     ("values", "end", "text"),
     [([1.0, 2, 3, 4], None, ""), ([*np.ones(20), 1000.0], 1.5, "↑ up to 1e+03")],
@@ -367,7 +359,7 @@ def test_all_of_it(small, tmp_path, capsys):
     assert all(f"wrote {path}" in out for path in paths)
     made = {path.stem for path in (tmp_path / "f").iterdir()}
     per_suite = {f"{kind}_{POINT}" for kind in PER_SUITE}
-    assert made == per_suite | {"profiles", "iqm", "q1", "q2", "q3", "q4", "q6", "q8"}
+    assert made == per_suite | {"iqm", "q1", "q2", "q3", "q4", "q6", "q8"}
     assert f"q7: is not drawn; missing: TRPO-USL, TRPO-SL on {POINT}" in err
     # One asked for by name that can't be drawn is a failure.
     assert plot.main([str(small), "--figure", "q7", "-o", str(tmp_path / "g")]) == 1
@@ -471,7 +463,7 @@ def test_page_is_complete_and_by_itself(small):
         "CPO",
         "PPO",
         "f" * 10,
-        "profiles",
+        "iqm",
         f"pareto_{POINT}",
         "feasible IQM return",
     ):

@@ -173,12 +173,6 @@ def test_environments_of_other_settings_are_not_compared(tmp_path):
         ({"commit": "a"}, {"seed": 1}, "runs differ in commit: a, none"),
         ({"versions": {"mujoco": "3"}}, {"seed": 1, "versions": {"mujoco": "4"}},
          "runs differ in mujoco: 3, 4"),
-        ({"algo": "trpo"}, {"config": {"policy_kwargs": {"net_arch": [8]}}},
-         'algorithms differ in policy_kwargs: default (trpo); {"net_arch": [8]} (cpo)'),
-        ({"algo": "trpo"}, {"config": {"n_steps": 5}},
-         "algorithms differ in n_steps: 50 (trpo); 5 (cpo)"),
-        ({"algo": "trpo", "config": {"gamma": 0.9}}, {},
-         "algorithms differ in gamma: 0.9 (trpo); default (cpo)"),
         ({}, {"seed": 1, "learned": [300]}, "were extended"),
     ],
 )  # fmt: skip

@@ -20,7 +20,7 @@ from matplotlib.ticker import EngFormatter
 
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.splits import SPLITS
-from sb3_guard.zoo.results.statistics import SCORES, interval, mean_curve, normalize, overall
+from sb3_guard.zoo.results.statistics import SCORES, mean_curve, overall
 from sb3_guard.zoo.results.tables import written
 
 FORMATS = ("png", "svg", "pdf")
@@ -299,41 +299,6 @@ def tiers(data: Data, suite: str) -> Figure | None:
         axis.set_yticks(range(len(algos)), [data.looks[algo].label for algo in algos])
         limit = draw_limit(axis.axvline, data, suite, "M_c")
         fit_costs(axis, [rows["high"], rows["cost"], limit], "x")
-    return figure
-
-
-def _reached(values: np.ndarray, axis: int, tau: np.ndarray, score: str) -> np.ndarray:
-    """The part of the values that are at least τ, or of costs at most τ, [B, len(tau)]."""
-    ordered = np.sort(values, axis=axis)
-    side: Any = "left" if score == "reward" else "right"
-    below = np.stack([np.searchsorted(one, tau, side=side) for one in ordered])
-    part = below / values.shape[axis]
-    return 1 - part if score == "reward" else part
-
-
-def profiles(data: Data) -> Figure | None:
-    """Performance profiles: the part of all runs that reach a score, with 95 % bands."""
-    single = normalize(data.runs, data.means)
-    if single[list(SCORES.values())].isna().all(axis=None):
-        return None
-    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
-    for axis, score in zip(figure.subplots(1, 3), SCORES.values(), strict=True):
-        finite = single[score].dropna()
-        # Costs have no upper bound: one run must not squeeze all others to the left.
-        highest = 1.0 if score == "reward" else max(1.2, float(finite.quantile(0.98)))
-        tau = np.linspace(min(0.0, float(finite.quantile(0.02))), highest, 201)
-        for algo, own in single.groupby("algo", sort=False):
-            groups = [group.dropna().to_numpy() for _, group in own.groupby("suite")[score]]
-            values, look = np.concatenate(groups), data.looks[str(algo)]
-            if not len(values):
-                continue
-            axis.plot(tau, _reached(values[None], 1, tau, score)[0], linewidth=1.5, **look.line)
-            low, high = interval(groups, lambda v, axis, t=tau, s=score: _reached(v, axis, t, s))
-            if not np.isscalar(low):
-                axis.fill_between(tau, low, high, color=look.color, alpha=0.12, linewidth=0)
-        sign = "≥" if score == "reward" else "≤"
-        axis.set(xlabel=f"{SCORE_AXES[score]}, τ", ylabel=f"part of runs {sign} τ")
-        axis.set_ylim(-0.02, 1.02)
     return figure
 
 

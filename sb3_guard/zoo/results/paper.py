@@ -23,7 +23,6 @@ from sb3_guard.zoo.results.figures import (
     fit_costs,
     iqm,
     pareto,
-    profiles,
     tiers,
 )
 from sb3_guard.zoo.results.runs import REFERENCE
@@ -198,8 +197,7 @@ def q8(data: Data) -> Figure | None:
 
 PER_SUITE = (curves, pareto, cdf, tiers)
 FIGURES: dict[str, Callable[..., Figure | None]] = {
-    function.__name__: function
-    for function in (*PER_SUITE, profiles, iqm, q1, q2, q3, q4, q5, q6, q7, q8)
+    function.__name__: function for function in (*PER_SUITE, iqm, q1, q2, q3, q4, q5, q6, q7, q8)
 }
 
 

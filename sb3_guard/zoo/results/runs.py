@@ -28,16 +28,12 @@ NUMBERS = (
 )  # fmt: skip
 TEXTS = (
     "suite", "robot", "task", "constraint", "algo", "label", "family", "limits", "verdict", "world",
-    "started_from", "settings", "config", *VERSIONS, "commit", "platform", "path",
+    "started_from", "config", *VERSIONS, "commit", "platform", "path",
 )  # fmt: skip
 COLUMNS = (*TEXTS[:7], *NUMBERS, *TEXTS[7:])
 _SUITE = re.compile(r"([A-Za-z][A-Za-z0-9]*)_([A-Za-z][A-Za-z0-9]*)_(\d+[A-Za-z]\w*)-v0")
 # Runs that agree in these are the same run, made again.
 _SAME = ["suite", "world", "algo", "limits", "seed", "steps", "started_from", "config"]
-# What algorithms that are compared should share
-SETTINGS = (
-    "n_envs", "n_steps", "gamma", "gae_lambda", "target_kl", "policy_kwargs", "normalize",
-)  # fmt: skip
 VERDICTS = ("exceeded", "undecided", "kept")  # the worst one first
 
 
@@ -109,8 +105,8 @@ def read_run(path: Path) -> dict[str, Any]:
         ``cost_limit`` (of the total cost; NaN: there is none), ``limits`` (of all costs, "1 2";
         missing: unconstrained), ``verdict`` on them (of several the worst), ``seconds`` of
         training, ``epoch`` (steps of a rollout), ``world`` (``env_kwargs``), ``started_from`` (the
-        model that training started from), ``settings`` (:data:`SETTINGS`) and ``config`` (the same
-        for the same hyperparameters). If the limits are on other costs than the total, there are
+        model that training started from) and ``config`` (the same for the same
+        hyperparameters). If the limits are on other costs than the total, there are
         ``M_c/<key>``, ``cost_limit/<key>`` and ``verdict/<key>`` of each
     :raises UsageError: the run is not finished, or damaged
     """
@@ -128,7 +124,6 @@ def read_run(path: Path) -> dict[str, Any]:
     verdicts = [cost["verdict"] for cost in result["costs"].values() if cost.get("verdict")]
     by_key = _by_key(result)
     total = len(limits) == 1 and not by_key and "limit_on" not in result
-    settings = {name: config.get(name) for name in SETTINGS}
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
     versions = result.get("versions") or {}
     numbers = {**METRICS, **{k: k for k in ("episodes", "physics_errors", "seconds")}}
@@ -148,7 +143,6 @@ def read_run(path: Path) -> dict[str, Any]:
         "epoch": math.nan if None in rollout else math.prod(rollout),
         "world": _text(config.get("env_kwargs") or {}),
         "started_from": args.get("trained_agent") or None,
-        "settings": _text(settings),
         "config": _digest(config, result.get("learned")),
         **{name: versions.get(name) for name in VERSIONS},
         "commit": result.get("commit"),
@@ -318,22 +312,13 @@ def _differences(group: pd.DataFrame) -> Iterable[str]:
         values = _values(group[name].fillna("none"))
         if len(values) > 1:
             yield f"runs differ in {name}: {_joined(values)}"
-    for algo, own in group.groupby("algo"):
-        if own["config"].nunique() > 1:
-            paths = _joined(own.drop_duplicates("config")["path"])
+    for algo, seeds in group.groupby("algo"):
+        if seeds["config"].nunique() > 1:
+            paths = _joined(seeds.drop_duplicates("config")["path"])
             yield f"runs of {algo} differ in hyperparameters or in how they were extended: {paths}"
-        twice = sorted(own.loc[own.duplicated("seed"), "seed"].unique())
+        twice = _values(seeds.loc[seeds.duplicated("seed"), "seed"])
         if twice:
             yield f"runs of {algo} count twice or more for one seed: {_joined(twice)}"
-    # Unconstrained baselines have settings of their own.
-    ours = group[compared(group)]
-    for name in SETTINGS if ours["algo"].nunique() > 1 else ():
-        texts = [_text(json.loads(settings)[name]) for settings in ours["settings"]]
-        stated = pd.Series(texts, index=ours.index).replace("null", "default")
-        if stated.nunique() > 1:
-            users = ours["algo"].groupby(stated, sort=False).unique()
-            named = "; ".join(f"{value} ({_joined(algos)})" for value, algos in users.items())
-            yield f"algorithms differ in {name}: {named}"
 
 
 def compared(table: pd.DataFrame) -> "pd.Series[bool]":

@@ -33,18 +33,17 @@ def iqm(values: Any, axis: int = 0) -> Any:
 
 
 def interval(
-    groups: Sequence[np.ndarray],
-    statistic: Callable[..., np.ndarray] = np.mean,
-) -> tuple[Any, Any]:
+    groups: Sequence[np.ndarray], statistic: Callable[..., np.ndarray] = np.mean
+) -> tuple[float, float]:
     """
     A 95 % percentile bootstrap interval, stratified: each group is resampled by itself.
 
     :param groups: values of independent runs, [n_g] each; NaN are left out
-    :param statistic: called with ``axis=1`` on [B, Σ n_g] resamples; returns [B, …]
-    :return: lower and upper end, each of the statistic's shape; NaN where no group has two values,
-        since one seed says nothing about another
+    :param statistic: called with ``axis=1`` on [B, Σ n_g] resamples; returns [B]
+    :return: lower and upper end; NaN where no group has two values, since one seed says nothing
+        about another
     """
-    groups = [group[~np.isnan(group)] for group in map(np.asarray, groups)]
+    groups = [group[~np.isnan(group)] for group in groups]
     if not any(len(group) > 1 for group in groups):
         return math.nan, math.nan
     rng = np.random.default_rng(0)
@@ -53,9 +52,8 @@ def interval(
         for group in groups
         if len(group)
     ]
-    values = statistic(np.concatenate(draws, axis=1), axis=1)
-    low, high = np.quantile(values, [0.025, 0.975], axis=0)
-    return low, high
+    low, high = np.quantile(statistic(np.concatenate(draws, axis=1), axis=1), [0.025, 0.975])
+    return float(low), float(high)
 
 
 # One run

@@ -17,7 +17,7 @@ from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import check_table, tables, terminal, write_table, written
 from sb3_guard.zoo.run.folder import require_writable
 
-TITLES = "\n".join(f"  {name:<10} {one.__doc__}" for name, one in FIGURES.items())
+TITLES = "\n".join(f"  {name:<10} {figure.__doc__}" for name, figure in FIGURES.items())
 
 
 @dataclass
@@ -82,12 +82,12 @@ def plot(flags: Flags) -> int:
     if kinds:
         require_writable(Path(flags.output), "-o")
 
-    found = reading.read_results(flags.folders)
-    for path, why in found.left_out.items():
+    results = reading.read_results(flags.folders)
+    for path, why in results.left_out.items():
         print(f"left out: {path}: {why}", file=sys.stderr)
-    if not len(found.runs):
+    if not len(results.runs):
         raise UsageError(f"there is no finished run below {', '.join(flags.folders)}")
-    chosen = with_safety(reading.choose(found.runs, flags.env, flags.cost_limit, flags.steps))
+    chosen = with_safety(reading.choose(results.runs, flags.env, flags.cost_limit, flags.steps))
     per_run = [file for file in files if file.suffix == ".csv"]
     for file in per_run:
         write_table(file, chosen)
@@ -106,7 +106,7 @@ def plot(flags: Flags) -> int:
     status = _draw(data, kinds, flags)
     if flags.report:
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
-        page = report(data, title, found.left_out, notes)
+        page = report(data, title, results.left_out, notes)
         with written(Path(flags.report)) as handle:
             handle.write(page.encode())
         print(f"wrote {flags.report}")

@@ -117,9 +117,9 @@ class Data:
             color, marker = places[row["algo"]]
             looks[row["algo"]] = Look(row["label"], COLORS[color], dashes[row["family"]], marker)
         for family in families:
-            own = table.loc[(table["family"] == family) & table["first"], "algo"].sort_values()
-            if len(own):
-                looks[family] = looks[own.iloc[0]]._replace(label=family)
+            members = table.loc[(table["family"] == family) & table["first"], "algo"]
+            if len(members):
+                looks[family] = looks[members.min()]._replace(label=family)
         return looks
 
     @property

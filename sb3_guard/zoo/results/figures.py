@@ -79,7 +79,7 @@ def fit_costs(axis: Axes, values: Iterable[Any], way: str = "y") -> None:
     :param values: all lines and points that are drawn, arrays or numbers; bands may be cut
     :param way: which axis, ``x`` or ``y``
     """
-    finite = np.concatenate([np.ravel(np.asarray(one, float)) for one in values])
+    finite = np.concatenate([np.ravel(np.asarray(part, float)) for part in values])
     finite = finite[np.isfinite(finite)]
     set_limits, end = getattr(axis, f"set_{way}lim"), getattr(axis, f"get_{way}lim")()[1]
     set_limits(0, end)
@@ -178,7 +178,7 @@ def name_points(axis: Axes, data: Data, means: Any, cost: str) -> None:
             covers = (box[:2] < taken[:, 2:]).all(axis=1) & (taken[:, :2] < box[2:]).all(axis=1)
             outside = (box[:2] < 0).any() or (box[2:] > size).any()
             tried.append((covers.sum() + 3 * outside, len(tried), (side, up), box))
-        _, _, offset, box = min(tried, key=lambda one: one[:2])
+        _, _, offset, box = min(tried, key=lambda place: place[:2])
         taken = np.vstack([taken, box])
         if row[cost] > x:
             axis.scatter(x, row["J_r"], s=80, color=look.color, marker=look.marker, zorder=3)
@@ -291,8 +291,7 @@ def tiers(data: Data, suite: str) -> Figure | None:
     for split, axis in panels.items():
         rows = data.splits[(data.splits["suite"] == suite) & (data.splits["split"] == split)]
         for row in rows.to_dict("records"):
-            y, style = algos.index(row["algo"]), TIER_STYLES[row["tier"]]
-            color, marker = style
+            y, (color, marker) = algos.index(row["algo"]), TIER_STYLES[row["tier"]]
             axis.plot([row["low"], row["high"]], [y, y], color=color, linewidth=4, alpha=0.5)
             name = row["tier"] or "no limit"
             axis.scatter(row["cost"], y, s=36, color=color, marker=marker, label=name, zorder=3)

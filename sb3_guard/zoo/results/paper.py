@@ -183,14 +183,14 @@ def q8(data: Data) -> Figure | None:
     spiders: dict[str, dict[str, list[float]]] = {}
     spokes: dict[str, list[str]] = {}
     for algo, look in data.looks.items():
-        own = table[table["algo"] == algo].groupby("option")[scores].agg(["mean", "size"])
-        if algo == REFERENCE or algo in data.families or not len(own):
+        tasks = table[table["algo"] == algo].groupby("option")[scores].agg(["mean", "size"])
+        if algo == REFERENCE or algo in data.families or not len(tasks):
             continue
-        own = own.reindex([*OPTIONS])
-        spiders[look.label] = {score: own[score, "mean"].tolist() for score in scores}
+        tasks = tasks.reindex([*OPTIONS])
+        spiders[look.label] = {score: tasks[score, "mean"].tolist() for score in scores}
         spokes[look.label] = [
             str(option) if number == len(ROBOTS) else f"{option}\n({number:.0f}/{len(ROBOTS)})"
-            for option, number in own["cost", "size"].fillna(0).items()
+            for option, number in tasks["cost", "size"].fillna(0).items()
         ]
     return draw_spiders(spiders, spokes, POLYGONS) if spiders else None
 

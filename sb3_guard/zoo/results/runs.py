@@ -23,15 +23,9 @@ REFERENCE = "trpo"  # scores are relative to it
 # Columns of the figures of merit, and their key in result.json
 METRICS = dict(zip(("J_r", "M_c", "rho_c"), MEASURES, strict=True))
 VERSIONS = ("sb3_guard", "mujoco", "gymnasium", "stable_baselines3", "torch", "numpy", "python")
-NUMBERS = (
-    "seed", "steps", *METRICS, "cost_limit", "episodes", "physics_errors", "seconds", "epoch",
-)  # fmt: skip
-TEXTS = (
-    "suite", "robot", "task", "constraint", "algo", "label", "family", "limits", "verdict", "world",
-    "started_from", "config", *VERSIONS, "commit", "platform", "path",
-)  # fmt: skip
-COLUMNS = (*TEXTS[:7], *NUMBERS, *TEXTS[7:])
-_SUITE = re.compile(r"([A-Za-z][A-Za-z0-9]*)_([A-Za-z][A-Za-z0-9]*)_(\d+[A-Za-z]\w*)-v0")
+_SUITE = re.compile(
+    r"(?P<task>[A-Za-z][A-Za-z0-9]*)_(?P<robot>[A-Za-z][A-Za-z0-9]*)_(?P<constraint>\d+[A-Za-z]\w*)-v0"
+)
 # Runs that agree in these are the same run, made again.
 _SAME = ["suite", "world", "algo", "limits", "seed", "steps", "started_from", "config"]
 VERDICTS = ("exceeded", "undecided", "kept")  # the worst one first
@@ -41,7 +35,7 @@ class Results(NamedTuple):
     """
     What log folders hold.
 
-    :param runs: a row per finished run, columns :data:`COLUMNS`; see :func:`read_run`
+    :param runs: a row per finished run, see :func:`read_run`
     :param left_out: why a folder could not be read, by its path
     """
 
@@ -65,7 +59,8 @@ def read_results(folders: Sequence[str | Path]) -> Results:
                 f"there is no run below {str(folder)!r}: a run is <algo>/<env>_<k>/, as train "
                 "writes it"
             )
-        paths = {path.resolve(): path for path in below} | paths
+        for path in below:
+            paths.setdefault(path.resolve(), path)
     rows: list[dict[str, Any]] = []
     left_out: dict[str, str] = {}
     for path in paths.values():
@@ -73,10 +68,10 @@ def read_results(folders: Sequence[str | Path]) -> Results:
             rows.append(read_run(path))
         except (UsageError, OSError, ValueError, TypeError) as error:
             left_out[str(path)] = one_line(error)
-    keys = sorted({name for row in rows for name in row} - {*COLUMNS})
-    runs = pd.DataFrame(rows, columns=[*COLUMNS, *keys])
-    texts = [*TEXTS, *(name for name in keys if name.startswith("verdict"))]
-    runs = runs.astype(dict.fromkeys(texts, "string"))
+    if not rows:
+        return Results(pd.DataFrame(), left_out)
+    runs = pd.DataFrame(rows)
+    runs = runs.astype(dict.fromkeys(runs.select_dtypes(exclude="number"), "string"))
     # The reference comes first, then family by family.
     order = ["suite", "_first", "family", "label", "algo", "cost_limit", "seed"]
     runs = runs.assign(_first=runs["algo"] != REFERENCE).sort_values(order, kind="stable")
@@ -86,13 +81,13 @@ def read_results(folders: Sequence[str | Path]) -> Results:
 def find_runs(folder: Path) -> list[Path]:
     """The run folders at or below a folder, complete or not, in the order of their numbers."""
     marks = {"result.json": 0, "0.monitor.csv": 0, "error.txt": 0, "args.yml": 1, "command.txt": 1}
-    found = {path.parents[up] for name, up in marks.items() for path in folder.rglob(name)}
+    paths = {path.parents[up] for name, up in marks.items() for path in folder.rglob(name)}
 
     def natural(path: Path) -> list[tuple[int, str]]:
         parts = re.split(r"(\d+)", str(path))
         return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
 
-    return sorted(found, key=natural)
+    return sorted(paths, key=natural)
 
 
 def read_run(path: Path) -> dict[str, Any]:
@@ -129,7 +124,9 @@ def read_run(path: Path) -> dict[str, Any]:
     numbers = {**METRICS, **{k: k for k in ("episodes", "physics_errors", "seconds")}}
     return {
         "suite": env.removesuffix("-v0") if parts else env,
-        **dict(zip(("task", "robot", "constraint"), parts.groups() if parts else (), strict=False)),
+        "task": parts and parts["task"],
+        "robot": parts and parts["robot"],
+        "constraint": parts and parts["constraint"],
         "algo": algo,
         "label": result.get("label") or algo.upper().replace("_", "-"),
         "family": (result.get("family") or "").replace("unconstrained", ""),

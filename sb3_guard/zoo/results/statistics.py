@@ -222,13 +222,13 @@ def overall(runs: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
     order = means.sort_values("algo", key=lambda a: a != REFERENCE, kind="stable")
     rows: list[dict[str, Any]] = []
     for algo in dict.fromkeys(order["algo"]):
-        own, each = (table[table["algo"] == algo] for table in (scores, single))
-        row: dict[str, Any] = {"algo": algo, "label": own["label"].iloc[0]}
+        suites, seeds = (table[table["algo"] == algo] for table in (scores, single))
+        row: dict[str, Any] = {"algo": algo, "label": suites["label"].iloc[0]}
         for score in SCORES.values():
-            groups = [group.dropna().to_numpy() for _, group in each.groupby("suite")[score]]
+            groups = [group.dropna().to_numpy() for _, group in seeds.groupby("suite")[score]]
             values = np.concatenate(groups)
             low, high = interval(groups, iqm)
-            row |= {score: own[score].mean(), f"{score}_n": int(own[score].notna().sum())}
+            row |= {score: suites[score].mean(), f"{score}_n": int(suites[score].notna().sum())}
             row[f"{score}_iqm"] = iqm(values) if len(values) else math.nan
             row |= {f"{score}_low": low, f"{score}_high": high}
         rows.append(row)

@@ -266,10 +266,10 @@ def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> No
     check_table(path)
     parts: list[str] = []
     if path.suffix == ".md":
-        parts = [f"## {title}\n\n{markdown(one)}" for title, one in tables(runs).items()]
+        parts = [f"## {title}\n\n{markdown(table)}" for title, table in tables(runs).items()]
         parts += ["\n".join(f"- {escaped(note)}" for note in notes)] if notes else []
     elif path.suffix == ".tex":
-        parts = [f"% {title}\n{latex(one)}" for title, one in tables(runs).items()]
+        parts = [f"% {title}\n{latex(table)}" for title, table in tables(runs).items()]
         parts += ["\n".join(f"% {note}" for note in notes)] if notes else []
     with written(path) as file:
         if path.suffix == ".csv":

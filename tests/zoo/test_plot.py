@@ -403,12 +403,13 @@ def test_suites_may_have_limits_of_their_own(small, tmp_path):
         (["."], "there is no run below '.'"),
         (["LOGS", "--figure", "q9"], "invalid choice: 'q9' (choose from"),
         (["LOGS", "--format", "gif"], "invalid choice: 'gif'"),
-        (["LOGS", "--table", "r.xls"], "unknown format '.xls'"),
-        (["LOGS", "--report", "r.pdf"], "--report 'r.pdf' is not an .html file"),
+        (["LOGS", "--table", "r.xls"], "--table: 'r.xls': unknown format '.xls'"),
+        (["LOGS", "--table", "r"], "allowed: .md, .tex, .csv"),
+        (["LOGS", "--report", "r.pdf"], "--report: 'r.pdf': unknown format '.pdf'"),
         (["LOGS", "--figures", "q1"], "did you mean --figure?"),
-        (["LOGS", "-o", "file/x"], "-o: can't write to folder 'file/x'"),
-        (["LOGS", "--table", "file/r.md"], "--table: can't write to folder 'file'"),
-        (["LOGS", "--report", "file/r.html"], "--report: can't write to folder 'file'"),
+        (["LOGS", "-o", "file/x"], "can't write to 'file/x/curves"),
+        (["LOGS", "--table", "file/r.md"], "can't write to 'file/r.md'"),
+        (["LOGS", "--report", "file/r.html"], "can't write to 'file/r.html'"),
     ],
 )
 def test_wrong_usage(small, tmp_path, monkeypatch, capsys, arguments, message):

@@ -221,11 +221,7 @@ def test_markdown_shows_cells_as_they_are(text, page):
     assert "|" in text or escaped(text) == page
 
 
-def test_formats(tmp_path, runs):
-    for name in ("r.xlsx", "r", "r.cvs"):
-        with pytest.raises(UsageError, match=r"unknown format .*.md, .tex, .csv"):
-            write_table(tmp_path / name, runs)
-        assert not (tmp_path / name).exists()
+def test_a_table_that_can_not_be_written(tmp_path, runs):
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match=r"can't write to"):
         write_table(tmp_path / "file" / "r.csv", runs)

@@ -16,9 +16,8 @@ from rich.text import Text
 
 from sb3_guard.common.files import replacing
 from sb3_guard.costs import verdict
-from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.markdown import escaped, table
-from sb3_guard.zoo.cli.usage import UsageError, explained
+from sb3_guard.zoo.cli.usage import explained
 
 # A column's name, or a function of a row; by heading
 Cell = str | Callable[[Any], str]
@@ -239,19 +238,6 @@ def written(path: Path) -> Iterator[BufferedRandom]:
             yield file
 
 
-def check_table(path: Path) -> None:
-    """
-    Find out before work is done whether a table can be written in the format its name asks for.
-
-    :raises UsageError: the format is unknown
-    """
-    if path.suffix not in FORMATS:
-        raise UsageError(
-            f"--table {str(path)!r}: unknown format {path.suffix!r}; "
-            f"{did_you_mean(path.suffix, FORMATS)}"
-        )
-
-
 def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> None:
     """
     Write a table in the format that the file's name says.
@@ -261,9 +247,8 @@ def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> No
     :param runs: with the columns of :func:`~sb3_guard.zoo.results.statistics.with_safety`; for
         means, those that may be averaged
     :param notes: what a reader of the means should know; written below them
-    :raises UsageError: see :func:`check_table`; or the file can't be written
+    :raises UsageError: the file can't be written
     """
-    check_table(path)
     parts: list[str] = []
     if path.suffix == ".md":
         parts = [f"## {title}\n\n{markdown(table)}" for title, table in tables(runs).items()]

@@ -90,7 +90,8 @@ def plot(flags: Flags) -> int:
     means = [file for file in flags.table if file.suffix != ".csv"]
     for file in flags.table:
         if file not in means:
-            tables.write_table(file, chosen)
+            with tables.written(file) as handle:
+                chosen.to_csv(handle, index=False)
             print(f"wrote {file}")
     by_default = not (flags.figure or flags.table or flags.report)
     if not (means or flags.figure or flags.report or by_default):
@@ -99,10 +100,10 @@ def plot(flags: Flags) -> int:
     notes = reading.notices(chosen, runs)
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
-    for file in means:
-        tables.write_table(file, runs, notes)
-        print(f"wrote {file}")
     data = Data(runs)
+    for file in means:
+        tables.write_tables(file, data, notes)
+        print(f"wrote {file}")
     status = _draw(data, ["curves"] if by_default else flags.figure, flags)
     if flags.report:
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
@@ -111,7 +112,7 @@ def plot(flags: Flags) -> int:
             handle.write(page.encode())
         print(f"wrote {flags.report}")
     if by_default:
-        for title, table in tables.tables(runs).items():
+        for title, table in tables.tables(data).items():
             print(f"\n{title}\n\n{tables.terminal(table)}")
     return status
 

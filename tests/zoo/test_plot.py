@@ -326,7 +326,7 @@ def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
     found = read(tmp_path / "logs")
     (row,) = found.runs.to_dict("records")
     assert (row["M_c/heat"], row["cost_limit/noise"], row["verdict"]) == (4, 2, "undecided")
-    shown = tables(found.runs)
+    shown = tables(found)
     assert shown["Results"]["limit"].tolist() == ["5 2: undecided"]
     assert shown["Limits"][["cost", "limit"]].to_numpy().tolist() == [
         ["heat", "5: kept"], ["noise", "2: undecided"]
@@ -334,7 +334,7 @@ def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
     limited(tmp_path / "logs", 1)  # with two seeds it is their mean that is judged
     fake_run(tmp_path / "logs", "trpo")  # which knows the total only
     found = read(tmp_path / "logs")
-    assert tables(found.runs)["Limits"]["limit"].tolist() == ["5: kept", "2: exceeded"]
+    assert tables(found)["Limits"]["limit"].tolist() == ["5: kept", "2: exceeded"]
     for kind, panels in (("curves", 5), ("pareto", 3)):
         (drawing,) = draw(kind, found)
         assert len(drawing.figure.axes) == panels

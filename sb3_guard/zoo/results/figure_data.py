@@ -1,4 +1,4 @@
-"""The data of figures: the runs, their means, scores and curves, and the look of each algorithm.
+"""The data of tables and figures: runs, means, scores, curves, and the look of each algorithm.
 
 Colours are readable on white and on black, and in the manner of Okabe and Ito's told apart by
 colour-blind readers; line styles and markers tell algorithms apart without them.
@@ -55,7 +55,7 @@ class Look(NamedTuple):
 
 class Data:
     """
-    What figures are drawn from, worked out when a figure asks.
+    What tables and figures are made from, worked out when one asks.
 
     :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
     """

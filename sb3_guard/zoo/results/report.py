@@ -38,7 +38,7 @@ def report(data: Data, title: str, left_out: Mapping[str, str], notes: Sequence[
         version=sb3_guard.__version__,
         notes=notes,
         left_out=left_out,
-        tables={heading: _html(table) for heading, table in tables(data.runs).items()},
+        tables={heading: _html(table) for heading, table in tables(data).items()},
         figures=figures,
         run_table=_html(spelled(data.runs, RUNS)),
     )

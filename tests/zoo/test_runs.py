@@ -79,10 +79,6 @@ DAMAGE = {
     "could not convert string to float: 'x'": lambda run: edit(run, seconds="x"),
     "no env, algo or seed": lambda run: params(run, "args.yml").write_text("env: 3"),
     "one <env>/args.yml": lambda run: params(run, "args.yml").unlink(),
-    "error.txt ends in 'disk on fire'": lambda run: (
-        (run / "error.txt").write_text("Traceback\n  …\ndisk on fire\n"),
-        (run / "result.json").unlink(),
-    ),
     "can't read": lambda run: (run / "0.monitor.csv").unlink(),
     "it has no episodes": lambda run: (run / "0.monitor.csv").write_text("#{}\nr,l,t,c\n"),
     "config.yml": lambda run: params(run, "config.yml").write_text("a: ["),

@@ -21,16 +21,11 @@ from matplotlib.ticker import EngFormatter
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.splits import SPLITS
 from sb3_guard.zoo.results.statistics import SCORES, mean_curve, overall
-from sb3_guard.zoo.results.tables import written
+from sb3_guard.zoo.results.tables import SCORE_HEADINGS, written
 
 FORMATS = ("png", "svg", "pdf")
 WIDTH = 8.0  # inches: at the width of a page, text has the size of the page's
 AXES = {"J_r": "return", "M_c": "episode cost", "rho_c": "cost rate, per step"}
-SCORE_AXES = {
-    "reward": "reward / TRPO's",
-    "cost": "episode cost / TRPO's",
-    "cost_rate": "cost rate / TRPO's",
-}
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -318,7 +313,7 @@ def iqm(data: Data) -> Figure | None:
                 axis.barh(y, high - low, 0.6, left=low, color=pale, edgecolor=INK, linewidth=0.5)
             axis.plot(middle, y, marker="|", markersize=13, markeredgewidth=2, color=color)
         axis.set_yticks(rows, table["label"])
-        axis.set(xlabel=SCORE_AXES[score])
+        axis.set(xlabel=SCORE_HEADINGS[score])
         axis.use_sticky_edges = False
         axis.margins(0.06)
         axis.axvline(1, color=INK, linewidth=1, linestyle=(0, (1, 2)))

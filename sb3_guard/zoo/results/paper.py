@@ -12,7 +12,6 @@ from matplotlib.ticker import MaxNLocator
 from sb3_guard.zoo.grids.presets import GHOSTS, HAZARDS, MAIN8, OPTIONS, PRESETS, RADAR4, ROBOTS
 from sb3_guard.zoo.results.figure_data import COLORS, DASHES, INK, Data, Look
 from sb3_guard.zoo.results.figures import (
-    SCORE_AXES,
     STYLE,
     WIDTH,
     Drawing,
@@ -27,6 +26,7 @@ from sb3_guard.zoo.results.figures import (
 )
 from sb3_guard.zoo.results.runs import REFERENCE
 from sb3_guard.zoo.results.statistics import SCORES
+from sb3_guard.zoo.results.tables import SCORE_HEADINGS
 
 SPOKES = {"reward": "reward", "cost": "cost", "cost_rate": "cost\nrate"}
 POLYGONS = {
@@ -63,7 +63,7 @@ def q2(data: Data) -> Figure | None:
             values = [data.score(suite, algo, score) for suite in (HAZARDS[0], GHOSTS[0])]
             if algo not in data.families and not np.isnan(values).all():
                 axis.plot(pair, values, marker=look.marker, **look.line)
-        axis.set(ylabel=SCORE_AXES[score], title="Goal, Point", xlim=(-0.3, 1.3))
+        axis.set(ylabel=SCORE_HEADINGS[score], title="Goal, Point", xlim=(-0.3, 1.3))
         mark_trpo(axis)
     return figure
 
@@ -147,7 +147,7 @@ def by_robot(data: Data, lines: Iterable[str]) -> Figure | None:
         for line in lines:
             look, values = data.looks[line], [data.score(suites[r], line, score) for r in shown]
             axis.plot(ticks, values, marker=look.marker, linewidth=1.4, **look.line)
-        axis.set(xlabel="robot, degrees of freedom", ylabel=SCORE_AXES[score])
+        axis.set(xlabel="robot, degrees of freedom", ylabel=SCORE_HEADINGS[score])
         axis.tick_params(axis="x", labelsize=7)
         axis.margins(x=0.06)
         mark_trpo(axis)

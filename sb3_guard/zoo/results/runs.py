@@ -82,12 +82,13 @@ def find_runs(folder: Path) -> list[Path]:
     """The run folders at or below a folder, complete or not, in the order of their numbers."""
     marks = {"result.json": 0, "0.monitor.csv": 0, "error.txt": 0, "args.yml": 1, "command.txt": 1}
     paths = {path.parents[up] for name, up in marks.items() for path in folder.rglob(name)}
+    return sorted(paths, key=_natural)
 
-    def natural(path: Path) -> list[tuple[int, str]]:
-        parts = re.split(r"(\d+)", str(path))
-        return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
 
-    return sorted(paths, key=natural)
+def _natural(value: Any) -> list[tuple[int, str]]:
+    """The key of an order in which numbers within texts count as numbers."""
+    parts = re.split(r"(\d+)", str(value))
+    return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
 
 
 def read_run(path: Path) -> dict[str, Any]:
@@ -106,7 +107,7 @@ def read_run(path: Path) -> dict[str, Any]:
     :raises UsageError: the run is not finished, or damaged
     """
     if not (path / "result.json").exists():
-        raise UsageError("unfinished: it has no result.json" + _last_words(path))
+        raise UsageError("unfinished: it has no result.json")
     folder = RunFolder(path)
     result, args, config = folder.checked_result(), folder.args(), folder.hyperparams()
     env, algo, seed = args.get("env"), args.get("algo"), args.get("seed")
@@ -166,15 +167,6 @@ def label_of(algo: str) -> str:
     from sb3_guard.zoo.run.algos import algorithm
 
     return getattr(algorithm(algo), "label", algo.upper().replace("_", "-"))
-
-
-def _last_words(path: Path) -> str:
-    """What a grid noted when the run failed."""
-    try:
-        lines = (path / "error.txt").read_text(errors="replace").strip().splitlines()
-    except OSError:
-        return ""
-    return f"; its error.txt ends in {lines[-1]!r}" if lines else ""
 
 
 def _number(value: Any) -> float:
@@ -274,11 +266,8 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _values(column: "pd.Series[Any]") -> list[Any]:
-    """The values that there are, limits in the order of their numbers."""
-    values = sorted(column.dropna().unique())
-    if column.name == "limits":
-        values.sort(key=lambda text: [float(limit) for limit in text.split()])
-    return values
+    """The values that there are."""
+    return sorted(column.dropna().unique(), key=_natural)
 
 
 def _joined(values: Iterable[Any]) -> str:

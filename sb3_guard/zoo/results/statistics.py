@@ -77,9 +77,8 @@ def judging_limits(runs: pd.DataFrame) -> "pd.Series[float]":
 
     That of an unconstrained run is the limit of the others on its suite, if it is the same for all.
     """
-    limits = runs.groupby("suite")["cost_limit"].unique().map(lambda all_: all_[~np.isnan(all_)])
-    common = runs["suite"].map(
-        lambda suite: limits[suite][0] if len(limits[suite]) == 1 else math.nan
+    common = runs.groupby("suite")["cost_limit"].transform(
+        lambda limits: limits.max() if limits.nunique() == 1 else math.nan
     )
     return runs["cost_limit"].where(runs["limits"].notna(), common).astype(float)
 

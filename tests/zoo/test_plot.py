@@ -97,6 +97,10 @@ def test_q2_shows_trpos_costs_and_the_slopes(data):
     bars, reward, cost = drawing.figure.axes
     assert [bar.get_height() for bar in bars.patches] == pytest.approx([4.0] * 2 * len(ROBOTS))
     assert lines(cost)["TRPO-USL"] == pytest.approx([1.5, 1.5])
+    costlier = data.runs["suite"].str.endswith("Ghosts")
+    runs = data.runs.assign(M_c=data.runs["M_c"].where(~costlier, 2 * data.runs["M_c"]))
+    (drawing,) = draw("q2", Data(runs))
+    assert drawing.figure.axes[0].get_ylim()[1] > 8  # no bar is cut
     # Hazards have two seeds: 5.5 of TRPO's 10.5; Ghosts one: 5 of 10
     assert lines(reward)["CPO"] == pytest.approx([5.5 / 10.5, 0.5])
 

@@ -54,7 +54,7 @@ def q2(data: Data) -> Figure | None:
             np.arange(len(robots)) + offset, rows["M_c"], 0.38, yerr=rows["M_c_std"], color=color,
             hatch=hatch, edgecolor=INK, ecolor=INK, capsize=2, label=f"8 {kind}",
         )  # fmt: skip
-        fit_costs(left, [bar.get_height() for bar in left.patches])
+    fit_costs(left, [bar.get_height() for bar in left.patches])
     left.set_xticks(range(len(robots)), robots, rotation=60)
     left.set(ylabel="episode cost of TRPO", title="Goal, every robot")
     left.grid(axis="x", visible=False)

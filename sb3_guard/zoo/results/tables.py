@@ -28,7 +28,11 @@ Columns = dict[str, Cell]
 FORMATS = (".md", ".tex", ".csv")
 DIGITS = {"rho_c": 5}
 HEADINGS = {"J_r": "return J_r", "M_c": "episode cost M_c", "rho_c": "cost rate ρ_c"}
-SCORE_HEADINGS = {"reward": "reward / TRPO", "cost": "cost / TRPO", "cost_rate": "rate / TRPO"}
+SCORE_HEADINGS = {
+    "reward": "reward / TRPO",
+    "cost": "cost / TRPO",
+    "cost_rate": "cost rate / TRPO",
+}
 _LATEX = {"±": r"$\pm$", "−": "$-$", "ρ": r"$\rho$", "–": "--", "\N{NO-BREAK SPACE}": "~"}
 
 

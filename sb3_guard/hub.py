@@ -4,11 +4,13 @@ import sys
 
 from sb3_guard.zoo.agents.flags import HubFlags as Flags
 from sb3_guard.zoo.cli.flags import command
+from sb3_guard.zoo.cli.usage import UsageError
 
 
 def hub(flags: Flags) -> int:
     """Upload an agent, or download one."""
-    flags.check()
+    if flags.pretrained:
+        raise UsageError("hub takes agents of your runs, not those of --pretrained")
 
     from sb3_guard.zoo.agents import hub
 

@@ -1,23 +1,36 @@
 """Tables and figures of trained runs: ``sb3-guard plot logs``."""
 
+import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import UsageError, positive
+from sb3_guard.zoo.results import figures, tables
 from sb3_guard.zoo.results import runs as reading
 from sb3_guard.zoo.results.figure_data import Data
-from sb3_guard.zoo.results.figures import FORMATS, save
 from sb3_guard.zoo.results.paper import FIGURES, draw
 from sb3_guard.zoo.results.report import report
 from sb3_guard.zoo.results.statistics import with_safety
-from sb3_guard.zoo.results.tables import check_table, tables, terminal, write_table, written
-from sb3_guard.zoo.run.folder import require_writable
 
-TITLES = "\n".join(f"  {name:<10} {one.__doc__}" for name, one in FIGURES.items())
+TITLES = "\n".join(f"  {name:<10} {figure.__doc__}" for name, figure in FIGURES.items())
+
+
+def file_of(*formats: str) -> Callable[[str], Path]:
+    """What makes a file's path of a flag's text, which ends in one of the formats."""
+
+    def read(text: str) -> Path:
+        end = Path(text).suffix
+        if end not in formats:
+            hint = did_you_mean(end, formats)
+            raise argparse.ArgumentTypeError(f"{text!r}: unknown format {end!r}; {hint}")
+        return Path(text)
+
+    return read
 
 
 @dataclass
@@ -54,9 +67,9 @@ figures:
     folders: list[str] = flag(default=["logs"], positional=True, nargs="*", metavar="DIR")
     figure: list[str] = flag(default=[], choices=[*FIGURES, "all"], metavar="NAME")
     output: str = flag("-o", default="figures", metavar="DIR")
-    format: list[str] = flag(default=["png"], choices=FORMATS)
-    table: list[str] = flag(default=[], metavar="FILE")
-    report: str | None = flag(metavar="FILE.html")
+    format: list[str] = flag(default=["png"], choices=figures.FORMATS)
+    table: list[Path] = flag(default=[], kind=file_of(*tables.FORMATS), metavar="FILE")
+    report: Path | None = flag(kind=file_of(".html"), metavar="FILE.html")
     env: list[str] | None = flag(metavar="ID")
     cost_limit: list[float] | None = flag(metavar="D")
     steps: int | None = flag(kind=positive, metavar="N")
@@ -68,59 +81,46 @@ def plot(flags: Flags) -> int:
 
     :return: exit status, 1 if a figure lacks all its runs
     """
-    files = [Path(name) for name in flags.table]
-    for file in files:
-        check_table(file)
-        require_writable(file.parent, "--table")
-    if flags.report:
-        if Path(flags.report).suffix not in (".html", ".htm"):
-            raise UsageError(f"--report {flags.report!r} is not an .html file; name it so")
-        require_writable(Path(flags.report).parent, "--report")
-    kinds = [*FIGURES] if "all" in flags.figure else flags.figure
-    by_default = not (kinds or files or flags.report)
-    kinds = ["curves"] if by_default else kinds
-    if kinds:
-        require_writable(Path(flags.output), "-o")
-
-    found = reading.read_results(flags.folders)
-    for path, why in found.left_out.items():
+    results = reading.read_results(flags.folders)
+    for path, why in results.left_out.items():
         print(f"left out: {path}: {why}", file=sys.stderr)
-    if not len(found.runs):
+    if not len(results.runs):
         raise UsageError(f"there is no finished run below {', '.join(flags.folders)}")
-    chosen = with_safety(reading.choose(found.runs, flags.env, flags.cost_limit, flags.steps))
-    per_run = [file for file in files if file.suffix == ".csv"]
-    for file in per_run:
-        write_table(file, chosen)
-        print(f"wrote {file}")
-    if len(per_run) == len(files) and not kinds and not flags.report:
+    chosen = with_safety(reading.choose(results.runs, flags.env, flags.cost_limit, flags.steps))
+    means = [file for file in flags.table if file.suffix != ".csv"]
+    for file in flags.table:
+        if file not in means:
+            with tables.written(file) as handle:
+                chosen.to_csv(handle, index=False)
+            print(f"wrote {file}")
+    by_default = not (flags.figure or flags.table or flags.report)
+    if not (means or flags.figure or flags.report or by_default):
         return 0
     runs = reading.select(chosen)
     notes = reading.notices(chosen, runs)
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
-    for file in files:
-        if file not in per_run:
-            write_table(file, runs, notes)
-            print(f"wrote {file}")
     data = Data(runs)
-    status = _draw(data, kinds, flags)
+    for file in means:
+        tables.write_tables(file, data, notes)
+        print(f"wrote {file}")
+    status = _draw(data, ["curves"] if by_default else flags.figure, flags)
     if flags.report:
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
-        page = report(data, title, found.left_out, notes)
-        with written(Path(flags.report)) as handle:
+        page = report(data, title, results.left_out, notes)
+        with tables.written(flags.report) as handle:
             handle.write(page.encode())
         print(f"wrote {flags.report}")
-    for why in data.unread.values():
-        print(f"left out of the curves: {why}", file=sys.stderr)
     if by_default:
-        for title, table in tables(runs).items():
-            print(f"\n{title}\n\n{terminal(table)}")
+        for title, table in tables.tables(data).items():
+            print(f"\n{title}\n\n{tables.terminal(table)}")
     return status
 
 
 def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
     """Draw figures; 1 if one that was asked for by name could not be drawn."""
     status = 0
+    kinds = [*FIGURES] if "all" in kinds else kinds
     for drawing in (drawing for kind in kinds for drawing in draw(kind, data)):
         if drawing.missing:
             lost = "" if drawing.figure else " is not drawn;"
@@ -130,7 +130,7 @@ def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
             continue
         for form in dict.fromkeys(flags.format):
             path = Path(flags.output) / f"{drawing.name}.{form}"
-            save(drawing.figure, path)
+            figures.save(drawing.figure, path)
             print(f"wrote {path}")
     return status
 

@@ -21,7 +21,7 @@ from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.grids.presets import ALGOS
 from sb3_guard.zoo.results.curves import read_episodes
-from sb3_guard.zoo.results.runs import described, find_runs, select
+from sb3_guard.zoo.results.runs import find_runs, label_of, select
 from sb3_guard.zoo.results.splits import judge
 from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import number, spread
@@ -107,7 +107,7 @@ def leaderboard(rows: pd.DataFrame) -> str:
         done = {*here["algo"]} if len(here) else set()
         for row in wanted.query("suite == @suite and budget == @budget").to_dict("records"):
             if row["algo"] not in done:
-                lines.append(_line("–", described(row["algo"])["label"], row["command"], grey=True))
+                lines.append(_line("–", label_of(row["algo"]), row["command"], grey=True))
         if suite in untrained.index:
             for key, label in (("random", "random actions"), ("zero", "idle")):
                 of = untrained.loc[suite]

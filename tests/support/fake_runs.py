@@ -47,7 +47,8 @@ def fake_run(
     settings = {"n_envs": 2, "n_steps": 50, "n_timesteps": 100 * epochs}
     if algo != "trpo":
         settings["cost_limit"] = 0.0
-    (params / "config.yml").write_text(yaml.safe_dump(settings | (config or {})))
+    settings |= config or {}
+    (params / "config.yml").write_text(yaml.safe_dump(settings))
     noise = np.random.default_rng(seed).normal(size=10)
     noise -= noise.mean()
     rows = ["#{}", "r,l,t,c"]
@@ -60,6 +61,7 @@ def fake_run(
         "label": label, "family": family, "algo": algo, "env": env,
         "return": returns, "cost": cost, "length": 10.0,
         "cost_rate": cost / 10, "episodes": 10, "n_timesteps": 100 * epochs, "physics_errors": 0,
+        "cost_limit": settings.get("cost_limit"),
     } | result  # fmt: skip
     content = {key: value for key, value in content.items() if value is not ...}
     (path / "result.json").write_text(json.dumps(content))

@@ -96,7 +96,7 @@ def test_filming_shows_how_far_it_is():
 @pytest.mark.parametrize("bar", [False, True])
 def test_the_bar_is_on_stderr_if_it_is_asked_for(bar, tmp_path, capsys):
     venv = CostMonitor(DummyVecEnv([lambda: Filmed("rgb_array", episode_length=8)]))
-    with filming(venv, None, tmp_path / "film.mp4", 3, bar) as film:
+    with filming(venv, None, tmp_path / "film.mp4", bar) as film:
         film.reset()
         for _ in range(3):
             film.step(np.zeros((1, 2)))

@@ -95,7 +95,7 @@ def test_a_row_for_each_split(runs):
     )
     # fake_run's last ten epochs are whole: 60 episodes of cost 5 ± a noise whose mean is 0.
     assert table.loc["cpo", "training"]["cost"] == pytest.approx(5)
-    text = tables(runs)["Tiers"]
+    text = tables(Data(runs))["Tiers"]
     cells = text[text["episodes"] == "final greedy"].set_index("algorithm").loc["CPO"]
     assert cells["limit"] == "5: undecided" and cells["cost"] == "6.5\xa0±\xa03.5 [4.0, 9.0]"
     assert cells["above limit, %"] == "50.0" and cells["D⁺"] == "0.80"
@@ -118,7 +118,7 @@ def test_a_limit_on_the_worst_step_says_nothing_of_the_sum(tmp_path):
     table = judge(runs)
     assert {*table["tier"]} == {""} and table["above"].isna().all()
     assert runs["above_limit"].isna().all() and runs["limits"].dropna().tolist() == ["5"]
-    assert {*tables(runs)["Tiers"]["limit"]} == {"–"}
+    assert {*tables(Data(runs))["Tiers"]["limit"]} == {"–"}
 
 
 def test_the_distribution_of_costs_is_drawn(runs):

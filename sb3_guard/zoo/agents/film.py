@@ -109,9 +109,7 @@ def below(words: Sequence[tuple[str, bool]], picture: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def filming(
-    env: VecEnv, model: BaseAlgorithm, video: Path, steps: int | None = None, bar: bool = False
-) -> Iterator[Film]:
+def filming(env: VecEnv, model: BaseAlgorithm, video: Path, bar: bool = False) -> Iterator[Film]:
     """
     The environment in which to play an agent that is filmed.
 
@@ -120,8 +118,7 @@ def filming(
 
     :param env: one environment
     :param video: mp4 to write
-    :param steps: that will be played; None: nobody knows
-    :param bar: show a progress bar on stderr
+    :param bar: show on stderr how many steps have been played
     :raises UsageError: no picture can be rendered, or the file can't be written
     """
     import imageio_ffmpeg
@@ -137,7 +134,7 @@ def filming(
     with (
         explained(f"can't write {video}", OSError),
         replacing(video) as file,
-        tqdm(total=steps, desc="Filming", unit=" steps", leave=False, disable=not bar) as progress,
+        tqdm(desc="Filming", unit=" steps", leave=False, disable=not bar) as progress,
     ):
         writer = imageio_ffmpeg.write_frames(
             file.name, (width, height), fps=fps, macro_block_size=2, output_params=["-f", "mp4"]

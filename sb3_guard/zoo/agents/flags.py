@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from sb3_guard.zoo.cli.flags import Command, flag
-from sb3_guard.zoo.cli.usage import UsageError, positive, seed_number
+from sb3_guard.zoo.cli.usage import positive, seed_number
 
 
 @dataclass
@@ -128,45 +128,25 @@ class HubFlags(AgentFlags):
     :param direction: push: upload an agent; load: download one
     :param organization: user or organization that owns the repository
     :param repo_name: name of the repository (default: <algo>-<env>)
-    :param repo_id: user/name; replaces --organization and --repo-name
 
     Push:
 
     :param commit_message: message of the upload (default: 'Upload a trained agent')
     :param private: make the repository private
     :param no_video: record no video of an episode
-    :param dry_run: write all files and upload nothing
-    :param to: local folder in which the upload is prepared (default: a temporary one)
+    :param to: write all files to this folder and upload nothing
     """
 
     prog: ClassVar[str] = "sb3-guard hub"
     examples: ClassVar[str] = """examples:
   sb3-guard hub push --algo cpo --env Goal_Point_8Hazards -f logs -orga me
-  sb3-guard hub push --algo cpo --env Goal_Point_8Hazards -orga me --dry-run --to card
+  sb3-guard hub push --algo cpo --env Goal_Point_8Hazards -orga me --to card
   sb3-guard hub load --algo cpo --env Goal_Point_8Hazards -orga me -f logs
 """
     direction: Literal["push", "load"] = flag(positional=True)
-    organization: str | None = flag("-orga", metavar="NAME")
+    organization: str = flag("-orga", required=True, metavar="NAME")
     repo_name: str | None = flag("-name", metavar="NAME")
-    repo_id: str | None = flag(metavar="USER/NAME")
     commit_message: str = flag("-m", default="Upload a trained agent", metavar="TEXT")
     private: bool = flag(default=False)
     no_video: bool = flag(default=False)
-    dry_run: bool = flag(default=False)
     to: str | None = flag(metavar="DIR")
-
-    def check(self) -> None:
-        """
-        Take ``--repo-id`` apart.
-
-        :raises UsageError: the repository's owner is missing, or its name has another form
-        """
-        if self.pretrained:
-            raise UsageError("hub takes agents of your runs, not those of --pretrained")
-        if self.repo_id is not None:
-            organization, slash, name = self.repo_id.partition("/")
-            if not (organization and slash and name) or "/" in name:
-                raise UsageError(f"--repo-id {self.repo_id!r} must be of the form user/name")
-            self.organization, self.repo_name = organization, name
-        elif self.organization is None:
-            raise UsageError("the repository has no owner; give -orga NAME, or --repo-id user/name")

@@ -5,20 +5,20 @@ import shlex
 import shutil
 import tempfile
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, closing, suppress
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any
 
 import yaml
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_guard.algorithms.common.limits import limits_at
-from sb3_guard.common.evaluation import evaluate_policy
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.zoo.agents import export
 from sb3_guard.zoo.agents.film import filming
 from sb3_guard.zoo.agents.flags import HubFlags
-from sb3_guard.zoo.agents.playback import Agent, open_agent, summary
-from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag
-from sb3_guard.zoo.run.folder import RunFolder, claim, folder_name, read_data, require_writable
+from sb3_guard.zoo.agents.playback import Agent, means, open_agent, summary
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, packages_flag
+from sb3_guard.zoo.run.folder import RunFolder, claim, folder_name, require_writable
 from sb3_guard.zoo.run.make_envs import full_id
 
 # Said before an agent is downloaded.
@@ -32,19 +32,19 @@ CARD = """
 # {name} on {env}
 
 A **{name}** agent for **{env}**, trained with
-[sb3_guard](https://arxiv.org/abs/2305.13681) for Stable-Baselines3.
+[sb3_guard](https://arxiv.org/abs/2305.13681) for Stable-Baselines3. With {actions} actions:
 
-| {episodes} episodes, {actions} actions | mean | std | 95 % interval of the mean |
-|---|---|---|---|
-{rows}
+```
+{means}
+```
 
-Cost is the undiscounted sum of `info["cost"]` over an episode{limit}.
+Cost is the undiscounted sum of `info["cost"]` over an episode.
 
 ## Play it
 
 ```bash
 pip install .   # in a clone of sb3_guard's repository
-sb3-guard hub load --repo-id {repo_id} --algo {algo} --env {env} -f logs
+sb3-guard hub load --algo {algo} --env {env} -orga {organization} -name {repo} -f logs{packages}
 sb3-guard enjoy --algo {algo} --env {env} -f logs{packages}
 ```
 
@@ -64,20 +64,31 @@ def model_name(algo: str, env_id: str) -> str:
     return f"{algo}-{folder_name(env_id)}"
 
 
+def layout(run: Path, name: str) -> dict[str, Path]:
+    """Files of a repository, by name there, and where a run's folder has them."""
+    return {
+        "0.monitor.csv": run / "0.monitor.csv",
+        "config.yml": run / name / "config.yml",
+        "command.txt": run / name / "command.txt",
+        "vec_normalize.pkl": run / name / "vecnormalize.pkl",
+        "args.yml": run / name / "args.yml",  # last: it makes the folder a run
+    }
+
+
 def push(flags: HubFlags) -> int:
     """Evaluate an agent, write its card, film it, and upload all to the hub."""
     require_writable(Path(flags.to or tempfile.gettempdir()), "--to")
     agent = open_agent(flags, None if flags.no_video else "rgb_array")
+    flags.repo_name = flags.repo_name or model_name(flags.algo, agent.env_id)
+    folder = Path(flags.to or tempfile.mkdtemp(prefix="sb3_guard_hub_"))
     with closing(agent.env):
-        name = flags.repo_name or model_name(flags.algo, agent.env_id)
-        repo_id = f"{flags.organization}/{name}"
-        folder = Path(flags.to or tempfile.mkdtemp(prefix="sb3_guard_hub_"))
-        stage(agent, flags, repo_id, folder)
+        stage(agent, flags, folder)
     print(f"Ready to upload: {folder}")
-    if flags.dry_run:
+    if flags.to:
         return 0
     from huggingface_hub import HfApi
 
+    repo_id = f"{flags.organization}/{flags.repo_name}"
     with _network(f"the upload of {folder} to {repo_id}"):
         api = HfApi()
         api.create_repo(repo_id, private=flags.private, exist_ok=True)
@@ -88,45 +99,44 @@ def push(flags: HubFlags) -> int:
     return 0
 
 
-def stage(agent: Agent, flags: HubFlags, repo_id: str, folder: Path) -> None:
+def stage(agent: Agent, flags: HubFlags, folder: Path) -> None:
     """
     Write everything that goes to the hub into a folder.
 
     :param agent: the agent and its environment
     :param flags: of the command
-    :param repo_id: ``organization/name``
     :param folder: made if it is not there; files of the same names are replaced
     :raises UsageError: the agent can't be filmed
     """
     folder.mkdir(parents=True, exist_ok=True)
-    statistics = agent.normalizer if agent.normalizer.suffix == ".pkl" else Path("none")
-    for source, name in {
-        agent.path: f"{model_name(flags.algo, agent.env_id)}.zip",
-        agent.run.params / "config.yml": "config.yml",
-        agent.run.monitor: agent.run.monitor.name,
-        statistics: "vec_normalize.pkl",
-    }.items():
+    for name, source in layout(agent.run.path, agent.run.name).items():
         if source.is_file():
             shutil.copyfile(source, folder / name)
+    shutil.copyfile(agent.path, folder / f"{model_name(flags.algo, agent.env_id)}.zip")
+    normalizer = unwrap_vec_normalize(agent.env)
+    if normalizer is not None:  # the model's, which may not be the run's last one
+        normalizer.save(str(folder / "vec_normalize.pkl"))
     trained = agent.run.args()
     trained |= {name: Path(trained[name]).name for name in PATHS if trained.get(name)}
     (folder / "args.yml").write_text(yaml.safe_dump(trained), encoding="utf-8")
-    (folder / "command.txt").write_text(command(agent.run), encoding="utf-8")
+    (folder / "command.txt").write_text(command(agent), encoding="utf-8")
     how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
-    results = summary(evaluate_policy(agent.model, agent.env, flags.n_episodes or EPISODES, **how))
+    evaluation = evaluate_policy(agent.model, agent.env, flags.n_episodes or EPISODES, **how)
     if not flags.no_video:
         with filming(agent.env, agent.model, folder / "replay.mp4") as env:
             evaluate_policy(agent.model, env, 1, **how)
+    results = summary(evaluation)
     try:
         export.write(agent, flags, folder / "policy.onnx", results)
     except UsageError as error:
         print(f"There is no policy.onnx: {error}")
     results["is_deterministic"] = not flags.stochastic
     (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
-    (folder / "README.md").write_text(card(agent, flags, repo_id, results), encoding="utf-8")
+    page = card(agent, flags, evaluation, results)
+    (folder / "README.md").write_text(page, encoding="utf-8")
 
 
-def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]) -> str:
+def card(agent: Agent, flags: HubFlags, evaluation: Evaluation, results: Mapping[str, Any]) -> str:
     """The model card: metadata that the hub reads, and a page that people read."""
     from huggingface_hub import EvalResult, ModelCardData
 
@@ -148,56 +158,35 @@ def card(agent: Agent, flags: HubFlags, repo_id: str, results: Mapping[str, Any]
             for kind, key in (("mean_reward", "return"), ("mean_cost", "cost"))
         ],
     )
-    rows = []
-    for key, one in results.items():
-        if not isinstance(one, dict):
-            continue
-        interval = "–" if one["low"] is None else f"{one['low']:.2f} to {one['high']:.2f}"
-        spread = "–" if one["low"] is None else f"{one['std']:.2f}"
-        rows.append(f"| {key} | {one['mean']:.2f} | {spread} | {interval} |")
-    limit = limits_at(getattr(agent.model, "cost_limit", None), 0.0)
-    constrained = getattr(agent.model, "constrained", False) and limit is not None
-    worst = " on the worst step" if "worst" in results else ""
     page = CARD.format(
         name=name,
         env=agent.env_id,
         algo=flags.algo,
+        organization=flags.organization,
+        repo=flags.repo_name,
         packages=packages_flag(agent.run.args().get("gym_packages") or []),
-        repo_id=repo_id,
-        episodes=results["episodes"],
-        actions="sampled" if flags.stochastic else "most likely",
-        rows="\n".join(rows),
-        limit=f"; the agent was trained under a limit of {limit}{worst}" if constrained else "",
-        command=command(agent.run),
+        actions="sampled" if flags.stochastic else "the most likely",
+        means=means(evaluation),
+        command=command(agent),
         hyperparams=yaml.safe_dump(agent.run.hyperparams()),
     )
     return f"---\n{data.to_yaml()}\n---\n{page}"
 
 
-def command(run: RunFolder) -> str:
+def command(agent: Agent) -> str:
     """The command line of a run, with the names of files, but not where they lie here."""
-    words = []
-    with suppress(OSError, ValueError):  # absent, or a quotation mark that nothing closes
-        words = shlex.split((run.params / "command.txt").read_text(encoding="utf-8"))
-    # The interpreter's own path and flags are this machine's: what follows is the command.
-    if "-m" in words:
-        words = ["python", *words[words.index("-m") :]]
-    else:
-        starts = [k for k, word in enumerate(words) if Path(word).stem == "sb3-guard"]
-        words = ["sb3-guard", *words[starts[0] + 1 :]] if starts else words
+    result = agent.run.read_result() or {}
+    default = f"sb3-guard train --algo {agent.run.path.parent.name} --env {agent.env_id}"
+    words = shlex.split(result.get("command", default))
     return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
 def load(flags: HubFlags) -> int:
     """Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it."""
-    try:
-        flags.env = full_id(flags.env)
-    except UsageError:
-        # The environment may be unknown to this process: the repository says which it is.
-        if not (flags.repo_id or flags.gym_packages):
-            raise
+    import_packages(flags.gym_packages)
+    flags.env = full_id(flags.env)
     name = model_name(flags.algo, flags.env)
-    repo_id = flags.repo_id or f"{flags.organization}/{flags.repo_name or name}"
+    repo_id = f"{flags.organization}/{flags.repo_name or name}"
     require_writable(Path(flags.folder), "--folder")
     from huggingface_hub import snapshot_download
 
@@ -215,33 +204,23 @@ def install(downloaded: Path, name: str, flags: HubFlags) -> RunFolder:
 
     :param downloaded: folder with the files that :func:`stage` writes
     :param name: name of the model
-    :raises UsageError: the model or its settings are not there, or they are another agent's
+    :raises UsageError: the model or its settings are not there
     """
-    model = downloaded / f"{name}.zip"
-    own = "name the agent's own --algo and --env"
-    for needed in (model, downloaded / "config.yml", downloaded / "args.yml"):
-        if not needed.is_file():
-            found = ", ".join(sorted(one.name for one in downloaded.iterdir())) or "nothing"
-            raise UsageError(f"the repository has no {needed.name}, but {found}; {own}")
-    env = folder_name(flags.env)
-    trained = read_data(downloaded / "args.yml")
-    if (trained.get("algo"), folder_name(str(trained.get("env")))) != (flags.algo, env):
+    needed = {f"{name}.zip", "config.yml", "args.yml"}
+    absent = needed - {path.name for path in downloaded.iterdir()}
+    if absent:
+        there = ", ".join(sorted(path.name for path in downloaded.iterdir())) or "nothing"
         raise UsageError(
-            f"the repository's agent is {trained.get('algo')} on {trained.get('env')} by its "
-            f"args.yml, not {flags.algo} on {flags.env}; {own}"
+            f"the repository has no {', '.join(sorted(absent))}, but {there}; name the agent's own "
+            "--algo and --env"
         )
+    env = folder_name(flags.env)
     parent = Path(flags.folder) / flags.algo
     parent.mkdir(parents=True, exist_ok=True)
     path = claim(parent, env)
     (path / env).mkdir()
-    shutil.copyfile(model, path / f"{env}.zip")
-    for file, target in {
-        "0.monitor.csv": path / "0.monitor.csv",
-        "config.yml": path / env / "config.yml",
-        "command.txt": path / env / "command.txt",
-        "vec_normalize.pkl": path / env / "vecnormalize.pkl",
-        "args.yml": path / env / "args.yml",  # last: it makes the folder a run
-    }.items():
+    shutil.copyfile(downloaded / f"{name}.zip", path / f"{env}.zip")
+    for file, target in layout(path, env).items():
         if (downloaded / file).is_file():
             shutil.copyfile(downloaded / file, target)
     return RunFolder(path)

@@ -1,47 +1,31 @@
 """A trained agent found in its run folder, played, and filmed."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_guard.checks import WorldError
 from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
-from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
-from sb3_guard.zoo.agents.pretrained import (
-    PLAYED,
-    PRETRAINED,
-    find_pretrained,
-    load_pretrained,
-    weights,
-)
+from sb3_guard.zoo.agents.pretrained import PRETRAINED, find_pretrained, load_pretrained, weights
 from sb3_guard.zoo.cli.names import packages_flag, require_named
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
-from sb3_guard.zoo.run.folder import (
-    RunFolder,
-    folder_name,
-    is_run,
-    latest_run,
-    require_writable,
-)
+from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_writable
 from sb3_guard.zoo.run.hyperparams import build, check
-from sb3_guard.zoo.run.make_envs import (
-    full_id,
-    make_envs,
-    source_of,
-)
+from sb3_guard.zoo.run.make_envs import full_id, make_envs, source_of
 
 BATCH = 30  # episodes at once: as many as tell whether a limit is kept
 VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
@@ -65,8 +49,8 @@ def find_run(
         return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
     algorithm(algo), full_id(env_id)  # a misspelled name has a message of its own
     ships = latest_run(PRETRAINED / algo, name)
-    runs = [one for one in sorted(Path(folder).glob("*/*_*")) if is_run(one)]
-    there = dict.fromkeys(f"{one.parent.name} on {one.name.rpartition('_')[0]}" for one in runs)
+    runs = [path for path in sorted(Path(folder).glob("*/*_*")) if is_run(path)]
+    there = dict.fromkeys(f"{path.parent.name} on {path.name.rpartition('_')[0]}" for path in runs)
     raise UsageError(
         f"there is no run of {algo} on {env_id} in {str(folder)!r}; train one with: "
         f"sb3-guard train --algo {algo} --env {env_id} -f {folder}{packages_flag(packages)}"
@@ -83,7 +67,7 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
 
     :raises UsageError: the run has no such model
     """
-    kept = {int(one.stem.split("_")[2]): one for one in run.path.glob("rl_model_*_steps.zip")}
+    kept = {int(path.stem.split("_")[2]): path for path in run.path.glob("rl_model_*_steps.zip")}
     steps = flags.load_checkpoint
     if flags.load_last_checkpoint and kept:
         steps = max(kept)
@@ -92,8 +76,8 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
         model, statistics = run.path / "best_model.zip", run.path / "best_model_vecnormalize.pkl"
     elif steps is not None:
         if steps not in kept:
-            known = ", ".join(map(str, sorted(kept))) or "none"
-            raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {known}")
+            allowed = ", ".join(map(str, sorted(kept))) or "none"
+            raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {allowed}")
         model, statistics = kept[steps], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
     elif flags.load_last_checkpoint or not model.exists():
         model = statistics = run.checkpoint
@@ -112,13 +96,11 @@ class Agent:
 
     :param run: where it comes from
     :param path: its model file
-    :param normalizer: its observation statistics; the file exists only if it has any
     :param env_id: full id of the environment
     """
 
     run: RunFolder
     path: Path
-    normalizer: Path
     env_id: str
     model: BaseAlgorithm
     env: VecEnv
@@ -136,43 +118,38 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     import_packages(flags.gym_packages)
     if flags.pretrained:
         run = find_pretrained(flags.env, flags.algo if "algo" in flags.given else None)
-        path, normalizer, flags.algo = weights(run), run.normalizer, run.path.parent.name
+        path, flags.algo = weights(run), run.path.parent.name
     else:
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
-        path, normalizer = find_model(run, flags)
+        path, statistics = find_model(run, flags)
     require_named(run.path, flags.gym_packages, run.args().get("gym_packages") or [])
-    values = {**run.hyperparams(), "callback": None}  # nobody calls one here
-    cls = algorithm(flags.algo)
-    source = source_of(flags.env)
+    cls, source = algorithm(flags.algo), source_of(flags.env)
     env_id, ours = str(source.env_id), source.batch is not None
-    setup = build(check(flags.algo, cls, values))
+    setup = build(check(flags.algo, cls, {**run.hyperparams(), "callback": None}))
     if flags.num_threads > 0:
-        import torch as th
-
         th.set_num_threads(flags.num_threads)
+    normalizer = None
     if flags.pretrained:
         model = load_pretrained(env_id, flags.algo, device=flags.device)
-        shipped = model.get_env()
     else:
-        model, shipped = load_model(cls, path, None, flags.device), None
+        model = load_model(cls, path, None, flags.device)
+        normalizer = None if setup.normalize is None else read_normalizer(statistics)
     # A batch has no window, and no wrappers of single environments.
     native = ours and not setup.env_wrapper and render_mode != "human"
+    size = VIDEO if ours and render_mode else {}
     env = make_envs(
         env_id,
         setup,
         n_envs=n_envs if native else 1,
         seed=flags.seed,
         vec_env="native" if native else "dummy",
-        env_kwargs={
-            **(VIDEO if ours and render_mode else {}),
-            **setup.env_kwargs,
-            **(flags.env_kwargs or {}),
-        },
+        env_kwargs={**size, **setup.env_kwargs, **(flags.env_kwargs or {})},
         cost_keys=getattr(model, "cost_keys", ("cost",)),
         evaluation=True,
-        normalizer=None if setup.normalize is None or shipped else read_normalizer(normalizer),
+        normalizer=normalizer,
         render_mode=render_mode,
     )
+    shipped = model.get_env()
     if shipped is not None:
         sync_envs_normalization(shipped, env)
         shipped.close()
@@ -181,7 +158,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
             f"{path} was trained on observations {model.observation_space}, "
             f"but {env_id} has {env.observation_space}"
         )
-    return Agent(run, path, normalizer, env_id, model, env)
+    return Agent(run, path, env_id, model, env)
 
 
 def play(flags: EnjoyFlags, render_mode: str | None) -> int:
@@ -200,17 +177,15 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         beside = agent.path.with_suffix(".mp4")
         own = f"{flags.algo}-{beside.name}"  # the package's folder is not the user's to write to
         video = Path(flags.record or (own if flags.pretrained else beside))
-        _require_file(video, "--record")
     episodes = flags.n_episodes
     if episodes is None and flags.n_timesteps is None:
         episodes = 1 if flags.record is not None else max(agent.env.num_envs, 5)
     if flags.verbose > 0:
         print(f"Playing {agent.path} on {agent.env_id}")
-    with (
-        closing(agent.env),
-        explained(f"can't play {agent.env_id}", WorldError),
-        _stage(agent, video, flags, episodes) as env,
-    ):
+    stage: AbstractContextManager[VecEnv] = nullcontext(agent.env)
+    if video is not None:
+        stage = filming(agent.env, agent.model, video, bar=flags.verbose > 0)
+    with closing(agent.env), explained(f"can't play {agent.env_id}", WorldError), stage as env:
         evaluation = evaluate_policy(
             agent.model,
             env,
@@ -219,19 +194,17 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
             seed=flags.seed,
             max_steps=flags.n_timesteps,
             on_step=(lambda: render(env)) if render_mode == "human" else None,
-            on_episode=(lambda *one: print(_episode(*one))) if flags.verbose > 0 else None,
+            on_episode=(lambda *ended: print(_episode(*ended))) if flags.verbose > 0 else None,
         )
-    print(_means(evaluation))
+    print(means(evaluation))
     if flags.verbose > 0:
-        for one in evaluation.unfinished:
-            print(_episode(*one), "so far: this episode did not end and is not counted")
+        for cut in evaluation.unfinished:
+            print(_episode(*cut), "so far: this episode did not end and is not counted")
         trained = (agent.run.read_result() or {}).get("return")
         if not flags.stochastic and trained is not None:
             best = evaluation.estimate(evaluation.returns).high
             if best < trained - 0.5 * abs(trained):
                 print(f"With noise, in training, its return was {trained:.2f}: see --stochastic")
-        for line in _when_shipped(flags, agent):
-            print(line)
     if flags.json:
         played = {name: getattr(flags, name) for name in ("algo", "seed", "stochastic")}
         content = {"model": str(agent.path), "env": agent.env_id, **played, **summary(evaluation)}
@@ -241,18 +214,6 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     if video is not None and flags.verbose > 0:
         print(f"Video: {video}")
     return 0
-
-
-def _stage(
-    agent: Agent, video: Path | None, flags: EnjoyFlags, episodes: int | None
-) -> AbstractContextManager[VecEnv]:
-    """The environment to play in, which is filmed if there is to be a video."""
-    if video is None:
-        return nullcontext(agent.env)
-    steps, native = flags.n_timesteps, agent.env.unwrapped
-    if steps is None and episodes is not None and isinstance(native, GuardVecEnv):
-        steps = episodes * native.envs.max_episode_steps
-    return filming(agent.env, agent.model, video, steps, bar=flags.verbose > 0)
 
 
 def _require_file(path: Path, flag: str) -> None:
@@ -274,8 +235,8 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
     out: dict[str, Any] = {"episodes": len(evaluation)}
     for name, values in _columns(evaluation).items():
         estimate = evaluation.estimate(values)._asdict()
-        known = {key: None if np.isnan(one) else one for key, one in estimate.items()}
-        out[name] = {**known, "values": values.tolist()}
+        finite = {key: None if np.isnan(value) else value for key, value in estimate.items()}
+        out[name] = {**finite, "values": values.tolist()}
     return out
 
 
@@ -292,7 +253,8 @@ def _episode(episode_return: float, cost: float, length: float) -> str:
     return f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length:.0f} steps"
 
 
-def _means(evaluation: Evaluation) -> str:
+def means(evaluation: Evaluation) -> str:
+    """The means in words, with their intervals and what these say of the limits."""
     count = len(evaluation)
     if count == 0:
         return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"
@@ -305,25 +267,11 @@ def _means(evaluation: Evaluation) -> str:
         name = "worst" if evaluation.limit_on == "max" else "cost"
         rows[name] = rows[name][0], evaluation.limits[0]
     title = f"Mean ± std of {count} episodes, 95 % interval of the mean:"
-    return "\n".join(["One episode:" if count == 1 else title, *_rows(rows)])
-
-
-def _rows(rows: Mapping[str, tuple[Estimate, float | None]]) -> Iterator[str]:
+    lines = ["One episode:" if count == 1 else title]
     width = max(map(len, rows))
     for name, (estimate, limit) in rows.items():
         mean, std, low, high = estimate
         interval = "" if np.isnan(low) else f" ± {std:.3f}   [{low:.3f}, {high:.3f}]"
         end = "" if limit is None else f"   {estimate.against(limit)}"
-        yield f"  {name:<{width}} {mean:9.3f}{interval}{end}"
-
-
-def _when_shipped(flags: EnjoyFlags, agent: Agent) -> Iterator[str]:
-    """What the package says of its own agents, where they act as then: few episodes say little."""
-    result = agent.run.read_result() or {}
-    if flags.pretrained and not flags.env_kwargs and "played" in result:
-        limits = {"cost": result.get("cost_limit")}
-        at = f"; trained at limit {result['trained_at']:g}" if "trained_at" in result else ""
-        for mode in PLAYED:
-            yield f"{result['episodes_played']} other episodes, --{mode}{at}:"
-            played = result["played"][mode].items()
-            yield from _rows({name: (Estimate(*one), limits.get(name)) for name, one in played})
+        lines.append(f"  {name:<{width}} {mean:9.3f}{interval}{end}")
+    return "\n".join(lines)

@@ -1,11 +1,10 @@
-"""The data of figures: the runs, their means, scores and curves, and the look of each algorithm.
+"""The data of tables and figures: runs, means, scores, curves, and the look of each algorithm.
 
 Colours are readable on white and on black, and in the manner of Okabe and Ito's told apart by
 colour-blind readers; line styles and markers tell algorithms apart without them.
 """
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from functools import cached_property
 from itertools import cycle
 from typing import Any, NamedTuple
@@ -13,9 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.results.curves import read_curve
-from sb3_guard.zoo.results.runs import REFERENCE, described
+from sb3_guard.zoo.results.runs import REFERENCE, label_of
 from sb3_guard.zoo.results.splits import FINAL, judge, read_splits
 from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize
 
@@ -57,16 +55,17 @@ class Look(NamedTuple):
 
 class Data:
     """
-    What figures are drawn from, worked out when a figure asks.
+    What tables and figures are made from, worked out when one asks.
 
     :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
     """
 
     def __init__(self, runs: pd.DataFrame):
         self.runs = runs
-        #: why the curve of a run can't be drawn, by its path
-        self.unread: dict[str, str] = {}
-        self._curves: dict[str, pd.DataFrame] = {}
+
+    def runs_of(self, suite: str, algo: str) -> pd.DataFrame:
+        """The seeds of an algorithm on an environment."""
+        return self.runs[(self.runs["suite"] == suite) & (self.runs["algo"] == algo)]
 
     @cached_property
     def means(self) -> pd.DataFrame:
@@ -92,12 +91,10 @@ class Data:
 
     def costs_of(self, suite: str, algo: str, split: str) -> np.ndarray:
         """The costs of all seeds' episodes of a split, in their order; none: there are none."""
-        own = self.runs[(self.runs["suite"] == suite) & (self.runs["algo"] == algo)]
-        costs: list[Any] = [np.zeros(0)]
-        for path, epoch in zip(own["path"], own["epoch"], strict=True):
-            with suppress(UsageError):
-                costs += [read_splits(path, epoch).get(split, pd.DataFrame({"M_c": []}))["M_c"]]
-        return np.sort(np.concatenate(costs))
+        seeds = self.runs_of(suite, algo)[["path", "epoch"]].itertuples(index=False)
+        played = [read_splits(path, epoch) for path, epoch in seeds]
+        costs = [splits[split]["M_c"] for splits in played if split in splits]
+        return np.sort(np.concatenate([np.zeros(0), *costs]))
 
     @cached_property
     def looks(self) -> dict[str, Look]:
@@ -120,9 +117,9 @@ class Data:
             color, marker = places[row["algo"]]
             looks[row["algo"]] = Look(row["label"], COLORS[color], dashes[row["family"]], marker)
         for family in families:
-            own = table.loc[(table["family"] == family) & table["first"], "algo"].sort_values()
-            if len(own):
-                looks[family] = looks[own.iloc[0]]._replace(label=family)
+            members = table.loc[(table["family"] == family) & table["first"], "algo"]
+            if len(members):
+                looks[family] = looks[members.min()]._replace(label=family)
         return looks
 
     @property
@@ -140,16 +137,15 @@ class Data:
         have = {*self.runs.loc[self.runs["suite"] == suite, "algo"]}
         return [algo for algo in self.looks if algo in have]
 
+    @cached_property
+    def _curves(self) -> dict[str, pd.DataFrame]:
+        """The learning curve of each run, by its path."""
+        runs = self.runs[["path", "epoch"]].itertuples(index=False)
+        return {path: read_curve(path, epoch) for path, epoch in runs}
+
     def curves(self, suite: str, algo: str) -> list[pd.DataFrame]:
-        """The seeds' learning curves; one that can't be read is left out, see ``unread``."""
-        own = self.runs[(self.runs["suite"] == suite) & (self.runs["algo"] == algo)]
-        for path, epoch in zip(own["path"], own["epoch"], strict=True):
-            if path not in self._curves and path not in self.unread:
-                try:
-                    self._curves[path] = read_curve(path, epoch)
-                except UsageError as error:
-                    self.unread[path] = one_line(error)
-        return [self._curves[path] for path in own["path"] if path in self._curves]
+        """The seeds' learning curves."""
+        return [self._curves[path] for path in self.runs_of(suite, algo)["path"]]
 
     def costs(self, suite: str) -> list[str]:
         """Columns of episode costs: the total, and those that have limits of their own."""
@@ -164,9 +160,6 @@ class Data:
         """A score of an algorithm or a family, NaN if there is none."""
         return float(self.scores[name].get((suite, algo), np.nan))
 
-    def _label(self, algo: str) -> str:
-        return self.looks[algo].label if algo in self.looks else described(algo)["label"]
-
     def missing(self, suites: Iterable[str], algos: Sequence[str]) -> str:
         """Which algorithms lack runs on which environments, in words."""
         have = {*zip(self.runs["suite"], self.runs["algo"], strict=True)}
@@ -176,7 +169,7 @@ class Data:
             if absent:
                 groups.setdefault(absent, []).append(suite)
         return "; ".join(
-            ("all algorithms" if len(absent) == 8 else ", ".join(map(self._label, absent)))
+            ("all algorithms" if len(absent) == 8 else ", ".join(map(label_of, absent)))
             + f" on {', '.join(names)}"
             for absent, names in groups.items()
         )

@@ -3,6 +3,7 @@
 A figure is drawn from the runs there are and says which are missing.
 """
 
+import html
 import io
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
@@ -19,17 +20,12 @@ from matplotlib.ticker import EngFormatter
 
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.splits import SPLITS
-from sb3_guard.zoo.results.statistics import SCORES, interval, mean_curve, normalize, overall
-from sb3_guard.zoo.results.tables import written
+from sb3_guard.zoo.results.statistics import SCORES, mean_curve, overall
+from sb3_guard.zoo.results.tables import SCORE_HEADINGS, written
 
 FORMATS = ("png", "svg", "pdf")
 WIDTH = 8.0  # inches: at the width of a page, text has the size of the page's
 AXES = {"J_r": "return", "M_c": "episode cost", "rho_c": "cost rate, per step"}
-SCORE_AXES = {
-    "reward": "reward / TRPO's",
-    "cost": "episode cost / TRPO's",
-    "cost_rate": "cost rate / TRPO's",
-}
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -78,7 +74,7 @@ def fit_costs(axis: Axes, values: Iterable[Any], way: str = "y") -> None:
     :param values: all lines and points that are drawn, arrays or numbers; bands may be cut
     :param way: which axis, ``x`` or ``y``
     """
-    finite = np.concatenate([np.ravel(np.asarray(one, float)) for one in values])
+    finite = np.concatenate([np.ravel(np.asarray(part, float)) for part in values])
     finite = finite[np.isfinite(finite)]
     set_limits, end = getattr(axis, f"set_{way}lim"), getattr(axis, f"get_{way}lim")()[1]
     set_limits(0, end)
@@ -135,13 +131,12 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
 def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
     """Return against an episode cost: means ± deviations, and the seeds as small marks."""
     means = data.means[(data.means["suite"] == suite)].dropna(subset=[cost, "J_r"])
-    runs = data.runs[data.runs["suite"] == suite]
     limit = draw_limit(axis.axvline, data, suite, cost)
     for row in means.to_dict("records"):
         look = data.looks[row["algo"]]
-        own = runs[runs["algo"] == row["algo"]]
+        seeds = data.runs_of(suite, row["algo"])
         style: dict[str, Any] = {"color": look.color, "marker": look.marker}
-        axis.scatter(own[cost], own["J_r"], s=14, alpha=0.6, **style)
+        axis.scatter(seeds[cost], seeds["J_r"], s=14, alpha=0.6, **style)
         axis.errorbar(
             row[cost], row["J_r"], row["J_r_std"], row[f"{cost}_std"], markersize=8.5,
             elinewidth=0.9, capsize=2, zorder=3, **style,
@@ -178,7 +173,7 @@ def name_points(axis: Axes, data: Data, means: Any, cost: str) -> None:
             covers = (box[:2] < taken[:, 2:]).all(axis=1) & (taken[:, :2] < box[2:]).all(axis=1)
             outside = (box[:2] < 0).any() or (box[2:] > size).any()
             tried.append((covers.sum() + 3 * outside, len(tried), (side, up), box))
-        _, _, offset, box = min(tried, key=lambda one: one[:2])
+        _, _, offset, box = min(tried, key=lambda place: place[:2])
         taken = np.vstack([taken, box])
         if row[cost] > x:
             axis.scatter(x, row["J_r"], s=80, color=look.color, marker=look.marker, zorder=3)
@@ -217,7 +212,7 @@ def title_of(data: Data, suite: str) -> str:
 
 def curves_of(data: Data, suites: Sequence[str]) -> Figure | None:
     """One row of panels per environment that has runs: return, episode costs, cost rate."""
-    drawn = [suite for suite in suites if any(data.curves(suite, a) for a in data.algos(suite))]
+    drawn = [suite for suite in suites if suite in data.suites]
     if not drawn:
         return None
     columns = max(len(data.panels(suite)) for suite in drawn)
@@ -291,49 +286,13 @@ def tiers(data: Data, suite: str) -> Figure | None:
     for split, axis in panels.items():
         rows = data.splits[(data.splits["suite"] == suite) & (data.splits["split"] == split)]
         for row in rows.to_dict("records"):
-            y, style = algos.index(row["algo"]), TIER_STYLES[row["tier"]]
-            color, marker = style
+            y, (color, marker) = algos.index(row["algo"]), TIER_STYLES[row["tier"]]
             axis.plot([row["low"], row["high"]], [y, y], color=color, linewidth=4, alpha=0.5)
             name = row["tier"] or "no limit"
             axis.scatter(row["cost"], y, s=36, color=color, marker=marker, label=name, zorder=3)
         axis.set_yticks(range(len(algos)), [data.looks[algo].label for algo in algos])
         limit = draw_limit(axis.axvline, data, suite, "M_c")
         fit_costs(axis, [rows["high"], rows["cost"], limit], "x")
-    return figure
-
-
-def _reached(values: np.ndarray, axis: int, tau: np.ndarray, score: str) -> np.ndarray:
-    """The part of the values that are at least τ, or of costs at most τ, [B, len(tau)]."""
-    ordered = np.sort(values, axis=axis)
-    side: Any = "left" if score == "reward" else "right"
-    below = np.stack([np.searchsorted(one, tau, side=side) for one in ordered])
-    part = below / values.shape[axis]
-    return 1 - part if score == "reward" else part
-
-
-def profiles(data: Data) -> Figure | None:
-    """Performance profiles: the part of all runs that reach a score, with 95 % bands."""
-    single = normalize(data.runs, data.means)
-    if single[list(SCORES.values())].isna().all(axis=None):
-        return None
-    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
-    for axis, score in zip(figure.subplots(1, 3), SCORES.values(), strict=True):
-        finite = single[score].dropna()
-        # Costs have no upper bound: one run must not squeeze all others to the left.
-        highest = 1.0 if score == "reward" else max(1.2, float(finite.quantile(0.98)))
-        tau = np.linspace(min(0.0, float(finite.quantile(0.02))), highest, 201)
-        for algo, own in single.groupby("algo", sort=False):
-            groups = [group.dropna().to_numpy() for _, group in own.groupby("suite")[score]]
-            values, look = np.concatenate(groups), data.looks[str(algo)]
-            if not len(values):
-                continue
-            axis.plot(tau, _reached(values[None], 1, tau, score)[0], linewidth=1.5, **look.line)
-            low, high = interval(groups, lambda v, axis, t=tau, s=score: _reached(v, axis, t, s))
-            if not np.isscalar(low):
-                axis.fill_between(tau, low, high, color=look.color, alpha=0.12, linewidth=0)
-        sign = "≥" if score == "reward" else "≤"
-        axis.set(xlabel=f"{SCORE_AXES[score]}, τ", ylabel=f"part of runs {sign} τ")
-        axis.set_ylim(-0.02, 1.02)
     return figure
 
 
@@ -354,7 +313,7 @@ def iqm(data: Data) -> Figure | None:
                 axis.barh(y, high - low, 0.6, left=low, color=pale, edgecolor=INK, linewidth=0.5)
             axis.plot(middle, y, marker="|", markersize=13, markeredgewidth=2, color=color)
         axis.set_yticks(rows, table["label"])
-        axis.set(xlabel=SCORE_AXES[score])
+        axis.set(xlabel=SCORE_HEADINGS[score])
         axis.use_sticky_edges = False
         axis.margins(0.06)
         axis.axvline(1, color=INK, linewidth=1, linestyle=(0, (1, 2)))
@@ -363,16 +322,6 @@ def iqm(data: Data) -> Figure | None:
 
 
 # Files
-
-
-def panel(draw_on: Callable[[Axes], None], size: tuple[float, float] = (4.4, 3.2)) -> Figure:
-    """One panel by itself, without legend or title."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=size, layout="constrained")
-        axis = figure.subplots()
-        draw_on(axis)
-        axis.set_title("")
-    return figure
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -397,4 +346,4 @@ def inline_svg(figure: Figure, title: str) -> str:
         figure.savefig(buffer, format="svg", transparent=True, metadata=nothing)
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(INK, "currentColor")
-    return text.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)
+    return text.replace("<svg ", f'<svg role="img" aria-label="{html.escape(title)}" ', 1)

@@ -12,7 +12,6 @@ from matplotlib.ticker import MaxNLocator
 from sb3_guard.zoo.grids.presets import GHOSTS, HAZARDS, MAIN8, OPTIONS, PRESETS, RADAR4, ROBOTS
 from sb3_guard.zoo.results.figure_data import COLORS, DASHES, INK, Data, Look
 from sb3_guard.zoo.results.figures import (
-    SCORE_AXES,
     STYLE,
     WIDTH,
     Drawing,
@@ -23,11 +22,11 @@ from sb3_guard.zoo.results.figures import (
     fit_costs,
     iqm,
     pareto,
-    profiles,
     tiers,
 )
 from sb3_guard.zoo.results.runs import REFERENCE
 from sb3_guard.zoo.results.statistics import SCORES
+from sb3_guard.zoo.results.tables import SCORE_HEADINGS
 
 SPOKES = {"reward": "reward", "cost": "cost", "cost_rate": "cost\nrate"}
 POLYGONS = {
@@ -55,7 +54,7 @@ def q2(data: Data) -> Figure | None:
             np.arange(len(robots)) + offset, rows["M_c"], 0.38, yerr=rows["M_c_std"], color=color,
             hatch=hatch, edgecolor=INK, ecolor=INK, capsize=2, label=f"8 {kind}",
         )  # fmt: skip
-        fit_costs(left, [bar.get_height() for bar in left.patches])
+    fit_costs(left, [bar.get_height() for bar in left.patches])
     left.set_xticks(range(len(robots)), robots, rotation=60)
     left.set(ylabel="episode cost of TRPO", title="Goal, every robot")
     left.grid(axis="x", visible=False)
@@ -64,7 +63,7 @@ def q2(data: Data) -> Figure | None:
             values = [data.score(suite, algo, score) for suite in (HAZARDS[0], GHOSTS[0])]
             if algo not in data.families and not np.isnan(values).all():
                 axis.plot(pair, values, marker=look.marker, **look.line)
-        axis.set(ylabel=SCORE_AXES[score], title="Goal, Point", xlim=(-0.3, 1.3))
+        axis.set(ylabel=SCORE_HEADINGS[score], title="Goal, Point", xlim=(-0.3, 1.3))
         mark_trpo(axis)
     return figure
 
@@ -148,7 +147,7 @@ def by_robot(data: Data, lines: Iterable[str]) -> Figure | None:
         for line in lines:
             look, values = data.looks[line], [data.score(suites[r], line, score) for r in shown]
             axis.plot(ticks, values, marker=look.marker, linewidth=1.4, **look.line)
-        axis.set(xlabel="robot, degrees of freedom", ylabel=SCORE_AXES[score])
+        axis.set(xlabel="robot, degrees of freedom", ylabel=SCORE_HEADINGS[score])
         axis.tick_params(axis="x", labelsize=7)
         axis.margins(x=0.06)
         mark_trpo(axis)
@@ -184,22 +183,21 @@ def q8(data: Data) -> Figure | None:
     spiders: dict[str, dict[str, list[float]]] = {}
     spokes: dict[str, list[str]] = {}
     for algo, look in data.looks.items():
-        own = table[table["algo"] == algo].groupby("option")[scores].agg(["mean", "size"])
-        if algo == REFERENCE or algo in data.families or not len(own):
+        tasks = table[table["algo"] == algo].groupby("option")[scores].agg(["mean", "size"])
+        if algo == REFERENCE or algo in data.families or not len(tasks):
             continue
-        own = own.reindex([*OPTIONS])
-        spiders[look.label] = {score: own[score, "mean"].tolist() for score in scores}
+        tasks = tasks.reindex([*OPTIONS])
+        spiders[look.label] = {score: tasks[score, "mean"].tolist() for score in scores}
         spokes[look.label] = [
             str(option) if number == len(ROBOTS) else f"{option}\n({number:.0f}/{len(ROBOTS)})"
-            for option, number in own["cost", "size"].fillna(0).items()
+            for option, number in tasks["cost", "size"].fillna(0).items()
         ]
     return draw_spiders(spiders, spokes, POLYGONS) if spiders else None
 
 
 PER_SUITE = (curves, pareto, cdf, tiers)
 FIGURES: dict[str, Callable[..., Figure | None]] = {
-    function.__name__: function
-    for function in (*PER_SUITE, profiles, iqm, q1, q2, q3, q4, q5, q6, q7, q8)
+    function.__name__: function for function in (*PER_SUITE, iqm, q1, q2, q3, q4, q5, q6, q7, q8)
 }
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.statistics import RESAMPLES, judging_limits, last_epochs
 
@@ -22,7 +21,6 @@ SPLITS = {
     "greedy": "final greedy",
 }
 FINAL = ("stochastic", "greedy")
-TIERS = ("certified", "undecided", "violating")
 
 
 def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataFrame]:
@@ -78,7 +76,7 @@ def nested_interval(seeds: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def tier(low: float, high: float, limit: float) -> str:
-    """Of :data:`TIERS`, by the interval of the mean cost and the limit; empty without a limit."""
+    """Certified, undecided or violating, by the interval of the mean cost; empty: no limit."""
     if math.isnan(limit):
         return ""
     return "certified" if high <= limit else "violating" if low > limit else "undecided"
@@ -97,19 +95,14 @@ def judge(runs: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     limited = runs.assign(judged_by=judging_limits(runs))
-    for (suite, algo), own in limited.groupby(["suite", "algo"], sort=False):
-        found: dict[str, list[pd.DataFrame]] = {split: [] for split in SPLITS}
-        for path, epoch in zip(own["path"], own["epoch"], strict=True):
-            try:
-                splits = read_splits(path, epoch)
-            except UsageError:
-                continue
-            for split, episodes in splits.items():
-                found[split].append(episodes)
-        names = {"suite": suite, "algo": algo, "label": own["label"].iloc[0]}
-        for split, seeds in found.items():
-            if seeds:
-                rows.append({**names, "split": split, **_row(seeds, own["judged_by"].iloc[0])})
+    for (suite, algo), group in limited.groupby(["suite", "algo"], sort=False):
+        seeds = group[["path", "epoch"]].itertuples(index=False)
+        played = [read_splits(path, epoch) for path, epoch in seeds]
+        names = {"suite": suite, "algo": algo, "label": group["label"].iloc[0]}
+        for split in SPLITS:
+            episodes = [splits[split] for splits in played if split in splits]
+            if episodes:
+                rows.append({**names, "split": split, **_row(episodes, group["judged_by"].iloc[0])})
     return pd.DataFrame(rows)
 
 

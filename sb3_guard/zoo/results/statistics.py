@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 from scipy.stats import trim_mean
 
-from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.runs import METRICS, REFERENCE, compared
 from sb3_guard.zoo.run.folder import EPOCH
@@ -34,18 +33,17 @@ def iqm(values: Any, axis: int = 0) -> Any:
 
 
 def interval(
-    groups: Sequence[np.ndarray],
-    statistic: Callable[..., np.ndarray] = np.mean,
-) -> tuple[Any, Any]:
+    groups: Sequence[np.ndarray], statistic: Callable[..., np.ndarray] = np.mean
+) -> tuple[float, float]:
     """
     A 95 % percentile bootstrap interval, stratified: each group is resampled by itself.
 
     :param groups: values of independent runs, [n_g] each; NaN are left out
-    :param statistic: called with ``axis=1`` on [B, Σ n_g] resamples; returns [B, …]
-    :return: lower and upper end, each of the statistic's shape; NaN where no group has two values,
-        since one seed says nothing about another
+    :param statistic: called with ``axis=1`` on [B, Σ n_g] resamples; returns [B]
+    :return: lower and upper end; NaN where no group has two values, since one seed says nothing
+        about another
     """
-    groups = [group[~np.isnan(group)] for group in map(np.asarray, groups)]
+    groups = [group[~np.isnan(group)] for group in groups]
     if not any(len(group) > 1 for group in groups):
         return math.nan, math.nan
     rng = np.random.default_rng(0)
@@ -54,9 +52,8 @@ def interval(
         for group in groups
         if len(group)
     ]
-    values = statistic(np.concatenate(draws, axis=1), axis=1)
-    low, high = np.quantile(values, [0.025, 0.975], axis=0)
-    return low, high
+    low, high = np.quantile(statistic(np.concatenate(draws, axis=1), axis=1), [0.025, 0.975])
+    return float(low), float(high)
 
 
 # One run
@@ -80,9 +77,8 @@ def judging_limits(runs: pd.DataFrame) -> "pd.Series[float]":
 
     That of an unconstrained run is the limit of the others on its suite, if it is the same for all.
     """
-    limits = runs.groupby("suite")["cost_limit"].unique().map(lambda all_: all_[~np.isnan(all_)])
-    common = runs["suite"].map(
-        lambda suite: limits[suite][0] if len(limits[suite]) == 1 else math.nan
+    common = runs.groupby("suite")["cost_limit"].transform(
+        lambda limits: limits.max() if limits.nunique() == 1 else math.nan
     )
     return runs["cost_limit"].where(runs["limits"].notna(), common).astype(float)
 
@@ -116,19 +112,12 @@ def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, floa
 
 def with_safety(runs: pd.DataFrame) -> pd.DataFrame:
     """
-    The table of runs with the columns of :func:`safety`; NaN where episodes can't be read.
+    The table of runs with the columns of :func:`safety`.
 
     They are judged by :func:`judging_limits`.
     """
-
-    def row(run: Any) -> dict[str, float]:
-        try:
-            return safety(read_episodes(run["path"]), run["epoch"], run["judged_by"])
-        except UsageError:
-            return dict.fromkeys(SAFETY, math.nan)
-
-    limited = runs.assign(judged_by=judging_limits(runs))
-    rows = [row(run) for run in limited.to_dict("records")]
+    judged = runs[["path", "epoch"]].assign(limit=judging_limits(runs)).itertuples(index=False)
+    rows = [safety(read_episodes(path), epoch, limit) for path, epoch, limit in judged]
     return runs.assign(**pd.DataFrame(rows, columns=list(SAFETY), index=runs.index, dtype=float))
 
 
@@ -232,13 +221,13 @@ def overall(runs: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
     order = means.sort_values("algo", key=lambda a: a != REFERENCE, kind="stable")
     rows: list[dict[str, Any]] = []
     for algo in dict.fromkeys(order["algo"]):
-        own, each = (table[table["algo"] == algo] for table in (scores, single))
-        row: dict[str, Any] = {"algo": algo, "label": own["label"].iloc[0]}
+        suites, seeds = (table[table["algo"] == algo] for table in (scores, single))
+        row: dict[str, Any] = {"algo": algo, "label": suites["label"].iloc[0]}
         for score in SCORES.values():
-            groups = [group.dropna().to_numpy() for _, group in each.groupby("suite")[score]]
+            groups = [group.dropna().to_numpy() for _, group in seeds.groupby("suite")[score]]
             values = np.concatenate(groups)
             low, high = interval(groups, iqm)
-            row |= {score: own[score].mean(), f"{score}_n": int(own[score].notna().sum())}
+            row |= {score: suites[score].mean(), f"{score}_n": int(suites[score].notna().sum())}
             row[f"{score}_iqm"] = iqm(values) if len(values) else math.nan
             row |= {f"{score}_low": low, f"{score}_high": high}
         rows.append(row)

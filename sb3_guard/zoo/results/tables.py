@@ -16,9 +16,11 @@ from rich.text import Text
 
 from sb3_guard.common.files import replacing
 from sb3_guard.costs import verdict
-from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.markdown import escaped, table
-from sb3_guard.zoo.cli.usage import UsageError, explained
+from sb3_guard.zoo.cli.usage import explained
+from sb3_guard.zoo.results.figure_data import Data
+from sb3_guard.zoo.results.splits import SPLITS
+from sb3_guard.zoo.results.statistics import by_family, normalize, overall
 
 # A column's name, or a function of a row; by heading
 Cell = str | Callable[[Any], str]
@@ -26,7 +28,11 @@ Columns = dict[str, Cell]
 FORMATS = (".md", ".tex", ".csv")
 DIGITS = {"rho_c": 5}
 HEADINGS = {"J_r": "return J_r", "M_c": "episode cost M_c", "rho_c": "cost rate ρ_c"}
-SCORE_HEADINGS = {"reward": "reward / TRPO", "cost": "cost / TRPO", "cost_rate": "rate / TRPO"}
+SCORE_HEADINGS = {
+    "reward": "reward / TRPO",
+    "cost": "cost / TRPO",
+    "cost_rate": "cost rate / TRPO",
+}
 _LATEX = {"±": r"$\pm$", "−": "$-$", "ρ": r"$\rho$", "–": "--", "\N{NO-BREAK SPACE}": "~"}
 
 
@@ -149,68 +155,57 @@ SAFETY_HEADINGS: Columns = {
 }
 
 
-def _splits(runs: pd.DataFrame) -> pd.DataFrame:
-    """Whether the policies of training and those after it keep their limits."""
-    from sb3_guard.zoo.results.splits import SPLITS, judge
-
-    def cost(row: Any) -> str:
-        ends = f"[{number(row['low'], 1)}, {number(row['high'], 1)}]"
-        return f"{spread(row['cost'], row['cost_std'], 1)} {ends}"
-
-    columns: Columns = {
-        "environment": "suite", "algorithm": "label", "episodes": lambda row: SPLITS[row["split"]],
-        "seeds": whole("seeds"),
-        "return": lambda row: spread(row["return"], row["return_std"]),
-        "cost": cost,
-        "limit": lambda row: "–" if pd.isna(row["limit"]) else f"{row['limit']:g}: {row['tier']}",
-        "above limit, %": lambda row: number(100 * row["above"], 1),
-        "D⁺": "excess",
-    }  # fmt: skip
-    return spelled(judge(runs), columns)
+def _interval_of_costs(row: Any) -> str:
+    """Mean cost of a split's episodes, over seeds, and its interval."""
+    ends = f"[{number(row['low'], 1)}, {number(row['high'], 1)}]"
+    return f"{spread(row['cost'], row['cost_std'], 1)} {ends}"
 
 
-def tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+TIER_HEADINGS: Columns = {
+    "episodes": lambda row: SPLITS[row["split"]],
+    "seeds": whole("seeds"),
+    "return": lambda row: spread(row["return"], row["return_std"]),
+    "cost": _interval_of_costs,
+    "limit": lambda row: "–" if pd.isna(row["limit"]) else f"{row['limit']:g}: {row['tier']}",
+    "above limit, %": lambda row: number(100 * row["above"], 1),
+    "D⁺": "excess",
+}
+
+
+def tables(data: Data) -> dict[str, pd.DataFrame]:
     """
     The tables of a report as text, by title.
 
-    :param runs: see :func:`~sb3_guard.zoo.results.runs.select`, with the columns of
+    :param data: of runs with the columns of
         :func:`~sb3_guard.zoo.results.statistics.with_safety`
     """
-    from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize, overall
-
-    means = aggregate(runs)
-    scores = normalize(means, means)
     who: Columns = {"environment": "suite", "algorithm": "label"}
     shown: Columns = {heading: score for score, heading in SCORE_HEADINGS.items()}
+    means = {heading: _with_interval(name) for name, heading in HEADINGS.items()}
     result = {
         "Results": spelled(
-            means,
-            {**who, "limit": _limit, "seeds": whole("seeds"), "steps": whole("steps")}
-            | {heading: _with_interval(name) for name, heading in HEADINGS.items()},
+            data.means,
+            {**who, "limit": _limit, "seeds": whole("seeds"), "steps": whole("steps"), **means},
         ),
-        "Limits": _limits(means),
-        "Safety": spelled(means, {**who, **SAFETY_HEADINGS}),
-        "Tiers": _splits(runs),
+        "Limits": _limits(data.means),
+        "Safety": spelled(data.means, {**who, **SAFETY_HEADINGS}),
+        "Tiers": spelled(data.splits, {**who, **TIER_HEADINGS}),
     }
-    result = {title: table for title, table in result.items() if len(table)}
-    if scores[["reward", "cost"]].isna().all(axis=None):
-        return result
-    result["Relative to TRPO"] = spelled(scores, who | shown)
-    families = by_family(scores)
-    if len(families):
-        columns: Columns = {
-            "environment": "suite",
-            "family": "family",
-            "algorithms": whole("algorithms"),
-        }
-        result["Families, relative to TRPO"] = spelled(families, columns | shown)
-    if scores["suite"].nunique() > 1:
-        columns = {"algorithm": "label"}
-        for score, heading in SCORE_HEADINGS.items():
-            columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"  # type: ignore[misc]
-            columns[f"{heading}, IQM"] = _with_interval(score, "_iqm")
-        result["All environments, relative to TRPO"] = spelled(overall(runs, means), columns)
-    return result
+    scores = normalize(data.means, data.means)
+    if scores[["reward", "cost"]].notna().any(axis=None):
+        result["Relative to TRPO"] = spelled(scores, who | shown)
+        families: Columns = {
+            "environment": "suite", "family": "family", "algorithms": whole("algorithms"), **shown,
+        }  # fmt: skip
+        result["Families, relative to TRPO"] = spelled(by_family(scores), families)
+        if scores["suite"].nunique() > 1:
+            columns: Columns = {"algorithm": "label"}
+            for score, heading in SCORE_HEADINGS.items():
+                columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"  # type: ignore[misc]
+                columns[f"{heading}, IQM"] = _with_interval(score, "_iqm")
+            table = spelled(overall(data.runs, data.means), columns)
+            result["All environments, relative to TRPO"] = table
+    return {title: table for title, table in result.items() if len(table)}
 
 
 RUNS: Columns = {
@@ -239,40 +234,21 @@ def written(path: Path) -> Iterator[BufferedRandom]:
             yield file
 
 
-def check_table(path: Path) -> None:
+def write_tables(path: Path, data: Data, notes: Sequence[str] = ()) -> None:
     """
-    Find out before work is done whether a table can be written in the format its name asks for.
+    Write the tables of means and scores in the format that the file's name says.
 
-    :raises UsageError: the format is unknown
-    """
-    if path.suffix not in FORMATS:
-        raise UsageError(
-            f"--table {str(path)!r}: unknown format {path.suffix!r}; "
-            f"{did_you_mean(path.suffix, FORMATS)}"
-        )
-
-
-def write_table(path: Path, runs: pd.DataFrame, notes: Sequence[str] = ()) -> None:
-    """
-    Write a table in the format that the file's name says.
-
-    :param path: ``.csv`` gets a row per run; ``.md`` and ``.tex`` the means over
-        seeds and the scores, see :func:`tables`
-    :param runs: with the columns of :func:`~sb3_guard.zoo.results.statistics.with_safety`; for
-        means, those that may be averaged
+    :param path: ``.md`` or ``.tex``
+    :param data: see :func:`tables`
     :param notes: what a reader of the means should know; written below them
-    :raises UsageError: see :func:`check_table`; or the file can't be written
+    :raises UsageError: the file can't be written
     """
-    check_table(path)
-    parts: list[str] = []
     if path.suffix == ".md":
-        parts = [f"## {title}\n\n{markdown(one)}" for title, one in tables(runs).items()]
-        parts += ["\n".join(f"- {escaped(note)}" for note in notes)] if notes else []
-    elif path.suffix == ".tex":
-        parts = [f"% {title}\n{latex(one)}" for title, one in tables(runs).items()]
-        parts += ["\n".join(f"% {note}" for note in notes)] if notes else []
+        parts = [f"## {title}\n\n{markdown(table)}" for title, table in tables(data).items()]
+        lines = [f"- {escaped(note)}" for note in notes]
+    else:
+        parts = [f"% {title}\n{latex(table)}" for title, table in tables(data).items()]
+        lines = [f"% {note}" for note in notes]
     with written(path) as file:
-        if path.suffix == ".csv":
-            runs.to_csv(file, index=False)
-        else:
-            file.write(("\n\n".join(parts) + "\n").encode())
+        text = "\n\n".join([*parts, "\n".join(lines)]).rstrip()
+        file.write(f"{text}\n".encode())

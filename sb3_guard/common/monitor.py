@@ -164,22 +164,15 @@ class CostMonitor(VecMonitor):
         )
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs to continue counting, and ``"length"``, the csv's bytes."""
-        writer = self.results_writer
-        length = 0 if writer is None else os.path.getsize(writer.file_handler.name)
+        """What :meth:`restore` needs to continue counting."""
         counts = {name: copy.copy(getattr(self, name)) for name in KEPT}
-        return {**counts, "episodes": copy.deepcopy(self.episodes), "length": length}
+        return {**counts, "episodes": copy.deepcopy(self.episodes)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue counting from :meth:`state`; the csv is left as it is."""
         for name in KEPT:
             setattr(self, name, copy.copy(state[name]))
-        if "episodes" in state:
-            self.episodes = copy.deepcopy(state["episodes"])
-        else:  # checkpoints of formats 5 and 6
-            totals = [state["episode_costs"], *state["_key_costs"]]
-            self.episodes.totals = np.stack(totals, axis=1)
-            self.episodes.lengths = state["episode_lengths"].copy()
+        self.episodes = copy.deepcopy(state["episodes"])
 
 
 def _require_finite(name: str, values: VecEnvObs) -> None:

@@ -246,7 +246,7 @@ def test_corrupt_checkpoint(content, capsys, run):
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     for path in (run, run / "checkpoint.zip"):
         arguments = [*GO_ON, str(path), "-n", "120"]
-        refused(train.main, arguments, capsys, "checkpoint.zip is damaged")
+        refused(train.main, arguments, capsys, "checkpoint.zip is damaged or no checkpoint")
     after = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     assert before == after
 
@@ -255,10 +255,10 @@ def test_checkpoints_that_are_none(capsys, run):
     run.joinpath("checkpoint.zip").unlink()
     refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "start it again without -i")
     shutil.copy(run / "CostPoint-v0.zip", run / "checkpoint.zip")
-    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "is a model, not a checkpoint")
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "damaged or no checkpoint", MEMBER)
     with zipfile.ZipFile(run / "checkpoint.zip", "a") as archive:
         archive.writestr(MEMBER, pickle.dumps({"other": 1}))
-    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "checkpoint.zip is damaged")
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "checkpoint.zip is damaged or")
 
 
 def test_corrupt_model(capsys, run, tmp_path):
@@ -311,11 +311,7 @@ def test_agent_of_another_environment(capsys, run, tmp_path):
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        (lambda args: {"a": 1}, ["there is no algo, checkpoint_every"]),
-        (
-            lambda args: {k: v for k, v in args.items() if k != "eval_freq"},
-            ["there is no eval_freq"],
-        ),
+        (lambda args: {"a": 1}, ["unknown entry 'a'"]),
         (lambda args: {**args, "seed": "one"}, ["seed: 'one' is not allowed"]),
     ],
 )
@@ -323,7 +319,7 @@ def test_damaged_flags(change, parts, capsys, run):
     path = run / "CostPoint-v0" / "args.yml"
     path.write_text(yaml.safe_dump(change(yaml.safe_load(path.read_text()))))
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "args.yml is damaged", *parts)
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "args.yml: ", *parts)
     assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
 
 

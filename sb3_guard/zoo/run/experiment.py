@@ -19,7 +19,7 @@ from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, require_writable
+from sb3_guard.zoo.run.folder import RunFolder, identity, require_writable
 from sb3_guard.zoo.run.hyperparams import Setup, build
 from sb3_guard.zoo.run.make_envs import (
     BAD_ARGUMENTS,
@@ -52,6 +52,11 @@ class Experiment:
         self.algorithm = algorithm(self.flags.algo)
         self.setup = build(self.hyperparams)
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What makes the run the run it is, as its files give it back."""
+        return identity(self.flags, self.hyperparams)
 
     @property
     def events(self) -> Path | None:

@@ -23,7 +23,7 @@ from filelock import SoftFileLease, Timeout
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.cli.flags import IDENTITY
-from sb3_guard.zoo.cli.usage import UsageError, explained, one_line, packages_flag, read_mapping
+from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag, read_mapping
 from sb3_guard.zoo.run.flags import RunFlags
 
 CHECKPOINT = "checkpoint.zip"
@@ -53,8 +53,13 @@ def is_disk_error(error: BaseException | None) -> bool:
 def plain(value: Any) -> Any:
     """A value as the files of a run give it back: lists for tuples."""
     if isinstance(value, Mapping):
-        return {key: plain(one) for key, one in value.items()}
-    return [plain(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: plain(item) for key, item in value.items()}
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def identity(flags: RunFlags, hyperparams: Mapping[str, Any]) -> dict[str, Any]:
+    """What makes a run the run it is: flags of that role, and hyperparameters."""
+    return plain({**flags.values(IDENTITY), **hyperparams})
 
 
 def read_data(path: Path) -> dict[str, Any]:
@@ -204,26 +209,11 @@ class RunFolder:
 
     def flags(self) -> RunFlags:
         """
-        The flags the run was started with: all of them, since one guessed would be another run.
+        The flags the run was started with.
 
-        :raises UsageError: one is absent, or has a value that it can't have
+        :raises UsageError: one has a value that it can't have
         """
-        saved = self.args()
-        absent = sorted(RunFlags.names() - saved.keys())
-        try:
-            if absent:
-                raise UsageError(f"args.yml: there is no {', '.join(absent[:4])}")
-            return RunFlags.read(saved, "args.yml")
-        except UsageError as error:
-            raise UsageError(
-                f"{self.params / 'args.yml'} is damaged ({one_line(error)}); put the file back as "
-                "it was, or start a new run without -i"
-            ) from error
-
-    def what(self) -> dict[str, Any]:
-        """What makes the run the run it is: flags of that role, and hyperparameters."""
-        args = self.args()
-        return {**{name: args.get(name) for name in RunFlags.names(IDENTITY)}, **self.hyperparams()}
+        return RunFlags.read(self.args(), self.params / "args.yml")
 
     def hyperparams(self) -> dict[str, Any]:
         """The hyperparameters the run was started with."""

@@ -18,7 +18,7 @@ import sb3_guard
 from sb3_guard.algorithms.common.limits import limits_at
 from sb3_guard.common.evaluation import estimate
 from sb3_guard.common.monitor import find_monitor
-from sb3_guard.costs import read_costs, verdict
+from sb3_guard.costs import verdict
 from sb3_guard.zoo.run.folder import EPOCH, cost_words
 
 PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")
@@ -72,17 +72,12 @@ class Epochs(BaseCallback):
         self._episodes: list[list[float]] = []
         #: the same without the step, of the last epoch in which any ended, [E, 3 + m]
         self.last = np.zeros((0, 4))
-        # highest costs of a step in the episodes under way, [n_envs, m], where limits bound those
-        self._worst: Any = 0.0
         # Taken now: what lies on disk may change while the run continues.
         self._provenance = provenance()
         #: steps after each part of the run that was to be shorter than it came to be
         self.learned: list[int] = []
-        self._seconds = 0.0  # of the processes before this one
-        self._began: float | None = None
 
     def _on_training_start(self) -> None:
-        self._began = time.monotonic()
         if self.show:
             self.bar = tqdm(
                 total=self.total,
@@ -99,20 +94,12 @@ class Epochs(BaseCallback):
             self._episodes = []
 
     def _on_step(self) -> bool:
-        dones, infos, limits_worst = self.locals["dones"], self.locals["infos"], self._limits_worst
-        if limits_worst:
-            costs, _ = read_costs(infos, self._keys, zero_if_missing=True)
-            self._worst = np.maximum(self._worst, costs)
-        for i in np.flatnonzero(dones):
-            episode = infos[i].get("episode")
-            if episode is not None:
-                bounded = [episode.get(f"c_{key}", episode["c"]) for key in self._keys]
-                if limits_worst:
-                    bounded = self._worst[i].tolist()
-                of_all = [episode[name] for name in "rcl"]
-                self._episodes.append([self.model.num_timesteps, *of_all, *bounded])
-        if limits_worst:
-            self._worst[dones] = 0.0
+        bounded = "max" if self._limits_worst else "c"
+        for i in np.flatnonzero(self.locals["dones"]):
+            episode = self.locals["infos"][i]["episode"]
+            costs = [episode.get(f"{bounded}_{key}", episode[bounded]) for key in self._keys]
+            totals = [episode[name] for name in "rcl"]
+            self._episodes.append([self.model.num_timesteps, *totals, *costs])
         if self.bar is not None:
             self.bar.update(self.model.num_timesteps - self.bar.n)
         return True
@@ -206,21 +193,17 @@ class Epochs(BaseCallback):
             "physics_errors": monitor.physics_errors,
             "cost_limit": limit,
             **({"limit_on": "max"} if self._limits_worst else {}),
-            "seconds": round(self._elapsed(), 3),
+            # SB3's clock, which a resumed run sets back
+            "seconds": round((time.time_ns() - self.model.start_time) / 1e9, 3),
             **({"learned": self.learned} if self.learned else {}),
             **self._provenance,
         }
-
-    def _elapsed(self) -> float:
-        return self._seconds + (0 if self._began is None else time.monotonic() - self._began)
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs to tell the same result."""
         return {
             "last": self.last,
             "episodes": self._episodes,
-            "worst": self._worst,
-            "seconds": self._elapsed(),
             "total": self.total,
             "steps": self.model.num_timesteps,
             "learned": self.learned,
@@ -228,10 +211,7 @@ class Epochs(BaseCallback):
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state`."""
-        if "worst" in state:  # else it knows no costs by key: the epoch begins anew
-            self.last, self._worst = state["last"], state["worst"]
-            self._episodes = list(state["episodes"])
-        self._seconds = state["seconds"]
+        self.last, self._episodes = state["last"], list(state["episodes"])
         self.learned = list(state["learned"])
         if state["total"] != self.total:
             self.learned.append(state["steps"])

@@ -41,7 +41,7 @@ from sb3_guard.zoo.run.make_envs import (
     evaluation_seed,
 )
 from sb3_guard.zoo.run.progress import Epochs
-from sb3_guard.zoo.run.tracking import Tracker
+from sb3_guard.zoo.run.tracking import ID, track
 
 FINAL_EPISODES = 100  # of each policy, after training
 #: what is played after training: the policy that was trained, and its most likely actions
@@ -66,13 +66,13 @@ class Training:
         self.model = experiment.make_model()
         self.env: VecEnv = self.model.get_env()  # type: ignore[assignment]
         self.evaluation: CostEvalCallback | None = None
-        self.tracker: Tracker | None = None
+        self.tracker: Any = None
         try:
             self.model.verbose = max(flags.verbose - 1, 0)
             if flags.eval_freq > 0:
                 self.evaluation = experiment.make_evaluation(self.model)
             if flags.track:
-                self.tracker = Tracker(flags, experiment.hyperparams, folder)
+                self.tracker = track(flags, experiment.hyperparams, folder)
         except BaseException:
             self.close()
             raise
@@ -150,7 +150,8 @@ class Training:
         if verbose:
             print(f"Run folder: {folder.path} (seed {self.flags.seed})")
         if self.tracker is not None:
-            self.tracker.remember(folder)
+            (folder.params / ID).write_text(self.tracker.id)
+            self.tracker.config.update({"folder": str(folder.path)}, allow_val_change=True)
         with explained(f"can't write to {folder.path}", OSError):
             # Two lines of the csv are no episodes.
             goes_on = state is not None and cut(folder.monitor, 2 + state["episodes"])

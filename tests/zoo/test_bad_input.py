@@ -58,8 +58,8 @@ TRAIN = [
      ["env_wrapper of a run", "'dummy' or 'subproc'"]),
     # an environment without the cost key
     ([*LIMITED, "--env", "NoCost-v0"],
-     ["no cost 'cost'", "depth", "cost_keys", "missing_cost:zero"]),
-    ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost 'heat'"]),
+     ["no cost key 'cost'", "depth", "cost_keys", "missing_cost='zero'"]),
+    ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost key 'heat'"]),
     # hyperparameters
     (["-params", "n_step:10"], ["no hyperparameter 'n_step'", "did you mean 'n_steps'?"]),
     (["-params", "n_steps:ten"], ["n_steps: 'ten'", "a whole number"]),
@@ -89,12 +89,12 @@ TRAIN = [
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
-    (["--gym-packages", "../x"], ["'../x' is not a module's name"]),
-    (["--gym-packages", ""], ["'' is not a module's name"]),
+    (["--gym-packages", "../x"], ["--gym-packages: can't import '../x'"]),
+    (["--gym-packages", ""], ["--gym-packages: can't import ''"]),
     (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown flag --sede", "--seed"]),
-    (["cpo"], ["'cpo' does not belong to a flag", "--help"]),
+    (["cpo"], ["unrecognized arguments: cpo"]),
     (["-params", "frame_stack:0"], ["frame_stack: 0", "at least 1"]),
     (["-n", "0"], ["-n", "at least 1"]),
     (["-n", "1.5"], ["'1.5' is not a whole number"]),

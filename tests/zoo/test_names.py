@@ -132,8 +132,6 @@ def test_printed_commands_name_the_modules(tmp_path, capsys):
         ("replay_buffer_class", "subprocess.Popen"),
         ("env_wrapper", {"subprocess.Popen": {"shell": True}}),
         ("vec_env_wrapper", ["gymnasium.Wrapper"]),
-        ("env_wrapper", {"stable_baselines3.common.monitor.Monitor": {"filename": "x"}}),
-        ("vec_env_wrapper", {"sb3_guard.common.monitor.CostMonitor": {"filename": "x"}}),
         ("env_wrapper", [["gymnasium.Wrapper"]]),
         ("policy_kwargs", "dict(features_extractor_class=th.hub.subprocess.Popen)"),
         ("policy_kwargs", "dict(features_extractor_class=th.os.PathLike)"),

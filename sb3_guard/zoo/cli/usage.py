@@ -72,7 +72,7 @@ def read_mapping(path: str | Path, what: str, form: str) -> dict[Any, Any]:
     :param form: what it must be, for the message
     :raises UsageError: it can't be read, or is not a mapping
     """
-    errors = OSError, ValueError, yaml.YAMLError
+    errors = OSError, ValueError, TypeError, yaml.YAMLError
     with explained(f"can't read {what} {path} as YAML", *errors):
         content = load_yaml(Path(path).read_text(encoding="utf-8"))
     if not isinstance(content, dict):
@@ -89,12 +89,8 @@ def import_packages(names: Sequence[str]) -> None:
     if names and os.getcwd() not in sys.path:  # as with python -m, also for the script sb3-guard
         sys.path.insert(0, os.getcwd())
     for name in names:
-        if not all(part.isidentifier() for part in name.split(".")):
-            raise UsageError(
-                f"--gym-packages: {name!r} is not a module's name; it must be like my_envs or "
-                "package.my_envs, importable from the current folder"
-            )
-        with explained(f"--gym-packages: can't import {name!r}", ImportError):
+        errors = ImportError, TypeError, ValueError  # the last two: it is no module's name
+        with explained(f"--gym-packages: can't import {name!r}", *errors):
             importlib.import_module(name)
 
 
@@ -119,9 +115,6 @@ class Parser(argparse.ArgumentParser):
             near = nearest(flag, flags)
             hint = f"did you mean {near}?" if near else "see --help"
             raise UsageError(f"unknown flag {flag}; {hint}")
-        extra = re.match(r"unrecognized arguments: (\S+)", message)
-        if extra:
-            raise UsageError(f"{extra[1]!r} does not belong to a flag; see --help")
         raise UsageError(" ".join(message.split()))
 
 

@@ -15,7 +15,8 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.callbacks import CostEvalCallback
-from sb3_guard.zoo.cli.usage import UsageError, explained
+from sb3_guard.costs import read_costs
+from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
@@ -71,7 +72,9 @@ class Experiment:
         :raises UsageError: one is not there, or the environment refuses a value or has no cost
         """
         flags = self.flags
-        _check_device(flags.device)
+        # SB3 would train on the CPU instead of a GPU that is not there.
+        with explained(f"--device {flags.device!r} is not allowed"):
+            th.empty(0, device="cpu" if flags.device == "auto" else flags.device)
         if self.events is not None:
             require_writable(self.events, "--tensorboard-log")
         self._try_environment(self.setup.env_kwargs)
@@ -160,24 +163,16 @@ class Experiment:
         vec_env = "dummy" if self.flags.vec_env == "subproc" else str(self.flags.vec_env)
         env = self.make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
         try:
+            env.action_space.seed(self.flags.seed)
             with explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
                 env.reset()
-                env.action_space.seed(self.flags.seed)
-                info = env.step(np.array([env.action_space.sample()]))[3][0]
+                infos = env.step(np.array([env.action_space.sample()]))[3]
         finally:
             env.close()
-        if not getattr(self.algorithm, "constrained", False):
-            return
-        if self.setup.model.get("missing_cost", "error") == "zero":
-            return
-        for key in self.cost_keys:
-            if key not in info:
-                raise UsageError(
-                    f"{self.flags.env} reports no cost {key!r} in its info, which has "
-                    f"{', '.join(sorted(info)) or 'nothing'}; name its costs with "
-                    "-params cost_keys:\"['name']\", or count a missing cost as 0 with "
-                    "-params missing_cost:zero"
-                )
+        if getattr(self.algorithm, "constrained", False):
+            optional = self.setup.model.get("missing_cost") == "zero"
+            with explained(f"{self.flags.env} reports no such cost", ValueError):
+                read_costs(infos, self.cost_keys, zero_if_missing=optional)
 
     def _make_model(self, env: VecEnv) -> BaseAlgorithm:
         flags = self.flags
@@ -213,17 +208,3 @@ class Experiment:
         if best.is_file():
             return best
         return min(agent.parent.glob("*/vecnormalize.pkl"), default=None)
-
-
-def _check_device(name: str) -> None:
-    """
-    Refuse a GPU that is not there; SB3 would train on the CPU instead.
-
-    :raises UsageError: torch has no such device
-    """
-    with explained(f"--device {name!r} is not allowed", RuntimeError):
-        device = th.device("cpu" if name == "auto" else name)
-    if device.type == "cuda" and (device.index or 0) >= th.cuda.device_count():
-        raise UsageError(
-            f"--device {name!r}: torch sees {th.cuda.device_count()} GPUs here; use auto or cpu"
-        )

@@ -2,7 +2,6 @@
 
 import platform
 import subprocess
-import sys
 import time
 from contextlib import suppress
 from importlib import metadata
@@ -66,7 +65,7 @@ class Epochs(BaseCallback):
         super().__init__()
         self.total = total
         self.show = bar
-        self.bar: Any = None
+        self.bar = tqdm(disable=True)
         # step at which it ended, return, cost, length, and what the m limits bound: the episodes
         # of the epoch under way
         self._episodes: list[list[float]] = []
@@ -78,16 +77,15 @@ class Epochs(BaseCallback):
         self.learned: list[int] = []
 
     def _on_training_start(self) -> None:
-        if self.show:
-            self.bar = tqdm(
-                total=self.total,
-                initial=self.model.num_timesteps,
-                unit=" steps",
-                unit_scale=True,
-                dynamic_ncols=True,
-                file=sys.stderr,
-            )
-            self._describe()
+        self.bar = tqdm(
+            total=self.total,
+            initial=self.model.num_timesteps,
+            unit=" steps",
+            unit_scale=True,
+            dynamic_ncols=True,
+            disable=not self.show,
+        )
+        self._describe()
 
     def _on_rollout_start(self) -> None:
         if not isinstance(self.model, OffPolicyAlgorithm):
@@ -100,8 +98,7 @@ class Epochs(BaseCallback):
             costs = [episode.get(f"{bounded}_{key}", episode[bounded]) for key in self._keys]
             totals = [episode[name] for name in "rcl"]
             self._episodes.append([self.model.num_timesteps, *totals, *costs])
-        if self.bar is not None:
-            self.bar.update(self.model.num_timesteps - self.bar.n)
+        self.bar.update(self.model.num_timesteps - self.bar.n)
         return True
 
     def _on_rollout_end(self) -> None:
@@ -116,12 +113,10 @@ class Epochs(BaseCallback):
             self.logger.record("rollout/physics_errors", errors)
 
     def _on_training_end(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
-            self.bar = None
+        self.bar.close()
 
     def _describe(self) -> None:
-        if self.bar is not None and len(self.last):
+        if self.show and len(self.last):
             earned, cost = self.last[:, :2].mean(axis=0)
             self.bar.set_postfix_str(
                 f"return {earned:.2f}, {cost_words({'cost': cost, 'costs': self._costs()})}, "

@@ -239,37 +239,9 @@ seed_or_random = number("less than 2**32; if negative, it is random", lambda n: 
 interval = number("at least 1, or -2 for never", lambda n: n >= 1 or n in (-1, -2))
 
 
-def parse_pairs(pairs: Sequence[str], what: str = "key:value") -> dict[str, Any]:
-    """
-    The mapping that ``["n_steps:512", "cost_limit:25.0"]`` stands for.
-
-    :param what: what it is given to, for the message
-    :raises UsageError: one has no colon
-    """
-    values = {}
-    for pair in pairs:
-        key, colon, value = str(pair).partition(":")
-        if not colon or not key:
-            raise UsageError(f"{what}: {pair!r} is not of the form key:value")
-        values[key] = parse_value(value)
-    return values
-
-
-class KeyValues(argparse.Action):
-    """
-    ``key:value`` pairs, as RL-Zoo takes them: ``-params n_steps:512 cost_limit:25.0``.
-
-    The flag may be repeated; what comes later wins.
-    """
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        """Add the pairs to the dictionary; a pair without a colon is an error."""
-        before = getattr(namespace, self.dest, None) or {}
-        pairs = parse_pairs(values, option_string or self.dest)
-        setattr(namespace, self.dest, {**before, **pairs})
+def key_value(text: Any) -> tuple[str, Any]:
+    """What RL-Zoo's ``n_steps:512`` stands for."""
+    key, colon, value = str(text).partition(":")
+    if not colon or not key:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form key:value")
+    return key, parse_value(value)

@@ -213,7 +213,7 @@ def test_more_than_plain_data(capsys, tmp_path):
         "hyperparams = {'default': {'policy_kwargs': {'activation_fn': nn.ReLU}, 'n_steps': 30}}\n"
     )
     arguments = [*LIMITED, "-n", "60", "-conf", str(conf), "-f", str(tmp_path / "logs")]
-    refused(train.main, arguments, capsys, "config.yml can hold plain data only", "nn.ReLU")
+    refused(train.main, arguments, capsys, "is more than plain data", "nn.ReLU")
     assert not (tmp_path / "logs").exists()
 
 

@@ -175,10 +175,9 @@ class RunFolder:
         :param hyperparams: all hyperparameters, plain data
         :param command: the command line
         :param path: its folder, on which the caller has :func:`lock`; None: the next free number
-        :raises UsageError: the folder can't be written to, or there is more than plain data
+        :raises UsageError: the folder can't be written to
         """
         name = folder_name(flags.env)
-        files = _dump(flags.values(), hyperparams)
         parent = Path(flags.log_folder) / flags.algo
         suffix = f"_{uuid.uuid4()}" if flags.uuid else ""
         what = f"can't write to log folder {flags.log_folder!r}"
@@ -188,7 +187,7 @@ class RunFolder:
             params = path / name
             params.mkdir(parents=True, exist_ok=True)
             (params / "command.txt").write_text(command, encoding="utf-8")
-            _write(params, files)
+            _write_config(params, flags, hyperparams)
         return cls(path)
 
     @classmethod
@@ -228,9 +227,9 @@ class RunFolder:
         """The flags of ``train`` that continue the run, for messages."""
         return f"-i {shlex.quote(str(self.path))}{packages_flag(flags.gym_packages)}"
 
-    def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
+    def write_config(self, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:
         """Replace what :meth:`create` wrote, e.g. to make a finished run longer."""
-        _write(self.params, _dump(args, hyperparams))
+        _write_config(self.params, flags, hyperparams)
 
     def curve_hash(self) -> str:
         """SHA-256 of step, return and cost of all training episodes: runs alike have the same."""
@@ -330,21 +329,11 @@ def _lost(compromise: Any) -> None:
     os._exit(1)
 
 
-def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, bytes]:
-    """The configuration files, by name."""
-    fix = "write classes and calls as text, such as policy_kwargs: dict(activation_fn=nn.ReLU)"
-    files = {}
-    for name, content in (("config.yml", hyperparams), ("args.yml", args)):
-        with explained(f"{name} can hold plain data only", yaml.YAMLError, fix=fix):
-            files[name] = yaml.safe_dump(dict(content)).encode()
-    return files
-
-
-def _write(params: Path, files: Mapping[str, bytes]) -> None:
+def _write_config(params: Path, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:
     # args.yml is what makes a folder a run, so it comes last.
-    for name, content in files.items():
+    for name, content in (("config.yml", dict(hyperparams)), ("args.yml", flags.values())):
         with replacing(params / name) as file:
-            file.write(content)
+            file.write(yaml.safe_dump(content).encode())
 
 
 def latest_run(parent: Path, name: str) -> int:

@@ -30,7 +30,7 @@ from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.names import PRESETS, as_data, classes, import_class, with_classes
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
-from sb3_guard.zoo.cli.values import typed, words
+from sb3_guard.zoo.cli.values import is_data, typed, words
 
 # What a hyperparameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -189,6 +189,11 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
         if name not in known:
             raise UsageError(
                 f"{algo} has no hyperparameter {name!r}; {did_you_mean(name, sorted(known))}"
+            )
+        if not is_data(value):
+            raise UsageError(
+                f"hyperparameter {name}: {value!r} is more than plain data; write classes and "
+                "calls as text, such as policy_kwargs: dict(activation_fn=nn.ReLU)"
             )
         try:
             checked[name] = typed(as_data(name, value), known[name])

@@ -180,7 +180,7 @@ class Training:
                 checkpoints.restore(self.model, state)
                 # In this order, and only now: a result in the folder is always that of its config.
                 folder.result.unlink(missing_ok=True)
-                folder.write_config(self.flags.values(), self.experiment.hyperparams)
+                folder.write_config(self.flags, self.experiment.hyperparams)
             last.callback(epochs.on_training_end)  # leaves the terminal tidy
             finished = self._learn(checkpoints)
             logger.close()

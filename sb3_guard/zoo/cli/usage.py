@@ -1,7 +1,6 @@
 """What a command says when it can't do what was asked: one line, exit status 2, no traceback."""
 
 import argparse
-import errno
 import importlib
 import math
 import os
@@ -145,10 +144,7 @@ def run(command: Callable[[], int]) -> int:
             raise  # some other pipe, such as one of an environment
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         return 141
-    except (UsageError, ImportError, OSError) as error:
-        # an absent package, or no backend for MuJoCo; a name too long, no room where output goes
-        if isinstance(error, OSError) and error.errno not in (errno.ENAMETOOLONG, errno.ENOSPC):
-            raise
+    except (UsageError, ImportError) as error:  # an absent package, or no backend for MuJoCo
         text = one_line(error)
         print(f"error: {text if len(text) <= LONGEST else text[:LONGEST] + ' …'}", file=sys.stderr)
         return getattr(error, "status", 2)

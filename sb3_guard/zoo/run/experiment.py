@@ -1,6 +1,7 @@
 """What one training is, as data, and what makes its parts: environments, model, evaluation."""
 
 import copy
+import dataclasses
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -50,6 +51,8 @@ class Experiment:
     cost_keys: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        if self.flags.track and not self.flags.tensorboard_log:
+            self.flags = dataclasses.replace(self.flags, tensorboard_log="runs")
         self.algorithm = algorithm(self.flags.algo)
         self.setup = build(self.hyperparams)
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
@@ -58,12 +61,6 @@ class Experiment:
     def identity(self) -> dict[str, Any]:
         """What makes the run the run it is, as its files give it back."""
         return identity(self.flags, self.hyperparams)
-
-    @property
-    def events(self) -> Path | None:
-        """Where TensorBoard's events go; None: nowhere."""
-        events = self.flags.tensorboard_log or ("runs" if self.flags.track else "")
-        return Path(events) if events else None
 
     def try_out(self) -> None:
         """
@@ -75,8 +72,8 @@ class Experiment:
         # SB3 would train on the CPU instead of a GPU that is not there.
         with explained(f"--device {flags.device!r} is not allowed"):
             th.empty(0, device="cpu" if flags.device == "auto" else flags.device)
-        if self.events is not None:
-            require_writable(self.events, "--tensorboard-log")
+        if flags.tensorboard_log:
+            require_writable(Path(flags.tensorboard_log), "--tensorboard-log")
         self._try_environment(self.setup.env_kwargs)
         if flags.eval_freq > 0 and flags.eval_env_kwargs is not None:
             self._try_environment(flags.eval_env_kwargs)

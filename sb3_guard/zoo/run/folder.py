@@ -125,7 +125,7 @@ def require_writable(folder: Path, flag: str) -> None:
     what = f"{flag}: can't write to folder {str(folder)!r}"
     with explained(what, OSError, fix="choose another"):
         whole = folder.absolute()
-        existing = next(one for one in (whole, *whole.parents) if one.exists())
+        existing = next(path for path in (whole, *whole.parents) if path.exists())
         # Permission bits mean little to root and on special file systems: only trying tells.
         with tempfile.TemporaryFile(dir=existing):
             pass
@@ -221,7 +221,7 @@ class RunFolder:
     def events(self, flags: RunFlags) -> Path:
         """The folder of its TensorBoard events, with its number: a resumed run finds it again."""
         name = f"{flags.algo}{self.path.name[len(self.name) :]}"
-        return Path(flags.tensorboard_log or "runs") / self.name / name
+        return Path(flags.tensorboard_log) / self.name / name
 
     def again(self, flags: RunFlags) -> str:
         """The flags of ``train`` that continue the run, for messages."""

@@ -159,7 +159,7 @@ class Training:
             logger = RunLogger(
                 folder.path,
                 stdout=self.experiment.prints_tables,
-                tensorboard=folder.events(self.flags) if self.experiment.events else None,
+                tensorboard=folder.events(self.flags) if self.flags.tensorboard_log else None,
                 state=None if state is None else state["logger"],
             )
         self.model.set_logger(logger)
@@ -311,9 +311,9 @@ def summary(
     packages = packages_flag(flags.gym_packages)
     if not finished:
         lines.append(f"  continue with      {folder.again(flags)}")
-    elif (own := folder.path.name[len(folder.name) + 1 :]).isdigit():
+    elif (exp_id := folder.path.name[len(folder.name) + 1 :]).isdigit():
         lines.append(
             f"  see the agent      sb3-guard enjoy --algo {flags.algo} --env {flags.env} "
-            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {own}{packages}"
+            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {exp_id}{packages}"
         )
     return "\n".join(lines)

@@ -16,7 +16,7 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import CHECKPOINT, RunFolder, identity, is_run, lock, plain, run_path
+from sb3_guard.zoo.run.folder import RunFolder, identity, is_run, lock, plain, run_path
 from sb3_guard.zoo.run.hyperparams import check, read_hyperparams
 from sb3_guard.zoo.run.make_envs import full_id, source_of
 from sb3_guard.zoo.run.training import Training
@@ -143,18 +143,6 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple
         for name in sorted({*there, *here})
         if there.get(name) != here.get(name)
     ]
-
-
-def continues_run(agent: str) -> bool:
-    """
-    Whether ``-i path`` means a run to continue, rather than a model to begin from.
-
-    :raises UsageError: it is neither
-    """
-    path = Path(agent)
-    if not path.exists():
-        raise UsageError(f"-i: there is no run folder or model {agent!r}")
-    return path.is_dir() or path.name == CHECKPOINT
 
 
 def resume(given: RunFlags) -> int:

@@ -94,6 +94,7 @@ class Command:
             epilog=cls.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             argument_default=argparse.SUPPRESS,
+            allow_abbrev=False,
         )
         groups: dict[str, Any] = {}
         said = cls._said()
@@ -150,13 +151,13 @@ class Command:
         :param but: flags that a file can't give
         :raises UsageError: a name is unknown, or a value not allowed
         """
-        known = {field.name: (field, hint) for field, hint in cls._flags() if field.name not in but}
+        flags = {field.name: (field, hint) for field, hint in cls._flags() if field.name not in but}
         given = {}
         for key, value in data.items():
             name = str(key).replace("-", "_")
-            if name not in known:
-                raise UsageError(f"{where}: unknown entry {key!r}; {did_you_mean(name, known)}")
-            field, hint = known[name]
+            if name not in flags:
+                raise UsageError(f"{where}: unknown entry {key!r}; {did_you_mean(name, flags)}")
+            field, hint = flags[name]
             if value is not None and value != _default(field):
                 try:
                     value = _typed(hint, field.metadata["kind"], value)
@@ -195,16 +196,16 @@ class Command:
     @classmethod
     def _said(cls) -> dict[str, tuple[str, str]]:
         """Heading and help of the flags, as the docstrings of the class and its bases have them."""
-        found = {}
+        texts = {}
         for base in reversed(cls.__mro__):
             heading = "options"
             for part in re.split(r"\n\s*\n|\n(?=\s*:param)", base.__doc__ or ""):
                 text = " ".join(part.split())
                 if flag := re.fullmatch(r":param (\w+): (.*)", text):
-                    found[flag[1]] = heading, flag[2].replace("%", "%%")
+                    texts[flag[1]] = heading, flag[2].replace("%", "%%")
                 elif text.endswith(":"):
                     heading = text[:-1].lower()
-        return found
+        return texts
 
     @classmethod
     def _flags(cls) -> Iterator[tuple[dataclasses.Field[Any], Any]]:

@@ -45,10 +45,10 @@ def import_class(name: str, path: str, base: type) -> Any:
             f"command line names; add --gym-packages {module}"
         )
     with explained(f"{name}: there is no class {path!r}"):
-        found = getattr(importlib.import_module(module), attribute)
-    if not (isinstance(found, type) and issubclass(found, base)):
+        cls = getattr(importlib.import_module(module), attribute)
+    if not (isinstance(cls, type) and issubclass(cls, base)):
         raise UsageError(f"{name}: {path!r} is not allowed; it must be a {base.__name__}")
-    return found
+    return cls
 
 
 def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:

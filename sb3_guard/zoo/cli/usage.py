@@ -101,16 +101,12 @@ def packages_flag(modules: Sequence[str]) -> str:
 class Parser(argparse.ArgumentParser):
     """An argument parser that raises :class:`UsageError` and knows which flag was meant."""
 
-    def __init__(self, *args: Any, **kwargs: Any):
-        kwargs.setdefault("allow_abbrev", False)
-        super().__init__(*args, **kwargs)
-
     def error(self, message: str) -> NoReturn:
         """Raise instead of printing the usage, which would bury the message."""
         unknown = re.match(r"unrecognized arguments: (-\S+)", message)
         if unknown:
             flag = unknown[1].split("=")[0]
-            flags = [one for one in self._option_string_actions if one.startswith("--")]
+            flags = [name for name in self._option_string_actions if name.startswith("--")]
             near = nearest(flag, flags)
             hint = f"did you mean {near}?" if near else "see --help"
             raise UsageError(f"unknown flag {flag}; {hint}")

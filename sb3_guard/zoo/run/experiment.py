@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import warnings
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, identity, require_writable
+from sb3_guard.zoo.run.folder import RunFolder, require_writable
 from sb3_guard.zoo.run.hyperparams import Setup, build
 from sb3_guard.zoo.run.make_envs import (
     BAD_ARGUMENTS,
@@ -56,11 +57,6 @@ class Experiment:
         self.algorithm = algorithm(self.flags.algo)
         self.setup = build(self.hyperparams)
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
-
-    @property
-    def identity(self) -> dict[str, Any]:
-        """What makes the run the run it is, as its files give it back."""
-        return identity(self.flags, self.hyperparams)
 
     def try_out(self) -> None:
         """
@@ -159,13 +155,10 @@ class Experiment:
         """Make one environment and take a step, so that nothing fails later for want of a cost."""
         vec_env = "dummy" if self.flags.vec_env == "subproc" else str(self.flags.vec_env)
         env = self.make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
-        try:
-            env.action_space.seed(self.flags.seed)
-            with explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
-                env.reset()
-                infos = env.step(np.array([env.action_space.sample()]))[3]
-        finally:
-            env.close()
+        env.action_space.seed(self.flags.seed)
+        with closing(env), explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
+            env.reset()
+            infos = env.step(np.array([env.action_space.sample()]))[3]
         if getattr(self.algorithm, "constrained", False):
             optional = self.setup.model.get("missing_cost") == "zero"
             with explained(f"{self.flags.env} reports no such cost", ValueError):

@@ -76,9 +76,9 @@ def make_model(
             },
             "make_model",
         )
-        known = annotations(algorithm(algo))
+        names = annotations(algorithm(algo))
         # What a file can't hold is not checked as data; the constructor looks at it.
-        objects = {n: v for n, v in hyperparams.items() if n in known and not is_data(v)}
+        objects = {n: v for n, v in hyperparams.items() if n in names and not is_data(v)}
         flags.hyperparams = {n: v for n, v in hyperparams.items() if n not in objects}
         experiment = Experiment(*prepare(flags))
         experiment.setup.model.update(objects)

@@ -33,7 +33,7 @@ from sb3_guard.zoo.cli.usage import (
 from sb3_guard.zoo.run.checkpoint import Checkpoints, Interrupted, read_checkpoint
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, is_disk_error
+from sb3_guard.zoo.run.folder import RunFolder, identity, is_disk_error
 from sb3_guard.zoo.run.logger import RunLogger, cut
 from sb3_guard.zoo.run.make_envs import (
     BAD_NUMBERS,
@@ -97,7 +97,7 @@ class Training:
         checkpoints = Checkpoints(
             folder.checkpoint,
             [*others, *self.callbacks],
-            identity=self.experiment.identity,
+            identity=identity(flags, self.experiment.hyperparams),
             every=flags.checkpoint_every,
             log_interval=flags.log_interval,
             asked_to_stop=asked_to_stop,

@@ -106,7 +106,7 @@ TRAIN = [
     (["--checkpoint-every", "nan"], ["--checkpoint-every: 'nan'"]),
     (["--log-interval", "0"], ["--log-interval: '0'"]),
     (["--device", "abacus"], ["abacus"]),
-    (["-i", "absent"], ["no run folder or file absent"]),
+    (["-i", "absent"], ["no run folder absent"]),
     ([*LIMITED, "-i", "absent.zip"], ["can't load absent.zip", "No such file"]),
     ([*LIMITED, "-tb", "/dev/null"], ["--tensorboard-log", "'/dev/null'", "choose another"]),
     ([*LIMITED, "-tb", "/proc/foo/bar"],

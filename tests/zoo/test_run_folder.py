@@ -54,7 +54,7 @@ def test_found_again_by_folder_and_by_checkpoint(tmp_path):
     run = create(tmp_path)
     run.checkpoint.touch()
     for path in (run.path, run.checkpoint):
-        again = RunFolder.open(path)
+        again = RunFolder(path)
         assert (again.path, again.name) == (run.path, run.name)
     assert again.args()["env"] == "Goal_Point_8Hazards-v0"
     assert again.hyperparams() == {"n_steps": 5, "normalize": True}
@@ -62,9 +62,9 @@ def test_found_again_by_folder_and_by_checkpoint(tmp_path):
 
 def test_not_a_run(tmp_path):
     with pytest.raises(UsageError, match="is not a run folder"):
-        RunFolder.open(tmp_path)
-    with pytest.raises(UsageError, match="there is no run folder or file"):
-        RunFolder.open(tmp_path / "absent")
+        RunFolder(tmp_path)
+    with pytest.raises(UsageError, match="there is no run folder"):
+        RunFolder(tmp_path / "absent")
 
 
 @pytest.mark.parametrize("content", ["a: [", "just text"])

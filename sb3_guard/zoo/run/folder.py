@@ -141,10 +141,14 @@ class RunFolder:
     model ``<env>.zip``, ``checkpoint.zip`` to resume from, and, once the run is complete,
     ``result.json``.
 
-    :param path: the folder
+    :param path: the folder, or the ``checkpoint.zip`` in it
+    :raises UsageError: it is not there, or it is not a run
     """
 
     def __init__(self, path: Path):
+        path = path.parent if path.name == CHECKPOINT else path
+        if not path.exists():
+            raise UsageError(f"there is no run folder {path}")
         self.path = path
         arguments = sorted(path.glob("*/args.yml"))
         if len(arguments) != 1:
@@ -189,18 +193,6 @@ class RunFolder:
             (params / "command.txt").write_text(command, encoding="utf-8")
             _write_config(params, flags, hyperparams)
         return cls(path)
-
-    @classmethod
-    def open(cls, path: str | Path) -> "RunFolder":
-        """
-        The run in a folder, or the one that a ``checkpoint.zip`` belongs to.
-
-        :raises UsageError: it is not there, or it is not a run
-        """
-        path = Path(path)
-        if not path.exists():
-            raise UsageError(f"there is no run folder or file {path}")
-        return cls(path if path.is_dir() else path.parent)
 
     def args(self) -> dict[str, Any]:
         """The flags the run was started with."""

@@ -153,7 +153,7 @@ def resume(given: RunFlags) -> int:
     :return: exit status
     :raises UsageError: the run can't be continued, or a flag contradicts what it is
     """
-    folder = RunFolder.open(given.trained_agent)
+    folder = RunFolder(Path(given.trained_agent))
     with lock(folder.path):
         saved, values = folder.flags(), folder.hyperparams()
         require_named(folder.path, given.gym_packages, saved.gym_packages)

@@ -32,7 +32,7 @@ from sb3_guard.zoo.run.resumable import capture, restore
 MEMBER = "run_state.pkl"
 NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
-# Checkpoints take at most this share of the time: those with a replay buffer are large.
+# Checkpoints take at most this share of the time: replay buffers and earlier rollouts are large.
 LARGEST_SHARE = 0.05
 # The tensors with gSDE's noise, of all environments and of one each.
 GSDE_NOISE = "exploration_mat", "exploration_matrices"

@@ -134,12 +134,16 @@ def complete(
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """What differs between two runs: name and both values, ``none`` for those that are absent."""
+
+    def shown(value: Any) -> Any:
+        return "none" if value in ("", None) else value
+
     # As data: files of older runs have expressions as text.
     there, here = (
         plain({name: as_data(name, value) for name, value in run.items()}) for run in (there, here)
     )
     return [
-        (name, there.get(name, "none"), here.get(name, "none"))
+        (name, shown(there.get(name)), shown(here.get(name)))
         for name in sorted({*there, *here})
         if there.get(name) != here.get(name)
     ]

@@ -18,8 +18,8 @@ def number(value: Any, name: str) -> float:
     :raises NumberError: it is something else, or not finite
     """
     try:
-        one = value.item() if isinstance(value, np.ndarray) else value
-        number = math.nan if isinstance(one, str | bytes) else float(one)
+        scalar = value.item() if isinstance(value, np.ndarray) else value
+        number = math.nan if isinstance(scalar, str | bytes) else float(scalar)
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):

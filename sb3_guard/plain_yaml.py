@@ -5,18 +5,10 @@ from typing import Any
 import yaml
 
 
-class DoubleKeyError(yaml.YAMLError):
-    """A mapping has a key twice, of which PyYAML would silently take the last."""
-
-
 # In C where libyaml is there, ten times as fast: a large grid reads a thousand files.
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     def get_single_node(self) -> Any:
-        """
-        The text's root. Constructing it writes merges, ``<<: *other``, into the mappings' nodes.
-
-        :raises DoubleKeyError: a mapping has a key twice
-        """
+        """The text's root. Constructing it writes merges, ``<<: *other``, into its mappings."""
         root = super().get_single_node()
         nodes, seen = [root], set()
         while nodes:
@@ -39,7 +31,8 @@ def _refuse_double_keys(node: yaml.MappingNode) -> None:
         if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
             line = key.start_mark.line + 1
             if key.value in lines:
-                raise DoubleKeyError(
+                # PyYAML would silently take the last.
+                raise yaml.YAMLError(
                     f"line {line} has the key {key.value!r} again, after line "
                     f"{lines[key.value]}: keep one of the two"
                 )
@@ -48,12 +41,7 @@ def _refuse_double_keys(node: yaml.MappingNode) -> None:
 
 def _ordered(loader: Any, node: Any) -> dict[Any, Any]:
     """The ordered mapping that RL-Zoo writes: a list of one list of pairs."""
-    try:
-        return dict(*loader.construct_sequence(node, deep=True))
-    except (TypeError, ValueError) as error:
-        raise yaml.constructor.ConstructorError(
-            None, None, f"an OrderedDict must hold a list of pairs: {error}", node.start_mark
-        ) from error
+    return dict(*loader.construct_sequence(node, deep=True))
 
 
 _Loader.add_constructor("tag:yaml.org,2002:python/object/apply:collections.OrderedDict", _ordered)

@@ -12,8 +12,8 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     """
     wrong = str(name).lower()
 
-    def likeness(one: str) -> float:
-        return difflib.SequenceMatcher(None, one.lower(), wrong).ratio()
+    def likeness(allowed: str) -> float:
+        return difflib.SequenceMatcher(None, allowed.lower(), wrong).ratio()
 
     close = max(known, key=likeness, default="")
     return close if likeness(close) >= 0.5 else None

@@ -50,11 +50,13 @@ def train(flags: Flags) -> int:
         if flags.jobs is not None:
             raise UsageError("--jobs goes with several seeds, such as --seeds 0 1 2")
 
-        from sb3_guard.zoo.run.start import continues_run, resume, start
+        from sb3_guard.zoo.run.folder import CHECKPOINT
+        from sb3_guard.zoo.run.start import resume, start
 
-        if run.trained_agent and continues_run(run.trained_agent):
-            return resume(run)
-        return start(run)
+        # Any other archive is a model to begin from.
+        path = Path(run.trained_agent)
+        model = path.suffix == ".zip" and path.name != CHECKPOINT
+        return start(run) if model or not run.trained_agent else resume(run)
     for name, value in (("-i", run.trained_agent), ("--uuid", run.uuid)):
         if value:
             raise UsageError(f"{name} is for a single run; leave it out, or --seeds")

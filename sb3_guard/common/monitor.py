@@ -41,8 +41,9 @@ class CostMonitor(VecMonitor):
 
     ``info["episode"]`` has ``r`` (return), ``l`` (steps), ``t`` (seconds since the start) and
     ``c``, the undiscounted sum of ``info["cost"]`` over the episode. When an environment has
-    several costs, each of ``cost_keys`` is summed too, as ``c_<key>``. The csv is what
-    :func:`stable_baselines3.common.monitor.load_results` reads.
+    several costs, each of ``cost_keys`` is summed too, as ``c_<key>``. ``max`` and ``max_<key>``,
+    which are not in the csv, are the highest costs of a step, 0 where none is above it. The csv is
+    what :func:`stable_baselines3.common.monitor.load_results` reads.
 
     The sums of the episodes under way are part of :meth:`state`, so that a resumed training run
     reports the episodes in which it was stopped as if nothing had happened.
@@ -143,6 +144,8 @@ class CostMonitor(VecMonitor):
         self.episode_returns[ended.row] = 0.0
         if self.results_writer is not None:
             self.results_writer.write_row(episode)
+        names = ["max", *(f"max_{name[2:]}" for name in self._columns)]
+        episode |= zip(names, ended.highest.tolist(), strict=True)
         # Infos may be the environment's own objects: a copy gets the new entry.
         infos[ended.row] = {**info, "episode": episode}
 
@@ -164,22 +167,15 @@ class CostMonitor(VecMonitor):
         )
 
     def state(self) -> dict[str, Any]:
-        """What :meth:`restore` needs to continue counting, and ``"length"``, the csv's bytes."""
-        writer = self.results_writer
-        length = 0 if writer is None else os.path.getsize(writer.file_handler.name)
+        """What :meth:`restore` needs to continue counting."""
         counts = {name: copy.copy(getattr(self, name)) for name in KEPT}
-        return {**counts, "episodes": copy.deepcopy(self.episodes), "length": length}
+        return {**counts, "episodes": copy.deepcopy(self.episodes)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue counting from :meth:`state`; the csv is left as it is."""
         for name in KEPT:
             setattr(self, name, copy.copy(state[name]))
-        if "episodes" in state:
-            self.episodes = copy.deepcopy(state["episodes"])
-        else:  # checkpoints of formats 5 and 6
-            totals = [state["episode_costs"], *state["_key_costs"]]
-            self.episodes.totals = np.stack(totals, axis=1)
-            self.episodes.lengths = state["episode_lengths"].copy()
+        self.episodes = copy.deepcopy(state["episodes"])
 
 
 def _require_finite(name: str, values: VecEnvObs) -> None:

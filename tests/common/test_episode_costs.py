@@ -9,7 +9,6 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_guard import PPOLag
 from sb3_guard.checks import NumberError
-from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.costs import EpisodeCosts
 
 
@@ -61,14 +60,3 @@ def test_files_with_three_arrays_are_read(tmp_path) -> None:
     np.testing.assert_array_equal(again.episodes.totals, sums)
     np.testing.assert_array_equal(again.episodes.lengths, [20, 20])
     assert not [name for name in vars(again) if name.startswith("running_")]
-
-
-def test_states_of_a_monitor_with_three_arrays_are_read() -> None:
-    monitor = CostMonitor(make_vec_env(CostPoint, 2), cost_keys=("cost", "heat"))
-    state = monitor.state()
-    del state["episodes"]
-    state["episode_costs"], state["episode_lengths"] = np.array([1.0, 2.0]), np.array([3, 4])
-    state["_key_costs"] = np.array([[0.5, 1.5], [0.5, 0.5]])  # by key
-    monitor.restore(state)
-    assert monitor.episodes.totals.tolist() == [[1.0, 0.5, 0.5], [2.0, 1.5, 0.5]]
-    assert monitor.episodes.lengths.tolist() == [3, 4]

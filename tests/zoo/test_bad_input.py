@@ -58,8 +58,8 @@ TRAIN = [
      ["env_wrapper of a run", "'dummy' or 'subproc'"]),
     # an environment without the cost key
     ([*LIMITED, "--env", "NoCost-v0"],
-     ["no cost 'cost'", "depth", "cost_keys", "missing_cost:zero"]),
-    ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost 'heat'"]),
+     ["no cost key 'cost'", "depth", "cost_keys", "missing_cost='zero'"]),
+    ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost key 'heat'"]),
     # hyperparameters
     (["-params", "n_step:10"], ["no hyperparameter 'n_step'", "did you mean 'n_steps'?"]),
     (["-params", "n_steps:ten"], ["n_steps: 'ten'", "a whole number"]),
@@ -89,12 +89,12 @@ TRAIN = [
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
-    (["--gym-packages", "../x"], ["'../x' is not a module's name"]),
-    (["--gym-packages", ""], ["'' is not a module's name"]),
+    (["--gym-packages", "../x"], ["--gym-packages: can't import '../x'"]),
+    (["--gym-packages", ""], ["--gym-packages: can't import ''"]),
     (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown flag --sede", "--seed"]),
-    (["cpo"], ["'cpo' does not belong to a flag", "--help"]),
+    (["cpo"], ["unrecognized arguments: cpo"]),
     (["-params", "frame_stack:0"], ["frame_stack: 0", "at least 1"]),
     (["-n", "0"], ["-n", "at least 1"]),
     (["-n", "1.5"], ["'1.5' is not a whole number"]),
@@ -106,7 +106,8 @@ TRAIN = [
     (["--checkpoint-every", "nan"], ["--checkpoint-every: 'nan'"]),
     (["--log-interval", "0"], ["--log-interval: '0'"]),
     (["--device", "abacus"], ["abacus"]),
-    (["-i", "absent"], ["no run folder or model 'absent'"]),
+    (["-i", "absent"], ["no run folder absent"]),
+    ([*LIMITED, "-i", "absent.zip"], ["can't load absent.zip", "No such file"]),
     ([*LIMITED, "-tb", "/dev/null"], ["--tensorboard-log", "'/dev/null'", "choose another"]),
     ([*LIMITED, "-tb", "/proc/foo/bar"],
      ["--tensorboard-log", "'/proc/foo/bar'", "choose another"]),
@@ -213,7 +214,7 @@ def test_more_than_plain_data(capsys, tmp_path):
         "hyperparams = {'default': {'policy_kwargs': {'activation_fn': nn.ReLU}, 'n_steps': 30}}\n"
     )
     arguments = [*LIMITED, "-n", "60", "-conf", str(conf), "-f", str(tmp_path / "logs")]
-    refused(train.main, arguments, capsys, "config.yml can hold plain data only", "nn.ReLU")
+    refused(train.main, arguments, capsys, "is more than plain data", "nn.ReLU")
     assert not (tmp_path / "logs").exists()
 
 
@@ -246,7 +247,7 @@ def test_corrupt_checkpoint(content, capsys, run):
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     for path in (run, run / "checkpoint.zip"):
         arguments = [*GO_ON, str(path), "-n", "120"]
-        refused(train.main, arguments, capsys, "checkpoint.zip is damaged")
+        refused(train.main, arguments, capsys, "checkpoint.zip is damaged or no checkpoint")
     after = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     assert before == after
 
@@ -255,10 +256,10 @@ def test_checkpoints_that_are_none(capsys, run):
     run.joinpath("checkpoint.zip").unlink()
     refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "start it again without -i")
     shutil.copy(run / "CostPoint-v0.zip", run / "checkpoint.zip")
-    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "is a model, not a checkpoint")
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "damaged or no checkpoint", MEMBER)
     with zipfile.ZipFile(run / "checkpoint.zip", "a") as archive:
         archive.writestr(MEMBER, pickle.dumps({"other": 1}))
-    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "checkpoint.zip is damaged")
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "checkpoint.zip is damaged or")
 
 
 def test_corrupt_model(capsys, run, tmp_path):
@@ -311,11 +312,7 @@ def test_agent_of_another_environment(capsys, run, tmp_path):
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        (lambda args: {"a": 1}, ["there is no algo, checkpoint_every"]),
-        (
-            lambda args: {k: v for k, v in args.items() if k != "eval_freq"},
-            ["there is no eval_freq"],
-        ),
+        (lambda args: {"a": 1}, ["unknown entry 'a'"]),
         (lambda args: {**args, "seed": "one"}, ["seed: 'one' is not allowed"]),
     ],
 )
@@ -323,7 +320,7 @@ def test_damaged_flags(change, parts, capsys, run):
     path = run / "CostPoint-v0" / "args.yml"
     path.write_text(yaml.safe_dump(change(yaml.safe_load(path.read_text()))))
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "args.yml is damaged", *parts)
+    refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "args.yml: ", *parts)
     assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
 
 
@@ -333,7 +330,6 @@ def test_damaged_flags(change, parts, capsys, run):
         ("/proc/foo.mp4", ["--record", "'/proc'", "choose another"]),
         ("/dev/null/foo.mp4", ["--record", "'/dev/null'", "choose another"]),
         (".", ["'.' is a folder"]),
-        ("x" * 300 + ".mp4", ["File name too long", "xxx"]),
     ],
 )
 def test_unwritable_video(record, parts, capsys, run, tmp_path, monkeypatch):

@@ -88,7 +88,6 @@ def test_python_file_and_module(tmp_path, monkeypatch):
         ("Goal_Point_8Hazards-v0: {}\n", "no entry for 'Goal_Point_8Hazard'.*did you mean"),
         ("\x00\x01", "as YAML"),
         ("default:\n  n_steps: 1\n  n_steps: 2\n", "line 3 has the key 'n_steps' again, .* line 2"),
-        ("default: {1: 2, n_steps: 3}\n", "1 below 'default' is not a name"),
     ],
 )
 def test_files_that_are_not_hyperparameters(tmp_path, content, message):
@@ -201,6 +200,13 @@ def test_how_often_to_train_in_episodes(value):
     for bad in ([1], ["episode", 1], [1, 2], "episode"):
         with pytest.raises(UsageError, match="a whole number or a list of a whole number and text"):
             check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": bad})
+
+
+def test_a_name_that_is_a_number(tmp_path):
+    (tmp_path / "conf.yml").write_text("default: {1: 2, n_steps: 3}")
+    values = read_hyperparams("cpo", "X-v0", str(tmp_path / "conf.yml"))
+    with pytest.raises(UsageError, match="cpo has no hyperparameter 1; "):
+        check("cpo", CPO, values)
 
 
 def test_names_that_are_flags():

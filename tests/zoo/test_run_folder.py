@@ -11,12 +11,10 @@ from huggingface_sb3 import EnvironmentName
 from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
 
 from sb3_guard.common.files import replacing
-from sb3_guard.common.monitor import KEPT
 from sb3_guard.zoo.cli.usage import UsageError
-from sb3_guard.zoo.run.checkpoint import cut_logs
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, RunInUse, folder_name, latest_run, lock, owner
-from sb3_guard.zoo.run.logger import RunLogger
+from sb3_guard.zoo.run.logger import RunLogger, cut
 
 
 def create(tmp_path, env_id="Goal_Point_8Hazards-v0", **kwargs) -> RunFolder:
@@ -56,7 +54,7 @@ def test_found_again_by_folder_and_by_checkpoint(tmp_path):
     run = create(tmp_path)
     run.checkpoint.touch()
     for path in (run.path, run.checkpoint):
-        again = RunFolder.open(path)
+        again = RunFolder(path)
         assert (again.path, again.name) == (run.path, run.name)
     assert again.args()["env"] == "Goal_Point_8Hazards-v0"
     assert again.hyperparams() == {"n_steps": 5, "normalize": True}
@@ -64,9 +62,9 @@ def test_found_again_by_folder_and_by_checkpoint(tmp_path):
 
 def test_not_a_run(tmp_path):
     with pytest.raises(UsageError, match="is not a run folder"):
-        RunFolder.open(tmp_path)
-    with pytest.raises(UsageError, match="there is no run folder or file"):
-        RunFolder.open(tmp_path / "absent")
+        RunFolder(tmp_path)
+    with pytest.raises(UsageError, match="there is no run folder"):
+        RunFolder(tmp_path / "absent")
 
 
 @pytest.mark.parametrize("content", ["a: [", "just text"])
@@ -149,15 +147,6 @@ def rows(path) -> list[str]:
     return (path / "progress.csv").read_text().splitlines()
 
 
-MONITOR = b"#{}\nr,l,t,c\n"
-
-
-def resumed(folder, state) -> RunLogger:
-    environments = [{"episodes": 3}, {**dict.fromkeys(KEPT), "length": len(MONITOR)}, None]
-    cut_logs(folder, {"logger": state, "environments": environments})
-    return RunLogger(folder, state=state)
-
-
 def test_progress_goes_on_where_it_was(tmp_path):
     logger = RunLogger(tmp_path)
     for k in range(3):
@@ -169,7 +158,7 @@ def test_progress_goes_on_where_it_was(tmp_path):
     logger.dump(4)  # dropped
     logger.close()
 
-    again = resumed(tmp_path, state)
+    again = RunLogger(tmp_path, state=state)
     again.record("a", 10)
     again.record("time/iterations", 1)
     again.dump(5)
@@ -178,7 +167,7 @@ def test_progress_goes_on_where_it_was(tmp_path):
     table = [dict(zip(header.split(","), line.split(","), strict=True)) for line in lines]
     assert [row["a"] for row in table] == ["0", "1", "2", "10"]
     assert (table[-1]["pending"], table[-1]["time/iterations"]) == ("7", "4")
-    assert "b" not in header
+    assert [row["b"] for row in table] == [""] * 4  # a column that came later stays
 
 
 def test_progress_of_no_rows_begins_anew(tmp_path):
@@ -187,7 +176,7 @@ def test_progress_of_no_rows_begins_anew(tmp_path):
     logger.record("a", 1)
     logger.dump()
     logger.close()
-    again = resumed(tmp_path, state)
+    again = RunLogger(tmp_path, state=state)
     again.record("b", 2)
     again.dump()
     again.close()
@@ -210,27 +199,25 @@ def test_a_sleeper_whose_run_was_taken_over_ends(tmp_path):
     assert "was taken over while this process gave no sign of life" in done.stderr
 
 
-@pytest.mark.parametrize("older", [False, True])
-def test_what_came_after_the_checkpoint_is_cut(older, tmp_path):
-    """New columns too, which extend the rows before; and as checkpoints of format 5 have it."""
-    logger = RunLogger(tmp_path)
-    for k in range(3):
-        logger.record("a", k)
-        logger.dump(k)
-    state = logger.state(iterations=3)
-    before = (tmp_path / "progress.csv").read_bytes()
-    if older:
-        state = {**state, "table": before.decode()}
-        del state["length"]
-    for k in range(3):
-        logger.record("b", k)
-        logger.record("c" * k, k)
+def test_what_came_after_the_checkpoint_is_cut(tmp_path):
+    """Columns that came later are those that the continued run adds again."""
+    logger, states = RunLogger(tmp_path), []
+    for k in range(6):
+        states.append(logger.state(iterations=k))
+        logger.record("a" if k < 3 else "b", k)
         logger.dump(k)
     logger.close()
-    (tmp_path / "0.monitor.csv").write_bytes(MONITOR + b"1,1,1,1\n")
-    resumed(tmp_path, state).close()
-    assert (tmp_path / "progress.csv").read_bytes() == before
-    assert (tmp_path / "0.monitor.csv").read_bytes() == MONITOR
+    whole = (tmp_path / "progress.csv").read_bytes()
+    again = RunLogger(tmp_path, state=states[3])
+    assert rows(tmp_path) == ["a,b", "0,", "1,", "2,"]
+    for k in range(3, 6):
+        again.record("b", k)
+        again.dump(k)
+    again.close()
+    assert (tmp_path / "progress.csv").read_bytes() == whole
+    assert cut(tmp_path / "progress.csv", 2)
+    assert (tmp_path / "progress.csv").read_text() == "a,b\n0,\n"
+    assert not cut(tmp_path / "absent.csv", 2)
 
 
 def test_a_deleted_log_begins_anew(tmp_path):
@@ -240,7 +227,7 @@ def test_a_deleted_log_begins_anew(tmp_path):
     state = logger.state(iterations=1)
     logger.close()
     (tmp_path / "progress.csv").unlink()
-    again = resumed(tmp_path, state)
+    again = RunLogger(tmp_path, state=state)
     again.record("b", 2)
     again.dump()
     again.close()

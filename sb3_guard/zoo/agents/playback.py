@@ -46,7 +46,7 @@ def find_run(
     parent, name = Path(folder) / algo, folder_name(with_version(env_id))
     number = number or latest_run(parent, name)
     if number:
-        return RunFolder.open(parent if number < 0 else parent / f"{name}_{number}")
+        return RunFolder(parent if number < 0 else parent / f"{name}_{number}")
     algorithm(algo), full_id(env_id)  # a misspelled name has a message of its own
     ships = latest_run(PRETRAINED / algo, name)
     runs = [path for path in sorted(Path(folder).glob("*/*_*")) if is_run(path)]

@@ -36,7 +36,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.cli.usage import KeyValues, Parser, UsageError, parse_pairs, run
+from sb3_guard.zoo.cli.usage import Parser, UsageError, key_value, run
 from sb3_guard.zoo.cli.values import typed, words
 
 # Roles of a flag: it says what a run is, how it is started, or how it is hosted and watched,
@@ -51,7 +51,6 @@ def flag(
     kind: Callable[[Any], Any] | None = None,
     exclusive: str | None = None,
     positional: bool = False,
-    former: Sequence[str] = (),
     **argparse_options: Any,
 ) -> Any:
     """
@@ -63,12 +62,11 @@ def flag(
     :param kind: makes the value of its text or number, and raises ``ArgumentTypeError``
     :param exclusive: at most one flag of the same ``exclusive`` can be given
     :param positional: the value is given without the flag's name
-    :param former: field names that the flag had before; they are still read, and not shown
     :param argparse_options: for ``add_argument``, e.g. ``metavar``
     """
     meta = {
         "names": names, "role": role, "kind": kind, "exclusive": exclusive,
-        "positional": positional, "former": former, "options": argparse_options,
+        "positional": positional, "options": argparse_options,
     }  # fmt: skip
     if isinstance(default, list | dict):
         copied = default
@@ -96,6 +94,7 @@ class Command:
             epilog=cls.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             argument_default=argparse.SUPPRESS,
+            allow_abbrev=False,
         )
         groups: dict[str, Any] = {}
         said = cls._said()
@@ -115,9 +114,6 @@ class Command:
                 group.add_argument(field.name, **{"default": None, **options})
             else:
                 group.add_argument(*_names(field), dest=field.name, **options)
-            for name in meta["former"]:
-                hidden = {**options, "help": argparse.SUPPRESS}
-                result.add_argument(_long(name), dest=field.name, **hidden)
         return result
 
     @classmethod
@@ -129,9 +125,14 @@ class Command:
         :raises UsageError: a flag is unknown, with the nearest name, or a value is not allowed
         """
         parsed = vars(cls.parser().parse_args(argv))
-        # What is absent is not there at all, except where values go without a flag.
-        bare = {field.name for field, _ in cls._flags() if field.metadata["positional"]}
-        return cls.of({n: v for n, v in parsed.items() if n not in bare or v not in (None, [])})
+        given = {}
+        for field, hint in cls._flags():
+            # What is absent is not there at all, except values that go without a flag.
+            bare = field.metadata["positional"]
+            if field.name in parsed and not (bare and parsed[field.name] in (None, [])):
+                value = parsed[field.name]
+                given[field.name] = dict(value) if _is(hint, dict) else value
+        return cls.of(given)
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:
@@ -150,15 +151,13 @@ class Command:
         :param but: flags that a file can't give
         :raises UsageError: a name is unknown, or a value not allowed
         """
-        known = {field.name: (field, hint) for field, hint in cls._flags() if field.name not in but}
-        former = {old: new for new, (field, _) in known.items() for old in field.metadata["former"]}
+        flags = {field.name: (field, hint) for field, hint in cls._flags() if field.name not in but}
         given = {}
         for key, value in data.items():
             name = str(key).replace("-", "_")
-            name = former.get(name, name)
-            if name not in known:
-                raise UsageError(f"{where}: unknown entry {key!r}; {did_you_mean(name, known)}")
-            field, hint = known[name]
+            if name not in flags:
+                raise UsageError(f"{where}: unknown entry {key!r}; {did_you_mean(name, flags)}")
+            field, hint = flags[name]
             if value is not None and value != _default(field):
                 try:
                     value = _typed(hint, field.metadata["kind"], value)
@@ -197,16 +196,16 @@ class Command:
     @classmethod
     def _said(cls) -> dict[str, tuple[str, str]]:
         """Heading and help of the flags, as the docstrings of the class and its bases have them."""
-        found = {}
+        texts = {}
         for base in reversed(cls.__mro__):
             heading = "options"
             for part in re.split(r"\n\s*\n|\n(?=\s*:param)", base.__doc__ or ""):
                 text = " ".join(part.split())
                 if flag := re.fullmatch(r":param (\w+): (.*)", text):
-                    found[flag[1]] = heading, flag[2].replace("%", "%%")
+                    texts[flag[1]] = heading, flag[2].replace("%", "%%")
                 elif text.endswith(":"):
                     heading = text[:-1].lower()
-        return found
+        return texts
 
     @classmethod
     def _flags(cls) -> Iterator[tuple[dataclasses.Field[Any], Any]]:
@@ -237,11 +236,7 @@ def command(flags: type[Any], function: Callable[[Any], int]) -> Callable[..., i
 
 
 def _names(field: "dataclasses.Field[Any]") -> list[str]:
-    return [*field.metadata["names"], _long(field.name)]
-
-
-def _long(name: str) -> str:
-    return "--" + name.replace("_", "-")
+    return [*field.metadata["names"], "--" + field.name.replace("_", "-")]
 
 
 def _default(field: "dataclasses.Field[Any]") -> Any:
@@ -256,18 +251,24 @@ def _bare(hint: Any) -> Any:
     return hint
 
 
+def _is(hint: Any, kind: type) -> bool:
+    """Whether an annotation is a list or a dictionary, of whatever it holds."""
+    return (typing.get_origin(_bare(hint)) or _bare(hint)) is kind
+
+
 def _options(field: "dataclasses.Field[Any]", hint: Any) -> dict[str, Any]:
     """What argparse needs to know of a flag."""
     meta, bare = field.metadata, _bare(hint)
-    origin, arguments = typing.get_origin(bare), typing.get_args(bare)
+    arguments = typing.get_args(bare)
     options: dict[str, Any] = {}
     if bare is bool:
         options["action"] = "store_true" if bare is hint else argparse.BooleanOptionalAction
-    elif (origin or bare) is dict:
-        options |= {"nargs": "+", "action": KeyValues, "metavar": "KEY:VALUE"}
-    elif origin is list:
+    elif _is(hint, dict):
+        # The flag may be repeated; what comes later wins.
+        options |= {"nargs": "+", "action": "extend", "type": key_value, "metavar": "KEY:VALUE"}
+    elif _is(hint, list):
         options |= {"nargs": "+", "type": meta["kind"] or arguments[0]}
-    elif origin is Literal:
+    elif typing.get_origin(bare) is Literal:
         options |= {"choices": list(arguments), "type": type(arguments[0])}
     else:
         options["type"] = meta["kind"] or bare
@@ -276,26 +277,19 @@ def _options(field: "dataclasses.Field[Any]", hint: Any) -> dict[str, Any]:
 
 def _typed(hint: Any, kind: Callable[[Any], Any] | None, value: Any) -> Any:
     """A value of a file as the flag has it."""
-    bare = _bare(hint)
-    origin, arguments = typing.get_origin(bare), typing.get_args(bare)
-    if (origin or bare) is dict:
-        return dict(value) if isinstance(value, Mapping) else parse_pairs(_several(value))
-    if origin is list:
-        return [_typed(arguments[0], kind, one) for one in _several(value)]
-    made = typed(value, bare)
+    items = value if isinstance(value, list) else [value]
+    if _is(hint, dict):
+        return dict(value) if isinstance(value, Mapping) else dict(map(key_value, items))
+    if _is(hint, list):
+        (item,) = typing.get_args(_bare(hint))
+        if not items:
+            raise TypeError
+        return [_typed(item, kind, value) for value in items]
+    made = typed(value, _bare(hint))
     return kind(value) if kind else made
 
 
-def _several(value: Any) -> list[Any]:
-    if isinstance(value, Mapping) or value == []:
-        raise TypeError
-    return value if isinstance(value, list) else [value]
-
-
 def _words(hint: Any) -> str:
-    bare = _bare(hint)
-    if (typing.get_origin(bare) or bare) is dict:
+    if _is(hint, dict):
         return "a mapping or a list of key:value"
-    if typing.get_origin(bare) is list:
-        return "one value or a list of them"
-    return words(bare)
+    return "one value or a list of them" if _is(hint, list) else words(_bare(hint))

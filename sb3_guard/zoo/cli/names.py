@@ -15,8 +15,7 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag
 from sb3_guard.zoo.cli.values import read_expression
@@ -28,28 +27,6 @@ PRESETS = {"paper": "the paper", "omnisafe": "the settings that OmniSafe has pub
 BASES: dict[str, type] = {
     "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
 }  # fmt: skip
-
-
-def entries(name: str, value: Any) -> list[tuple[str, dict[str, Any]]]:
-    """
-    The classes that ``env_wrapper``, ``vec_env_wrapper`` or ``callback`` names.
-
-    :param value: ``module.Class``, ``{module.Class: {argument: value}}``, or a list of such
-    :return: dotted names and arguments
-    :raises UsageError: it is not of that form
-    """
-    found: list[tuple[str, dict[str, Any]]] = []
-    for one in [] if value is None else value if isinstance(value, list) else [value]:
-        path, kwargs = one, None
-        if isinstance(one, Mapping) and len(one) == 1:
-            path, kwargs = next(iter(one.items()))
-        if not isinstance(path, str) or not isinstance(kwargs or {}, Mapping):
-            raise UsageError(
-                f"hyperparameter {name}: {one!r} is not allowed; it must be module.Class, or "
-                "{module.Class: {argument: value}}"
-            )
-        found.append((path, dict(kwargs or {})))
-    return found
 
 
 def import_class(name: str, path: str, base: type) -> Any:
@@ -68,27 +45,31 @@ def import_class(name: str, path: str, base: type) -> Any:
             f"command line names; add --gym-packages {module}"
         )
     with explained(f"{name}: there is no class {path!r}"):
-        found = getattr(importlib.import_module(module), attribute)
-    if not (isinstance(found, type) and issubclass(found, base)):
+        cls = getattr(importlib.import_module(module), attribute)
+    if not (isinstance(cls, type) and issubclass(cls, base)):
         raise UsageError(f"{name}: {path!r} is not allowed; it must be a {base.__name__}")
-    return found
+    return cls
 
 
 def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:
     """
-    What ``env_wrapper``, ``vec_env_wrapper`` or ``callback`` names: classes and their arguments.
+    The classes that ``env_wrapper``, ``vec_env_wrapper`` or ``callback`` names.
 
-    :raises UsageError: one is not there, not of its kind, or a monitor that writes a file
+    :param value: ``module.Class``, ``{module.Class: {argument: value}}``, or a list of such
+    :return: classes and their arguments
+    :raises UsageError: it is not of that form, or a class is not there or not of its kind
     """
     result = []
-    for path, arguments in entries(name, value):
-        cls = import_class(name, path, BASES[name])
-        if issubclass(cls, Monitor | VecMonitor) and arguments.get("filename") is not None:
+    for entry in [] if value is None else value if isinstance(value, list) else [value]:
+        path, arguments = entry, None
+        if isinstance(entry, Mapping) and len(entry) == 1:
+            path, arguments = next(iter(entry.items()))
+        if not isinstance(path, str) or not isinstance(arguments or {}, Mapping):
             raise UsageError(
-                f"{name}: {path} would write to {arguments['filename']!r}, which may be another "
-                "run's; leave it out, since 0.monitor.csv of the run has all episodes"
+                f"hyperparameter {name}: {entry!r} is not allowed; it must be module.Class, or "
+                "{module.Class: {argument: value}}"
             )
-        result.append((cls, arguments))
+        result.append((import_class(name, path, BASES[name]), dict(arguments or {})))
     return result
 
 
@@ -112,11 +93,6 @@ def torch_class(path: str) -> Any:
     return value
 
 
-def _torch_name(path: str) -> str:
-    torch_class(path)
-    return path
-
-
 def _evaluating(name: str, value: Any) -> AbstractContextManager[None]:
     what = f"hyperparameter {name}: {value!r} can't be evaluated"
     allowed = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
@@ -128,11 +104,11 @@ def as_data(name: str, value: Any) -> Any:
     A hyperparameter as data, of text such as ``dict(activation_fn=nn.ReLU)`` too.
 
     :return: mappings, lists and literals; classes stay text, see :func:`with_classes`
-    :raises UsageError: it is more than literals and names of torch's classes
+    :raises UsageError: it is more than literals and names
     """
     if isinstance(value, str) and value.lstrip().startswith(("dict(", "{")):
         with _evaluating(name, value):
-            return read_expression(value, _torch_name)
+            return read_expression(value, str)
     return value
 
 
@@ -143,9 +119,9 @@ def with_classes(name: str, value: Any) -> Any:
     :raises UsageError: torch has no class of a name that begins with ``nn.``, ``th.``, ``torch.``
     """
     if isinstance(value, Mapping):
-        return {key: with_classes(name, one) for key, one in value.items()}
+        return {key: with_classes(name, item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return type(value)(with_classes(name, one) for one in value)
+        return type(value)(with_classes(name, item) for item in value)
     if isinstance(value, str) and value.startswith(("nn.", "th.", "torch.")):
         with _evaluating(name, value):
             return torch_class(value)

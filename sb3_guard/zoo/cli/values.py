@@ -33,9 +33,11 @@ def _value(node: ast.expr, named: Callable[[str], Any] | None) -> Any:
             if all(pair.arg for pair in pairs):  # none is **
                 return {pair.arg: _value(pair.value, named) for pair in pairs}
         case ast.Dict(keys=keys, values=values):
-            pairs_ = [(key, one) for key, one in zip(keys, values, strict=True) if key is not None]
-            if len(pairs_) == len(values):
-                return {_key(key): _value(one, named) for key, one in pairs_}
+            if None not in keys:  # none is **
+                return {
+                    _key(key): _value(value, named)  # type: ignore[arg-type]
+                    for key, value in zip(keys, values, strict=True)
+                }
         case ast.List(elts=items):
             return [_value(item, named) for item in items]
         case ast.Tuple(elts=items):

@@ -6,15 +6,13 @@ from sb3_guard.algorithms import ALGORITHMS
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError
 
-# ARS plays whole episodes in workers of its own, past the monitor that counts costs.
-NOT_HERE = {"ars": "its costs can't be counted; RL-Zoo's own rl_zoo3.train runs it"}
-
 
 def baselines() -> dict[str, type[BaseAlgorithm]]:
     """RL-Zoo's algorithms by key: unconstrained, with their costs logged; ``trpo`` is ours."""
     from rl_zoo3.utils import ALGOS
 
-    return {key: ALGOS[key] for key in ALGOS if key not in ALGORITHMS and key not in NOT_HERE}
+    # ARS plays whole episodes in workers of its own, past the monitor that counts costs.
+    return {key: ALGOS[key] for key in ALGOS if key not in {*ALGORITHMS, "ars"}}
 
 
 def algorithm(key: str) -> type[BaseAlgorithm]:
@@ -23,8 +21,6 @@ def algorithm(key: str) -> type[BaseAlgorithm]:
 
     :raises UsageError: there is none of that name
     """
-    if key in NOT_HERE:
-        raise UsageError(f"algorithm {key!r} is not available here: {NOT_HERE[key]}")
     # RL-Zoo, which takes a while to import, is asked only where it must be.
     table = ALGORITHMS if key in ALGORITHMS else {**ALGORITHMS, **baselines()}
     if key not in table:

@@ -1,8 +1,10 @@
 """What one training is, as data, and what makes its parts: environments, model, evaluation."""
 
 import copy
+import dataclasses
 import warnings
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,8 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.callbacks import CostEvalCallback
-from sb3_guard.zoo.cli.usage import UsageError, explained
+from sb3_guard.costs import read_costs
+from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
@@ -49,15 +52,11 @@ class Experiment:
     cost_keys: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        if self.flags.track and not self.flags.tensorboard_log:
+            self.flags = dataclasses.replace(self.flags, tensorboard_log="runs")
         self.algorithm = algorithm(self.flags.algo)
         self.setup = build(self.hyperparams)
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
-
-    @property
-    def events(self) -> Path | None:
-        """Where TensorBoard's events go; None: nowhere."""
-        events = self.flags.tensorboard_log or ("runs" if self.flags.track else "")
-        return Path(events) if events else None
 
     def try_out(self) -> None:
         """
@@ -66,9 +65,11 @@ class Experiment:
         :raises UsageError: one is not there, or the environment refuses a value or has no cost
         """
         flags = self.flags
-        _check_device(flags.device)
-        if self.events is not None:
-            require_writable(self.events, "--tensorboard-log")
+        # SB3 would train on the CPU instead of a GPU that is not there.
+        with explained(f"--device {flags.device!r} is not allowed"):
+            th.empty(0, device="cpu" if flags.device == "auto" else flags.device)
+        if flags.tensorboard_log:
+            require_writable(Path(flags.tensorboard_log), "--tensorboard-log")
         self._try_environment(self.setup.env_kwargs)
         if flags.eval_freq > 0 and flags.eval_env_kwargs is not None:
             self._try_environment(flags.eval_env_kwargs)
@@ -154,25 +155,14 @@ class Experiment:
         """Make one environment and take a step, so that nothing fails later for want of a cost."""
         vec_env = "dummy" if self.flags.vec_env == "subproc" else str(self.flags.vec_env)
         env = self.make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
-        try:
-            with explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
-                env.reset()
-                env.action_space.seed(self.flags.seed)
-                info = env.step(np.array([env.action_space.sample()]))[3][0]
-        finally:
-            env.close()
-        if not getattr(self.algorithm, "constrained", False):
-            return
-        if self.setup.model.get("missing_cost", "error") == "zero":
-            return
-        for key in self.cost_keys:
-            if key not in info:
-                raise UsageError(
-                    f"{self.flags.env} reports no cost {key!r} in its info, which has "
-                    f"{', '.join(sorted(info)) or 'nothing'}; name its costs with "
-                    "-params cost_keys:\"['name']\", or count a missing cost as 0 with "
-                    "-params missing_cost:zero"
-                )
+        env.action_space.seed(self.flags.seed)
+        with closing(env), explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
+            env.reset()
+            infos = env.step(np.array([env.action_space.sample()]))[3]
+        if getattr(self.algorithm, "constrained", False):
+            optional = self.setup.model.get("missing_cost") == "zero"
+            with explained(f"{self.flags.env} reports no such cost", ValueError):
+                read_costs(infos, self.cost_keys, zero_if_missing=optional)
 
     def _make_model(self, env: VecEnv) -> BaseAlgorithm:
         flags = self.flags
@@ -208,17 +198,3 @@ class Experiment:
         if best.is_file():
             return best
         return min(agent.parent.glob("*/vecnormalize.pkl"), default=None)
-
-
-def _check_device(name: str) -> None:
-    """
-    Refuse a GPU that is not there; SB3 would train on the CPU instead.
-
-    :raises UsageError: torch has no such device
-    """
-    with explained(f"--device {name!r} is not allowed", RuntimeError):
-        device = th.device("cpu" if name == "auto" else name)
-    if device.type == "cuda" and (device.index or 0) >= th.cuda.device_count():
-        raise UsageError(
-            f"--device {name!r}: torch sees {th.cuda.device_count()} GPUs here; use auto or cpu"
-        )

@@ -23,7 +23,7 @@ from filelock import SoftFileLease, Timeout
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.cli.flags import IDENTITY
-from sb3_guard.zoo.cli.usage import UsageError, explained, one_line, packages_flag, read_mapping
+from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag, read_mapping
 from sb3_guard.zoo.run.flags import RunFlags
 
 CHECKPOINT = "checkpoint.zip"
@@ -53,8 +53,13 @@ def is_disk_error(error: BaseException | None) -> bool:
 def plain(value: Any) -> Any:
     """A value as the files of a run give it back: lists for tuples."""
     if isinstance(value, Mapping):
-        return {key: plain(one) for key, one in value.items()}
-    return [plain(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: plain(item) for key, item in value.items()}
+    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def identity(flags: RunFlags, hyperparams: Mapping[str, Any]) -> dict[str, Any]:
+    """What makes a run the run it is: flags of that role, and hyperparameters."""
+    return plain({**flags.values(IDENTITY), **hyperparams})
 
 
 def read_data(path: Path) -> dict[str, Any]:
@@ -120,7 +125,7 @@ def require_writable(folder: Path, flag: str) -> None:
     what = f"{flag}: can't write to folder {str(folder)!r}"
     with explained(what, OSError, fix="choose another"):
         whole = folder.absolute()
-        existing = next(one for one in (whole, *whole.parents) if one.exists())
+        existing = next(path for path in (whole, *whole.parents) if path.exists())
         # Permission bits mean little to root and on special file systems: only trying tells.
         with tempfile.TemporaryFile(dir=existing):
             pass
@@ -136,10 +141,14 @@ class RunFolder:
     model ``<env>.zip``, ``checkpoint.zip`` to resume from, and, once the run is complete,
     ``result.json``.
 
-    :param path: the folder
+    :param path: the folder, or the ``checkpoint.zip`` in it
+    :raises UsageError: it is not there, or it is not a run
     """
 
     def __init__(self, path: Path):
+        path = path.parent if path.name == CHECKPOINT else path
+        if not path.exists():
+            raise UsageError(f"there is no run folder {path}")
         self.path = path
         arguments = sorted(path.glob("*/args.yml"))
         if len(arguments) != 1:
@@ -170,10 +179,9 @@ class RunFolder:
         :param hyperparams: all hyperparameters, plain data
         :param command: the command line
         :param path: its folder, on which the caller has :func:`lock`; None: the next free number
-        :raises UsageError: the folder can't be written to, or there is more than plain data
+        :raises UsageError: the folder can't be written to
         """
         name = folder_name(flags.env)
-        files = _dump(flags.values(), hyperparams)
         parent = Path(flags.log_folder) / flags.algo
         suffix = f"_{uuid.uuid4()}" if flags.uuid else ""
         what = f"can't write to log folder {flags.log_folder!r}"
@@ -183,20 +191,8 @@ class RunFolder:
             params = path / name
             params.mkdir(parents=True, exist_ok=True)
             (params / "command.txt").write_text(command, encoding="utf-8")
-            _write(params, files)
+            _write_config(params, flags, hyperparams)
         return cls(path)
-
-    @classmethod
-    def open(cls, path: str | Path) -> "RunFolder":
-        """
-        The run in a folder, or the one that a ``checkpoint.zip`` belongs to.
-
-        :raises UsageError: it is not there, or it is not a run
-        """
-        path = Path(path)
-        if not path.exists():
-            raise UsageError(f"there is no run folder or file {path}")
-        return cls(path if path.is_dir() else path.parent)
 
     def args(self) -> dict[str, Any]:
         """The flags the run was started with."""
@@ -204,26 +200,11 @@ class RunFolder:
 
     def flags(self) -> RunFlags:
         """
-        The flags the run was started with: all of them, since one guessed would be another run.
+        The flags the run was started with.
 
-        :raises UsageError: one is absent, or has a value that it can't have
+        :raises UsageError: one has a value that it can't have
         """
-        saved = self.args()
-        absent = sorted(RunFlags.names() - saved.keys())
-        try:
-            if absent:
-                raise UsageError(f"args.yml: there is no {', '.join(absent[:4])}")
-            return RunFlags.read(saved, "args.yml")
-        except UsageError as error:
-            raise UsageError(
-                f"{self.params / 'args.yml'} is damaged ({one_line(error)}); put the file back as "
-                "it was, or start a new run without -i"
-            ) from error
-
-    def what(self) -> dict[str, Any]:
-        """What makes the run the run it is: flags of that role, and hyperparameters."""
-        args = self.args()
-        return {**{name: args.get(name) for name in RunFlags.names(IDENTITY)}, **self.hyperparams()}
+        return RunFlags.read(self.args(), self.params / "args.yml")
 
     def hyperparams(self) -> dict[str, Any]:
         """The hyperparameters the run was started with."""
@@ -232,15 +213,15 @@ class RunFolder:
     def events(self, flags: RunFlags) -> Path:
         """The folder of its TensorBoard events, with its number: a resumed run finds it again."""
         name = f"{flags.algo}{self.path.name[len(self.name) :]}"
-        return Path(flags.tensorboard_log or "runs") / self.name / name
+        return Path(flags.tensorboard_log) / self.name / name
 
     def again(self, flags: RunFlags) -> str:
         """The flags of ``train`` that continue the run, for messages."""
         return f"-i {shlex.quote(str(self.path))}{packages_flag(flags.gym_packages)}"
 
-    def write_config(self, args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> None:
+    def write_config(self, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:
         """Replace what :meth:`create` wrote, e.g. to make a finished run longer."""
-        _write(self.params, _dump(args, hyperparams))
+        _write_config(self.params, flags, hyperparams)
 
     def curve_hash(self) -> str:
         """SHA-256 of step, return and cost of all training episodes: runs alike have the same."""
@@ -340,21 +321,11 @@ def _lost(compromise: Any) -> None:
     os._exit(1)
 
 
-def _dump(args: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, bytes]:
-    """The configuration files, by name."""
-    fix = "write classes and calls as text, such as policy_kwargs: dict(activation_fn=nn.ReLU)"
-    files = {}
-    for name, content in (("config.yml", hyperparams), ("args.yml", args)):
-        with explained(f"{name} can hold plain data only", yaml.YAMLError, fix=fix):
-            files[name] = yaml.safe_dump(dict(content)).encode()
-    return files
-
-
-def _write(params: Path, files: Mapping[str, bytes]) -> None:
+def _write_config(params: Path, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:
     # args.yml is what makes a folder a run, so it comes last.
-    for name, content in files.items():
+    for name, content in (("config.yml", dict(hyperparams)), ("args.yml", flags.values())):
         with replacing(params / name) as file:
-            file.write(content)
+            file.write(yaml.safe_dump(content).encode())
 
 
 def latest_run(parent: Path, name: str) -> int:

@@ -30,7 +30,7 @@ from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.names import PRESETS, as_data, classes, import_class, with_classes
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
-from sb3_guard.zoo.cli.values import typed, words
+from sb3_guard.zoo.cli.values import is_data, typed, words
 
 # What a hyperparameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -86,10 +86,6 @@ def read_file(path: str | Path) -> dict[str, Any]:
         content = module.get("hyperparams", {None: None})
     if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
         raise UsageError(f"{name} must map {form}")
-    for entry, values in content.items():
-        for key in values:
-            if not isinstance(key, str):
-                raise UsageError(f"{name}: {key!r} below {entry!r} is not a name but a value")
     return content
 
 
@@ -125,7 +121,7 @@ def read_hyperparams(
     algo: str, env_id: str, conf_file: str | None = None, overrides: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """
-    The hyperparameters of an algorithm on an environment, sorted by name, not yet checked.
+    The hyperparameters of an algorithm on an environment, not yet checked.
 
     :param algo: key of the algorithm, names the shipped file
     :param env_id: its own entry is taken, with or without a version, else the first pattern that
@@ -138,14 +134,14 @@ def read_hyperparams(
     changes = preset(conf_file, algo, env_id) if conf_file in PRESETS else {}
     path = shipped_file(algo) if conf_file is None or conf_file in PRESETS else conf_file
     # An algorithm of a user has no shipped file; its own defaults serve.
-    own = conf_file is None and not Path(path).is_file()
-    content: dict[str, Any] = {"default": {}} if own else read_file(path)
+    absent = conf_file is None and not Path(path).is_file()
+    content: dict[str, Any] = {"default": {}} if absent else read_file(path)
     values = entry(content, env_id)
     if values is None:
         raise UsageError(
             f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
         )
-    return dict(sorted({**values, **changes, **(overrides or {})}.items()))
+    return {**values, **changes, **(overrides or {})}
 
 
 def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] | None:
@@ -160,17 +156,17 @@ def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] 
 
 def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
     """The hyperparameters an algorithm takes, from its constructor and those it hands on to."""
-    found = signature(algorithm, getattr(algorithm, "fixed_arguments", frozenset())).parameters
-    return {name: one for name, one in found.items() if name not in NOT_HYPERPARAMETERS}
+    arguments = signature(algorithm, getattr(algorithm, "fixed_arguments", frozenset())).parameters
+    return {name: arguments[name] for name in arguments if name not in NOT_HYPERPARAMETERS}
 
 
 def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
     """The hyperparameters that runs of an algorithm may have: name to type annotation."""
-    known = {
-        name: Any if one.annotation is one.empty else one.annotation
-        for name, one in parameters(algorithm).items()
+    hints = {
+        name: Any if parameter.annotation is parameter.empty else parameter.annotation
+        for name, parameter in parameters(algorithm).items()
     }
-    return {**known, **RUN_KEYS, **(NOISE_KEYS if "action_noise" in known else {})}
+    return {**hints, **RUN_KEYS, **(NOISE_KEYS if "action_noise" in hints else {})}
 
 
 def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -181,20 +177,25 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, a
         NaN, or a count below 1
     """
-    known = annotations(algorithm)
+    hints = annotations(algorithm)
     checked = {}
     for name, value in values.items():
         if name in FLAGS:
             raise UsageError(f"{name!r} is not a hyperparameter; use the flag {FLAGS[name]}")
-        if name not in known:
+        if name not in hints:
             raise UsageError(
-                f"{algo} has no hyperparameter {name!r}; {did_you_mean(name, sorted(known))}"
+                f"{algo} has no hyperparameter {name!r}; {did_you_mean(name, sorted(hints))}"
+            )
+        if not is_data(value):
+            raise UsageError(
+                f"hyperparameter {name}: {value!r} is more than plain data; write classes and "
+                "calls as text, such as policy_kwargs: dict(activation_fn=nn.ReLU)"
             )
         try:
-            checked[name] = typed(as_data(name, value), known[name])
+            checked[name] = typed(as_data(name, value), hints[name])
         except TypeError:
             raise UsageError(
-                f"hyperparameter {name}: {value!r} is not allowed; it must be {words(known[name])}"
+                f"hyperparameter {name}: {value!r} is not allowed; it must be {words(hints[name])}"
             ) from None
     checked.setdefault("n_envs", 1)
     checked.setdefault("n_timesteps", N_TIMESTEPS)
@@ -254,9 +255,9 @@ class Setup:
 
         :raises UsageError: one is not there, not a callback, or refuses its arguments
         """
-        found = classes("callback", self.callback)
+        callbacks = classes("callback", self.callback)
         with explained("a callback can't be made"):
-            return [cls(**kwargs) for cls, kwargs in found]
+            return [cls(**kwargs) for cls, kwargs in callbacks]
 
     def action_noise(self, actions: int) -> ActionNoise | None:
         """

@@ -1,5 +1,6 @@
 """A logger whose table is continued from a checkpoint."""
 
+import csv
 import os
 import sys
 from collections.abc import Mapping
@@ -14,6 +15,17 @@ from stable_baselines3.common.logger import (
 )
 
 
+def cut(path: str | os.PathLike[str], lines: int) -> bool:
+    """Drop all but the first lines of a file; False: there is no such file."""
+    if not os.path.exists(path):
+        return False
+    with open(path, "r+b") as file:
+        for _ in range(lines):
+            file.readline()
+        file.truncate()
+    return True
+
+
 class RunLogger(Logger):
     """
     Write a run's diagnostics to ``progress.csv``, and to the terminal and TensorBoard if wanted.
@@ -21,8 +33,7 @@ class RunLogger(Logger):
     :param folder: the run folder
     :param stdout: print each row as a table
     :param tensorboard: folder of the TensorBoard events; None: none
-    :param state: continue from what :meth:`state` said, after the rows that the file has; None: a
-        new run
+    :param state: continue from what :meth:`state` said, and cut the file there; None: a new run
     """
 
     def __init__(
@@ -35,9 +46,10 @@ class RunLogger(Logger):
         self._csv = CSVOutputFormat(os.devnull)  # which empties the file it opens
         self._csv.close()
         path = os.path.join(folder, "progress.csv")
-        goes_on = state is not None and os.path.exists(path)
+        goes_on = state is not None and cut(path, state["lines"])
         self._csv.file = open(path, "r+" if goes_on else "w+", encoding="utf-8", newline="\n")
-        goes_on = self._csv.file.seek(0, os.SEEK_END) > 0
+        self._csv.keys = next(csv.reader(self._csv.file), [])
+        self._csv.file.seek(0, os.SEEK_END)
         formats: list[KVWriter] = [self._csv]
         if stdout:
             formats.append(HumanOutputFormat(sys.stdout))
@@ -46,8 +58,6 @@ class RunLogger(Logger):
         super().__init__(os.fspath(folder), formats)
         self._iterations_before = 0
         if state is not None:
-            if goes_on:
-                self._csv.keys = list(state["columns"])
             # What training logged after the last row is written with the next one.
             self.name_to_value.update(state["values"])
             self.name_to_count.update(state["counts"])
@@ -66,9 +76,9 @@ class RunLogger(Logger):
 
         :param iterations: rollouts so far, those before a resume included
         """
+        self._csv.file.seek(0)
         return {
-            "length": self._csv.file.seek(0, os.SEEK_END),  # bytes
-            "columns": list(self._csv.keys),
+            "lines": sum(1 for line in self._csv.file),
             "values": dict(self.name_to_value),
             "counts": dict(self.name_to_count),
             "excluded": dict(self.name_to_excluded),

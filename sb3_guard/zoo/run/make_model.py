@@ -65,20 +65,20 @@ def make_model(
             {
                 "algo": algo,
                 "env": env_id,
-                "seed": -1 if seed is None else seed,
+                "seed": seed,
                 "conf_file": None if conf is None else str(conf),
-                "env_kwargs": None if env_kwargs is None else dict(env_kwargs),
+                "env_kwargs": env_kwargs,
                 "vec_env": vec_env,
                 "device": device,
-                "num_threads": -1 if num_threads is None else num_threads,
+                "num_threads": num_threads,
                 "eval_freq": -1,
                 "verbose": 0,
             },
             "make_model",
         )
-        known = annotations(algorithm(algo))
+        names = annotations(algorithm(algo))
         # What a file can't hold is not checked as data; the constructor looks at it.
-        objects = {n: v for n, v in hyperparams.items() if n in known and not is_data(v)}
+        objects = {n: v for n, v in hyperparams.items() if n in names and not is_data(v)}
         flags.hyperparams = {n: v for n, v in hyperparams.items() if n not in objects}
         experiment = Experiment(*prepare(flags))
         experiment.setup.model.update(objects)

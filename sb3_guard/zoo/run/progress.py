@@ -2,7 +2,6 @@
 
 import platform
 import subprocess
-import sys
 import time
 from contextlib import suppress
 from importlib import metadata
@@ -18,7 +17,7 @@ import sb3_guard
 from sb3_guard.algorithms.common.limits import limits_at
 from sb3_guard.common.evaluation import estimate
 from sb3_guard.common.monitor import find_monitor
-from sb3_guard.costs import read_costs, verdict
+from sb3_guard.costs import verdict
 from sb3_guard.zoo.run.folder import EPOCH, cost_words
 
 PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")
@@ -66,55 +65,40 @@ class Epochs(BaseCallback):
         super().__init__()
         self.total = total
         self.show = bar
-        self.bar: Any = None
+        self.bar = tqdm(disable=True)
         # step at which it ended, return, cost, length, and what the m limits bound: the episodes
         # of the epoch under way
         self._episodes: list[list[float]] = []
         #: the same without the step, of the last epoch in which any ended, [E, 3 + m]
         self.last = np.zeros((0, 4))
-        # highest costs of a step in the episodes under way, [n_envs, m], where limits bound those
-        self._worst: Any = 0.0
         # Taken now: what lies on disk may change while the run continues.
         self._provenance = provenance()
         #: steps after each part of the run that was to be shorter than it came to be
         self.learned: list[int] = []
-        self._seconds = 0.0  # of the processes before this one
-        self._began: float | None = None
 
     def _on_training_start(self) -> None:
-        self._began = time.monotonic()
-        if self.show:
-            self.bar = tqdm(
-                total=self.total,
-                initial=self.model.num_timesteps,
-                unit=" steps",
-                unit_scale=True,
-                dynamic_ncols=True,
-                file=sys.stderr,
-            )
-            self._describe()
+        self.bar = tqdm(
+            total=self.total,
+            initial=self.model.num_timesteps,
+            unit=" steps",
+            unit_scale=True,
+            dynamic_ncols=True,
+            disable=not self.show,
+        )
+        self._describe()
 
     def _on_rollout_start(self) -> None:
         if not isinstance(self.model, OffPolicyAlgorithm):
             self._episodes = []
 
     def _on_step(self) -> bool:
-        dones, infos, limits_worst = self.locals["dones"], self.locals["infos"], self._limits_worst
-        if limits_worst:
-            costs, _ = read_costs(infos, self._keys, zero_if_missing=True)
-            self._worst = np.maximum(self._worst, costs)
-        for i in np.flatnonzero(dones):
-            episode = infos[i].get("episode")
-            if episode is not None:
-                bounded = [episode.get(f"c_{key}", episode["c"]) for key in self._keys]
-                if limits_worst:
-                    bounded = self._worst[i].tolist()
-                of_all = [episode[name] for name in "rcl"]
-                self._episodes.append([self.model.num_timesteps, *of_all, *bounded])
-        if limits_worst:
-            self._worst[dones] = 0.0
-        if self.bar is not None:
-            self.bar.update(self.model.num_timesteps - self.bar.n)
+        bounded = "max" if self._limits_worst else "c"
+        for i in np.flatnonzero(self.locals["dones"]):
+            episode = self.locals["infos"][i]["episode"]
+            costs = [episode.get(f"{bounded}_{key}", episode[bounded]) for key in self._keys]
+            totals = [episode[name] for name in "rcl"]
+            self._episodes.append([self.model.num_timesteps, *totals, *costs])
+        self.bar.update(self.model.num_timesteps - self.bar.n)
         return True
 
     def _on_rollout_end(self) -> None:
@@ -129,12 +113,10 @@ class Epochs(BaseCallback):
             self.logger.record("rollout/physics_errors", errors)
 
     def _on_training_end(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
-            self.bar = None
+        self.bar.close()
 
     def _describe(self) -> None:
-        if self.bar is not None and len(self.last):
+        if self.show and len(self.last):
             earned, cost = self.last[:, :2].mean(axis=0)
             self.bar.set_postfix_str(
                 f"return {earned:.2f}, {cost_words({'cost': cost, 'costs': self._costs()})}, "
@@ -206,21 +188,17 @@ class Epochs(BaseCallback):
             "physics_errors": monitor.physics_errors,
             "cost_limit": limit,
             **({"limit_on": "max"} if self._limits_worst else {}),
-            "seconds": round(self._elapsed(), 3),
+            # SB3's clock, which a resumed run sets back
+            "seconds": round((time.time_ns() - self.model.start_time) / 1e9, 3),
             **({"learned": self.learned} if self.learned else {}),
             **self._provenance,
         }
-
-    def _elapsed(self) -> float:
-        return self._seconds + (0 if self._began is None else time.monotonic() - self._began)
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs to tell the same result."""
         return {
             "last": self.last,
             "episodes": self._episodes,
-            "worst": self._worst,
-            "seconds": self._elapsed(),
             "total": self.total,
             "steps": self.model.num_timesteps,
             "learned": self.learned,
@@ -228,10 +206,7 @@ class Epochs(BaseCallback):
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state`."""
-        if "worst" in state:  # else it knows no costs by key: the epoch begins anew
-            self.last, self._worst = state["last"], state["worst"]
-            self._episodes = list(state["episodes"])
-        self._seconds = state["seconds"]
+        self.last, self._episodes = state["last"], list(state["episodes"])
         self.learned = list(state["learned"])
         if state["total"] != self.total:
             self.learned.append(state["steps"])

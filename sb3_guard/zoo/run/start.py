@@ -3,22 +3,21 @@
 import dataclasses
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sb3_guard.zoo.cli.flags import HOST, IDENTITY
+from sb3_guard.zoo.cli.flags import START
 from sb3_guard.zoo.cli.names import as_data, require_named
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
-from sb3_guard.zoo.cli.values import is_data
 from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.checkpoint import is_checkpoint, read_checkpoint
+from sb3_guard.zoo.run.checkpoint import read_checkpoint
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import CHECKPOINT, RunFolder, is_run, lock, plain, run_path
-from sb3_guard.zoo.run.hyperparams import check, parameters, read_hyperparams
+from sb3_guard.zoo.run.folder import RunFolder, identity, is_run, lock, plain, run_path
+from sb3_guard.zoo.run.hyperparams import check, read_hyperparams
 from sb3_guard.zoo.run.make_envs import full_id, source_of
 from sb3_guard.zoo.run.training import Training
 
@@ -92,11 +91,11 @@ def standing(flags: RunFlags, values: Mapping[str, Any]) -> str:
     if not is_run(path):
         return "new"
     folder = RunFolder(path)
-    found = differences(folder.what(), plain({**flags.values(IDENTITY), **values}))
-    if found:
-        said = [f"{name}: {a} there, {b} here" for name, a, b in found[:3]]
+    there = identity(folder.flags(), folder.hyperparams())
+    if others := differences(there, identity(flags, values)):
+        words = [f"{name}: {a} there, {b} here" for name, a, b in others[:3]]
         raise UsageError(
-            f"{path} holds another run ({'; '.join(said)}); choose another folder with -f"
+            f"{path} holds another run ({'; '.join(words)}); choose another folder with -f"
         )
     if folder.read_result() is not None:
         return "done"
@@ -140,25 +139,14 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple
         return "none" if value in ("", None) else value
 
     # As data: files of older runs have expressions as text.
-    pairs = [
-        (name, plain(as_data(name, there.get(name))), plain(as_data(name, here.get(name))))
+    there, here = (
+        plain({name: as_data(name, value) for name, value in run.items()}) for run in (there, here)
+    )
+    return [
+        (name, shown(there.get(name)), shown(here.get(name)))
         for name in sorted({*there, *here})
+        if there.get(name) != here.get(name)
     ]
-    return [(name, shown(a), shown(b)) for name, a, b in pairs if a != b]
-
-
-def continues_run(agent: str) -> bool:
-    """
-    Whether ``-i path`` means a run to continue, rather than a model to begin from.
-
-    :raises UsageError: it is neither
-    """
-    path = Path(agent)
-    if path.is_dir() or path.name == CHECKPOINT or is_checkpoint(path):
-        return True
-    if not path.is_file():
-        raise UsageError(f"-i: there is no run folder or model {agent!r}")
-    return False
 
 
 def resume(given: RunFlags) -> int:
@@ -169,70 +157,36 @@ def resume(given: RunFlags) -> int:
     :return: exit status
     :raises UsageError: the run can't be continued, or a flag contradicts what it is
     """
-    folder = RunFolder.open(given.trained_agent)
+    folder = RunFolder(Path(given.trained_agent))
     with lock(folder.path):
-        flags, values = folder.flags(), folder.hyperparams()
-        require_named(folder.path, given.gym_packages, flags.gym_packages)
+        saved, values = folder.flags(), folder.hyperparams()
+        require_named(folder.path, given.gym_packages, saved.gym_packages)
         import_packages(given.gym_packages)
-        _refuse(differences(*_compared(given, flags, values, folder)), f"when {folder.path} began")
-        for name in {*(given.given & RunFlags.names(HOST)), "progress"}:
-            setattr(flags, name, getattr(given, name))
-        if flags.tensorboard_log and "tensorboard_log" not in given.given:
-            # A file may name any folder: it is followed to where the run has written before.
-            if not folder.events(flags).is_dir():
-                print(f"no events in {folder.events(flags)}; --tensorboard-log says where to write")
-                flags.tensorboard_log = ""
         state = read_checkpoint(folder.checkpoint)
-        defaults = defaults_of(flags.algo)
-        ours, its = (
-            {**defaults, **what, "n_timesteps": None} for what in (folder.what(), state["what"])
-        )
-        _refuse(differences(its, ours), f"of the training so far, in {folder.params}")
-        done, wanted = state["num_timesteps"], given.n_timesteps
-        if 0 < wanted < done:
+        cls, done = algorithm(saved.algo), state["num_timesteps"]
+        changed = {name: getattr(given, name) for name in {*given.given, "progress", "verbose"}}
+        changed |= {name: getattr(saved, name) for name in ("trained_agent", "hyperparams")}
+        if "env" in changed:
+            changed["env"] = full_id(given.env)
+        if 0 < given.n_timesteps < done:
             raise UsageError(
-                f"-n {wanted} is less than the {done} steps that {folder.path} has done"
+                f"-n {given.n_timesteps} is less than the {done} steps that {folder.path} has done"
             )
-        if wanted > 0:
-            values["n_timesteps"] = flags.n_timesteps = wanted
-        values = check(flags.algo, algorithm(flags.algo), values)
+        if given.n_timesteps > 0:
+            values["n_timesteps"] = given.n_timesteps
+        values = check(saved.algo, cls, {**values, **(given.hyperparams or {})})
+        flags = dataclasses.replace(saved, **changed)
+        was = {**saved.values(START), **state["identity"], "n_timesteps": None}
+        now = {**flags.values(START), **identity(flags, values), "n_timesteps": None}
+        for name, old, new in differences(was, now):
+            raise UsageError(
+                f"{name} = {new} contradicts {old}, with which {folder.path} was trained; put it "
+                "back or leave it out, or start a new run with it, without -i"
+            )
         if folder.read_result() is not None and done >= values["n_timesteps"]:
             print(
                 f"{folder.path} is finished: {done} of {values['n_timesteps']} steps; "
                 "a larger -n continues it"
             )
             return 0
-        return Training(Experiment(flags, values, folder)).train(folder, restate=True)
-
-
-def _compared(
-    given: RunFlags, saved: RunFlags, values: Mapping[str, Any], folder: RunFolder
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The settings that differ between the start of the run and now, and must not."""
-    hosted = {*RunFlags.names(HOST), "trained_agent", "n_timesteps", "hyperparams"}
-    now = {name: getattr(given, name) for name in given.given & RunFlags.names() - hosted}
-    if "env" in now:
-        now["env"] = full_id(given.env)
-    if "log_folder" in now:
-        now["log_folder"] = str(Path(given.log_folder).resolve())
-    if given.hyperparams:
-        asked = check(saved.algo, algorithm(saved.algo), {**values, **given.hyperparams})
-        now |= {name: asked[name] for name in given.hyperparams}
-    was = {**defaults_of(saved.algo), **saved.values(), **values}
-    was["log_folder"] = str(folder.path.parent.parent.resolve())
-    return {name: plain(was.get(name)) for name in now}, plain(now)
-
-
-def defaults_of(algo: str) -> dict[str, Any]:
-    """The hyperparameters that an algorithm has where a run does not say."""
-    defaults = {name: one.default for name, one in parameters(algorithm(algo)).items()}
-    return {name: plain(value) for name, value in defaults.items() if is_data(value)}
-
-
-def _refuse(found: Sequence[tuple[str, Any, Any]], when: str) -> None:
-    """Raise if something is not what it was."""
-    for name, was, now in found:
-        raise UsageError(
-            f"{name} = {now} contradicts {was} {when}; put it back or leave it out, or start a new "
-            "run with it, without -i"
-        )
+        return Training(Experiment(flags, values, folder)).train(folder)

@@ -35,24 +35,18 @@ from sb3_guard.zoo.cli.usage import (
     one_line,
     packages_flag,
 )
-from sb3_guard.zoo.run.checkpoint import (
-    Checkpoints,
-    Interrupted,
-    cut_logs,
-    read_checkpoint,
-    restore_run,
-)
+from sb3_guard.zoo.run.checkpoint import Checkpoints, Interrupted, read_checkpoint
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, is_disk_error
-from sb3_guard.zoo.run.logger import RunLogger
+from sb3_guard.zoo.run.folder import RunFolder, identity, is_disk_error
+from sb3_guard.zoo.run.logger import RunLogger, cut
 from sb3_guard.zoo.run.make_envs import (
     BAD_NUMBERS,
     PROCESS_DIED,
     evaluation_seed,
 )
 from sb3_guard.zoo.run.progress import Epochs
-from sb3_guard.zoo.run.tracking import Tracker
+from sb3_guard.zoo.run.tracking import ID, track
 
 FINAL_EPISODES = 100  # of each policy, after training
 #: what is played after training: the policy that was trained, and its most likely actions
@@ -77,18 +71,21 @@ class Training:
         self.model = experiment.make_model()
         self.env: VecEnv = self.model.get_env()  # type: ignore[assignment]
         self.evaluation: CostEvalCallback | None = None
-        self.tracker: Tracker | None = None
+        self.tracker: Any = None
         try:
             self.model.verbose = max(flags.verbose - 1, 0)
             if flags.eval_freq > 0:
                 self.evaluation = experiment.make_evaluation(self.model)
             if flags.track:
-                self.tracker = Tracker(flags, experiment.hyperparams, folder)
+                self.tracker = track(flags, experiment.hyperparams, folder)
         except BaseException:
             self.close()
             raise
 
-    def _make_callbacks(self, folder: RunFolder) -> tuple[Checkpoints, Epochs, list[BaseCallback]]:
+    def _make_callbacks(
+        self, folder: RunFolder, asked_to_stop: Callable[[], bool]
+    ) -> tuple[Checkpoints, Epochs]:
+        """The callbacks; that of the checkpoints has all others."""
         flags = self.flags
         epochs = Epochs(self.setup.n_timesteps, bar=bool(flags.progress))
         others: list[BaseCallback] = [epochs]
@@ -102,34 +99,27 @@ class Training:
             self.evaluation.log_path = str(folder.path / "evaluations")
             self.evaluation.best_model_save_path = str(folder.path)
             others.append(self.evaluation)
-        others += self.callbacks
         checkpoints = Checkpoints(
             folder.checkpoint,
-            others,
+            [*others, *self.callbacks],
+            identity=identity(flags, self.experiment.hyperparams),
             every=flags.checkpoint_every,
             log_interval=flags.log_interval,
-            what=folder.what(),
+            asked_to_stop=asked_to_stop,
         )
-        # The checkpoint comes first: it must see the others as the last rollout left them.
-        return checkpoints, epochs, [checkpoints, *others]
+        return checkpoints, epochs
 
-    def train(
-        self,
-        folder: RunFolder,
-        asked_to_stop: Callable[[], bool] = lambda: False,
-        restate: bool = False,
-    ) -> int:
+    def train(self, folder: RunFolder, asked_to_stop: Callable[[], bool] = lambda: False) -> int:
         """
         Train to the end, or to an interrupt, and report.
 
         :param folder: the run's folder, owned by this process
         :param asked_to_stop: training ends after the rollout under way when this says so
-        :param restate: state flags and hyperparameters again once training can continue
         :return: exit status: 0, or 128 + the signal's number when interrupted
         :raises UsageError: training can't continue, or the disk is full or read-only
         """
         try:
-            return self._train(folder, asked_to_stop, restate)
+            return self._train(folder, asked_to_stop)
         except PROCESS_DIED as error:
             print(flush=True)  # fails again if it is the reader of our output that is gone
             if self.flags.vec_env != "subproc":
@@ -160,37 +150,26 @@ class Training:
         if self.tracker is not None:
             self.tracker.finish()
 
-    def _train(self, folder: RunFolder, asked: Callable[[], bool], restate: bool) -> int:
+    def _train(self, folder: RunFolder, asked_to_stop: Callable[[], bool]) -> int:
         state, verbose = self.state, self.flags.verbose > 0
         if verbose:
             print(f"Run folder: {folder.path} (seed {self.flags.seed})")
         if self.tracker is not None:
-            self.tracker.remember(folder)
+            (folder.params / ID).write_text(self.tracker.id)
+            self.tracker.config.update({"folder": str(folder.path)}, allow_val_change=True)
         with explained(f"can't write to {folder.path}", OSError):
-            if state is not None:
-                cut_logs(folder.path, state)
-            goes_on = state is not None and folder.monitor.exists()
+            # Two lines of the csv are no episodes.
+            goes_on = state is not None and cut(folder.monitor, 2 + state["episodes"])
             find_monitor(self.env).log_to(folder.monitor, append=goes_on)
             logger = RunLogger(
                 folder.path,
                 stdout=self.experiment.prints_tables,
-                tensorboard=folder.events(self.flags) if self.experiment.events else None,
+                tensorboard=folder.events(self.flags) if self.flags.tensorboard_log else None,
                 state=None if state is None else state["logger"],
             )
         self.model.set_logger(logger)
-        checkpoints, epochs, callbacks = self._make_callbacks(folder)
-        checkpoints.asked = asked
-        if state is not None:
-            checkpoints.restore(state, self.model.action_noise)
-            # In this order, and only now: a result in the folder is always that of its config.
-            folder.result.unlink(missing_ok=True)
-            if restate:
-                folder.write_config(self.flags.values(), self.experiment.hyperparams)
-                checkpoints.what = folder.what()
-            restore_run(self.model, state, folder.path)
 
         def stop(number: int) -> None:
-            checkpoints.stop = True
             if verbose:
                 print(
                     "\nStopping after this rollout; Ctrl-C again stops immediately.",
@@ -199,8 +178,16 @@ class Training:
 
         began = time.monotonic()
         with interrupts(stop) as received, ExitStack() as last:
+            checkpoints, epochs = self._make_callbacks(
+                folder, lambda: bool(received) or asked_to_stop()
+            )
+            if state is not None:
+                checkpoints.restore(self.model, state)
+                # In this order, and only now: a result in the folder is always that of its config.
+                folder.result.unlink(missing_ok=True)
+                folder.write_config(self.flags, self.experiment.hyperparams)
             last.callback(epochs.on_training_end)  # leaves the terminal tidy
-            finished = self._learn(callbacks)
+            finished = self._learn(checkpoints)
             logger.close()
             result = self._finish(folder, epochs.result(), finished)
         if verbose:
@@ -261,7 +248,9 @@ class Training:
             env.close()
         return final
 
-    def _learn(self, callbacks: list[BaseCallback]) -> bool:
+    def _learn(self, checkpoints: Checkpoints) -> bool:
+        # The checkpoint comes first: it must see the others as the last rollout left them.
+        callbacks = [checkpoints, *checkpoints.others]
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.state else 0)
         interval = self.flags.log_interval
         kwargs: dict[str, Any] = {}
@@ -326,9 +315,9 @@ def summary(
     packages = packages_flag(flags.gym_packages)
     if not finished:
         lines.append(f"  continue with      {folder.again(flags)}")
-    elif (own := folder.path.name[len(folder.name) + 1 :]).isdigit():
+    elif (exp_id := folder.path.name[len(folder.name) + 1 :]).isdigit():
         lines.append(
             f"  see the agent      sb3-guard enjoy --algo {flags.algo} --env {flags.env} "
-            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {own}{packages}"
+            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {exp_id}{packages}"
         )
     return "\n".join(lines)

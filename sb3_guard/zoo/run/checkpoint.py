@@ -21,7 +21,7 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_guard.algorithms.common.reuse import Reuse
+from sb3_guard.algorithms.common.reuse import Reuse, Rollout
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.cli.usage import UsageError, explained
@@ -32,6 +32,7 @@ from sb3_guard.zoo.run.resumable import capture, restore
 MEMBER = "run_state.pkl"
 NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
+EARLIER = "earlier"  # folder beside the checkpoint: earlier rollouts, each written once
 # Checkpoints take at most this share of the time: replay buffers and earlier rollouts are large.
 LARGEST_SHARE = 0.05
 # The tensors with gSDE's noise, of all environments and of one each.
@@ -149,6 +150,7 @@ class Checkpoints(BaseCallback):
         assert isinstance(self.logger, RunLogger)
         began = time.monotonic()
         exploration = _exploration(self.model) if at_rollout else None
+        earlier = self._write_earlier()
         state = {
             "format": FORMAT,
             "identity": self.identity,
@@ -172,8 +174,7 @@ class Checkpoints(BaseCallback):
             "elapsed": (time.time_ns() - self.model.start_time) / 1e9,
             "start": self.model._num_timesteps_at_start,
             "action_noise": self.model.action_noise,
-            # Rollouts that an update uses in addition to its own.
-            "earlier": self.model.earlier if isinstance(self.model, Reuse) else [],
+            "earlier": earlier,
         }
         with replacing(self.path) as file:
             self.model.save(file)
@@ -186,8 +187,30 @@ class Checkpoints(BaseCallback):
                 if isinstance(self.model, OffPolicyAlgorithm):
                     with archive.open(REPLAY_BUFFER, "w", force_zip64=True) as member:
                         pickle.dump(self.model.replay_buffer, member, pickle.HIGHEST_PROTOCOL)
+        self._keep_earlier(earlier)
         self._last = time.monotonic()
         self._took = self._last - began
+
+    @property
+    def _earlier(self) -> Path:
+        return self.path.parent / EARLIER
+
+    def _write_earlier(self) -> list[str]:
+        """Write the earlier rollouts that an update uses and that are not yet there; their names."""
+        rollouts = self.model.earlier if isinstance(self.model, Reuse) else []
+        for rollout in rollouts:
+            self._earlier.mkdir(exist_ok=True)
+            path = self._earlier / f"{rollout.number}.pkl"
+            if not path.exists():
+                with replacing(path) as file:
+                    pickle.dump(tuple(rollout), file, pickle.HIGHEST_PROTOCOL)
+        return [f"{rollout.number}.pkl" for rollout in rollouts]
+
+    def _keep_earlier(self, names: Sequence[str]) -> None:
+        """Remove the rollouts that no checkpoint needs any longer."""
+        for file in self._earlier.glob("*"):
+            if file.name not in names:
+                file.unlink()
 
     def _evaluation_envs(self) -> list[VecEnv]:
         return [other.eval_env for other in self.others if isinstance(other, EvalCallback)]
@@ -198,6 +221,7 @@ class Checkpoints(BaseCallback):
 
         :param model: as loaded from the same checkpoint, with its environment
         :param state: as :func:`read_checkpoint` returns it
+        :raises UsageError: an earlier rollout that an update uses is absent or damaged
         """
         self._resumed = state
         self.rollouts = state["rollouts"]
@@ -209,7 +233,12 @@ class Checkpoints(BaseCallback):
             evaluation.reset()
             restore(evaluation, parts)
         if isinstance(model, Reuse):
-            model.earlier = state["earlier"]
+            with explained(f"can't read the earlier rollouts in {self._earlier}"):
+                model.earlier = [
+                    Rollout(*pickle.loads((self._earlier / name).read_bytes()))
+                    for name in state["earlier"]
+                ]
+            self._keep_earlier(state["earlier"])
         env = model.get_env()
         assert env is not None
         env.reset()

@@ -196,7 +196,7 @@ class Checkpoints(BaseCallback):
         return self.path.parent / EARLIER
 
     def _write_earlier(self) -> list[str]:
-        """Write the earlier rollouts that an update uses and that are not yet there; their names."""
+        """Write those earlier rollouts of the next update that are not yet there; names of all."""
         rollouts = self.model.earlier if isinstance(self.model, Reuse) else []
         for rollout in rollouts:
             self._earlier.mkdir(exist_ok=True)

@@ -52,18 +52,10 @@ class Report:
     :param folder: where they go; several processes may write them
     :param settings: of the study, as data
     :param packages: modules that register the environment
-    :param resumable: the folder is enough to continue the study
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        settings: Mapping[str, Any],
-        packages: Sequence[str] = (),
-        resumable: bool = False,
-    ):
+    def __init__(self, folder: Path, settings: Mapping[str, Any], packages: Sequence[str] = ()):
         self.folder, self.settings, self.packages = folder, settings, packages
-        self.resumable = resumable
         self.keys: list[str] = settings["cost_keys"]
         self.limits: list[float] | None = settings["cost_limit"]
 
@@ -132,7 +124,6 @@ class Report:
             f"Trial {trial.number} of tuning {settings['algo']} on {settings['env']}:",
             f"{self.outcome(trial)} ({steps}).",
             f"Train with: {self.command(name)}",
-            self.length(trial),
         ]
         values = {settings["env"]: trial.user_attrs["hyperparams"]}
         body = yaml.safe_dump(values, default_flow_style=None, allow_unicode=True)
@@ -145,22 +136,6 @@ class Report:
         flags += ["--gym-packages", *packages] if packages else []
         conf = str(self.folder / name)
         return shlex.join(["sb3-guard", "train", *flags, "-conf", conf])
-
-    @property
-    def _again(self) -> str:
-        """How to continue the study."""
-        if not self.resumable:
-            return "  The same command continues the study."
-        flags = ["--gym-packages", *self.packages] if self.packages else []
-        command = ["sb3-guard", "tune", "-i", str(self.folder), *flags]
-        return f"  continue with {shlex.join(command)}"
-
-    def length(self, trial: FrozenTrial) -> str:
-        """How long that command trains, and how to train as long as the trials."""
-        steps, tried = trial.user_attrs["hyperparams"]["n_timesteps"], self.settings["n_timesteps"]
-        if steps == tried:
-            return f"It trains for {steps:,} steps, as the trials did."
-        return f"It trains for {steps:,} steps; add -n {tried} to train as long as the trials."
 
     def line(self, trials: Sequence[FrozenTrial], trial: FrozenTrial) -> str:
         """A finished trial in one line."""
@@ -175,7 +150,7 @@ class Report:
         top = best(trials)
         return f"{text}; best so far" if top and top.number == trial.number else text
 
-    def summary(self, study: optuna.Study, interrupted: bool = False) -> str:
+    def summary(self, study: optuna.Study) -> str:
         """What the study came to."""
         trials = study.get_trials(deepcopy=False)
         done, top = complete(trials), best(trials)
@@ -184,8 +159,6 @@ class Report:
         if self.limits is not None:
             feasible = sum(rank(one)[0] for one in done)
             lines[0] += f"; {feasible} of {len(done)} kept the cost limit"
-        if interrupted:
-            lines.append(self._again)
         if top is None:
             return "\n".join([*lines, "  No trial went to its end: there is no best one."])
         if self.limits is not None and not rank(top)[0]:
@@ -200,7 +173,7 @@ class Report:
             lines += [f"               trial {t.number}: {self.outcome(t)}" for t in front(study)]
             lines.append(f"               {self.folder / 'pareto'}/trial_N.yml")
         lines.append(f"  train with   {self.command('best.yml')}")
-        lines.append(f"               {self.length(top)}")
+        lines.append(f"               for {self.settings['n_timesteps']:,} steps, or those of -n")
         return "\n".join(lines)
 
     def plot(self, study: optuna.Study) -> None:

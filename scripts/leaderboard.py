@@ -47,7 +47,7 @@ def planned() -> pd.DataFrame:
         algos = ALGOS if grid["algos"] == ["all"] else grid["algos"]
         seeds = " ".join(map(str, grid["seeds"]))
         steps = int(float(grid["n_timesteps"]))
-        for env_id in map(full_id, grid.get("envs") or grid["suites"]):
+        for env_id in map(full_id, grid["envs"]):
             for algo in algos:
                 command = f"sb3-guard train --algo {algo} --env {env_id} --seeds {seeds} -n {steps}"
                 row = {"suite": env_id.removesuffix("-v0") if "_" in env_id else env_id}

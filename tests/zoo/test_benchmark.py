@@ -217,15 +217,6 @@ def test_a_preset_in_a_grid_file_is_no_program(capsys, tmp_path):
 # what becomes of it
 
 
-def test_the_former_name_of_a_flag_is_read_and_not_shown(tmp_path, capsys):
-    file = tmp_path / "old.yml"
-    file.write_text("suites: [Goal_Ant_8Ghosts]")
-    named = benchmark.Flags.parse(["--suites", "Goal_Ant_8Ghosts"])
-    filed = benchmark.with_file(benchmark.Flags.parse(["--grid", str(file)]))
-    assert named.envs == filed.envs == ["Goal_Ant_8Ghosts"]
-    assert "suites" not in benchmark.Flags.parser().format_help()
-
-
 def test_runs_are_runs_of_train(tmp_path, here, capsys):
     folder = tmp_path / "grid"
     assert benchmark.main([*GRID, "--algos", "cpo", "--seeds", "3", "-f", str(folder)]) == 0
@@ -420,9 +411,9 @@ def test_bars_of_what_runs(tmp_path):
         rows.writeheader()
         rows.writerow({"time/total_timesteps": 1_500_000, "rollout/ep_rew_mean": 12.345})
     console = Console(width=200, record=True, force_terminal=True, file=open(os.devnull, "w"))
-    board = Board("logs/x", console=console)
+    board = Board("logs/x", runs, console=console)
     with board.bars:
-        board.update(runs, now=True)
+        board.update(now=True)
         console.print(board.bars)
     text = console.export_text()
     for part in (
@@ -433,7 +424,7 @@ def test_bars_of_what_runs(tmp_path):
     assert "trpo on Goal_Point" not in text
     # The same without a terminal
     console = Console(width=200, record=True, file=open(os.devnull, "w"))
-    Board("logs/x", console=console).update(runs, now=True)
+    Board("logs/x", runs, console=console).update(now=True)
     assert "cpo on Goal_Point_8Hazards-v0, seed 0: 1,500,000 steps, return 12.35" in (
         console.export_text()
     )

@@ -209,9 +209,6 @@ def tune(flags: TuneFlags, main: bool = True) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
-            warnings.filterwarnings("ignore", message="The number of trials is too small")
-            warnings.filterwarnings("ignore", module="optuna.importance")
-            warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes")
             return _tune(flags, main)
     except Exception as error:
         if isinstance(error, OSError) and is_disk_error(error):

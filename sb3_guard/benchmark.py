@@ -192,10 +192,7 @@ def benchmark(flags: Flags) -> int:
     names = {"jobs", "scheduler", "gym_packages"}
     words = flags.words(names | {"conf_file"} if is_program(flags.conf_file) else names)
     again = shlex.join(["sb3-guard", "benchmark", "-f", str(folder), *words])
-    status = run_grid(runs, folder, again, flags.jobs, flags.scheduler, flags.verbose)
-    if status == 0 and flags.verbose > 0:
-        print(f"tables and curves: sb3-guard plot {shlex.quote(str(folder))}")
-    return status
+    return run_grid(runs, folder, again, flags.jobs, flags.scheduler, flags.verbose)
 
 
 main = command(Flags, benchmark)

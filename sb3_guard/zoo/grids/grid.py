@@ -13,7 +13,6 @@ import shlex
 import socket
 import sys
 import threading
-import time
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
@@ -159,9 +158,8 @@ def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
             return "in use", one_line(error)
         except Exception as error:
             # The grid's summary says it too, so a record that can't be written is no failure.
-            with suppress(OSError), open(run.path / "error.txt", "a") as file:
-                now = time.strftime("%Y-%m-%d %H:%M:%S")
-                file.write(f"--- {now}\n{traceback.format_exc()}\n")
+            with suppress(OSError):
+                (run.path / "error.txt").write_text(traceback.format_exc())
             return "failed", one_line(error)
     return "stopped" if status else "done", ""
 

@@ -50,12 +50,12 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     :raises UsageError: something is wrong with the flags
     """
     fixed = dict(flags.hyperparams or {})
-    own = dict(fixed)
+    hyperparams = dict(fixed)
     if flags.cost_limit is not None:
         # Beside the trials: training with the result keeps the best model by the same limit.
         limit = flags.cost_limit
-        own["selection_limit"] = limit[0] if len(limit) == 1 else limit
-    how = {"hyperparams": own, "seed": flags.seeds[0], "verbose": 0, "progress": False}
+        hyperparams["selection_limit"] = limit[0] if len(limit) == 1 else limit
+    how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "verbose": 0, "progress": False}
     run, values = start.prepare(RunFlags.shared(flags, **how))
     n_timesteps = values["n_timesteps"]
     n_evaluations = flags.n_evaluations or max(n_timesteps // 100_000, 4)

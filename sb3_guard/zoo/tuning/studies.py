@@ -137,29 +137,28 @@ def database_error(error: BaseException | None) -> str | None:
 
 def repeat(study: optuna.Study, trial: FrozenTrial, most: int | None = MOST_REPEATS) -> None:
     """
-    Queue a trial again, with its hyperparameters and the seeds that are done.
+    Queue a trial again, with its hyperparameters and the seeds that are done, unless it is queued.
 
     :param trial: a copy
     :param most: give it up after so many repetitions; None: never
     """
-    trial.user_attrs.pop(WORKER, None)
-    RetryHeartbeatStaleTrialCallback(most)(study, trial)
+    history = RetryHeartbeatStaleTrialCallback.retry_history
+    # A worker may die, or lose its database, after it has queued its trial and before it fails it.
+    if not any(trial.number in history(other) for other in study.get_trials(deepcopy=False)):
+        trial.user_attrs.pop(WORKER, None)
+        RetryHeartbeatStaleTrialCallback(most)(study, trial)
 
 
 def repeat_lost_trials(study: optuna.Study, storage: Storage) -> None:
-    """Queue the trials again whose worker is gone, unless they are queued already."""
+    """Queue the trials again whose worker is gone."""
     fail_stale_trials(study)
-    trials = study.get_trials()
-    histories = map(RetryHeartbeatStaleTrialCallback.retry_history, trials)
-    repeated = {number for history in histories for number in history}
-    for trial in trials:
+    for trial in study.get_trials():
         if _is_lost(trial, storage):
             # Another worker may do the same at the same moment.
             with suppress(ValueError, UpdateFinishedTrialError):
                 if trial.state == TrialState.RUNNING:
                     study.tell(trial.number, state=TrialState.FAIL)
-                if trial.number not in repeated:
-                    repeat(study, trial)
+                repeat(study, trial)
 
 
 def _is_old(moment: datetime | None) -> bool:

@@ -83,9 +83,9 @@ class Settings:
         :raises UsageError: they are not the same
         """
 
-        def flat(one: Mapping[str, Any]) -> dict[str, Any]:
-            own = {f"hyperparams {name}": value for name, value in one["hyperparams"].items()}
-            return {**one, "hyperparams": None, **own}
+        def flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+            values = {f"hyperparams {n}": value for n, value in settings["hyperparams"].items()}
+            return {**settings, "hyperparams": None, **values}
 
         for name, old, value in differences(flat(saved), flat(asdict(self))):
             raise UsageError(
@@ -215,7 +215,7 @@ class Objective:
 
         def after(history: list[list[float]]) -> bool:
             """Report the mean of the seeds so far; whether to continue."""
-            mean[:] = np.mean([one[-1] for one in [*finished, history]], axis=0).tolist()
+            mean[:] = np.mean([rows[-1] for rows in [*finished, history]], axis=0).tolist()
             outcome = settings.outcome(mean)
             trial.set_user_attr("result", outcome)
             step = settings.n_evaluations * len(finished) + len(history)

@@ -99,7 +99,7 @@ class Flags(EvaluationFlags, TrainingFlags):
 
         algos: list[str] | None = None
         if self.algos is not None:
-            algos = [one for algo in self.algos for one in (ALGOS if algo == "all" else [algo])]
+            algos = [key for algo in self.algos for key in (ALGOS if algo == "all" else [algo])]
         if self.preset is not None:
             if self.envs is not None:
                 raise UsageError(
@@ -148,9 +148,9 @@ def show_plan(runs: Sequence["Run"]) -> None:
     """Print the runs and how far they are."""
     from sb3_guard.zoo.grids.live import summary
 
-    for one in runs:
-        print(f"{one.state:<7} {one.path}  {one.steps:,} steps")
-    print(f"{summary(runs)}; {sum(one.steps for one in runs):,} steps in all")
+    for run in runs:
+        print(f"{run.state:<7} {run.path}  {run.steps:,} steps")
+    print(f"{summary(runs)}; {sum(run.steps for run in runs):,} steps in all")
 
 
 def benchmark(flags: Flags) -> int:
@@ -175,7 +175,6 @@ def benchmark(flags: Flags) -> int:
     of_a_run.check()
 
     from sb3_guard.zoo.cli.names import is_program
-    from sb3_guard.zoo.cli.usage import packages_flag
     from sb3_guard.zoo.grids.grid import expand, run_grid, try_out
 
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
@@ -189,15 +188,11 @@ def benchmark(flags: Flags) -> int:
         # Several may begin in one folder.
         with FileLock(folder / ".grid.lock"), replacing(folder / RECORD) as file:
             file.write(yaml.safe_dump(flags.asked_for(), sort_keys=False).encode())
-    how = {name: getattr(flags, name) for name in ("jobs", "scheduler") if name in flags.given}
-    again = f"sb3-guard benchmark -f {shlex.quote(str(folder))}"
-    again += "".join(f" --{name} {value}" for name, value in how.items())
-    again += packages_flag(flags.gym_packages)
-    again += f" -conf {flags.conf_file}" if is_program(flags.conf_file) else ""
-    status = run_grid(runs, folder, again, flags.jobs, flags.scheduler, flags.verbose)
-    if status == 0 and flags.verbose > 0:
-        print(f"tables and curves: sb3-guard plot {shlex.quote(str(folder))}")
-    return status
+    # What the record leaves out, or may not name.
+    names = {"jobs", "scheduler", "gym_packages"}
+    words = flags.words(names | {"conf_file"} if is_program(flags.conf_file) else names)
+    again = shlex.join(["sb3-guard", "benchmark", "-f", str(folder), *words])
+    return run_grid(runs, folder, again, flags.jobs, flags.scheduler, flags.verbose)
 
 
 main = command(Flags, benchmark)

@@ -8,10 +8,9 @@ from typing import ClassVar, Literal
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.suites import SUITES, Suite
-from sb3_guard.envs.suites.guard import LADDER
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
-from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
+from sb3_guard.zoo.cli.usage import import_packages
 
 
 def summary(part: type) -> str:
@@ -98,7 +97,7 @@ KINDS = {
 }
 
 
-def _kind(text: str) -> str:
+def kind_of(text: str) -> str:
     """The name of a list; ``suites`` is the former name of ``environments``."""
     return "environments" if text == "suites" else text
 
@@ -109,8 +108,6 @@ class Flags(Command):
     Print environments, robots, tasks, constraints and pretrained agents.
 
     :param kind: print only this list
-    :param ladder: print ids of growing difficulty, with 1 to 16 objects of a constraint, e.g.
-        Goal_Point Hazards
     :param gym_packages: modules to import first, which register parts
     """
 
@@ -118,30 +115,16 @@ class Flags(Command):
     examples: ClassVar[str] = """examples:
   sb3-guard list
   sb3-guard list robots
-  sb3-guard list --ladder Goal_Point Hazards
 """
     kind: Literal["environments", "robots", "tasks", "constraints", "agents"] | None = flag(
-        positional=True, nargs="?", type=_kind
+        positional=True, nargs="?", type=kind_of
     )
-    ladder: list[str] | None = flag(nargs="*", metavar="TASK_ROBOT CONSTRAINT")
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
 
 
 def show_lists(flags: Flags) -> int:
     """Print what there is."""
     import_packages(flags.gym_packages)
-    if flags.ladder is not None:
-        if len(flags.ladder) != 2:
-            raise UsageError(
-                f"--ladder takes a task with a robot, and a constraint, not {len(flags.ladder)} "
-                "values: for example --ladder Goal_Point Hazards"
-            )
-        ids = [f"{flags.ladder[0]}_{num}{flags.ladder[1]}-v0" for num in LADDER]
-        with explained("--ladder", ValueError):
-            for env_id in ids:
-                Scenario.parse(env_id)
-        print("\n".join(ids))
-        return 0
     print("\n\n".join(KINDS[kind]() for kind in ([flags.kind] if flags.kind else KINDS)))
     return 0
 

@@ -2,15 +2,14 @@
 
 Every ratio is measured in one run: short slices of the full step and of a bare loop on the same
 model alternate, and the best slice of each counts; of a reset, the best of five repetitions.
-``python scripts/bench_engine.py`` prints the marks for one environment, ``--all`` a table of all,
-``--envs`` one of those whose ids match. On a machine with neighbours ``--rounds 5`` goes through
-the table five times and takes the best of each figure, which may be of different rounds: noise
-comes and goes in minutes; with ``--threads 1``, by the time that one core had, it hardly counts.
+``--envs`` names environments or patterns, ``'*'`` for all. On a machine with neighbours
+``--rounds 5`` goes through the table five times and takes the best of each figure, which may be of
+different rounds: noise comes and goes in minutes; with ``--threads 1``, by the time that one core
+had, it hardly counts.
 ``--beside PYTHON`` runs the real Safety-Gymnasium, in the environment that
 ``scripts/safety_gymnasium/check.py`` sets up, in turn with our task of the same id: on one core by
 its time, or with ``--threads 2`` ours on two, both by the clock on the wall. The best slices of 40
-steps count. ``--params '{"robot": {"mass": {"low": 0.5, "high": 2}}}'`` prints what parameters
-cost: a suite in turn with the same suite that has them.
+steps count.
 """
 
 from __future__ import annotations
@@ -18,24 +17,23 @@ from __future__ import annotations
 import argparse
 import fnmatch
 import itertools
-import json
 import math
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
 from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.envs import env_ids, env_spec
+from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.mujoco_gaps import profiling_clock
 from sb3_guard.envs.physics import ACC, FRAME_SKIP
 from sb3_guard.envs.vector_env import GuardVectorEnv
+from sb3_guard.zoo.cli.markdown import table
 
 CLOCK = profiling_clock()
 SHIPPED = CLOCK.value if CLOCK is not None else None
@@ -84,71 +82,32 @@ def stepper(env: GuardVecEnv) -> Callable[[], int]:
     return step
 
 
-def batch_rates(
+def bare_stepper(engine: Engine) -> Callable[[], int]:
+    """Four steps of nothing but the physics of an engine."""
+    batch = Batch(engine.model, nsim=engine.num_envs, nthread=engine.num_threads, persistent=True)
+    batch.state[:] = engine.batch.state
+    low, high = engine.model.actuator_ctrlrange.T
+    shape = (64, engine.num_envs, engine.model.nu)
+    controls = itertools.cycle(np.random.default_rng(0).uniform(low, high, shape))
+    control = batch.bind("ctrl")
+
+    def step() -> int:
+        for _ in range(4):
+            control[:] = next(controls)
+            batch.step(nstep=engine.batch.frame_skip)
+        return 4 * engine.num_envs
+
+    return step
+
+
+def rates(
     env_id: str, n: int, seconds: float, slices: int, threads: int | None = None
 ) -> dict[str, float]:
-    """Full vector step against a bare loop of the same Batch, N = n."""
-    scenario = env_spec(env_id).kwargs["scenario"]
-    full = GuardVecEnv(scenario, n, num_threads=threads)
-    step_full = stepper(full)
-    engine = full.envs.engine
-    bare = Batch(engine.model, nsim=n, nthread=engine.num_threads, persistent=True)
-    bare.state[:] = engine.batch.state
-    low, high = engine.model.actuator_ctrlrange.T
-    ctrls = np.random.default_rng(0).uniform(low, high, (64, n, engine.model.nu))
-    ctrl = bare.bind("ctrl")
-    turn = iter(range(10**12))
-
-    def step_bare() -> int:
-        for _ in range(4):
-            ctrl[:] = ctrls[next(turn) % 64]
-            bare.step(nstep=engine.batch.frame_skip)
-        return 4 * n
-
+    """Full vector step against a bare loop on the same model, N = n."""
+    env = GuardVecEnv(env_spec(env_id).kwargs["scenario"], n, num_threads=threads)
+    functions = {"full": stepper(env), "bare": bare_stepper(env.envs.engine)}
     clock = time.process_time if threads == 1 else time.perf_counter
-    return best({"full": step_full, "bare": step_bare}, seconds, slices, clock)
-
-
-def param_rates(
-    env_id: str,
-    params: dict[str, Any],
-    n: int,
-    seconds: float,
-    slices: int,
-    threads: int | None = None,
-) -> dict[str, float]:
-    """Full vector steps of a suite as it is and with other parameters, N = n."""
-    scenario = env_spec(env_id).kwargs["scenario"]
-    usual, changed = (
-        stepper(GuardVecEnv(scenario, n, num_threads=threads, **kwargs)) for kwargs in ({}, params)
-    )
-    clock = time.process_time if threads == 1 else time.perf_counter
-    return best({"as it is": usual, "changed": changed}, seconds, slices, clock)
-
-
-def single_rates(env_id: str, seconds: float, slices: int) -> dict[str, float]:
-    """The lone environment against a bare mj_step loop."""
-    env = gymnasium.make(env_id)
-    env.reset(seed=0)
-    model = env.unwrapped.engine.model
-    data = mujoco.MjData(model)
-    actions = np.random.default_rng(0).uniform(-1, 1, (64, *env.action_space.shape))
-    turn = iter(range(10**12))
-
-    def step_full() -> int:
-        for _ in range(16):
-            *_, truncated, _ = env.step(actions[next(turn) % 64])
-            if truncated:
-                env.reset()
-        return 16
-
-    def step_bare() -> int:
-        for _ in range(16):
-            data.ctrl[:] = actions[next(turn) % 64]
-            mujoco.mj_step(model, data, nstep=env.unwrapped.engine.batch.frame_skip)
-        return 16
-
-    return best({"full": step_full, "bare": step_bare}, seconds, slices)
+    return best(functions, seconds, slices, clock)
 
 
 def reset_seconds(env_id: str, n: int = 100, repeats: int = 5) -> float:
@@ -226,81 +185,43 @@ def beside(python: str, env_id: str, threads: int = 1, turns: int = 5) -> None:
     print(f"times as many {ours / theirs:>6.1f} {own / whole:>7.1f}")
 
 
-def print_table(suites: list[str], args: argparse.Namespace) -> None:
-    """Print the marks of several suites, the best of each over the rounds."""
-    full, bare = dict.fromkeys(suites, 0.0), dict.fromkeys(suites, 0.0)
-    reset = dict.fromkeys(suites, math.inf)
-    try:
-        for turn in range(args.rounds):
-            for i, env_id in enumerate(suites, 1):
-                print(f"\rround {turn + 1}, {i} of {len(suites)} ", end="", file=sys.stderr)
-                rates = batch_rates(env_id, 30, args.seconds / 6, args.slices, args.threads)
-                full[env_id] = max(full[env_id], rates["full"])
-                bare[env_id] = max(bare[env_id], rates["bare"])
-                reset[env_id] = min(reset[env_id], 1e3 * reset_seconds(env_id))
-        print(file=sys.stderr)
-    except KeyboardInterrupt:
-        print("\ninterrupted; so far:", file=sys.stderr)
-        suites = [i for i in suites if reset[i] < math.inf]
-    print("| environment | env-steps/s | of bare physics | reset, ms |\n|---|---|---|---|")
-    for i in suites:
-        print(f"| {i} | {full[i]:,.0f} | {full[i] / bare[i]:.2f} | {reset[i]:.2f} |")
+def print_table(env_ids: list[str], args: argparse.Namespace) -> None:
+    """Print the marks of environments, the best of each over the rounds."""
+    full, bare = dict.fromkeys(env_ids, 0.0), dict.fromkeys(env_ids, 0.0)
+    reset = dict.fromkeys(env_ids, math.inf)
+    for turn in range(args.rounds):
+        for i, env_id in enumerate(env_ids, 1):
+            print(f"\rround {turn + 1}, {i} of {len(env_ids)} ", end="", file=sys.stderr)
+            measured = rates(env_id, 30, args.seconds, args.slices, args.threads)
+            full[env_id] = max(full[env_id], measured["full"])
+            bare[env_id] = max(bare[env_id], measured["bare"])
+            reset[env_id] = min(reset[env_id], 1e3 * reset_seconds(env_id))
+    print(file=sys.stderr)
+    rows = [[i, f"{full[i]:,.0f}", f"{full[i] / bare[i]:.2f}", f"{reset[i]:.2f}"] for i in env_ids]
+    print(table(["environment", "env-steps/s", "of bare physics", "reset, ms"], rows))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument(
-        "--env", default="Goal_Point_8Hazards-v0", help="the environment to measure"
-    )
-    table = parser.add_mutually_exclusive_group()
-    table.add_argument("--all", action="store_true", help="a table of all environments at N = 30")
-    table.add_argument(
-        "--envs",
-        nargs="+",
-        metavar="PATTERN",
-        help="a table of the environments whose ids match, such as '*_Arm?_*'",
-    )
-    table.add_argument("--beside", metavar="PYTHON", help="that Python's Safety-Gymnasium instead")
-    table.add_argument(
-        "--params",
-        type=json.loads,
-        metavar="JSON",
-        help="the environment compared with itself with these",
-    )
-    parser.add_argument("--seconds", type=float, default=6.0, help="time for each figure")
+        "--envs", nargs="+", metavar="PATTERN", default=["Goal_Point_8Hazards-v0"],
+        help="environments whose ids match, such as '*_Arm?_*' (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--beside", metavar="PYTHON", help="that Python's Safety-Gymnasium instead")
+    parser.add_argument("--seconds", type=float, default=1.0, help="time for each environment")
     parser.add_argument("--slices", type=int, default=20, help="slices that alternate")
-    parser.add_argument("--rounds", type=int, default=1, help="times through a table")
+    parser.add_argument("--rounds", type=int, default=1, help="times through the table")
     parser.add_argument("--threads", type=int, help="1: by the time that one core had for it")
     args = parser.parse_args()
+    matching = [i for i in env_ids() if any(fnmatch.fnmatch(i, p) for p in args.envs)]
+    if not matching:
+        parser.error(f"no id matches {' '.join(args.envs)}; ids look like Goal_Point_8Hazards-v0")
     if args.beside:
-        return beside(args.beside, args.env, args.threads or 1)
-    if args.params:
-        for n in (1, 30):
-            rates = param_rates(args.env, args.params, n, args.seconds, args.slices, args.threads)
-            usual, changed = rates.values()
-            print(f"{args.env}, N = {n}: {usual:,.0f} steps/s; with params {changed:,.0f}, "
-                  f"{100 * (1 - changed / usual):.1f} % fewer")  # fmt: skip
+        for env_id in matching:
+            beside(args.beside, env_id, args.threads or 1)
         return
-    patterns = ["*"] if args.all else args.envs or []
-    if args.rounds < 1:
-        parser.error(f"--rounds {args.rounds} must be at least 1")
-    suites = [i for i in env_ids() if any(fnmatch.fnmatch(i, p) for p in patterns)]
-    if args.rounds > 1 and not patterns:
-        parser.error("--rounds goes with --all or --envs")
-    if patterns and not suites:
-        parser.error(f"no id matches {' '.join(patterns)}; ids look like {args.env}")
     print(f"mujoco {mujoco.__version__}, stage {ACC}, {FRAME_SKIP} physics steps per control step")
-    if suites:
-        print_table(suites, args)
-        return
-    print(f"{args.env}: env-steps/s, full step and bare loop, and their ratio")
-    rates = single_rates(args.env, args.seconds, args.slices)
-    for n in (1, 30, 128):
-        if n > 1:
-            rates = batch_rates(args.env, n, args.seconds, args.slices, args.threads)
-        ratio = rates["full"] / rates["bare"]
-        print(f"N = {n:>3}  {rates['full']:>9,.0f}  {rates['bare']:>9,.0f}  {ratio:.2f}")
-    print(f"reset {1e3 * reset_seconds(args.env):.2f} ms, layout, state and first observation")
+    print_table(matching, args)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the commands do; read 
 import bench_engine
 import numpy as np
 import torch
-from mujoco.batch import Batch
 from sb3_contrib import TQC
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -44,20 +43,6 @@ BESIDE: dict[type[BaseAlgorithm], dict[str, float | None]] = {
 ON_POLICY = [key for key, cls in ALGORITHMS.items() if issubclass(cls, OnPolicyAlgorithm)]
 # Seconds an update may take on two free cores.
 MARKS = {"trpo": 2.5, "cpo": 3.5}
-
-
-def bare_rate(engine: Any, seconds: float = 2.0) -> float:
-    """Env-steps/s of a bare physics loop on the engine's model, with MuJoCo's clock as shipped."""
-    batch = Batch(engine.model, nsim=N_ENVS, nthread=engine.num_threads, persistent=True)
-    batch.bind("ctrl")[:] = np.random.default_rng(0).uniform(-1, 1, (N_ENVS, engine.model.nu))
-
-    def step() -> int:
-        batch.step(nstep=engine.batch.frame_skip)
-        return N_ENVS
-
-    rate = bench_engine.best({"bare": step}, seconds, slices=10)["bare"]
-    bench_engine.as_shipped(False)
-    return rate
 
 
 def start_seconds(*arguments: str) -> float:
@@ -148,7 +133,9 @@ def main() -> None:
             if "actor" not in model.timing:  # first order: one loop trains both
                 times["actor"] = time.perf_counter() - started - times["collect"]
             best = {k: min(best.get(k, 1e9), v) for k, v in times.items()}
-        bare = bare_rate(env.unwrapped.envs.engine)
+        step = bench_engine.bare_stepper(env.unwrapped.envs.engine)
+        bare = bench_engine.best({"bare": step}, seconds=2.0, slices=10)["bare"]
+        bench_engine.as_shipped(False)
         rate = N_ENVS * N_STEPS / best["collect"]
         total = sum(best.values())
         minutes = 6e6 / (N_ENVS * N_STEPS) * total / 60

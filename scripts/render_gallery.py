@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -53,24 +54,26 @@ FILES = {"file_go1": ("WalkingGo1-v0", 1.6), "file_yam": ("ReachingYam-v0", 2.2)
 ZOOM = {"Arm3": 1.0, "Arm6": 1.0, "Humanoid": 1.3, "Hopper": 1.4}
 
 
+def scenes() -> Iterator[tuple[str, str, str, float]]:
+    """Stem, environment, camera and zoom of each robot, near, and each task and constraint."""
+    for robot in guard(ROBOTS):
+        yield f"robot_{robot.lower()}", f"Goal_{robot}_8Hazards-v0", "track", ZOOM.get(robot, 1.6)
+    for task in guard(TASKS):
+        yield f"task_{task.lower()}", f"{task}_Point_8Hazards-v0", "fixed", 1.0
+    for constraint in guard(CONSTRAINTS):
+        yield f"constraint_{constraint.lower()}", f"Goal_Point_8{constraint}-v0", "fixed", 1.0
+
+
 def picture(
-    name: str,
-    path: Path,
-    camera: str | None,
-    steps: int,
-    seed: int,
-    zoom: float = 1.0,
-    **params: Any,
+    env_id: str, path: Path, camera: str | None, seed: int, zoom: float = 1.0, **params: Any
 ) -> None:
-    """Write a picture of an environment after some random steps: the site shows it at half size."""
+    """Write a picture of an environment after a random step: the site shows it at half size."""
     # The speeds that MuJoCo writes into a picture have the same size in all: small in large ones.
-    width, height = (360, 300) if "Velocity" in name else (720, 600)
+    width, height = (360, 300) if "Velocity" in env_id else (720, 600)
     window = {"width": round(width * zoom), "height": round(height * zoom), "camera": camera}
-    env = GuardVectorEnv(1, name, render_mode="rgb_array", **window, **params)
+    env = GuardVectorEnv(1, env_id, render_mode="rgb_array", **window, **params)
     env.reset(seed=seed)
-    rng = np.random.default_rng(seed)
-    for _ in range(steps):
-        env.step(rng.uniform(-0.2, 0.2, env.action_space.shape))
+    env.step(np.random.default_rng(seed).uniform(-0.2, 0.2, env.action_space.shape))
     (frame,) = env.render() or ()
     env.close()
     left, top = (frame.shape[1] - width) // 2, (frame.shape[0] - height) // 2
@@ -173,19 +176,6 @@ def write_clip(model: BaseAlgorithm, env: VecEnv, path: Path, deterministic: boo
     print(f"{path} {path.stat().st_size / 1024:.0f} KiB", flush=True)
 
 
-def clips(output: Path, folder: str, seed: int) -> None:
-    """A clip of each robot, near, and of each task and constraint, from above."""
-    for robot in guard(ROBOTS):
-        path, zoom = output / f"robot_{robot.lower()}.webp", ZOOM.get(robot, 1.6)
-        clip(f"Goal_{robot}_8Hazards-v0", path, "track", folder, seed, zoom)
-    for task in guard(TASKS):
-        path = output / f"task_{task.lower()}.webp"
-        clip(f"{task}_Point_8Hazards-v0", path, "fixed", folder, seed)
-    for constraint in guard(CONSTRAINTS):
-        path = output / f"constraint_{constraint.lower()}.webp"
-        clip(f"Goal_Point_8{constraint}-v0", path, "fixed", folder, seed)
-
-
 def file_clips(output: Path, folder: str, seed: int) -> None:
     """A clip and a still of each robot of another package with a task in examples/robots.py."""
     sys.path.append(str(Path(__file__).parents[1] / "examples"))
@@ -225,25 +215,17 @@ def main() -> None:
         seed = typical() if args.film_seed is None else args.film_seed
         animation(args.output / "trained.gif", seed)
     if args.only in (None, "clips"):
-        clips(args.output, args.agents, args.seed)
+        for stem, env_id, camera, zoom in scenes():
+            clip(env_id, args.output / f"{stem}.webp", camera, args.agents, args.seed, zoom)
     if args.only in (None, "files"):
         file_clips(args.output, args.agents, args.seed)
-    if args.only in ("clips", "files", "trained"):
-        return
-    for robot in guard(ROBOTS):
-        path = args.output / f"robot_{robot.lower()}.png"
-        zoom = ZOOM.get(robot, 1.6)
-        picture(f"Goal_{robot}_8Hazards", path, "track", 1, args.seed, zoom)
-    for task in guard(TASKS):
-        path = args.output / f"task_{task.lower()}.png"
-        picture(f"{task}_Point_8Hazards", path, "fixed", 1, args.seed)
-    for constraint in guard(CONSTRAINTS):
-        path = args.output / f"constraint_{constraint.lower()}.png"
-        picture(f"Goal_Point_8{constraint}", path, "fixed", 1, args.seed)
-    for stem, env_id in SAFETY.items():
-        picture(env_id, args.output / f"{stem}.png", None, 1, args.seed)
-    for stem, (env_id, params) in VARIANTS.items():
-        picture(env_id, args.output / f"{stem}.png", "fixed", 1, args.seed, **params)
+    if args.only in (None, "pictures"):
+        for stem, env_id, camera, zoom in scenes():
+            picture(env_id, args.output / f"{stem}.png", camera, args.seed, zoom)
+        for stem, env_id in SAFETY.items():
+            picture(env_id, args.output / f"{stem}.png", None, args.seed)
+        for stem, (env_id, params) in VARIANTS.items():
+            picture(env_id, args.output / f"{stem}.png", "fixed", args.seed, **params)
 
 
 if __name__ == "__main__":

@@ -15,9 +15,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from sb3_guard.envs import Scenario, register_robot
+from sb3_guard.common.native import GuardVecEnv
+from sb3_guard.envs import register_robot
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.zoo.cli.markdown import table
@@ -89,24 +88,6 @@ def path(source: Source) -> Path:
     return folder / source.file
 
 
-def rates(engines: Mapping[str, Engine], slices: int = 5, steps: int = 40) -> dict[str, float]:
-    """Steps per second of each engine: the best of alternating slices."""
-    best = dict.fromkeys(engines, 0.0)
-    rng = np.random.default_rng(0)
-    for engine in engines.values():
-        engine.reset(np.arange(engine.num_envs))
-    for _ in range(slices):
-        for name, engine in engines.items():
-            low, high = engine.robot.action_range
-            actions = rng.uniform(low, high, (engine.num_envs, engine.robot.action_size))
-            began = time.thread_time()
-            for _ in range(steps):
-                engine.step(actions)
-            rate = steps * engine.num_envs / (time.thread_time() - began)
-            best[name] = max(best[name], rate)
-    return best
-
-
 def observed(engine: Engine, name: str) -> str:
     """The robot's observations in words, those of many sensors by their number."""
     names = [n for n in engine.observation_layout if n not in ("goal_compass", "hazards_lidar")]
@@ -123,13 +104,15 @@ def observed(engine: Engine, name: str) -> str:
 
 def main() -> None:
     """Write the table."""
+    import bench_engine  # beside this file, which tests run for its SOURCES
+
     rows = []
     for name, source in SOURCES.items():
         register_robot(name, xml=path(source), **source.needed)
-        suite = Scenario.parse(f"Goal_{name}_8Hazards")
-        point = Scenario.parse("Goal_Point_8Hazards").build(30, 1)
-        engine = suite.build(30, 1)
-        speed = rates({"Point": point, name: engine})
+        envs = {r: GuardVecEnv(f"Goal_{r}_8Hazards", 30, num_threads=1) for r in ("Point", name)}
+        engine = envs[name].envs.engine
+        steps = {robot: bench_engine.stepper(env) for robot, env in envs.items()}
+        speed = bench_engine.best(steps, seconds=2.0, slices=10, clock=time.thread_time)
         stated = ", ".join(f"`{key}={value!r}`" for key, value in source.needed.items())
         where = (source.wheel or "gymnasium").partition("==")[0]
         rows.append(

@@ -64,9 +64,7 @@ def test_a_family_of_its_own_is_known_everywhere(mazes, capsys, tmp_path):
     assert GuardVectorEnv(2, "MazeSmall-v1").max_episode_steps == 5
     assert GuardVectorEnv(2, "MazeSmall-v0").max_episode_steps == 1000
     assert listing.main(["environments"]) == 0
-    names = capsys.readouterr().out
-    assert "MazeSmall-v1" in names
-    assert listing.main(["suites"]) == 0 and capsys.readouterr().out == names
+    assert "MazeSmall-v1" in capsys.readouterr().out
     assert show.main(["MazeSmall-v0", "-o", str(tmp_path / "maze.png")]) == 0
     with pytest.raises(ValueError, match="'MazeLarge' is not here"):
         Scenario.parse("MazeLarge")

@@ -1,6 +1,7 @@
 """Layouts and random episodes of ours beside those recorded of Safety-Gymnasium 1.0.0.
 
-``scripts/safety_gymnasium/record_more.py`` records them.
+Recorded are the layouts of 400 new episodes, of Button1 and Button2 of 1,000, and return, cost and
+length of 200 random episodes of at most 100 steps.
 """
 
 from __future__ import annotations

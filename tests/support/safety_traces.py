@@ -1,6 +1,13 @@
 """Traces of Safety-Gymnasium 1.0.0, and our simulations in the states that they hold.
 
-``scripts/safety_gymnasium/record.py`` and ``record_more.py`` say what is recorded.
+Each file of ``tests/data/safety_gymnasium`` but two holds the states of a navigation id and what
+one step made of each, with MuJoCo 2.3.3. The robot was placed next to an object and driven at it,
+so that every event that the task knows happens; other states are random. After the physics of a
+step, before rewards, costs and observations are computed from it, the state was rounded to a grid
+and the start of the solver, ``qacc_warmstart``, set to 0: positions and velocities in the files are
+exact. Observations have 21 bits. ``velocity.npz`` has the same of the velocity tasks, with 24 bits,
+and the states in which episodes of ten seeds begin; ``safety_distributions`` reads the other one.
+docs/fidelity.md names the commit of the scripts that recorded them.
 """
 
 from __future__ import annotations
@@ -147,7 +154,7 @@ class Trace:
 def velocity_steps(name: str) -> tuple[dict[str, Any], Any, Outcome]:
     """One step of ours from each recorded state of ``Safety<name>Velocity-v1``.
 
-    :return: what was recorded (``scripts/safety_gymnasium/record_more.py``), our qpos after the
+    :return: what was recorded, our qpos after the
         step, [n, nq], and our outcomes
     """
     recorded = {

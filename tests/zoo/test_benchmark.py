@@ -420,9 +420,9 @@ def test_bars_of_what_runs(tmp_path):
         rows.writeheader()
         rows.writerow({"time/total_timesteps": 1_500_000, "rollout/ep_rew_mean": 12.345})
     console = Console(width=200, record=True, force_terminal=True, file=open(os.devnull, "w"))
-    board = Board("logs/x", console=console)
+    board = Board("logs/x", runs, console=console)
     with board.bars:
-        board.update(runs, now=True)
+        board.update(now=True)
         console.print(board.bars)
     text = console.export_text()
     for part in (
@@ -433,7 +433,7 @@ def test_bars_of_what_runs(tmp_path):
     assert "trpo on Goal_Point" not in text
     # The same without a terminal
     console = Console(width=200, record=True, file=open(os.devnull, "w"))
-    Board("logs/x", console=console).update(runs, now=True)
+    Board("logs/x", runs, console=console).update(now=True)
     assert "cpo on Goal_Point_8Hazards-v0, seed 0: 1,500,000 steps, return 12.35" in (
         console.export_text()
     )

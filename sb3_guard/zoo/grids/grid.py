@@ -13,7 +13,6 @@ import shlex
 import socket
 import sys
 import threading
-import time
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
@@ -86,27 +85,26 @@ def expand(
         than the one that belongs there
     """
     given = flags.hyperparams or {}
-    known = {
-        algo: annotations(algorithm(algo)) for algo in dict.fromkeys(algo for _, algo in pairs)
-    }
-    every = sorted(set[str]().union(*known.values()))
-    for name in given.keys() - every:
-        hint = did_you_mean(name, every)
+    taken = {algo: annotations(algorithm(algo)) for _, algo in pairs}
+    names = sorted(set[str]().union(*taken.values()))
+    for name in given.keys() - names:
+        hint = did_you_mean(name, names)
         raise UsageError(f"none of the algorithms has a hyperparameter {name!r}; {hint}")
     first = {}
     flags = replace(flags, progress=False, num_threads=max(flags.num_threads, 1))
     for env_id, algo in pairs:
-        own = {name: value for name, value in given.items() if name in known[algo]}
-        mine = replace(flags, env=env_id, algo=algo, seed=0, hyperparams=own or None)
-        one, values = prepare(mine)
-        one.n_timesteps = values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
-        first[one.env, algo] = one, values, sorted(given.keys() - own.keys())
-    runs = []
-    for seed in dict.fromkeys(seeds):
-        for one, values, ignored in first.values():
-            mine = replace(one, seed=seed)
-            runs.append(Run(mine, values, ignored, standing(mine, values)))
-    return runs
+        hyperparams = {name: value for name, value in given.items() if name in taken[algo]}
+        run, values = prepare(
+            replace(flags, env=env_id, algo=algo, seed=0, hyperparams=hyperparams or None)
+        )
+        run.n_timesteps = values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
+        first[run.env, algo] = run, values, sorted(given.keys() - hyperparams.keys())
+    seeded = [
+        (replace(run, seed=seed), values, ignored)
+        for seed in dict.fromkeys(seeds)
+        for run, values, ignored in first.values()
+    ]
+    return [Run(run, values, ignored, standing(run, values)) for run, values, ignored in seeded]
 
 
 def try_out(runs: Sequence[Run]) -> None:
@@ -160,9 +158,8 @@ def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
             return "in use", one_line(error)
         except Exception as error:
             # The grid's summary says it too, so a record that can't be written is no failure.
-            with suppress(OSError), open(run.path / "error.txt", "a") as file:
-                now = time.strftime("%Y-%m-%d %H:%M:%S")
-                file.write(f"--- {now}\n{traceback.format_exc()}\n")
+            with suppress(OSError):
+                (run.path / "error.txt").write_text(traceback.format_exc())
             return "failed", one_line(error)
     return "stopped" if status else "done", ""
 
@@ -260,7 +257,7 @@ def execute(runs: Sequence[Run], executor: Executor, stop: Path, board: Board) -
                     why = one_line(error).rstrip(".")
                     raise UsageError(f"a worker or scheduler is gone: {why}") from error
                 board.note(run)
-            board.update(runs)
+            board.update()
     if received:
         return 128 + received[0]
     return int(any(run.state != "done" for run in runs))
@@ -289,7 +286,7 @@ def run_grid(
     :raises UsageError: a worker or the scheduler is gone
     """
     status, stop_file = 0, folder / stop
-    board = Board(str(folder), verbose)
+    board = Board(str(folder), runs, verbose)
     todo = sum(run.state != "done" for run in runs)
     with board.bars:
         for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():

@@ -5,48 +5,33 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import pandas as pd
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sb3_guard.zoo.run.folder import RunFolder, cost_words
+
+if TYPE_CHECKING:
+    from sb3_guard.zoo.grids.grid import Run
 
 REFRESH = 1.0  # seconds between looks into the folders
 LINE_EVERY = 60.0  # seconds between plain lines of progress
 LOGGED = {
-    "steps": "time/total_timesteps",
-    "return": "rollout/ep_rew_mean",
-    "cost": "rollout/ep_cost_mean",
+    "time/total_timesteps": "steps",
+    "rollout/ep_rew_mean": "return",
+    "rollout/ep_cost_mean": "cost",
 }
-
-
-class Run(Protocol):
-    """What is shown of a run of a grid."""
-
-    state: str  # such as waiting, running or done
-    error: str  # what went wrong, in a line
-
-    @property
-    def path(self) -> Path:
-        """Its folder."""
-
-    @property
-    def steps(self) -> int:
-        """Its length, environment steps."""
 
 
 def read_progress(run: Path) -> dict[str, float]:
     """The last ``steps``, ``return`` and ``cost`` that a run has logged, whoever writes to it."""
     last = {"steps": 0.0}
-    with suppress(OSError, ValueError):  # absent, empty, or half written
+    with suppress(OSError, ValueError, IndexError):  # absent, empty, or half written
         table = pd.read_csv(run / "progress.csv", on_bad_lines="skip", encoding_errors="replace")
-        for name, column in LOGGED.items():
-            if column in table:
-                known = pd.to_numeric(table[column], errors="coerce").dropna()
-                if len(known):
-                    last[name] = float(known.iloc[-1])
+        table = table.rename(columns=LOGGED).filter(items=[*LOGGED.values()])
+        last |= table.apply(pd.to_numeric, errors="coerce").ffill().iloc[-1].dropna().to_dict()
     return last
 
 
@@ -55,27 +40,32 @@ class Board:
     Show how a grid goes; ``bars`` are shown within their ``with`` block.
 
     :param title: its folder
+    :param runs: of the grid, whose states follow
     :param verbose: 0: say nothing
     :param console: where to; None: stdout
     """
 
-    def __init__(self, title: str, verbose: int = 1, console: Console | None = None):
+    def __init__(
+        self, title: str, runs: "Sequence[Run]", verbose: int = 1, console: Console | None = None
+    ):
         self.console = console or Console(quiet=verbose == 0, highlight=False)
-        self.title = title
+        self.title, self.runs = title, runs
         columns = ("[progress.description]{task.description}", "{task.fields[reached]}")
         self.bars = Progress(
             TextColumn(columns[0]), BarColumn(24), TextColumn(columns[1]), TimeRemainingColumn(),
             console=self.console, disable=not self.console.is_terminal, speed_estimate_period=600,
         )  # fmt: skip
-        self._total = self.bars.add_task("", reached="")
-        self._tasks: dict[Run, TaskID] = {}
+        self._total = self.bars.add_task("", total=sum(run.steps for run in runs), reached="")
+        self._tasks = [
+            self.bars.add_task(str(run), total=run.steps, visible=False, reached="") for run in runs
+        ]
         self._looked = self._line = time.monotonic()
 
     def say(self, text: str) -> None:
         """Print a line, above the bars if there are any."""
         self.console.print(text, markup=False, soft_wrap=True)
 
-    def note(self, run: Run) -> None:
+    def note(self, run: "Run") -> None:
         """Say what has become of a run."""
         line = f"{time.strftime('%H:%M:%S')}  {run.state}: {run}"
         if run.state == "done":
@@ -86,7 +76,7 @@ class Board:
             line += f": {run.error}"
         self.say(line)
 
-    def update(self, runs: Sequence[Run], now: bool = False) -> None:
+    def update(self, now: bool = False) -> None:
         """
         Look into the folders and show what is there, but not too often.
 
@@ -96,34 +86,30 @@ class Board:
         if clock - self._looked < REFRESH and not now:
             return
         self._looked = clock
-        for run in runs:
+        for run in self.runs:
             if run.state in ("waiting", "running"):
                 run.state = "running" if (run.path / ".lock").exists() else "waiting"
         if not self.bars.disable:
-            reached = sum(self._show(run) for run in runs)
-            title = f"{self.title}: {summary(runs)}"
-            total = sum(run.steps for run in runs)
-            self.bars.update(self._total, completed=reached, total=total, description=title)
+            self._show()
         elif clock - self._line > LINE_EVERY or now:
             self._line = clock
-            self.say(f"{time.strftime('%H:%M:%S')}  {summary(runs)}")
-            for run in runs:
+            self.say(f"{time.strftime('%H:%M:%S')}  {summary(self.runs)}")
+            for run in self.runs:
                 if run.state == "running":
-                    last = read_progress(run.path)
-                    self.say(f"          {run}: {reached_words(last)}")
+                    self.say(f"          {run}: {reached_words(read_progress(run.path))}")
 
-    def _show(self, run: Run) -> float:
-        """A bar for a run while it is under way; how many steps it has done."""
-        last = {"steps": float(run.steps)} if run.state == "done" else read_progress(run.path)
-        shown = run.state == "running"
-        if run not in self._tasks:
-            self._tasks[run] = self.bars.add_task(
-                str(run), total=run.steps, visible=False, reached=""
-            )
-        self.bars.update(
-            self._tasks[run], completed=last["steps"], visible=shown, reached=reached_words(last)
-        )
-        return last["steps"]
+    def _show(self) -> None:
+        """A bar for the grid, and one for each run that is under way."""
+        reached = 0.0
+        for task, run in zip(self._tasks, self.runs, strict=True):
+            last = {"steps": float(run.steps)} if run.state == "done" else read_progress(run.path)
+            reached += last["steps"]
+            self.bars.update(
+                task, completed=last["steps"], visible=run.state == "running",
+                reached=reached_words(last),
+            )  # fmt: skip
+        title = f"{self.title}: {summary(self.runs)}"
+        self.bars.update(self._total, completed=reached, description=title)
 
 
 def reached_words(last: Mapping[str, float]) -> str:
@@ -132,7 +118,7 @@ def reached_words(last: Mapping[str, float]) -> str:
     return ", ".join(words + [f"{n} {last[n]:.2f}" for n in ("return", "cost") if n in last])
 
 
-def summary(runs: Sequence[Run]) -> str:
+def summary(runs: "Sequence[Run]") -> str:
     """The grid on one line: how many runs are where."""
     counts = Counter(run.state for run in runs)
     others = [f"{n} {state}" for state, n in counts.items() if state != "done"]

@@ -60,6 +60,9 @@ def preset(name: str, algos: Sequence[str] | None = None) -> list[tuple[str, str
         raise UsageError(f"unknown preset {name!r}; {did_you_mean(name, PRESETS)}")
     blocks = PRESETS[name]
     pairs = [
-        (f"{one}-v0", algo) for suites, own in blocks for one in suites for algo in algos or own
+        (f"{env_id}-v0", algo)
+        for env_ids, usual in blocks
+        for env_id in env_ids
+        for algo in algos or usual
     ]
     return list(dict.fromkeys(pairs))

@@ -1,8 +1,7 @@
-"""The flags of tuning, and those that a study's folder remembers."""
+"""The flags of tuning."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from sb3_guard.zoo.cli.flags import flag
 from sb3_guard.zoo.cli.usage import (
@@ -10,7 +9,6 @@ from sb3_guard.zoo.cli.usage import (
     amount,
     count,
     positive,
-    read_mapping,
     seed_number,
     seed_or_random,
 )
@@ -24,13 +22,8 @@ EXAMPLES = """examples:
   sb3-guard tune ... --storage postgresql://me:secret@server/studies
 
 The same command continues a study that was stopped, and joins a study that is running: --n-trials
-counts the trials of the study, not of the process. The folder of the study is enough, too:
-
-  sb3-guard tune -i logs/cpo/Goal_Point_8Hazards-v0_tune --n-trials 100
+counts the trials of the study, not of the process.
 """
-# The file of a study's folder that `-i` reads; flags that it does not state.
-RECORD = "study.yml"
-HOW = ("resume", "log_folder", "gym_packages", "verbose")
 
 
 @dataclass
@@ -52,7 +45,6 @@ class TuneFlags(TrainingFlags):
 
     :param n_trials: number of finished trials of the study, pruned ones included (default: 50)
     :param seeds: random seeds that every trial trains with (default: 0)
-    :param n_seeds: train every trial with the seeds 0 to N - 1
     :param seed: random seed of the sampler; -1: a random one (default: -1)
     :param sampler: Optuna sampler (default: tpe)
     :param pruner: Optuna pruner, which stops bad trials early (default: median)
@@ -64,7 +56,6 @@ class TuneFlags(TrainingFlags):
 
     Storage and workers:
 
-    :param resume: folder of a study to continue or join, with the flags that it was started with
     :param log_folder: folder for studies (default: logs)
     :param study_name: name of the study, to have several (default: <algo>_<env>)
     :param storage: postgresql://… to share a study between machines, or a journal file (default: a
@@ -84,8 +75,7 @@ class TuneFlags(TrainingFlags):
     search_space: str | None = flag(metavar="FILE")
 
     n_trials: int = flag("--max-total-trials", default=50, kind=positive, metavar="N")
-    seeds: list[int] = flag(default=[0], kind=seed_number, metavar="S", exclusive="seeds")
-    n_seeds: int | None = flag(kind=positive, metavar="N", exclusive="seeds")
+    seeds: list[int] = flag(default=[0], kind=seed_number, metavar="S")
     seed: int = flag(default=-1, kind=seed_or_random)
     sampler: Literal["tpe", "gp", "nsgaii", "random"] = flag(default="tpe")
     pruner: Literal["median", "halving", "none"] = flag(default="median")
@@ -93,7 +83,6 @@ class TuneFlags(TrainingFlags):
     n_evaluations: int | None = flag(kind=positive, metavar="N")
     eval_episodes: int = flag(default=5, kind=positive, metavar="N")
 
-    resume: str | None = flag("-i", metavar="FOLDER")
     log_folder: str = flag("-f", default="logs", metavar="DIR")
     study_name: str | None = flag(metavar="NAME")
     storage: str | None = flag(metavar="URL")
@@ -103,39 +92,11 @@ class TuneFlags(TrainingFlags):
 
     def check(self) -> None:
         """
-        Complete the flags with what follows from others.
+        What can be said before anything heavy is imported.
 
-        :raises UsageError: two contradict each other
+        :raises UsageError: two flags contradict each other
         """
-        if self.n_seeds is not None:
-            self.seeds = list(range(self.n_seeds))
         if len(set(self.seeds)) < len(self.seeds):
             raise UsageError(f"--seeds {' '.join(map(str, self.seeds))}: a seed is given twice")
         if self.pareto and self.pruner != "none" and "pruner" in self.given:
             raise UsageError("--pruner: there is no pruning with --pareto; leave it out")
-
-    def recorded(self) -> dict[str, Any] | None:
-        """The flags for the study's folder; None for a database, whose address has a password."""
-        if self.storage is not None and "://" in self.storage:
-            return None
-        return {name: getattr(self, name) for name in sorted(self.given - {*HOW})}
-
-    def completed(self) -> "TuneFlags":
-        """
-        The flags completed by those that the study to continue was begun with.
-
-        :raises UsageError: there is no such study
-        """
-        if self.resume is None:
-            return self
-        folder = Path(self.resume).absolute()
-        path = folder / RECORD
-        if not path.is_file():
-            raise UsageError(
-                f"-i: {self.resume} has no {RECORD}, so it is not the folder of a study in a "
-                "journal file; the command that began a study continues it"
-            )
-        filed = TuneFlags.read(read_mapping(path, "the study's file", "flags to values"), path, HOW)
-        given = {name: getattr(filed, name) for name in filed.given}
-        given |= {name: getattr(self, name) for name in self.given - {"resume"}}
-        return TuneFlags.of({**given, "log_folder": str(folder.parent.parent)})

@@ -3,7 +3,6 @@
 import io
 import shlex
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import optuna
 import pandas as pd
 import yaml
 from filelock import FileLock
-from optuna.importance import PedAnovaImportanceEvaluator
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_guard.common.files import replacing
@@ -26,7 +24,7 @@ def short(value: Any) -> str:
 
 def complete(trials: Sequence[FrozenTrial]) -> list[FrozenTrial]:
     """The trials that went to their end."""
-    return [one for one in trials if one.state == TrialState.COMPLETE]
+    return [trial for trial in trials if trial.state == TrialState.COMPLETE]
 
 
 def rank(trial: FrozenTrial) -> tuple[bool, float, float]:
@@ -42,7 +40,7 @@ def best(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
 
 def front(study: optuna.Study) -> list[FrozenTrial]:
     """The trials that no other beats in return and costs, by falling return."""
-    return sorted(study.best_trials, key=lambda one: -one.values[0])
+    return sorted(study.best_trials, key=lambda trial: -trial.values[0])
 
 
 class Report:
@@ -52,18 +50,10 @@ class Report:
     :param folder: where they go; several processes may write them
     :param settings: of the study, as data
     :param packages: modules that register the environment
-    :param resumable: the folder is enough to continue the study
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        settings: Mapping[str, Any],
-        packages: Sequence[str] = (),
-        resumable: bool = False,
-    ):
+    def __init__(self, folder: Path, settings: Mapping[str, Any], packages: Sequence[str] = ()):
         self.folder, self.settings, self.packages = folder, settings, packages
-        self.resumable = resumable
         self.keys: list[str] = settings["cost_keys"]
         self.limits: list[float] | None = settings["cost_limit"]
 
@@ -73,7 +63,7 @@ class Report:
         files = {"trials.csv": self.table(trials).to_csv(index=False).encode()}
         chosen = {"best.yml": best(trials)}
         if self.settings["pareto"]:
-            chosen |= {f"pareto/trial_{one.number}.yml": one for one in front(study)}
+            chosen |= {f"pareto/trial_{trial.number}.yml": trial for trial in front(study)}
         for name, trial in chosen.items():
             if trial is not None:
                 files[name] = self.hyperparams(trial, name).encode()
@@ -97,18 +87,18 @@ class Report:
         columns = ["return", *self.keys, "violation"]
         return pd.DataFrame(
             {
-                "trial": one.number,
-                "state": one.state.name.lower(),
+                "trial": trial.number,
+                "state": trial.state.name.lower(),
                 **dict.fromkeys(columns),
-                **one.user_attrs.get("result", {}),
-                "feasible": rank(one)[0] if "result" in one.user_attrs else None,
-                "seconds": one.duration and one.duration.total_seconds(),
-                "retry_of": one.system_attrs.get("failed_trial"),
-                "worker": one.user_attrs.get("worker"),
-                "error": one.user_attrs.get("error"),
-                **one.params,
+                **trial.user_attrs.get("result", {}),
+                "feasible": rank(trial)[0] if "result" in trial.user_attrs else None,
+                "seconds": trial.duration and trial.duration.total_seconds(),
+                "retry_of": trial.system_attrs.get("failed_trial"),
+                "worker": trial.user_attrs.get("worker"),
+                "error": trial.user_attrs.get("error"),
+                **trial.params,
             }
-            for one in trials
+            for trial in trials
         )
 
     def outcome(self, trial: FrozenTrial) -> str:
@@ -132,7 +122,6 @@ class Report:
             f"Trial {trial.number} of tuning {settings['algo']} on {settings['env']}:",
             f"{self.outcome(trial)} ({steps}).",
             f"Train with: {self.command(name)}",
-            self.length(trial),
         ]
         values = {settings["env"]: trial.user_attrs["hyperparams"]}
         body = yaml.safe_dump(values, default_flow_style=None, allow_unicode=True)
@@ -145,22 +134,6 @@ class Report:
         flags += ["--gym-packages", *packages] if packages else []
         conf = str(self.folder / name)
         return shlex.join(["sb3-guard", "train", *flags, "-conf", conf])
-
-    @property
-    def _again(self) -> str:
-        """How to continue the study."""
-        if not self.resumable:
-            return "  The same command continues the study."
-        flags = ["--gym-packages", *self.packages] if self.packages else []
-        command = ["sb3-guard", "tune", "-i", str(self.folder), *flags]
-        return f"  continue with {shlex.join(command)}"
-
-    def length(self, trial: FrozenTrial) -> str:
-        """How long that command trains, and how to train as long as the trials."""
-        steps, tried = trial.user_attrs["hyperparams"]["n_timesteps"], self.settings["n_timesteps"]
-        if steps == tried:
-            return f"It trains for {steps:,} steps, as the trials did."
-        return f"It trains for {steps:,} steps; add -n {tried} to train as long as the trials."
 
     def line(self, trials: Sequence[FrozenTrial], trial: FrozenTrial) -> str:
         """A finished trial in one line."""
@@ -175,17 +148,15 @@ class Report:
         top = best(trials)
         return f"{text}; best so far" if top and top.number == trial.number else text
 
-    def summary(self, study: optuna.Study, interrupted: bool = False) -> str:
+    def summary(self, study: optuna.Study) -> str:
         """What the study came to."""
         trials = study.get_trials(deepcopy=False)
         done, top = complete(trials), best(trials)
-        pruned = sum(one.state == TrialState.PRUNED for one in trials)
+        pruned = sum(trial.state == TrialState.PRUNED for trial in trials)
         lines = [f"finished trials: {len(done) + pruned}, of them pruned: {pruned}"]
         if self.limits is not None:
-            feasible = sum(rank(one)[0] for one in done)
+            feasible = sum(rank(trial)[0] for trial in done)
             lines[0] += f"; {feasible} of {len(done)} kept the cost limit"
-        if interrupted:
-            lines.append(self._again)
         if top is None:
             return "\n".join([*lines, "  No trial went to its end: there is no best one."])
         if self.limits is not None and not rank(top)[0]:
@@ -200,63 +171,28 @@ class Report:
             lines += [f"               trial {t.number}: {self.outcome(t)}" for t in front(study)]
             lines.append(f"               {self.folder / 'pareto'}/trial_N.yml")
         lines.append(f"  train with   {self.command('best.yml')}")
-        lines.append(f"               {self.length(top)}")
+        lines.append(f"               for {self.settings['n_timesteps']:,} steps, or those of -n")
         return "\n".join(lines)
 
     def plot(self, study: optuna.Study) -> None:
-        """Draw ``history.png``, ``importances.png`` and ``pareto.png``, as far as trials allow."""
-        import matplotlib
+        """Draw ``pareto.png``: return against each cost, the trials over the limit hollow."""
+        done = complete(study.get_trials(deepcopy=False))
+        if not done:
+            return
+        from matplotlib.figure import Figure
 
-        with matplotlib.rc_context({"backend": "Agg"}):
-            from matplotlib import pyplot
-            from optuna.visualization import matplotlib as plots
-
-            done = complete(study.get_trials(deepcopy=False))
-            if not done:
-                return
-            title = f"{self.settings['algo']} on {self.settings['env']}"
-
-            def value(trial: FrozenTrial) -> float:
-                feasible, violation, value = rank(trial)
-                worst = min(one.user_attrs["result"]["return"] for one in done)
-                return -(value if feasible else worst + violation)  # low values are explained
-
-            draw = {
-                "history.png": lambda: plots.plot_optimization_history(
-                    study,
-                    target=(lambda one: one.values[0]) if self.settings["pareto"] else None,
-                    target_name="return",
-                ),
-                "importances.png": lambda: plots.plot_param_importances(
-                    study,
-                    evaluator=PedAnovaImportanceEvaluator(),
-                    target=value,
-                    target_name="return within the limit",
-                ),
-                "pareto.png": lambda: self._scatter(pyplot, done),
-            }
-            files = {}
-            for name, function in draw.items():
-                with suppress(ValueError, RuntimeError), io.BytesIO() as buffer:
-                    axes = function()
-                    axes.set_title("", loc="left")
-                    axes.set_title(title)
-                    pyplot.gcf().savefig(buffer, format="png", dpi=150, bbox_inches="tight")
-                    files[name] = buffer.getvalue()
-            pyplot.close("all")
-        self.save(files)
-
-    def _scatter(self, pyplot: Any, done: Sequence[FrozenTrial]) -> Any:
-        """Return against each cost: trials within the limit filled, others hollow."""
-        size = (6.4 * len(self.keys), 4.8)
-        _, axes = pyplot.subplots(1, len(self.keys), sharey=True, squeeze=False, figsize=size)
+        figure = Figure(figsize=(6.4 * len(self.keys), 4.8), layout="constrained")
+        figure.suptitle(f"{self.settings['algo']} on {self.settings['env']}")
         table = self.table(done)
-        for i, (axis, key) in enumerate(zip(axes[0], self.keys, strict=True)):
-            for feasible, own in table.groupby("feasible", sort=False):
+        panels = figure.subplots(1, len(self.keys), sharey=True, squeeze=False)[0]
+        for i, (axis, key) in enumerate(zip(panels, self.keys, strict=True)):
+            for feasible, rows in table.groupby("feasible", sort=False):
                 face, label = ("C0", "trial within the limit") if feasible else ("none", "over it")
-                axis.scatter(own[key], own["return"], ec="C0", facecolors=face, label=label)
+                axis.scatter(rows[key], rows["return"], ec="C0", facecolors=face, label=label)
             if self.limits is not None:
                 axis.axvline(self.limits[i], color="C1", linestyle="--", label="cost limit")
             axis.set(xlabel=f"episode {key}", ylabel="return")
             axis.legend()
-        return axes[0, 0]
+        with io.BytesIO() as buffer:
+            figure.savefig(buffer, format="png", dpi=150)
+            self.save({"pareto.png": buffer.getvalue()})

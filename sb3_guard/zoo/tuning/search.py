@@ -10,15 +10,14 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
 import optuna
-import yaml
-from optuna.exceptions import ExperimentalWarning, UpdateFinishedTrialError
+from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.storages import RDBStorage
 from optuna.study import MaxTrialsCallback, StudyDirection
@@ -30,10 +29,10 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import folder_name, is_disk_error, require_writable
-from sb3_guard.zoo.run.hyperparams import check, read_hyperparams
+from sb3_guard.zoo.run.hyperparams import check
 from sb3_guard.zoo.run.training import Training
 from sb3_guard.zoo.tuning import studies
-from sb3_guard.zoo.tuning.flags import RECORD, TuneFlags
+from sb3_guard.zoo.tuning.flags import TuneFlags
 from sb3_guard.zoo.tuning.report import FINISHED, Report, short
 from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space
 from sb3_guard.zoo.tuning.studies import Storage, open_storage, repeat_lost_trials
@@ -51,34 +50,30 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     :raises UsageError: something is wrong with the flags
     """
     fixed = dict(flags.hyperparams or {})
-    own = dict(fixed)
+    hyperparams = dict(fixed)
     if flags.cost_limit is not None:
         # Beside the trials: training with the result keeps the best model by the same limit.
         limit = flags.cost_limit
-        own["selection_limit"] = limit[0] if len(limit) == 1 else limit
-    how = {"hyperparams": own, "seed": flags.seeds[0], "verbose": 0, "progress": False}
+        hyperparams["selection_limit"] = limit[0] if len(limit) == 1 else limit
+    how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "verbose": 0, "progress": False}
     run, values = start.prepare(RunFlags.shared(flags, **how))
     n_timesteps = values["n_timesteps"]
-    # Training with the result is as long as the file says, whatever the trials are.
-    filed = read_hyperparams(run.algo, run.env, run.conf_file, own)
-    cls, length = algorithm(run.algo), filed.get("n_timesteps", n_timesteps)
-    base = check(run.algo, cls, {**values, "n_timesteps": length})
     n_evaluations = flags.n_evaluations or max(n_timesteps // 100_000, 4)
     if n_evaluations > n_timesteps:
         raise UsageError(
             f"--n-evaluations {n_evaluations} is not allowed; there are {n_timesteps} steps"
         )
     space = read_space(flags.search_space) if flags.search_space else None
-    search = Search(flags.algo, base, space, fixed)
+    search = Search(flags.algo, values, space, fixed)
     for corner in search.corners():
-        check(run.algo, cls, corner)
+        check(run.algo, algorithm(run.algo), corner)
     with closing(Training(Experiment(run, values))) as training:
         assert training.evaluation is not None
         limits = training.evaluation.limits().tolist()
     settings = Settings(
         algo=run.algo,
         env=run.env,
-        hyperparams=base,
+        hyperparams=values,
         space=search.description(),
         n_timesteps=n_timesteps,
         seeds=flags.seeds,
@@ -170,17 +165,8 @@ class Work:
 
     def _optimize(self, n_trials: int | None = None) -> None:
         enough = [] if n_trials else [MaxTrialsCallback(self.flags.n_trials, states=FINISHED)]
-        try:
+        with suppress(Stopped):
             self.study.optimize(self.objective, n_trials, callbacks=[self._after, *enough])
-        except Stopped:
-            pass
-        except (ValueError, UpdateFinishedTrialError) as error:
-            if isinstance(error, ValueError) and not self.objective.taken:
-                raise
-            raise UsageError(
-                f"this process gave no sign of life for {studies.GRACE} s, and its trial was "
-                "given to another; the same command joins the study again"
-            ) from error
 
     def _count(self, *states: TrialState) -> int:
         return len(self.study.get_trials(deepcopy=False, states=states))
@@ -223,9 +209,6 @@ def tune(flags: TuneFlags, main: bool = True) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExperimentalWarning)
-            warnings.filterwarnings("ignore", message="The number of trials is too small")
-            warnings.filterwarnings("ignore", module="optuna.importance")
-            warnings.filterwarnings("ignore", message="PedAnovaImportanceEvaluator computes")
             return _tune(flags, main)
     except Exception as error:
         if isinstance(error, OSError) and is_disk_error(error):
@@ -244,10 +227,7 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     storage, shown = open_storage(flags.storage, folder / "study.journal")
     study = open_study(flags, settings, search, name, storage, shown)
     objective = Objective(flags, training, settings, search)
-    record = flags.recorded()
-    report = Report(folder, asdict(settings), flags.gym_packages, resumable=record is not None)
-    if main and record is not None:
-        report.save({RECORD: yaml.safe_dump(record, sort_keys=False).encode()})
+    report = Report(folder, asdict(settings), flags.gym_packages)
     work = Work(study, storage, objective, report)
     loud = main and flags.verbose > 0
     if loud:
@@ -269,7 +249,9 @@ def _tune(flags: TuneFlags, main: bool) -> int:
         report.write(study)
         report.plot(study)
         if loud:
-            print(report.summary(study, interrupted=bool(received)))
+            print(report.summary(study))
+            if received:
+                print("The same command continues the study.")
     return 128 + received[0] if received else 0
 
 

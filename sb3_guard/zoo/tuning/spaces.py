@@ -49,11 +49,10 @@ def space_of(algo: str) -> dict[str, Any]:
     :param algo: key of the algorithm
     :raises UsageError: there is no such algorithm, or one of the entries is wrong
     """
-    found = dict(SPACES.get(algo, {}))
+    space = dict(SPACES.get(algo, {}))
     for cls in reversed(algorithm(algo).__mro__):
-        found |= vars(cls).get("search_space", {})
-    searched = {name: entry for name, entry in found.items() if entry is not None}
-    return {name: _checked(name, entry, algo) for name, entry in searched.items()}
+        space |= vars(cls).get("search_space", {})
+    return {n: _checked(n, entry, algo) for n, entry in space.items() if entry is not None}
 
 
 def read_space(path: str) -> dict[str, Any]:
@@ -80,8 +79,8 @@ def _checked(name: str, entry: Any, where: str) -> Any:
     with explained(f"search space: {name}: {entry} in {where}", fix=fix):
         if isinstance(entry, list) and len(entry) > 1:
             return entry
-        known = {**entry, **{key: _bound(entry[key]) for key in ("low", "high")}}
-        return {"log": False, **known} if _distribution(known) else None
+        bounds = {**entry, **{key: _bound(entry[key]) for key in ("low", "high")}}
+        return {"log": False, **bounds} if _distribution(bounds) else None
 
 
 def _bound(value: Any) -> int | float:
@@ -138,7 +137,7 @@ def get_dotted(values: Mapping[str, Any], name: str) -> Any:
 def _named(value: Any) -> Any:
     """Data that :func:`~sb3_guard.zoo.cli.names.with_classes` makes these objects of."""
     if isinstance(value, Mapping):
-        return {name: _named(one) for name, one in value.items()}
+        return {name: _named(item) for name, item in value.items()}
     if isinstance(value, type):
         return f"{value.__module__}.{value.__qualname__}"
     return value
@@ -227,16 +226,16 @@ class Search:
         The base's own place in the space, for the first trial, with the algorithm's defaults where
         the base says nothing; what lies outside is drawn.
         """
-        known = {}
+        places = {}
         cls = algorithm(self.algo)
         defaults = {name: parameter.default for name, parameter in parameters(cls).items()}
         defaults["policy_kwargs"] = getattr(cls, "policy_defaults", {})
         for name, entry in self.space.items():
-            own = get_dotted(self.base, name)
-            own = get_dotted(defaults, name) if own is None else own
-            if _contains(entry, own):
-                known[name] = _label(own)
-        return known
+            value = get_dotted(self.base, name)
+            value = get_dotted(defaults, name) if value is None else value
+            if _contains(entry, value):
+                places[name] = _label(value)
+        return places
 
 
 def rl_zoo_sampler(algo: str, base: Mapping[str, Any]) -> Callable[..., dict[str, Any]]:

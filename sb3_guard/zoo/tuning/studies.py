@@ -137,32 +137,28 @@ def database_error(error: BaseException | None) -> str | None:
 
 def repeat(study: optuna.Study, trial: FrozenTrial, most: int | None = MOST_REPEATS) -> None:
     """
-    Queue a trial again, with its hyperparameters and the seeds that are done.
+    Queue a trial again, with its hyperparameters and the seeds that are done, unless it is queued.
 
     :param trial: a copy
     :param most: give it up after so many repetitions; None: never
     """
-    trial.user_attrs.pop(WORKER, None)
-    RetryHeartbeatStaleTrialCallback(most)(study, trial)
+    history = RetryHeartbeatStaleTrialCallback.retry_history
+    # A worker may die, or lose its database, after it has queued its trial and before it fails it.
+    if not any(trial.number in history(other) for other in study.get_trials(deepcopy=False)):
+        trial.user_attrs.pop(WORKER, None)
+        RetryHeartbeatStaleTrialCallback(most)(study, trial)
 
 
 def repeat_lost_trials(study: optuna.Study, storage: Storage) -> None:
     """Queue the trials again whose worker is gone."""
     fail_stale_trials(study)
-    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+    for trial in study.get_trials():
         if _is_lost(trial, storage):
             # Another worker may do the same at the same moment.
             with suppress(ValueError, UpdateFinishedTrialError):
-                study.tell(trial.number, state=TrialState.FAIL)
+                if trial.state == TrialState.RUNNING:
+                    study.tell(trial.number, state=TrialState.FAIL)
                 repeat(study, trial)
-    trials = study.get_trials()
-    histories = map(RetryHeartbeatStaleTrialCallback.retry_history, trials)
-    repeated = {number for history in histories for number in history}
-    for trial in trials:
-        # Whoever noticed that its worker is gone was killed before the trial was queued.
-        failed = trial.state == TrialState.FAIL and _is_old(trial.datetime_complete)
-        if failed and trial.number not in repeated:
-            repeat(study, trial)
 
 
 def _is_old(moment: datetime | None) -> bool:
@@ -170,6 +166,10 @@ def _is_old(moment: datetime | None) -> bool:
 
 
 def _is_lost(trial: FrozenTrial, storage: Storage) -> bool:
+    if trial.state == TrialState.FAIL:  # whoever noticed it was killed before it was queued
+        return _is_old(trial.datetime_complete)
+    if trial.state != TrialState.RUNNING:
+        return False
     if WORKER not in trial.user_attrs:  # killed before its first sign of life
         return _is_old(trial.datetime_start)
     host, _, process = trial.user_attrs[WORKER].rpartition("-")

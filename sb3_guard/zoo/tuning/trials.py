@@ -7,7 +7,6 @@ cost is a constraint of the study, ``J_C - limit <= 0``, so samplers know which 
 import multiprocessing
 import os
 import socket
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -36,7 +35,6 @@ from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
 FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError)
 FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
 INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
-PROGRESS = 15.0  # seconds between two lines about a trial under way
 GIVEN = "given"  # its hyperparameters are those of the file
 
 
@@ -85,9 +83,9 @@ class Settings:
         :raises UsageError: they are not the same
         """
 
-        def flat(one: Mapping[str, Any]) -> dict[str, Any]:
-            own = {f"hyperparams {name}": value for name, value in one["hyperparams"].items()}
-            return {**one, "hyperparams": None, **own}
+        def flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+            values = {f"hyperparams {n}": value for n, value in settings["hyperparams"].items()}
+            return {**settings, "hyperparams": None, **values}
 
         for name, old, value in differences(flat(saved), flat(asdict(self))):
             raise UsageError(
@@ -108,7 +106,7 @@ class Evaluations(BaseCallback):
     :param settings: of the study
     :param after: called with all evaluations so far, each a list of the mean return and the mean
         episode costs; False ends the training
-    :param on_step: called with the number of steps so far; what it raises ends the training
+    :param stopped: whether to stop, asked at each step
     """
 
     def __init__(
@@ -116,16 +114,16 @@ class Evaluations(BaseCallback):
         training: Training,
         settings: Settings,
         after: Callable[[list[list[float]]], bool],
-        on_step: Callable[[int], None],
+        stopped: Callable[[], bool],
     ):
         super().__init__()
-        self.training, self.settings = training, settings
-        self.after, self.on_step_taken = after, on_step
+        self.training, self.settings, self.after, self.stopped = training, settings, after, stopped
         self.history: list[list[float]] = []
         self.ended = False
 
     def _on_step(self) -> bool:
-        self.on_step_taken(self.num_timesteps)
+        if self.stopped():
+            raise Stopped
         done = len(self.history) + 1
         due = done * self.settings.n_timesteps / self.settings.n_evaluations
         # The last one is for the agent that has learned all it could: see finish.
@@ -162,9 +160,7 @@ class Objective:
         self.flags, self.training = flags, training
         self.settings, self.search = settings, search
         self.stop = False
-        self.taken = False  # the trial under way was given to another worker
         self.failures = 0  # in a row
-        self._said = 0.0
 
     def stopped(self) -> bool:
         """Whether to stop: a signal came, or the process that started this one is gone."""
@@ -179,14 +175,10 @@ class Objective:
         :raises optuna.TrialPruned: it compares badly, or its hyperparameters fail
         :raises Stopped: it is to be done again
         """
-        self._said = time.monotonic()
         try:
             trial.set_user_attr(WORKER, f"{socket.gethostname()}-{os.getpid()}")
             mean = self._train_seeds(trial)
-        except TrialPruned:
-            raise
-        except UpdateFinishedTrialError:
-            self.taken = True
+        except (TrialPruned, UpdateFinishedTrialError):  # the latter: it was given to another
             raise
         except FAILURES as error:
             if self.flags.verbose > 1:
@@ -223,12 +215,16 @@ class Objective:
 
         def after(history: list[list[float]]) -> bool:
             """Report the mean of the seeds so far; whether to continue."""
-            mean[:] = np.mean([one[-1] for one in [*finished, history]], axis=0).tolist()
+            mean[:] = np.mean([rows[-1] for rows in [*finished, history]], axis=0).tolist()
             outcome = settings.outcome(mean)
             trial.set_user_attr("result", outcome)
+            step = settings.n_evaluations * len(finished) + len(history)
+            if self.flags.verbose and step < last:
+                costs = ", ".join(map(short, mean[1:]))
+                print(f"Trial {trial.number}: return {short(mean[0])}, cost {costs} after {step} "
+                      f"of {last} evaluations", flush=True)  # fmt: skip
             if settings.pareto:
                 return True
-            step = settings.n_evaluations * len(finished) + len(history)
             violation = outcome["violation"]
             trial.report(INFEASIBLE - violation if violation else mean[0], step)
             return step == last or given or not trial.should_prune()
@@ -259,26 +255,10 @@ class Objective:
     ) -> tuple[list[list[float]], bool]:
         """One training: its evaluations, and whether it went to the end."""
         settings = self.settings
-        checked = check(
-            settings.algo,
-            algorithm(settings.algo),
-            {**values, "n_timesteps": settings.n_timesteps},
-        )
+        checked = check(settings.algo, algorithm(settings.algo), values)
         training = Training(Experiment(replace(self.training, seed=seed), checked))
 
-        def on_step(steps: int) -> None:
-            if self.stopped():
-                raise Stopped
-            if self.flags.verbose and time.monotonic() - self._said >= PROGRESS:
-                self._said = time.monotonic()
-                of = f" of seed {seed}" if len(settings.seeds) > 1 else ""
-                text = f"Trial {trial.number}: {steps:,} of {settings.n_timesteps:,} steps{of}"
-                if evaluations.history:
-                    text += f", return {short(evaluations.history[-1][0])}"
-                    text += f", cost {', '.join(map(short, evaluations.history[-1][1:]))}"
-                print(text, flush=True)
-
-        evaluations = Evaluations(training, settings, after, on_step)
+        evaluations = Evaluations(training, settings, after, self.stopped)
         try:
             training.model.set_logger(Logger(folder=None, output_formats=[]))
             training.model.learn(settings.n_timesteps, callback=[evaluations, *training.callbacks])

@@ -22,7 +22,9 @@ OF_THE_ENVIRONMENT = {*RUN_KEYS, "policy", "policy_kwargs", "cost_limit", "n_ste
 OF_THE_ENVIRONMENT |= {"noise_type", "noise_std", "learning_starts", "train_freq", "gradient_steps"}
 #: … and where robots need other values than known optima.
 DEPARTURES = {
-    ("trpo_lag", ENVS[0]): {"cost_gae_lambda", "lambda_lr", "proportional_gain"},
+    ("trpo_lag", ENVS[0]): {
+        "cost_gae_lambda", "lambda_lr", "proportional_gain", "limit_start", "limit_fall",
+    },
     ("trpo_lag", ENVS[1]): {"cost_gae_lambda"},
     **{("trpo_ipo", env): {"cost_gae_lambda"} for env in ENVS},
     **{(algo, env): {"lambda_lr"} for algo in ("sac_lag", "td3_lag", "tqc_lag") for env in ENVS},

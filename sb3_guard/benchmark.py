@@ -27,7 +27,7 @@ from sb3_guard.zoo.run.flags import (
 )
 
 if TYPE_CHECKING:
-    from sb3_guard.zoo.grids.grid import Run
+    from sb3_guard.zoo.grids.run import Run
 
 # The file that says what a grid is, in its folder; `--grid` reads such a file.
 RECORD = "grid.yml"

@@ -18,52 +18,21 @@ import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, interrupts_ignored, one_line
 from sb3_guard.zoo.grids.live import REFRESH, Board, summary
+from sb3_guard.zoo.grids.run import Run
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunInUse
 from sb3_guard.zoo.run.hyperparams import annotations
-from sb3_guard.zoo.run.start import complete, path_of, prepare, standing
+from sb3_guard.zoo.run.start import complete, prepare, standing
 from sb3_guard.zoo.run.training import Training
-
-
-@dataclass(eq=False)
-class Run:
-    """
-    One run of a grid.
-
-    :param flags: all flags, as its folder states them
-    :param values: all hyperparameters, in the same form
-    :param ignored: those given for the grid that its algorithm does not have
-    """
-
-    flags: RunFlags
-    values: dict[str, Any]
-    ignored: list[str]
-    #: at first done · resume · new; later waiting · running · in use · done · failed · stopped
-    state: str
-    #: what went wrong, in a line
-    error: str = ""
-
-    @property
-    def path(self) -> Path:
-        """Its folder."""
-        return path_of(self.flags)
-
-    @property
-    def steps(self) -> int:
-        """Its length, environment steps."""
-        return int(self.values["n_timesteps"])
-
-    def __str__(self) -> str:
-        return f"{self.flags.algo} on {self.flags.env}, seed {self.flags.seed}"
 
 
 def expand(

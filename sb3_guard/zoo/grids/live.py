@@ -5,16 +5,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pandas as pd
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from sb3_guard.zoo.grids.run import Run
 from sb3_guard.zoo.run.folder import RunFolder, cost_words
-
-if TYPE_CHECKING:
-    from sb3_guard.zoo.grids.grid import Run
 
 REFRESH = 1.0  # seconds between looks into the folders
 LINE_EVERY = 60.0  # seconds between plain lines of progress
@@ -46,7 +43,7 @@ class Board:
     """
 
     def __init__(
-        self, title: str, runs: "Sequence[Run]", verbose: int = 1, console: Console | None = None
+        self, title: str, runs: Sequence[Run], verbose: int = 1, console: Console | None = None
     ):
         self.console = console or Console(quiet=verbose == 0, highlight=False)
         self.title, self.runs = title, runs
@@ -65,7 +62,7 @@ class Board:
         """Print a line, above the bars if there are any."""
         self.console.print(text, markup=False, soft_wrap=True)
 
-    def note(self, run: "Run") -> None:
+    def note(self, run: Run) -> None:
         """Say what has become of a run."""
         line = f"{time.strftime('%H:%M:%S')}  {run.state}: {run}"
         if run.state == "done":
@@ -118,7 +115,7 @@ def reached_words(last: Mapping[str, float]) -> str:
     return ", ".join(words + [f"{n} {last[n]:.2f}" for n in ("return", "cost") if n in last])
 
 
-def summary(runs: "Sequence[Run]") -> str:
+def summary(runs: Sequence[Run]) -> str:
     """The grid on one line: how many runs are where."""
     counts = Counter(run.state for run in runs)
     others = [f"{n} {state}" for state, n in counts.items() if state != "done"]

@@ -49,6 +49,7 @@ from sb3_guard.algorithms import (
 )
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 from sb3_guard.algorithms.common.policies import FilteredPolicy
+from sb3_guard.algorithms.common.rollouts import CostRollouts
 
 PACKAGES = (stable_baselines3, sb3_contrib)
 # The classes that ours stand in for, with what they are made with where a test says nothing: as
@@ -64,6 +65,8 @@ REPLACED: dict[type, dict[str, dict[str, Any]]] = {
 # What their classes take and ours have no use for, beside ``fixed_arguments``.
 THEIR_ARGUMENTS = {"n_epochs", "sub_sampling_factor"}
 OUR_ARGUMENTS = {"cost_limit": 50.0, "n_critic_updates": 20}
+# How SB3's policies begin: from our own beginning, a few thousand steps learn less.
+THEIR_START = {"policy_kwargs": {"ortho_init": True, "log_std_init": 0.0}}
 # Their costs are noise: as in hyperparams/trpo_ipo.yml, lest they weigh ten times the reward.
 OF_CLASS: dict[str, dict[str, Any]] = {"TRPOIPO": {"max_multiplier": 0.5}}
 # Of images nothing is learnt in these tests, and each pass over a rollout of them takes long.
@@ -125,7 +128,8 @@ def stand_in(cls: type, name: str, defaults: dict[str, Any]) -> type:
                 if argument not in taken:
                     kwargs.pop(argument, None)
             small = OF_IMAGES if policy == "CnnPolicy" else {}
-            ours = {**OUR_ARGUMENTS, **OF_CLASS.get(cls.__name__, {}), **small}
+            start = THEIR_START if issubclass(cls, CostRollouts) else {}
+            ours = {**OUR_ARGUMENTS, **start, **OF_CLASS.get(cls.__name__, {}), **small}
             ours = {argument: value for argument, value in ours.items() if argument in taken}
             kwargs = {**ours, **defaults, **kwargs}
             if filtered and isinstance(policy, type) and not issubclass(policy, FilteredPolicy):

@@ -47,7 +47,8 @@ class CostLimits:
         a line from 50 to 25 over the training
     :param cost_keys: entries of ``info`` that hold the costs of a step
     :param limit_start: how many times ``cost_limit`` the limit is when the training begins; it
-        falls to ``cost_limit`` along a line. 1 for ``cost_limit`` from the first step on
+        falls to ``cost_limit`` along a line. 1 for ``cost_limit`` from the first step on; a limit
+        of 0 is 0 throughout
     :param limit_fall: share of the training over which it falls
     """
 

@@ -39,7 +39,7 @@ class Film(VecEnvWrapper):
         self.keys = tuple(getattr(model, "cost_keys", ("cost",)))
         self.limits: list[float | None] = [None] * len(self.keys)
         if isinstance(model, Constrained) and model.constrained:
-            self.limits = model.cost_limits.tolist()
+            self.limits = model.final_cost_limits.tolist()
         self.worst = getattr(model, "limit_on", "sum") == "max"
         self.every = _steps_per_picture(venv)
         self.steps = 0

@@ -178,6 +178,8 @@ def resume(given: RunFlags) -> int:
         flags = dataclasses.replace(saved, **changed)
         was = {**saved.values(START), **state["identity"], "n_timesteps": None}
         now = {**flags.values(START), **identity(flags, values), "n_timesteps": None}
+        if Path(flags.log_folder).resolve() == folder.path.resolve().parents[1]:
+            now["log_folder"] = was["log_folder"]  # the same folder in other words
         for name, old, new in differences(was, now):
             raise UsageError(
                 f"{name} = {new} contradicts {old}, with which {folder.path} was trained; put it "

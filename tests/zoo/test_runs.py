@@ -42,6 +42,15 @@ def test_a_row_says_all_about_a_run(tmp_path):
     assert pd.isna(row["torch"])
 
 
+def test_the_last_digit_of_a_cost_does_not_take_its_limit_away(tmp_path):
+    run = fake_run(tmp_path, algo="cpo", seed=0)
+    cost = 3.309844098555052
+    edit(run, cost=cost, costs={"cost": {"mean": cost + 4e-16, "limit": 2.0}}, cost_limit=2.0)
+    assert json.loads((run / "result.json").read_text())["costs"]["cost"]["mean"] != cost
+    row = read_results([tmp_path]).runs.iloc[0]
+    assert row["cost_limit"] == 2.0
+
+
 def test_an_algorithm_that_states_no_name_has_its_key(tmp_path):
     fake_run(tmp_path, "sac_x", env="CartPole-v1", label=None, family=None)
     (row,) = read_results([tmp_path]).runs.to_dict("records")

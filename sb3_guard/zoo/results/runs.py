@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from sb3_guard.spelling import did_you_mean
@@ -152,7 +153,10 @@ def read_run(path: Path) -> dict[str, Any]:
 def _by_key(result: Mapping[str, Any]) -> dict[str, Any]:
     """Columns of the costs that have limits of their own, rather than their total."""
     costs = result["costs"]
-    if "limit_on" in result or [cost["mean"] for cost in costs.values()] == [result["cost"]]:
+    means = [_number(cost["mean"]) for cost in costs.values()]
+    # Both are means of the same episodes, but may be rounded differently.
+    total = np.allclose(means, [_number(result["cost"])] * len(means), equal_nan=True)
+    if "limit_on" in result or (total and len(means) == 1):
         return {}
     columns: dict[str, Any] = {}
     for key, cost in costs.items():

@@ -217,6 +217,17 @@ def test_scripts_exist_where_they_are_named_and_each_is_named_somewhere():
     assert scripts <= set().union(*(named[path] for path in guides))
 
 
+def test_files_of_the_repository_that_pages_name_exist():
+    """Paths from its root, and tests by their names; contributors write others by recipes."""
+    folders = "docs|examples|hyperparams|scripts|sb3_guard|tests"
+    for page in [ROOT / "README.md", *PAGES]:
+        text = page.read_text()
+        paths = set(re.findall(rf"\b(?:{folders})/[\w/-]+\.(?:py|yml)\b", text))
+        assert not {path for path in paths if not (ROOT / path).is_file()}, page
+        tests = set(re.findall(r"`(test_\w+\.py)`", text))
+        assert not {name for name in tests if not any((ROOT / "tests").rglob(name))}, page
+
+
 def test_tables_of_results_are_made_of_their_logs():
     for path, text in script("results").pages().items():
         assert path.read_text() == text, "run `python scripts/results.py`"

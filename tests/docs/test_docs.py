@@ -190,6 +190,11 @@ def test_every_public_name_is_in_the_api_reference():
     text = (DOCS / "api" / "index.md").read_text()
     missing = [name for name in sb3_guard.__all__ if f"`{name}`" not in text]
     assert missing == ["__version__"]
+    rows = re.findall(r"^\| `(sb3_guard[\w.]+)` \| ([^|]*) \|", text, re.MULTILINE)
+    assert dict(rows).keys() >= {"sb3_guard.algorithms", "sb3_guard.envs.part"}
+    for module, names in rows:
+        for name in re.findall(r"`(\w+)`", names):
+            assert hasattr(importlib.import_module(module), name), f"{module}.{name}"
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))

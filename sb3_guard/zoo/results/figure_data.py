@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from sb3_guard.zoo.grids.presets import ALGOS
 from sb3_guard.zoo.results.curves import read_curve
 from sb3_guard.zoo.results.runs import REFERENCE, label_of
 from sb3_guard.zoo.results.splits import FINAL, judge, read_splits
@@ -169,7 +170,7 @@ class Data:
             if absent:
                 groups.setdefault(absent, []).append(suite)
         return "; ".join(
-            ("all algorithms" if len(absent) == 8 else ", ".join(map(label_of, absent)))
+            ("all algorithms" if absent == ALGOS else ", ".join(map(label_of, absent)))
             + f" on {', '.join(names)}"
             for absent, names in groups.items()
         )

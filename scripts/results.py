@@ -5,8 +5,9 @@ models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and 
 a page stands the table of its runs, or of one environment in short, ``<!-- runs: NAME SUITE -->``.
 Instead of ``runs`` there are ``learnt: NAME``, returns in the end and those of the untrained agents
 of ``docs/data/untrained.csv``; ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep:
-NAME SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; and ``agents: pretrained``,
-those of ``enjoy --pretrained``. A row of a single run is in italics, which the site shows in grey.
+NAME SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; ``splits: NAME``, how the
+agents keep their limit in training and after it; and ``agents: pretrained``, those of ``enjoy
+--pretrained``. A row of a single run is in italics, which the site shows in grey.
 ``--pack FOLDER NAME`` packs the logs of a folder.
 
 ``--curves`` draws the learning curves: of each algorithm's page, beside an unconstrained algorithm,
@@ -37,14 +38,15 @@ from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish, save
 from sb3_guard.zoo.results.paper import draw
-from sb3_guard.zoo.results.runs import Results, read_results
+from sb3_guard.zoo.results.runs import Results, read_results, select
+from sb3_guard.zoo.results.splits import SPLITS, judge
 from sb3_guard.zoo.results.statistics import aggregate, normalize, with_safety
 from sb3_guard.zoo.results.tables import markdown, number, spelled, spread, whole
 
 DOCS = Path(__file__).parents[1] / "docs"
 DATA = DOCS / "data"
 BLOCK = re.compile(
-    r"(<!-- (runs|learnt|scores|sweep|agents): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)",
+    r"(<!-- (runs|learnt|scores|sweep|splits|agents): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)",
     re.DOTALL,
 )
 PUBLISHED_STEPS = 1_000_000
@@ -216,6 +218,27 @@ def sweep(name: str, suite: str) -> str:
     return markdown(spelled(rows, {"limit": whole("limit"), **columns}))
 
 
+def splits(name: str) -> str:
+    """A table of how the agents of a grid keep their limit, a row for each split."""
+    with unpacked(name) as found:
+        rows = judge(select(with_safety(found.runs)))
+    highest = rows["return"].abs().max()
+    digits = 0 if highest >= 100 else 1
+    columns: dict[str, Any] = {
+        "algorithm": "label",
+        "episodes": lambda row: SPLITS[row["split"]],
+        "seeds": whole("seeds"),
+        "return": lambda row: spread(row["return"], row["return_std"], digits),
+        "cost": lambda row: spread(row["cost"], row["cost_std"], 1),
+        "95 % interval of the cost": lambda row: f"[{row['low']:.1f}, {row['high']:.1f}]",
+        "tier": "tier",
+        "episodes above the limit": lambda row: percent(row["above"]),
+    }
+    if rows["suite"].nunique() > 1:
+        columns = {"environment": "suite", **columns}
+    return grey(rows, columns)
+
+
 def _published(known: pd.DataFrame, algo: str) -> str:
     if algo not in known.index:
         return "–"
@@ -229,7 +252,9 @@ def filled(page: str) -> str:
 
     def remade(match: re.Match[str]) -> str:
         begin, kind, name, only, end = match.groups()
-        made = {"learnt": learnt, "scores": scores, "agents": lambda _: listed()}
+        made = {
+            "learnt": learnt, "scores": scores, "splits": splits, "agents": lambda _: listed()
+        }  # fmt: skip
         if kind == "sweep":
             text = sweep(name, only)
         else:

@@ -1,6 +1,7 @@
 """SAC-, TD3- and TQC-Lagrangian: SB3's own while the limit holds, and what costs add to them."""
 
 import itertools
+import pickle
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,11 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_guard import SACLag, TD3Lag, TQCLag, evaluate_policy
-from sb3_guard.algorithms.common.replay import CostReplayBuffer, CostReplayBufferSamples
+from sb3_guard.algorithms.common.replay import (
+    CostDictReplayBuffer,
+    CostReplayBuffer,
+    CostReplayBufferSamples,
+)
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
 from sb3_guard.common.monitor import CostMonitor
 
@@ -391,6 +396,36 @@ def test_a_callback_that_stops_loses_no_cost() -> None:
     assert model.num_timesteps == 60 and model.episodes.lengths.tolist() == [0]
     assert model.total_cost == pytest.approx(sum(float(cost[0]) for cost in model.ep_cost_buffer))
     assert len(model.ep_cost_buffer) == 2
+
+
+@pytest.mark.parametrize("steps", [5, 70])
+@pytest.mark.parametrize("kind", ["flat", "flat, memory saved", "dictionary"])
+def test_a_buffer_is_saved_without_its_empty_rows(kind: str, steps: int) -> None:
+    dictionary, memory = kind == "dictionary", kind == "flat, memory saved"
+    box = spaces.Box(-1.0, 1.0, (3,))
+    space: Any = spaces.Dict({"a": box, "b": box}) if dictionary else box
+    cls = CostDictReplayBuffer if dictionary else CostReplayBuffer
+    kwargs = {"handle_timeout_termination": not memory, "optimize_memory_usage": memory}
+    buffer = cls(128, space, box, device="cpu", n_envs=2, n_costs=2, **kwargs)
+    space.seed(0)
+    box.seed(0)
+    for row in range(steps):
+        obs: Any = [space.sample() for _ in range(4)]
+        if dictionary:
+            obs = [
+                {k: np.stack([one[k], two[k]]) for k in "ab"}
+                for one, two in itertools.pairwise(obs)
+            ]
+        else:
+            obs = [np.stack(pair) for pair in itertools.pairwise(obs)]
+        buffer.costs[buffer.pos] = row
+        zeros = np.zeros(2)
+        buffer.add(obs[0], obs[1], np.stack([box.sample()] * 2), zeros, zeros, [{}, {}])
+    text = pickle.dumps(buffer)
+    assert (len(text) < 4_000) == (steps == 5)
+    again = pickle.loads(text)
+    assert (again.pos, again.full) == (buffer.pos, buffer.full) == (steps % 64, steps > 64)
+    np.testing.assert_equal(vars(again), vars(buffer))
 
 
 @every

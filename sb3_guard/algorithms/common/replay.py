@@ -43,8 +43,21 @@ class CostReplayBufferSamples(NamedTuple):
     costs: th.Tensor
 
 
+def _of_length(rows: int, value: Any, length: int) -> Any:
+    """An array of so many rows, or a dictionary of such, cut or filled with zeros to a length."""
+    if isinstance(value, dict):
+        return {key: _of_length(rows, item, length) for key, item in value.items()}
+    if not isinstance(value, np.ndarray) or len(value) != rows:
+        return value
+    if length <= rows:
+        return value[:length]
+    filled = np.zeros((length, *value.shape[1:]), value.dtype)
+    filled[:rows] = value
+    return filled
+
+
 class _CostColumns(ReplayBuffer):
-    """Cost columns in addition to a replay buffer.
+    """Cost columns in addition to a replay buffer; rows that are still empty are not pickled.
 
     :param n_costs: number m of costs
     """
@@ -52,6 +65,17 @@ class _CostColumns(ReplayBuffer):
     def __init__(self, *args: Any, n_costs: int = 1, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.costs = np.zeros((self.buffer_size, self.n_envs, n_costs), np.float32)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # One more with `optimize_memory_usage`, where it is the next observation of the last.
+        rows = min(self.size() + 1, self.buffer_size)
+        state = {n: _of_length(self.buffer_size, v, rows) for n, v in vars(self).items()}
+        return {**state, "rows": rows}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        rows = state.pop("rows", state["buffer_size"])
+        for name, value in state.items():
+            setattr(self, name, _of_length(rows, value, state["buffer_size"]))
 
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
         # SB3 draws the environments of the rows in there and does not tell: look ahead.

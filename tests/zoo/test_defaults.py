@@ -20,6 +20,7 @@ ENVS = ["SafetyPointGoal1-v0", "Goal_Point_8Hazards-v0"]
 #: Entries hold what depends on the environment: its limit, the shape of rollouts, wrappers …
 OF_THE_ENVIRONMENT = {*RUN_KEYS, "policy", "policy_kwargs", "cost_limit", "n_steps", "batch_size"}
 OF_THE_ENVIRONMENT |= {"noise_type", "noise_std", "learning_starts", "train_freq", "gradient_steps"}
+OF_THE_ENVIRONMENT |= {"buffer_size"}
 #: … and where robots need other values than known optima.
 DEPARTURES = {
     ("trpo_lag", ENVS[0]): {

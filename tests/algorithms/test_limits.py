@@ -60,6 +60,15 @@ def test_a_limit_falls_to_what_is_asked_for_and_stays_there() -> None:
             CPO("MlpPolicy", points(), cost_limit=2.0, **{name: value})
 
 
+def test_a_schedule_begins_where_it_says_and_a_number_at_limit_start() -> None:
+    model = CPO(
+        "MlpPolicy", points(), cost_limit=["lin_8_4", 10.0], cost_keys=("cost", "a"),
+        limit_start=3.0, missing_cost="zero",
+    )  # fmt: skip
+    model._current_progress_remaining = 1.0
+    assert model.cost_limits.tolist() == [8.0, 30.0]
+
+
 @pytest.mark.parametrize("cls", [CPO, PPOLag, SACLag])
 @pytest.mark.parametrize(
     "limit",

@@ -48,7 +48,7 @@ class CostLimits:
     :param cost_keys: entries of ``info`` that hold the costs of a step
     :param limit_start: how many times ``cost_limit`` the limit is when the training begins; it
         falls to ``cost_limit`` along a line. 1 for ``cost_limit`` from the first step on; a limit
-        of 0 is 0 throughout
+        of 0 is 0 throughout, and a schedule begins where it says
     :param limit_fall: share of the training over which it falls
     """
 
@@ -78,9 +78,13 @@ class CostLimits:
     @property
     def limits_change(self) -> bool:
         """Whether a limit is a schedule, or falls from ``limit_start``."""
+        return self.limit_start > 1.0 or any(self._scheduled)
+
+    @property
+    def _scheduled(self) -> list[bool]:
+        """Of each limit that is given, whether it is a schedule; one element, or m."""
         limits = self.cost_limit if isinstance(self.cost_limit, list | tuple) else [self.cost_limit]
-        scheduled = any(isinstance(limit, str) or callable(limit) for limit in limits)
-        return scheduled or self.limit_start > 1.0
+        return [isinstance(limit, str) or callable(limit) for limit in limits]
 
     def _check_cost_limit(self) -> None:
         for remaining in (1.0, 0.0):
@@ -96,4 +100,4 @@ class CostLimits:
             )
         limits = np.broadcast_to(np.asarray(limit, np.float64), (len(self.cost_keys),))
         excess = LinearSchedule(self.limit_start - 1.0, 0.0, self.limit_fall)(remaining)
-        return limits + excess * np.abs(limits)
+        return limits + np.where(self._scheduled, 0.0, excess * np.abs(limits))

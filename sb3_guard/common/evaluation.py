@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import (
@@ -173,6 +174,30 @@ def _own_random_numbers(seed: int | None) -> Iterator[None]:
         yield
 
 
+@contextmanager
+def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[None]:
+    """Let an evaluation see normalised observations and leave their statistics as they are.
+
+    :raises ValueError: the model learnt from normalised observations, and the environment has none
+    """
+    learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is None:
+        if learnt_with is not None and learnt_with.norm_obs:
+            raise ValueError(
+                "the model learnt from normalised observations, and env has no VecNormalize: "
+                "evaluate it in model.get_env(), or wrap env in VecNormalize and call "
+                "sync_normalization(model.get_env(), env)"
+            )
+        yield
+        return
+    training, normalizer.training = normalizer.training, False
+    try:
+        yield
+    finally:
+        normalizer.training = training
+
+
 def evaluate_policy(
     model: PolicyPredictor,
     env: gym.Env | VecEnv,
@@ -200,7 +225,8 @@ def evaluate_policy(
     episode, as ``predict(..., state=(costs,))``.
 
     A model's own training environment will do: if ``learn`` is called again, it begins new
-    episodes. In a callback, which runs during ``learn``, evaluate in another environment.
+    episodes. In a callback, which runs during ``learn``, evaluate in another environment. The
+    statistics of ``VecNormalize`` stay as they are.
 
     :param model: anything with ``predict``: an algorithm or a policy
     :param env: a single or a vectorised environment; it is reset first
@@ -215,7 +241,8 @@ def evaluate_policy(
     :param on_step: called after each step, e.g. to render
     :param on_episode: called with return, cost and length of each counted episode as it ends
     :raises ValueError: ``n_eval_episodes`` is below 1, a cost is not finite or missing where it
-        must not be, or the policy acts on another number of costs than ``cost_keys`` names
+        must not be, the policy acts on another number of costs than ``cost_keys`` names, or the
+        model learnt from normalised observations and ``env`` has none
     """
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
@@ -237,7 +264,7 @@ def evaluate_policy(
         model.begin_anew |= share_environment(model.env, env)
 
     tally = _Tally(env, n_eval_episodes, keys, on_episode)
-    with _own_random_numbers(seed):
+    with _constant_normalization(model, env), _own_random_numbers(seed):
         if seed is not None:
             env.seed(seed)
         observations = env.reset()

@@ -11,7 +11,12 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_guard.algorithms import CPO, TRPOSL
-from sb3_guard.common.evaluation import Evaluation, estimate, evaluate_policy
+from sb3_guard.common.evaluation import (
+    Evaluation,
+    estimate,
+    evaluate_policy,
+    sync_normalization,
+)
 from sb3_guard.common.monitor import CostMonitor
 
 
@@ -269,3 +274,26 @@ def test_interval_covers_the_mean_about_as_often_as_it_says():
         hits += low <= 5.0 <= high
     # Percentile intervals of 30 values cover a little less than 95 %.
     assert 0.90 <= hits / len(samples) <= 0.97
+
+
+def test_an_evaluation_leaves_the_normalization_as_it_is():
+    env = VecNormalize(CostMonitor(DummyVecEnv([lambda: CostPoint(30)] * 2)))
+    model = CPO("MlpPolicy", env, n_steps=60, seed=0, device="cpu").learn(120)
+    count, rows = env.obs_rms.count, []
+    for _ in range(2):
+        rows.append(evaluate_policy(model, model.get_env(), 4, seed=3).returns)
+    assert env.training and env.obs_rms.count == count
+    np.testing.assert_array_equal(*rows)
+
+
+def test_an_agent_of_normalized_observations_is_not_given_raw_ones():
+    env = VecNormalize(CostMonitor(DummyVecEnv([lambda: CostPoint(30)])))
+    model = CPO("MlpPolicy", env, n_steps=60, device="cpu")
+    raw = CostMonitor(DummyVecEnv([lambda: CostPoint(30)]))
+    with pytest.raises(ValueError, match=r"env has no VecNormalize: .*model.get_env\(\)"):
+        evaluate_policy(model, raw)
+    other = VecNormalize(raw, training=False)
+    sync_normalization(env, other)
+    assert len(evaluate_policy(model, other)) == 10
+    env.norm_obs = False
+    assert len(evaluate_policy(model, raw)) == 10

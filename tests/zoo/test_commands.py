@@ -610,3 +610,5 @@ def test_early_termination_is_for_training_alone(tmp_path, normalize):
         assert {*split["lengths"]} == {20}
     evaluations = np.load(run / "evaluations.npz")
     assert (evaluations["ep_lengths"] == 20).all()
+    # That cut episodes cost little says nothing of the limit.
+    assert result["cut"] and "verdict" not in result["costs"]["cost"]

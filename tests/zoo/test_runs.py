@@ -147,6 +147,14 @@ def test_an_environment_is_chosen_with_or_without_its_version(tmp_path):
         choose(found, [goal, "SafetyPointGoal1-v1"])
 
 
+def test_runs_with_and_without_a_wrapper_are_not_averaged(tmp_path):
+    wrapper = "sb3_guard.common.vec_budgets.VecEarlyTermination"
+    fake_run(tmp_path)
+    fake_run(tmp_path, seed=1, config={"vec_env_wrapper": {wrapper: {"budget": 25}}})
+    with pytest.raises(UsageError, match=r"of cpo differ in wrappers, .*give the folders of one"):
+        select(read_results([tmp_path]).runs)
+
+
 def test_runs_of_several_lengths_are_not_averaged(tmp_path):
     fake_run(tmp_path, "trpo", epochs=4)
     for epochs in (3, 6):

@@ -108,6 +108,12 @@ def test_runs_of_older_versions_have_the_training_only(tmp_path):
     assert table["split"].tolist() == ["training"]
 
 
+def test_episodes_that_a_wrapper_ended_are_not_judged(tmp_path):
+    fake_run(tmp_path, cut=True, final=final([1.0, 2.0], [1.0, 9.0]))
+    table = judge(with_safety(read_results([tmp_path]).runs))
+    assert table["split"].tolist() == ["stochastic", "greedy"]
+
+
 def test_a_limit_on_the_worst_step_says_nothing_of_the_sum(tmp_path):
     """SCPO's: no tier by the sum of an episode's costs, and none for TRPO by that limit."""
     for algo in ("scpo", "trpo"):

@@ -28,7 +28,7 @@ _SUITE = re.compile(
     r"(?P<task>[A-Za-z][A-Za-z0-9]*)_(?P<robot>[A-Za-z][A-Za-z0-9]*)_(?P<constraint>\d+[A-Za-z]\w*)-v0"
 )
 # Runs that agree in these are the same run, made again.
-_SAME = ["suite", "world", "algo", "limits", "seed", "steps", "started_from", "config"]
+_SAME = ["suite", "world", "wrappers", "algo", "limits", "seed", "steps", "started_from", "config"]
 VERDICTS = ("exceeded", "undecided", "kept")  # the worst one first
 
 
@@ -101,9 +101,9 @@ def read_run(path: Path) -> dict[str, Any]:
         (cumulative cost ÷ steps),
         ``cost_limit`` (of the total cost; NaN: there is none), ``limits`` (of all costs, "1 2";
         missing: unconstrained), ``verdict`` on them (of several the worst), ``seconds`` of
-        training, ``epoch`` (steps of a rollout), ``world`` (``env_kwargs``), ``started_from`` (the
-        model that training started from) and ``config`` (the same for the same
-        hyperparameters). If the limits are on other costs than the total, there are
+        training, ``epoch`` (steps of a rollout), ``world`` (``env_kwargs``), ``wrappers``,
+        ``started_from`` (the model that training started from) and ``config`` (the same for the
+        same hyperparameters). If the limits are on other costs than the total, there are
         ``M_c/<key>``, ``cost_limit/<key>`` and ``verdict/<key>`` of each
     :raises UsageError: the run is not finished, or damaged
     """
@@ -141,6 +141,7 @@ def read_run(path: Path) -> dict[str, Any]:
         **by_key,
         "epoch": math.nan if None in rollout else math.prod(rollout),
         "world": _text(config.get("env_kwargs") or {}),
+        "wrappers": _text([config.get(f"{kind}env_wrapper") for kind in ("", "vec_")]),
         "started_from": args.get("trained_agent") or None,
         "config": _digest(config, result.get("learned")),
         **{name: versions.get(name) for name in VERSIONS},
@@ -251,12 +252,13 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
     The runs that may be averaged: of runs that are the same, seed included, the last one counts.
 
     :raises UsageError: an environment has several cost limits or ``env_kwargs``, or an algorithm
-        on it several lengths
+        on it several lengths or wrappers
     """
     for column, name, keys, fix in (
         ("limits", "cost limit", ["suite"], "choose one, such as --cost-limit {}"),
         ("world", "env_kwargs", ["suite"], "give the folders of one kind only"),
         ("steps", "length", ["suite", "algo"], "choose one, such as --steps {}"),
+        ("wrappers", "wrappers", ["suite", "algo"], "give the folders of one kind only"),
     ):
         for key, group in runs.groupby(keys):
             values = _values(group[column])

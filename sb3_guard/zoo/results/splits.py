@@ -30,12 +30,15 @@ def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataF
     :param path: the run folder
     :param epoch: steps, as for :func:`~sb3_guard.zoo.results.statistics.last_epochs`
     :return: for each of :data:`SPLITS` that the run has, its episodes' ``J_r`` and ``M_c``: of
-        training those of the last ten epochs. Runs of older versions have no final ones
+        training those of the last ten epochs, if no wrapper ended them early. Runs of older
+        versions have no final ones
     :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
     """
-    splits = {"training": last_epochs(read_episodes(path), epoch)[["J_r", "M_c"]]}
-    played = json.loads((Path(path) / "result.json").read_bytes()).get("final", {})
-    for split, episodes in played.items():
+    result = json.loads((Path(path) / "result.json").read_bytes())
+    splits = {}
+    if not result.get("cut"):
+        splits["training"] = last_epochs(read_episodes(path), epoch)[["J_r", "M_c"]]
+    for split, episodes in result.get("final", {}).items():
         splits[split] = pd.DataFrame({"J_r": episodes["returns"], "M_c": episodes["costs"]})
     return splits
 

@@ -249,6 +249,12 @@ class Setup:
     noise_type: str | None = None
     noise_std: float = 0.0
 
+    @property
+    def cuts_episodes(self) -> bool:
+        """Whether a wrapper ends episodes of the training alone, as EarlyTermination does."""
+        wrappers = [*self.env_wrapper, *self.vec_env_wrapper]
+        return any(getattr(cls, "training_only", False) for cls, _ in wrappers)
+
     def callbacks(self) -> list[BaseCallback]:
         """
         The callbacks, made only where somebody trains.

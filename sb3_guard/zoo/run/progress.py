@@ -59,12 +59,15 @@ class Epochs(BaseCallback):
 
     :param total: steps at which training ends
     :param bar: show a progress bar on stderr
+    :param cut: a wrapper ends the episodes early, so that their costs do not say whether the agent
+        keeps its limits
     """
 
-    def __init__(self, total: int, bar: bool = False):
+    def __init__(self, total: int, bar: bool = False, cut: bool = False):
         super().__init__()
         self.total = total
         self.show = bar
+        self.cut = cut
         self.bar = tqdm(disable=True)
         # step at which it ended, return, cost, length, and what the m limits bound: the episodes
         # of the epoch under way
@@ -151,7 +154,7 @@ class Epochs(BaseCallback):
             interval = estimate(episodes)
             if not np.isnan(interval.low):
                 cost |= {"low": interval.low, "high": interval.high}
-                if cost["limit"] is not None:
+                if cost["limit"] is not None and not self.cut:
                     cost["verdict"] = verdict(interval.low, interval.high, cost["limit"])
         return costs
 
@@ -167,10 +170,10 @@ class Epochs(BaseCallback):
             "exceeded" or "undecided" (without interval and verdict if fewer than two episodes
             ended), ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the
             number of episodes that ended because the physics diverged, ``cost_limit`` (None:
-            unconstrained), ``limit_on`` of an algorithm that limits the worst step,
-            ``seconds`` of training, and :func:`provenance`. ``learned``, absent from a straight
-            run, is the steps at which it was made longer, since warm-up and schedules were those
-            of shorter runs until then
+            unconstrained), ``limit_on`` of an algorithm that limits the worst step, ``cut`` where a
+            wrapper ended the episodes early, which leaves no verdict, ``seconds`` of training, and
+            :func:`provenance`. ``learned``, absent from a straight run, is the steps at which it
+            was made longer, since warm-up and schedules were those of shorter runs until then
         """
         monitor = find_monitor(self.training_env)
         means = self.last[:, :3].mean(axis=0).tolist() if len(self.last) else [None] * 3
@@ -188,6 +191,7 @@ class Epochs(BaseCallback):
             "physics_errors": monitor.physics_errors,
             "cost_limit": limit,
             **({"limit_on": "max"} if self._limits_worst else {}),
+            **({"cut": True} if self.cut else {}),
             # SB3's clock, which a resumed run sets back
             "seconds": round((time.time_ns() - self.model.start_time) / 1e9, 3),
             **({"learned": self.learned} if self.learned else {}),

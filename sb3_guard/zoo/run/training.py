@@ -87,7 +87,8 @@ class Training:
     ) -> tuple[Checkpoints, Epochs]:
         """The callbacks; that of the checkpoints has all others."""
         flags = self.flags
-        epochs = Epochs(self.setup.n_timesteps, bar=bool(flags.progress))
+        bar, cut = bool(flags.progress), self.setup.cuts_episodes
+        epochs = Epochs(self.setup.n_timesteps, bar=bar, cut=cut)
         others: list[BaseCallback] = [epochs]
         if not isinstance(self.model, Constrained):
             others.append(LogCosts())

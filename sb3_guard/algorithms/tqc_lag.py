@@ -1,6 +1,6 @@
 """TQC-Lagrangian: TQC with critics of the costs' distributions, and multipliers."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from sb3_contrib import TQC
@@ -79,6 +79,8 @@ class TQCLag(SoftActorCritic, TQC):
     """
 
     label, family, paper = "TQC-Lagrangian", "Lagrangian", "Kuznetsov et al. 2020"
+
+    search_space: ClassVar[dict[str, Any]] = {"cost_quantile": [None, 0.7, 0.9]}
 
     cost_quantile: float | None = hyperparameter(None, high=1.0, ends="()")
 

@@ -147,6 +147,7 @@ class Experiment:
             seed=seed,
             cost_keys=self.cost_keys,
             num_threads=flags.num_threads if flags.num_threads > 0 else None,
+            packages=flags.gym_packages,
             normalizer=read_normalizer(statistics) if statistics else None,
             **kwargs,
         )

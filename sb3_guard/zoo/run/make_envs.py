@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 from sb3_guard.checks import WorldError
 from sb3_guard.common.sources import Source, find
 from sb3_guard.common.vec_env import make_vec_env
-from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts_ignored
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, interrupts_ignored
 from sb3_guard.zoo.run.hyperparams import Setup
 from sb3_guard.zoo.run.resumable import ResumableEnv
 
@@ -93,6 +93,7 @@ def make_envs(
     env_kwargs: Mapping[str, Any],
     cost_keys: Sequence[str] = ("cost",),
     num_threads: int | None = None,
+    packages: Sequence[str] = (),
     evaluation: bool = False,
     normalizer: VecNormalize | None = None,
     render_mode: str | None = None,
@@ -108,6 +109,7 @@ def make_envs(
     :param env_kwargs: arguments of the environment
     :param cost_keys: entries of info that are costs
     :param num_threads: threads of the native engine; None: its own choice
+    :param packages: modules whose functions wrappers name, to be imported in each process
     :param evaluation: observations are normalised with given statistics, rewards not at all, and
         wrappers that are ``training_only`` are left out
     :param normalizer: statistics to begin with; it is given the environment
@@ -116,6 +118,7 @@ def make_envs(
     """
 
     def wrap(env: gym.Env) -> gym.Env:
+        import_packages(packages)
         for cls, arguments in _wrappers(setup.env_wrapper, evaluation):
             env = cls(env, **arguments)
         return ResumableEnv(env)

@@ -18,7 +18,8 @@ try:
 except (RuntimeError, AttributeError) as error:  # what a backend that is not there raises
     raise ImportError(
         f"mujoco does not import with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r} ({error}): "
-        "unset MUJOCO_GL, or set it to one of egl, glfw, osmesa that is installed"
+        "unset MUJOCO_GL, or set it to one of egl, glfw, osmesa that is installed",
+        name="mujoco",
     ) from error
 import gymnasium
 from gymnasium.envs.registration import EnvSpec, parse_env_id

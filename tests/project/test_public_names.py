@@ -25,7 +25,6 @@ ALLOWED = {
     },
     "Gymnasium's hook for vector environments": {"_add_info"},
     "documented in Python": {"_asdict", "_exit", "_replace"},
-    "argparse's, for the nearest flag": {"_option_string_actions"},
 }  # fmt: skip
 
 

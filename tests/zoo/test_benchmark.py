@@ -167,7 +167,7 @@ REFUSED = [
     (["--jobs", "0"], ["--jobs", "at least 1"]),
     (["--scheduler", "x", "--jobs", "2"], ["--nworkers"]),
     (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
-    (["--envz", "x"], ["unknown flag --envz", "--envs"]),
+    (["--envz", "x"], ["unknown argument --envz", "--envs"]),
     (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
 ]
 

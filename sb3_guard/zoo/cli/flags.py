@@ -35,7 +35,7 @@ import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.spelling import did_you_mean, nearest
 from sb3_guard.zoo.cli.usage import Parser, UsageError, key_value, run
 from sb3_guard.zoo.cli.values import typed, words
 
@@ -129,8 +129,14 @@ class Command:
         :param argv: arguments; None: those of the process
         :raises UsageError: a flag is unknown, with the nearest name, or a value is not allowed
         """
-        parsed = vars(cls.parser().parse_args(argv))
-        given = {}
+        namespace, unknown = cls.parser().parse_known_args(argv)
+        if unknown:
+            word = unknown[0].split("=")[0]
+            flags = (field.name for field, _ in cls._flags() if not field.metadata["positional"])
+            near = nearest(word, map(_long, flags))
+            remedy = f"did you mean {near}?" if near else "see --help"
+            raise UsageError(f"unknown argument {word}; {remedy}")
+        parsed, given = vars(namespace), {}
         for field, hint in cls._flags():
             # What is absent is not there at all, except values that go without a flag.
             bare = field.metadata["positional"]

@@ -4,7 +4,6 @@ import argparse
 import importlib
 import math
 import os
-import re
 import shlex
 import signal
 import sys
@@ -17,7 +16,6 @@ from typing import Any, NoReturn
 import yaml
 
 from sb3_guard.plain_yaml import load_yaml
-from sb3_guard.spelling import nearest
 from sb3_guard.zoo.cli.values import parse_value
 
 LONGEST = 500  # characters of an error that are printed
@@ -99,17 +97,10 @@ def packages_flag(modules: Sequence[str]) -> str:
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that raises :class:`UsageError` and knows which flag was meant."""
+    """An argument parser that raises :class:`UsageError`."""
 
     def error(self, message: str) -> NoReturn:
         """Raise instead of printing the usage, which would bury the message."""
-        unknown = re.match(r"unrecognized arguments: (-\S+)", message)
-        if unknown:
-            flag = unknown[1].split("=")[0]
-            flags = [name for name in self._option_string_actions if name.startswith("--")]
-            near = nearest(flag, flags)
-            hint = f"did you mean {near}?" if near else "see --help"
-            raise UsageError(f"unknown flag {flag}; {hint}")
         raise UsageError(" ".join(message.split()))
 
 

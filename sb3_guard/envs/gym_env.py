@@ -323,4 +323,4 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a :meth:`state` of the same scenario."""
         super().restore(state)
-        self._np_random = self.engine.rngs[0]
+        self.np_random = self.engine.rngs[0]

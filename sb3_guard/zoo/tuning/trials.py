@@ -256,7 +256,8 @@ class Objective:
         """One training: its evaluations, and whether it went to the end."""
         settings = self.settings
         checked = check(settings.algo, algorithm(settings.algo), values)
-        training = Training(Experiment(replace(self.training, seed=seed), checked))
+        experiment = Experiment(replace(self.training, seed=seed), checked)
+        training = Training(experiment.try_out())
 
         evaluations = Evaluations(training, settings, after, self.stopped)
         try:

@@ -17,6 +17,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.callbacks import CostEvalCallback, selection_limits
+from sb3_guard.common.sources import Source
 from sb3_guard.costs import read_costs
 from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.run.algos import algorithm
@@ -30,6 +31,7 @@ from sb3_guard.zoo.run.make_envs import (
     evaluation_seed,
     make_envs,
     seed_rows,
+    source_of,
 )
 
 
@@ -41,13 +43,14 @@ class Experiment:
     :param flags: all flags of the run
     :param hyperparams: hyperparameters as data, checked
     :param folder: the folder of the run to continue; None: a new run
-    :raises UsageError: a hyperparameter names what does not exist
+    :raises UsageError: there is no such algorithm or environment, or no class of that name
     """
 
     flags: RunFlags
     hyperparams: Mapping[str, Any]
     folder: RunFolder | None = None
     algorithm: type[BaseAlgorithm] = field(init=False)
+    source: Source = field(init=False)
     setup: Setup = field(init=False)
     cost_keys: tuple[str, ...] = field(init=False)
 
@@ -55,6 +58,7 @@ class Experiment:
         if self.flags.track and not self.flags.tensorboard_log:
             self.flags = dataclasses.replace(self.flags, tensorboard_log="runs")
         self.algorithm = algorithm(self.flags.algo)
+        self.source = source_of(self.flags.env)
         self.setup = build(self.hyperparams)
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
 
@@ -153,7 +157,7 @@ class Experiment:
         kwargs = {"vec_env": str(flags.vec_env), "env_kwargs": self.setup.env_kwargs, **kwargs}
         statistics = self._statistics_beside()
         return make_envs(
-            flags.env,
+            self.source,
             self.setup,
             n_envs=n_envs,
             seed=seed,

@@ -84,7 +84,7 @@ def full_id(env_id: str) -> str:
 
 
 def make_envs(
-    env_id: str,
+    source: Source,
     setup: Setup,
     *,
     n_envs: int,
@@ -101,7 +101,7 @@ def make_envs(
     """
     Make environments and wrap them: monitor, ``vec_env_wrapper``, VecNormalize, frame stack.
 
-    :param env_id: full id
+    :param source: where they come from, see :func:`source_of`
     :param setup: the run's hyperparameters
     :param n_envs: how many
     :param seed: the environments get seed, seed + 1, …
@@ -124,11 +124,11 @@ def make_envs(
         return ResumableEnv(env)
 
     with (
-        explained(f"can't make {env_id}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
+        explained(f"can't make {source.env_id}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
         interrupts_ignored(),  # a rollout under way can be finished
     ):
         env = make_vec_env(
-            env_id,
+            source,
             n_envs,
             seed,
             vec_env=vec_env,
@@ -138,7 +138,7 @@ def make_envs(
             wrapper_class=wrap if vec_env != "native" or setup.env_wrapper else None,
             monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
         )
-    with ExitStack() as made, explained(f"can't wrap {env_id}", *BAD_ARGUMENTS):
+    with ExitStack() as made, explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
         made.callback(env.close)
         wrapped = _wrap(env, setup, evaluation, normalizer)
         made.pop_all()

@@ -474,14 +474,15 @@ OUTPUT = (
 ).split()
 
 
-def test_output_that_nobody_reads(tmp_path):
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_output_that_nobody_reads(tmp_path, vec_env):
     """As with ``| head -3``, which is no process of environments that died."""
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
-        [sys.executable, "-m", "sb3_guard.train", *OUTPUT, str(tmp_path)],
+        [sys.executable, "-m", "sb3_guard.train", *OUTPUT, str(tmp_path), "--vec-env", vec_env],
         stdout=writer, stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(SUPPORT)},
+        env={**os.environ, "PYTHONPATH": str(SUPPORT), "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
     os.close(writer)
     assert done.returncode == 141 and b"subproc" not in done.stderr

@@ -122,21 +122,27 @@ def run(command: Callable[[], int]) -> int:
         status = command()
         sys.stdout.flush()
         return status
-    except BrokenPipeError:
-        try:
-            print(flush=True)
-        except BrokenPipeError:
-            pass
-        else:
-            raise  # some other pipe, such as one of an environment
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
-        return 141
-    except (UsageError, ImportError) as error:  # an absent package, or no backend for MuJoCo
-        text = one_line(error)
+    except (BrokenPipeError, UsageError, ImportError) as error:
+        # Python does not say which pipe is broken: ours, or one of an environment.
+        if isinstance(error.__cause__ or error, BrokenPipeError) and _nobody_reads():
+            return 141
+        if isinstance(error, BrokenPipeError):
+            raise
+        text = one_line(error)  # also of an absent package, or no backend for MuJoCo
         print(f"error: {text if len(text) <= LONGEST else text[:LONGEST] + ' …'}", file=sys.stderr)
         return getattr(error, "status", 2)
     except KeyboardInterrupt:
         return 130
+
+
+def _nobody_reads() -> bool:
+    """Whether the reader of standard output is gone, which another line tells; if so, stop it."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return True
+    return False
 
 
 @contextmanager

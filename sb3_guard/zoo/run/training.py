@@ -120,7 +120,6 @@ class Training:
         try:
             return self._train(folder, asked_to_stop)
         except PROCESS_DIED as error:
-            print(flush=True)  # fails again if it is the reader of our output that is gone
             if self.flags.vec_env != "subproc":
                 raise
             raise UsageError(

@@ -217,15 +217,6 @@ def test_a_preset_in_a_grid_file_is_no_program(capsys, tmp_path):
 # what becomes of it
 
 
-def test_the_former_name_of_a_flag_is_read_and_not_shown(tmp_path, capsys):
-    file = tmp_path / "old.yml"
-    file.write_text("suites: [Goal_Ant_8Ghosts]")
-    named = benchmark.Flags.parse(["--suites", "Goal_Ant_8Ghosts"])
-    filed = benchmark.with_file(benchmark.Flags.parse(["--grid", str(file)]))
-    assert named.envs == filed.envs == ["Goal_Ant_8Ghosts"]
-    assert "suites" not in benchmark.Flags.parser().format_help()
-
-
 def test_runs_are_runs_of_train(tmp_path, here, capsys):
     folder = tmp_path / "grid"
     assert benchmark.main([*GRID, "--algos", "cpo", "--seeds", "3", "-f", str(folder)]) == 0

@@ -160,25 +160,14 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
     def _setup_model(self) -> None:
         self._check_hyperparameters()
         self.cost_keys = tuple(self.cost_keys)  # loading turns tuples into lists
-        self._read_running_episodes()
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
-
-    def _read_running_episodes(self) -> None:
-        """Take over the episodes under way from a file that has them as three arrays."""
-        arrays = [
-            vars(self).pop(f"running_{name}", None) for name in ("costs", "charges", "lengths")
-        ]
-        if self.episodes is None and arrays[0] is not None:
-            self.episodes = EpisodeCosts(*arrays[0].shape, self.limit_on)
-            self.episodes.totals, self.episodes.highest, self.episodes.lengths = arrays
 
     def _choose_buffer(self) -> None:
         """Say which buffer SB3 is to make, and what it has to know of the costs."""
 
     def _excluded_save_params(self) -> list[str]:
-        # "cost_limits" is of files from before it was derived from cost_limit
-        return [*super()._excluded_save_params(), "cost_limits", "step_costs"]
+        return [*super()._excluded_save_params(), "step_costs"]
 
     # Costs
 

@@ -47,5 +47,5 @@ try:
     importlib.import_module("sb3_guard.envs")
 except ImportError as error:
     # the algorithms train on any environment, also where MuJoCo is older than the engine needs
-    if "mujoco" not in str(error) and "gymnasium" not in str(error):
+    if (error.name or "").split(".")[0] not in {"mujoco", "gymnasium"}:
         raise

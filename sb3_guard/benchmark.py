@@ -73,7 +73,7 @@ class Flags(EvaluationFlags, TrainingFlags):
   sb3-guard benchmark --preset paper45 --scheduler tcp://node1:8786
 """
 
-    envs: list[str] | None = flag(metavar="ENV", role=IDENTITY, former=("suites",))
+    envs: list[str] | None = flag(metavar="ENV", role=IDENTITY)
     preset: str | None = flag(metavar="NAME", role=IDENTITY)
     algos: list[str] | None = flag(metavar="ALGO", role=IDENTITY)
     seeds: list[int] = flag(default=[0, 1], kind=seed_number, metavar="K", role=IDENTITY)

@@ -1,14 +1,16 @@
-"""Costs as environments report them in ``info``: read, summed and refused in one way."""
+"""Costs as environments report them in ``info``: read, summed, judged and refused in one way."""
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from sb3_guard.checks import NumberError
 from sb3_guard.spelling import nearest
+
+RESAMPLES = 2000  # of a bootstrap
 
 
 def number(value: Any, name: str) -> float:
@@ -25,6 +27,33 @@ def number(value: Any, name: str) -> float:
     if not math.isfinite(number):
         raise NumberError(f"{name} is {value!r}: a cost must be a finite number")
     return number
+
+
+def interval(
+    groups: Sequence[np.ndarray],
+    statistic: Callable[..., np.ndarray] = np.mean,
+    resamples: int = RESAMPLES,
+) -> tuple[float, float]:
+    """A 95 % percentile bootstrap interval, stratified: each group is resampled by itself.
+
+    The resampling has its own fixed seed: the same values give the same interval.
+
+    :param groups: independent values, such as one per episode or run, [n_g] each
+    :param statistic: called with ``axis=1`` on [resamples, Σ n_g] values; returns [resamples]
+    :param resamples: number of bootstrap samples
+    :return: lower and upper end; NaN where no group has two values, since one says nothing about
+        another
+    """
+    if not any(len(group) > 1 for group in groups):
+        return math.nan, math.nan
+    rng = np.random.default_rng(0)
+    draws = [
+        group[rng.integers(len(group), size=(resamples, len(group)))]
+        for group in groups
+        if len(group)
+    ]
+    low, high = np.quantile(statistic(np.concatenate(draws, axis=1), axis=1), [0.025, 0.975])
+    return float(low), float(high)
 
 
 def verdict(low: float, high: float, limit: float) -> str:

@@ -1,10 +1,13 @@
-"""Ids of environments: one rule for a version that is left out."""
+"""Ids of environments: which are ours, and one rule for a version that is left out."""
 
 import re
 from collections.abc import Iterable
 
 import gymnasium
 from gymnasium.envs.registration import find_highest_version
+
+#: of our environments, as Gymnasium's registry has it
+ENTRY_POINT = "sb3_guard.envs.gym_env:GuardEnv"
 
 
 class UnknownId(ValueError):

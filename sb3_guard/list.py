@@ -97,11 +97,6 @@ KINDS = {
 }
 
 
-def kind_of(text: str) -> str:
-    """The name of a list; ``suites`` is the former name of ``environments``."""
-    return "environments" if text == "suites" else text
-
-
 @dataclass
 class Flags(Command):
     """
@@ -117,7 +112,7 @@ class Flags(Command):
   sb3-guard list robots
 """
     kind: Literal["environments", "robots", "tasks", "constraints", "agents"] | None = flag(
-        positional=True, nargs="?", type=kind_of
+        positional=True, nargs="?"
     )
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
 

@@ -110,14 +110,14 @@ def rates(
     return best(functions, seconds, slices, clock)
 
 
-def reset_seconds(env_id: str, n: int = 100, repeats: int = 5) -> float:
+def reset_seconds(env_id: str, n: int = 100) -> float:
     """Mean seconds of a reset: layout, state and first observation.
 
     The same resets are done several times over and the fastest of each counts: layouts differ in
     what they take, repetitions only in what else the machine does.
     """
     vec = GuardVectorEnv(1, env_spec(env_id).kwargs["scenario"])
-    seconds = np.empty((repeats, n))
+    seconds = np.empty((5, n))
     for row in seconds:
         vec.begin([0])
         for i in range(n):
@@ -150,7 +150,7 @@ for _ in sys.stdin:
 """
 
 
-def beside(python: str, env_id: str, threads: int = 1, turns: int = 5) -> None:
+def beside(python: str, env_id: str, threads: int = 1) -> None:
     """Print our steps per second, and those of the real package, which has one thread."""
     clock = time.process_time if threads == 1 else time.perf_counter
     command = [python, "-W", "ignore", "-c", REAL, env_id, clock.__name__]
@@ -161,7 +161,7 @@ def beside(python: str, env_id: str, threads: int = 1, turns: int = 5) -> None:
     ours, theirs, longest = 0.0, 0.0, math.inf
     scenario = env_spec(env_id).kwargs["scenario"]
     rng = np.random.default_rng(0)
-    for _ in range(turns):
+    for _ in range(5):
         env = GuardVectorEnv(30, scenario, num_threads=threads)
         env.reset(seed=0)
         actions = rng.uniform(-1, 1, (64, *env.action_space.shape))

@@ -20,14 +20,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sb3_guard.costs import verdict
+from sb3_guard.costs import interval, verdict
 from sb3_guard.envs import GuardEnv, env_spec
 from sb3_guard.envs.constraints.obstacles import Obstacles
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.observation import Compass, Lidar, Scan
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
 from sb3_guard.envs.tasks.goal import Goal
-from sb3_guard.zoo.results.statistics import interval
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "docs" / "browser"

@@ -38,7 +38,7 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.folder import RunFolder, run_path
 from sb3_guard.zoo.run.hyperparams import build
-from sb3_guard.zoo.run.make_envs import make_envs
+from sb3_guard.zoo.run.make_envs import make_envs, source_of
 
 RECORDED = Path(__file__).parents[1] / "tests" / "data" / "pretrained.npz"
 EPISODES = 300
@@ -70,8 +70,8 @@ def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
     """The agent of a run as it was saved, with environments to play in."""
     setup = build(run.hyperparams())
     env = make_envs(
-        run.name, setup, n_envs=n_envs, seed=seed, vec_env="native", env_kwargs=setup.env_kwargs,
-        evaluation=True,
+        source_of(run.name), setup, n_envs=n_envs, seed=seed, vec_env="native",
+        env_kwargs=setup.env_kwargs, evaluation=True,
         normalizer=None if setup.normalize is None else read_normalizer(run.normalizer),
     )  # fmt: skip
     return load_model(algorithm(run.args()["algo"]), run.model, env, "cpu")

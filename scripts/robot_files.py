@@ -88,7 +88,7 @@ def path(source: Source) -> Path:
     return folder / source.file
 
 
-def observed(engine: Engine, name: str) -> str:
+def observed(engine: Engine) -> str:
     """The robot's observations in words, those of many sensors by their number."""
     names = [n for n in engine.observation_layout if n not in ("goal_compass", "hazards_lidar")]
     computed = ("base_", "gravity", "joint_", "last_action")
@@ -117,7 +117,7 @@ def main() -> None:
         where = (source.wheel or "gymnasium").partition("==")[0]
         rows.append(
             [f"`{Path(source.file).name}` of {where}", stated or "nothing", source.tasks,
-             str(engine.robot.action_size), observed(engine, name),
+             str(engine.robot.action_size), observed(engine),
              f"{speed[name] / speed['Point']:.2f}"]
         )  # fmt: skip
         ROBOTS.pop(name)

@@ -35,6 +35,7 @@ from typing import Any
 import pytest
 import sb3_contrib
 import stable_baselines3
+from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -137,7 +138,8 @@ def stand_in(cls: type, name: str, defaults: dict[str, Any]) -> type:
             try:
                 super().__init__(policy, env, *args, **kwargs)
             except ValueError as error:
-                if filtered and "corrects actions of a Box" in str(error):
+                space = getattr(self, "action_space", None)  # absent if the policy is refused
+                if filtered and space is not None and not isinstance(space, spaces.Box):
                     pytest.skip(str(error))
                 raise
 

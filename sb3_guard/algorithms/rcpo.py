@@ -21,13 +21,5 @@ class RCPO(PenalizedTrustRegion):
     label, family, paper = "RCPO", "Lagrangian", "Tessler et al. 2019"
     defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.1, "proportional_gain": 0.5}
 
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        if vars(self).get("penalized_reward"):  # in a file of a development version
-            raise ValueError(
-                "penalized_reward=True: this version has no RCPO with the penalty in the reward; "
-                "train a new agent without it"
-            )
-
     def accept(self, trial: Trial) -> bool:
         return True

@@ -96,9 +96,10 @@ class TRPOUSL(FilteredTrustRegion):
         unit = self._layer.unit
         if bool((batch.costs < 0.0).any()):
             self._warn_once(
+                "costs below zero",
                 "TRPOUSL met costs below zero: to its critic no cost to come is less than 0; add a "
                 "constant to the cost of every step, and its sum over an episode to cost_limit, "
-                "or use TRPOSL"
+                "or use TRPOSL",
             )
         loss = self._layer.regression().fit(
             (batch.observations, self._executed(batch)),

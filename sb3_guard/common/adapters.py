@@ -7,8 +7,9 @@ MuJoCo. Wrappers that use the cost are in ``budgets.py``.
 """
 
 import copy
-import pkgutil
+import operator
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, SupportsFloat
 
@@ -217,21 +218,25 @@ class CostFromFunction(gym.Wrapper, RecordConstructorArgs):
     :param cost: ``cost(obs, action, next_obs, info)``, called after each step with the observation
         before it, the action, the observation after it and the step's ``info``. It returns a
         number, or several in a dictionary or list, which are reported as in :class:`CostFromInfo`.
-        Its name, ``"package.module:function"``, will do, so that a hyperparameter file can say it
-    :raises ValueError: nothing of that name can be imported, or it can't be called
+        Its name, ``"package.module:function"``, will do, so that a hyperparameter file can say it;
+        the module must have been imported, because a file may not run code
+    :raises ValueError: there is no function of that name, or its module is not imported
     """
 
     def __init__(self, env: gym.Env, cost: CostFunction | str) -> None:
         RecordConstructorArgs.__init__(self, cost=cost)
         gym.Wrapper.__init__(self, env)
         if isinstance(cost, str):
-            try:
-                cost = pkgutil.resolve_name(cost)
-            except (ImportError, AttributeError, ValueError) as error:
+            module, _, name = cost.rpartition(":" if ":" in cost else ".")
+            if module not in sys.modules:
                 raise ValueError(
-                    f"cost={cost!r}: must be a function or its name 'package.module:function' "
-                    f"({error})"
-                ) from error
+                    f"cost={cost!r}: must be a function or the name 'package.module:function' of "
+                    f"an imported one; import {module!r} first, or add --gym-packages {module}"
+                )
+            try:
+                cost = operator.attrgetter(name)(sys.modules[module])
+            except AttributeError as error:
+                raise ValueError(f"cost={cost!r}: {error}") from error
         if not callable(cost):
             raise ValueError(f"cost={cost!r}: must be a function cost(obs, action, next_obs, info)")
         self.cost: CostFunction = cost

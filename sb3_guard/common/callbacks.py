@@ -31,6 +31,30 @@ KEPT = (
 )  # fmt: skip
 
 
+def selection_limits(
+    selection_limit: float | Sequence[float] | None, cost_limit: Any, cost_keys: Sequence[str]
+) -> np.ndarray:
+    """
+    Episode cost up to which a model counts as safe, one per cost key, shape [m].
+
+    :param selection_limit: as for :class:`CostEvalCallback`
+    :param cost_limit: of the algorithm; None: it is unconstrained
+    :raises ValueError: ``selection_limit`` does not fit the cost keys
+    """
+    limit: Any = selection_limit
+    if limit is None:
+        final = limits_at(cost_limit, 0.0)
+        limit = np.inf if final is None else np.where(np.equal(final, 0.0), 1.0, final)
+    limits = np.asarray(limit, dtype=np.float64)
+    m = len(cost_keys)
+    if limits.shape not in ((), (m,)) or np.isnan(limits).any():
+        raise ValueError(
+            f"selection_limit={limit!r}: must be one number, or one for each of the {m} cost "
+            f"keys {cost_keys}"
+        )
+    return np.broadcast_to(limits, (m,))
+
+
 class LogCosts(BaseCallback):
     """
     Log the costs of training an algorithm that knows none, such as SB3's PPO or SAC.
@@ -161,19 +185,9 @@ class CostEvalCallback(EvalCallback):
 
         :raises ValueError: ``selection_limit`` does not fit the cost keys
         """
-        limit: Any = self.selection_limit
-        if limit is None:
-            final: Any = limits_at(getattr(self.model, "cost_limit", None), 0.0)
-            constrained = final is not None and getattr(self.model, "constrained", True)
-            limit = np.where(np.equal(final, 0.0), 1.0, final) if constrained else np.inf
-        limits = np.asarray(limit, dtype=np.float64)
-        m = len(self.cost_keys)
-        if limits.shape not in ((), (m,)) or np.isnan(limits).any():
-            raise ValueError(
-                f"selection_limit={limit!r}: must be one number, or one for each of the {m} cost "
-                f"keys {self.cost_keys}"
-            )
-        return np.broadcast_to(limits, (m,))
+        constrained = getattr(self.model, "constrained", True)
+        cost_limit = getattr(self.model, "cost_limit", None) if constrained else None
+        return selection_limits(self.selection_limit, cost_limit, self.cost_keys)
 
     def score(self, *evaluations: Evaluation) -> tuple[bool, float]:
         """How two models compare: the greater tuple is the better model.

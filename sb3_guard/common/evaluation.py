@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.monitor import total_cost
-from sb3_guard.costs import EpisodeCost, EpisodeCosts, read_costs, verdict
+from sb3_guard.costs import RESAMPLES, EpisodeCost, EpisodeCosts, interval, read_costs, verdict
 
 
 class Estimate(NamedTuple):
@@ -44,11 +44,9 @@ class Estimate(NamedTuple):
         return f"limit {limit:g}" + (f": {words}" if words else "")
 
 
-def estimate(values: np.ndarray, resamples: int = 2000) -> Estimate:
+def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
     """
-    Mean, standard deviation and 95 % percentile-bootstrap interval of one value an episode.
-
-    The resampling has its own fixed seed: the same episodes give the same interval.
+    Mean, standard deviation and :func:`~sb3_guard.costs.interval` of one value an episode.
 
     :param values: one value an episode, shape [E], e.g. ``evaluation.costs``
     :param resamples: number of bootstrap samples
@@ -56,11 +54,8 @@ def estimate(values: np.ndarray, resamples: int = 2000) -> Estimate:
     """
     if len(values) == 0:
         return Estimate(*[float("nan")] * 4)
-    low = high = float("nan")
-    if len(values) > 1:
-        rows = np.random.default_rng(0).integers(len(values), size=(resamples, len(values)))
-        low, high = np.quantile(values[rows].mean(axis=1), [0.025, 0.975]).tolist()
-    return Estimate(float(np.mean(values)), float(np.std(values)), low, high)
+    ends = interval([values], resamples=resamples)
+    return Estimate(float(np.mean(values)), float(np.std(values)), *ends)
 
 
 def bounded_name(key: str, limit_on: str) -> str:

@@ -18,15 +18,13 @@ from gymnasium.error import DependencyNotInstalled
 
 from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
 from sb3_guard.common.native import GuardVecEnv
-from sb3_guard.ids import UnknownId, with_version
+from sb3_guard.ids import ENTRY_POINT, UnknownId, with_version
 from sb3_guard.spelling import nearest
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
     from sb3_guard.envs.scenario import Scenario
-
-OURS = "sb3_guard.envs.gym_env:GuardEnv"
 
 
 class Source(NamedTuple):
@@ -60,7 +58,7 @@ def find(
         return _ours(env_id)
     env_id = env_id.removeprefix("sb3_guard:")
     spec = gymnasium.registry.get(with_version(env_id))
-    if spec is not None and spec.entry_point == OURS:
+    if spec is not None and spec.entry_point == ENTRY_POINT:
         return _ours(env_id)
     try:
         if is_safety_gymnasium(env_id):

@@ -18,7 +18,8 @@ try:
 except (RuntimeError, AttributeError) as error:  # what a backend that is not there raises
     raise ImportError(
         f"mujoco does not import with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r} ({error}): "
-        "unset MUJOCO_GL, or set it to one of egl, glfw, osmesa that is installed"
+        "unset MUJOCO_GL, or set it to one of egl, glfw, osmesa that is installed",
+        name="mujoco",
     ) from error
 import gymnasium
 from gymnasium.envs.registration import EnvSpec, parse_env_id
@@ -32,7 +33,7 @@ from sb3_guard.envs.registry import (
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.suites import env_ids, episode_steps
 from sb3_guard.envs.vector_env import GuardVectorEnv
-from sb3_guard.ids import with_version
+from sb3_guard.ids import ENTRY_POINT, with_version
 
 __all__ = [
     "GuardEnv",
@@ -46,9 +47,6 @@ __all__ = [
     "register_robot",
     "register_task",
 ]
-
-
-ENTRY_POINT = "sb3_guard.envs.gym_env:GuardEnv"
 
 
 def env_spec(name: str | Path | Mapping[str, Any] | Scenario) -> EnvSpec:

@@ -117,7 +117,6 @@ class Engine:
         self.drawn.bind(self.model)
         self._motion = Motion(self.parts)
         self.observer = Observer(self.robot, self.parts, lidar, self.extras.components)
-        self.observation_size = self.observer.size
         # of each named component, in the order of the flat observation: where it lies; its size,
         # bounds and unit
         self.observation_layout: dict[str, slice] = self.observer.slices

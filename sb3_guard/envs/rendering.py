@@ -183,23 +183,23 @@ class Renderer:
         """
         if not self._human:
             return self.frame(row)
-        viewer = self._viewer
+        window = self._viewer
         words = {**(words or {}), **self._words(row)}
         self._engine.batch.get_data(row, self._data)
-        with viewer.lock():
-            viewer.user_scn.ngeom = 0
-            self._paint(viewer.user_scn, self._data, row)
-        viewer.set_texts((None, None, "\n".join(words), "\n".join(words.values())))
-        viewer.sync()
+        with window.lock():
+            window.user_scn.ngeom = 0
+            self._paint(window.user_scn, self._data, row)
+        window.set_texts((None, None, "\n".join(words), "\n".join(words.values())))
+        window.sync()
         began, since = self._pace
         ahead = self._data.time - began - (time.monotonic() - since)  # s
         if ahead > 0:
             time.sleep(ahead)
         else:  # an episode has begun, or the machine is slow
             self._pace = self._data.time, time.monotonic()
-        while self._paused and viewer.is_running():
+        while self._paused and window.is_running():
             time.sleep(0.02)
-        if not viewer.is_running():
+        if not window.is_running():
             raise KeyboardInterrupt("the window was closed")
         return None
 

@@ -2,7 +2,6 @@
 
 import random
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -302,19 +301,6 @@ def test_crpo_lowers_the_cost_that_is_most_above_its_limit(costs: Any, worst: An
 def test_rcpo_takes_the_whole_step() -> None:
     model = make(RCPO, cost_limit=0.5).learn(256)
     assert model.logger.name_to_value["train/line_search_step"] == 1.0
-
-
-def test_a_file_with_the_penalty_in_the_reward_is_refused_in_a_line(tmp_path: Path) -> None:
-    model = make(RCPO)
-    model.penalized_reward = False
-    model.save(tmp_path / "model")
-    RCPO.load(tmp_path / "model")
-    model.penalized_reward = True
-    model.save(tmp_path / "model")
-    with pytest.raises(ValueError, match="penalized_reward=True: this version has no RCPO"):
-        RCPO.load(tmp_path / "model")
-    with pytest.raises(TypeError, match="RCPO takes no argument 'penalized_reward'"):
-        make(RCPO, penalized_reward=True)
 
 
 def test_epochs_stop_by_the_mean_over_the_rollout() -> None:

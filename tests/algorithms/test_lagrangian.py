@@ -157,13 +157,6 @@ def test_the_relative_lagrangian_by_hand() -> None:
     assert found == pytest.approx(-0.25 / 1.5, rel=1e-5)
 
 
-def test_the_old_name_of_the_weight_warns() -> None:
-    model = make(TRPOLag, **RAW)
-    with pytest.warns(DeprecationWarning, match="TRPOLag: `price` is deprecated.*`cost_weight`"):
-        weight = model.price()
-    np.testing.assert_array_equal(weight, model.cost_weight())
-
-
 def test_without_multiplier_it_is_trpo() -> None:
     """λ stays zero under a limit that holds: the same trajectories, bit for bit."""
     models = [make(cls, cost_limit=1e6).learn(1200) for cls in (TRPO, TRPOLag)]

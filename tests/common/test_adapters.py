@@ -480,6 +480,13 @@ def test_adapters_need_neither_torch_nor_mujoco():
     assert run.returncode == 0, run.stderr
 
 
+def test_only_mujoco_and_gymnasium_may_be_absent():
+    run = without("sb3_guard.envs.mujoco_gaps", code="import sb3_guard")
+    assert "import of sb3_guard.envs.mujoco_gaps halted" in run.stderr
+    run = without("mujoco", "mujoco.batch", code="import sb3_guard")
+    assert run.returncode == 0, run.stderr
+
+
 # MuJoCo 2.3 and 3 have no `mujoco.batch`
 @pytest.mark.slow
 @pytest.mark.parametrize("absent", ["mujoco", "mujoco.batch"])

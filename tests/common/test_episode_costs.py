@@ -4,10 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cost_envs import CostPoint
-from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_guard import PPOLag
 from sb3_guard.checks import NumberError
 from sb3_guard.costs import EpisodeCosts
 
@@ -46,17 +43,3 @@ def test_a_negative_cost_has_no_highest_one_to_limit() -> None:
     assert EpisodeCosts(1, 1).step(costs, dones) == []
     with pytest.raises(NumberError, match=r"a cost is -0\.5: .* at least 0"):
         EpisodeCosts(1, 1, "max").step(costs, dones)
-
-
-def test_files_with_three_arrays_are_read(tmp_path) -> None:
-    env = make_vec_env(lambda: CostPoint(episode_length=50), 2)
-    model = PPOLag("MlpPolicy", env, n_steps=20, batch_size=20, n_epochs=1, cost_limit=1.0)
-    model.learn(40)
-    sums, lengths = model.episodes.totals, model.episodes.lengths
-    model.running_costs, model.running_charges, model.running_lengths = sums, sums, lengths
-    model.episodes = None
-    model.save(tmp_path / "model")
-    again = PPOLag.load(tmp_path / "model", env=env, force_reset=False)
-    np.testing.assert_array_equal(again.episodes.totals, sums)
-    np.testing.assert_array_equal(again.episodes.lengths, [20, 20])
-    assert not [name for name in vars(again) if name.startswith("running_")]

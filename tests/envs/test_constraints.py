@@ -297,7 +297,7 @@ def test_any_mixture_and_several_of_one_type():
     engine.reset(np.arange(2))
     names = set(scenario.constraints)
     assert {f"{n}_lidar" for n in names} <= set(engine.channels)
-    assert engine.observation_size == 14 + 16 * len(names)
+    assert engine.observer.size == 14 + 16 * len(names)
     for action in actions(engine, 50):
         outcome = engine.step(action)
         assert set(outcome.costs) == {f"cost_{n}" for n in names}

@@ -107,7 +107,7 @@ def test_sizes_mass_and_time_step(robot: str) -> None:
     engine = Scenario.parse(f"Goal_{robot}_8Hazards").build()
     facts = FACTS[robot]
     assert engine.robot.action_size == facts.actions
-    assert engine.observation_size == facts.observation
+    assert engine.observer.size == facts.observation
     assert engine.model.opt.timestep == facts.timestep
     assert list(engine.model.opt.gravity) == [0, 0, -9.81]
     body = engine.model.body("robot/robot").id
@@ -301,7 +301,7 @@ GAITS = {
 @pytest.mark.parametrize("robot", GAITS)
 def test_gait_covers_ground(robot: str) -> None:
     engine, gait = world(robot), GAITS[robot]
-    felt = np.zeros(engine.observation_size)
+    felt = np.zeros(engine.observer.size)
     for t in range(gait.steps):
         turn = 2 * math.pi * (t / gait.period + np.asarray(gait.phase, float))
         action = np.asarray(gait.offset) + np.asarray(gait.amplitude) * np.sin(turn)

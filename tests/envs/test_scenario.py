@@ -636,8 +636,8 @@ def test_what_remains_must_agree_with_the_time_limit():
 def test_goal_and_object_can_be_seen_by_lidar_and_distance():
     base = Scenario.parse("Push_Point_2Hazards")
     seen = base.override(push={"lidar": True, "distance": True, "object_lidar": True}).build()
-    size = base.build().observation_size
-    assert seen.observation_size == size + 16 + 1 + 16
+    size = base.build().observer.size
+    assert seen.observer.size == size + 16 + 1 + 16
     seen.reset(np.zeros(1, dtype=int))
     obs, layout = seen.observe()[0], seen.observation_layout
     robot, goal = seen.robot.position[0, :2], seen.places("goal")[0, 0, :2]

@@ -87,7 +87,7 @@ def test_sizes_of_observations_and_actions(env_id):
     engine = Scenario.parse(env_id).build()
     assert engine.robot.action_size == actions
     if size is not None:
-        assert engine.observation_size == size
+        assert engine.observer.size == size
 
 
 @pytest.mark.slow

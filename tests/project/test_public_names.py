@@ -2,10 +2,9 @@
 
 import ast
 import functools
-import importlib
+import pkgutil
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,10 +22,15 @@ ALLOWED = {
         "_stats_window_size", "_total_timesteps", "_update_features_extractor",
         "_update_learning_rate", "_vec_normalize_env", "_wrap_env",
     },
+    "steps before `learn`: SB3 has no other way to log the speed of a resumed run": {
+        "_num_timesteps_at_start",
+    },
+    "the seeds of a VecEnv: its `seed` knows only seed, seed + 1, …": {"_seeds"},
     "Gymnasium's hook for vector environments": {"_add_info"},
     "documented in Python": {"_asdict", "_exit", "_replace"},
-    "argparse's, for the nearest flag": {"_option_string_actions"},
 }  # fmt: skip
+# MuJoCo's Renderer takes no backend, and MuJoCo chooses one before it is known whether it works.
+PATCHED = {"mujoco.rendering.classic.gl_context.GLContext"}
 
 
 def private(name: str) -> bool:
@@ -40,54 +44,58 @@ def tree(path: Path) -> ast.Module:
 
 @functools.cache
 def defined() -> set[str]:
-    """Private names that the package defines: functions, classes, variables, attributes."""
+    """Private names that the package defines: functions, classes, variables, own attributes."""
     names = set()
     for path in FILES:
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.FunctionDef | ast.ClassDef):
                 names.add(node.name)
-            elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
-                names.add(node.id if isinstance(node, ast.Name) else node.attr)
+            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+                names.add(node.id)
+            elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+                if ast.unparse(node.value) in ("self", "cls"):
+                    names.add(node.attr)
     return {name for name in names if private(name)}
 
 
-def of_libraries(module: ast.Module) -> dict[str, Any]:
-    """What a module has imported from the libraries, by the name that it has there."""
+def imports(module: ast.Module) -> dict[str, str]:
+    """Names that a module imports from outside the package, and what they stand for."""
     names = {}
     for node in ast.walk(module):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in LIBRARIES:
-            for alias in node.names:
-                library = importlib.import_module(str(node.module))
-                names[alias.asname or alias.name] = getattr(library, alias.name, None)
+        if isinstance(node, ast.ImportFrom):
+            names |= {each.asname or each.name: f"{node.module}.{each.name}" for each in node.names}
         elif isinstance(node, ast.Import):
             for alias in node.names:
-                if alias.name.split(".")[0] in LIBRARIES:
-                    names[alias.asname or alias.name] = importlib.import_module(alias.name)
-    return names
-
-
-def root(node: ast.expr) -> str:
-    """The first name of ``a.b.c``."""
-    while isinstance(node, ast.Attribute):
-        node = node.value
-    return node.id if isinstance(node, ast.Name) else ""
+                top = alias.name.partition(".")[0]
+                names[alias.asname or top] = alias.name if alias.asname else top
+    return {name: path for name, path in names.items() if not path.startswith("sb3_guard")}
 
 
 def offences(module: ast.Module) -> list[str]:
     allowed = defined().union(*ALLOWED.values())
-    imported = of_libraries(module)
+    imported = imports(module)
     found = []
+
+    def path(node: ast.expr) -> str:
+        """``optuna.storages.X`` for ``storages.X``; empty: it is of nothing imported."""
+        first, *others = ast.unparse(node).split(".")
+        return ".".join([imported[first], *others]) if first in imported else ""
+
     for node in ast.walk(module):
         if isinstance(node, ast.ImportFrom | ast.Import):
             names = [*(getattr(node, "module", None) or "").split(".")]
             names += [part for alias in node.names for part in alias.name.split(".")]
             if names[0] in LIBRARIES or any(n.name.split(".")[0] in LIBRARIES for n in node.names):
                 found += [f"imports {name}" for name in names if private(name)]
-        elif isinstance(node, ast.Attribute) and private(node.attr):
-            if node.attr not in allowed or root(node) in imported:
+        elif isinstance(node, ast.Attribute):
+            of_library = path(node).split(".")[0] in LIBRARIES
+            if private(node.attr) and (node.attr not in allowed or of_library):
                 found.append(f"uses {ast.unparse(node)}")
+            if isinstance(node.ctx, ast.Store) and path(node) not in {"", *PATCHED}:
+                found.append(f"patches {ast.unparse(node)}")
         elif isinstance(node, ast.ClassDef):
-            bases = [imported.get(root(base)) for base in node.bases]
+            bases = [path(base) for base in node.bases]
+            bases = [pkgutil.resolve_name(b) for b in bases if b.split(".")[0] in LIBRARIES]
             methods = [part.name for part in node.body if isinstance(part, ast.FunctionDef)]
             found += [
                 f"overrides {node.name}.{name}"
@@ -99,7 +107,7 @@ def offences(module: ast.Module) -> list[str]:
             if isinstance(name, ast.Constant) and private(str(name.value)):
                 if name.value not in allowed:
                     found.append(f"uses {ast.unparse(node)}")
-            elif root(node.args[0]) in imported and node.func.id == "setattr":
+            elif path(node.args[0]) and node.func.id == "setattr":
                 found.append(f"patches {ast.unparse(node)}")
     return found
 
@@ -120,10 +128,21 @@ def test_no_private_name_of_a_library(path):
         "import optuna\nsetattr(optuna.Study, name, patched)",
         "from optuna import Study\nclass Mine(Study):\n    def _log_completed_trial(self): ...",
         "import mujoco\nmujoco._structs",
+        "model._num_timesteps = 1",
+        "env.unwrapped._infos = {}",
+        "space._np_random = generator",
+        "import optuna\noptuna.Study.ask = ask",
+        "import torch as th\nth.nn.Module.forward = forward",
+        "import optuna\nclass S(optuna.storages.RDBStorage):\n    def _create_new_trial(self): ...",
+        "import optuna.storages as o\nclass S(o.RDBStorage):\n    def _create_new_trial(self): ...",
     ],
 )
 def test_such_names_are_noticed(code):
     assert len(offences(ast.parse(code))) >= 1
+
+
+def test_own_names_may_be_stored():
+    assert offences(ast.parse("import sb3_guard\nself._seeds = 1\nresult.given = set()")) == []
 
 
 def test_what_is_allowed_is_used():

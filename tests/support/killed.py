@@ -3,8 +3,6 @@
 import io
 import json
 import os
-import subprocess
-import time
 import zipfile
 from pathlib import Path
 
@@ -116,14 +114,6 @@ def crash(monkeypatch, arguments: list[str], steps: int) -> None:
 
 def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(SUPPORT), "OMP_NUM_THREADS": "1"}
-
-
-def wait_for(condition, process: subprocess.Popen, seconds: float = 300.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def lines(path: Path) -> int:

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from subprocess import Popen
+from typing import Any
 
 
 def fresh(command: Callable[[list[str]], int], arguments: list[str], output: Path) -> BaseProcess:
@@ -32,9 +34,12 @@ def _run(command: Callable[[list[str]], int], arguments: list[str], output: Path
         sys.exit(command(arguments))
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    """Wait until something is true, which it must be in time."""
+def wait_for(
+    condition: Callable[[], bool], seconds: float = 60.0, process: Popen[Any] | None = None
+) -> None:
+    """Wait until something is true, which it must be in time, and before ``process`` ends."""
     end = time.monotonic() + seconds
     while not condition():
+        assert process is None or process.poll() is None, process.communicate()
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.02)

@@ -86,6 +86,11 @@ class Broken(CostPoint):
         return super().step(action)
 
 
+def far(obs: np.ndarray, action: np.ndarray, next_obs: np.ndarray, info: Any) -> float:
+    """A cost for ``CostFromFunction``."""
+    return float(np.linalg.norm(next_obs))
+
+
 class StopAt(BaseCallback):
     """A user's callback that ends training."""
 

@@ -93,8 +93,8 @@ TRAIN = [
     (["--gym-packages", ""], ["--gym-packages: can't import ''"]),
     (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
-    (["--sede", "3"], ["unknown flag --sede", "--seed"]),
-    (["cpo"], ["unrecognized arguments: cpo"]),
+    (["--sede", "3"], ["unknown argument --sede", "--seed"]),
+    (["cpo"], ["unknown argument cpo"]),
     (["-params", "frame_stack:0"], ["frame_stack: 0", "at least 1"]),
     (["-n", "0"], ["-n", "at least 1"]),
     (["-n", "1.5"], ["'1.5' is not a whole number"]),
@@ -128,7 +128,7 @@ ENJOY = [
     (["--n-episodes", "0"], ["--n-episodes", "at least 1"]),
     (["--n-episodes", "1", "-n", "5"], ["not allowed with"]),
     (["--seed", "-1"], ["--seed: '-1'"]),
-    (["--load-bets"], ["unknown flag --load-bets", "--load-best"]),
+    (["--load-bets"], ["unknown argument --load-bets", "--load-best"]),
 ]
 
 
@@ -474,14 +474,15 @@ OUTPUT = (
 ).split()
 
 
-def test_output_that_nobody_reads(tmp_path):
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_output_that_nobody_reads(tmp_path, vec_env):
     """As with ``| head -3``, which is no process of environments that died."""
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
-        [sys.executable, "-m", "sb3_guard.train", *OUTPUT, str(tmp_path)],
+        [sys.executable, "-m", "sb3_guard.train", *OUTPUT, str(tmp_path), "--vec-env", vec_env],
         stdout=writer, stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(SUPPORT)},
+        env={**os.environ, "PYTHONPATH": str(SUPPORT), "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
     os.close(writer)
     assert done.returncode == 141 and b"subproc" not in done.stderr

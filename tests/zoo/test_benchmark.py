@@ -17,8 +17,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from killed import assert_same_run, environment, lines, runs_of, wait_for
+from killed import assert_same_run, environment, lines, runs_of
 from kills import Campaign, differences
+from processes import wait_for
 from rich.console import Console
 from typed import TOY, refused
 
@@ -167,7 +168,7 @@ REFUSED = [
     (["--jobs", "0"], ["--jobs", "at least 1"]),
     (["--scheduler", "x", "--jobs", "2"], ["--nworkers"]),
     (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
-    (["--envz", "x"], ["unknown flag --envz", "--envs"]),
+    (["--envz", "x"], ["unknown argument --envz", "--envs"]),
     (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
 ]
 
@@ -215,15 +216,6 @@ def test_a_preset_in_a_grid_file_is_no_program(capsys, tmp_path):
 
 
 # what becomes of it
-
-
-def test_the_former_name_of_a_flag_is_read_and_not_shown(tmp_path, capsys):
-    file = tmp_path / "old.yml"
-    file.write_text("suites: [Goal_Ant_8Ghosts]")
-    named = benchmark.Flags.parse(["--suites", "Goal_Ant_8Ghosts"])
-    filed = benchmark.with_file(benchmark.Flags.parse(["--grid", str(file)]))
-    assert named.envs == filed.envs == ["Goal_Ant_8Ghosts"]
-    assert "suites" not in benchmark.Flags.parser().format_help()
 
 
 def test_runs_are_runs_of_train(tmp_path, here, capsys):
@@ -526,14 +518,14 @@ def test_interrupted_once_and_twice(number, tmp_path):
     """Once: with a checkpoint. Twice: immediately, and the workers end, too."""
     arguments = [*GRID, "-n", "600000", "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)]
     with start(arguments, start_new_session=True) as process:
-        wait_for(lambda: episodes(tmp_path) > 20, process, 180)
+        wait_for(lambda: episodes(tmp_path) > 20, 180, process)
         os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 128 + number and "Traceback" not in out + err
     assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in out
     before = episodes(tmp_path)
     with start([*PACKAGE, "-f", str(tmp_path)]) as process:
-        wait_for(lambda: episodes(tmp_path) > before + 10, process, 180)
+        wait_for(lambda: episodes(tmp_path) > before + 10, 180, process)
         process.send_signal(number)
         time.sleep(0.1)
         process.send_signal(number)
@@ -573,7 +565,7 @@ def test_a_cluster_with_a_worker_killed(tmp_path):
 
     try:
         scheduler = begin("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0")
-        wait_for(address.exists, scheduler, 120)
+        wait_for(address.exists, 120, scheduler)
         flags = ["--nthreads", "1", "--no-nanny"]
         workers = [begin("distributed.cli.dask_worker", *flags) for _ in range(2)]
         folder = tmp_path / "grid"
@@ -586,7 +578,7 @@ def test_a_cluster_with_a_worker_killed(tmp_path):
                 logs = list(folder.glob("*/*/0.monitor.csv"))
                 return len(logs) == 2 and all(lines(path) > 30 for path in logs)
 
-            wait_for(both_run, process, 600)
+            wait_for(both_run, 600, process)
             workers[0].kill()
             workers[0].wait()  # a zombie would still hold its lock
             out, err = process.communicate(timeout=400)

@@ -28,7 +28,7 @@ from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.zoo.agents import playback
 from sb3_guard.zoo.cli import usage
 from sb3_guard.zoo.run.hyperparams import build, check
-from sb3_guard.zoo.run.make_envs import make_envs
+from sb3_guard.zoo.run.make_envs import make_envs, source_of
 
 
 def test_track_sends_what_tensorboard_gets_and_goes_on(tmp_path, monkeypatch):
@@ -328,7 +328,7 @@ def test_enjoy_normalises_as_training_did(tmp_path, capsys):
 def test_only_training_adds_to_the_statistics(evaluation):
     setup = build(check("cpo", CPO, {"n_timesteps": 1, "normalize": True}))
     env = make_envs(
-        "CartPole-v1", setup, n_envs=2, seed=0, vec_env="dummy", env_kwargs={},
+        source_of("CartPole-v1"), setup, n_envs=2, seed=0, vec_env="dummy", env_kwargs={},
         evaluation=evaluation,
     )  # fmt: skip
     assert (env.training, env.norm_reward) == (not evaluation, not evaluation)

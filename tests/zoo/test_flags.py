@@ -53,7 +53,10 @@ def test_typed_attributes_and_what_was_given():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--lenght=3"], "unknown flag --lenght; did you mean --length"),
+        (["--lenght=3"], "unknown argument --lenght; did you mean --length"),
+        (["-lenght"], "unknown argument -lenght; did you mean --length"),
+        (["big", "--zzz"], "unknown argument --zzz; see --help"),
+        (["big", "small"], "unknown argument small; see --help"),
         (["-n", "0"], "-n/--length: '0' is not allowed"),
         (["-n", "2.5"], "'2.5' is not a whole number"),
         (["medium"], "invalid choice: 'medium'"),

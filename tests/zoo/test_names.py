@@ -1,5 +1,6 @@
 """Data never runs: hostile files and values try to write a file, and none appears."""
 
+import json
 import shlex
 import sys
 from pathlib import Path
@@ -21,13 +22,14 @@ ESCAPE = (
     "dict(a=[c for c in ().__class__.__base__.__subclasses__() if c.__name__ == 'Popen'][0]"
     "('touch {}', shell=True))"
 )
+COST = "sb3_guard.common.adapters.CostFromFunction"
 
 
 @pytest.fixture
 def trap(tmp_path, monkeypatch):
     """A file that appears when anything of a hostile file runs; the current folder has a module."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.syspath_prepend(tmp_path)
     path = tmp_path / "trap"
     (tmp_path / "hostile.py").write_text(
         f"open({str(path)!r}, 'w')\nhyperparams = {{'default': {{}}}}\n"
@@ -55,6 +57,8 @@ def test_values_are_read_not_evaluated(trap):
         ({"envs": ["hostile:X-v0"]}, "write --gym-packages hostile --env X-v0"),
         ({"hyperparams": {"env_wrapper": "hostile.Wrapper"}}, "add --gym-packages hostile"),
         ({"hyperparams": {"policy": "hostile.Policy"}}, "add --gym-packages hostile"),
+        ({"hyperparams": {"env_wrapper": {COST: {"cost": "hostile:f"}}}}, "add --gym-packages h"),
+        ({"hyperparams": {"env_wrapper": {COST: {"cost": "hostile.f"}}}}, "add --gym-packages h"),
     ],
 )
 def test_a_grid_file_runs_nothing(tmp_path, trap, entry, message, capsys):
@@ -108,6 +112,15 @@ def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
     assert not trap.exists()
     enjoy.main([*without, "--gym-packages", "hostile"])
     assert trap.exists()
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_a_file_may_name_a_function_of_a_module_that_the_command_line_names(tmp_path, vec_env):
+    (tmp_path / "conf.yml").write_text(
+        yaml.safe_dump({"default": {"env_wrapper": {COST: {"cost": "registered_envs:far"}}}})
+    )
+    run = trained(tmp_path, "-conf", str(tmp_path / "conf.yml"), "--vec-env", vec_env)
+    assert json.loads((run / "result.json").read_text())["cost"] > 0
 
 
 def test_printed_commands_name_the_modules(tmp_path, capsys):

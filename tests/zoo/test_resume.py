@@ -24,8 +24,8 @@ from killed import (
     outcome,
     runs_of,
     tensors,
-    wait_for,
 )
+from processes import wait_for
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard import make_vec_env, train
@@ -284,7 +284,7 @@ def test_kill_minus_nine(tmp_path):
     arguments = [*TOY, *SHORT, *SMALL, "--eval-freq", "300", "-n", "1200"]
     start = command(*arguments, "-f", str(tmp_path / "cut"))
     with subprocess.Popen(start, env=environment(), stderr=subprocess.PIPE) as process:
-        wait_for(lambda: any(lines(one) > 5 for one in tmp_path.rglob("0.*.csv")), process)
+        wait_for(lambda: any(lines(one) > 5 for one in tmp_path.rglob("0.*.csv")), 300, process)
         process.kill()
     assert process.returncode == -signal.SIGKILL
     assert train.main(["-i", str(runs_of(tmp_path / "cut")), *TOY[:2]]) == 0

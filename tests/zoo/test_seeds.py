@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from registered_envs import CostPoint  # noqa: F401  registers the environments
+from registered_envs import CostPoint  # which registers the environments
 
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
@@ -40,3 +40,19 @@ def test_first_observations_of_seeds_0_and_1_differ(algo, vec_env):
         training.close()
     rows = np.concatenate(firsts)
     assert len(np.unique(rows, axis=0)) == len(rows) == 16
+
+
+def test_only_a_tried_out_experiment_takes_a_step(monkeypatch):
+    steps = []
+    step = CostPoint.step
+    monkeypatch.setattr(CostPoint, "step", lambda *args: steps.append(1) or step(*args))
+    flags, values = prepare(
+        RunFlags(algo="cpo", env="CostPoint-v0", seed=0, hyperparams={"cost_limit": 0}, verbose=0)
+    )
+    experiment = Experiment(flags, values)
+    training = Training(experiment)
+    np.testing.assert_array_equal(experiment.limits(), training.evaluation.limits())
+    assert not steps
+    experiment.try_out()
+    assert len(steps) == 1
+    training.close()

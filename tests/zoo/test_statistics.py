@@ -8,6 +8,7 @@ import pytest
 from fake_runs import LABELS, fake_run
 
 from sb3_guard import plot
+from sb3_guard.costs import interval
 from sb3_guard.zoo.cli.markdown import escaped
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.results.curves import read_curve
@@ -17,7 +18,6 @@ from sb3_guard.zoo.results.statistics import (
     SAFETY,
     aggregate,
     by_family,
-    interval,
     iqm,
     mean_curve,
     normalize,
@@ -86,11 +86,12 @@ def test_means_and_intervals_over_seeds(tmp_path):
     assert row["cost_last_se"] == pytest.approx(1 / math.sqrt(3))
     assert row["cost_total"] == pytest.approx(360)
     worst = read_results([tmp_path]).runs
+    assert aggregate(worst.assign(J_r=[10, 20, math.nan]))["J_r_low"].tolist() == [10]
     assert row["cost_max"] == with_safety(worst)["cost_max"].max()
 
 
 def test_interval():
-    assert np.isnan(interval([np.array([3.0, np.nan]), np.array([])])).all()  # one seed
+    assert np.isnan(interval([np.array([3.0]), np.array([])])).all()  # one seed
     # Resampling across the groups would mix 0 and 100; within them nothing varies.
     assert interval([np.zeros(5), np.full(5, 100.0)]) == (50.0, 50.0)
     values = np.random.default_rng(0).normal(3.0, 2.0, size=400)

@@ -689,7 +689,7 @@ WRONG = [
     (["--storage", "redis://here"], ["--storage redis://here", "must be postgresql://"]),
     (["--num-threads", "0"], ["--num-threads", "at least 1"]),
     (["--search-space", "absent.yml"], ["--search-space", "absent.yml"]),
-    (["--trials", "3"], ["unknown flag --trials", "did you mean"]),
+    (["--trials", "3"], ["unknown argument --trials", "did you mean"]),
     (["-f", "/proc/nowhere"], ["-f", "'/proc/nowhere"]),
 ]
 

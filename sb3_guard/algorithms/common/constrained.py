@@ -109,9 +109,10 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         new = kwargs.get("_init_setup_model", True)
         if self.constrained and new and "cost_limit" not in kwargs:
             self._warn_once(
+                "cost_limit",
                 f"{type(self).__name__} without cost_limit: it is 0, no cost at all, which hardly "
                 "any policy keeps; choose a positive one, such as half of what an episode of TRPO "
-                "or PPO costs, or write cost_limit=0.0"
+                "or PPO costs, or write cost_limit=0.0",
             )
         for name, one in stated(type(self)).items():
             setattr(self, name, kwargs.pop(name, one.default))
@@ -159,25 +160,14 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
     def _setup_model(self) -> None:
         self._check_hyperparameters()
         self.cost_keys = tuple(self.cost_keys)  # loading turns tuples into lists
-        self._read_running_episodes()
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
-
-    def _read_running_episodes(self) -> None:
-        """Take over the episodes under way from a file that has them as three arrays."""
-        arrays = [
-            vars(self).pop(f"running_{name}", None) for name in ("costs", "charges", "lengths")
-        ]
-        if self.episodes is None and arrays[0] is not None:
-            self.episodes = EpisodeCosts(*arrays[0].shape, self.limit_on)
-            self.episodes.totals, self.episodes.highest, self.episodes.lengths = arrays
 
     def _choose_buffer(self) -> None:
         """Say which buffer SB3 is to make, and what it has to know of the costs."""
 
     def _excluded_save_params(self) -> list[str]:
-        # "cost_limits" is of files from before it was derived from cost_limit
-        return [*super()._excluded_save_params(), "cost_limits", "step_costs"]
+        return [*super()._excluded_save_params(), "step_costs"]
 
     # Costs
 
@@ -241,8 +231,9 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         )
         if self.constrained and any(type(one) is EvalCallback for one in _within(callbacks)):
             self._warn_once(
+                "EvalCallback",
                 "EvalCallback keeps the model of the highest reward, whatever it costs: "
-                "sb3_guard.CostEvalCallback keeps the best safe one"
+                "sb3_guard.CostEvalCallback keeps the best safe one",
             )
         return steps, callbacks
 
@@ -292,8 +283,9 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
             return False
         if self.constrained and not self._cost_seen_lately:
             self._warn_once(
+                "no cost",
                 f"no info had a cost key of {tuple(self.cost_keys)} during a whole rollout: "
-                "training continues as if nothing cost anything (missing_cost='zero')"
+                "training continues as if nothing cost anything (missing_cost='zero')",
             )
         violation = (episode_cost - self.cost_limits) / horizon
         self.costs = CostEstimate(episode_cost, horizon, violation)
@@ -320,13 +312,13 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         longest = float(self.episodes.lengths.max())
         if self.constrained:
             self._warn_once(
+                "no episode",
                 "no episode has ended yet and the environment states no max_episode_steps: until "
-                f"one ends, the cost limit is spread over the longest so far, {longest:g} steps"
+                f"one ends, the cost limit is spread over the longest so far, {longest:g} steps",
             )
         return longest
 
-    def _warn_once(self, message: str) -> None:
-        topic = message.split(":")[0]
+    def _warn_once(self, topic: str, message: str) -> None:
         if topic not in self._warned:
             self._warned.add(topic)
             # The line to show is the user's, however many constructors are between (from Python

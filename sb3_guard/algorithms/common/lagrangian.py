@@ -1,6 +1,5 @@
 """Lagrange multipliers that follow the violation, for on- and off-policy algorithms."""
 
-import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Literal
 
@@ -216,12 +215,6 @@ class Lagrangian(Constrained):
             weight = weight * spread
             self._record_per_cost("train/cost_weight", weight)
         return weight.astype(np.float32)
-
-    def price(self, spread: np.ndarray | float = 1.0) -> np.ndarray:
-        """Deprecated name of :meth:`cost_weight`."""
-        message = f"{type(self).__name__}: `price` is deprecated, call `cost_weight`"
-        warnings.warn(message, DeprecationWarning, stacklevel=2)
-        return self.cost_weight(spread)
 
     def ascend(self) -> None:
         """Let the multipliers follow J_C, unless they have followed this estimate already."""

@@ -226,9 +226,10 @@ class TrustRegion(CostRollouts):
             for module in actor_modules(self.policy)
         ):
             self._warn_once(
+                "batch normalisation",
                 "the actor has batch normalisation that has seen no data: it will keep the mean 0 "
                 "and variance 1 it starts from, since statistics that move would change the "
-                "policy outside the trust region; VecNormalize normalises observations"
+                "policy outside the trust region; VecNormalize normalises observations",
             )
 
     # Collecting

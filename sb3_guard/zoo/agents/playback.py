@@ -138,7 +138,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     native = ours and not setup.env_wrapper and render_mode != "human"
     size = VIDEO if ours and render_mode else {}
     env = make_envs(
-        env_id,
+        source,
         setup,
         n_envs=n_envs if native else 1,
         seed=flags.seed,

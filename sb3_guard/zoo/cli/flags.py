@@ -35,7 +35,7 @@ import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.spelling import did_you_mean, nearest
 from sb3_guard.zoo.cli.usage import Parser, UsageError, key_value, run
 from sb3_guard.zoo.cli.values import typed, words
 
@@ -51,7 +51,6 @@ def flag(
     kind: Callable[[Any], Any] | None = None,
     exclusive: str | None = None,
     positional: bool = False,
-    former: Sequence[str] = (),
     **argparse_options: Any,
 ) -> Any:
     """
@@ -63,12 +62,11 @@ def flag(
     :param kind: makes the value of its text or number, and raises ``ArgumentTypeError``
     :param exclusive: at most one flag of the same ``exclusive`` can be given
     :param positional: the value is given without the flag's name
-    :param former: field names that the flag had before; they are still read, and not shown
     :param argparse_options: for ``add_argument``, e.g. ``metavar``
     """
     meta = {
         "names": names, "role": role, "kind": kind, "exclusive": exclusive,
-        "positional": positional, "former": former, "options": argparse_options,
+        "positional": positional, "options": argparse_options,
     }  # fmt: skip
     if isinstance(default, list | dict):
         copied = default
@@ -116,9 +114,6 @@ class Command:
                 group.add_argument(field.name, **{"default": None, **options})
             else:
                 group.add_argument(*_names(field), dest=field.name, **options)
-            hidden = {**options, "help": argparse.SUPPRESS}
-            for name in meta["former"]:
-                result.add_argument(_long(name), dest=field.name, **hidden)
         return result
 
     @classmethod
@@ -129,8 +124,14 @@ class Command:
         :param argv: arguments; None: those of the process
         :raises UsageError: a flag is unknown, with the nearest name, or a value is not allowed
         """
-        parsed = vars(cls.parser().parse_args(argv))
-        given = {}
+        namespace, unknown = cls.parser().parse_known_args(argv)
+        if unknown:
+            word = unknown[0].split("=")[0]
+            flags = (field.name for field, _ in cls._flags() if not field.metadata["positional"])
+            near = nearest(word, map(_long, flags))
+            remedy = f"did you mean {near}?" if near else "see --help"
+            raise UsageError(f"unknown argument {word}; {remedy}")
+        parsed, given = vars(namespace), {}
         for field, hint in cls._flags():
             # What is absent is not there at all, except values that go without a flag.
             bare = field.metadata["positional"]
@@ -157,11 +158,9 @@ class Command:
         :raises UsageError: a name is unknown, or a value not allowed
         """
         flags = {field.name: (field, hint) for field, hint in cls._flags() if field.name not in but}
-        former = {old: new for new, (field, _) in flags.items() for old in field.metadata["former"]}
         given = {}
         for key, value in data.items():
             name = str(key).replace("-", "_")
-            name = former.get(name, name)
             if name not in flags:
                 raise UsageError(f"{where}: unknown entry {key!r}; {did_you_mean(name, flags)}")
             field, hint = flags[name]

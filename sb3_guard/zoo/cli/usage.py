@@ -4,7 +4,6 @@ import argparse
 import importlib
 import math
 import os
-import re
 import shlex
 import signal
 import sys
@@ -17,7 +16,6 @@ from typing import Any, NoReturn
 import yaml
 
 from sb3_guard.plain_yaml import load_yaml
-from sb3_guard.spelling import nearest
 from sb3_guard.zoo.cli.values import parse_value
 
 LONGEST = 500  # characters of an error that are printed
@@ -99,17 +97,10 @@ def packages_flag(modules: Sequence[str]) -> str:
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that raises :class:`UsageError` and knows which flag was meant."""
+    """An argument parser that raises :class:`UsageError`."""
 
     def error(self, message: str) -> NoReturn:
         """Raise instead of printing the usage, which would bury the message."""
-        unknown = re.match(r"unrecognized arguments: (-\S+)", message)
-        if unknown:
-            flag = unknown[1].split("=")[0]
-            flags = [name for name in self._option_string_actions if name.startswith("--")]
-            near = nearest(flag, flags)
-            hint = f"did you mean {near}?" if near else "see --help"
-            raise UsageError(f"unknown flag {flag}; {hint}")
         raise UsageError(" ".join(message.split()))
 
 
@@ -131,21 +122,27 @@ def run(command: Callable[[], int]) -> int:
         status = command()
         sys.stdout.flush()
         return status
-    except BrokenPipeError:
-        try:
-            print(flush=True)
-        except BrokenPipeError:
-            pass
-        else:
-            raise  # some other pipe, such as one of an environment
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
-        return 141
-    except (UsageError, ImportError) as error:  # an absent package, or no backend for MuJoCo
-        text = one_line(error)
+    except (BrokenPipeError, UsageError, ImportError) as error:
+        # Python does not say which pipe is broken: ours, or one of an environment.
+        if isinstance(error.__cause__ or error, BrokenPipeError) and _nobody_reads():
+            return 141
+        if isinstance(error, BrokenPipeError):
+            raise
+        text = one_line(error)  # also of an absent package, or no backend for MuJoCo
         print(f"error: {text if len(text) <= LONGEST else text[:LONGEST] + ' …'}", file=sys.stderr)
         return getattr(error, "status", 2)
     except KeyboardInterrupt:
         return 130
+
+
+def _nobody_reads() -> bool:
+    """Whether the reader of standard output is gone, which another line tells; if so, stop it."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return True
+    return False
 
 
 @contextmanager

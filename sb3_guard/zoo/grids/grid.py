@@ -97,7 +97,7 @@ def try_out(runs: Sequence[Run]) -> None:
         try:
             if flags.device != "auto":
                 th.device(flags.device)
-            Training(Experiment(here, run.values)).close()
+            Training(Experiment(here, run.values).try_out()).close()
         except (UsageError, RuntimeError) as error:
             raise UsageError(f"{flags.algo} on {flags.env}: {one_line(error)}") from error
 

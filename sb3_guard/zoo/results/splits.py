@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from sb3_guard.costs import RESAMPLES, verdict
 from sb3_guard.zoo.results.curves import read_episodes
-from sb3_guard.zoo.results.statistics import RESAMPLES, judging_limits, last_epochs
+from sb3_guard.zoo.results.statistics import judging_limits, last_epochs
 
 #: by key what was played; the final ones are in ``result.json``, see ``Training``
 SPLITS = {
@@ -21,6 +22,8 @@ SPLITS = {
     "greedy": "final greedy",
 }
 FINAL = ("stochastic", "greedy")
+#: SafeRLEval's words for verdicts
+TIERS = {"kept": "certified", "exceeded": "violating"}
 
 
 def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataFrame]:
@@ -82,7 +85,7 @@ def tier(low: float, high: float, limit: float) -> str:
     """Certified, undecided or violating, by the interval of the mean cost; empty: no limit."""
     if math.isnan(limit):
         return ""
-    return "certified" if high <= limit else "violating" if low > limit else "undecided"
+    return TIERS.get(verdict(low, high, limit), "undecided")
 
 
 def judge(runs: pd.DataFrame) -> pd.DataFrame:

@@ -3,17 +3,18 @@
 Scores are relative to TRPO's (arXiv 2305.13681). Intervals and interquartile means follow Agarwal
 et al. 2021 (arXiv 2108.13264). Their library, rliable, saw its last release in 2024 and does not
 import with pandas 3 (through ``arch``), so the stratified bootstrap, the one piece needed, is
-:func:`interval`.
+:func:`~sb3_guard.costs.interval`.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.stats import trim_mean
 
+from sb3_guard.costs import interval
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.runs import METRICS, REFERENCE, compared
 from sb3_guard.zoo.run.folder import EPOCH
@@ -24,36 +25,11 @@ EPOCHS = 10  # at the end of a run, that its safety is judged by
 SAFETY = (
     "return_last", "cost_last", "above_limit", "cost_p95", "cost_max", "cost_total", "feasible_iqm",
 )  # fmt: skip
-RESAMPLES = 2000
 
 
 def iqm(values: Any, axis: int = 0) -> Any:
     """The mean of the middle half of the values along an axis."""
     return trim_mean(values, 0.25, axis=axis)
-
-
-def interval(
-    groups: Sequence[np.ndarray], statistic: Callable[..., np.ndarray] = np.mean
-) -> tuple[float, float]:
-    """
-    A 95 % percentile bootstrap interval, stratified: each group is resampled by itself.
-
-    :param groups: values of independent runs, [n_g] each; NaN are left out
-    :param statistic: called with ``axis=1`` on [B, Σ n_g] resamples; returns [B]
-    :return: lower and upper end; NaN where no group has two values, since one seed says nothing
-        about another
-    """
-    groups = [group[~np.isnan(group)] for group in groups]
-    if not any(len(group) > 1 for group in groups):
-        return math.nan, math.nan
-    rng = np.random.default_rng(0)
-    draws = [
-        group[rng.integers(len(group), size=(RESAMPLES, len(group)))]
-        for group in groups
-        if len(group)
-    ]
-    low, high = np.quantile(statistic(np.concatenate(draws, axis=1), axis=1), [0.025, 0.975])
-    return float(low), float(high)
 
 
 # One run
@@ -141,7 +117,7 @@ def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
     parts = [groups[list(stated)].first(), groups["seed"].nunique()]
     parts.append(groups["steps"].max())
     for name in (*METRICS, *runs.filter(regex="^M_c/")):
-        ends = [interval([group.to_numpy()]) for _, group in groups[name]]
+        ends = [interval([group.dropna().to_numpy()]) for _, group in groups[name]]
         low, high = np.array(ends).reshape(-1, 2).T
         part = groups[name].agg(["mean", "std"]).assign(low=low, high=high)
         parts.append(part.set_axis([name, *(f"{name}_{end}" for end in ("std", "low", "high"))],

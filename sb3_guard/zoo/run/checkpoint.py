@@ -246,10 +246,11 @@ class Checkpoints(BaseCallback):
         if state["environments"][-1] is None:
             # `learn` begins new episodes when there is no observation to go on from; not the first
             # ones of the run again.
-            model._last_obs = None
+            model.set_env(env)
             seed_rows(env, model.seed or 0, 0, state["num_timesteps"])
         set_random_state(state)
-        model.action_space._np_random = state["action_space"]
+        generator = state["action_space"].bit_generator
+        model.action_space.np_random.bit_generator.state = generator.state
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch as th
@@ -16,7 +16,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.common.callbacks import CostEvalCallback
+from sb3_guard.common.callbacks import CostEvalCallback, selection_limits
+from sb3_guard.common.sources import Source
 from sb3_guard.costs import read_costs
 from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.run.algos import algorithm
@@ -30,6 +31,7 @@ from sb3_guard.zoo.run.make_envs import (
     evaluation_seed,
     make_envs,
     seed_rows,
+    source_of,
 )
 
 
@@ -41,13 +43,14 @@ class Experiment:
     :param flags: all flags of the run
     :param hyperparams: hyperparameters as data, checked
     :param folder: the folder of the run to continue; None: a new run
-    :raises UsageError: a hyperparameter names what does not exist
+    :raises UsageError: there is no such algorithm or environment, or no class of that name
     """
 
     flags: RunFlags
     hyperparams: Mapping[str, Any]
     folder: RunFolder | None = None
     algorithm: type[BaseAlgorithm] = field(init=False)
+    source: Source = field(init=False)
     setup: Setup = field(init=False)
     cost_keys: tuple[str, ...] = field(init=False)
 
@@ -55,13 +58,26 @@ class Experiment:
         if self.flags.track and not self.flags.tensorboard_log:
             self.flags = dataclasses.replace(self.flags, tensorboard_log="runs")
         self.algorithm = algorithm(self.flags.algo)
+        self.source = source_of(self.flags.env)
         self.setup = build(self.hyperparams)
         self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
 
-    def try_out(self) -> None:
+    def limits(self) -> np.ndarray:
+        """
+        Episode cost up to which a model of this run counts as safe, one per cost key.
+
+        :raises UsageError: ``selection_limit`` does not fit the cost keys
+        """
+        constrained = getattr(self.algorithm, "constrained", False)
+        cost_limit = self.setup.model.get("cost_limit") if constrained else None
+        with explained("hyperparameter", ValueError):
+            return selection_limits(self.setup.selection_limit, cost_limit, self.cost_keys)
+
+    def try_out(self) -> Self:
         """
         Check what no value shows: the device, the folder of events, and a step of the environment.
 
+        :return: the same experiment
         :raises UsageError: one is not there, or the environment refuses a value or has no cost
         """
         flags = self.flags
@@ -73,6 +89,7 @@ class Experiment:
         self._try_environment(self.setup.env_kwargs)
         if flags.eval_freq > 0 and flags.eval_env_kwargs is not None:
             self._try_environment(flags.eval_env_kwargs)
+        return self
 
     def make_model(self) -> BaseAlgorithm:
         """
@@ -100,6 +117,7 @@ class Experiment:
         :raises UsageError: the environment refuses a value, or a limit does not fit the costs
         """
         flags = self.flags
+        self.limits()
         evaluation = CostEvalCallback(
             self.make_evaluation_envs(flags.eval_episodes),
             selection_limit=self.setup.selection_limit,
@@ -109,8 +127,6 @@ class Experiment:
             verbose=int(flags.verbose > 0 and self.prints_tables),
         )
         evaluation.model = model
-        with explained("hyperparameter", ValueError):
-            evaluation.limits()
         return evaluation
 
     def make_evaluation_envs(self, episodes: int) -> VecEnv:
@@ -141,12 +157,13 @@ class Experiment:
         kwargs = {"vec_env": str(flags.vec_env), "env_kwargs": self.setup.env_kwargs, **kwargs}
         statistics = self._statistics_beside()
         return make_envs(
-            flags.env,
+            self.source,
             self.setup,
             n_envs=n_envs,
             seed=seed,
             cost_keys=self.cost_keys,
             num_threads=flags.num_threads if flags.num_threads > 0 else None,
+            packages=flags.gym_packages,
             normalizer=read_normalizer(statistics) if statistics else None,
             **kwargs,
         )

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 from sb3_guard.checks import WorldError
 from sb3_guard.common.sources import Source, find
 from sb3_guard.common.vec_env import make_vec_env
-from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts_ignored
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, interrupts_ignored
 from sb3_guard.zoo.run.hyperparams import Setup
 from sb3_guard.zoo.run.resumable import ResumableEnv
 
@@ -84,7 +84,7 @@ def full_id(env_id: str) -> str:
 
 
 def make_envs(
-    env_id: str,
+    source: Source,
     setup: Setup,
     *,
     n_envs: int,
@@ -93,6 +93,7 @@ def make_envs(
     env_kwargs: Mapping[str, Any],
     cost_keys: Sequence[str] = ("cost",),
     num_threads: int | None = None,
+    packages: Sequence[str] = (),
     evaluation: bool = False,
     normalizer: VecNormalize | None = None,
     render_mode: str | None = None,
@@ -100,7 +101,7 @@ def make_envs(
     """
     Make environments and wrap them: monitor, ``vec_env_wrapper``, VecNormalize, frame stack.
 
-    :param env_id: full id
+    :param source: where they come from, see :func:`source_of`
     :param setup: the run's hyperparameters
     :param n_envs: how many
     :param seed: the environments get seed, seed + 1, …
@@ -108,6 +109,7 @@ def make_envs(
     :param env_kwargs: arguments of the environment
     :param cost_keys: entries of info that are costs
     :param num_threads: threads of the native engine; None: its own choice
+    :param packages: modules whose functions wrappers name, to be imported in each process
     :param evaluation: observations are normalised with given statistics, rewards not at all, and
         wrappers that are ``training_only`` are left out
     :param normalizer: statistics to begin with; it is given the environment
@@ -116,16 +118,17 @@ def make_envs(
     """
 
     def wrap(env: gym.Env) -> gym.Env:
+        import_packages(packages)
         for cls, arguments in _wrappers(setup.env_wrapper, evaluation):
             env = cls(env, **arguments)
         return ResumableEnv(env)
 
     with (
-        explained(f"can't make {env_id}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
+        explained(f"can't make {source.env_id}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
         interrupts_ignored(),  # a rollout under way can be finished
     ):
         env = make_vec_env(
-            env_id,
+            source,
             n_envs,
             seed,
             vec_env=vec_env,
@@ -135,7 +138,7 @@ def make_envs(
             wrapper_class=wrap if vec_env != "native" or setup.env_wrapper else None,
             monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
         )
-    with ExitStack() as made, explained(f"can't wrap {env_id}", *BAD_ARGUMENTS):
+    with ExitStack() as made, explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
         made.callback(env.close)
         wrapped = _wrap(env, setup, evaluation, normalizer)
         made.pop_all()

@@ -64,7 +64,7 @@ def start(flags: RunFlags) -> int:
     :raises UsageError: anything is wrong with the flags; nothing has been written then
     """
     flags, values = prepare(flags)
-    training = Training(Experiment(flags, values))
+    training = Training(Experiment(flags, values).try_out())
     try:
         folder = RunFolder.create(flags, values, shlex.join(sys.orig_argv))
     except UsageError:
@@ -129,7 +129,8 @@ def complete(
         folder = RunFolder(path) if made else RunFolder.create(flags, values, command, path)
         quiet = dataclasses.replace(flags, progress=False, verbose=0)
         begun = folder if state == "resume" else None
-        return Training(Experiment(quiet, values, begun)).train(folder, asked_to_stop)
+        experiment = Experiment(quiet, values, begun).try_out()
+        return Training(experiment).train(folder, asked_to_stop)
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
@@ -191,4 +192,4 @@ def resume(given: RunFlags) -> int:
                 "a larger -n continues it"
             )
             return 0
-        return Training(Experiment(flags, values, folder)).train(folder)
+        return Training(Experiment(flags, values, folder).try_out()).train(folder)

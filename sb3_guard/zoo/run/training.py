@@ -57,7 +57,7 @@ class Training:
     """
     A run whose environments and model are made; it is on disk once it has a folder.
 
-    :param experiment: what is trained
+    :param experiment: what is trained, which :meth:`~Experiment.try_out` should have checked
     :raises UsageError: something can't be made, or is not there
     """
 
@@ -67,7 +67,6 @@ class Training:
         self.callbacks = self.setup.callbacks()
         #: the checkpoint to continue from
         self.state = None if folder is None else read_checkpoint(folder.checkpoint)
-        experiment.try_out()
         self.model = experiment.make_model()
         self.env: VecEnv = self.model.get_env()  # type: ignore[assignment]
         self.evaluation: CostEvalCallback | None = None
@@ -122,7 +121,6 @@ class Training:
         try:
             return self._train(folder, asked_to_stop)
         except PROCESS_DIED as error:
-            print(flush=True)  # fails again if it is the reader of our output that is gone
             if self.flags.vec_env != "subproc":
                 raise
             raise UsageError(

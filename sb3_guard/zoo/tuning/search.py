@@ -10,7 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -67,9 +67,9 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     search = Search(flags.algo, values, space, fixed)
     for corner in search.corners():
         check(run.algo, algorithm(run.algo), corner)
-    with closing(Training(Experiment(run, values))) as training:
-        assert training.evaluation is not None
-        limits = training.evaluation.limits().tolist()
+    experiment = Experiment(run, values)
+    Training(experiment.try_out()).close()
+    limits = experiment.limits().tolist()
     settings = Settings(
         algo=run.algo,
         env=run.env,
@@ -79,7 +79,7 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         seeds=flags.seeds,
         n_evaluations=n_evaluations,
         eval_episodes=flags.eval_episodes,
-        cost_keys=list(training.experiment.cost_keys),
+        cost_keys=list(experiment.cost_keys),
         cost_limit=limits if np.isfinite(limits).all() else None,
         pareto=flags.pareto,
     )

@@ -233,7 +233,7 @@ class Objective:
             # A trial that is done again has kept the seeds that were done.
             history = trial.user_attrs.get(f"seed {seed}")
             if history is None:
-                history, on = self._train(trial, values, seed, after)
+                history, on = self._train(values, seed, after)
                 if on:
                     trial.set_user_attr(f"seed {seed}", history)
             else:
@@ -248,7 +248,6 @@ class Objective:
 
     def _train(
         self,
-        trial: optuna.Trial,
         values: Mapping[str, Any],
         seed: int,
         after: Callable[[list[list[float]]], bool],
@@ -256,7 +255,8 @@ class Objective:
         """One training: its evaluations, and whether it went to the end."""
         settings = self.settings
         checked = check(settings.algo, algorithm(settings.algo), values)
-        training = Training(Experiment(replace(self.training, seed=seed), checked))
+        experiment = Experiment(replace(self.training, seed=seed), checked)
+        training = Training(experiment.try_out())
 
         evaluations = Evaluations(training, settings, after, self.stopped)
         try:

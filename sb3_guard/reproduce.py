@@ -83,7 +83,7 @@ def reproduce(flags: Flags) -> int:
     from sb3_guard.zoo.cli.names import is_program, require_named
     from sb3_guard.zoo.run.flags import RunFlags
     from sb3_guard.zoo.run.folder import RunFolder
-    from sb3_guard.zoo.run.start import complete, path_of, prepare
+    from sb3_guard.zoo.run.start import complete, path_of, prepare, standing
 
     if not flags.run:
         raise UsageError("which run? Give a row of the leaderboard, or a run folder")
@@ -97,6 +97,8 @@ def reproduce(flags: Flags) -> int:
         raise UsageError(f"the run has its hyperparameters from a program, {run.conf_file}")
     run, values = prepare(run)
     print(f"{row['command']}\n{values['n_timesteps']:,} steps in {path_of(run)} …", flush=True)
+    if standing(run, values) == "done":
+        print("This run was trained already; to train it again, remove its folder or change -f.")
     if status := complete(run, values, row["command"], lambda: False):
         print("The same command continues it.")
         return status

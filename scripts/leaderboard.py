@@ -18,6 +18,7 @@ from grand_table import GRIDS
 from results import DATA, DOCS, pack, percent, unpacked
 
 from sb3_guard.zoo.cli.markdown import table
+from sb3_guard.zoo.cli.names import PRESETS
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.grids.presets import ALGOS
 from sb3_guard.zoo.results.curves import read_episodes
@@ -37,6 +38,7 @@ PLANNED = GRIDS[:5]  # a row of these that is missing is shown, with the command
 # What a run that is sent in may not change: the task, or which code is run.
 REFUSED = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "cost_keys")
 BUDGETS = (1, 2, 10)  # millions of steps
+SEEDS = 3
 
 
 def planned() -> pd.DataFrame:
@@ -205,8 +207,11 @@ def problems(path: Path) -> Iterator[str]:
     ):
         if args.get(name):
             yield f"args.yml has {name}: {args[name]}, which {why}"
+    if args.get("conf_file") not in (None, *PRESETS):
+        allowed = ", ".join(PRESETS)
+        yield f"args.yml has conf_file: {args['conf_file']}, which others lack; allowed: {allowed}"
     limit = 25 if run.name.startswith("Safety") else 2
-    if result.get("cost_limit", limit) != limit:
+    if result.get("cost_limit") not in (None, limit):  # None: unconstrained
         yield f"cost_limit is {result['cost_limit']}, not {limit}"
     if config["n_timesteps"] not in [MILLION * budget for budget in BUDGETS]:
         yield f"n_timesteps is {config['n_timesteps']:,}; allowed: {BUDGETS} million"
@@ -224,13 +229,21 @@ def problems(path: Path) -> Iterator[str]:
 def check(folder: Path) -> bool:
     """Print what is wrong with the runs of a folder, and what they say; whether nothing is."""
     paths, fine = find_runs(folder), True
+    seeds: dict[str, set[int]] = {}
     for path in paths:
         try:
             found = [*problems(path)]
+            args = RunFolder(path).args()
+            seeds.setdefault(f"{args['algo']} on {args['env']}", set()).add(args["seed"])
         except (UsageError, OSError, KeyError, ValueError) as error:
             found = [one_line(error)]
         fine = fine and not found
         print(f"{path}: {'; '.join(found) or 'fine'}")
+    if not paths:
+        print(f"no finished run in {folder}")
+    for name, there in seeds.items():
+        if len(there) < SEEDS:
+            print(f"{name}: {len(there)} of the at least {SEEDS} seeds that the page asks for")
     return fine and bool(paths)
 
 

@@ -4,12 +4,14 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 from fake_runs import fake_run
 
 from sb3_guard import train
+from sb3_guard.zoo.run.folder import RunFolder
 
 ROOT = Path(__file__).parents[2]
 
@@ -79,6 +81,67 @@ def test_packed_logs_are_small(scripts, tmp_path):
         text = Path(copy, "0.monitor.csv").read_text()
         assert max(map(len, text.splitlines())) < 30
         assert Path(copy, "result.json").read_text() == (path / "result.json").read_text()
+
+
+def sent(folder: Path, algo: str = "cpo", seed: int = 0, **entries: Any) -> Path:
+    """A run without a fault, where a million is 600."""
+    limit = {"config": {"cost_limit": 2.0}, "cost_limit": 2.0}
+    played = {key: [1 / 3] * 100 for key in ("returns", "costs", "lengths")}
+    final = {"stochastic": played, "greedy": played}
+    path = fake_run(folder, algo, seed=seed, returns=1 / 3, **limit | entries, final=final,
+                    versions={"sb3_guard": "1"})  # fmt: skip
+    run = RunFolder(path)
+    made = {"command": run.flags().command(), "curve": run.curve_hash()}
+    run.write_result(run.checked_result() | made)
+    return path
+
+
+def test_a_run_without_a_limit_can_be_sent_in(scripts, tmp_path, monkeypatch, capsys):
+    board, _ = scripts
+    monkeypatch.setattr(board, "MILLION", 600)
+    for seed in range(3):
+        sent(tmp_path / "logs", "ppo", seed, config={}, cost_limit=None)
+    assert board.check(tmp_path / "logs")
+    assert [line.split(": ")[1] for line in capsys.readouterr().out.splitlines()] == ["fine"] * 3
+
+
+def test_too_few_seeds_are_no_fault_but_told(scripts, tmp_path, monkeypatch, capsys):
+    board, _ = scripts
+    monkeypatch.setattr(board, "MILLION", 600)
+    for seed in (0, 1, 1):
+        sent(tmp_path / "logs", seed=seed)
+    assert board.check(tmp_path / "logs")
+    assert "cpo on Goal_Point_8Hazards-v0: 2 of the at least 3 seeds" in capsys.readouterr().out
+
+
+def test_hashes_can_be_checked_after_packing(scripts, tmp_path, monkeypatch, capsys):
+    board, results = scripts
+    monkeypatch.setattr(board, "MILLION", 600)
+    sent(tmp_path / "logs")
+    results.pack(tmp_path / "logs", "sent_mine")
+    with results.unpacked("sent_mine") as found:
+        (path,) = found.runs["path"]
+        assert board.check(Path(path)), capsys.readouterr().out
+
+
+def test_hyperparameters_of_a_file_elsewhere_are_refused(scripts, tmp_path, monkeypatch, capsys):
+    board, _ = scripts
+    monkeypatch.setattr(board, "MILLION", 600)
+    sent(tmp_path / "logs", args={"conf_file": "omnisafe"})
+    assert board.check(tmp_path / "logs")
+    sent(tmp_path / "logs", args={"conf_file": "mine.yml"})
+    assert not board.check(tmp_path / "logs")
+    assert "args.yml has conf_file: mine.yml" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_a_folder_without_runs(scripts, tmp_path, capsys, made):
+    board, _ = scripts
+    folder = tmp_path / "logs"
+    if made:
+        folder.mkdir()
+    assert not board.check(folder)
+    assert capsys.readouterr().out == f"no finished run in {folder}\n"
 
 
 def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):

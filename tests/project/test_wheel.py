@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+import tarfile
 import zipfile
 from email import message_from_bytes
 from pathlib import Path
@@ -37,6 +38,28 @@ def test_the_long_description_has_absolute_links(wheel):
         kind = "raw" if old.endswith((".png", ".gif")) else "blob"
         whole = rf"https://.*/{kind}/v{re.escape(metadata['Version'])}/{re.escape(old)}"
         assert re.fullmatch(whole, link) if old in relative else link == old
+
+
+def test_packages_know_their_commit(wheel, tmp_path):
+    """Also a wheel of an unpacked source distribution, as ``python -m build`` makes it."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("no checkout")
+    git = ["git", "-C", str(ROOT), "rev-parse", "HEAD"]
+    head = subprocess.run(git, check=True, capture_output=True, text=True).stdout.strip()
+    build = [sys.executable, "-m", "hatchling", "build", "-d", str(tmp_path), "-t"]
+    subprocess.run([*build, "sdist"], cwd=ROOT, check=True, capture_output=True)
+    (sdist,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(tmp_path, filter="data")
+    source = tmp_path / sdist.name.removesuffix(".tar.gz")
+    subprocess.run([*build, "wheel"], cwd=source, check=True, capture_output=True)
+    (path,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(path) as again:
+        for built in (wheel, again):
+            text = built.read("sb3_guard/COMMIT").decode().strip()
+            assert text.removesuffix("-dirty") == head
+    (source / "sb3_guard" / "COMMIT").unlink()  # outside git, nothing else tells
+    subprocess.run([*build, "wheel"], cwd=source, check=True, capture_output=True)
 
 
 def test_a_wheel_installed_elsewhere_trains_and_plays(wheel, tmp_path):

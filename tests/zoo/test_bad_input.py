@@ -444,7 +444,7 @@ def test_what_is_not_a_number_ends_training_in_a_line(algo, what, capsys, tmp_pa
 
 
 def test_a_gpu_that_is_not_there(capsys, tmp_path):
-    refused(train.main, ["--device", "cuda:99", "-f", str(tmp_path)], capsys, "--device 'cuda:99'")
+    refused(train.main, ["--device", "cuda:99", "-f", str(tmp_path)], capsys, "device 'cuda:99'")
 
 
 def test_a_run_whose_files_were_edited(run, capsys):

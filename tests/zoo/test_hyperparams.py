@@ -170,7 +170,7 @@ def test_values_in_their_proper_type(name, value, expected):
         ("normalize_advantage", 1, "True or False"),
         ("normalize_advantage", "yes", "True or False"),
         ("missing_cost", "ignore", "'error' or 'zero'"),
-        ("cost_limit", "low", "a number or a schedule such as lin_0.001 or a list"),
+        ("cost_limit", "low", "a number or a schedule such as lin_50_25 or a list"),
         ("cost_keys", "cost", r"a list \(text each\)"),
         ("policy", 3, "text or the dotted name of a class"),
         ("policy_kwargs", 3, "a mapping or None"),

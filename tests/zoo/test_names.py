@@ -11,7 +11,7 @@ from cost_envs import CostPoint
 from typed import SMALL, TOY, refused, trained
 
 from sb3_guard import CPO, benchmark, enjoy, train
-from sb3_guard.zoo.cli.names import as_data
+from sb3_guard.zoo.cli.names import as_data, classes
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.cli.values import parse_value
 from sb3_guard.zoo.grids import grid
@@ -153,6 +153,20 @@ def test_only_classes_of_their_kind(name, value):
     with pytest.raises(UsageError, match=name):
         values = {"n_envs": 1, "n_timesteps": 1, name: as_data(name, value)}
         build(values).callbacks()
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "arguments"),
+    [
+        ("vec_env_wrapper", "sb3_guard.common.vec_budgets.VecEarlyTermination", {"budgets": 5}),
+        ("env_wrapper", "sb3_guard.common.budgets.EarlyTermination", {"budgets": 5}),
+        ("callback", "stable_baselines3.common.callbacks.EveryNTimesteps", {"n_step": 5}),
+    ],
+)
+def test_arguments_of_classes_are_checked(name, path, arguments):
+    (wrong,) = arguments
+    with pytest.raises(UsageError, match=rf"{name}: .*'{wrong}'; did you mean '\w+'\?"):
+        classes(name, {path: arguments})
 
 
 class Hostile:

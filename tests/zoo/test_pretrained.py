@@ -134,10 +134,11 @@ def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert enjoy.main(["--pretrained", "--env", POINT, "-n", "20", "--no-render"]) == 0
     out = capsys.readouterr().out
-    assert f"{POINT}-v0_1" in out
+    assert f"{POINT}-v0_1" in out and f"on {POINT}-v0, trained at limit 3\n" in out
     which = ["--algo", "trpo", "--env", POINT, "--no-render"]
     short = ["--n-episodes", "1", "--env-kwargs", "max_episode_steps:30"]
     assert enjoy.main([*which, "--pretrained", *short, "--json", "played.json"]) == 0
+    assert f"on {POINT}-v0\n" in capsys.readouterr().out  # it has no limit
     assert json.loads((tmp_path / "played.json").read_text())["length"]["values"] == [30]
     assert enjoy.main(which) == 2
     assert "or play the package's own with --pretrained" in capsys.readouterr().err

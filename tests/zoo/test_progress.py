@@ -112,8 +112,11 @@ def test_commit_of_changed_and_of_installed_code(tmp_path, monkeypatch):
     own.write_text("changed = True")
     assert commit().endswith("-dirty")
     # Installed below somebody's checkout, but no part of it
-    monkeypatch.setattr(sb3_guard, "__file__", str(package(tmp_path / ".venv")))
+    installed = package(tmp_path / ".venv")
+    monkeypatch.setattr(sb3_guard, "__file__", str(installed))
     assert commit() is None
+    installed.with_name("COMMIT").write_text("abc\n")
+    assert commit() == "abc"
 
 
 def test_no_git_no_commit(monkeypatch):

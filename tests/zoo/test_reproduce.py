@@ -30,7 +30,10 @@ def test_a_run_goes_the_same_way(run, tmp_path, capsys):
     result = json.loads((run / "result.json").read_text())
     assert result["command"] in out and "The same: all training episodes agree" in out
     new = json.loads((tmp_path / "again" / "cpo" / "CostPoint-v0_4" / "result.json").read_text())
-    assert new["final"] == result["final"]
+    assert new["final"] == result["final"] and "trained already" not in out
+    assert again(tmp_path, str(run), *PACKAGES) == 0  # trains nothing, and says so
+    out = capsys.readouterr().out
+    assert 0 < out.index("This run was trained already") < out.index("The same")
 
 
 def test_a_row_that_went_another_way(run, tmp_path, capsys, monkeypatch):

@@ -122,7 +122,9 @@ def test_each_earlier_rollout_is_written_once(tmp_path, monkeypatch, capsys):
     assert kept == ["240.pkl", "300.pkl"]
     (run / "earlier" / "240.pkl").unlink()
     assert train.main(["-i", str(run), "-n", "360", *TOY[:2]]) == 2
-    assert f"can't read the earlier rollouts in {run / 'earlier'}" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"can't read the earlier rollouts in {run / 'earlier'}" in said
+    assert "start the run again without -i" in said
 
 
 def test_the_log_folder_may_be_written_otherwise(tmp_path, capsys):

@@ -144,3 +144,40 @@ def test_tiers_are_drawn(runs):
     (cpo,) = (line for line in greedy.lines if [*line.get_ydata()] == [0, 0])
     assert [*cpo.get_xdata()] == [4, 9] and cpo.get_color() == TIER_STYLES["undecided"][0]
     assert stochastic.collections[0].get_label() in ("certified", "violating")
+
+
+@pytest.mark.parametrize("kind", ["cdf", "tiers"])
+@pytest.mark.parametrize(("dear", "cheap"), [("stochastic", "greedy"), ("greedy", "stochastic")])
+def test_no_panel_hides_what_another_shows(tmp_path, kind, dear, cheap):
+    """Panels share their cost axis: it shows the agents of all of them, and the limit."""
+    limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
+    costs = {dear: [50.0, 60.0, 70.0], cheap: [1.0, 1.0, 2.0]}
+    fake_run(tmp_path, "cpo", **limit, final=final(costs["stochastic"], costs["greedy"]))
+    (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs)))
+    for axis in drawing.figure.axes:
+        assert axis.get_xlim()[0] <= 0 and 70 <= axis.get_xlim()[1] < 150
+
+
+@pytest.mark.parametrize("kind", ["cdf", "tiers"])
+def test_the_limit_is_in_sight(tmp_path, kind):
+    limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
+    fake_run(tmp_path, "cpo", **limit, final=final([1.0, 2.0], [1.0, 2.0]))
+    (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs)))
+    assert all(axis.get_xlim()[1] > 25 for axis in drawing.figure.axes)
+
+
+def test_the_distribution_of_few_costs_is_whole(tmp_path):
+    fake_run(tmp_path, "cpo", final=final([4.0], [1.0]))
+    (drawing,) = draw("cdf", Data(with_safety(read_results([tmp_path]).runs)))
+    assert drawing.figure.axes[0].get_xlim() == (0, 4)
+
+
+def test_agents_with_other_limits_are_told_from_those_without(tmp_path):
+    """Limits on several costs say nothing of their sum."""
+    costs = {key: {"mean": 2.5, "limit": 4.0} for key in ("heat", "wear")}
+    several = {"cost_limit": [4.0, 4.0], "costs": costs}
+    for algo, entries in (("cpo", several), ("trpo", {})):
+        fake_run(tmp_path, algo, **entries, final=final([1.0, 2.0], [1.0, 9.0]))
+    (drawing,) = draw("tiers", Data(with_safety(read_results([tmp_path]).runs)))
+    labels = drawing.figure.axes[0].get_legend_handles_labels()[1]
+    assert sorted(labels) == ["no limit", "other limits"]

@@ -180,8 +180,11 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     episodes = flags.n_episodes
     if episodes is None and flags.n_timesteps is None:
         episodes = 1 if flags.record is not None else max(agent.env.num_envs, 5)
+    result = agent.run.read_result() or {}
     if flags.verbose > 0:
-        print(f"Playing {agent.path} on {agent.env_id}")
+        limit = result.get("trained_at")
+        trained_at = "" if limit is None else f", trained at limit {limit:g}"
+        print(f"Playing {agent.path} on {agent.env_id}{trained_at}")
     stage: AbstractContextManager[VecEnv] = nullcontext(agent.env)
     if video is not None:
         stage = filming(agent.env, agent.model, video, bar=flags.verbose > 0)
@@ -200,7 +203,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     if flags.verbose > 0:
         for cut in evaluation.unfinished:
             print(_episode(*cut), "so far: this episode did not end and is not counted")
-        trained = (agent.run.read_result() or {}).get("return")
+        trained = result.get("return")
         if not flags.stochastic and trained is not None:
             best = evaluation.estimate(evaluation.returns).high
             if best < trained - 0.5 * abs(trained):

@@ -6,6 +6,7 @@ file may name classes of :data:`KNOWN` packages only, and of modules that the co
 """
 
 import importlib
+import inspect
 import operator
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag
 from sb3_guard.zoo.cli.values import read_expression
 
@@ -57,7 +59,8 @@ def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:
 
     :param value: ``module.Class``, ``{module.Class: {argument: value}}``, or a list of such
     :return: classes and their arguments
-    :raises UsageError: it is not of that form, or a class is not there or not of its kind
+    :raises UsageError: it is not of that form, or a class is not there, not of its kind or without
+        such an argument
     """
     result = []
     for entry in [] if value is None else value if isinstance(value, list) else [value]:
@@ -69,8 +72,20 @@ def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:
                 f"hyperparameter {name}: {entry!r} is not allowed; it must be module.Class, or "
                 "{module.Class: {argument: value}}"
             )
-        result.append((import_class(name, path, BASES[name]), dict(arguments or {})))
+        cls, arguments = import_class(name, path, BASES[name]), dict(arguments or {})
+        _check_arguments(name, cls, arguments)
+        result.append((cls, arguments))
     return result
+
+
+def _check_arguments(name: str, cls: type, arguments: Mapping[str, Any]) -> None:
+    parameters = inspect.signature(cls).parameters
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return
+    known = [parameter for parameter in parameters if parameter not in ("env", "venv")]
+    for argument in arguments.keys() - known:
+        hint = did_you_mean(argument, known)
+        raise UsageError(f"{name}: {cls.__name__} has no argument {argument!r}; {hint}")
 
 
 def torch_class(path: str) -> Any:

@@ -52,7 +52,8 @@ TIER_STYLES = {
     "certified": (COLORS[2], "o"),
     "undecided": (COLORS[4], "D"),
     "violating": (COLORS[1], "X"),
-    "": (INK, "s"),
+    "other limits": (INK, "P"),
+    "no limit": (INK, "s"),
 }
 
 
@@ -262,20 +263,21 @@ def _split_axes(data: Data, suite: str, height: float) -> tuple[Figure | None, d
 def cdf(data: Data, suite: str) -> Figure | None:
     """Share of episodes that cost at most x, of the final policies, a figure per environment."""
     figure, panels = _split_axes(data, suite, height=3.4)
+    shown = [0.0]  # of all panels, which share their axis
     for split, axis in panels.items():
-        drawn = []
         for algo in data.algos(suite):
             costs = data.costs_of(suite, algo, split)
             if len(costs):
                 share = np.arange(1, len(costs) + 1) / len(costs)
                 # From a share of 0 on, and on to the end of the axis.
-                x, y = [0.0, *costs, 1e9], [0.0, *share, 1.0]
+                x, y = [-1e9, *costs, 1e9], [0.0, *share, 1.0]
                 axis.step(x, y, where="post", linewidth=1.5, **data.looks[algo].line)
-                drawn.append(costs[: -len(costs) // 50 or None])
-        axis.set_xlim(0, max(map(np.max, drawn), default=0.0) or 1.0)
-        draw_limit(axis.axvline, data, suite, "M_c")
+                shown += costs[: len(costs) - len(costs) // 50].tolist()
+        shown.append(1.05 * draw_limit(axis.axvline, data, suite, "M_c"))
         axis.set(ylim=(-0.02, 1.02), ylabel="share of episodes")
         axis.label_outer()
+    for axis in panels.values():
+        axis.set_xlim(np.nanmin(shown), np.nanmax(shown) or 1.0)
     return figure
 
 
@@ -283,16 +285,18 @@ def tiers(data: Data, suite: str) -> Figure | None:
     """Mean costs with 95 % intervals and the limit: certified or not, a figure per environment."""
     algos = data.algos(suite)[::-1]
     figure, panels = _split_axes(data, suite, height=1.4 + 0.28 * len(algos))
+    limited = {*data.runs.loc[data.runs["suite"] == suite].dropna(subset=["limits"])["algo"]}
     for split, axis in panels.items():
         rows = data.splits[(data.splits["suite"] == suite) & (data.splits["split"] == split)]
         for row in rows.to_dict("records"):
-            y, (color, marker) = algos.index(row["algo"]), TIER_STYLES[row["tier"]]
+            name = row["tier"] or ("other limits" if row["algo"] in limited else "no limit")
+            y, (color, marker) = algos.index(row["algo"]), TIER_STYLES[name]
             axis.plot([row["low"], row["high"]], [y, y], color=color, linewidth=4, alpha=0.5)
-            name = row["tier"] or "no limit"
             axis.scatter(row["cost"], y, s=36, color=color, marker=marker, label=name, zorder=3)
         axis.set_yticks(range(len(algos)), [data.looks[algo].label for algo in algos])
-        limit = draw_limit(axis.axvline, data, suite, "M_c")
-        fit_costs(axis, [rows["high"], rows["cost"], limit], "x")
+        draw_limit(axis.axvline, data, suite, "M_c")
+    for axis in panels.values():  # once all are drawn: they share their axis
+        axis.set_xlim(left=min(0.0, axis.get_xlim()[0]))
     return figure
 
 

@@ -233,7 +233,8 @@ class Checkpoints(BaseCallback):
             evaluation.reset()
             restore(evaluation, parts)
         if isinstance(model, Reuse):
-            with explained(f"can't read the earlier rollouts in {self._earlier}"):
+            fix = f"start the run again without -i, or, in a grid, after removing {self.path}"
+            with explained(f"can't read the earlier rollouts in {self._earlier}", fix=fix):
                 model.earlier = [
                     Rollout(*pickle.loads((self._earlier / name).read_bytes()))
                     for name in state["earlier"]

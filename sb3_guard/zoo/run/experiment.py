@@ -75,15 +75,12 @@ class Experiment:
 
     def try_out(self) -> Self:
         """
-        Check what no value shows: the device, the folder of events, and a step of the environment.
+        Check what no value shows: the folder of events, and a step of the environment.
 
         :return: the same experiment
         :raises UsageError: one is not there, or the environment refuses a value or has no cost
         """
         flags = self.flags
-        # SB3 would train on the CPU instead of a GPU that is not there.
-        with explained(f"--device {flags.device!r} is not allowed"):
-            th.empty(0, device="cpu" if flags.device == "auto" else flags.device)
         if flags.tensorboard_log:
             require_writable(Path(flags.tensorboard_log), "--tensorboard-log")
         self._try_environment(self.setup.env_kwargs)
@@ -95,9 +92,13 @@ class Experiment:
         """
         The model with its environments, seeded: what ``learn`` does next is settled.
 
-        :raises UsageError: the environment, the algorithm or a wrapper refuses a value
+        :raises UsageError: the environment, the algorithm or a wrapper refuses a value, or the
+            device is not there
         """
         flags = self.flags
+        # SB3 would train on the CPU instead of a GPU that is not there.
+        with explained(f"device {flags.device!r} is not allowed"):
+            th.empty(0, device="cpu" if flags.device == "auto" else flags.device)
         if flags.num_threads > 0:
             th.set_num_threads(flags.num_threads)
         set_random_seed(flags.seed)

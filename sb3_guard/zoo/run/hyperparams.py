@@ -194,8 +194,11 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
         try:
             checked[name] = typed(as_data(name, value), hints[name])
         except TypeError:
+            allowed = words(hints[name])
+            if name == "cost_limit":  # its schedules are other ones
+                allowed = allowed.replace("lin_0.001", "lin_50_25")
             raise UsageError(
-                f"hyperparameter {name}: {value!r} is not allowed; it must be {words(hints[name])}"
+                f"hyperparameter {name}: {value!r} is not allowed; it must be {allowed}"
             ) from None
     checked.setdefault("n_envs", 1)
     checked.setdefault("n_timesteps", N_TIMESTEPS)

@@ -15,6 +15,11 @@ from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.hyperparams import annotations
 from sb3_guard.zoo.run.start import prepare
 
+# Hyperparameters of a run that are none of its model, and what takes them.
+ELSEWHERE = {
+    "callback": "model.learn", "n_timesteps": "model.learn", "selection_limit": "CostEvalCallback"
+}  # fmt: skip
+
 
 def make_model(
     algo: str,
@@ -60,6 +65,11 @@ def make_model(
     :return: the model, not yet trained
     :raises ValueError: a name or value is not allowed; the message says what is
     """
+    for argument, value in (("algo", algo), ("env_id", env_id)):
+        if not isinstance(value, str):
+            raise ValueError(f"{argument}={value!r} is not allowed; it must be a name")
+    for argument in ELSEWHERE.keys() & hyperparams:
+        raise ValueError(f"make_model takes no {argument!r}; give it to {ELSEWHERE[argument]}")
     try:
         flags = RunFlags.read(
             {

@@ -27,7 +27,9 @@ def commit() -> str | None:
     """
     The git commit that this package's code is at, followed by ``-dirty`` if it was changed since.
 
-    :return: None if the code is not under git, as when it was installed
+    A package that was built from a checkout has the file ``COMMIT``.
+
+    :return: None if nothing tells
     """
     git = ["git", "-C", str(Path(sb3_guard.__file__).parent)]
     describe = "describe --always --dirty --abbrev=40 --exclude=*".split()
@@ -37,7 +39,8 @@ def commit() -> str | None:
         subprocess.run([*git, "ls-files", "--error-unmatch", "__init__.py"], **options)
         return str(subprocess.run([*git, *describe], **options).stdout.strip())
     except (OSError, subprocess.SubprocessError):
-        return None
+        built = Path(sb3_guard.__file__).with_name("COMMIT")
+        return built.read_text().strip() if built.is_file() else None
 
 
 def provenance() -> dict[str, Any]:

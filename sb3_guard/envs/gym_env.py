@@ -91,15 +91,14 @@ class Simulated:
     def _simulate(
         self,
         scenario: str | Path | Mapping[str, Any] | Scenario,
+        params: Mapping[str, Any],
         num_envs: int,
         num_threads: int | None,
         render_mode: str | None,
-        /,
-        flatten: bool = True,
-        width: int = 480,
-        height: int = 480,
-        camera: str | None = None,
-        **params: Any,
+        flatten: bool,
+        width: int,
+        height: int,
+        camera: str | None,
     ) -> None:
         """Check the options and run the scenario.
 
@@ -253,10 +252,14 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         self,
         scenario: str | Path | Mapping[str, Any] | Scenario = "Goal_Point_8Hazards",
         render_mode: str | None = None,
+        flatten: bool = True,
+        width: int = 480,
+        height: int = 480,
+        camera: str | None = None,
         **params: Any,
     ) -> None:
-        self._simulate(scenario, 1, None, render_mode, **params)
-        self.observation_space = observation_space(self.engine, self.flatten)
+        self._simulate(scenario, params, 1, None, render_mode, flatten, width, height, camera)
+        self.observation_space = observation_space(self.engine, flatten)
         self.action_space = action_space(self.engine)
         self._so_far = np.zeros(2)  # return and cost of the episode, for a window
 

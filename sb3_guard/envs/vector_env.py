@@ -76,17 +76,23 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         max_episode_steps: int | None = None,
         num_threads: int | None = None,
         render_mode: str | None = None,
+        flatten: bool = True,
+        width: int = 480,
+        height: int = 480,
+        camera: str | None = None,
         **params: Any,
     ) -> None:
         if max_episode_steps is None:
             steps = episode_steps(scenario) if isinstance(scenario, str) else EPISODE_STEPS
             max_episode_steps = steps
         check_count("max_episode_steps", max_episode_steps)
-        self._simulate(scenario, num_envs, num_threads, render_mode, **params)
+        self._simulate(
+            scenario, params, num_envs, num_threads, render_mode, flatten, width, height, camera
+        )
         self.engine.extras.check_limit(max_episode_steps)
         self.num_envs = self.engine.num_envs
         self.max_episode_steps = max_episode_steps
-        self.single_observation_space = observation_space(self.engine, self.flatten)
+        self.single_observation_space = observation_space(self.engine, flatten)
         self.single_action_space = action_space(self.engine)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)

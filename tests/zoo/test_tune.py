@@ -274,7 +274,7 @@ def test_the_best_is_feasible_first(outcomes, number):
 def pretend(monkeypatch, outcome):
     """Let a training come to ``outcome(values, seed)`` in a moment, rising to it evenly."""
 
-    def train(self, trial, values, seed, after):
+    def train(self, values, seed, after):
         history = []
         for k in range(1, self.settings.n_evaluations + 1):
             if self.stopped():

@@ -78,6 +78,9 @@ def test_a_missing_network_of_sb3s_is_still_an_error(tmp_path):
     model = PPOLag("MlpPolicy", CostPoint(10), n_steps=40, batch_size=20, cost_limit=1.0)
     with pytest.raises(ValueError, match="policy"):
         model.set_parameters({"policy.optimizer": model.policy.optimizer.state_dict()})
+    given = model.get_parameters()
+    with pytest.raises(ValueError, match="cost_critic"):
+        model.set_parameters({name: given[name] for name in given if name != "cost_critic"})
 
 
 @pytest.mark.parametrize("beside", ["ppo_vecnormalize.pkl", "run/vecnormalize.pkl", None])

@@ -113,7 +113,8 @@ class LoadsOthers(BaseAlgorithm):
     def set_parameters(
         self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto"
     ) -> None:
-        """Set networks and optimizers as SB3 does; those that SB3's algorithm lacks may be absent.
+        """Set networks and optimizers as SB3 does; those that SB3's algorithm lacks may be absent,
+        all of them.
 
         :param load_path_or_dict: a file, or states by name
         :param exact_match: whether all that SB3's algorithm has must be there
@@ -124,7 +125,8 @@ class LoadsOthers(BaseAlgorithm):
             _, given, _ = load_from_zip_file(given, load_data=False, device=device)
         theirs = super()._get_torch_save_params()[0]
         ours = {name: now for name, now in self.get_parameters().items() if name not in theirs}
-        given = {**ours, **given}
+        if not ours.keys() & given.keys():
+            given = {**ours, **given}
         if "policy" in given:
             weights = self.policy.state_dict()
             action_filter = {k: v for k, v in weights.items() if k.startswith("action_filter.")}

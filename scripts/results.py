@@ -152,7 +152,7 @@ def grey(rows: pd.DataFrame, columns: dict[str, Any]) -> str:
     """A table in Markdown whose rows of a single seed are in italics."""
     texts = spelled(rows, columns).map(escaped)
     lines = [
-        [f"*{cell}*" if seeds == 1 else cell for cell in line]
+        [f"*{cell}*" if seeds == 1 and cell else cell for cell in line]
         for line, seeds in zip(texts.to_numpy().tolist(), rows["seeds"], strict=True)
     ]
     return table(list(columns), lines)

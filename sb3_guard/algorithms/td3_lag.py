@@ -25,13 +25,14 @@ class TD3Lag(LagrangianReplay, TD3):
 
     def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
         """TD3's step: critics, and with a delay actor and targets."""
+        discounts = self.gamma if batch.discounts is None else batch.discounts  # of n-step returns
         with th.no_grad():
             noise = th.empty_like(batch.actions).normal_(0, self.target_policy_noise)
             noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
             next_actions = (self.actor_target(batch.next_observations) + noise).clamp(-1, 1)
             after = th.cat(self.critic_target(batch.next_observations, next_actions), dim=1)
             after = after.amin(dim=1, keepdim=True)
-            target = batch.rewards + (1 - batch.dones) * self.gamma * after
+            target = batch.rewards + (1 - batch.dones) * discounts * after
         values = self.critic(batch.observations, batch.actions)
         critic_loss = sum(F.mse_loss(value, target) for value in values)
         self.critic.optimizer.zero_grad()

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_guard import SACLag, TD3Lag, TQCLag, evaluate_policy
 from sb3_guard.algorithms.common.replay import (
     CostDictReplayBuffer,
+    CostNStepReplayBuffer,
     CostReplayBuffer,
     CostReplayBufferSamples,
 )
@@ -75,7 +76,10 @@ def state_of(model: Any) -> list[Any]:
     [
         (SACLag, SAC, {"gradient_steps": 2, "target_update_interval": 2, "ent_coef": "auto"}),
         (SACLag, SAC, {"ent_coef": 0.1, "use_sde": True}),
+        (SACLag, SAC, {"ent_coef": "auto", "n_steps": 3}),
         (TD3Lag, TD3, {"gradient_steps": 3}),
+        (TD3Lag, TD3, {"n_steps": 3}),
+        (TQCLag, TQC, {"ent_coef": "auto", "n_steps": 3}),
         (TQCLag, TQC, {"gradient_steps": 2, "target_update_interval": 2, "ent_coef": "auto"}),
         (TQCLag, TQC, {"ent_coef": 0.1, "use_sde": True, "top_quantiles_to_drop_per_net": 5}),
     ],
@@ -154,6 +158,48 @@ def test_what_is_replayed_and_learnt_from(cls: Any, cut: bool) -> None:
         values = critic.online(batch.observations, batch.actions)[:, :, 0]
         expected = float(((values - target.repeat_interleave(2, dim=1)) ** 2).mean())
     assert model.fit_cost_critic(batch, actions) == pytest.approx(expected, rel=1e-5)
+
+
+@every
+@pytest.mark.parametrize("cut", [False, True])
+def test_sums_of_several_steps(cls: Any, cut: bool) -> None:
+    """Costs of n steps, or of those until the episode ends, discounted by γ_C, not by γ."""
+    env = make_vec_env(lambda: Clock(4, cut), 3)
+    model = cls(
+        "MlpPolicy",
+        env,
+        cost_keys=("cost", "ten"),
+        cost_limit=[10.0, 1.0],
+        n_steps=3,
+        gamma=0.9,
+        cost_gamma=0.5,
+        **settings(),
+    )
+    model.learn(96)
+    batch = model.replay_buffer.sample(256)
+    times = batch.observations[:, 0]
+    for index, t in enumerate(times.tolist()):
+        costs, discount, reached = 0.0, 1.0, t
+        while reached <= min(t + 2.0, 4.0):
+            costs, discount, reached = costs + discount * reached, discount * 0.5, reached + 1.0
+        assert batch.costs[index].tolist() == [costs, 10.0 * costs]
+        assert batch.cost_discounts[index].item() == discount
+        assert batch.next_observations[index].item() == reached
+        assert batch.dones[index].item() == (reached == 5.0 and not cut)
+    assert model.logger.name_to_value["train/cost_critic_loss"] > 0.0
+
+
+def test_several_steps_survive_saving(tmp_path: Path) -> None:
+    more = {"n_steps": 3, "gamma": 0.9, "cost_gamma": 0.5}
+    model = SACLag("MlpPolicy", points(), **settings(), **more).learn(100)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = SACLag.load(tmp_path / "model", env=points())
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    buffer = loaded.replay_buffer
+    assert isinstance(buffer, CostNStepReplayBuffer)
+    assert (buffer.n_steps, buffer.gamma, buffer.cost_gamma) == (3, 0.9, 0.5)
+    loaded.learn(50, reset_num_timesteps=False)
 
 
 @pytest.mark.parametrize("quantile", [None, 0.9])
@@ -500,7 +546,12 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
 @pytest.mark.parametrize(
     ("more", "error"),
     [
-        ({"n_steps": 3}, "n_steps=3: must be 1"),
+        ({"n_steps": 0}, "n_steps=0: must be an integer of at least 1"),
+        (
+            {"n_steps": 3, "replay_buffer_class": CostReplayBuffer},
+            "n_steps=3: must be 1 with a CostReplayBuffer",
+        ),
+        ({"n_steps": 3, "optimize_memory_usage": True}, "n_steps=3: must be 1 .*optimize_memory"),
         ({"cost_gamma": 1.0}, r"cost_gamma=1.0: must be a number in \[0, 1\)"),
         ({"gamma": 1.0}, "gamma=1.0: .* must be below 1, .*; give cost_gamma=0.99 too"),
         ({"gamma": 2.0, "cost_gamma": 0.9}, r"gamma=2.0: must be a number in \[0, 1\]"),

@@ -4,6 +4,7 @@ The costs of each step go into the replay buffer. Two networks per cost learn
 Q_C(s, a) = c + γ_C Q_C(s', a'); the latest episodes tell J_C.
 """
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -12,7 +13,11 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import (
+    DictReplayBuffer,
+    NStepReplayBuffer,
+    ReplayBuffer,
+)
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -32,7 +37,11 @@ from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
 
 class CostReplayBufferSamples(NamedTuple):
-    """What SB3's replay buffers return, and the costs of the B transitions, shape [B, m]."""
+    """What SB3's replay buffers return, and the costs of the B transitions, shape [B, m].
+
+    With n-step returns, costs are discounted sums of n steps, and ``cost_discounts`` [B, 1] are
+    what the value after them counts, as ``discounts`` are for the reward.
+    """
 
     observations: Any
     actions: th.Tensor
@@ -41,6 +50,7 @@ class CostReplayBufferSamples(NamedTuple):
     rewards: th.Tensor
     discounts: th.Tensor | None
     costs: th.Tensor
+    cost_discounts: th.Tensor | None = None
 
 
 def _of_length(rows: int, value: Any, length: int) -> Any:
@@ -93,6 +103,35 @@ class CostReplayBuffer(_CostColumns):
 
 class CostDictReplayBuffer(_CostColumns, DictReplayBuffer):
     """The same for Dict observations."""
+
+
+class CostNStepReplayBuffer(_CostColumns, NStepReplayBuffer):
+    """The same for n-step returns of rewards and costs.
+
+    :param cost_gamma: discount factor of the costs
+    """
+
+    def __init__(self, *args: Any, cost_gamma: float = 0.99, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.cost_gamma = cost_gamma
+
+    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
+        # SB3's sums of rewards, drawn anew for each cost in their place, from the same generator.
+        generator = np.random.get_state()  # noqa: NPY002 (the generator SB3 draws from)
+        samples = NStepReplayBuffer._get_samples(self, batch_inds, env)
+        rewards, gamma = self.rewards, self.gamma
+        self.gamma = self.cost_gamma
+        sums = []
+        for costs in np.moveaxis(self.costs, -1, 0):
+            np.random.set_state(generator)  # noqa: NPY002
+            self.rewards = costs
+            sums.append(NStepReplayBuffer._get_samples(self, batch_inds))
+        self.rewards, self.gamma = rewards, gamma
+        return CostReplayBufferSamples(
+            *samples,
+            costs=th.cat([each.rewards for each in sums], dim=1),
+            cost_discounts=sums[0].discounts,
+        )
 
 
 class CostReplay(Constrained, OffPolicyAlgorithm):
@@ -156,23 +195,39 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
                 f"gamma={self.gamma!r}: cost_gamma, which is gamma unless it is given, must be "
                 "below 1, as undiscounted costs add up without end; give cost_gamma=0.99 too"
             )
-        if self.n_steps != 1:
-            raise ValueError(f"n_steps={self.n_steps!r}: must be 1, costs are replayed by step")
         buffer_class = self.replay_buffer_class
         if buffer_class is not None and not issubclass(buffer_class, _CostColumns):
             raise ValueError(
                 f"replay_buffer_class={buffer_class.__name__}: must be a subclass of "
                 "CostReplayBuffer, or of CostDictReplayBuffer for Dict observations"
             )
+        check_integer("n_steps", self.n_steps)
+        if self.n_steps > 1:
+            reasons = {
+                "for Dict observations": isinstance(self.observation_space, spaces.Dict),
+                "with optimize_memory_usage=True": self.optimize_memory_usage,
+                f"with a {getattr(buffer_class, '__name__', '')}": buffer_class is not None
+                and not issubclass(buffer_class, CostNStepReplayBuffer),
+            }
+            for reason in (reason for reason, applies in reasons.items() if applies):
+                raise ValueError(f"n_steps={self.n_steps}: must be 1 {reason}")
 
     def _choose_buffer(self) -> None:
+        chosen: dict[str, Any] = {"n_costs": len(self.cost_keys)}
         if self.replay_buffer_class is None:
             dictionary = isinstance(self.observation_space, spaces.Dict)
             self.replay_buffer_class = CostDictReplayBuffer if dictionary else CostReplayBuffer
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_costs": len(self.cost_keys)}
+            if self.n_steps > 1:
+                self.replay_buffer_class = CostNStepReplayBuffer
+        if issubclass(self.replay_buffer_class, CostNStepReplayBuffer):
+            chosen |= {"n_steps": self.n_steps, "gamma": self.gamma}
+            chosen |= {"cost_gamma": self.gamma if self.cost_gamma is None else self.cost_gamma}
+        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **chosen}
 
     def _setup_model(self) -> None:
-        super()._setup_model()
+        with warnings.catch_warnings():  # SB3 takes it that no buffer but its own knows n_steps
+            warnings.filterwarnings("ignore", "`n_steps=")
+            super()._setup_model()
         # Its first weights take nothing from the stream that actions are sampled from.
         with th.random.fork_rng(devices=[]):
             self.cost_critic = self.make_cost_critic()
@@ -253,10 +308,12 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         :param next_actions: a', which the reward's critic has been given too
         :return: the loss
         """
-        critic, gamma = self.cost_critic, self.gamma if self.cost_gamma is None else self.cost_gamma
+        critic, gamma = self.cost_critic, batch.cost_discounts
+        if gamma is None:
+            gamma = self.gamma if self.cost_gamma is None else self.cost_gamma
         with th.no_grad():
             after = critic.predict(critic.target, batch.next_observations, next_actions)
-            after = (1 - batch.dones[:, None]) * gamma * critic.samples(after)
+            after = ((1 - batch.dones) * gamma)[:, :, None] * critic.samples(after)
             target = batch.costs[:, :, None] + after  # [B, m, K]
         predicted = critic.predict(critic.online, batch.observations, batch.actions)
         values = critic.value(predicted.detach())

@@ -119,11 +119,12 @@ class SoftActorCritic(LagrangianReplay):
         log_prob = log_prob.reshape(-1, 1)
         logs, alpha = self.fit_temperature(log_prob.detach())
 
+        discounts = self.gamma if batch.discounts is None else batch.discounts  # of n-step returns
         with th.no_grad():
             next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
             after = self.next_values(self.critic_target(batch.next_observations, next_actions))
             after = after - alpha * next_log_prob.reshape(-1, 1)
-            target = batch.rewards + (1 - batch.dones) * self.gamma * after
+            target = batch.rewards + (1 - batch.dones) * discounts * after
         values = self.critic(batch.observations, batch.actions)
         critic_loss = self.critic_loss(values, target)
         self.critic.optimizer.zero_grad()

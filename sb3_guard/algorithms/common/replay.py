@@ -175,6 +175,10 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
 
     # Construction and saving
 
+    @property
+    def _gamma_of_costs(self) -> float:
+        return self.gamma if self.cost_gamma is None else self.cost_gamma
+
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
         for name in ("batch_size", "buffer_size", "policy_delay", "target_update_interval"):
@@ -221,7 +225,7 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
                 self.replay_buffer_class = CostNStepReplayBuffer
         if issubclass(self.replay_buffer_class, CostNStepReplayBuffer):
             chosen |= {"n_steps": self.n_steps, "gamma": self.gamma}
-            chosen |= {"cost_gamma": self.gamma if self.cost_gamma is None else self.cost_gamma}
+            chosen |= {"cost_gamma": self._gamma_of_costs}
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **chosen}
 
     def _setup_model(self) -> None:
@@ -308,9 +312,8 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         :param next_actions: a', which the reward's critic has been given too
         :return: the loss
         """
-        critic, gamma = self.cost_critic, batch.cost_discounts
-        if gamma is None:
-            gamma = self.gamma if self.cost_gamma is None else self.cost_gamma
+        critic = self.cost_critic
+        gamma = self._gamma_of_costs if batch.cost_discounts is None else batch.cost_discounts
         with th.no_grad():
             after = critic.predict(critic.target, batch.next_observations, next_actions)
             after = ((1 - batch.dones) * gamma)[:, :, None] * critic.samples(after)

@@ -60,6 +60,15 @@ def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
     np.testing.assert_array_equal(again.predict(obs)[0].shape, new.predict(obs)[0].shape)
 
 
+@pytest.mark.parametrize(("ours", "arguments"), [(CPO, ON), (SACLag, OFF)])
+def test_arguments_of_the_policy_are_given_again_as_they_were(ours, arguments, tmp_path):
+    given = {"policy_kwargs": {"net_arch": [16]}}
+    ours("MlpPolicy", CostPoint(10), cost_limit=3.0, **{**arguments, **given}).save(tmp_path / "a")
+    ours.load(tmp_path / "a", **given)
+    with pytest.raises(ValueError, match="policy kwargs do not equal"):
+        ours.load(tmp_path / "a", policy_kwargs={"net_arch": [8]})
+
+
 def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
     """sb3-contrib's KL is a mean over the dimensions of an action, ours a sum."""
     sb3_contrib.TRPO("MlpPolicy", CostPoint(10), target_kl=0.5, n_steps=40).save(tmp_path / "a")

@@ -7,7 +7,7 @@ anew.
 
 import inspect
 import warnings
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -56,6 +56,9 @@ def replacements(cls: Any, data: dict[str, Any]) -> dict[str, Any]:
 class LoadsOthers(BaseAlgorithm):
     """Loads agents of algorithms that know no cost. Mixed in before an algorithm."""
 
+    #: Arguments of the policy where ``policy_kwargs`` does not have them.
+    policy_defaults: ClassVar[dict[str, Any]] = {}
+
     @classmethod
     def load(
         cls,
@@ -93,6 +96,8 @@ class LoadsOthers(BaseAlgorithm):
             known = {*vars(blank), "lr_schedule", "n_envs"}
             settings = {k: v for k, v in data.items() if callable(v) or isinstance(v, int | float)}
             left = sorted(settings.keys() - known)
+        elif kwargs.get("policy_kwargs") is not None:  # taken as the constructor took them
+            kwargs["policy_kwargs"] = {**cls.policy_defaults, **kwargs["policy_kwargs"]}
         model = super().load(
             path, env, device, custom_objects, print_system_info, force_reset, **kwargs
         )
@@ -130,5 +135,6 @@ class LoadsOthers(BaseAlgorithm):
         if "policy" in given:
             weights = self.policy.state_dict()
             action_filter = {k: v for k, v in weights.items() if k.startswith("action_filter.")}
-            given["policy"] = {**action_filter, **given["policy"]}
+            if not action_filter.keys() & given["policy"].keys():
+                given = {**given, "policy": {**action_filter, **given["policy"]}}
         super().set_parameters(given, exact_match, device)

@@ -83,8 +83,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     }
     #: Whether a critic of the costs is built and trained.
     uses_cost_critic: bool = True
-    #: Arguments of the policy where ``policy_kwargs`` does not have them.
-    policy_defaults: ClassVar[dict[str, Any]] = {}
     #: What critics learn: SB3's λ-returns, or discounted rewards- and costs-to-go.
     returns: ClassVar[Literal["lambda", "discounted"]] = "lambda"
 

@@ -10,7 +10,7 @@ import torch as th
 from cost_envs import CostPoint
 
 import sb3_guard
-from sb3_guard import CPO, TRPOUSL, PPOLag, SACLag, TD3Lag, TQCLag, TRPOLag, train
+from sb3_guard import CPO, TRPOSL, TRPOUSL, PPOLag, SACLag, TD3Lag, TQCLag, TRPOLag, train
 from sb3_guard.algorithms.common.arguments import stated
 from sb3_guard.zoo.run.checkpoint import read_normalizer
 
@@ -90,6 +90,11 @@ def test_a_missing_network_of_sb3s_is_still_an_error(tmp_path):
     given = model.get_parameters()
     with pytest.raises(ValueError, match="cost_critic"):
         model.set_parameters({name: given[name] for name in given if name != "cost_critic"})
+    filtered = TRPOSL("MlpPolicy", CostPoint(10), n_steps=40, batch_size=20, cost_limit=1.0)
+    given = filtered.get_parameters()
+    optimizer = "policy.action_filter.optimizer"
+    with pytest.raises(ValueError, match=optimizer):
+        filtered.set_parameters({name: given[name] for name in given if name != optimizer})
 
 
 @pytest.mark.parametrize("beside", ["ppo_vecnormalize.pkl", "run/vecnormalize.pkl", None])

@@ -130,11 +130,11 @@ class LoadsOthers(BaseAlgorithm):
             _, given, _ = load_from_zip_file(given, load_data=False, device=device)
         theirs = super()._get_torch_save_params()[0]
         ours = {name: now for name, now in self.get_parameters().items() if name not in theirs}
-        if not ours.keys() & given.keys():
+        weights = self.policy.state_dict()
+        filters = {k: v for k, v in weights.items() if k.startswith("action_filter.")}
+        policy = given.get("policy", {})
+        if not ours.keys() & given.keys() and not filters.keys() & policy.keys():
             given = {**ours, **given}
-        if "policy" in given:
-            weights = self.policy.state_dict()
-            action_filter = {k: v for k, v in weights.items() if k.startswith("action_filter.")}
-            if not action_filter.keys() & given["policy"].keys():
-                given = {**given, "policy": {**action_filter, **given["policy"]}}
+            if policy:
+                given["policy"] = {**filters, **policy}
         super().set_parameters(given, exact_match, device)

@@ -429,7 +429,7 @@ def test_the_omnisafe_preset_is_the_table_of_its_page():
 def test_the_omnisafe_preset_makes_a_model(algo):
     env_id = "Goal_Point_8Hazards-v0"
     values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, env_id, "omnisafe"))
-    on_policy = "n_steps" in values
+    on_policy = "learning_starts" not in values
     assert not on_policy or values["n_envs"] * values["n_steps"] == 20_000
     model = ALGORITHMS[algo](env=make_vec_env(env_id, 1), **build(values).model)
     rates = [model.lr_schedule(left) for left in (1.0, 0.5, 0.0)]

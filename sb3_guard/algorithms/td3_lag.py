@@ -5,7 +5,8 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.replay import CostReplayBufferSamples, LagrangianReplay
+from sb3_guard.algorithms.common.replay import LagrangianReplay
+from sb3_guard.algorithms.common.replay_buffers import CostReplayBufferSamples
 
 
 class TD3Lag(LagrangianReplay, TD3):

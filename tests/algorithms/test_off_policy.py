@@ -22,7 +22,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_guard import SACLag, TD3Lag, TQCLag, evaluate_policy
-from sb3_guard.algorithms.common.replay import (
+from sb3_guard.algorithms.common.replay_buffers import (
     CostDictReplayBuffer,
     CostNStepReplayBuffer,
     CostReplayBuffer,

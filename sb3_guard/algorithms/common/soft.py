@@ -7,7 +7,8 @@ import torch as th
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_guard.algorithms.common.replay import CostReplayBufferSamples, LagrangianReplay
+from sb3_guard.algorithms.common.replay import LagrangianReplay
+from sb3_guard.algorithms.common.replay_buffers import CostReplayBufferSamples
 
 
 class SoftActorCritic(LagrangianReplay):

@@ -60,7 +60,7 @@ def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
     np.testing.assert_array_equal(again.predict(obs)[0].shape, new.predict(obs)[0].shape)
 
 
-@pytest.mark.parametrize(("ours", "arguments"), [(CPO, ON), (SACLag, OFF)])
+@pytest.mark.parametrize(("ours", "arguments"), [(CPO, ON), (PPOLag, ON)])
 def test_arguments_of_the_policy_are_given_again_as_they_were(ours, arguments, tmp_path):
     given = {"policy_kwargs": {"net_arch": [16]}}
     ours("MlpPolicy", CostPoint(10), cost_limit=3.0, **{**arguments, **given}).save(tmp_path / "a")

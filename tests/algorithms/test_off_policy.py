@@ -200,6 +200,27 @@ def test_several_steps_survive_saving(tmp_path: Path) -> None:
     assert isinstance(buffer, CostNStepReplayBuffer)
     assert (buffer.n_steps, buffer.gamma, buffer.cost_gamma) == (3, 0.9, 0.5)
     loaded.learn(50, reset_num_timesteps=False)
+    changed = SACLag.load(tmp_path / "model", env=points(), cost_gamma=0.7)
+    changed.load_replay_buffer(tmp_path / "buffer")
+    assert changed.replay_buffer.cost_gamma == 0.7
+    one = SACLag.load(tmp_path / "model", env=points(), n_steps=1)
+    assert type(one.replay_buffer) is CostReplayBuffer
+    with pytest.raises(ValueError, match=r"n_steps=1: .* was saved by a model with more than one"):
+        one.load_replay_buffer(tmp_path / "buffer")
+    one.save(tmp_path / "one")
+    assert isinstance(
+        SACLag.load(tmp_path / "one", env=points(), n_steps=5).replay_buffer, CostNStepReplayBuffer
+    )
+
+
+def test_sums_end_where_learning_begins_anew() -> None:
+    """No cost of the next ``learn`` counts for an episode that was left in the middle."""
+    env = make_vec_env(lambda: Clock(8, False), 1)
+    model = TD3Lag("MlpPolicy", env, n_steps=3, cost_limit=1.0, **settings())
+    model.learn(12)
+    model.learn(12)
+    batch = model.replay_buffer.sample(256)
+    assert (batch.next_observations > batch.observations).all()
 
 
 @pytest.mark.parametrize("quantile", [None, 0.9])
@@ -548,8 +569,8 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
     [
         ({"n_steps": 0}, "n_steps=0: must be an integer of at least 1"),
         (
-            {"n_steps": 3, "replay_buffer_class": CostReplayBuffer},
-            "n_steps=3: must be 1 with a CostReplayBuffer",
+            {"n_steps": 3, "replay_buffer_class": type("Own", (CostReplayBuffer,), {})},
+            "n_steps=3: must be 1 with a Own",
         ),
         ({"n_steps": 3, "optimize_memory_usage": True}, "n_steps=3: must be 1 .*optimize_memory"),
         ({"cost_gamma": 1.0}, r"cost_gamma=1.0: must be a number in \[0, 1\)"),

@@ -37,6 +37,10 @@ from sb3_guard.algorithms.common.replay_buffers import (
 )
 from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
+# What is chosen where the user names no buffer, and what the last of them alone takes.
+AUTOMATIC = (CostReplayBuffer, CostDictReplayBuffer, CostNStepReplayBuffer)
+N_STEP_ARGUMENTS = ("n_steps", "gamma", "cost_gamma")
+
 
 class CostReplay(Constrained, OffPolicyAlgorithm):
     """Costs and cost critics for an off-policy algorithm with continuous actions.
@@ -103,6 +107,8 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
                 f"gamma={self.gamma!r}: cost_gamma, which is gamma unless it is given, must be "
                 "below 1, as undiscounted costs add up without end; give cost_gamma=0.99 too"
             )
+        if self.replay_buffer_class in AUTOMATIC:  # a loaded model, perhaps with another n_steps
+            self.replay_buffer_class = None
         buffer_class = self.replay_buffer_class
         if buffer_class is not None and not issubclass(buffer_class, CostColumns):
             raise ValueError(
@@ -130,7 +136,8 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         if issubclass(self.replay_buffer_class, CostNStepReplayBuffer):
             chosen |= {"n_steps": self.n_steps, "gamma": self.gamma}
             chosen |= {"cost_gamma": self._gamma_of_costs}
-        self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **chosen}
+        given = {k: v for k, v in self.replay_buffer_kwargs.items() if k not in N_STEP_ARGUMENTS}
+        self.replay_buffer_kwargs = {**given, **chosen}
 
     def _setup_model(self) -> None:
         with warnings.catch_warnings():  # SB3 takes it that no buffer but its own knows n_steps
@@ -148,7 +155,31 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "cost_critic", "cost_critic.optimizer"], tensors
 
+    def load_replay_buffer(self, path: Any, *args: Any, **kwargs: Any) -> None:
+        super().load_replay_buffer(path, *args, **kwargs)
+        several = isinstance(self.replay_buffer, CostNStepReplayBuffer)
+        if several != (self.n_steps > 1):
+            raise ValueError(
+                f"n_steps={self.n_steps}: the replay buffer was saved by a model with "
+                f"{'more than one step' if several else 'n_steps=1'}"
+            )
+        for name in N_STEP_ARGUMENTS if several else ():
+            setattr(self.replay_buffer, name, self.replay_buffer_kwargs[name])
+
     # Collecting
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: Any = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+    ) -> tuple[int, BaseCallback]:
+        if isinstance(self.replay_buffer, CostNStepReplayBuffer) and (
+            reset_num_timesteps or self._last_obs is None
+        ):
+            self.replay_buffer.cut()  # new episodes begin
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any

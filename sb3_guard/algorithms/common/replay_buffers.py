@@ -90,6 +90,11 @@ class CostNStepReplayBuffer(CostColumns, NStepReplayBuffer):
         super().__init__(*args, **kwargs)
         self.cost_gamma = cost_gamma
 
+    def cut(self) -> None:
+        """Let no sum reach beyond the latest step: what comes next is another episode."""
+        if self.size() > 0:
+            self.timeouts[self.pos - 1] = 1.0 - self.dones[self.pos - 1]
+
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
         # SB3's sums of rewards, drawn anew for each cost in their place, from the same generator.
         generator = np.random.get_state()  # noqa: NPY002 (the generator SB3 draws from)

@@ -107,35 +107,33 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
                 f"gamma={self.gamma!r}: cost_gamma, which is gamma unless it is given, must be "
                 "below 1, as undiscounted costs add up without end; give cost_gamma=0.99 too"
             )
-        if self.replay_buffer_class in AUTOMATIC:  # a loaded model, perhaps with another n_steps
-            self.replay_buffer_class = None
-        buffer_class = self.replay_buffer_class
-        if buffer_class is not None and not issubclass(buffer_class, CostColumns):
+        check_integer("n_steps", self.n_steps)
+        own = None if self.replay_buffer_class in AUTOMATIC else self.replay_buffer_class
+        if own is not None and not issubclass(own, CostColumns):
             raise ValueError(
-                f"replay_buffer_class={buffer_class.__name__}: must be a subclass of "
+                f"replay_buffer_class={own.__name__}: must be a subclass of "
                 "CostReplayBuffer, or of CostDictReplayBuffer for Dict observations"
             )
-        check_integer("n_steps", self.n_steps)
-        if self.n_steps > 1:
-            reasons = {
-                "for Dict observations": isinstance(self.observation_space, spaces.Dict),
-                "with optimize_memory_usage=True": self.optimize_memory_usage,
-                f"with a {getattr(buffer_class, '__name__', '')}": buffer_class is not None
-                and not issubclass(buffer_class, CostNStepReplayBuffer),
-            }
-            for reason in (reason for reason, applies in reasons.items() if applies):
-                raise ValueError(f"n_steps={self.n_steps}: must be 1 {reason}")
+        reason = None
+        if isinstance(self.observation_space, spaces.Dict):
+            reason = "for Dict observations"
+        elif self.optimize_memory_usage:
+            reason = "with optimize_memory_usage=True"
+        elif own is not None and not issubclass(own, CostNStepReplayBuffer):
+            reason = f"with a {own.__name__}"
+        if self.n_steps > 1 and reason is not None:
+            raise ValueError(f"n_steps={self.n_steps}: must be 1 {reason}")
 
     def _choose_buffer(self) -> None:
-        chosen: dict[str, Any] = {"n_costs": len(self.cost_keys)}
-        if self.replay_buffer_class is None:
+        # A loaded model names the one that was chosen for it, and may have another n_steps now.
+        if self.replay_buffer_class is None or self.replay_buffer_class in AUTOMATIC:
             dictionary = isinstance(self.observation_space, spaces.Dict)
-            self.replay_buffer_class = CostDictReplayBuffer if dictionary else CostReplayBuffer
-            if self.n_steps > 1:
-                self.replay_buffer_class = CostNStepReplayBuffer
+            one_step = CostDictReplayBuffer if dictionary else CostReplayBuffer
+            self.replay_buffer_class = CostNStepReplayBuffer if self.n_steps > 1 else one_step
+        chosen: dict[str, Any] = {"n_costs": len(self.cost_keys)}
         if issubclass(self.replay_buffer_class, CostNStepReplayBuffer):
-            chosen |= {"n_steps": self.n_steps, "gamma": self.gamma}
-            chosen |= {"cost_gamma": self._gamma_of_costs}
+            values = (self.n_steps, self.gamma, self._gamma_of_costs)
+            chosen |= dict(zip(N_STEP_ARGUMENTS, values, strict=True))
         given = {k: v for k, v in self.replay_buffer_kwargs.items() if k not in N_STEP_ARGUMENTS}
         self.replay_buffer_kwargs = {**given, **chosen}
 
@@ -158,7 +156,7 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
     def load_replay_buffer(self, path: Any, *args: Any, **kwargs: Any) -> None:
         super().load_replay_buffer(path, *args, **kwargs)
         several = isinstance(self.replay_buffer, CostNStepReplayBuffer)
-        if several != (self.n_steps > 1):
+        if several != issubclass(self.replay_buffer_class, CostNStepReplayBuffer):  # type: ignore[arg-type]
             raise ValueError(
                 f"n_steps={self.n_steps}: the replay buffer was saved by a model with "
                 f"{'more than one step' if several else 'n_steps=1'}"

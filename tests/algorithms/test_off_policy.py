@@ -356,6 +356,20 @@ def test_multipliers_follow_the_mean_of_episodes(cls: Any) -> None:
 
 
 @shared
+@pytest.mark.parametrize("sign", [1.0, -1.0])  # at most 5 of a cost; at least 5 of something
+def test_a_safety_margin_is_a_share_of_the_limit(cls: Any, sign: float) -> None:
+    """Episodes 0.2 within the limit break it by 0.8 and 1.8 with margins of 20 and 40 %."""
+    gains = {"cost_limit": 5.0 * sign, "lambda_lr": 0.1, "proportional_gain": 0.0}
+    gains |= {"lambda_lr_per": "episode", "lambda_starts": 0.0}
+    values = []
+    for margin in (0.0, 0.2, 0.4):
+        env = given(itertools.repeat(5.0 * sign - 0.2), 1, length=4)
+        model = cls("MlpPolicy", env, safety_margin=margin, **gains, **settings())
+        values.append(float(model.learn(200).multiplier.integral))
+    assert values[0] == 0.0 and values[2] / values[1] == pytest.approx(1.8 / 0.8)
+
+
+@shared
 def test_multipliers_do_not_run_ahead_of_the_policy(cls: Any) -> None:
     """Eight episodes for each gradient step; TD3's actor learns, and pays, in every other one."""
     gains = {"cost_limit": 5.0, "lambda_lr": 0.1, "proportional_gain": 0.0, "lambda_starts": 80}
@@ -587,6 +601,7 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
         ({"tau": 2.0}, r"tau=2.0: must be a number in \[0, 1\]"),
         ({"learning_rate": 0.0}, "learning_rate=0.0: must be a positive number or a schedule"),
         ({"lambda_starts": -1}, "lambda_starts=-1"),
+        ({"safety_margin": 1.0}, "safety_margin=1.0"),
         ({"cost_limit": [1.0, 2.0]}, "cost_limit=.*one for each of the 1 cost keys"),
         ({"lambda_init": 2.0, "lambda_max": 1.0}, "lambda_max=1.0"),
         ({"env": "CartPole-v1"}, r"^\w+ needs continuous actions \(Box\), not Discrete"),

@@ -295,6 +295,8 @@ class LagrangianReplay(Lagrangian, CostReplay):
     :param lambda_starts: when the multipliers begin to move: after that many steps, or below 1
         after that share of the training. Before it the policy learns its task at ``lambda_init``
     :param lambda_window: number of episodes in that mean
+    :param safety_margin: how far below a limit d the multipliers keep J_C, as a share of abs(d):
+        they follow J_C - (d - safety_margin abs(d))
     """
 
     search_space: ClassVar[dict[str, Any]] = {
@@ -302,6 +304,7 @@ class LagrangianReplay(Lagrangian, CostReplay):
         "lambda_init": {"low": 0.0, "high": 2.0},
         "proportional_gain": {"low": 0.0, "high": 2.0},
         "lambda_starts": {"low": 0.0, "high": 0.3},
+        "safety_margin": [0.0, 0.1, 0.2],
     }
     defaults: ClassVar[dict[str, Any]] = {
         "lambda_lr": 3.0,
@@ -312,6 +315,7 @@ class LagrangianReplay(Lagrangian, CostReplay):
     lambda_lr_per: Literal["training", "episode"] = hyperparameter("training")
     lambda_starts: float = hyperparameter(0.15)
     lambda_window: int = hyperparameter(50)
+    safety_margin: float = hyperparameter(0.0, high=1.0)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
@@ -344,7 +348,9 @@ class LagrangianReplay(Lagrangian, CostReplay):
         return self.lambda_lr * self.costs.horizon / self.num_timesteps
 
     def costs_to_follow(self) -> list[np.ndarray]:
-        means, steps = self.unfollowed, self._n_updates - self.followed_at
+        margin = self.safety_margin * np.abs(self.cost_limits)
+        means = [mean + margin for mean in self.unfollowed]
+        steps = self._n_updates - self.followed_at
         self.unfollowed, self.followed_at = [], self._n_updates
         return means[-steps:] if self.lambda_lr_per == "episode" else means
 

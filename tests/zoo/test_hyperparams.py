@@ -444,9 +444,11 @@ def test_the_omnisafe_preset_makes_a_model(algo):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("env_id", ["SafetyPointGoal1-v0", "Goal_Point_8Hazards-v0"])
-def test_no_published_limit_falls(preset: str, env_id: str) -> None:
+def test_no_published_limit_falls_or_has_a_margin(preset: str, env_id: str) -> None:
     for algo in read_file(hyperparams_folder() / f"{preset}.yml").keys() - {"all"}:
-        assert read_hyperparams(algo, env_id, preset).get("limit_start", 1.0) == 1.0, algo
+        values = read_hyperparams(algo, env_id, preset)
+        assert values.get("limit_start", 1.0) == 1.0, algo
+        assert values.get("safety_margin", 0.0) == 0.0, algo
 
 
 def test_every_algorithm_has_a_file_and_every_file_an_algorithm():

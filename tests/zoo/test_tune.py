@@ -49,8 +49,8 @@ def draw(search: Search, seed: int = 0) -> dict:
     return search.draw(study.ask())
 
 
-def shipped(algo: str) -> dict:
-    return check(algo, algorithm(algo), read_hyperparams(algo, "Goal_Point_8Hazards-v0"))
+def shipped(algo: str, env_id: str = "Goal_Point_8Hazards-v0") -> dict:
+    return check(algo, algorithm(algo), read_hyperparams(algo, env_id))
 
 
 # What is searched
@@ -82,9 +82,10 @@ def test_the_decay_of_cost_advantages_is_searched_where_it_matters():
     assert not any("cost_gae_lambda" in space_of(algo) for algo in ("trpo", "trpo_sl"))
 
 
+@pytest.mark.parametrize("env_id", ["Goal_Point_8Hazards-v0", "SafetyPointGoal1-v0"])
 @pytest.mark.parametrize("algo", OURS)
-def test_the_first_trial_is_the_shipped_one(algo):
-    base = shipped(algo)
+def test_the_first_trial_is_the_shipped_one(algo, env_id):
+    base = shipped(algo, env_id)
     search = Search(algo, base)
     study = optuna.create_study()
     study.enqueue_trial(search.first())

@@ -304,7 +304,7 @@ class LagrangianReplay(Lagrangian, CostReplay):
         "lambda_init": {"low": 0.0, "high": 2.0},
         "proportional_gain": {"low": 0.0, "high": 2.0},
         "lambda_starts": {"low": 0.0, "high": 0.3},
-        "safety_margin": [0.0, 0.1, 0.2],
+        "safety_margin": {"low": 0.0, "high": 0.3},
     }
     defaults: ClassVar[dict[str, Any]] = {
         "lambda_lr": 3.0,

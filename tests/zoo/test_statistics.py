@@ -59,6 +59,8 @@ def test_safety_by_hand():
     unlimited = safety(episodes, epoch=math.nan, limit=math.nan)
     assert math.isnan(unlimited["above_limit"]) and math.isnan(unlimited["feasible_iqm"])
     assert math.isnan(safety(episodes, 10, limit=3)["feasible_iqm"])
+    # Rollouts too short to end an episode, as with n_steps off-policy, are no epochs.
+    assert safety(episodes, 4, limit=8) == safety(episodes, math.nan, limit=8) != found
 
 
 def test_unconstrained_runs_are_judged_by_the_others_limit(tmp_path):

@@ -40,9 +40,10 @@ def last_epochs(episodes: pd.DataFrame, epoch: float) -> pd.DataFrame:
     The episodes of the last ten epochs of a run, with their ``epoch``'s number.
 
     :param episodes: see :func:`~sb3_guard.zoo.results.curves.read_episodes`
-    :param epoch: steps; NaN: 30,000, or a twentieth of a shorter run
+    :param epoch: steps; NaN, or too few to end an episode: 30,000, or a twentieth of a shorter run
     """
-    size = epoch if epoch > 0 else min(EPOCH, episodes["step"].iloc[-1] / 20)
+    total = episodes["step"].iloc[-1]
+    size = epoch if epoch * len(episodes) >= total else min(EPOCH, total / 20)
     numbered = episodes.assign(epoch=np.ceil(episodes["step"] / size))
     return numbered[numbered["epoch"] > numbered["epoch"].iloc[-1] - EPOCHS]
 

@@ -46,6 +46,7 @@ STATEWISE = {
 #: Problems with a limit of 0, and who is tried on them.
 ZERO = {"brink": ("cpo", "pcpo", "trpo_lag", "trpo_ipo", "trpo_fac", "trpo_sl", "trpo_usl")}
 KEPT = 0.8  # share of the optimum that those need that act within a limit
+NONE = 0.05  # at a limit of 0: share of what the unconstrained optimum costs
 
 
 def fits(algo: str, name: str) -> bool:
@@ -88,7 +89,16 @@ def keep(run: Run, outcome: Outcome, seconds: float) -> None:
         csv.writer(file, lineterminator="\n").writerow(values)
 
 
-def cell(outcomes: Sequence[Outcome], algo: str) -> str:
+def passes(outcome: Outcome, algo: str, name: str) -> bool:
+    """Whether that solves a problem."""
+    if name in ZERO:
+        return outcome.value >= 0.9 and outcome.cost.max() <= NONE
+    if issubclass(ALGORITHMS[algo], FilteredTrustRegion):
+        return outcome.value >= KEPT and outcome.cost.max() <= 1.0
+    return outcome.good
+
+
+def cell(outcomes: Sequence[Outcome], algo: str, name: str) -> str:
     """Mean ± standard error of return and costs over seeds, and whether the mean passes."""
     n = len(outcomes)
 
@@ -98,10 +108,7 @@ def cell(outcomes: Sequence[Outcome], algo: str) -> str:
 
     values = np.array([each.value for each in outcomes])
     costs = np.array([each.cost for each in outcomes])  # [seeds, m]
-    average = Outcome(values.mean(), costs.mean(axis=0))
-    good = average.good
-    if issubclass(ALGORITHMS[algo], FilteredTrustRegion):
-        good = average.value >= KEPT and average.cost.max() <= 1.0
+    good = passes(Outcome(values.mean(), costs.mean(axis=0)), algo, name)
     shown = ", ".join(mean(column) for column in costs.T)
     return f"{mean(values)}; {shown}{' ✓' if good else ''} ({n})"
 
@@ -120,9 +127,9 @@ def tables(results: dict[Run, Outcome]) -> str:
         lines = [] if scale == 1.0 else [f"Costs and limits × {scale:g}:", ""]
         lines += ["| | " + " | ".join(names) + " |", "|" + "---|" * (len(names) + 1)]
         for algo in ALGORITHMS:
-            row = [cells[algo, name] for name in names]
-            if any(row):
-                shown = (cell(each, algo) if each else "" for each in row)
+            row = {name: cells[algo, name] for name in names}
+            if any(row.values()):
+                shown = (cell(each, algo, name) if each else "" for name, each in row.items())
                 lines.append(f"| `{algo}` | " + " | ".join(shown) + " |")
         texts.append("\n".join(lines))
     return "\n\n".join(texts)

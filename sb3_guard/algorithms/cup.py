@@ -11,6 +11,9 @@ from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 
+#: KL that the second step may go, in that of the first: twice as far, and KL is quadratic.
+REACH = 4.0
+
 
 class CUP(Lagrangian, FirstOrder):
     """Constrained update projection (Yang et al., 2022, arXiv 2209.07089).
@@ -24,7 +27,9 @@ class CUP(Lagrangian, FirstOrder):
     violations. The factor comes from the paper's bound with generalised advantages, and grows
     without bound as γ → 1.
 
-    With ``target_kl`` each of the two steps stops by its distance from where it began.
+    ``target_kl`` stops the first step by its distance from π_k, and the second at four times that
+    from π_{k+½}: a KL divergence grows with the square of the distance, so the second may take back
+    what the first has done and go as far again to the other side.
 
     :param projection_kl: ``"forward"`` as above; ``"reverse"`` for KL(π ‖ π_{k+½})
     """
@@ -38,7 +43,7 @@ class CUP(Lagrangian, FirstOrder):
     # is much noise in both. Gains are a sixth of others': at γ = 0.99 and λ = 0.95 the factor above
     # is six.
     defaults: ClassVar[dict[str, Any]] = {
-        "n_epochs": 10,
+        "n_epochs": 5,
         "lambda_lr": 0.016,
         "proportional_gain": 0.08,
         "lambda_units": "relative",
@@ -68,7 +73,7 @@ class CUP(Lagrangian, FirstOrder):
         super().train()  # PPO's, on the rewards
         if bool(self._weight.any()):
             self._improved = self.snapshot()
-            self.descend(self.projection, values=False, start=self._improved)
+            self.descend(self.projection, values=False, start=self._improved, reach=REACH)
 
     def projection(
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution

@@ -1,5 +1,7 @@
 """TD3-Lagrangian: TD3 with cost critics and a multiplier that follows the violation."""
 
+from typing import Any, ClassVar
+
 import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.utils import polyak_update
@@ -23,6 +25,7 @@ class TD3Lag(LagrangianReplay, TD3):
     """
 
     label, family, paper = "TD3-Lagrangian", "Lagrangian", "Ray et al. 2019"
+    defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 10.0}
 
     def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
         """TD3's step: critics, and with a delay actor and targets."""

@@ -84,6 +84,7 @@ class Remaining(_Counting):
     """What :class:`RemainingBudget` counts, in N environments."""
 
     name, first = "budget", 1.0
+    training_arguments = ("unsafe_reward",)
 
     def __init__(
         self,

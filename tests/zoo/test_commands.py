@@ -612,3 +612,19 @@ def test_early_termination_is_for_training_alone(tmp_path, normalize):
     assert (evaluations["ep_lengths"] == 20).all()
     # That cut episodes cost little says nothing of the limit.
     assert result["cut"] and "verdict" not in result["costs"]["cost"]
+
+
+@pytest.mark.parametrize("kind", ["budgets.RemainingBudget", "vec_budgets.VecRemainingBudget"])
+def test_the_reward_of_an_overspent_budget_is_for_training_alone(tmp_path, kind):
+    arguments = "{'budget': 0.01, 'unsafe_reward': -100.0}"
+    wrapper = (
+        f"{'vec_' * kind.startswith('vec')}env_wrapper:{{'sb3_guard.common.{kind}': {arguments}}}"
+    )
+    here = ["--env-kwargs", "hazard:(-1.0, 0.0)"]
+    run = trained(tmp_path, "-n", "480", *here, "-params", wrapper)
+    trained_on = load_results(str(run))["r"].min()
+    assert (trained_on <= -100.0) == kind.startswith("budgets")  # inside the monitor, or around it
+    result = json.loads((run / "result.json").read_text())
+    assert [*result["final"]] == ["stochastic", "greedy"]
+    for split in result["final"].values():
+        assert min(split["costs"]) > 0.01 and min(split["returns"]) > -100.0

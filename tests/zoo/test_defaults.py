@@ -13,10 +13,12 @@ from torch import nn
 from sb3_guard import ALGORITHMS, make_model, make_vec_env, train
 from sb3_guard.algorithms import CostReplay
 from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.run.algos import baselines
 from sb3_guard.zoo.run.hyperparams import RUN_KEYS, build, check, parameters, read_hyperparams
 from sb3_guard.zoo.run.make_envs import seed_rows
 
 ENVS = ["SafetyPointGoal1-v0", "Goal_Point_8Hazards-v0"]
+FOREIGN = "CliffWalking-v1"  # an id that has no entry
 #: Entries hold what depends on the environment: its limit, the shape of rollouts, wrappers …
 OF_THE_ENVIRONMENT = {*RUN_KEYS, "policy", "policy_kwargs", "cost_limit", "n_steps", "batch_size"}
 OF_THE_ENVIRONMENT |= {"noise_type", "noise_std", "learning_starts", "train_freq", "gradient_steps"}
@@ -42,7 +44,7 @@ DEPARTURES = {
 SEED, ROLLOUT, N_ENVS = 3, 100, 4
 
 
-@pytest.mark.parametrize("env_id", ENVS)
+@pytest.mark.parametrize("env_id", [*ENVS, FOREIGN])
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_entries_hold_only_what_depends_on_the_environment(algo: str, env_id: str) -> None:
     values, known = read_hyperparams(algo, env_id), parameters(ALGORITHMS[algo])
@@ -133,11 +135,12 @@ def test_sizes_of_a_file_are_not_warned_of() -> None:
         make_model("ppo_lag", "Goal_Point_8Hazards", conf="omnisafe", n_steps=999, seed=0)
 
 
-@pytest.mark.parametrize("algo", ["ppo", "sac"])
+@pytest.mark.parametrize("algo", [key for key in baselines() if key not in ("dqn", "qrdqn")])
 def test_make_model_makes_baselines(algo: str) -> None:
     model = make_model(algo, "SafetyPointGoal1", n_envs=2)
-    assert type(model).__name__ == algo.upper()
-    assert (model.get_vec_normalize_env() is not None) == (algo == "ppo")
+    assert type(model) is baselines()[algo]
+    if algo in ("ppo", "sac"):
+        assert (model.get_vec_normalize_env() is not None) == (algo == "ppo")
 
 
 @pytest.mark.parametrize(

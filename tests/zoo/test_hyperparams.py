@@ -216,8 +216,9 @@ def test_names_that_are_flags():
 
 def test_training_takes_a_million_steps_unless_somebody_says_otherwise():
     assert check("cpo", CPO, {})["n_timesteps"] == 1_000_000
-    for algo in ALGORITHMS:
-        assert read_hyperparams(algo, "Goal_Ant_8Hazards-v0")["n_timesteps"] == 1e6
+    for algo in (*ALGORITHMS, *baselines()):
+        entry = read_hyperparams(algo, "Goal_Ant_8Hazards-v0")
+        assert entry.get("n_timesteps", 1e6) == 1e6
 
 
 def test_objects_are_made():

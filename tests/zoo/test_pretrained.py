@@ -102,13 +102,14 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
 @pytest.mark.parametrize("run", SHIPPED, ids=lambda run: f"{run.path.parent.name}-{run.name}")
 @pytest.mark.parametrize("noise", [[], ["--stochastic"]])
 def test_a_shipped_agent_keeps_its_limit(run, noise, tmp_path):
-    """On average: 200 episodes, whose standard error is at most a tenth of the limit."""
+    """On average, by the interval of 200 episodes."""
     which = ["--algo", run.path.parent.name, "--env", run.name, *noise]
     file = tmp_path / "played.json"
     quiet = ["--no-render", "--verbose", "0", "--n-episodes", "200", "--json", str(file)]
     assert enjoy.main(["--pretrained", *which, *quiet]) == 0
     limit = run.checked_result().get("cost_limit", np.inf)
-    assert 1 < json.loads(file.read_text())["cost"]["mean"] < 1.1 * limit
+    cost = json.loads(file.read_text())["cost"]
+    assert cost["mean"] > 1 and cost["high"] <= limit
 
 
 def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):

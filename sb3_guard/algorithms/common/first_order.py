@@ -104,6 +104,7 @@ class FirstOrder(CostRollouts, PPO):
         loss: Loss,
         values: bool = True,
         start: Before | None = None,
+        reach: float = 1.0,
     ) -> None:
         """Take passes of minibatches down a loss.
 
@@ -111,12 +112,13 @@ class FirstOrder(CostRollouts, PPO):
         :param values: whether the reward critic and the entropy bonus learn along; a step without
             them is logged as a projection
         :param start: the policy whose distance stops the passes; None for the one that acted
+        :param reach: that distance, in ``target_kl``
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         history: dict[str, list[float]] = {}
         for _ in range(self.n_epochs):
-            stop = self._descend_once(loss, values, history, start)
+            stop = self._descend_once(loss, values, history, start, reach)
             self._n_updates += 1
             if stop:
                 break
@@ -132,8 +134,10 @@ class FirstOrder(CostRollouts, PPO):
         values: bool,
         history: dict[str, list[float]],
         start: Before | None,
+        reach: float,
     ) -> bool:
         """One pass; whether it was the last."""
+        furthest = np.inf if self.target_kl is None else reach * self.target_kl
         names = "policy_gradient_loss", "approx_kl"
         loss_name, kl_name = names if values else ("projection_loss", "projection_kl")
         history[kl_name] = []  # of the last pass alone, as SB3 logs it
@@ -162,8 +166,7 @@ class FirstOrder(CostRollouts, PPO):
             for name, value in {**losses, kl_name: divergence}.items():
                 history.setdefault(name, []).append(number := value.item())
                 self._check_finite(name, number)
-            too_far = self.target_kl is not None and float(divergence) > 1.5 * self.target_kl
-            if self.kl_stop == "minibatch" and too_far:
+            if self.kl_stop == "minibatch" and float(divergence) > 1.5 * furthest:
                 return True
             self.policy.optimizer.zero_grad()
             total.backward()
@@ -171,8 +174,8 @@ class FirstOrder(CostRollouts, PPO):
             self.policy.optimizer.step()
         return (
             self.kl_stop == "epoch"
-            and self.target_kl is not None
-            and mean_kl(self, start) > self.target_kl
+            and self.target_kl is not None  # the distance takes time
+            and mean_kl(self, start) > furthest
         )
 
     def _value_loss(self, batch: CostRolloutBufferSamples, values: th.Tensor) -> th.Tensor:

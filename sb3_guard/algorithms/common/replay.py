@@ -300,7 +300,7 @@ class LagrangianReplay(Lagrangian, CostReplay):
     """
 
     search_space: ClassVar[dict[str, Any]] = {
-        "lambda_lr": {"low": 0.2, "high": 10.0, "log": True},
+        "lambda_lr": {"low": 0.2, "high": 30.0, "log": True},
         "lambda_init": {"low": 0.0, "high": 2.0},
         "proportional_gain": {"low": 0.0, "high": 2.0},
         "lambda_starts": {"low": 0.0, "high": 0.3},

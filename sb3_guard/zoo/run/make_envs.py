@@ -111,7 +111,7 @@ def make_envs(
     :param num_threads: threads of the native engine; None: its own choice
     :param packages: modules whose functions wrappers name, to be imported in each process
     :param evaluation: observations are normalised with given statistics, rewards not at all, and
-        wrappers that are ``training_only`` are left out
+        wrappers that are ``training_only`` and their ``training_arguments`` are left out
     :param normalizer: statistics to begin with; it is given the environment
     :param render_mode: as for :func:`gymnasium.make`
     :raises UsageError: the environment refuses an argument, or can't be made
@@ -148,8 +148,14 @@ def make_envs(
 def _wrappers(
     wrappers: list[tuple[Any, dict[str, Any]]], evaluation: bool
 ) -> list[tuple[Any, dict[str, Any]]]:
-    """Those that are for evaluation, too: what ends episodes early would hide what they cost."""
-    return [w for w in wrappers if not (evaluation and getattr(w[0], "training_only", False))]
+    """Evaluation is without what ends episodes early, or changes rewards."""
+    if not evaluation:
+        return wrappers
+    return [
+        (cls, {k: v for k, v in given.items() if k not in getattr(cls, "training_arguments", ())})
+        for cls, given in wrappers
+        if not getattr(cls, "training_only", False)
+    ]
 
 
 def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: VecNormalize | None) -> VecEnv:

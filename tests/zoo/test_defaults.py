@@ -30,6 +30,11 @@ DEPARTURES = {
     },
     ("trpo_lag", ENVS[1]): {"cost_gae_lambda"},
     **{("trpo_ipo", env): {"cost_gae_lambda"} for env in ENVS},
+    **{
+        (algo, env): {"lambda_lr", "proportional_gain"}
+        for algo in ("ppo_lag", "cppo_pid", "focops")
+        for env in ENVS
+    },
     **{("cup", env): {"n_epochs"} for env in ENVS},
     ("sac_lag", ENVS[0]): {"limit_start", "safety_margin"},
     ("sac_lag", ENVS[1]): {"lambda_lr"},

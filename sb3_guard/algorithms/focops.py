@@ -39,7 +39,7 @@ class FOCOPS(Lagrangian, FirstOrder):
         "proportional_gain": {"low": 0.0, "high": 4.0},
         "temperature": {"low": 0.5, "high": 5.0, "log": True},
     }
-    defaults: ClassVar[dict[str, Any]] = RELATIVE
+    defaults: ClassVar[dict[str, Any]] = {**RELATIVE, "lambda_lr": 0.25}
     fixed_arguments: ClassVar[frozenset[str]] = frozenset({"clip_range", "clip_range_vf"})
 
     temperature: float = hyperparameter(1.5, ends="()")

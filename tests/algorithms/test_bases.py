@@ -176,7 +176,7 @@ def test_defaults_are_stated_where_only_they_differ() -> None:
     class Hastier(Hasty):
         defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.9}
 
-    for cls, rate in ((PPOLag, 0.1), (Hasty, 0.7), (Hastier, 0.9)):
+    for cls, rate in ((PPOLag, 0.2), (Hasty, 0.7), (Hastier, 0.9)):
         taken = inspect.signature(cls).parameters
         assert taken["lambda_lr"].default == rate and taken["lambda_units"].default == "relative"
         assert list(taken)[:3] == ["policy", "env", "learning_rate"]

@@ -31,7 +31,7 @@ DEPARTURES = {
     ("trpo_lag", ENVS[1]): {"cost_gae_lambda"},
     **{("trpo_ipo", env): {"cost_gae_lambda"} for env in ENVS},
     **{
-        (algo, env): {"lambda_lr", "proportional_gain"}
+        (algo, env): {"lambda_lr"}
         for algo in ("ppo_lag", "cppo_pid", "focops")
         for env in ENVS
     },

@@ -20,7 +20,7 @@ def _only_of_its_kind(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> d
 
 
 # Gains that keep positive limits whatever the unit of cost, for policies that learn from rollouts.
-RELATIVE = {"lambda_lr": 0.5, "proportional_gain": 2.0, "lambda_units": "relative"}
+RELATIVE = {"lambda_lr": 0.2, "proportional_gain": 0.5, "lambda_units": "relative"}
 # A limit that nothing keeps raises λ as long as it may; where limits are kept it ends below this.
 HIGHEST = 5.0  # in standard deviations of the advantages
 

@@ -11,10 +11,6 @@ from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 
-#: KL that the second step may go, in that of the first: twice as far, and KL is quadratic.
-REACH = 4.0
-
-
 class CUP(Lagrangian, FirstOrder):
     """Constrained update projection (Yang et al., 2022, arXiv 2209.07089).
 
@@ -32,6 +28,7 @@ class CUP(Lagrangian, FirstOrder):
     what the first has done and go as far again to the other side.
 
     :param projection_kl: ``"forward"`` as above; ``"reverse"`` for KL(π ‖ π_{k+½})
+    :param projection_reach: KL from π_{k+½} at which the second step stops, in ``target_kl``
     """
 
     label, family, paper = "CUP", "First-order", "Yang et al. 2022"
@@ -52,6 +49,7 @@ class CUP(Lagrangian, FirstOrder):
     fuse_adam = True  # it takes twice as many steps as PPO's
 
     projection_kl: Literal["forward", "reverse"] = hyperparameter("forward")
+    projection_reach: float = hyperparameter(4.0)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -73,7 +71,7 @@ class CUP(Lagrangian, FirstOrder):
         super().train()  # PPO's, on the rewards
         if bool(self._weight.any()):
             self._improved = self.snapshot()
-            self.descend(self.projection, values=False, start=self._improved, reach=REACH)
+            self.descend(self.projection, values=False, start=self._improved, reach=self.projection_reach)
 
     def projection(
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution

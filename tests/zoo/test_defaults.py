@@ -35,7 +35,7 @@ DEPARTURES = {
         for algo in ("ppo_lag", "cppo_pid", "focops")
         for env in ENVS
     },
-    **{("cup", env): {"n_epochs"} for env in ENVS},
+    **{("cup", env): {"n_epochs", "projection_reach"} for env in ENVS},
     ("sac_lag", ENVS[0]): {"limit_start", "safety_margin"},
     ("sac_lag", ENVS[1]): {"lambda_lr"},
     **{(algo, env): {"lambda_lr"} for algo in ("td3_lag", "tqc_lag") for env in ENVS},

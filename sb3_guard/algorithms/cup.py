@@ -11,6 +11,7 @@ from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.first_order import FirstOrder
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 
+
 class CUP(Lagrangian, FirstOrder):
     """Constrained update projection (Yang et al., 2022, arXiv 2209.07089).
 
@@ -71,7 +72,9 @@ class CUP(Lagrangian, FirstOrder):
         super().train()  # PPO's, on the rewards
         if bool(self._weight.any()):
             self._improved = self.snapshot()
-            self.descend(self.projection, values=False, start=self._improved, reach=self.projection_reach)
+            self.descend(
+                self.projection, values=False, start=self._improved, reach=self.projection_reach
+            )
 
     def projection(
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution

@@ -24,9 +24,9 @@ class CUP(Lagrangian, FirstOrder):
     violations. The factor comes from the paper's bound with generalised advantages, and grows
     without bound as γ → 1.
 
-    ``target_kl`` stops the first step by its distance from π_k, and the second at four times that
-    from π_{k+½}: a KL divergence grows with the square of the distance, so the second may take back
-    what the first has done and go as far again to the other side.
+    ``target_kl`` stops the first step by its distance from π_k, ``projection_reach`` times that the
+    second by its distance from π_{k+½}. A KL divergence grows with the square of the distance: at 4
+    the second may take back what the first has done, and go as far again to the other side.
 
     :param projection_kl: ``"forward"`` as above; ``"reverse"`` for KL(π ‖ π_{k+½})
     :param projection_reach: KL from π_{k+½} at which the second step stops, in ``target_kl``

@@ -29,7 +29,8 @@ class CUP(Lagrangian, FirstOrder):
     the second may take back what the first has done, and go as far again to the other side.
 
     :param projection_kl: ``"forward"`` as above; ``"reverse"`` for KL(π ‖ π_{k+½})
-    :param projection_reach: KL from π_{k+½} at which the second step stops, in ``target_kl``
+    :param projection_reach: KL from π_{k+½} at which the second step stops, in ``target_kl``;
+        without ``target_kl`` nothing stops it
     """
 
     label, family, paper = "CUP", "First-order", "Yang et al. 2022"
@@ -38,8 +39,7 @@ class CUP(Lagrangian, FirstOrder):
         "proportional_gain": {"low": 0.0, "high": 1.0},
     }
     # At the limit the second step takes back what the first has done: with PPO's ten passes there
-    # is much noise in both. Gains are a sixth of others': at γ = 0.99 and λ = 0.95 the factor above
-    # is six.
+    # is much noise in both. Gains are small, since the factor above is six at γ = 0.99, λ = 0.95.
     defaults: ClassVar[dict[str, Any]] = {
         "n_epochs": 5,
         "lambda_lr": 0.016,
@@ -50,7 +50,7 @@ class CUP(Lagrangian, FirstOrder):
     fuse_adam = True  # it takes twice as many steps as PPO's
 
     projection_kl: Literal["forward", "reverse"] = hyperparameter("forward")
-    projection_reach: float = hyperparameter(4.0)
+    projection_reach: float = hyperparameter(4.0, ends="()")
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

@@ -27,8 +27,11 @@ from sb3_guard.envs.part import Constraint
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.zoo.agents import playback
 from sb3_guard.zoo.cli import usage
+from sb3_guard.zoo.run.experiment import Experiment
+from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.hyperparams import build, check
 from sb3_guard.zoo.run.make_envs import make_envs, source_of
+from sb3_guard.zoo.run.start import prepare
 
 
 def test_track_sends_what_tensorboard_gets_and_goes_on(tmp_path, monkeypatch):
@@ -615,16 +618,16 @@ def test_early_termination_is_for_training_alone(tmp_path, normalize):
 
 
 @pytest.mark.parametrize("kind", ["budgets.RemainingBudget", "vec_budgets.VecRemainingBudget"])
-def test_the_reward_of_an_overspent_budget_is_for_training_alone(tmp_path, kind):
-    arguments = "{'budget': 0.01, 'unsafe_reward': -100.0}"
-    wrapper = (
-        f"{'vec_' * kind.startswith('vec')}env_wrapper:{{'sb3_guard.common.{kind}': {arguments}}}"
+@pytest.mark.parametrize("evaluation", [False, True])
+def test_the_reward_of_an_overspent_budget_is_for_training_alone(kind, evaluation):
+    wrappers = {f"sb3_guard.common.{kind}": {"budget": 0.01, "unsafe_reward": -100.0}}
+    setup = {"cost_limit": 1.0, f"{'vec_' * kind.startswith('vec')}env_wrapper": wrappers}
+    here = {"gym_packages": ["registered_envs"], "env_kwargs": {"hazard": (-1.0, 0.0)}}
+    flags, values = prepare(
+        RunFlags(algo="cpo", env="CostPoint-v0", seed=0, hyperparams=setup, **here)
     )
-    here = ["--env-kwargs", "hazard:(-1.0, 0.0)"]
-    run = trained(tmp_path, "-n", "480", *here, "-params", wrapper)
-    trained_on = load_results(str(run))["r"].min()
-    assert (trained_on <= -100.0) == kind.startswith("budgets")  # inside the monitor, or around it
-    result = json.loads((run / "result.json").read_text())
-    assert [*result["final"]] == ["stochastic", "greedy"]
-    for split in result["final"].values():
-        assert min(split["costs"]) > 0.01 and min(split["returns"]) > -100.0
+    env = Experiment(flags, values).make_envs(4, seed=0, evaluation=evaluation)
+    env.reset()
+    rewards = [env.step(np.zeros((4, *env.action_space.shape)))[1] for _ in range(10)]
+    assert (np.min(rewards) == -100.0) == (not evaluation)
+    env.close()

@@ -4,7 +4,8 @@
 algorithm: nothing is set but the limit, and the problem's number of steps and environments. Every
 run becomes a line of ``docs/data/known_optima.csv`` as soon as it has ended, is not repeated, and
 goes into the tables of ``docs/notes/known_optima.md``. ``--seeds`` without a number only writes
-that page.
+that page. Lines of an algorithm whose defaults have changed since, by ``known_optima.json``, are
+dropped.
 
 Return is a share of the constrained optimum and costs are shares of their limits, over the last
 fifth of the training, by the policy that explores; ± is the standard error over seeds.
@@ -13,7 +14,9 @@ fifth of the training, by the policy that explores; ± is the standard error ove
 
 import argparse
 import csv
+import inspect
 import itertools
+import json
 import os
 import sys
 import time
@@ -37,6 +40,7 @@ from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 Run = tuple[str, str, float, int]  # problem, algorithm, scale, seed
 DOCS = Path(__file__).parents[1] / "docs"
 RESULTS, PAGE = DOCS / "data" / "known_optima.csv", DOCS / "notes" / "known_optima.md"
+SETTINGS = RESULTS.with_suffix(".json")  # of each algorithm, the defaults that its lines are of
 MARKS = "<!-- known optima: begin -->", "<!-- known optima: end -->"
 #: A limit that is not one of an episode's mean cost, and whose it is.
 STATEWISE = {
@@ -78,6 +82,28 @@ def read() -> dict[Run, Outcome]:
             costs = np.array([float(cost) for cost in row["costs"].split()])
             results[run] = Outcome(float(row["return"]), costs)
     return results
+
+
+def settings() -> str:
+    """JSON: the default of every argument, a line per algorithm."""
+    lines = []
+    for algo, cls in ALGORITHMS.items():
+        found = [p for p in inspect.signature(cls).parameters.values() if p.default is not p.empty]
+        lines.append(f'"{algo}": ' + json.dumps({p.name: repr(p.default) for p in found}))
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def drop_stale() -> None:
+    """Drop what other defaults have reached. Arguments that are new had one value before."""
+    now, stale = json.loads(settings()), []
+    for algo, then in json.loads(SETTINGS.read_text()).items():
+        changed = [name for name, value in then.items() if now.get(algo, {}).get(name) != value]
+        if changed:
+            stale.append(algo)
+            print(f"{algo}: other defaults of {', '.join(changed)}; its lines are dropped")
+    lines = RESULTS.read_text().splitlines(keepends=True)
+    RESULTS.write_text("".join(line for line in lines if line.split(",")[1] not in stale))
+    SETTINGS.write_text(settings())
 
 
 def keep(run: Run, outcome: Outcome, seconds: float) -> None:
@@ -141,7 +167,8 @@ def pages() -> dict[Path, str]:
     _, end, after = rest.partition(MARKS[1])
     if not end:
         raise SystemExit(f"{PAGE} has no lines {MARKS[0]} and {MARKS[1]} for the tables")
-    return {PAGE: f"{before}{MARKS[0]}\n{tables(read())}\n{MARKS[1]}{after}"}
+    page = f"{before}{MARKS[0]}\n{tables(read())}\n{MARKS[1]}{after}"
+    return {PAGE: page, SETTINGS: settings()}
 
 
 def main() -> None:
@@ -153,6 +180,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1, help="processes")
     arguments = parser.parse_args()
 
+    drop_stale()
     results = read()
     # A seed of everything before the next one: a table that is cut short is even.
     wanted = [

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.suites import SUITES, Suite
+from sb3_guard.ids import with_version
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import import_packages
@@ -38,7 +39,8 @@ def _of_one(suite: Suite) -> str:
     """The ids of an environment, a row for each name up to its last part."""
     stems: dict[str, list[str]] = {}
     for env_id in suite.scenarios:
-        name = env_id.removesuffix("-v0")
+        short = env_id.removesuffix("-v0")
+        name = short if with_version(short) == env_id else env_id
         stem = name.rpartition("_")[0] or re.sub(r"\d*(-v\d+)?$", "", name)
         stems.setdefault(stem, []).append(name)
     width = max(map(len, stems.values()))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.spelling import nearest
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import UsageError
 
@@ -54,11 +54,9 @@ def published(name: str) -> dict[str, Any]:
     with ROWS.open(newline="", encoding="utf-8") as file:
         rows = {row["row"]: row for row in csv.DictReader(file)}
     if name not in rows:
-        raise UsageError(
-            f"{name!r} is no run folder and no row of the table; {did_you_mean(name, rows)}"
-            if rows
-            else f"{name!r} is no run folder, and the table has no rows yet"
-        )
+        close = nearest(name, rows)
+        hint = "" if close is None else f"; did you mean {close!r}?"
+        raise UsageError(f"{name!r} is no run folder and no row of docs/leaderboard.md{hint}")
     return dict(rows[name])
 
 

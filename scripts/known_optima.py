@@ -4,8 +4,9 @@
 algorithm: nothing is set but the limit, and the problem's number of steps and environments. Every
 run becomes a line of ``docs/data/known_optima.csv`` as soon as it has ended, is not repeated, and
 goes into the tables of ``docs/notes/known_optima.md``. ``--seeds`` without a number only writes
-that page. Lines of an algorithm whose defaults have changed since, by ``known_optima.json``, are
-dropped.
+that page. Algorithms that had other defaults or numbers of updates when their lines were written,
+by ``known_optima.json``, are refused until ``--drop-stale`` has removed these lines. Changes of
+the code it cannot see.
 
 Return is a share of the constrained optimum and costs are shares of their limits, over the last
 fifth of the training, by the policy that explores; ± is the standard error over seeds.
@@ -20,7 +21,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -41,6 +42,7 @@ Run = tuple[str, str, float, int]  # problem, algorithm, scale, seed
 DOCS = Path(__file__).parents[1] / "docs"
 RESULTS, PAGE = DOCS / "data" / "known_optima.csv", DOCS / "notes" / "known_optima.md"
 SETTINGS = RESULTS.with_suffix(".json")  # of each algorithm, the defaults that its lines are of
+NO_EFFECT = ("verbose", "device", "seed", "tensorboard_log", "stats_window_size")
 MARKS = "<!-- known optima: begin -->", "<!-- known optima: end -->"
 #: A limit that is not one of an episode's mean cost, and whose it is.
 STATEWISE = {
@@ -85,25 +87,36 @@ def read() -> dict[Run, Outcome]:
 
 
 def settings() -> str:
-    """JSON: the default of every argument, a line per algorithm."""
+    """JSON, a line per algorithm: the default of every argument, and the updates of a problem."""
     lines = []
     for algo, cls in ALGORITHMS.items():
-        found = [p for p in inspect.signature(cls).parameters.values() if p.default is not p.empty]
-        lines.append(f'"{algo}": ' + json.dumps({p.name: repr(p.default) for p in found}))
+        arguments = inspect.signature(cls).parameters.values()
+        values = {
+            each.name: repr(each.default)
+            for each in arguments
+            if each.default is not each.empty and each.name not in NO_EFFECT
+        }
+        values["updates of bandit"] = repr(budget(cls, problems()["bandit"]).updates)
+        lines.append(f'"{algo}": ' + json.dumps(values))
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def drop_stale() -> None:
-    """Drop what other defaults have reached. Arguments that are new had one value before."""
-    now, stale = json.loads(settings()), []
-    for algo, then in json.loads(SETTINGS.read_text()).items():
-        changed = [name for name, value in then.items() if now.get(algo, {}).get(name) != value]
-        if changed:
-            stale.append(algo)
-            print(f"{algo}: other defaults of {', '.join(changed)}; its lines are dropped")
+def stale() -> dict[str, list[str]]:
+    """Algorithms with lines of other settings than today's, and which settings differ."""
+    recorded, current = (json.loads(text) for text in (SETTINGS.read_text(), settings()))
+    differing = {}
+    for algo in {run[1] for run in read()}:
+        before, today = recorded.get(algo, {}), current.get(algo, {})
+        names = [name for name in {**before, **today} if before.get(name) != today.get(name)]
+        if names:
+            differing[algo] = names
+    return differing
+
+
+def drop(algos: Collection[str]) -> None:
+    """Remove the lines of algorithms."""
     lines = RESULTS.read_text().splitlines(keepends=True)
-    RESULTS.write_text("".join(line for line in lines if line.split(",")[1] not in stale))
-    SETTINGS.write_text(settings())
+    RESULTS.write_text("".join(line for line in lines if line.split(",")[1] not in algos))
 
 
 def keep(run: Run, outcome: Outcome, seconds: float) -> None:
@@ -124,6 +137,12 @@ def passes(outcome: Outcome, algo: str, name: str) -> bool:
     return outcome.good
 
 
+def mean_of(outcomes: Sequence[Outcome]) -> Outcome:
+    """Their mean return and costs."""
+    value = float(np.mean([each.value for each in outcomes]))
+    return Outcome(value, np.mean([each.cost for each in outcomes], axis=0))
+
+
 def cell(outcomes: Sequence[Outcome], algo: str, name: str) -> str:
     """Mean ± standard error of return and costs over seeds, and whether the mean passes."""
     n = len(outcomes)
@@ -134,7 +153,7 @@ def cell(outcomes: Sequence[Outcome], algo: str, name: str) -> str:
 
     values = np.array([each.value for each in outcomes])
     costs = np.array([each.cost for each in outcomes])  # [seeds, m]
-    good = passes(Outcome(values.mean(), costs.mean(axis=0)), algo, name)
+    good = passes(mean_of(outcomes), algo, name)
     shown = ", ".join(mean(column) for column in costs.T)
     return f"{mean(values)}; {shown}{' ✓' if good else ''} ({n})"
 
@@ -161,13 +180,30 @@ def tables(results: dict[Run, Outcome]) -> str:
     return "\n\n".join(texts)
 
 
+def failing(results: dict[Run, Outcome]) -> str:
+    """Markdown: the single seeds that fail where the mean over several passes."""
+    seeds: dict[tuple[str, str], list[Outcome]] = {}
+    for (name, algo, scale, _), outcome in results.items():
+        if scale == 1.0:
+            seeds.setdefault((algo, name), []).append(outcome)
+    lines = []
+    for (algo, name), outcomes in sorted(seeds.items()):
+        failed = [each for each in outcomes if not passes(each, algo, name)]
+        if failed and passes(mean_of(outcomes), algo, name):
+            shown = (cell([each], algo, name).removesuffix(" (1)") for each in failed)
+            lines.append(f"* `{algo}` on `{name}`: {' and '.join(shown)}")
+    return "\n".join(lines)
+
+
 def pages() -> dict[Path, str]:
     """The page as the results make it."""
     before, _, rest = PAGE.read_text().partition(MARKS[0])
     _, end, after = rest.partition(MARKS[1])
     if not end:
         raise SystemExit(f"{PAGE} has no lines {MARKS[0]} and {MARKS[1]} for the tables")
-    page = f"{before}{MARKS[0]}\n{tables(read())}\n{MARKS[1]}{after}"
+    results = read()
+    failed = f"Single seeds that fail where the mean passes:\n\n{failing(results)}"
+    page = f"{before}{MARKS[0]}\n{tables(results)}\n\n{failed}\n{MARKS[1]}{after}"
     return {PAGE: page, SETTINGS: settings()}
 
 
@@ -178,9 +214,15 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="*", type=int, default=[11, 12, 13, 14, 15])
     parser.add_argument("--scale", nargs="+", type=float, default=[1.0])
     parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--drop-stale", action="store_true", help="remove lines of other defaults")
     arguments = parser.parse_args()
 
-    drop_stale()
+    if others := stale():
+        for algo, names in others.items():
+            print(f"{algo}: other {', '.join(names)} when its lines were written")
+        if not arguments.drop_stale:
+            raise SystemExit("--drop-stale removes them")
+        drop(others)
     results = read()
     # A seed of everything before the next one: a table that is cut short is even.
     wanted = [

@@ -26,7 +26,7 @@ from sb3_guard.zoo.results.runs import find_runs, label_of, select
 from sb3_guard.zoo.results.splits import judge
 from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import number, spread
-from sb3_guard.zoo.run.folder import RunFolder
+from sb3_guard.zoo.run.folder import RunFolder, is_run
 from sb3_guard.zoo.run.make_envs import full_id
 from sb3_guard.zoo.run.training import FINAL_EPISODES
 
@@ -252,6 +252,11 @@ def main() -> None:
     parser.add_argument("--check", type=Path, metavar="FOLDER", help="check runs to be sent in")
     parser.add_argument("--pack", metavar="NAME", help="pack them if nothing is wrong")
     args = parser.parse_args()
+    if args.pack is not None:
+        if args.check is None or is_run(args.check):
+            parser.error("--pack needs --check with the log folder of several runs")
+        if not re.fullmatch(r"\w+", args.pack):
+            parser.error(f"--pack takes letters, digits and _, not {args.pack!r}")
     if args.check:
         if not check(args.check):
             raise SystemExit(1)

@@ -4,9 +4,11 @@ Looked at are all runs below the folder, as ``scripts/grand_table.py`` writes th
 certified if the 95 % interval of the mean cost of its final episodes with sampled actions ends at
 or below the limit; of an environment's certified runs that with the highest return is taken. It is
 played again, 300 episodes of other seeds with sampled actions and 300 with the most likely ones,
-and shipped if the former certify it, too; else the next one is tried. The package gets its
-settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get some
-observations and actions, ``tests/data/pretrained.npz``.
+and shipped if the former certify it, too; else the next one is tried. An agent that is shipped
+already is kept if its return is as high. Runs from a packed archive have no model: ``sb3-guard
+reproduce`` trains them again. The package gets the run's settings, its policy's tensors,
+``<env>.pth``, and what it got, ``result.json``; the tests get some observations and actions,
+``tests/data/pretrained.npz``.
 """
 
 from __future__ import annotations
@@ -51,8 +53,8 @@ TRAINING_ONLY = (
 DROPPED = ("final", "platform", "seconds")  # of result.json
 
 
-def candidates(folder: Path, env_id: str) -> Iterator[RunFolder]:
-    """The certified runs on an environment, the highest return first."""
+def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
+    """The certified runs on an environment with a return above ``least``, the highest first."""
     found = []
     for run in map(RunFolder, find_runs(folder)):
         if run.name != env_id or (result := run.read_result()) is None:
@@ -60,10 +62,22 @@ def candidates(folder: Path, env_id: str) -> Iterator[RunFolder]:
         final = result.get("final", {}).get("stochastic")
         if final is None or result.get("cost_limit") not in (None, LIMITS[env_id]):
             continue
-        if estimate(np.array(final["costs"])).high <= LIMITS[env_id]:
-            found.append((float(np.mean(final["returns"])), str(run.path)))
-    for _, path in sorted(found, reverse=True):
-        yield RunFolder(Path(path))
+        mean = float(np.mean(final["returns"]))
+        if mean > least and estimate(np.array(final["costs"])).high <= LIMITS[env_id]:
+            found.append((mean, str(run.path)))
+    for mean, path in sorted(found, reverse=True):
+        run = RunFolder(Path(path))
+        if run.model.exists():
+            yield run
+        else:
+            print(f"{path}, return {mean:.4g}, has no model; sb3-guard reproduce trains it again")
+
+
+def shipped_return(env_id: str) -> float:
+    """Of the agent with a limit that the package has; minus infinity without one."""
+    results = [run.checked_result() for run in pretrained() if run.name == env_id]
+    limited = [got for got in results if got.get("cost_limit", np.inf) <= LIMITS[env_id]]
+    return max((got["played"]["stochastic"]["return"][0] for got in limited), default=-np.inf)
 
 
 def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
@@ -155,11 +169,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="folder of the grand table's runs")
     args = parser.parse_args()
     for env_id, limit in LIMITS.items():
-        for run in candidates(args.folder, env_id):
+        shipped = shipped_return(env_id)
+        for run in candidates(args.folder, env_id, shipped):
             got = played(run)
             costs = [got[actions]["cost"] for actions in PLAYED]
             print(run.path, got["stochastic"]["return"], *costs, sep="\n  ", flush=True)
-            if costs[0].high > limit:
+            if costs[0].high > limit or got["stochastic"]["return"].mean <= shipped:
                 continue
             for old in PRETRAINED.glob(f"*/{env_id}_1"):
                 if "cost_limit" in json.loads((old / "result.json").read_text()):

@@ -39,7 +39,7 @@ class CUP(Lagrangian, FirstOrder):
         "proportional_gain": {"low": 0.0, "high": 1.0},
     }
     # At the limit the second step takes back what the first has done: with PPO's ten passes there
-    # is much noise in both. Gains are small, since the factor above is six at γ = 0.99, λ = 0.95.
+    # is much noise in both. Gains are small, since the factor above is four with the defaults.
     defaults: ClassVar[dict[str, Any]] = {
         "n_epochs": 5,
         "lambda_lr": 0.016,

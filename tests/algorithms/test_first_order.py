@@ -352,7 +352,8 @@ def test_cups_second_step_may_take_back_what_the_first_has_done(stop: str) -> No
     last = model.logger.name_to_value["train/projection_kl"]  # before the last step, or after it
     assert 0.7 * bound < last < 1.4 * bound
     if stop == "epoch":  # the KL that stopped the first step is logged as it was then
-        assert model.logger.name_to_value["train/approx_kl"] < 1.6 * model.target_kl
+        first = model.logger.name_to_value["train/approx_kl"]
+        assert 0.1 * model.target_kl < first < 1.6 * model.target_kl
 
 
 # Bad input

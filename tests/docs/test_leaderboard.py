@@ -144,6 +144,32 @@ def test_a_folder_without_runs(scripts, tmp_path, capsys, made):
     assert capsys.readouterr().out == f"no finished run in {folder}\n"
 
 
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--pack", "mine"], "--pack needs --check"),
+        (["--check", "{run}", "--pack", "mine"], "log folder of several runs"),
+        (["--check", "{logs}", "--pack", "a/b"], "letters, digits and _"),
+        (["--check", "{logs}", "--pack", ""], "letters, digits and _"),
+    ],
+)
+def test_bad_flags(scripts, tmp_path, monkeypatch, capsys, flags, message):
+    board, _ = scripts
+    run = sent(tmp_path / "logs")
+    flags = [flag.format(run=run, logs=tmp_path / "logs") for flag in flags]
+    monkeypatch.setattr(sys, "argv", ["leaderboard.py", *flags])
+    with pytest.raises(SystemExit):
+        board.main()
+    assert message in capsys.readouterr().err
+
+
+def test_an_empty_curve_is_a_fault(scripts, tmp_path, capsys):
+    board, _ = scripts
+    (sent(tmp_path / "logs") / "0.monitor.csv").write_text("")
+    assert not board.check(tmp_path / "logs")
+    assert "0.monitor.csv" in capsys.readouterr().out
+
+
 def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
     board, _ = scripts
     toy = (

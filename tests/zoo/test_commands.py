@@ -631,7 +631,7 @@ def test_the_reward_of_an_overspent_budget_is_for_training_alone(tmp_path):
 
 @pytest.mark.parametrize("kind", ["budgets.RemainingBudget", "vec_budgets.VecRemainingBudget"])
 @pytest.mark.parametrize("evaluation", [False, True])
-def test_evaluation_keeps_the_rewards_of_an_overspent_budget(kind, evaluation):
+def test_an_overspent_budget_changes_the_rewards_of_the_training_alone(kind, evaluation):
     wrappers = {f"sb3_guard.common.{kind}": {"budget": 0.01, "unsafe_reward": -100.0}}
     setup = {"cost_limit": 1.0, f"{'vec_' * kind.startswith('vec')}env_wrapper": wrappers}
     here = {"gym_packages": ["registered_envs"], "env_kwargs": {"hazard": (-1.0, 0.0)}}

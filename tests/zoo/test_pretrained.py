@@ -2,6 +2,7 @@
 
 import json
 import runpy
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from typed import require_rendering
 from sb3_guard import cli, enjoy, evaluate_policy, load_pretrained, train
 from sb3_guard.common.evaluation import Estimate
 from sb3_guard.zoo.agents import playback, pretrained
+from sb3_guard.zoo.run.folder import RunFolder
 from sb3_guard.zoo.run.make_envs import make_envs
 
 POINT = "Goal_Point_8Hazards"
@@ -76,9 +78,8 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
         final = {"returns": [got] * 4, "costs": [cost] * 4, "lengths": [9] * 4}
         file.write_text(json.dumps(result | {"final": {"stochastic": final}}))
     there = tmp_path / "pretrained"
-    before = there / "trpo_lag" / "Goal_Point_8Hazards-v0_1"
-    before.mkdir(parents=True)
-    (before / "result.json").write_text('{"cost_limit": 5}')
+    before = there / "cpo" / "Goal_Point_8Hazards-v0_1"  # at a limit of 5
+    shutil.copytree(pretrained.PRETRAINED / "cpo" / before.name, before)
     names = script["main"].__globals__
     estimates = {"return": Estimate(6, 0, 6, 6), "cost": Estimate(1.5, 0, 1.4, 1.6)}
     monkeypatch.setitem(names, "played", lambda run: dict.fromkeys(pretrained.PLAYED, estimates))
@@ -96,6 +97,15 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
         line for line in capsys.readouterr().out.splitlines() if line.startswith("| Goal_P")
     )
     assert "1.5 [1.4, 1.6], kept" in line
+
+    best, higher = (tmp_path / "grand" / "grand_table_guard" / algo / before.name
+                    for algo in ("pcpo", "trpo_ipo"))  # fmt: skip
+    (higher / "result.json").write_text((best / "result.json").read_text().replace("6.0", "8.0"))
+    RunFolder(higher).model.unlink()
+    made = (there / "pcpo" / before.name).stat().st_mtime_ns
+    script["main"]()
+    assert f"{higher}, return 8, has no model" in capsys.readouterr().out
+    assert (there / "pcpo" / before.name).stat().st_mtime_ns == made
 
 
 @pytest.mark.slow

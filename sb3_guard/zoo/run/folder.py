@@ -227,7 +227,7 @@ class RunFolder:
         """SHA-256 of step, return and cost of all training episodes: runs alike have the same."""
         digest, step = hashlib.sha256(), 0
         with self.monitor.open(newline="") as file:
-            next(file)  # SB3's header, which has the time
+            next(file, "")  # SB3's header, which has the time
             for episode in csv.DictReader(file):
                 step += int(episode["l"])
                 digest.update(f"{step},{episode['r']},{episode['c']}\n".encode())

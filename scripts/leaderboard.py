@@ -11,6 +11,7 @@ import argparse
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import yaml
@@ -32,12 +33,13 @@ from sb3_guard.zoo.run.training import FINAL_EPISODES
 
 PAGE = DOCS / "leaderboard.md"
 ROWS = DOCS.parent / "sb3_guard" / "zoo" / "results" / "rows.csv"
-BLOCK = re.compile(r"(<!-- (leaderboard|untrained) -->\n).*?(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- (glance|leaderboard|untrained) -->\n).*?(<!-- end -->)", re.DOTALL)
 MILLION = 1_000_000
 PLANNED = GRIDS[:5]  # a row of these that is missing is shown, with the command that fills it
 # What a run that is sent in may not change: the task, or which code is run.
 REFUSED = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "cost_keys")
 BUDGETS = (1, 2, 10)  # millions of steps
+MARKS = {"certified": " ✓", "undecided": "", "violating": " ✗"}
 SEEDS = 3
 
 
@@ -167,6 +169,31 @@ def _table(lines: list[dict[str, str]]) -> str:
     return table([*lines[0]], [[*line.values()] for line in lines])
 
 
+def glance(rows: pd.DataFrame) -> str:
+    """For each budget and family of tasks, a row per algorithm and a column per task."""
+    parts = []
+    final = rows[rows["split"] == "stochastic"].drop_duplicates(["suite", "algo", "budget"])
+    safety = final["suite"].str.startswith("Safety").rename("safety")
+    for (budget, _), group in final.groupby(["budget", ~safety]):
+        tasks = [*dict.fromkeys(group["suite"])]
+        lines = []
+        for algo in dict.fromkeys(group["algo"]):
+            line = {f"{budget}e6 steps": label_of(algo)}
+            for task in tasks:
+                of = group.query("suite == @task and algo == @algo").to_dict("records")
+                short = re.sub(r"Safety|_8Hazards|-v\d", "", task)
+                line[short] = "".join(map(_at_a_glance, of))
+            lines.append(line)
+        parts.append(_table(lines))
+    return "\n\n".join(parts)
+
+
+def _at_a_glance(row: dict[str, Any]) -> str:
+    digits = 0 if abs(row["return"]) >= 100 else 1
+    values = f"{number(row['return'], digits)}; {number(row['cost'], 1)}"
+    return f"{values}{MARKS[row['tier']]} ({row['seeds']})"
+
+
 def untrained() -> str:
     """A table of the agents that learn nothing, with their goals where there are some."""
     lines = []
@@ -183,7 +210,11 @@ def untrained() -> str:
 
 def page(rows: pd.DataFrame) -> str:
     """The page with its tables remade."""
-    made = {"leaderboard": lambda: leaderboard(rows), "untrained": untrained}
+    made = {
+        "glance": lambda: glance(rows),
+        "leaderboard": lambda: leaderboard(rows),
+        "untrained": untrained,
+    }
     return BLOCK.sub(lambda m: f"{m[1]}\n{made[m[2]]()}\n\n{m[3]}", PAGE.read_text())
 
 

@@ -55,6 +55,9 @@ def test_certified_rows_come_first_by_return(scripts, tmp_path):
     results.pack(tmp_path / "logs", "grand_table")
     rows, runs = board.read()
     assert len(runs) == 6 and "grand_table/cpo/SafetyPointGoal1-v0_1" in {*runs["row"]}
+    glance = [" ".join(line.split()) for line in board.glance(rows).splitlines()]
+    assert glance[0] == "| 1e6 steps | PointGoal1 |"
+    assert {"| PCPO | 12.0; 24.0 ✓ (2) |", "| TRPO-Lagrangian | 20.0; 30.0 ✗ (2) |"} < {*glance}
     table = rows_of(board.leaderboard(rows), "SafetyPointGoal1-v0, 1e6 steps")
     assert [row[:2] for row in table[:3]] == [
         ["1", "PCPO"], ["2", "CPO"], ["–", "*TRPO-Lagrangian*"],

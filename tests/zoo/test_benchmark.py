@@ -530,7 +530,8 @@ def test_interrupted_once_and_twice(number, tmp_path):
         time.sleep(0.1)
         process.send_signal(number)
         out, err = process.communicate(timeout=30)
-    assert process.returncode in (130, 128 + number) and "Traceback" not in out + err
+    # -number: the second signal came while the process was ending.
+    assert process.returncode in (130, 128 + number, -number) and "Traceback" not in out + err
 
 
 # a cluster

@@ -55,8 +55,8 @@ def published(name: str) -> dict[str, Any]:
         rows = {row["row"]: row for row in csv.DictReader(file)}
     if name not in rows:
         close = nearest(name, rows)
-        hint = "" if close is None else f"; did you mean {close!r}?"
-        raise UsageError(f"{name!r} is no run folder and no row of docs/leaderboard.md{hint}")
+        hint = f"a row is {next(iter(rows))!r}" if close is None else f"did you mean {close!r}?"
+        raise UsageError(f"{name!r} is no run folder and no row of the leaderboard; {hint}")
     return dict(rows[name])
 
 

@@ -4,9 +4,10 @@
 algorithm: nothing is set but the limit, and the problem's number of steps and environments. Every
 run becomes a line of ``docs/data/known_optima.csv`` as soon as it has ended, is not repeated, and
 goes into the tables of ``docs/notes/known_optima.md``. ``--seeds`` without a number only writes
-that page. Algorithms that had other defaults or numbers of updates when their lines were written,
-by ``known_optima.json``, are refused until ``--drop-stale`` has removed these lines. Changes of
-the code it cannot see.
+that page. Algorithms whose defaults or updates of ``bandit`` have changed since their lines were
+written, by ``known_optima.json``, are refused until ``--drop-stale`` has removed these lines; where
+the runs are the same (an argument is new), enter the new value in that file instead. The script
+does not notice changes of the code.
 
 Return is a share of the constrained optimum and costs are shares of their limits, over the last
 fifth of the training, by the policy that explores; ± is the standard error over seeds.
@@ -181,17 +182,20 @@ def tables(results: dict[Run, Outcome]) -> str:
 
 
 def failing(results: dict[Run, Outcome]) -> str:
-    """Markdown: the single seeds that fail where the mean over several passes."""
-    seeds: dict[tuple[str, str], list[Outcome]] = {}
-    for (name, algo, scale, _), outcome in results.items():
+    """Markdown: the single seeds that fail where the mean over several passes, costs × 1."""
+    cells: dict[tuple[str, str], dict[int, Outcome]] = {}
+    for (name, algo, scale, seed), outcome in results.items():
         if scale == 1.0:
-            seeds.setdefault((algo, name), []).append(outcome)
+            cells.setdefault((algo, name), {})[seed] = outcome
     lines = []
-    for (algo, name), outcomes in sorted(seeds.items()):
-        failed = [each for each in outcomes if not passes(each, algo, name)]
-        if failed and passes(mean_of(outcomes), algo, name):
-            shown = (cell([each], algo, name).removesuffix(" (1)") for each in failed)
-            lines.append(f"* `{algo}` on `{name}`: {' and '.join(shown)}")
+    for (algo, name), outcomes in sorted(cells.items()):
+        failed = {seed: each for seed, each in outcomes.items() if not passes(each, algo, name)}
+        if failed and passes(mean_of([*outcomes.values()]), algo, name):
+            shown = (
+                f"seed {seed}: {cell([each], algo, name).removesuffix(' (1)')}"
+                for seed, each in failed.items()
+            )
+            lines.append(f"* `{algo}` on `{name}`: {', '.join(shown)}")
     return "\n".join(lines)
 
 
@@ -219,10 +223,11 @@ def main() -> None:
 
     if others := stale():
         for algo, names in others.items():
-            print(f"{algo}: other {', '.join(names)} when its lines were written")
+            print(f"{algo}: changed since its lines were written: {', '.join(names)}")
         if not arguments.drop_stale:
-            raise SystemExit("--drop-stale removes them")
+            raise SystemExit(f"--drop-stale removes these lines; or edit {SETTINGS.name}")
         drop(others)
+        SETTINGS.write_text(settings())
     results = read()
     # A seed of everything before the next one: a table that is cut short is even.
     wanted = [

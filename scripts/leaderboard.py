@@ -27,7 +27,7 @@ from sb3_guard.zoo.results.runs import find_runs, label_of, select
 from sb3_guard.zoo.results.splits import judge
 from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import number, spread
-from sb3_guard.zoo.run.folder import RunFolder, is_run
+from sb3_guard.zoo.run.folder import RunFolder
 from sb3_guard.zoo.run.make_envs import full_id
 from sb3_guard.zoo.run.training import FINAL_EPISODES
 
@@ -39,7 +39,7 @@ PLANNED = GRIDS[:5]  # a row of these that is missing is shown, with the command
 # What a run that is sent in may not change: the task, or which code is run.
 REFUSED = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "cost_keys")
 BUDGETS = (1, 2, 10)  # millions of steps
-MARKS = {"certified": " ✓", "undecided": "", "violating": " ✗"}
+MARKS = {"certified": " ✓", "violating": " ✗"}
 SEEDS = 3
 
 
@@ -171,27 +171,30 @@ def _table(lines: list[dict[str, str]]) -> str:
 
 def glance(rows: pd.DataFrame) -> str:
     """For each budget and family of tasks, a row per algorithm and a column per task."""
+    if not len(rows):
+        return ""
+    # Of several rows of an algorithm, that with most seeds.
+    final = rows[rows["split"] == "stochastic"].reset_index(drop=True)
+    most = final.sort_values("seeds", ascending=False, kind="stable")
+    final = most.drop_duplicates(["suite", "algo", "budget"]).sort_index()
     parts = []
-    final = rows[rows["split"] == "stochastic"].drop_duplicates(["suite", "algo", "budget"])
-    safety = final["suite"].str.startswith("Safety").rename("safety")
-    for (budget, _), group in final.groupby(["budget", ~safety]):
-        tasks = [*dict.fromkeys(group["suite"])]
-        lines = []
-        for algo in dict.fromkeys(group["algo"]):
-            line = {f"{budget}e6 steps": label_of(algo)}
-            for task in tasks:
-                of = group.query("suite == @task and algo == @algo").to_dict("records")
-                short = re.sub(r"Safety|_8Hazards|-v\d", "", task)
-                line[short] = "".join(map(_at_a_glance, of))
-            lines.append(line)
+    for (budget, _), group in final.groupby(["budget", ~final["suite"].str.startswith("Safety")]):
+        cells = {(row["algo"], row["suite"]): _at_a_glance(row) for row in group.to_dict("records")}
+        tasks = {task: re.sub(r"Safety|_8Hazards|-v\d", "", task) for task in group["suite"]}
+        lines = [
+            {f"{budget}e6 steps": label_of(algo)}
+            | {short: cells.get((algo, task), "") for task, short in tasks.items()}
+            for algo in dict.fromkeys(group["algo"])
+        ]
         parts.append(_table(lines))
     return "\n\n".join(parts)
 
 
 def _at_a_glance(row: dict[str, Any]) -> str:
+    """A cell: return, cost, tier and seeds."""
     digits = 0 if abs(row["return"]) >= 100 else 1
-    values = f"{number(row['return'], digits)}; {number(row['cost'], 1)}"
-    return f"{values}{MARKS[row['tier']]} ({row['seeds']})"
+    values = f"{number(row['return'], digits)} / {number(row['cost'], 1)}"
+    return f"{values}{MARKS.get(row['tier'], '')} ({row['seeds']})"
 
 
 def untrained() -> str:
@@ -284,10 +287,14 @@ def main() -> None:
     parser.add_argument("--pack", metavar="NAME", help="pack them if nothing is wrong")
     args = parser.parse_args()
     if args.pack is not None:
-        if args.check is None or is_run(args.check):
-            parser.error("--pack needs --check with the log folder of several runs")
+        if args.check is None or any(
+            Path(path).parents[1] != args.check for path in find_runs(args.check)
+        ):
+            parser.error("--pack needs --check with a log folder, which has a folder per algorithm")
         if not re.fullmatch(r"\w+", args.pack):
             parser.error(f"--pack takes letters, digits and _, not {args.pack!r}")
+        if (DATA / f"sent_{args.pack}.tar.xz").exists():
+            parser.error(f"docs/data has sent_{args.pack}.tar.xz; choose another name")
     if args.check:
         if not check(args.check):
             raise SystemExit(1)

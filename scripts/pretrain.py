@@ -6,9 +6,9 @@ or below the limit; of an environment's certified runs that with the highest ret
 played again, 300 episodes of other seeds with sampled actions and 300 with the most likely ones,
 and shipped if the former certify it, too; else the next one is tried. An agent that is shipped
 already is kept if its return is as high. Runs from a packed archive have no model: ``sb3-guard
-reproduce`` trains them again. The package gets the run's settings, its policy's tensors,
-``<env>.pth``, and what it got, ``result.json``; the tests get some observations and actions,
-``tests/data/pretrained.npz``.
+reproduce FOLDER`` trains them again, below ``logs/reproduced``. The package gets the run's
+settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get some
+observations and actions, ``tests/data/pretrained.npz``.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
         if run.model.exists():
             yield run
         else:
-            print(f"{path}, return {mean:.4g}, has no model; sb3-guard reproduce trains it again")
+            print(f"return {mean:.4g}, but no model: sb3-guard reproduce {path}")
 
 
 def shipped_return(env_id: str) -> float:
     """Of the agent with a limit that the package has; minus infinity without one."""
     results = [run.checked_result() for run in pretrained() if run.name == env_id]
-    limited = [got for got in results if got.get("cost_limit", np.inf) <= LIMITS[env_id]]
+    limited = [got for got in results if (got.get("cost_limit") or np.inf) <= LIMITS[env_id]]
     return max((got["played"]["stochastic"]["return"][0] for got in limited), default=-np.inf)
 
 

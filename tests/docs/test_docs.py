@@ -270,3 +270,5 @@ def test_known_optima_of_other_defaults_are_found(tmp_path, monkeypatch, change,
     sys.argv.append("--drop-stale")
     optima.main()
     assert {run[1] for run in before} - {run[1] for run in optima.read()} == {"cpo"}
+    optima.keep(("bandit", "cpo", 1.0, 1), optima.Outcome(1.0, [1.0]), 1.0)
+    assert not optima.stale()  # so the next call continues

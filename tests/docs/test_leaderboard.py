@@ -57,7 +57,7 @@ def test_certified_rows_come_first_by_return(scripts, tmp_path):
     assert len(runs) == 6 and "grand_table/cpo/SafetyPointGoal1-v0_1" in {*runs["row"]}
     glance = [" ".join(line.split()) for line in board.glance(rows).splitlines()]
     assert glance[0] == "| 1e6 steps | PointGoal1 |"
-    assert {"| PCPO | 12.0; 24.0 ✓ (2) |", "| TRPO-Lagrangian | 20.0; 30.0 ✗ (2) |"} < {*glance}
+    assert {"| PCPO | 12.0 / 24.0 ✓ (2) |", "| TRPO-Lagrangian | 20.0 / 30.0 ✗ (2) |"} < {*glance}
     table = rows_of(board.leaderboard(rows), "SafetyPointGoal1-v0, 1e6 steps")
     assert [row[:2] for row in table[:3]] == [
         ["1", "PCPO"], ["2", "CPO"], ["–", "*TRPO-Lagrangian*"],
@@ -73,6 +73,8 @@ def test_certified_rows_come_first_by_return(scripts, tmp_path):
     table = rows_of(board.leaderboard(rows), "SafetyPointGoal1-v0, 1e6 steps")
     assert [row[1] for row in table[:5]] == ["PCPO", "PCPO", "CPO", "CPO", "*TRPO-Lagrangian*"]
     assert "sent_again/pcpo" in table[1][-1]
+    assert [" ".join(line.split()) for line in board.glance(rows).splitlines()] == glance
+    assert board.glance(rows.iloc[:0]) == ""
 
 
 def test_packed_logs_are_small(scripts, tmp_path):
@@ -151,7 +153,9 @@ def test_a_folder_without_runs(scripts, tmp_path, capsys, made):
     ("flags", "message"),
     [
         (["--pack", "mine"], "--pack needs --check"),
-        (["--check", "{run}", "--pack", "mine"], "log folder of several runs"),
+        (["--check", "{run}", "--pack", "mine"], "a folder per algorithm"),
+        (["--check", "{logs}/..", "--pack", "mine"], "a folder per algorithm"),
+        (["--check", "{logs}", "--pack", "there"], "docs/data has sent_there.tar.xz"),
         (["--check", "{logs}", "--pack", "a/b"], "letters, digits and _"),
         (["--check", "{logs}", "--pack", ""], "letters, digits and _"),
     ],
@@ -159,6 +163,7 @@ def test_a_folder_without_runs(scripts, tmp_path, capsys, made):
 def test_bad_flags(scripts, tmp_path, monkeypatch, capsys, flags, message):
     board, _ = scripts
     run = sent(tmp_path / "logs")
+    (board.DATA / "sent_there.tar.xz").touch()
     flags = [flag.format(run=run, logs=tmp_path / "logs") for flag in flags]
     monkeypatch.setattr(sys, "argv", ["leaderboard.py", *flags])
     with pytest.raises(SystemExit):

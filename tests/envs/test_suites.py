@@ -12,6 +12,7 @@ from sb3_guard import list as listing
 from sb3_guard import show
 from sb3_guard.envs import GuardVectorEnv, Scenario, env_ids, registry, suites
 from sb3_guard.envs.suites.guard import parse
+from sb3_guard.ids import with_version
 
 
 def test_there_are_72_suites_from_one_product():
@@ -20,6 +21,14 @@ def test_there_are_72_suites_from_one_product():
     assert "Goal_Arm6_8Hazards-v0" in ids and "Defense_Drone_8Ghosts-v0" in ids
     assert all(env_id in gymnasium.registry for env_id in ids)
     assert not any("Car" in env_id or "Doggo" in env_id for env_id in ids)
+
+
+def test_every_id_that_is_printed_is_an_environments_own(capsys):
+    assert listing.main(["environments"]) == 0
+    rows = [line.split("|")[2:-1] for line in capsys.readouterr().out.splitlines()]
+    printed = [name.strip() for row in rows for name in row]
+    named = [with_version(name) for name in printed if name and not {*name} <= {"-"} | {*"id"}]
+    assert len(named) == len({*named}) and {*named} == {*env_ids()}
 
 
 def test_there_are_eleven_robots_and_the_parts_of_the_paper():

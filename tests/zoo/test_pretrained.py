@@ -60,7 +60,7 @@ def test_shipped_agents_are_small_together_and_what_is_missing_is_said():
     keeps = {run.name: run.checked_result().get("cost_limit", np.inf) for run in reversed(SHIPPED)}
     for env_id, limit in pretrained.LIMITS.items():
         missing = keeps.get(env_id, np.inf) > limit
-        assert missing == (f"{env_id} (limit {limit:g})" in said.partition("None certified yet")[2])
+        assert missing == (f"{env_id} (limit {limit:g})" in said.partition("No certified agent")[2])
 
 
 def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, capsys):
@@ -104,7 +104,7 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
     RunFolder(higher).model.unlink()
     made = (there / "pcpo" / before.name).stat().st_mtime_ns
     script["main"]()
-    assert f"{higher}, return 8, has no model" in capsys.readouterr().out
+    assert f"return 8, but no model: sb3-guard reproduce {higher}" in capsys.readouterr().out
     assert (there / "pcpo" / before.name).stat().st_mtime_ns == made
 
 

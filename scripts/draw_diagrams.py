@@ -117,7 +117,7 @@ def costs() -> Figure:
     suite, limit, width = "SafetyPointGoal1-v0", 25.0, 5.0
     figure = Figure(figsize=(WIDTH, 2.8), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    with unpacked("safety_gymnasium") as found:
+    with unpacked("grand_table") as found:
         data = Data(found.runs)
         of = {algo: data.costs_of(suite, algo, "training") for algo in ("ppo", "cpo")}
     last = width * np.ceil(max(np.percentile(values, 98) for values in of.values()) / width)

@@ -57,7 +57,7 @@ LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml"
 
 # Archives, the suite, and whom an algorithm is beside.
 GRIDS = (
-    (("safety_gymnasium", "safety_gymnasium_others"), "SafetyPointGoal1-v0", "ppo"),
+    (("grand_table", "safety_gymnasium_others"), "SafetyPointGoal1-v0", "ppo"),
     (("guard_limit2",), "Goal_Point_8Hazards", "trpo"),
 )
 
@@ -375,9 +375,8 @@ def main() -> None:
     for path, text in pages().items():
         path.write_text(text)
         print(path)
-        for _, kind, name, only, _ in BLOCK.findall(text):
-            if only or kind != "runs":
-                continue
+        drawn = {name for _, kind, name, _, _ in BLOCK.findall(text) if kind == "runs"}
+        for name in (name for name in sorted(drawn) if f"images/{name}_" in text):
             # Drawn is what the tables have: the last ten epochs, not the last one.
             found = runs(name)
             found = found.assign(J_r=found["return_last"], M_c=found["cost_last"])

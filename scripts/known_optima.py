@@ -106,7 +106,7 @@ def stale() -> dict[str, list[str]]:
     """Algorithms with lines of other settings than today's, and which settings differ."""
     recorded, current = (json.loads(text) for text in (SETTINGS.read_text(), settings()))
     differing = {}
-    for algo in {run[1] for run in read()}:
+    for algo in sorted({run[1] for run in read()}):
         before, today = recorded.get(algo, {}), current.get(algo, {})
         names = [name for name in {**before, **today} if before.get(name) != today.get(name)]
         if names:

@@ -3,9 +3,12 @@
 import csv
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import timedelta
+from math import nan
 from pathlib import Path
+from statistics import fmean
 from typing import Any, ClassVar
 
 from sb3_guard.spelling import nearest
@@ -14,13 +17,20 @@ from sb3_guard.zoo.cli.usage import UsageError
 
 # A row for each run of the grand table, written by scripts/leaderboard.py
 ROWS = Path(__file__).parent / "zoo" / "results" / "rows.csv"
+MEASURES = {
+    "return": "return of the final epoch",
+    "cost": "cost of the final epoch",
+    "final_return": "return of the final policy, sampled actions",
+    "final_cost": "cost of the final policy, sampled actions",
+}
 
 
 @dataclass
 class Flags(Command):
     """
     Train a run of the published table, or of a folder, again from its command and seed, and say
-    whether it went the same way. The exit status is 0 if all training episodes are the same.
+    whether it went the same way. The exit status is 0 if all training episodes are the same, and
+    the return and cost of the final policy.
 
     :param run: row of the leaderboard, e.g. grand_table/cpo/SafetyPointGoal1-v0_1, or a run folder
     :param log_folder: log folder of the new run (default: logs/reproduced)
@@ -38,42 +48,57 @@ class Flags(Command):
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
 
 
+def measures(result: Mapping[str, Any]) -> dict[str, float]:
+    """By key of :data:`MEASURES` the numbers of a result; older ones have no final episodes."""
+    found = {n: nan if result[n] is None else result[n] for n in ("return", "cost")}
+    if played := (result.get("final") or {}).get("stochastic"):
+        found |= {f"final_{name}": fmean(played[f"{name}s"]) for name in ("return", "cost")}
+    return found
+
+
 def published(name: str) -> dict[str, Any]:
     """
-    What is known of a run: ``command``, ``curve``, ``return`` and ``cost``, ``commit``.
+    What is known of a run: ``command``, ``curve``, ``commit``, ``seconds`` and :func:`measures`.
 
     :param name: of a row of the package's table, or of a run folder
-    :raises UsageError: there is neither
+    :raises UsageError: there is neither, or the folder is damaged
     """
+    from sb3_guard.zoo.cli.usage import explained
+    from sb3_guard.zoo.results.runs import find_runs
     from sb3_guard.zoo.run.folder import RunFolder, is_run
 
     if is_run(Path(name)):
         run = RunFolder(Path(name))
         result = run.checked_result()
-        return {"command": run.flags().command(), "curve": run.curve_hash(), **result}
+        with explained(f"can't read {run.monitor}", OSError, KeyError, ValueError):
+            curve = run.curve_hash()
+        if result.setdefault("curve", curve) != curve:
+            print(
+                f"{run.monitor} is not as the run wrote it (packed logs are rounded); "
+                "compared is the hash in result.json."
+            )
+        return result | {"command": run.flags().command(), **measures(result)}
     with ROWS.open(newline="", encoding="utf-8") as file:
         rows = {row["row"]: row for row in csv.DictReader(file)}
     if name not in rows:
         close = nearest(name, rows)
         hint = f"a row is {next(iter(rows))!r}" if close is None else f"did you mean {close!r}?"
+        if below := find_runs(Path(name)):
+            hint = f"run folders in it: {', '.join(map(str, below))}"
         raise UsageError(f"{name!r} is no run folder and no row of the leaderboard; {hint}")
     return dict(rows[name])
 
 
-def compared(row: Mapping[str, Any], result: Mapping[str, Any]) -> Iterator[str]:
-    """How a run that was trained again differs from the published one, in lines."""
-    if row["curve"] == result["curve"]:
-        yield f"The same: all training episodes agree (curve {result['curve'][:12]}…)."
-    else:
-        yield "Not the same: the training episodes differ."
-        for name in ("return", "cost"):
-            was, new = (float(of[name] or "nan") for of in (row, result))
-            yield f"  {name} of the final epoch: {was:.6g} there, {new:.6g} here ({new - was:+.6g})"
-    if (row.get("commit") or None) != result["commit"]:
-        yield (
-            f"The run there is of commit {row.get('commit') or 'unknown'}, the one here of "
-            f"{result['commit'] or 'an installed package'}."
-        )
+def differences(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
+    """How a run that was trained again differs from the published one, in lines; none: nothing."""
+    lines = []
+    if row["curve"] != result["curve"]:
+        lines.append("Not the same: the training episodes differ.")
+    for name, new in measures(result).items():
+        was = float(row.get(name) or "nan")
+        if abs(new - was) > 1e-6 * max(1.0, abs(was)):
+            lines.append(f"  {MEASURES[name]}: {was:.6g} there, {new:.6g} here ({new - was:+.6g})")
+    return lines
 
 
 def reproduce(flags: Flags) -> int:
@@ -94,15 +119,26 @@ def reproduce(flags: Flags) -> int:
     if is_program(run.conf_file):
         raise UsageError(f"the run has its hyperparameters from a program, {run.conf_file}")
     run, values = prepare(run)
-    print(f"{row['command']}\n{values['n_timesteps']:,} steps in {path_of(run)} …", flush=True)
+    seconds = row.get("seconds")
+    took = f", which took {timedelta(seconds=round(float(seconds)))} there" if seconds else ""
+    steps = f"{values['n_timesteps']:,} steps{took}"
+    print(f"{row['command']}\n{steps}, in {path_of(run)} …", flush=True)
     if standing(run, values) == "done":
         print("This run was trained already; to train it again, remove its folder or change -f.")
     if status := complete(run, values, row["command"], lambda: False):
         print("The same command continues it.")
         return status
     result = RunFolder(path_of(run)).checked_result()
-    print(*compared(row, result), sep="\n")
-    return int(row["curve"] != result["curve"])
+    lines = differences(row, result)
+    if not lines:
+        print(f"The same: all training episodes agree (curve {result['curve'][:12]}…).")
+    print(*lines, sep="\n", end="\n" if lines else "")
+    if (row.get("commit") or None) != result["commit"]:
+        print(
+            f"The run there is of commit {row.get('commit') or 'unknown'}, the one here of "
+            f"{result['commit'] or 'an installed package'}."
+        )
+    return int(bool(lines))
 
 
 main = command(Flags, reproduce)

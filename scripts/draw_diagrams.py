@@ -21,7 +21,8 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from results import DATA, runs, unpacked
+from archives import DATA, unpacked
+from results import runs
 
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data

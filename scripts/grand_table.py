@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from results import DATA, pack
+from archives import DATA, pack
 
 # Grid and folder, whose name is that of its archive; several grids may share one.
 GRIDS = (
@@ -48,8 +48,8 @@ def main() -> None:
     if args.pack:
         for name in dict.fromkeys(name for _, name in GRIDS):
             if any((args.folder / name).rglob("result.json")):
-                pack(args.folder / name, name)
-                print(DATA / f"{name}.tar.xz")
+                pack(args.folder / name, name, by_environment=True)
+                print(DATA / name)
         return
     for grid, name in GRIDS:
         train(grid, args.folder / name, args.jobs)

@@ -9,24 +9,28 @@ folder is packed as ``sent_NAME`` if nothing is.
 
 import argparse
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import yaml
+from archives import DATA, DOCS, archives, pack, unpacked
 from grand_table import GRIDS
-from results import DATA, DOCS, pack, percent, unpacked
+from results import percent
 
+from sb3_guard.reproduce import measures
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.names import PRESETS
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.grids.presets import ALGOS
 from sb3_guard.zoo.results.curves import read_episodes
-from sb3_guard.zoo.results.runs import find_runs, label_of, select
-from sb3_guard.zoo.results.splits import judge
+from sb3_guard.zoo.results.runs import find_runs, label_of, read_run, select
+from sb3_guard.zoo.results.splits import FINAL, judge
 from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import number, spread
+from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import RunFolder
 from sb3_guard.zoo.run.make_envs import full_id
 from sb3_guard.zoo.run.training import FINAL_EPISODES
@@ -40,30 +44,44 @@ PLANNED = GRIDS[:5]  # a row of these that is missing is shown, with the command
 REFUSED = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "cost_keys")
 BUDGETS = (1, 2, 10)  # millions of steps
 MARKS = {"certified": " ✓", "violating": " ✗"}
-SEEDS = 3
+SEEDS = 3  # from which on a certified row has a place
 
 
 def planned() -> pd.DataFrame:
-    """The rows that the grand table is to have: ``suite``, ``algo``, ``budget``, ``command``."""
-    rows = []
+    """The rows that the grand table is to have: ``suite``, ``algo``, ``budget``, ``seeds``."""
+    rows: dict[tuple[str, str, int], list[int]] = {}
     for name, _ in PLANNED:
         grid = yaml.safe_load((DATA / f"{name}.yml").read_text())
         algos = ALGOS if grid["algos"] == ["all"] else grid["algos"]
-        seeds = " ".join(map(str, grid["seeds"]))
-        steps = int(float(grid["n_timesteps"]))
+        budget = int(float(grid["n_timesteps"])) // MILLION
         for env_id in map(full_id, grid["envs"]):
+            suite = env_id.removesuffix("-v0") if "_" in env_id else env_id
             for algo in algos:
-                command = f"sb3-guard train --algo {algo} --env {env_id} --seeds {seeds} -n {steps}"
-                row = {"suite": env_id.removesuffix("-v0") if "_" in env_id else env_id}
-                rows.append({**row, "algo": algo, "budget": steps // MILLION, "command": command})
-    return pd.DataFrame(rows).drop_duplicates(["suite", "algo", "budget"])
+                rows.setdefault((suite, algo, budget), []).extend(grid["seeds"])
+    return pd.DataFrame(
+        [(*row, seeds) for row, seeds in rows.items()], columns=["suite", "algo", "budget", "seeds"]
+    )
 
 
-def archives() -> list[str]:
+def training(suite: str, algo: str, budget: int, seeds: Iterable[int]) -> str:
+    """The command that trains seeds of a row."""
+    numbers = " ".join(map(str, seeds))
+    return (
+        f"sb3-guard train --algo {algo} --env {full_id(suite)} --seeds {numbers} "
+        f"-n {budget * MILLION}"
+    )
+
+
+def limit_of(env_id: str) -> float:
+    """The cost limit that the rows of an environment are judged by."""
+    return 25.0 if env_id.startswith("Safety") else 2.0
+
+
+def packed() -> list[str]:
     """Names of the packed logs that the page is made from."""
     names = [*dict.fromkeys(name for _, name in GRIDS)]
     names += sorted(path.name.removesuffix(".tar.xz") for path in DATA.glob("sent_*.tar.xz"))
-    return [name for name in names if (DATA / f"{name}.tar.xz").exists()]
+    return [name for name in names if archives(name)]
 
 
 def read() -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -71,11 +89,11 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
     What the packed logs say.
 
     :return: the rows of the page, as :func:`~sb3_guard.zoo.results.splits.judge` has them, with
-        ``budget`` (millions of steps), ``cost_total`` and ``row``, the first run's; and those of
-        the package, a row per run
+        ``budget`` (millions of steps), ``cost_total``, ``row``, the first run's, and ``there``, the
+        seeds; and those of the package, a row per run
     """
     pages, runs = [], []
-    for name in archives():
+    for name in packed():
         with unpacked(name) as found:
             all_ = with_safety(found.runs)
             all_["row"] = [f"{Path(path).parents[1].name}/{Path(path).parent.name}/"
@@ -83,15 +101,17 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
             for run in all_.to_dict("records"):
                 result = RunFolder(Path(run["path"])).checked_result()
                 if "curve" in result:
-                    kept = {key: result[key] for key in ("command", "curve", "return", "cost")}
-                    runs.append({"row": run["row"], **kept, "commit": result.get("commit")})
+                    kept = {key: result.get(key) for key in ("command", "curve", "commit")}
+                    seconds = round(result["seconds"])
+                    runs.append({"row": run["row"], **kept, **measures(result), "seconds": seconds})
             all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)
             for budget, group in all_.groupby("budget"):
                 own = select(group)
                 extra = own.groupby(["suite", "algo"]).agg(
-                    cost_total=("cost_total", "mean"), row=("row", "first")
+                    cost_total=("cost_total", "mean"), row=("row", "first"), there=("seed", list)
                 )
-                judged = judge(own).merge(extra.reset_index(), on=["suite", "algo"])
+                judged = judge(own, own["suite"].map(limit_of))
+                judged = judged.merge(extra.reset_index(), on=["suite", "algo"])
                 pages.append(judged.assign(budget=budget))
     return pd.concat(pages) if pages else pd.DataFrame(), pd.DataFrame(runs)
 
@@ -107,46 +127,60 @@ def leaderboard(rows: pd.DataFrame) -> str:
     parts = []
     for suite, budget in places.drop_duplicates().itertuples(index=False):
         here = rows.query("suite == @suite and budget == @budget") if len(rows) else rows
-        lines = [*_ranked(here)] if len(here) else []
-        done = {*here["algo"]} if len(here) else set()
-        for row in wanted.query("suite == @suite and budget == @budget").to_dict("records"):
-            if row["algo"] not in done:
-                lines.append(_line("–", label_of(row["algo"]), row["command"], grey=True))
+        plan = wanted.query("suite == @suite and budget == @budget").set_index("algo")["seeds"]
+        lines = [*_ranked(here, plan)] if len(here) else []
+        for algo in plan.index.difference(here["algo"] if len(here) else [], sort=False):
+            command = training(suite, algo, budget, plan[algo])
+            lines.append(_line("–", label_of(algo), f"`{command}`", grey=True))
         if suite in untrained.index:
             for key, label in (("random", "random actions"), ("zero", "idle")):
                 of = untrained.loc[suite]
-                values = {"return": spread(of[key], of[f"{key}_se"]),
-                          "cost": number(of[f"{key}_cost"], 1)}  # fmt: skip
-                lines.append(_line("–", label, "python scripts/untrained.py", grey=True, **values))
+                digits = 2 if abs(of[key]) < 10 else 1 if abs(of[key]) < 100 else 0
+                values = {"return": number(of[key], digits), "cost": number(of[f"{key}_cost"], 1)}
+                lines.append(
+                    _line("–", label, "`python scripts/untrained.py`", grey=True, **values)
+                )
         parts.append(f"### {suite}, {budget}e6 steps\n\n{_table(lines)}")
     return "\n\n".join(parts)
 
 
-def _ranked(rows: pd.DataFrame) -> Iterator[dict[str, str]]:
-    """The rows of a table: those whose policy is certified first, by return."""
+def _ranked(rows: pd.DataFrame, plan: "pd.Series[Any]") -> Iterator[dict[str, str]]:
+    """
+    The rows of a table: first those with a place, certified with enough seeds, by return.
+
+    :param plan: the seeds that the grand table is to have, by algorithm
+    """
     final = rows[rows["split"] == "stochastic"].assign(certified=lambda t: t["tier"] == "certified")
+    final["placed"] = final["certified"] & (final["seeds"] >= SEEDS)
     greedy = rows[rows["split"] == "greedy"].set_index("row")
-    order = final.sort_values(["certified", "return"], ascending=False).to_dict("records")
-    for place, row in enumerate(order, 1):
+    order = final.sort_values(["placed", "certified", "return"], ascending=False)
+    for place, row in enumerate(order.to_dict("records"), 1):
         other = greedy.loc[row["row"]]
         digits = 0 if abs(row["return"]) >= 100 else 1
+        of_table = row["row"].startswith("grand_table")
+        seeds = plan.get(row["algo"], []) if of_table else []
+        missing = [seed for seed in seeds if seed not in row["there"]]
+        commands = [f"sb3-guard reproduce {row['row']}"]
+        if missing:
+            commands.append(training(row["suite"], row["algo"], row["budget"], missing))
         yield _line(
-            str(place) if row["certified"] else "–",
+            str(place) if row["placed"] else "–",
             row["label"],
-            f"sb3-guard reproduce {row['row']}",
-            grey=not row["certified"],
-            seeds=str(row["seeds"]),
+            "; missing: ".join(f"`{command}`" for command in commands),
+            grey=not row["placed"],
+            seeds=f"{row['seeds']} of {len(seeds)}" if missing else str(row["seeds"]),
             **{"return": spread(row["return"], row["return_std"], digits)},
             cost=f"{number(row['cost'], 1)} [{number(row['low'], 1)}, {number(row['high'], 1)}]",
             tier=row["tier"],
             above=percent(row["above"]),
+            excess=number(row["excess"], 2),
             greedy=f"{number(other['return'], digits)}; {number(other['cost'], 1)}, "
             f"{other['tier']}",
             total=number(row["cost_total"], 0),
         )
 
 
-def _line(place: str, label: str, command: str, *, grey: bool, **values: str) -> dict[str, str]:
+def _line(place: str, label: str, commands: str, *, grey: bool, **values: str) -> dict[str, str]:
     """A line of a table; a grey one is in italics."""
     cells = {
         "place": place,
@@ -156,12 +190,13 @@ def _line(place: str, label: str, command: str, *, grey: bool, **values: str) ->
         "cost [95 % interval]": values.get("cost", ""),
         "tier": values.get("tier", ""),
         "episodes above the limit": values.get("above", ""),
+        "D⁺": values.get("excess", ""),
         "greedy: return; cost, tier": values.get("greedy", ""),
         "cost of training": values.get("total", ""),
     }
     if grey:
         cells = {key: f"*{cell}*" if cell and cell != "–" else cell for key, cell in cells.items()}
-    return {**cells, "run it again": f"`{command}`"}
+    return {**cells, "run it again": commands}
 
 
 def _table(lines: list[dict[str, str]]) -> str:
@@ -232,6 +267,28 @@ def problems(path: Path) -> Iterator[str]:
         yield "curve in result.json is not the hash of 0.monitor.csv"
     if "command" in result and result["command"] != run.flags().command():
         yield "command in result.json is not that of args.yml"
+    if str(result.get("commit")).endswith("-dirty"):
+        yield "it was trained with changes that are not committed"
+    yield from _other_task(run, result, config, args)
+    yield from _other_length(run, result, config)
+    for split in FINAL:
+        played = result.get("final", {}).get(split, {})
+        values = [played.get(key, []) for key in ("returns", "costs", "lengths")]
+        counts = {len(numbers) for numbers in values}
+        if counts != {FINAL_EPISODES}:
+            yield f"final {split} has {counts} episodes, not {FINAL_EPISODES}"
+        elif not np.isfinite(values).all():
+            yield f"final {split} has numbers that are not finite"
+
+
+def _other_task(
+    run: RunFolder, result: Mapping[str, Any], config: Mapping[str, Any], args: Mapping[str, Any]
+) -> Iterator[str]:
+    """In what a run differs from what the page is about, but for its length."""
+    for name, value in (("algo", run.path.parent.name), ("env", run.name)):
+        if not value == args[name] == result.get(name, value):
+            yield f"{name} is {args[name]} in args.yml, {result.get(name)} in result.json"
+    full_id(args["env"])
     for name in REFUSED:
         if config.get(name):
             yield f"config.yml has {name}: {config[name]}, which changes the task"
@@ -244,41 +301,56 @@ def problems(path: Path) -> Iterator[str]:
     if args.get("conf_file") not in (None, *PRESETS):
         allowed = ", ".join(PRESETS)
         yield f"args.yml has conf_file: {args['conf_file']}, which others lack; allowed: {allowed}"
-    limit = 25 if run.name.startswith("Safety") else 2
-    if result.get("cost_limit") not in (None, limit):  # None: unconstrained
-        yield f"cost_limit is {result['cost_limit']}, not {limit}"
-    if config["n_timesteps"] not in [MILLION * budget for budget in BUDGETS]:
-        yield f"n_timesteps is {config['n_timesteps']:,}; allowed: {BUDGETS} million"
-    episodes = read_episodes(path)
+    limited = getattr(algorithm(args["algo"]), "constrained", False)
+    limit = limit_of(run.name) if limited else None
+    for name, of in (("config.yml", config), ("result.json", result)):
+        if of.get("cost_limit") != limit:
+            yield f"cost_limit is {of.get('cost_limit')} in {name}, not {limit}"
+    if result.get("cut"):
+        yield "episodes of the training were cut"
+
+
+def _other_length(
+    run: RunFolder, result: Mapping[str, Any], config: Mapping[str, Any]
+) -> Iterator[str]:
+    """In what the length of a run is another than it says, or than the page has."""
+    asked, done = config["n_timesteps"], result["n_timesteps"]
+    if asked not in [MILLION * budget for budget in BUDGETS]:
+        yield f"n_timesteps is {asked:,}; allowed: {BUDGETS} million"
+    if done < asked:
+        yield f"result.json has {done:,} steps of {asked:,}"
+    episodes = read_episodes(run.path)
     steps, longest = int(episodes["step"].iloc[-1]), int(episodes["step"].diff().max())
-    missing = result["n_timesteps"] - steps
-    if not 0 <= missing <= config["n_envs"] * longest:
-        yield f"0.monitor.csv has {steps:,} steps of {result['n_timesteps']:,}"
-    for split, played in (result.get("final") or {}).items():
-        counts = {len(played[key]) for key in ("returns", "costs", "lengths")}
-        if counts != {FINAL_EPISODES}:
-            yield f"final {split} has {counts} episodes, not {FINAL_EPISODES}"
+    if not 0 <= done - steps <= config["n_envs"] * longest:
+        yield f"0.monitor.csv has {steps:,} steps of {done:,}"
 
 
 def check(folder: Path) -> bool:
     """Print what is wrong with the runs of a folder, and what they say; whether nothing is."""
-    paths, fine = find_runs(folder), True
-    seeds: dict[str, set[int]] = {}
-    for path in paths:
+    runs, fine = [], True
+    for path in find_runs(folder):
         try:
             found = [*problems(path)]
-            args = RunFolder(path).args()
-            seeds.setdefault(f"{args['algo']} on {args['env']}", set()).add(args["seed"])
-        except (UsageError, OSError, KeyError, ValueError) as error:
+            runs.append(read_run(path) | {"curve": RunFolder(path).curve_hash()})
+        except (UsageError, OSError, KeyError, ValueError, TypeError) as error:
             found = [one_line(error)]
         fine = fine and not found
         print(f"{path}: {'; '.join(found) or 'fine'}")
-    if not paths:
+    if not runs:
         print(f"no finished run in {folder}")
-    for name, there in seeds.items():
-        if len(there) < SEEDS:
-            print(f"{name}: {len(there)} of the at least {SEEDS} seeds that the page asks for")
-    return fine and bool(paths)
+        return False
+    table = pd.DataFrame(runs)
+    for (algo, suite), group in table.groupby(["algo", "suite"]):
+        if group["config"].nunique() > 1:
+            fine = False
+            print(f"{algo} on {suite}: the seeds have different hyperparameters")
+        if (seeds := group["seed"].nunique()) < SEEDS:
+            print(f"{algo} on {suite}: {seeds} of the {SEEDS} seeds from which a row has a place")
+    for _, group in table.groupby("curve"):
+        if group["seed"].nunique() > 1:
+            fine = False
+            print(f"the same episodes under several seeds: {', '.join(group['path'])}")
+    return fine
 
 
 def main() -> None:

@@ -1,13 +1,14 @@
 """Write the tables of results into the pages, from the logs: ``python scripts/results.py``.
 
-``docs/data/NAME.tar.xz`` holds the logs of a grid of runs, as ``benchmark`` writes them, without
-models; ``docs/data/NAME.yml`` is the grid. Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of
-a page stands the table of its runs, or of one environment in short, ``<!-- runs: NAME SUITE -->``.
-Instead of ``runs`` there are ``learnt: NAME``, returns in the end and those of the untrained agents
-of ``docs/data/untrained.csv``; ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep:
-NAME SUITE``, return and cost at each limit N of ``NAME_limitN.tar.xz``; ``splits: NAME``, how the
-agents keep their limit in training and after it; and ``agents: pretrained``, those of ``enjoy
---pretrained``. A row of a single run is in italics, which the site shows in grey.
+``docs/data/NAME.tar.xz``, or ``docs/data/NAME/ENV.tar.xz`` for each environment, holds the logs
+of a grid of runs, as ``benchmark`` writes them, without models; ``docs/data/NAME.yml`` is the grid.
+Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of a page stands the table of its runs, or of
+one environment in short, ``<!-- runs: NAME SUITE -->``. Instead of ``runs`` there are ``learnt:
+NAME``, returns in the end and those of the untrained agents of ``docs/data/untrained.csv``;
+``scores: NAME``, returns and costs as shares of TRPO's; ``sweep: NAME SUITE``, return and cost at
+each limit N of ``NAME_limitN.tar.xz``; ``splits: NAME``, how the agents keep their limit in
+training and after it; and ``agents: pretrained``, those of ``enjoy --pretrained``. A row of a
+single run is in italics, which the site shows in grey.
 ``--pack FOLDER NAME`` packs the logs of a folder.
 
 ``--curves`` draws the learning curves: of each algorithm's page, beside an unconstrained algorithm,
@@ -19,16 +20,13 @@ from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of al
 import argparse
 import re
 import tarfile
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import pandas as pd
+from archives import DATA, DOCS, pack, unpacked
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
@@ -38,22 +36,20 @@ from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish, save
 from sb3_guard.zoo.results.paper import draw
-from sb3_guard.zoo.results.runs import Results, read_results, select
+from sb3_guard.zoo.results.runs import select
 from sb3_guard.zoo.results.splits import SPLITS, judge
 from sb3_guard.zoo.results.statistics import aggregate, normalize, with_safety
 from sb3_guard.zoo.results.tables import markdown, number, spelled, spread, whole
 
-DOCS = Path(__file__).parents[1] / "docs"
-DATA = DOCS / "data"
 BLOCK = re.compile(
     r"(<!-- (runs|learnt|scores|sweep|splits|agents): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)",
     re.DOTALL,
 )
+# A figure of a packed grid: file, grid and kind
+IMAGE = re.compile(r"images/((\w+?)_(pareto|cdf|tiers)_[\w-]+\.png)")
 PUBLISHED_STEPS = 1_000_000
 LAST = 90  # episodes: three rollouts of 30 environments
 APART = 3.0  # standard errors: what counts as learnt
-FRACTION = re.compile(rb"-?\d+\.\d+(?:e[-+]?\d+)?")
-LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml")
 
 # Archives, the suite, and whom an algorithm is beside.
 GRIDS = (
@@ -77,16 +73,6 @@ HEALTHY = {
         ("stuck: -conf paper, limit 0", 0.0, "guard_paper", f"guard_paper/trpo_lag/{HAZARDS}_1"),
     ),
 }
-
-
-@contextmanager
-def unpacked(*names: str) -> Iterator[Results]:
-    """The runs of packed grids, whose logs are there within the block."""
-    with tempfile.TemporaryDirectory() as folder:
-        for name in names:
-            with tarfile.open(DATA / f"{name}.tar.xz") as archive:
-                archive.extractall(folder, filter="data")
-        yield read_results([folder])
 
 
 @cache
@@ -233,6 +219,7 @@ def splits(name: str) -> str:
         "95 % interval of the cost": lambda row: f"[{row['low']:.1f}, {row['high']:.1f}]",
         "tier": "tier",
         "episodes above the limit": lambda row: percent(row["above"]),
+        "D⁺": lambda row: number(row["excess"], 2),
     }
     if rows["suite"].nunique() > 1:
         columns = {"environment": "suite", **columns}
@@ -273,29 +260,6 @@ def pages() -> dict[Path, str]:
     ]
     texts = {path: path.read_text() for path in files}
     return {path: filled(text) for path, text in texts.items() if BLOCK.search(text)}
-
-
-def pack(folder: Path, name: str) -> None:
-    """
-    Pack the logs of finished runs, the same bytes for the same logs wherever they were.
-
-    Logs keep four significant digits of fractions: a run takes a third of the room.
-    """
-    done = sorted(path.parent for path in folder.rglob("result.json"))
-    with tarfile.open(DATA / f"{name}.tar.xz", "w:xz", preset=9) as archive:
-        for path in (path for run in done for path in sorted(run.rglob("*"))):
-            if path.name not in LOGS:
-                continue
-            text = path.read_bytes()
-            # The hash of a run that was sent in is checked against its 0.monitor.csv.
-            exact = name.startswith("sent_") and path.name == "0.monitor.csv"
-            if path.suffix == ".csv" and not exact:
-                text = FRACTION.sub(lambda digits: b"%.4g" % float(digits[0]), text)
-            if path.name == "args.yml":
-                text = re.sub(rb"(?m)^log_folder: .*", f"log_folder: logs/{name}".encode(), text)
-            info = tarfile.TarInfo(str(Path(name) / path.relative_to(folder)))
-            info.size = len(text)
-            archive.addfile(info, BytesIO(text))
 
 
 def draw_healthy(algo: str) -> Figure:
@@ -375,14 +339,16 @@ def main() -> None:
     for path, text in pages().items():
         path.write_text(text)
         print(path)
-        drawn = {name for _, kind, name, _, _ in BLOCK.findall(text) if kind == "runs"}
-        for name in (name for name in sorted(drawn) if f"images/{name}_" in text):
-            # Drawn is what the tables have: the last ten epochs, not the last one.
-            found = runs(name)
-            found = found.assign(J_r=found["return_last"], M_c=found["cost_last"])
-            for drawing in draw("pareto", Data(found)):
+        images = IMAGE.findall(text)
+        for name, kind in sorted({(name, kind) for _, name, kind in images}):
+            with unpacked(name) as found:
+                runs = with_safety(found.runs)
+                # Drawn is what the tables have: the last ten epochs, not the last one.
+                means = {"J_r": runs["return_last"], "M_c": runs["cost_last"]}
+                drawings = draw(kind, Data(runs.assign(**means)))
+            for drawing in drawings:
                 file = f"{name}_{drawing.name}.png"
-                if drawing.figure is not None and file in text:
+                if drawing.figure is not None and (file, name, kind) in images:
                     save(drawing.figure, DOCS / "images" / file)
 
 

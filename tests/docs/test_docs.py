@@ -49,7 +49,9 @@ SHORTER = {
 def script(name):
     spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:  # one may import another
+        patch.setattr(sys, "path", [*sys.path, str(ROOT / "scripts")])
+        spec.loader.exec_module(module)
     return module
 
 

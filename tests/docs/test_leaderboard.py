@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 def scripts(monkeypatch, tmp_path):
     """The scripts, with a folder of data of their own."""
     monkeypatch.syspath_prepend(ROOT / "scripts")
+    import archives
     import grand_table
     import leaderboard
     import results
@@ -29,10 +30,10 @@ def scripts(monkeypatch, tmp_path):
     for path in (ROOT / "docs" / "data").glob("*table*.yml"):
         shutil.copy(path, data)
     shutil.copy(ROOT / "docs" / "data" / "untrained.csv", data)
-    for module in (results, leaderboard, grand_table):
+    for module in (archives, results, leaderboard, grand_table):
         monkeypatch.setattr(module, "DATA", data)
-    yield leaderboard, results
-    for name in ("grand_table", "leaderboard", "results"):
+    yield leaderboard, archives
+    for name in ("archives", "grand_table", "leaderboard", "results"):
         sys.modules.pop(name)
 
 
@@ -43,45 +44,75 @@ def rows_of(text: str, heading: str) -> list[list[str]]:
 
 
 def test_certified_rows_come_first_by_return(scripts, tmp_path):
-    board, results = scripts
-    for algo, mean, cost in (("cpo", 10.0, 20.0), ("pcpo", 12.0, 24.0), ("trpo_lag", 20.0, 30.0)):
-        limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
-        for seed in (0, 1):
-            played = {"returns": [mean] * 4, "costs": [cost] * 4, "lengths": [1000] * 4}
-            made = {"command": "sb3-guard train", "curve": "12"}
-            final = {"stochastic": played, "greedy": played}
-            fake_run(tmp_path / "logs", algo, "SafetyPointGoal1-v0", seed, **limit, final=final,
-                     **made, **{"n_timesteps": 1_000_000})  # fmt: skip
-    results.pack(tmp_path / "logs", "grand_table")
+    board, archives = scripts
+    for algo, mean, cost, seeds in (
+        ("cpo", 10.0, 20.0, 3), ("pcpo", 12.0, 24.0, 3), ("p3o", 15.0, 24.0, 2),
+        ("trpo_lag", 20.0, 30.0, 2),
+    ):  # fmt: skip
+        played_by(tmp_path / "logs", algo, mean, cost, seeds)
+    archives.pack(tmp_path / "logs", "grand_table", by_environment=True)
     rows, runs = board.read()
-    assert len(runs) == 6 and "grand_table/cpo/SafetyPointGoal1-v0_1" in {*runs["row"]}
+    assert len(runs) == 10 and "grand_table/cpo/SafetyPointGoal1-v0_1" in {*runs["row"]}
     glance = [" ".join(line.split()) for line in board.glance(rows).splitlines()]
     assert glance[0] == "| 1e6 steps | PointGoal1 |"
-    assert {"| PCPO | 12.0 / 24.0 ✓ (2) |", "| TRPO-Lagrangian | 20.0 / 30.0 ✗ (2) |"} < {*glance}
+    assert {"| PCPO | 12.0 / 24.0 ✓ (3) |", "| TRPO-Lagrangian | 20.0 / 30.0 ✗ (2) |"} < {*glance}
     table = rows_of(board.leaderboard(rows), "SafetyPointGoal1-v0, 1e6 steps")
-    assert [row[:2] for row in table[:3]] == [
-        ["1", "PCPO"], ["2", "CPO"], ["–", "*TRPO-Lagrangian*"],
+    # Two seeds are too few for a place.
+    assert [row[:3] for row in table[:4]] == [
+        ["1", "PCPO", "3"], ["2", "CPO", "3"], ["–", "*P3O*", "*2 of 3*"],
+        ["–", "*TRPO-Lagrangian*", "*2 of 3*"],
     ]  # fmt: skip
     assert table[0][-1] == "`sb3-guard reproduce grand_table/pcpo/SafetyPointGoal1-v0_1`"
-    assert table[0][4] == "24.0 [24.0, 24.0]" and table[2][6] == "*100\xa0%*"
+    train = "`sb3-guard train --algo {} --env SafetyPointGoal1-v0 --seeds {} -n 1000000`"
+    assert table[2][-1].endswith(f"; missing: {train.format('p3o', 2)}")
+    assert table[0][4] == "24.0 [24.0, 24.0]" and table[2][5] == "*certified*"
+    assert table[3][6:8] == ["*100\xa0%*", "*0.20*"]
     missing = next(row for row in table if row[1] == "*PPO*")
-    assert missing[-1].startswith("`sb3-guard train --algo ppo --env SafetyPointGoal1-v0 --seeds")
+    assert missing[-1] == train.format("ppo", "0 1 2")
     assert [row[1] for row in table[-2:]] == ["*random actions*", "*idle*"]
-    # The same algorithm, sent in by another.
-    results.pack(tmp_path / "logs", "sent_again")
+    # The same algorithms, sent in by another.
+    archives.pack(tmp_path / "logs", "sent_again")
     rows, _ = board.read()
     table = rows_of(board.leaderboard(rows), "SafetyPointGoal1-v0, 1e6 steps")
-    assert [row[1] for row in table[:5]] == ["PCPO", "PCPO", "CPO", "CPO", "*TRPO-Lagrangian*"]
-    assert "sent_again/pcpo" in table[1][-1]
+    assert [row[1] for row in table[:5]] == ["PCPO", "PCPO", "CPO", "CPO", "*P3O*"]
+    assert "sent_again/pcpo" in table[1][-1] and "missing" not in table[5][-1]
     assert [" ".join(line.split()) for line in board.glance(rows).splitlines()] == glance
     assert board.glance(rows.iloc[:0]) == ""
 
 
+def played_by(folder: Path, algo: str, mean: float, cost: float, seeds: int) -> None:
+    """Runs on SafetyPointGoal1 whose final episodes all have the same return and cost."""
+    played = {"returns": [mean] * 4, "costs": [cost] * 4, "lengths": [1000] * 4}
+    made = {"command": "sb3-guard train", "curve": "12", "seconds": 9.0, "n_timesteps": 1_000_000}
+    for seed in range(seeds):
+        fake_run(folder, algo, "SafetyPointGoal1-v0", seed, config={"cost_limit": 25.0},
+                 final={"stochastic": played, "greedy": played},
+                 cost_limit=None if algo == "ppo" else 25.0, **made)  # fmt: skip
+
+
+def test_an_unconstrained_row_is_judged_by_the_limit_of_the_page(scripts, tmp_path):
+    board, archives = scripts
+    played_by(tmp_path / "logs", "ppo", 10.0, 30.0, 3)
+    archives.pack(tmp_path / "logs", "sent_ppo")
+    rows, _ = board.read()
+    (row,) = rows.query("split == 'stochastic'").to_dict("records")
+    assert row["tier"] == "violating" and row["above"] == 1
+
+
+def test_all_seeds_that_are_planned_are_asked_for(scripts):
+    """Those of several grids are seeds of one row."""
+    board, _ = scripts
+    plan = board.planned().set_index(["suite", "algo", "budget"])["seeds"]
+    assert plan["Goal_Point_8Hazards", "cpo", 1] == [0, 1, 2]
+    assert plan["Goal_Hopper_8Hazards", "cpo", 1] == [0]
+    assert plan["SafetyPointGoal1-v0", "cpo", 10] == [0]
+
+
 def test_packed_logs_are_small(scripts, tmp_path):
-    _, results = scripts
+    _, archives = scripts
     path = fake_run(tmp_path / "logs", returns=1 / 3)
-    results.pack(tmp_path / "logs", "small")
-    with results.unpacked("small") as found:
+    archives.pack(tmp_path / "logs", "small")
+    with archives.unpacked("small") as found:
         (copy,) = found.runs["path"]
         text = Path(copy, "0.monitor.csv").read_text()
         assert max(map(len, text.splitlines())) < 30
@@ -105,7 +136,7 @@ def test_a_run_without_a_limit_can_be_sent_in(scripts, tmp_path, monkeypatch, ca
     board, _ = scripts
     monkeypatch.setattr(board, "MILLION", 600)
     for seed in range(3):
-        sent(tmp_path / "logs", "ppo", seed, config={}, cost_limit=None)
+        sent(tmp_path / "logs", "ppo", seed, config={"cost_limit": None}, cost_limit=None)
     assert board.check(tmp_path / "logs")
     assert [line.split(": ")[1] for line in capsys.readouterr().out.splitlines()] == ["fine"] * 3
 
@@ -116,15 +147,15 @@ def test_too_few_seeds_are_no_fault_but_told(scripts, tmp_path, monkeypatch, cap
     for seed in (0, 1, 1):
         sent(tmp_path / "logs", seed=seed)
     assert board.check(tmp_path / "logs")
-    assert "cpo on Goal_Point_8Hazards-v0: 2 of the at least 3 seeds" in capsys.readouterr().out
+    assert "cpo on Goal_Point_8Hazards: 2 of the 3 seeds from" in capsys.readouterr().out
 
 
 def test_hashes_can_be_checked_after_packing(scripts, tmp_path, monkeypatch, capsys):
-    board, results = scripts
+    board, archives = scripts
     monkeypatch.setattr(board, "MILLION", 600)
     sent(tmp_path / "logs")
-    results.pack(tmp_path / "logs", "sent_mine")
-    with results.unpacked("sent_mine") as found:
+    archives.pack(tmp_path / "logs", "sent_mine")
+    with archives.unpacked("sent_mine") as found:
         (path,) = found.runs["path"]
         assert board.check(Path(path)), capsys.readouterr().out
 
@@ -171,6 +202,61 @@ def test_bad_flags(scripts, tmp_path, monkeypatch, capsys, flags, message):
     assert message in capsys.readouterr().err
 
 
+NAN = {key: [float("nan")] * 100 for key in ("returns", "costs", "lengths")}
+
+
+@pytest.mark.parametrize(
+    ("file", "changes", "message"),
+    [
+        ("result.json", {"final": {"stochastic": NAN, "greedy": NAN}}, "not finite"),
+        ("result.json", {"final": {"stochastic": NAN}}, "final greedy has {0} episodes"),
+        ("result.json", {"cost_limit": None}, "cost_limit is None in result.json, not 2"),
+        ("result.json", {"n_timesteps": 500}, "500 steps of 600"),
+        ("result.json", {"algo": "pcpo"}, "algo is cpo in args.yml, pcpo in result.json"),
+        ("result.json", {"cut": True}, "were cut"),
+        ("result.json", {"commit": "abc-dirty"}, "not committed"),
+        ("config.yml", {"cost_limit": 100.0}, "cost_limit is 100.0 in config.yml"),
+        ("config.yml", {"cost_limit": "lin_25"}, "cost_limit is lin_25 in config.yml"),
+        ("args.yml", {"env": "Goal_Ant_8Hazards-v0"}, "env is Goal_Ant_8Hazards-v0 in args.yml"),
+    ],
+)
+def test_a_row_that_is_not_what_it_says(
+    scripts, tmp_path, monkeypatch, capsys, file, changes, message
+):
+    board, _ = scripts
+    monkeypatch.setattr(board, "MILLION", 600)
+    run = sent(tmp_path / "logs")
+    assert board.check(run)
+    (path,) = run.rglob(file)
+    content = yaml.safe_load(path.read_text()) | changes  # YAML contains JSON
+    path.write_text(json.dumps(content) if path.suffix == ".json" else yaml.safe_dump(content))
+    assert not board.check(run)
+    assert message in capsys.readouterr().out
+
+
+def test_seeds_have_episodes_of_their_own(scripts, tmp_path, monkeypatch, capsys):
+    board, _ = scripts
+    monkeypatch.setattr(board, "MILLION", 600)
+    run = sent(tmp_path / "logs", seed=1)
+    copy = sent(tmp_path / "logs", seed=2)
+    assert board.check(tmp_path / "logs")
+    shutil.copy(run / "0.monitor.csv", copy)
+    made = json.loads((copy / "result.json").read_text())
+    curve = json.loads((run / "result.json").read_text())["curve"]
+    (copy / "result.json").write_text(json.dumps(made | {"curve": curve}))
+    assert not board.check(tmp_path / "logs")
+    assert "the same episodes under several seeds" in capsys.readouterr().out
+
+
+def test_seeds_of_a_row_have_the_same_hyperparameters(scripts, tmp_path, monkeypatch, capsys):
+    board, _ = scripts
+    monkeypatch.setattr(board, "MILLION", 600)
+    for seed in (1, 2):
+        sent(tmp_path / "logs", seed=seed, config={"cost_limit": 2.0, "gamma": 0.9 + seed / 100})
+    assert not board.check(tmp_path / "logs")
+    assert "cpo on Goal_Point_8Hazards: the seeds have different" in capsys.readouterr().out
+
+
 def test_an_empty_curve_is_a_fault(scripts, tmp_path, capsys):
     board, _ = scripts
     (sent(tmp_path / "logs") / "0.monitor.csv").write_text("")
@@ -189,7 +275,8 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
     assert not board.check(tmp_path / "logs")
     said = capsys.readouterr().out
     assert "final greedy has {1} episodes, not 100" in said
-    assert "n_timesteps is 8,000; allowed" in said and said.count(";") == 3
+    assert "n_timesteps is 8,000; allowed" in said
+    assert said.count(";") == 3 + said.count("not committed; ")
     result = json.loads((run / "result.json").read_text())
     (run / "result.json").write_text(
         json.dumps(result | {"curve": "0", "command": "x", "final": {}})
@@ -210,7 +297,13 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
     (run / "result.json").write_text(json.dumps(result | {"cost_limit": 100.0}))
     assert not board.check(tmp_path / "logs")
     said = capsys.readouterr().out
-    for text in ("trained_agent: ppo.zip", "gym_packages", "cost_keys", "env_kwargs", "100.0, not"):
+    for text in (
+        "trained_agent: ppo.zip",
+        "gym_packages",
+        "cost_keys",
+        "env_kwargs",
+        "100.0 in result",
+    ):
         assert text in said
 
 

@@ -52,6 +52,38 @@ def test_a_row_that_went_another_way(run, tmp_path, capsys, monkeypatch):
     assert "did you mean 'table/cpo/A_1'" in capsys.readouterr().err
 
 
+def test_other_final_episodes_are_another_run(run, tmp_path, capsys):
+    """Every tier is made of them."""
+    result = json.loads((run / "result.json").read_text())
+    costs = result["final"]["stochastic"]["costs"]
+    result["final"]["stochastic"]["costs"] = [cost + 2 for cost in costs]
+    (run / "result.json").write_text(json.dumps(result))
+    assert again(tmp_path, str(run), *PACKAGES) == 1
+    out = capsys.readouterr().out
+    assert "cost of the final policy, sampled actions" in out and "(-2)" in out
+
+
+def test_logs_that_are_not_as_the_run_wrote_them(run, tmp_path, capsys):
+    """Packed ones are rounded: the hash of the result counts, and the user is told."""
+    monitor = run / "0.monitor.csv"
+    lines = monitor.read_text().splitlines()
+    monitor.write_text("\n".join([*lines[:-1], "9,20,9,9"]) + "\n")
+    assert again(tmp_path, str(run), *PACKAGES) == 0
+    out = capsys.readouterr().out
+    assert "is not as the run wrote it" in out and "The same" in out and ", which took 0:00:" in out
+    monitor.write_text("\n".join([lines[0], "r,l,t", "1.0,20,1"]) + "\n")
+    assert again(tmp_path, str(run), *PACKAGES) == 2
+    assert f"can't read {monitor}" in capsys.readouterr().err
+    monitor.unlink()
+    assert again(tmp_path, str(run), *PACKAGES) == 2
+    assert f"can't read {monitor}: No such file" in capsys.readouterr().err
+
+
+def test_a_folder_of_runs_is_told_from_a_run(run, tmp_path, capsys):
+    assert again(tmp_path, str(run.parent)) == 2
+    assert f"run folders in it: {run}" in capsys.readouterr().err
+
+
 def test_a_command_imports_what_the_user_names_only(run, tmp_path, capsys):
     assert again(tmp_path, str(run)) == 2
     assert "only the command line may name" in capsys.readouterr().err

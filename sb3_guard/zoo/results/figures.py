@@ -86,8 +86,12 @@ def fit_costs(axis: Axes, values: Iterable[Any], way: str = "y") -> None:
     if 0 < enough < highest:
         set_limits(0, min(1.5 * finite[finite <= enough].max(), 1.05 * enough))
         if way == "y":
-            text = f"↑ up to {highest:.3g}"
-            axis.annotate(text, (0.99, 0.98), xycoords="axes fraction", ha="right", va="top")
+            say_highest(axis, f"↑ up to {highest:.3g}", 0.98, "top")
+
+
+def say_highest(axis: Axes, text: str, y: float, anchor: str) -> None:
+    """Write at the right of a panel how far the costs go that its axis does not show."""
+    axis.annotate(text, (0.99, y), xycoords="axes fraction", ha="right", va=anchor)
 
 
 def cost_name(column: str) -> str:
@@ -264,7 +268,9 @@ def cdf(data: Data, suite: str) -> Figure | None:
     """Share of episodes that cost at most x, of the final policies, a figure per environment."""
     figure, panels = _split_axes(data, suite, height=3.4)
     shown = [0.0]  # of all panels, which share their axis
+    highest = {}
     for split, axis in panels.items():
+        highest[split] = 0.0
         for algo in data.algos(suite):
             costs = data.costs_of(suite, algo, split)
             if len(costs):
@@ -273,11 +279,14 @@ def cdf(data: Data, suite: str) -> Figure | None:
                 x, y = [-1e9, *costs, 1e9], [0.0, *share, 1.0]
                 axis.step(x, y, where="post", linewidth=1.5, **data.looks[algo].line)
                 shown += costs[: len(costs) - len(costs) // 50].tolist()
+                highest[split] = max(highest[split], costs[-1])
         shown.append(1.05 * draw_limit(axis.axvline, data, suite, "M_c"))
         axis.set(ylim=(-0.02, 1.02), ylabel="share of episodes")
         axis.label_outer()
-    for axis in panels.values():
+    for split, axis in panels.items():
         axis.set_xlim(np.nanmin(shown), np.nanmax(shown) or 1.0)
+        if highest[split] > axis.get_xlim()[1]:
+            say_highest(axis, f"→ up to {highest[split]:.3g}", 0.03, "bottom")
     return figure
 
 

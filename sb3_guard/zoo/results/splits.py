@@ -88,19 +88,20 @@ def tier(low: float, high: float, limit: float) -> str:
     return TIERS.get(verdict(low, high, limit), "undecided")
 
 
-def judge(runs: pd.DataFrame) -> pd.DataFrame:
+def judge(runs: pd.DataFrame, limits: "pd.Series[float] | None" = None) -> pd.DataFrame:
     """
     How agents of an algorithm keep their limit, a row per suite, algorithm and split.
 
     :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
-    :return: ``suite``, ``algo``, ``label``, ``split``, ``seeds``, ``limit`` (of unconstrained
-        algorithms that of the others; NaN: none), ``return`` and ``cost``, means over seeds of
-        their episodes' means, with ``_std`` (over seeds; NaN for one), ``low`` and ``high`` of
-        the cost (:func:`nested_interval`), ``tier``, ``above`` and ``excess``
-        (:func:`violations`, of all seeds' episodes)
+    :param limits: by which each run is judged; None: its own, an unconstrained one by that of the
+        others
+    :return: ``suite``, ``algo``, ``label``, ``split``, ``seeds``, ``limit`` (NaN: none), ``return``
+        and ``cost``, means over seeds of their episodes' means, with ``_std`` (over seeds; NaN for
+        one), ``low`` and ``high`` of the cost (:func:`nested_interval`), ``tier``, ``above`` and
+        ``excess`` (:func:`violations`, of all seeds' episodes)
     """
     rows = []
-    limited = runs.assign(judged_by=judging_limits(runs))
+    limited = runs.assign(judged_by=judging_limits(runs) if limits is None else limits)
     for (suite, algo), group in limited.groupby(["suite", "algo"], sort=False):
         seeds = group[["path", "epoch"]].itertuples(index=False)
         played = [read_splits(path, epoch) for path, epoch in seeds]

@@ -1,0 +1,70 @@
+"""The packed logs of ``docs/data``: grids of runs, as ``benchmark`` writes them, without models.
+
+``NAME.tar.xz`` holds a grid, or ``NAME/ENV.tar.xz`` its runs of an environment.
+"""
+
+import re
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+
+from sb3_guard.zoo.results.runs import Results, read_results
+
+DOCS = Path(__file__).parents[1] / "docs"
+DATA = DOCS / "data"
+FRACTION = re.compile(rb"-?\d+\.\d+(?:e[-+]?\d+)?")
+LOGS = ("progress.csv", "0.monitor.csv", "result.json", "args.yml", "config.yml")
+
+
+def archives(name: str) -> list[Path]:
+    """The files of a packed grid: one, or one for each environment."""
+    return [*DATA.glob(f"{name}.tar.xz"), *sorted(DATA.glob(f"{name}/*.tar.xz"))]
+
+
+@contextmanager
+def unpacked(*names: str) -> Iterator[Results]:
+    """The runs of packed grids, whose logs are there within the block."""
+    with tempfile.TemporaryDirectory() as folder:
+        for path in (path for name in names for path in archives(name)):
+            with tarfile.open(path) as archive:
+                archive.extractall(folder, filter="data")
+        yield read_results([folder])
+
+
+def pack(folder: Path, name: str, by_environment: bool = False) -> None:
+    """
+    Pack the logs of finished runs, the same bytes for the same logs wherever they were.
+
+    Logs keep four significant digits of fractions: a run takes a third of the room.
+
+    :param by_environment: an archive for each, so that new runs change few of them
+    """
+    done: dict[Path, list[Path]] = {}
+    for run in sorted(path.parent for path in folder.rglob("result.json")):
+        env_id = run.name.rpartition("_")[0]
+        file = Path(name, env_id) if by_environment else Path(name)
+        done.setdefault(DATA / f"{file}.tar.xz", []).append(run)
+    for file, runs in done.items():
+        file.parent.mkdir(exist_ok=True)
+        with tarfile.open(file, "w:xz", preset=9) as archive:
+            for path in (path for run in runs for path in sorted(run.rglob("*"))):
+                if path.name in LOGS:
+                    text = _packed(path, name)
+                    info = tarfile.TarInfo(str(Path(name) / path.relative_to(folder)))
+                    info.size = len(text)
+                    archive.addfile(info, BytesIO(text))
+
+
+def _packed(path: Path, name: str) -> bytes:
+    """A log as an archive has it."""
+    text = path.read_bytes()
+    # The hash of a run that was sent in is checked against its 0.monitor.csv.
+    exact = name.startswith("sent_") and path.name == "0.monitor.csv"
+    if path.suffix == ".csv" and not exact:
+        text = FRACTION.sub(lambda digits: b"%.4g" % float(digits[0]), text)
+    if path.name == "args.yml":
+        text = re.sub(rb"(?m)^log_folder: .*", f"log_folder: logs/{name}".encode(), text)
+    return text

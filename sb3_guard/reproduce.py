@@ -1,6 +1,8 @@
 """Train a published run again and compare: ``sb3-guard reproduce ROW``."""
 
 import csv
+import hashlib
+import json
 import shlex
 import sys
 from collections.abc import Mapping
@@ -56,9 +58,16 @@ def measures(result: Mapping[str, Any]) -> dict[str, float]:
     return found
 
 
+def final_hash(result: Mapping[str, Any]) -> str | None:
+    """SHA-256 of the final episodes, from which tiers are made; older results have none."""
+    final = result.get("final")
+    return final and hashlib.sha256(json.dumps(final, sort_keys=True).encode()).hexdigest()
+
+
 def published(name: str) -> dict[str, Any]:
     """
-    What is known of a run: ``command``, ``curve``, ``commit``, ``seconds`` and :func:`measures`.
+    What is known of a run: ``command``, ``curve``, ``final``, ``commit``, ``seconds`` and
+    :func:`measures`.
 
     :param name: of a row of the package's table, or of a run folder
     :raises UsageError: there is neither, or the folder is damaged
@@ -70,14 +79,15 @@ def published(name: str) -> dict[str, Any]:
     if is_run(Path(name)):
         run = RunFolder(Path(name))
         result = run.checked_result()
-        with explained(f"can't read {run.monitor}", OSError, KeyError, ValueError):
+        with explained(f"can't read {run.monitor}", OSError, KeyError, TypeError, ValueError):
             curve = run.curve_hash()
         if result.setdefault("curve", curve) != curve:
             print(
                 f"{run.monitor} is not as the run wrote it (packed logs are rounded); "
                 "compared is the hash in result.json."
             )
-        return result | {"command": run.flags().command(), **measures(result)}
+        made = {"command": run.flags().command(), "final": final_hash(result)}
+        return result | made | measures(result)
     with ROWS.open(newline="", encoding="utf-8") as file:
         rows = {row["row"]: row for row in csv.DictReader(file)}
     if name not in rows:
@@ -92,12 +102,17 @@ def published(name: str) -> dict[str, Any]:
 def differences(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
     """How a run that was trained again differs from the published one, in lines; none: nothing."""
     lines = []
-    if row["curve"] != result["curve"]:
-        lines.append("Not the same: the training episodes differ.")
+    for name, new, what in (
+        ("curve", result["curve"], "training"),
+        ("final", final_hash(result), "final"),
+    ):
+        if row.get(name) and row[name] != new:
+            lines.append(f"Not the same: the {what} episodes differ.")
+    if not lines:
+        return []
     for name, new in measures(result).items():
         was = float(row.get(name) or "nan")
-        if abs(new - was) > 1e-6 * max(1.0, abs(was)):
-            lines.append(f"  {MEASURES[name]}: {was:.6g} there, {new:.6g} here ({new - was:+.6g})")
+        lines.append(f"  {MEASURES[name]}: {was:.6g} there, {new:.6g} here ({new - was:+.6g})")
     return lines
 
 

@@ -40,8 +40,10 @@ def pack(folder: Path, name: str, by_environment: bool = False) -> None:
 
     Logs keep four significant digits of fractions: a run takes a third of the room.
 
-    :param by_environment: an archive for each, so that new runs change few of them
+    :param by_environment: an archive for each, so that new runs change few of them; as before if
+        there are such
     """
+    by_environment = by_environment or (DATA / name).is_dir()
     done: dict[Path, list[Path]] = {}
     for run in sorted(path.parent for path in folder.rglob("result.json")):
         env_id = run.name.rpartition("_")[0]

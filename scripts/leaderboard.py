@@ -1,50 +1,38 @@
-"""Write the leaderboard, docs/leaderboard.md, and check what is sent in for it.
+"""Write the leaderboard, docs/leaderboard.md: ``python scripts/leaderboard.py``.
 
-``python scripts/leaderboard.py`` makes the tables of the page, and ``rows.csv`` in
-``sb3_guard/zoo/results`` for ``sb3-guard reproduce``, from the packed logs of the grand table
-(``scripts/grand_table.py``) and from those that were sent in, ``docs/data/sent_*.tar.xz``.
-``--check FOLDER`` says what is wrong with a folder of runs to be sent in; with ``--pack NAME`` the
-folder is packed as ``sent_NAME`` if nothing is.
+Made are the tables of the page, and ``rows.csv`` in ``sb3_guard/zoo/results`` for ``sb3-guard
+reproduce``, from the packed logs of the grand table (``scripts/grand_table.py``) and from those
+that were sent in, ``docs/data/sent_*.tar.xz`` (``scripts/check_runs.py``).
 """
 
 import argparse
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import yaml
-from archives import DATA, DOCS, archives, pack, unpacked
+from archives import DATA, DOCS, archives, unpacked
+from check_runs import MILLION, SEEDS, limit_of
 from grand_table import GRIDS
 from results import percent
 
-from sb3_guard.reproduce import measures
+from sb3_guard.reproduce import final_hash, measures
 from sb3_guard.zoo.cli.markdown import table
-from sb3_guard.zoo.cli.names import PRESETS
-from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.grids.presets import ALGOS
-from sb3_guard.zoo.results.curves import read_episodes
-from sb3_guard.zoo.results.runs import find_runs, label_of, read_run, select
-from sb3_guard.zoo.results.splits import FINAL, judge
+from sb3_guard.zoo.results.runs import label_of, select
+from sb3_guard.zoo.results.splits import judge
 from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import number, spread
-from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import RunFolder
 from sb3_guard.zoo.run.make_envs import full_id
-from sb3_guard.zoo.run.training import FINAL_EPISODES
 
 PAGE = DOCS / "leaderboard.md"
 ROWS = DOCS.parent / "sb3_guard" / "zoo" / "results" / "rows.csv"
 BLOCK = re.compile(r"(<!-- (glance|leaderboard|untrained) -->\n).*?(<!-- end -->)", re.DOTALL)
-MILLION = 1_000_000
 PLANNED = GRIDS[:5]  # a row of these that is missing is shown, with the command that fills it
-# What a run that is sent in may not change: the task, or which code is run.
-REFUSED = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "cost_keys")
-BUDGETS = (1, 2, 10)  # millions of steps
 MARKS = {"certified": " ✓", "violating": " ✗"}
-SEEDS = 3  # from which on a certified row has a place
 
 
 def planned() -> pd.DataFrame:
@@ -68,13 +56,8 @@ def training(suite: str, algo: str, budget: int, seeds: Iterable[int]) -> str:
     numbers = " ".join(map(str, seeds))
     return (
         f"sb3-guard train --algo {algo} --env {full_id(suite)} --seeds {numbers} "
-        f"-n {budget * MILLION}"
+        f"-n {budget * MILLION} --eval-freq -1 --num-threads 1"
     )
-
-
-def limit_of(env_id: str) -> float:
-    """The cost limit that the rows of an environment are judged by."""
-    return 25.0 if env_id.startswith("Safety") else 2.0
 
 
 def packed() -> list[str]:
@@ -102,8 +85,8 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
                 result = RunFolder(Path(run["path"])).checked_result()
                 if "curve" in result:
                     kept = {key: result.get(key) for key in ("command", "curve", "commit")}
-                    seconds = round(result["seconds"])
-                    runs.append({"row": run["row"], **kept, **measures(result), "seconds": seconds})
+                    kept |= {"final": final_hash(result), "seconds": round(result["seconds"])}
+                    runs.append({"row": run["row"], **kept, **measures(result)})
             all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)
             for budget, group in all_.groupby("budget"):
                 own = select(group)
@@ -256,123 +239,8 @@ def page(rows: pd.DataFrame) -> str:
     return BLOCK.sub(lambda m: f"{m[1]}\n{made[m[2]]()}\n\n{m[3]}", PAGE.read_text())
 
 
-def problems(path: Path) -> Iterator[str]:
-    """What is wrong with a run that is sent in."""
-    run = RunFolder(path)
-    result, config, args = run.checked_result(), run.hyperparams(), run.args()
-    for name in ("command", "curve", "final", "versions"):
-        if not result.get(name):
-            yield f"result.json has no {name}: train it with this version"
-    if result.get("curve") != run.curve_hash():
-        yield "curve in result.json is not the hash of 0.monitor.csv"
-    if "command" in result and result["command"] != run.flags().command():
-        yield "command in result.json is not that of args.yml"
-    if str(result.get("commit")).endswith("-dirty"):
-        yield "it was trained with changes that are not committed"
-    yield from _other_task(run, result, config, args)
-    yield from _other_length(run, result, config)
-    for split in FINAL:
-        played = result.get("final", {}).get(split, {})
-        values = [played.get(key, []) for key in ("returns", "costs", "lengths")]
-        counts = {len(numbers) for numbers in values}
-        if counts != {FINAL_EPISODES}:
-            yield f"final {split} has {counts} episodes, not {FINAL_EPISODES}"
-        elif not np.isfinite(values).all():
-            yield f"final {split} has numbers that are not finite"
-
-
-def _other_task(
-    run: RunFolder, result: Mapping[str, Any], config: Mapping[str, Any], args: Mapping[str, Any]
-) -> Iterator[str]:
-    """In what a run differs from what the page is about, but for its length."""
-    for name, value in (("algo", run.path.parent.name), ("env", run.name)):
-        if not value == args[name] == result.get(name, value):
-            yield f"{name} is {args[name]} in args.yml, {result.get(name)} in result.json"
-    full_id(args["env"])
-    for name in REFUSED:
-        if config.get(name):
-            yield f"config.yml has {name}: {config[name]}, which changes the task"
-    for name, why in (
-        ("gym_packages", "is not the package's"),
-        ("trained_agent", "was trained before"),
-    ):
-        if args.get(name):
-            yield f"args.yml has {name}: {args[name]}, which {why}"
-    if args.get("conf_file") not in (None, *PRESETS):
-        allowed = ", ".join(PRESETS)
-        yield f"args.yml has conf_file: {args['conf_file']}, which others lack; allowed: {allowed}"
-    limited = getattr(algorithm(args["algo"]), "constrained", False)
-    limit = limit_of(run.name) if limited else None
-    for name, of in (("config.yml", config), ("result.json", result)):
-        if of.get("cost_limit") != limit:
-            yield f"cost_limit is {of.get('cost_limit')} in {name}, not {limit}"
-    if result.get("cut"):
-        yield "episodes of the training were cut"
-
-
-def _other_length(
-    run: RunFolder, result: Mapping[str, Any], config: Mapping[str, Any]
-) -> Iterator[str]:
-    """In what the length of a run is another than it says, or than the page has."""
-    asked, done = config["n_timesteps"], result["n_timesteps"]
-    if asked not in [MILLION * budget for budget in BUDGETS]:
-        yield f"n_timesteps is {asked:,}; allowed: {BUDGETS} million"
-    if done < asked:
-        yield f"result.json has {done:,} steps of {asked:,}"
-    episodes = read_episodes(run.path)
-    steps, longest = int(episodes["step"].iloc[-1]), int(episodes["step"].diff().max())
-    if not 0 <= done - steps <= config["n_envs"] * longest:
-        yield f"0.monitor.csv has {steps:,} steps of {done:,}"
-
-
-def check(folder: Path) -> bool:
-    """Print what is wrong with the runs of a folder, and what they say; whether nothing is."""
-    runs, fine = [], True
-    for path in find_runs(folder):
-        try:
-            found = [*problems(path)]
-            runs.append(read_run(path) | {"curve": RunFolder(path).curve_hash()})
-        except (UsageError, OSError, KeyError, ValueError, TypeError) as error:
-            found = [one_line(error)]
-        fine = fine and not found
-        print(f"{path}: {'; '.join(found) or 'fine'}")
-    if not runs:
-        print(f"no finished run in {folder}")
-        return False
-    table = pd.DataFrame(runs)
-    for (algo, suite), group in table.groupby(["algo", "suite"]):
-        if group["config"].nunique() > 1:
-            fine = False
-            print(f"{algo} on {suite}: the seeds have different hyperparameters")
-        if (seeds := group["seed"].nunique()) < SEEDS:
-            print(f"{algo} on {suite}: {seeds} of the {SEEDS} seeds from which a row has a place")
-    for _, group in table.groupby("curve"):
-        if group["seed"].nunique() > 1:
-            fine = False
-            print(f"the same episodes under several seeds: {', '.join(group['path'])}")
-    return fine
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--check", type=Path, metavar="FOLDER", help="check runs to be sent in")
-    parser.add_argument("--pack", metavar="NAME", help="pack them if nothing is wrong")
-    args = parser.parse_args()
-    if args.pack is not None:
-        if args.check is None or any(
-            Path(path).parents[1] != args.check for path in find_runs(args.check)
-        ):
-            parser.error("--pack needs --check with a log folder, which has a folder per algorithm")
-        if not re.fullmatch(r"\w+", args.pack):
-            parser.error(f"--pack takes letters, digits and _, not {args.pack!r}")
-        if (DATA / f"sent_{args.pack}.tar.xz").exists():
-            parser.error(f"docs/data has sent_{args.pack}.tar.xz; choose another name")
-    if args.check:
-        if not check(args.check):
-            raise SystemExit(1)
-        if args.pack:
-            pack(args.check, f"sent_{args.pack}")
-        return
+    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args()
     rows, runs = read()
     PAGE.write_text(page(rows))
     runs.to_csv(ROWS, index=False)

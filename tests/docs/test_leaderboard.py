@@ -21,6 +21,7 @@ def scripts(monkeypatch, tmp_path):
     """The scripts, with a folder of data of their own."""
     monkeypatch.syspath_prepend(ROOT / "scripts")
     import archives
+    import check_runs
     import grand_table
     import leaderboard
     import results
@@ -30,10 +31,11 @@ def scripts(monkeypatch, tmp_path):
     for path in (ROOT / "docs" / "data").glob("*table*.yml"):
         shutil.copy(path, data)
     shutil.copy(ROOT / "docs" / "data" / "untrained.csv", data)
-    for module in (archives, results, leaderboard, grand_table):
+    for module in (archives, check_runs, results, leaderboard, grand_table):
         monkeypatch.setattr(module, "DATA", data)
-    yield leaderboard, archives
-    for name in ("archives", "grand_table", "leaderboard", "results"):
+    monkeypatch.setattr(check_runs, "MILLION", 600)
+    yield leaderboard, archives, check_runs
+    for name in ("archives", "check_runs", "grand_table", "leaderboard", "results"):
         sys.modules.pop(name)
 
 
@@ -44,7 +46,7 @@ def rows_of(text: str, heading: str) -> list[list[str]]:
 
 
 def test_certified_rows_come_first_by_return(scripts, tmp_path):
-    board, archives = scripts
+    board, archives, _ = scripts
     for algo, mean, cost, seeds in (
         ("cpo", 10.0, 20.0, 3), ("pcpo", 12.0, 24.0, 3), ("p3o", 15.0, 24.0, 2),
         ("trpo_lag", 20.0, 30.0, 2),
@@ -63,7 +65,10 @@ def test_certified_rows_come_first_by_return(scripts, tmp_path):
         ["–", "*TRPO-Lagrangian*", "*2 of 3*"],
     ]  # fmt: skip
     assert table[0][-1] == "`sb3-guard reproduce grand_table/pcpo/SafetyPointGoal1-v0_1`"
-    train = "`sb3-guard train --algo {} --env SafetyPointGoal1-v0 --seeds {} -n 1000000`"
+    train = (
+        "`sb3-guard train --algo {} --env SafetyPointGoal1-v0 --seeds {} -n 1000000 "
+        "--eval-freq -1 --num-threads 1`"
+    )
     assert table[2][-1].endswith(f"; missing: {train.format('p3o', 2)}")
     assert table[0][4] == "24.0 [24.0, 24.0]" and table[2][5] == "*certified*"
     assert table[3][6:8] == ["*100\xa0%*", "*0.20*"]
@@ -91,7 +96,7 @@ def played_by(folder: Path, algo: str, mean: float, cost: float, seeds: int) -> 
 
 
 def test_an_unconstrained_row_is_judged_by_the_limit_of_the_page(scripts, tmp_path):
-    board, archives = scripts
+    board, archives, _ = scripts
     played_by(tmp_path / "logs", "ppo", 10.0, 30.0, 3)
     archives.pack(tmp_path / "logs", "sent_ppo")
     rows, _ = board.read()
@@ -101,7 +106,7 @@ def test_an_unconstrained_row_is_judged_by_the_limit_of_the_page(scripts, tmp_pa
 
 def test_all_seeds_that_are_planned_are_asked_for(scripts):
     """Those of several grids are seeds of one row."""
-    board, _ = scripts
+    board, *_ = scripts
     plan = board.planned().set_index(["suite", "algo", "budget"])["seeds"]
     assert plan["Goal_Point_8Hazards", "cpo", 1] == [0, 1, 2]
     assert plan["Goal_Hopper_8Hazards", "cpo", 1] == [0]
@@ -109,7 +114,7 @@ def test_all_seeds_that_are_planned_are_asked_for(scripts):
 
 
 def test_packed_logs_are_small(scripts, tmp_path):
-    _, archives = scripts
+    _, archives, _ = scripts
     path = fake_run(tmp_path / "logs", returns=1 / 3)
     archives.pack(tmp_path / "logs", "small")
     with archives.unpacked("small") as found:
@@ -133,72 +138,83 @@ def sent(folder: Path, algo: str = "cpo", seed: int = 0, **entries: Any) -> Path
 
 
 def test_a_run_without_a_limit_can_be_sent_in(scripts, tmp_path, monkeypatch, capsys):
-    board, _ = scripts
-    monkeypatch.setattr(board, "MILLION", 600)
+    checks = scripts[2]
     for seed in range(3):
         sent(tmp_path / "logs", "ppo", seed, config={"cost_limit": None}, cost_limit=None)
-    assert board.check(tmp_path / "logs")
+    assert checks.check(tmp_path / "logs")
     assert [line.split(": ")[1] for line in capsys.readouterr().out.splitlines()] == ["fine"] * 3
 
 
+def test_an_algorithm_without_a_limit_may_have_one_in_its_hyperparameters(scripts, tmp_path):
+    """A grid gives all its algorithms the same."""
+    sent(tmp_path / "logs", "trpo", config={"cost_limit": 2.0}, cost_limit=None)
+    assert scripts[2].check(tmp_path / "logs")
+
+
+def test_the_algorithm_is_told_by_the_folder(scripts, tmp_path, monkeypatch, capsys):
+    run = sent(tmp_path / "logs")
+    monkeypatch.chdir(run.parent)
+    assert scripts[2].check(Path(".")), capsys.readouterr().out
+    run.parent.rename(tmp_path / "logs" / "pcpo")
+    assert not scripts[2].check(tmp_path / "logs")
+    assert "cpo in result.json, pcpo by the folder's name" in capsys.readouterr().out
+
+
 def test_too_few_seeds_are_no_fault_but_told(scripts, tmp_path, monkeypatch, capsys):
-    board, _ = scripts
-    monkeypatch.setattr(board, "MILLION", 600)
+    checks = scripts[2]
     for seed in (0, 1, 1):
         sent(tmp_path / "logs", seed=seed)
-    assert board.check(tmp_path / "logs")
-    assert "cpo on Goal_Point_8Hazards: 2 of the 3 seeds from" in capsys.readouterr().out
+    assert checks.check(tmp_path / "logs")
+    assert "cpo on Goal_Point_8Hazards: 2 of the 3 seeds that" in capsys.readouterr().out
 
 
 def test_hashes_can_be_checked_after_packing(scripts, tmp_path, monkeypatch, capsys):
-    board, archives = scripts
-    monkeypatch.setattr(board, "MILLION", 600)
+    _, archives, checks = scripts
     sent(tmp_path / "logs")
     archives.pack(tmp_path / "logs", "sent_mine")
     with archives.unpacked("sent_mine") as found:
         (path,) = found.runs["path"]
-        assert board.check(Path(path)), capsys.readouterr().out
+        assert checks.check(Path(path)), capsys.readouterr().out
 
 
 def test_hyperparameters_of_a_file_elsewhere_are_refused(scripts, tmp_path, monkeypatch, capsys):
-    board, _ = scripts
-    monkeypatch.setattr(board, "MILLION", 600)
+    checks = scripts[2]
     sent(tmp_path / "logs", args={"conf_file": "omnisafe"})
-    assert board.check(tmp_path / "logs")
+    assert checks.check(tmp_path / "logs")
     sent(tmp_path / "logs", args={"conf_file": "mine.yml"})
-    assert not board.check(tmp_path / "logs")
+    assert not checks.check(tmp_path / "logs")
     assert "args.yml has conf_file: mine.yml" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("made", [True, False])
 def test_a_folder_without_runs(scripts, tmp_path, capsys, made):
-    board, _ = scripts
+    checks = scripts[2]
     folder = tmp_path / "logs"
     if made:
         folder.mkdir()
-    assert not board.check(folder)
+    assert not checks.check(folder)
     assert capsys.readouterr().out == f"no finished run in {folder}\n"
 
 
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--pack", "mine"], "--pack needs --check"),
-        (["--check", "{run}", "--pack", "mine"], "a folder per algorithm"),
-        (["--check", "{logs}/..", "--pack", "mine"], "a folder per algorithm"),
-        (["--check", "{logs}", "--pack", "there"], "docs/data has sent_there.tar.xz"),
-        (["--check", "{logs}", "--pack", "a/b"], "letters, digits and _"),
-        (["--check", "{logs}", "--pack", ""], "letters, digits and _"),
+        (["--pack", "mine"], "required: folder"),
+        (["{run}", "--pack", "mine"], "a folder per algorithm"),
+        (["{logs}/..", "--pack", "mine"], "a folder per algorithm"),
+        (["{logs}", "--pack", "there"], "docs/data has sent_there.tar.xz"),
+        (["{logs}", "--pack", "a/b"], "letters, digits and _"),
+        (["{logs}", "--pack", ""], "letters, digits and _"),
     ],
 )
 def test_bad_flags(scripts, tmp_path, monkeypatch, capsys, flags, message):
-    board, _ = scripts
+    checks = scripts[2]
     run = sent(tmp_path / "logs")
-    (board.DATA / "sent_there.tar.xz").touch()
+    (checks.DATA / "sent_there.tar.xz").touch()
     flags = [flag.format(run=run, logs=tmp_path / "logs") for flag in flags]
-    monkeypatch.setattr(sys, "argv", ["leaderboard.py", *flags])
+    monkeypatch.setattr(sys, "argv", ["leaderchecks.py", *flags])
     with pytest.raises(SystemExit):
-        board.main()
+        checks.main()
     assert message in capsys.readouterr().err
 
 
@@ -213,70 +229,72 @@ NAN = {key: [float("nan")] * 100 for key in ("returns", "costs", "lengths")}
         ("result.json", {"cost_limit": None}, "cost_limit is None in result.json, not 2"),
         ("result.json", {"n_timesteps": 500}, "500 steps of 600"),
         ("result.json", {"algo": "pcpo"}, "algo is cpo in args.yml, pcpo in result.json"),
+        ("result.json", {"n_timesteps": 800}, "800 steps of 600"),
+        ("result.json", {"final": None}, "no final"),
+        ("result.json", {"limit_on": "max"}, "on an episode's worst step"),
         ("result.json", {"cut": True}, "were cut"),
         ("result.json", {"commit": "abc-dirty"}, "not committed"),
         ("config.yml", {"cost_limit": 100.0}, "cost_limit is 100.0 in config.yml"),
         ("config.yml", {"cost_limit": "lin_25"}, "cost_limit is lin_25 in config.yml"),
+        ("config.yml", {"monitor_kwargs": {"cost_keys": []}}, "config.yml has monitor_kwargs"),
+        ("args.yml", {"eval_env_kwargs": {"hazards": {"num": 0}}}, "in another environment"),
         ("args.yml", {"env": "Goal_Ant_8Hazards-v0"}, "env is Goal_Ant_8Hazards-v0 in args.yml"),
     ],
 )
 def test_a_row_that_is_not_what_it_says(
     scripts, tmp_path, monkeypatch, capsys, file, changes, message
 ):
-    board, _ = scripts
-    monkeypatch.setattr(board, "MILLION", 600)
+    checks = scripts[2]
     run = sent(tmp_path / "logs")
-    assert board.check(run)
+    assert checks.check(run)
     (path,) = run.rglob(file)
     content = yaml.safe_load(path.read_text()) | changes  # YAML contains JSON
     path.write_text(json.dumps(content) if path.suffix == ".json" else yaml.safe_dump(content))
-    assert not board.check(run)
+    assert not checks.check(run)
     assert message in capsys.readouterr().out
 
 
 def test_seeds_have_episodes_of_their_own(scripts, tmp_path, monkeypatch, capsys):
-    board, _ = scripts
-    monkeypatch.setattr(board, "MILLION", 600)
+    checks = scripts[2]
     run = sent(tmp_path / "logs", seed=1)
     copy = sent(tmp_path / "logs", seed=2)
-    assert board.check(tmp_path / "logs")
+    assert checks.check(tmp_path / "logs")
     shutil.copy(run / "0.monitor.csv", copy)
     made = json.loads((copy / "result.json").read_text())
     curve = json.loads((run / "result.json").read_text())["curve"]
     (copy / "result.json").write_text(json.dumps(made | {"curve": curve}))
-    assert not board.check(tmp_path / "logs")
+    assert not checks.check(tmp_path / "logs")
     assert "the same episodes under several seeds" in capsys.readouterr().out
 
 
 def test_seeds_of_a_row_have_the_same_hyperparameters(scripts, tmp_path, monkeypatch, capsys):
-    board, _ = scripts
-    monkeypatch.setattr(board, "MILLION", 600)
+    checks = scripts[2]
     for seed in (1, 2):
         sent(tmp_path / "logs", seed=seed, config={"cost_limit": 2.0, "gamma": 0.9 + seed / 100})
-    assert not board.check(tmp_path / "logs")
-    assert "cpo on Goal_Point_8Hazards: the seeds have different" in capsys.readouterr().out
+    assert not checks.check(tmp_path / "logs")
+    assert "cpo on Goal_Point_8Hazards: the seeds differ in length or" in capsys.readouterr().out
 
 
 def test_an_empty_curve_is_a_fault(scripts, tmp_path, capsys):
-    board, _ = scripts
+    checks = scripts[2]
     (sent(tmp_path / "logs") / "0.monitor.csv").write_text("")
-    assert not board.check(tmp_path / "logs")
+    assert not checks.check(tmp_path / "logs")
     assert "0.monitor.csv" in capsys.readouterr().out
 
 
 def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
-    board, _ = scripts
+    checks = scripts[2]
     toy = (
         "--env Goal_Point_1Hazards --seed 0 --eval-freq -1 --verbose 0 --num-threads 1 -n 8000 "
         "-params n_envs:2 n_steps:2000 n_critic_updates:1 cost_limit:2"
     ).split()
     assert train.main([*toy, "-f", str(tmp_path / "logs")]) == 0
     (run,) = (tmp_path / "logs" / "cpo").iterdir()
-    assert not board.check(tmp_path / "logs")
+    assert not checks.check(tmp_path / "logs")
     said = capsys.readouterr().out
     assert "final greedy has {1} episodes, not 100" in said
     assert "n_timesteps is 8,000; allowed" in said
-    assert said.count(";") == 3 + said.count("not committed; ")
+    assert said.count(";") == 4 + said.count("not committed; ")
     result = json.loads((run / "result.json").read_text())
     (run / "result.json").write_text(
         json.dumps(result | {"curve": "0", "command": "x", "final": {}})
@@ -284,7 +302,7 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
     (run / "0.monitor.csv").write_text(
         "\n".join((run / "0.monitor.csv").read_text().splitlines()[:-3]) + "\n"
     )
-    assert not board.check(tmp_path / "logs")
+    assert not checks.check(tmp_path / "logs")
     said = capsys.readouterr().out
     for text in ("no final", "not the hash", "not that of args.yml", "5,000 steps of 8,000"):
         assert text in said
@@ -295,7 +313,7 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
         (file,) = run.glob(f"*/{name}")
         file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | changes))
     (run / "result.json").write_text(json.dumps(result | {"cost_limit": 100.0}))
-    assert not board.check(tmp_path / "logs")
+    assert not checks.check(tmp_path / "logs")
     said = capsys.readouterr().out
     for text in (
         "trained_agent: ppo.zip",
@@ -308,8 +326,9 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
 
 
 def test_the_page_is_made_of_its_logs(scripts, monkeypatch):
-    board, _ = scripts
+    board, *_ = scripts
     for module in scripts:
         monkeypatch.setattr(module, "DATA", ROOT / "docs" / "data")
-    rows, _ = board.read()
+    rows, runs = board.read()
     assert board.page(rows) == board.PAGE.read_text(), "run `python scripts/leaderboard.py`"
+    assert runs.to_csv(index=False) == board.ROWS.read_text(), "its rows are of other logs"

@@ -52,15 +52,17 @@ def test_a_row_that_went_another_way(run, tmp_path, capsys, monkeypatch):
     assert "did you mean 'table/cpo/A_1'" in capsys.readouterr().err
 
 
-def test_other_final_episodes_are_another_run(run, tmp_path, capsys):
+@pytest.mark.parametrize("split", ["stochastic", "greedy"])
+def test_other_final_episodes_are_another_run(run, tmp_path, capsys, split):
     """Every tier is made of them."""
     result = json.loads((run / "result.json").read_text())
-    costs = result["final"]["stochastic"]["costs"]
-    result["final"]["stochastic"]["costs"] = [cost + 2 for cost in costs]
+    costs = result["final"][split]["costs"]
+    result["final"][split]["costs"] = [cost + 2 for cost in costs]
     (run / "result.json").write_text(json.dumps(result))
     assert again(tmp_path, str(run), *PACKAGES) == 1
     out = capsys.readouterr().out
-    assert "cost of the final policy, sampled actions" in out and "(-2)" in out
+    assert "Not the same: the final episodes differ" in out and "training episodes" not in out
+    assert ("(-2)" in out) == (split == "stochastic")
 
 
 def test_logs_that_are_not_as_the_run_wrote_them(run, tmp_path, capsys):
@@ -71,9 +73,10 @@ def test_logs_that_are_not_as_the_run_wrote_them(run, tmp_path, capsys):
     assert again(tmp_path, str(run), *PACKAGES) == 0
     out = capsys.readouterr().out
     assert "is not as the run wrote it" in out and "The same" in out and ", which took 0:00:" in out
-    monitor.write_text("\n".join([lines[0], "r,l,t", "1.0,20,1"]) + "\n")
-    assert again(tmp_path, str(run), *PACKAGES) == 2
-    assert f"can't read {monitor}" in capsys.readouterr().err
+    for damaged in (["r,l,t", "1.0,20,1"], [lines[1], "9"]):
+        monitor.write_text("\n".join([lines[0], *damaged]) + "\n")
+        assert again(tmp_path, str(run), *PACKAGES) == 2
+        assert f"can't read {monitor}" in capsys.readouterr().err
     monitor.unlink()
     assert again(tmp_path, str(run), *PACKAGES) == 2
     assert f"can't read {monitor}: No such file" in capsys.readouterr().err

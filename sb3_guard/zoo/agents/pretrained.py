@@ -104,7 +104,7 @@ def load_pretrained(
 
 def listed() -> str:
     """A table of them with return and cost, and the environments that have none yet."""
-    header = ["environment", "algorithm", "limit", "trained at"]
+    header = ["environment", "algorithm", "steps", "limit", "trained at"]
     for actions in PLAYED.values():
         header += [f"return, {actions} actions", f"cost, {actions} actions"]
     rows, certified = [], set()
@@ -113,7 +113,7 @@ def listed() -> str:
         limit = result.get("cost_limit")
         limits = [limit, result.get("trained_at")]
         words = ["–" if value is None else f"{value:g}" for value in limits]
-        cells = [run.name, run.path.parent.name, *words]
+        cells = [run.name, run.path.parent.name, f"{result['n_timesteps']:,}", *words]
         for actions in PLAYED:
             played = result["played"][actions]
             cost = Estimate(*played["cost"])

@@ -1,0 +1,181 @@
+"""Check runs that are to be sent in for the leaderboard: ``python scripts/check_runs.py FOLDER``.
+
+What is wrong with the runs of the folder is printed, run by run. With ``--pack NAME`` the folder
+is packed as ``docs/data/sent_NAME.tar.xz`` if nothing is wrong.
+"""
+
+import argparse
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from archives import DATA, pack
+
+from sb3_guard.envs.suites import SUITES
+from sb3_guard.zoo.cli.names import PRESETS
+from sb3_guard.zoo.cli.usage import UsageError, one_line
+from sb3_guard.zoo.results.curves import read_episodes
+from sb3_guard.zoo.results.runs import find_runs, read_run
+from sb3_guard.zoo.results.splits import FINAL
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.folder import RunFolder
+from sb3_guard.zoo.run.training import FINAL_EPISODES
+
+MILLION = 1_000_000
+BUDGETS = (1, 2, 10)  # millions of steps
+SEEDS = 3  # from which on a certified row has a place
+ENVIRONMENTS = {env_id for suite in SUITES.values() for env_id in suite.scenarios}
+# Keys of config.yml that change the task, and flags in args.yml that change what is run.
+TASK = ("env_kwargs", "env_wrapper", "vec_env_wrapper", "callback", "cost_keys", "monitor_kwargs")
+FLAGS = {
+    "gym_packages": "modules that are not the package's",
+    "trained_agent": "an agent that was trained before",
+    "eval_env_kwargs": "final episodes in another environment",
+}
+
+
+def limit_of(env_id: str) -> float:
+    """The cost limit that the rows of an environment are judged by."""
+    return 25.0 if env_id.startswith("Safety") else 2.0
+
+
+def problems(path: Path) -> Iterator[str]:
+    """What is wrong with a run."""
+    run = RunFolder(path)
+    result, config = run.checked_result(), run.hyperparams()
+    for name in ("command", "curve", "final", "versions"):
+        if not result.get(name):
+            yield f"result.json has no {name}: train it with this version"
+    if result.get("curve") != run.curve_hash():
+        yield "curve in result.json is not the hash of 0.monitor.csv"
+    if "command" in result and result["command"] != run.flags().command():
+        yield "command in result.json is not that of args.yml"
+    if str(result.get("commit")).endswith("-dirty"):
+        yield "it was trained with changes that are not committed"
+    yield from _wrong_flags(run, result)
+    for name in TASK:
+        if config.get(name):
+            yield f"config.yml has {name}: {config[name]}, which changes the task"
+    yield from _wrong_limit(run, result, config)
+    yield from _wrong_length(run, result, config)
+    for split in FINAL:
+        played = (result.get("final") or {}).get(split, {})
+        values = [played.get(key, []) for key in ("returns", "costs", "lengths")]
+        counts = {len(numbers) for numbers in values}
+        if counts != {FINAL_EPISODES}:
+            yield f"final {split} has {counts} episodes, not {FINAL_EPISODES}"
+        elif not np.isfinite(np.array(values, float)).all():
+            yield f"final {split} has numbers that are not finite"
+
+
+def _wrong_flags(run: RunFolder, result: Mapping[str, Any]) -> Iterator[str]:
+    """Flags that are not those of the folder and the result, or that change what is run."""
+    args = run.args()
+    for name, named in (("algo", run.path.resolve().parent.name), ("env", run.name)):
+        if not named == args[name] == result.get(name, named):
+            there = f"{args[name]} in args.yml, {result.get(name)} in result.json"
+            yield f"{name} is {there}, {named} by the folder's name"
+    if run.name not in ENVIRONMENTS:
+        yield f"{run.name} is no environment of `sb3-guard list`"
+    for name, what in FLAGS.items():
+        if args.get(name):
+            yield f"args.yml has {name}: {args[name]}, {what}"
+    if args.get("conf_file") not in (None, *PRESETS):
+        allowed = ", ".join(PRESETS)
+        yield f"args.yml has conf_file: {args['conf_file']}, which others lack; allowed: {allowed}"
+
+
+def _wrong_limit(
+    run: RunFolder, result: Mapping[str, Any], config: Mapping[str, Any]
+) -> Iterator[str]:
+    """Another cost limit than the rows of the environment have, or one on something else."""
+    limit = limit_of(run.name)
+    if not getattr(algorithm(run.args()["algo"]), "constrained", False):
+        if result.get("cost_limit") is not None:
+            yield f"cost_limit is {result['cost_limit']} in result.json, but there is none"
+        return
+    for name, of in (("config.yml", config), ("result.json", result)):
+        if of.get("cost_limit") != limit:
+            yield f"cost_limit is {of.get('cost_limit')} in {name}, not {limit}"
+    if "limit_on" in result:
+        yield "its limit is on an episode's worst step, the page's on the sum"
+    if result.get("cut"):
+        yield "episodes of the training were cut"
+
+
+def _wrong_length(
+    run: RunFolder, result: Mapping[str, Any], config: Mapping[str, Any]
+) -> Iterator[str]:
+    """Lengths that the page does not have, or that differ from one another."""
+    asked, done = config["n_timesteps"], result["n_timesteps"]
+    if asked not in [MILLION * budget for budget in BUDGETS]:
+        yield f"n_timesteps is {asked:,}; allowed: {BUDGETS} million"
+    if not asked <= done <= 1.05 * asked:
+        yield f"result.json has {done:,} steps of {asked:,}"
+    episodes = read_episodes(run.path)
+    steps, longest = int(episodes["step"].iloc[-1]), int(episodes["step"].diff().max())
+    if not 0 <= done - steps <= config["n_envs"] * longest:
+        yield f"0.monitor.csv has {steps:,} steps of {done:,}"
+
+
+def problems_together(runs: pd.DataFrame) -> Iterator[str]:
+    """What is wrong with the seeds of a row, of runs that can be read."""
+    for (algo, suite), group in runs.groupby(["algo", "suite"]):
+        if group[["config", "steps"]].drop_duplicates().shape[0] > 1:
+            yield f"{algo} on {suite}: the seeds differ in length or in hyperparameters"
+    for _, group in runs.groupby("curve"):
+        if group["seed"].nunique() > 1:
+            yield f"the same episodes under several seeds: {', '.join(group['path'])}"
+
+
+def check(folder: Path) -> bool:
+    """
+    Print what is wrong with the runs of a folder.
+
+    :return: whether there are runs, and nothing is wrong
+    """
+    paths, runs, fine = find_runs(folder), [], True
+    for path in paths:
+        try:
+            found = [*problems(path)]
+            runs.append(read_run(path) | {"curve": RunFolder(path).curve_hash()})
+        except (UsageError, OSError, AttributeError, KeyError, ValueError, TypeError) as error:
+            found = [one_line(error)]
+        fine = fine and not found
+        print(f"{path}: {'; '.join(found) or 'fine'}")
+    if not paths:
+        print(f"no finished run in {folder}")
+    if runs:
+        table = pd.DataFrame(runs)
+        for problem in problems_together(table):
+            fine = False
+            print(problem)
+        for (algo, suite), seeds in table.groupby(["algo", "suite"])["seed"].nunique().items():
+            if seeds < SEEDS:
+                print(f"{algo} on {suite}: {seeds} of the {SEEDS} seeds that a place needs")
+    return fine and bool(paths)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="log folder, or a run")
+    parser.add_argument("--pack", metavar="NAME", help="pack the folder if nothing is wrong")
+    args = parser.parse_args()
+    if args.pack is not None:
+        if any(Path(path).parents[1] != args.folder for path in find_runs(args.folder)):
+            parser.error("--pack needs a log folder, which has a folder per algorithm")
+        if not re.fullmatch(r"\w+", args.pack):
+            parser.error(f"--pack takes letters, digits and _, not {args.pack!r}")
+        if (DATA / f"sent_{args.pack}.tar.xz").exists():
+            parser.error(f"docs/data has sent_{args.pack}.tar.xz; choose another name")
+    if not check(args.folder):
+        raise SystemExit(1)
+    if args.pack:
+        pack(args.folder, f"sent_{args.pack}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,10 +1,10 @@
 """Ship the best certified agents of the grand table: ``python scripts/pretrain.py logs/grand``.
 
 Looked at are all runs below the folder, as ``scripts/grand_table.py`` writes them. A run is
-certified if the 95 % interval of the mean cost of its final episodes with sampled actions ends at
-or below the limit; of an environment's certified runs that with the highest return is taken. It is
-played again, 300 episodes of other seeds with sampled actions and 300 with the most likely ones,
-and shipped if the former certify it, too; else the next one is tried. An agent that is shipped
+certified if the 95 % intervals of the mean cost of its final episodes, with sampled actions and
+with the most likely ones, end at or below the limit; of an environment's certified runs that with
+the highest return is taken. It is played again, 300 episodes of other seeds with each kind of
+actions, and shipped if these certify it, too; else the next one is tried. An agent that is shipped
 already is kept if its return is as high. Runs from a packed archive have no model: ``sb3-guard
 reproduce FOLDER`` trains them again, below ``logs/reproduced``. The package gets the run's
 settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get some
@@ -59,11 +59,12 @@ def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
     for run in map(RunFolder, find_runs(folder)):
         if run.name != env_id or (result := run.read_result()) is None:
             continue
-        final = result.get("final", {}).get("stochastic")
-        if final is None or result.get("cost_limit") not in (None, LIMITS[env_id]):
+        final = result.get("final", {})
+        if not final or result.get("cost_limit") not in (None, LIMITS[env_id]):
             continue
-        mean = float(np.mean(final["returns"]))
-        if mean > least and estimate(np.array(final["costs"])).high <= LIMITS[env_id]:
+        mean = float(np.mean(final["stochastic"]["returns"]))
+        ends = [estimate(np.array(episodes["costs"])).high for episodes in final.values()]
+        if mean > least and max(ends) <= LIMITS[env_id]:
             found.append((mean, str(run.path)))
     for mean, path in sorted(found, reverse=True):
         run = RunFolder(Path(path))
@@ -174,7 +175,10 @@ def main() -> None:
             got = played(run)
             costs = [got[actions]["cost"] for actions in PLAYED]
             print(run.path, got["stochastic"]["return"], *costs, sep="\n  ", flush=True)
-            if costs[0].high > limit or got["stochastic"]["return"].mean <= shipped:
+            if (
+                max(cost.high for cost in costs) > limit
+                or got["stochastic"]["return"].mean <= shipped
+            ):
                 continue
             for old in PRETRAINED.glob(f"*/{env_id}_1"):
                 if "cost_limit" in json.loads((old / "result.json").read_text()):

@@ -71,12 +71,18 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
         f"{tmp_path / 'grand' / 'grand_table_guard'} -params cost_limit:2 n_envs:2 n_steps:1000 "
         "n_critic_updates:1 normalize:True"
     ).split()
-    for algo, cost, got in (("cpo", 1.0, 5.0), ("pcpo", 1.5, 6.0), ("trpo_ipo", 3.0, 7.0)):
+    for algo, sampled, greedy, got in (
+        ("cpo", 1.0, 1.0, 5.0), ("pcpo", 1.5, 1.5, 6.0), ("trpo_ipo", 3.0, 1.0, 7.0),
+        ("trpo_lag", 1.0, 3.0, 7.0),
+    ):  # fmt: skip
         assert train.main(["--algo", algo, "--seed", "0", *toy]) == 0
         file = next((tmp_path / "grand").glob(f"*/{algo}/*/result.json"))
         result = json.loads(file.read_text())
-        final = {"returns": [got] * 4, "costs": [cost] * 4, "lengths": [9] * 4}
-        file.write_text(json.dumps(result | {"final": {"stochastic": final}}))
+        final = {
+            split: {"returns": [got] * 4, "costs": [cost] * 4, "lengths": [9] * 4}
+            for split, cost in (("stochastic", sampled), ("greedy", greedy))
+        }
+        file.write_text(json.dumps(result | {"final": final}))
     there = tmp_path / "pretrained"
     before = there / "cpo" / "Goal_Point_8Hazards-v0_1"  # at a limit of 5
     shutil.copytree(pretrained.PRETRAINED / "cpo" / before.name, before)
@@ -119,7 +125,8 @@ def test_a_shipped_agent_keeps_its_limit(run, noise, tmp_path):
     assert enjoy.main(["--pretrained", *which, *quiet]) == 0
     limit = run.checked_result().get("cost_limit", np.inf)
     cost = json.loads(file.read_text())["cost"]
-    assert cost["mean"] > 1 and cost["high"] <= limit
+    # The most likely actions may cost nothing.
+    assert (cost["mean"] > 1 or not noise) and cost["high"] <= limit
 
 
 def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):

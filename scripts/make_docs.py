@@ -310,7 +310,8 @@ def command_line() -> str:
     """The page of the commands and their flags."""
     parts = [
         "# Command line",
-        "`sb3-guard <command>` and `python -m sb3_guard.<command>` are the same. `--help` prints "
+        "`sb3-guard <command>` and `python -m sb3_guard.<command>` are the same (`export`: "
+        "`sb3_guard.export_agent`). `--help` prints "
         "these tables, and a misspelled flag or value is an error that names the nearest one. "
         "Flags that take KEY:VALUE take Python literals: `-params n_envs:10 normalize:True`.",
         table(

@@ -31,8 +31,8 @@ MEASURES = {
 class Flags(Command):
     """
     Train a run of the published table, or of a folder, again from its command and seed, and say
-    whether it went the same way. The exit status is 0 if all training episodes are the same, and
-    the return and cost of the final policy.
+    whether it went the same way. The exit status is 0 if all training and final episodes are the
+    same.
 
     :param run: row of the leaderboard, e.g. grand_table/cpo/SafetyPointGoal1-v0_1, or a run folder
     :param log_folder: log folder of the new run (default: logs/reproduced)
@@ -145,9 +145,8 @@ def reproduce(flags: Flags) -> int:
         return status
     result = RunFolder(path_of(run)).checked_result()
     lines = differences(row, result)
-    if not lines:
-        print(f"The same: all training episodes agree (curve {result['curve'][:12]}…).")
-    print(*lines, sep="\n", end="\n" if lines else "")
+    same = f"The same: all training episodes agree (curve {result['curve'][:12]}…)."
+    print("\n".join(lines) or same)
     if (row.get("commit") or None) != result["commit"]:
         print(
             f"The run there is of commit {row.get('commit') or 'unknown'}, the one here of "

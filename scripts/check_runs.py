@@ -64,9 +64,10 @@ def problems(path: Path) -> Iterator[str]:
     for split in FINAL:
         played = (result.get("final") or {}).get(split, {})
         values = [played.get(key, []) for key in ("returns", "costs", "lengths")]
-        counts = {len(numbers) for numbers in values}
-        if counts != {FINAL_EPISODES}:
-            yield f"final {split} has {counts} episodes, not {FINAL_EPISODES}"
+        counts = sorted({len(numbers) for numbers in values})
+        if counts != [FINAL_EPISODES]:
+            there = " or ".join(map(str, counts))
+            yield f"final {split} has {there} episodes, not {FINAL_EPISODES}"
         elif not np.isfinite(np.array(values, float)).all():
             yield f"final {split} has numbers that are not finite"
 
@@ -112,7 +113,7 @@ def _wrong_length(
     """Lengths that the page does not have, or that differ from one another."""
     asked, done = config["n_timesteps"], result["n_timesteps"]
     if asked not in [MILLION * budget for budget in BUDGETS]:
-        yield f"n_timesteps is {asked:,}; allowed: {BUDGETS} million"
+        yield f"n_timesteps is {asked:,}; allowed: {', '.join(map(str, BUDGETS))} million"
     if not asked <= done <= 1.05 * asked:
         yield f"result.json has {done:,} steps of {asked:,}"
     episodes = read_episodes(run.path)

@@ -225,7 +225,7 @@ NAN = {key: [float("nan")] * 100 for key in ("returns", "costs", "lengths")}
     ("file", "changes", "message"),
     [
         ("result.json", {"final": {"stochastic": NAN, "greedy": NAN}}, "not finite"),
-        ("result.json", {"final": {"stochastic": NAN}}, "final greedy has {0} episodes"),
+        ("result.json", {"final": {"stochastic": NAN}}, "final greedy has 0 episodes"),
         ("result.json", {"cost_limit": None}, "cost_limit is None in result.json, not 2"),
         ("result.json", {"n_timesteps": 500}, "500 steps of 600"),
         ("result.json", {"algo": "pcpo"}, "algo is cpo in args.yml, pcpo in result.json"),
@@ -292,7 +292,7 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
     (run,) = (tmp_path / "logs" / "cpo").iterdir()
     assert not checks.check(tmp_path / "logs")
     said = capsys.readouterr().out
-    assert "final greedy has {1} episodes, not 100" in said
+    assert "final greedy has 1 episodes, not 100" in said
     assert "n_timesteps is 8,000; allowed" in said
     assert said.count(";") == 4 + said.count("not committed; ")
     result = json.loads((run / "result.json").read_text())

@@ -9,6 +9,9 @@ from gymnasium.envs.registration import find_highest_version
 #: of our environments, as Gymnasium's registry has it
 ENTRY_POINT = "sb3_guard.envs.gym_env:GuardEnv"
 
+#: for messages that say what is allowed
+OWN = "; to use your own, import the module that registers it (commands: --gym-packages MODULE)"
+
 
 class UnknownId(ValueError):
     """An id that names no environment."""

@@ -19,7 +19,7 @@ import yaml
 from sb3_guard.envs import GuardVectorEnv, env_spec, register_robot
 from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.registry import ROBOTS
-from sb3_guard.envs.rendering import CAMERAS, RenderingError
+from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.envs.robots.file_robot import FileRobot
 from sb3_guard.envs.robots.model_file import GAINS, NoActuators
 from sb3_guard.zoo.cli.flags import Command, command, flag
@@ -135,7 +135,8 @@ class Flags(Command):
     :param output: PNG file for the picture (default: <env>.png)
     :param mjcf: MJCF file for the model: robot and objects before an episode places them; zones
         without bodies, such as hazards, are not in it
-    :param camera: camera of the picture (default: fixed, or track where the robot runs far away)
+    :param camera: fixed, track, top, or a camera of the robot's file (default: fixed, or track
+        where the robot runs far away)
     :param window: open MuJoCo's viewer with random actions instead: Space pauses, Tab opens menus,
         F shows contact forces
     :param seed: random seed of the episode in the picture (default: 0)
@@ -155,7 +156,7 @@ class Flags(Command):
     robot_kwargs: dict[str, Any] | None = flag()
     output: str | None = flag("-o", metavar="FILE.png")
     mjcf: str | None = flag(metavar="FILE")
-    camera: str | None = flag(choices=CAMERAS)
+    camera: str | None = flag(metavar="NAME")
     window: bool = flag(default=False)
     seed: int = flag(default=0)
     gym_packages: list[str] = flag(default=[], metavar="MODULE")

@@ -1,6 +1,7 @@
 """How good and how safe a policy is: returns and costs of episodes, with their uncertainty."""
 
 import copy
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,6 +24,8 @@ from stable_baselines3.common.vec_env import (
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.monitor import total_cost
 from sb3_guard.costs import RESAMPLES, EpisodeCost, EpisodeCosts, interval, read_costs, verdict
+
+LONG = 20_000  # steps without an end of an episode that evaluate_policy warns of
 
 
 class Estimate(NamedTuple):
@@ -330,6 +333,14 @@ class _Tally:
             over[i] = self._is_over(infos[i])
         for cost in self.costs.step(np.hstack([costs, totals]), over):
             self._end(cost, infos[cost.row])
+        if not self.ended and self.costs.lengths.max() == LONG:
+            warnings.warn(
+                f"no episode has ended in {LONG:,} steps; if the environment ends none itself, "
+                "give it a limit: gymnasium.register(..., max_episode_steps=1000), or "
+                "gymnasium.wrappers.TimeLimit(env, 1000)",
+                UserWarning,
+                stacklevel=3,
+            )
 
     def _is_over(self, info: dict[str, Any]) -> bool:
         """Whether an episode that a step ended has come to its true end.

@@ -18,7 +18,7 @@ from gymnasium.error import DependencyNotInstalled
 
 from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
 from sb3_guard.common.native import GuardVecEnv
-from sb3_guard.ids import ENTRY_POINT, UnknownId, with_version
+from sb3_guard.ids import ENTRY_POINT, OWN, UnknownId, with_version
 from sb3_guard.spelling import nearest
 
 if TYPE_CHECKING:
@@ -103,10 +103,12 @@ def _ours(env_id: str | Path | Mapping[str, Any] | Scenario) -> Source:
     except UnknownId:
         near = nearest(str(env_id), [*envs.env_ids(), *gymnasium.registry])
         hint = "" if near is None else f"did you mean {near!r}? "
+        if str(env_id).endswith(".xml"):
+            hint = f"register the robot with sb3_guard.register_robot(NAME, xml={env_id!r}); "
         raise UnknownId(
             f"unknown environment {env_id!r}: {hint}allowed: ids of the form "
             "Task_Robot_NConstraint-v0, such as 'Goal_Point_8Hazards-v0', and ids registered with "
-            "Gymnasium"
+            f"Gymnasium{OWN}"
         ) from None
 
     def batch(n_envs: int, **kwargs: Any) -> VecEnv:

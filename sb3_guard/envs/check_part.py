@@ -118,8 +118,9 @@ def _watch(engine: Engine, alone: bool) -> str | None:
         if exploded(engine, outcome):
             return (
                 f"the robot, {how}, explodes within {seconds}: reduce its timestep (now "
-                f"{engine.model.opt.timestep:g} s), or the stiffness of its joints and the gears "
-                "and gains of its actuators, or move apart geoms that overlap"
+                f"{engine.model.opt.timestep:g} s), or the stiffness of its joints and the gears, "
+                "gains and control ranges of its actuators (of servos in rad, also where a file "
+                "has degrees), or move apart geoms that overlap"
             )
         if alone and engine.robot.position[0, 2] < -0.1:
             return (

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 from gymnasium import spaces
 
@@ -15,6 +16,7 @@ from sb3_guard.envs.extras import EYE
 from sb3_guard.envs.outcome import Outcome
 from sb3_guard.envs.parameters import check_count
 from sb3_guard.envs.rendering import CAMERAS, Renderer
+from sb3_guard.envs.robots.robot import PREFIX
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.types import Array
 from sb3_guard.spelling import did_you_mean
@@ -73,6 +75,18 @@ def action_space(engine: Engine) -> spaces.Box:
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
+def cameras(model: mujoco.MjModel) -> dict[str, str]:
+    """The cameras that can be chosen: what the renderer calls them, by the names that users give.
+
+    Those of a robot's file go without prefix, and after others of the same name.
+    """
+    names = [name for i in range(model.ncam) if (name := model.camera(i).name)]
+    chosen = {name: name for name in CAMERAS}
+    for name in sorted(names, key=lambda name: name.startswith(PREFIX)):
+        chosen.setdefault(name.removeprefix(PREFIX), name)
+    return chosen
+
+
 class Simulated:
     """What the lone environment and the vector environment share: an engine and ways to see it.
 
@@ -108,8 +122,6 @@ class Simulated:
         if render_mode is not None and render_mode not in modes:
             hint = did_you_mean(render_mode, modes)
             raise ValueError(f"unknown render_mode {render_mode!r}: {hint}")
-        if camera is not None and camera not in CAMERAS:
-            raise ValueError(f"unknown camera {camera!r}: {did_you_mean(camera, CAMERAS)}")
         if not isinstance(flatten, bool):
             raise ValueError(f"flatten = {flatten!r} must be true or false")
         for name, value in (("width", width), ("height", height)):
@@ -118,7 +130,10 @@ class Simulated:
         self.render_mode, self.flatten = render_mode, flatten
         self._num_threads = num_threads
         self.engine = self.scenario.build(num_envs, num_threads)
-        self._window = (width, height, camera or self.engine.task.camera)
+        names = cameras(self.engine.model)
+        if camera is not None and camera not in names:
+            raise ValueError(f"unknown camera {camera!r}: {did_you_mean(camera, names)}")
+        self._window = (width, height, names[camera or self.engine.task.camera])
         self.metadata = {**self.metadata, "render_fps": round(1 / self.engine.control_step)}
 
     @property
@@ -240,8 +255,8 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
     :param flatten: False for a Dict observation with the components by name
     :param width: width of rendered frames, pixels
     :param height: height of rendered frames, pixels
-    :param camera: ``"fixed"``, ``"track"`` or ``"top"``; None: the task's, which is fixed, or
-        track where the robot runs far away
+    :param camera: ``"fixed"``, ``"track"``, ``"top"``, or a camera of the robot's file; None: the
+        task's, which is fixed, or track where the robot runs far away
     :param params: parameters of parts to change, such as ``hazards={"num": 4}``
     :raises ValueError: unknown names or bad values
     """

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_guard.algorithms import CPO, TRPOSL
 from sb3_guard.common.evaluation import (
+    LONG,
     Evaluation,
     estimate,
     evaluate_policy,
@@ -86,6 +87,13 @@ def test_stops_after_max_steps():
     result = evaluate_policy(Idle(), fixed(2, 5), n_eval_episodes=100, max_steps=4)
     assert result.lengths.tolist() == [2, 2]
     assert result.unfinished[:, [0, 2]].tolist() == [[4.0, 4.0]]  # return and steps of the other
+
+
+def test_episodes_without_an_end_are_told(recwarn):
+    evaluate_policy(Idle(), Fixed(LONG - 1), n_eval_episodes=1)
+    assert not recwarn
+    with pytest.warns(UserWarning, match="no episode has ended in 20,000 steps.*TimeLimit"):
+        evaluate_policy(Idle(), Fixed(-1), n_eval_episodes=1, max_steps=LONG)
 
 
 def test_callbacks():

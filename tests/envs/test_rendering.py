@@ -9,11 +9,20 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from robot_models import DOG
 from typed import require_rendering
+from worlds import own_parts
 
 import sb3_guard
 from sb3_guard import make_vec_env
-from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_ids, registry, rendering
+from sb3_guard.envs import (
+    GuardEnv,
+    GuardVectorEnv,
+    env_ids,
+    register_robot,
+    registry,
+    rendering,
+)
 from sb3_guard.envs import scene as scene_module
 from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.engine import Engine
@@ -198,6 +207,23 @@ def test_no_backend_is_a_clear_error(monkeypatch):
     monkeypatch.setattr(rendering.sys, "executable", "/bin/false")
     with pytest.raises(rendering.RenderingError, match=r"tried osmesa .*install EGL"):
         rendering.gl_backend.__wrapped__()
+
+
+def test_cameras_of_a_robots_file_are_chosen_by_their_names(tmp_path):
+    file = tmp_path / "dog.xml"
+    camera = '<camera name="nose" pos="0.4 0 0" xyaxes="0 -1 0 0 0 1"/><site name="imu"/>'
+    file.write_text(DOG.format(keys="").replace('<site name="imu"/>', camera))
+    with own_parts():
+        register_robot("Dog", xml=file, root="trunk", actuators={"kp": 40, "kd": 2})
+        frames = []
+        for camera in ("nose", "fixed"):
+            env = GuardEnv("Goal_Dog_2Hazards", render_mode="rgb_array", camera=camera)
+            env.reset(seed=0)
+            frames.append(env.render())
+            env.close()
+        assert not np.array_equal(*frames)
+        with pytest.raises(ValueError, match="camera 'noes': did you mean 'nose'"):
+            GuardEnv("Goal_Dog_2Hazards", render_mode="rgb_array", camera="noes")
 
 
 def test_the_robots_own_camera_can_be_observed():

@@ -39,7 +39,9 @@ TRAIN = [
     (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),
     (["--env", "Goal_Point_8Hazzards-v0"], ["'Hazzards'", "'Hazards'"]),
     (["--env", "CartPole-v99"], ["CartPole-v99"]),
-    (["--env", "Nonsense"], ["'Nonsense'"]),
+    (["--env", "Nonsense"], ["'Nonsense'", "--gym-packages"]),
+    (["--env", "Goal_Rover_8Hazards"], ["unknown robot 'Rover'", "--gym-packages"]),
+    (["--env", "go1.xml"], ["register_robot(NAME, xml='go1.xml')"]),
     (["--env", "no_such_module:Env-v0"], ["no_such_module"]),
     (["--gym-packages", "no_such_package"], ["--gym-packages", "'no_such_package'"]),
     (["--env-kwargs", "hazard:{}"], ["'hazard'", "hazards"]),
@@ -89,7 +91,8 @@ TRAIN = [
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
-    (["--gym-packages", "../x"], ["--gym-packages: can't import '../x'"]),
+    (["--gym-packages", "../x"], ["--gym-packages '../x' is a path: name the module, x"]),
+    (["--gym-packages", "robots.py"], ["'robots.py' is a path: name the module, robots,"]),
     (["--gym-packages", ""], ["--gym-packages: can't import ''"]),
     (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
@@ -129,6 +132,7 @@ ENJOY = [
     (["--n-episodes", "1", "-n", "5"], ["not allowed with"]),
     (["--seed", "-1"], ["--seed: '-1'"]),
     (["--load-bets"], ["unknown argument --load-bets", "--load-best"]),
+    ([".."], ["unknown argument ..; did you mean --folder ..?"]),
 ]
 
 

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import re
+import shutil
 
 import onnxruntime
 import pytest
@@ -23,7 +25,8 @@ def logs(tmp_path_factory):
 def test_an_exported_run_says_what_it_was_trained_at(logs, tmp_path, capsys):
     path = tmp_path / "robot" / "policy.onnx"
     assert cli.main(["export", *WHICH, "-f", str(logs), "--load-best", "-o", str(path)]) == 0
-    assert str(path) in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert str(path) in out and re.search(r"cost .* limit 2: (kept|exceeded|undecided)", out)
     session = onnxruntime.InferenceSession(path)
     assert [(each.name, each.shape) for each in session.get_inputs()] == [
         ("observation", ["batch", 4])
@@ -40,6 +43,25 @@ def test_an_exported_run_says_what_it_was_trained_at(logs, tmp_path, capsys):
     )
     assert contract["costs"] == [{"name": "cost", "limit": 2.0, "per": "episode"}]
     assert contract["inputs"][0]["normalized"] is True
+
+
+def test_the_folder_of_a_run_says_which_it_is(logs, tmp_path, capsys):
+    run = find_run(logs, "cpo", "CostPoint-v0")
+    here = [*WHICH[2:], "-f", str(run.path), "-o", str(tmp_path / "policy.onnx")]
+    assert export_agent.main(here) == 0
+    assert "warning" not in capsys.readouterr().err
+    trained_at = json.loads((tmp_path / "contract.json").read_text())["trained"]
+    assert (trained_at["algo"], trained_at["env"]) == ("cpo", "CostPoint-v0")
+    refused(export_agent.main, [*here, "--algo", "cpo"], capsys, "is a run: leave out --algo")
+
+
+def test_the_agent_of_a_training_that_has_not_ended_is_told(logs, tmp_path, capsys):
+    shutil.copytree(logs, tmp_path / "logs")
+    run = find_run(tmp_path / "logs", "cpo", "CostPoint-v0")
+    run.model.unlink()
+    here = [*WHICH, "-f", str(tmp_path / "logs"), "-o", str(tmp_path / "policy.onnx")]
+    assert export_agent.main(here) == 0
+    assert "warning: the training has not ended" in capsys.readouterr().err
 
 
 def test_what_can_not_be_exported_is_said_before_it_is_played(logs, tmp_path, capsys):

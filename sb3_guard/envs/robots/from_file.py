@@ -101,6 +101,7 @@ def robot_class(name: str, path: Path, stated: Mapping[str, Any]) -> type[FileRo
     size = radius(model, data, file.root)
     worked_out: dict[str, Any] = {
         "asset": "",
+        "__doc__": f"The robot of {path.name}.",
         "path": classmethod(lambda cls: path),
         "file": file,
         "lidar_bodies": (body,),

@@ -1,6 +1,7 @@
 """A trained agent of a run folder as an ONNX file, with what it was trained at and measured."""
 
 import hashlib
+import sys
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.deployment import onnx_file
 from sb3_guard.zoo.agents.flags import AgentFlags, ExportFlags
-from sb3_guard.zoo.agents.playback import BATCH, Agent, open_agent, summary
+from sb3_guard.zoo.agents.playback import BATCH, Agent, means, open_agent, summary
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.folder import require_writable
 
@@ -26,14 +27,16 @@ def export(flags: ExportFlags) -> int:
             onnx_file.check(agent.model, flags.stochastic)
         how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
         episodes = flags.n_episodes or max(agent.env.num_envs, 5)
-        measured = summary(evaluate_policy(agent.model, agent.env, episodes, **how))
-        contract = write(agent, flags, path, measured)
-    print(
-        f"{path}: {', '.join(contract['file']['operators'])}\n"
-        f"{path.with_name(onnx_file.CONTRACT)}: "
-        f"return {measured['return']['mean']:.2f}, cost {measured['cost']['mean']:.2f} "
-        f"in {measured['episodes']} episodes"
-    )
+        evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
+        contract = write(agent, flags, path, summary(evaluation))
+    print(f"{path}: {', '.join(contract['file']['operators'])}")
+    print(f"{path.with_name(onnx_file.CONTRACT)}: {means(evaluation)}")
+    if agent.path == agent.run.checkpoint:
+        print(
+            f"warning: the training has not ended: this is its agent after "
+            f"{agent.model.num_timesteps:,} steps",
+            file=sys.stderr,
+        )
     return 0
 
 

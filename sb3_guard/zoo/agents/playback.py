@@ -119,6 +119,12 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     if flags.pretrained:
         run = find_pretrained(flags.env, flags.algo if "algo" in flags.given else None)
         path, flags.algo = weights(run), run.path.parent.name
+    elif is_run(Path(flags.folder)):
+        if flags.given & {"algo", "env", "exp_id"}:
+            raise UsageError(f"{flags.folder} is a run: leave out --algo, --env and --exp-id")
+        run = RunFolder(Path(flags.folder))
+        flags.algo, flags.env = run.args()["algo"], run.args()["env"]
+        path, statistics = find_model(run, flags)
     else:
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
         path, statistics = find_model(run, flags)

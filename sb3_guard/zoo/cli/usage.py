@@ -86,6 +86,12 @@ def import_packages(names: Sequence[str]) -> None:
     if names and os.getcwd() not in sys.path:  # as with python -m, also for the script sb3-guard
         sys.path.insert(0, os.getcwd())
     for name in names:
+        path = Path(name)
+        if path.suffix == ".py" or path.name != name:
+            raise UsageError(
+                f"--gym-packages {name!r} is a path: name the module, {path.stem}, and call the "
+                "command in its folder"
+            )
         errors = ImportError, TypeError, ValueError  # the last two: it is no module's name
         with explained(f"--gym-packages: can't import {name!r}", *errors):
             importlib.import_module(name)

@@ -5,7 +5,6 @@ import sys
 
 from sb3_guard.zoo.agents.flags import EnjoyFlags as Flags
 from sb3_guard.zoo.cli.flags import command
-from sb3_guard.zoo.cli.usage import UsageError
 
 
 def _has_display() -> bool:
@@ -16,12 +15,7 @@ def _has_display() -> bool:
 
 def enjoy(flags: Flags) -> int:
     """Play an agent, in a window, for a video, or unseen."""
-    if flags.pretrained and flags.given & {"folder", "exp_id"}:
-        raise UsageError(
-            "--pretrained plays an agent that comes with the package: leave out --folder and "
-            "--exp-id, or leave out --pretrained to play a run of your own"
-        )
-    if flags.pretrained and not flags.given & {"env", "algo"}:
+    if flags.pretrained and not flags.given & {"env", "algo", "folder", "exp_id"}:
         from sb3_guard.zoo.agents.pretrained import listed
 
         print(f"{listed()}\n\nPlay one: sb3-guard enjoy --pretrained --env {flags.env}")

@@ -9,8 +9,8 @@ from gymnasium.envs.registration import find_highest_version
 #: of our environments, as Gymnasium's registry has it
 ENTRY_POINT = "sb3_guard.envs.gym_env:GuardEnv"
 
-#: for messages that say what is allowed
-OWN = "; to use your own, import the module that registers it (commands: --gym-packages MODULE)"
+#: Ends messages about unknown names.
+IMPORT_FIRST = "; parts or environments of your own need their module: --gym-packages MODULE"
 
 
 class UnknownId(ValueError):

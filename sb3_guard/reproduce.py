@@ -52,22 +52,23 @@ class Flags(Command):
 
 def measures(result: Mapping[str, Any]) -> dict[str, float]:
     """By key of :data:`MEASURES` the numbers of a result; older ones have no final episodes."""
-    found = {n: nan if result[n] is None else result[n] for n in ("return", "cost")}
+    values = {n: nan if result[n] is None else result[n] for n in ("return", "cost")}
     if played := (result.get("final") or {}).get("stochastic"):
-        found |= {f"final_{name}": fmean(played[f"{name}s"]) for name in ("return", "cost")}
-    return found
+        values |= {f"final_{name}": fmean(played[f"{name}s"]) for name in ("return", "cost")}
+    return values
 
 
 def final_hash(result: Mapping[str, Any]) -> str | None:
     """SHA-256 of the final episodes, from which tiers are made; older results have none."""
-    final = result.get("final")
+    final = result.get("final") or None
     return final and hashlib.sha256(json.dumps(final, sort_keys=True).encode()).hexdigest()
 
 
 def published(name: str) -> dict[str, Any]:
     """
-    What is known of a run: ``command``, ``curve``, ``final``, ``commit``, ``seconds`` and
-    :func:`measures`.
+    ``command``, ``curve``, ``final``, ``commit``, ``seconds`` and :func:`measures` of a run.
+
+    Runs of older versions have neither ``curve`` nor ``final``.
 
     :param name: of a row of the package's table, or of a run folder
     :raises UsageError: there is neither, or the folder is damaged
@@ -81,13 +82,15 @@ def published(name: str) -> dict[str, Any]:
         result = run.checked_result()
         with explained(f"can't read {run.monitor}", OSError, KeyError, TypeError, ValueError):
             curve = run.curve_hash()
-        if result.setdefault("curve", curve) != curve:
+        if result.get("curve") not in (None, curve):
             print(
-                f"{run.monitor} is not as the run wrote it (packed logs are rounded); "
-                "compared is the hash in result.json."
+                f"{run.monitor} is not as the run wrote it (packed logs are rounded): the hash in "
+                "result.json is compared."
             )
-        made = {"command": run.flags().command(), "final": final_hash(result)}
-        return result | made | measures(result)
+        with explained(f"{run.result} is damaged"):
+            seconds = float(result.get("seconds") or 0)
+            made = {"final": final_hash(result), "seconds": seconds, **measures(result)}
+        return result | made | {"command": run.flags().command()}
     with ROWS.open(newline="", encoding="utf-8") as file:
         rows = {row["row"]: row for row in csv.DictReader(file)}
     if name not in rows:
@@ -101,19 +104,23 @@ def published(name: str) -> dict[str, Any]:
 
 def differences(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
     """How a run that was trained again differs from the published one, in lines; none: nothing."""
-    lines = []
-    for name, new, what in (
-        ("curve", result["curve"], "training"),
-        ("final", final_hash(result), "final"),
-    ):
-        if row.get(name) and row[name] != new:
-            lines.append(f"Not the same: the {what} episodes differ.")
-    if not lines:
-        return []
-    for name, new in measures(result).items():
-        was = float(row.get(name) or "nan")
-        lines.append(f"  {MEASURES[name]}: {was:.6g} there, {new:.6g} here ({new - was:+.6g})")
-    return lines
+    hashes = {"training": ("curve", result["curve"]), "final": ("final", final_hash(result))}
+    lines = [
+        f"Not the same: the {kind} episodes differ."
+        for kind, (name, new) in hashes.items()
+        if row.get(name) and row[name] != new
+    ]
+    values = [
+        (name, float(row[name]), new)
+        for name, new in measures(result).items()
+        if row.get(name) not in (None, "")
+    ]
+    if not row.get("curve") and any(before != new for _, before, new in values):
+        lines.append("Not the same: returns or costs differ.")
+    return lines and lines + [
+        f"  {MEASURES[name]}: before {before:.6g}, now {new:.6g} ({new - before:+.6g})"
+        for name, before, new in values
+    ]
 
 
 def reproduce(flags: Flags) -> int:
@@ -135,8 +142,10 @@ def reproduce(flags: Flags) -> int:
         raise UsageError(f"the run has its hyperparameters from a program, {run.conf_file}")
     run, values = prepare(run)
     seconds = row.get("seconds")
-    took = f", which took {timedelta(seconds=round(float(seconds)))} there" if seconds else ""
+    took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""
     steps = f"{values['n_timesteps']:,} steps{took}"
+    if path_of(run).resolve() == Path(flags.run).resolve():
+        raise UsageError(f"the new run would be in {flags.run} itself: choose another --log-folder")
     print(f"{row['command']}\n{steps}, in {path_of(run)} …", flush=True)
     if standing(run, values) == "done":
         print("This run was trained already; to train it again, remove its folder or change -f.")
@@ -146,10 +155,12 @@ def reproduce(flags: Flags) -> int:
     result = RunFolder(path_of(run)).checked_result()
     lines = differences(row, result)
     same = f"The same: all training episodes agree (curve {result['curve'][:12]}…)."
+    if not row.get("curve"):
+        same = "The same return and cost; an older version kept no hash of the episodes."
     print("\n".join(lines) or same)
     if (row.get("commit") or None) != result["commit"]:
         print(
-            f"The run there is of commit {row.get('commit') or 'unknown'}, the one here of "
+            f"The run before is of commit {row.get('commit') or 'unknown'}, the new one of "
             f"{result['commit'] or 'an installed package'}."
         )
     return int(bool(lines))

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
+import yaml
+
 from sb3_guard.zoo.results.runs import Results, read_results
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -51,6 +53,8 @@ def pack(folder: Path, name: str, by_environment: bool = False) -> None:
         done.setdefault(DATA / f"{file}.tar.xz", []).append(run)
     for file, runs in done.items():
         file.parent.mkdir(exist_ok=True)
+        if lost := _runs_in(file) - {f"{name}/{run.relative_to(folder)}" for run in runs}:
+            raise SystemExit(f"{file} has runs that {folder} lacks: unpack it there; {min(lost)}")
         with tarfile.open(file, "w:xz", preset=9) as archive:
             for path in (path for run in runs for path in sorted(run.rglob("*"))):
                 if path.name in LOGS:
@@ -58,6 +62,20 @@ def pack(folder: Path, name: str, by_environment: bool = False) -> None:
                     info = tarfile.TarInfo(str(Path(name) / path.relative_to(folder)))
                     info.size = len(text)
                     archive.addfile(info, BytesIO(text))
+
+
+def _runs_in(file: Path) -> set[str]:
+    """Run folders in an archive, as they are named there; none if it does not exist yet."""
+    if not file.exists():
+        return set()
+    with tarfile.open(file) as archive:
+        return {str(Path(path).parent) for path in archive.getnames() if path.endswith(".json")}
+
+
+def with_log_folder(path: Path, folder: str) -> bytes:
+    """The flags of a run, ``args.yml``, with another log folder than that of this machine."""
+    flags = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return yaml.safe_dump({**flags, "log_folder": folder}).encode()
 
 
 def _packed(path: Path, name: str) -> bytes:
@@ -68,5 +86,5 @@ def _packed(path: Path, name: str) -> bytes:
     if path.suffix == ".csv" and not exact:
         text = FRACTION.sub(lambda digits: b"%.4g" % float(digits[0]), text)
     if path.name == "args.yml":
-        text = re.sub(rb"(?m)^log_folder: .*", f"log_folder: logs/{name}".encode(), text)
+        text = with_log_folder(path, f"logs/{name}")
     return text

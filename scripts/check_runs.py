@@ -1,24 +1,26 @@
 """Check runs that are to be sent in for the leaderboard: ``python scripts/check_runs.py FOLDER``.
 
-What is wrong with the runs of the folder is printed, run by run. With ``--pack NAME`` the folder
-is packed as ``docs/data/sent_NAME.tar.xz`` if nothing is wrong.
+The script prints the faults of each run of the folder. With ``--pack NAME`` it packs a folder
+without faults as ``docs/data/sent_NAME.tar.xz``.
 """
 
 import argparse
+import csv
 import re
 from collections.abc import Iterator, Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from archives import DATA, pack
 
 from sb3_guard.envs.suites import SUITES
+from sb3_guard.reproduce import ROWS
 from sb3_guard.zoo.cli.names import PRESETS
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.results.curves import read_episodes
-from sb3_guard.zoo.results.runs import find_runs, read_run
+from sb3_guard.zoo.results.runs import find_runs, label_of, read_run
 from sb3_guard.zoo.results.splits import FINAL
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import RunFolder
@@ -46,11 +48,15 @@ def problems(path: Path) -> Iterator[str]:
     """What is wrong with a run."""
     run = RunFolder(path)
     result, config = run.checked_result(), run.hyperparams()
-    for name in ("command", "curve", "final", "versions"):
+    for name in ("command", "curve", "final", "seconds", "versions"):
         if not result.get(name):
             yield f"result.json has no {name}: train it with this version"
     if result.get("curve") != run.curve_hash():
         yield "curve in result.json is not the hash of 0.monitor.csv"
+    with ROWS.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            if row["curve"] == result.get("curve"):
+                yield f"it has the episodes of {row['row']}"
     if "command" in result and result["command"] != run.flags().command():
         yield "command in result.json is not that of args.yml"
     if str(result.get("commit")).endswith("-dirty"):
@@ -68,8 +74,10 @@ def problems(path: Path) -> Iterator[str]:
         if counts != [FINAL_EPISODES]:
             there = " or ".join(map(str, counts))
             yield f"final {split} has {there} episodes, not {FINAL_EPISODES}"
-        elif not np.isfinite(np.array(values, float)).all():
-            yield f"final {split} has numbers that are not finite"
+        elif not all(isinstance(v, int | float) and isfinite(v) for n in values for v in n):
+            yield f"final {split} has values that are no finite numbers"
+        elif min(values[1]) < 0 or min(values[2]) < 1:
+            yield f"final {split} has negative costs, or lengths below 1"
 
 
 def _wrong_flags(run: RunFolder, result: Mapping[str, Any]) -> Iterator[str]:
@@ -77,8 +85,10 @@ def _wrong_flags(run: RunFolder, result: Mapping[str, Any]) -> Iterator[str]:
     args = run.args()
     for name, named in (("algo", run.path.resolve().parent.name), ("env", run.name)):
         if not named == args[name] == result.get(name, named):
-            there = f"{args[name]} in args.yml, {result.get(name)} in result.json"
-            yield f"{name} is {there}, {named} by the folder's name"
+            names = f"{args[name]} in args.yml, {result.get(name)} in result.json"
+            yield f"{name} is {names}, {named} by the folder's name"
+    if result.get("label") != label_of(args["algo"]):
+        yield f"label is {result.get('label')!r}, not {label_of(args['algo'])!r}"
     if run.name not in ENVIRONMENTS:
         yield f"{run.name} is no environment of `sb3-guard list`"
     for name, what in FLAGS.items():

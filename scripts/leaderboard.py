@@ -112,7 +112,8 @@ def leaderboard(rows: pd.DataFrame) -> str:
         here = rows.query("suite == @suite and budget == @budget") if len(rows) else rows
         plan = wanted.query("suite == @suite and budget == @budget").set_index("algo")["seeds"]
         lines = [*_ranked(here, plan)] if len(here) else []
-        for algo in plan.index.difference(here["algo"] if len(here) else [], sort=False):
+        trained = here.loc[here["row"].str.startswith("grand_table"), "algo"] if len(here) else []
+        for algo in plan.index.difference(trained, sort=False):
             command = training(suite, algo, budget, plan[algo])
             lines.append(_line("–", label_of(algo), f"`{command}`", grey=True))
         if suite in untrained.index:

@@ -1,6 +1,6 @@
 """Ship the best certified agents of the grand table: ``python scripts/pretrain.py logs/grand``.
 
-Looked at are all runs below the folder, as ``scripts/grand_table.py`` writes them. A run is
+The runs below the folder are those that ``scripts/grand_table.py`` writes. A run is
 certified if the 95 % intervals of the mean cost of its final episodes, with sampled actions and
 with the most likely ones, end at or below the limit; of an environment's certified runs that with
 the highest return is taken. It is played again, 300 episodes of other seeds with each kind of
@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from archives import with_log_folder
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard import evaluate_policy
@@ -38,7 +39,7 @@ from sb3_guard.zoo.agents.pretrained import (
 from sb3_guard.zoo.results.runs import find_runs
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
-from sb3_guard.zoo.run.folder import RunFolder, run_path
+from sb3_guard.zoo.run.folder import RunFolder, is_run, run_path
 from sb3_guard.zoo.run.hyperparams import build
 from sb3_guard.zoo.run.make_envs import make_envs, source_of
 
@@ -55,9 +56,11 @@ DROPPED = ("final", "platform", "seconds")  # of result.json
 
 def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
     """The certified runs on an environment with a return above ``least``, the highest first."""
-    found = []
-    for run in map(RunFolder, find_runs(folder)):
-        if run.name != env_id or (result := run.read_result()) is None:
+    certified = []
+    for path in find_runs(folder):
+        if not is_run(path) or (run := RunFolder(path)).name != env_id:
+            continue
+        if (result := run.read_result()) is None:
             continue
         final = result.get("final", {})
         if not final or result.get("cost_limit") not in (None, LIMITS[env_id]):
@@ -65,13 +68,13 @@ def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
         mean = float(np.mean(final["stochastic"]["returns"]))
         ends = [estimate(np.array(episodes["costs"])).high for episodes in final.values()]
         if mean > least and max(ends) <= LIMITS[env_id]:
-            found.append((mean, str(run.path)))
-    for mean, path in sorted(found, reverse=True):
-        run = RunFolder(Path(path))
+            certified.append((mean, str(path)))
+    for mean, name in sorted(certified, reverse=True):
+        run = RunFolder(Path(name))
         if run.model.exists():
             yield run
         else:
-            print(f"return {mean:.4g}, but no model: sb3-guard reproduce {path}")
+            print(f"return {mean:.4g}, but no model: sb3-guard reproduce {name}")
 
 
 def shipped_return(env_id: str) -> float:
@@ -94,15 +97,15 @@ def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
 
 def played(run: RunFolder) -> dict[str, Any]:
     """Return and cost of an agent in 300 episodes of each kind of actions."""
-    found = {}
+    values = {}
     for actions, seed in SEEDS.items():
         model = loaded(run, 100, seed)
         got = evaluate_policy(
             model, model.env, EPISODES, deterministic=actions == "deterministic", seed=seed
         )
         model.env.close()
-        found[actions] = {"return": estimate(got.returns), "cost": estimate(got.costs)}
-    return found
+        values[actions] = {"return": estimate(got.returns), "cost": estimate(got.costs)}
+    return values
 
 
 def actions_of(model: BaseAlgorithm, raw: np.ndarray, actions: str) -> np.ndarray:
@@ -124,9 +127,8 @@ def write(run: RunFolder, limit: float | None, got: dict[str, Any]) -> RunFolder
     original = loaded(run, 10, 0)
     path = run_path(str(PRETRAINED), algo, run.name, 1)
     (path / run.name).mkdir(parents=True)
-    for name in ("config.yml", "args.yml"):
-        text = (run.params / name).read_text()
-        (path / run.name / name).write_text(text.replace(run.args()["log_folder"], "logs"))
+    shutil.copy(run.params / "config.yml", path / run.name)
+    (path / run.name / "args.yml").write_bytes(with_log_folder(run.params / "args.yml", "logs"))
     copy = RunFolder(path)
     policy = original.policy.state_dict()
     saved: dict[str, Any] = {"policy": {n: t.clone() for n, t in policy.items()
@@ -181,7 +183,8 @@ def main() -> None:
             ):
                 continue
             for old in PRETRAINED.glob(f"*/{env_id}_1"):
-                if "cost_limit" in json.loads((old / "result.json").read_text()):
+                limited = "cost_limit" in json.loads((old / "result.json").read_text())
+                if limited or old.parent.name == run.path.parent.name:
                     shutil.rmtree(old)
             write(run, limit, got)
             break

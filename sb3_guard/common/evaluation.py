@@ -22,10 +22,10 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.common.monitor import total_cost
+from sb3_guard.common.monitor import CostMonitor, find_monitor, total_cost
 from sb3_guard.costs import RESAMPLES, EpisodeCost, EpisodeCosts, interval, read_costs, verdict
 
-LONG = 20_000  # steps without an end of an episode that evaluate_policy warns of
+LONG_EPISODE = 20_000  # steps after which evaluate_policy warns that an episode may never end
 
 
 class Estimate(NamedTuple):
@@ -196,6 +196,13 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
         normalizer.training = training
 
 
+def _cost_keys(model: PolicyPredictor, env: VecEnv) -> tuple[str, ...]:
+    """The entries of info that are costs, by the model or by the monitor."""
+    if hasattr(model, "cost_keys"):
+        return tuple(model.cost_keys)
+    return find_monitor(env).cost_keys if is_vecenv_wrapped(env, CostMonitor) else ("cost",)
+
+
 def evaluate_policy(
     model: PolicyPredictor,
     env: gym.Env | VecEnv,
@@ -233,7 +240,8 @@ def evaluate_policy(
     :param seed: seed of the episodes and of sampled actions. With the same seed, the same policy
         has the same evaluation, and training is not affected; None: continue from where the
         generators are
-    :param cost_keys: entries of info that are costs; None: those of ``model``, else ``"cost"``
+    :param cost_keys: entries of info that are costs; None: those of ``model``, else those of the
+        environment's :class:`~sb3_guard.common.monitor.CostMonitor`, else ``"cost"``
     :param max_steps: stop after this many steps of the (vectorised) environment; episodes that
         have not ended are left out
     :param on_step: called after each step, e.g. to render
@@ -247,7 +255,7 @@ def evaluate_policy(
     if not isinstance(env, VecEnv):
         lone = env
         env = DummyVecEnv([lambda: lone])
-    keys = tuple(getattr(model, "cost_keys", ("cost",)) if cost_keys is None else cost_keys)
+    keys = tuple(_cost_keys(model, env) if cost_keys is None else cost_keys)
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
@@ -314,6 +322,7 @@ class _Tally:
         self.costs = EpisodeCosts(n, len(keys) + 1)  # each of the keys, then all costs
         self.ended: list[tuple[float, int, EpisodeCost]] = []  # return, steps, costs
         self.successes: list[bool] = []
+        self.reported = False  # whether any step reported a cost
 
     def step(
         self,
@@ -324,6 +333,7 @@ class _Tally:
     ) -> None:
         """Add a step of every environment, and the episodes that it ends."""
         self.returns += rewards
+        self.reported = self.reported or any(key in info for info in infos for key in self.keys)
         if len(self.keys) == 1:
             totals = costs
         else:
@@ -333,12 +343,10 @@ class _Tally:
             over[i] = self._is_over(infos[i])
         for cost in self.costs.step(np.hstack([costs, totals]), over):
             self._end(cost, infos[cost.row])
-        if not self.ended and self.costs.lengths.max() == LONG:
+        if (self.costs.lengths[self.left > 0] == LONG_EPISODE).any():
             warnings.warn(
-                f"no episode has ended in {LONG:,} steps; if the environment ends none itself, "
-                "give it a limit: gymnasium.register(..., max_episode_steps=1000), or "
-                "gymnasium.wrappers.TimeLimit(env, 1000)",
-                UserWarning,
+                f"an episode has not ended in {LONG_EPISODE:,} steps; if it may never end, limit "
+                "its length: gymnasium.wrappers.TimeLimit(env, 1000)",
                 stacklevel=3,
             )
 
@@ -368,6 +376,12 @@ class _Tally:
 
     def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
         """What was seen."""
+        if not self.reported and not limits:
+            warnings.warn(
+                f"no step reported a cost as info[{self.keys[0]!r}], so that costs are 0; if they "
+                "have other names, state them with cost_keys",
+                stacklevel=3,
+            )
         shape = len(self.ended), len(self.keys)
         lengths = self.costs.lengths
         under_way = np.stack([self.returns, self.costs.totals[:, -1], lengths], axis=1)

@@ -18,7 +18,7 @@ from gymnasium.error import DependencyNotInstalled
 
 from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
 from sb3_guard.common.native import GuardVecEnv
-from sb3_guard.ids import ENTRY_POINT, OWN, UnknownId, with_version
+from sb3_guard.ids import ENTRY_POINT, IMPORT_FIRST, UnknownId, with_version
 from sb3_guard.spelling import nearest
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _ours(env_id: str | Path | Mapping[str, Any] | Scenario) -> Source:
         raise UnknownId(
             f"unknown environment {env_id!r}: {hint}allowed: ids of the form "
             "Task_Robot_NConstraint-v0, such as 'Goal_Point_8Hazards-v0', and ids registered with "
-            f"Gymnasium{OWN}"
+            f"Gymnasium{IMPORT_FIRST}"
         ) from None
 
     def batch(n_envs: int, **kwargs: Any) -> VecEnv:

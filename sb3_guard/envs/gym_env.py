@@ -76,14 +76,16 @@ def action_space(engine: Engine) -> spaces.Box:
 
 
 def cameras(model: mujoco.MjModel) -> dict[str, str]:
-    """The cameras that can be chosen: what the renderer calls them, by the names that users give.
+    """The cameras that can be chosen: the renderer's names, by the names that users give.
 
-    Those of a robot's file go without prefix, and after others of the same name.
+    A camera of a robot's file has its name there, and that with the prefix if another has that
+    name, too.
     """
     names = [name for i in range(model.ncam) if (name := model.camera(i).name)]
     chosen = {name: name for name in CAMERAS}
     for name in sorted(names, key=lambda name: name.startswith(PREFIX)):
-        chosen.setdefault(name.removeprefix(PREFIX), name)
+        short = name.removeprefix(PREFIX)
+        chosen[name if short in chosen else short] = name
     return chosen
 
 
@@ -130,10 +132,10 @@ class Simulated:
         self.render_mode, self.flatten = render_mode, flatten
         self._num_threads = num_threads
         self.engine = self.scenario.build(num_envs, num_threads)
-        names = cameras(self.engine.model)
-        if camera is not None and camera not in names:
-            raise ValueError(f"unknown camera {camera!r}: {did_you_mean(camera, names)}")
-        self._window = (width, height, names[camera or self.engine.task.camera])
+        names, camera = cameras(self.engine.model), camera or self.engine.task.camera
+        if not isinstance(camera, str) or camera not in names:
+            raise ValueError(f"unknown camera {camera!r}: {did_you_mean(str(camera), names)}")
+        self._window = (width, height, names[camera])
         self.metadata = {**self.metadata, "render_fps": round(1 / self.engine.control_step)}
 
     @property

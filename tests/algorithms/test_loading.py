@@ -97,6 +97,14 @@ def test_a_missing_network_of_sb3s_is_still_an_error(tmp_path):
         filtered.set_parameters({name: given[name] for name in given if name != optimizer})
 
 
+def test_an_agent_of_another_class_of_ours_is_refused(tmp_path):
+    PPOLag("MlpPolicy", CostPoint(10), n_steps=40, batch_size=20, cost_limit=1.0).save(
+        tmp_path / "a"
+    )
+    with pytest.raises(ValueError, match=r"CPO: .*do not match.*multiplier.* class that saved it"):
+        CPO.load(tmp_path / "a", env=CostPoint(10))
+
+
 @pytest.mark.parametrize("beside", ["ppo_vecnormalize.pkl", "run/vecnormalize.pkl", None])
 def test_train_goes_on_with_the_statistics_beside_the_agent(tmp_path, capsys, beside):
     env = sb3.common.vec_env.DummyVecEnv([lambda: CostPoint(20)])

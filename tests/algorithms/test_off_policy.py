@@ -2,6 +2,7 @@
 
 import itertools
 import pickle
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -672,3 +673,13 @@ def test_it_finds_a_known_optimum(cls: Any) -> None:
     cls("MlpPolicy", env, cost_limit=0.5, policy_kwargs=policy, **fast).learn(steps, outcomes)
     assert np.mean(outcomes.returns) / problem.best >= 0.9
     assert 0.85 <= np.mean(outcomes.costs) / 0.5 <= 1.05
+
+
+def test_a_training_that_learns_nothing_is_told():
+    model = SACLag("MlpPolicy", CostPoint(10), cost_limit=1.0, **settings())
+    with pytest.warns(UserWarning, match="nothing is learnt in 60 steps: .* learning_starts=60"):
+        model.learn(60)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(1, reset_num_timesteps=False)
+    assert model._n_updates == 1

@@ -1,6 +1,7 @@
 """Whole episodes, counted fairly, with an honest interval."""
 
 import dataclasses
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_guard.algorithms import CPO, TRPOSL
 from sb3_guard.common.evaluation import (
-    LONG,
+    LONG_EPISODE,
     Evaluation,
     estimate,
     evaluate_policy,
@@ -90,10 +91,23 @@ def test_stops_after_max_steps():
 
 
 def test_episodes_without_an_end_are_told(recwarn):
-    evaluate_policy(Idle(), Fixed(LONG - 1), n_eval_episodes=1)
+    evaluate_policy(Idle(), Fixed(LONG_EPISODE), n_eval_episodes=1)
+    evaluate_policy(Idle(), fixed(-1, 1), n_eval_episodes=1)  # nobody waits for the first
     assert not recwarn
-    with pytest.warns(UserWarning, match="no episode has ended in 20,000 steps.*TimeLimit"):
-        evaluate_policy(Idle(), Fixed(-1), n_eval_episodes=1, max_steps=LONG)
+    with pytest.warns(UserWarning, match="episode has not ended in 20,000 steps.*TimeLimit"):
+        evaluate_policy(Idle(), fixed(3, -1), n_eval_episodes=2, max_steps=LONG_EPISODE)
+
+
+def test_costs_that_no_step_reports_are_told(recwarn):
+    def play(*keys: str, **monitor: Any) -> Evaluation:
+        env = CostMonitor(DummyVecEnv([lambda: CostPoint(cost_keys=keys)]), **monitor)
+        return evaluate_policy(Idle(), env, n_eval_episodes=1)
+
+    play("cost")
+    renamed = play("heat", cost_keys=("heat",))  # the monitor knows the name
+    assert renamed.cost_keys == ("heat",) and not recwarn
+    with pytest.warns(UserWarning, match=r"no step reported a cost as info\['cost'\]"):
+        assert play("heat").costs.tolist() == [0.0]
 
 
 def test_callbacks():

@@ -11,6 +11,7 @@ import yaml
 from fake_runs import fake_run
 
 from sb3_guard import train
+from sb3_guard.zoo.results.runs import label_of
 from sb3_guard.zoo.run.folder import RunFolder
 
 ROOT = Path(__file__).parents[2]
@@ -127,12 +128,13 @@ def test_packed_logs_are_small(scripts, tmp_path):
 def sent(folder: Path, algo: str = "cpo", seed: int = 0, **entries: Any) -> Path:
     """A run without a fault, where a million is 600."""
     limit = {"config": {"cost_limit": 2.0}, "cost_limit": 2.0}
-    played = {key: [1 / 3] * 100 for key in ("returns", "costs", "lengths")}
+    played = {"returns": [1 / 3] * 100, "costs": [1 / 3] * 100, "lengths": [20] * 100}
     final = {"stochastic": played, "greedy": played}
     path = fake_run(folder, algo, seed=seed, returns=1 / 3, **limit | entries, final=final,
                     versions={"sb3_guard": "1"})  # fmt: skip
     run = RunFolder(path)
-    made = {"command": run.flags().command(), "curve": run.curve_hash()}
+    made = {"command": run.flags().command(), "curve": run.curve_hash(), "label": label_of(algo)}
+    made["seconds"] = 1.0
     run.write_result(run.checked_result() | made)
     return path
 
@@ -218,14 +220,22 @@ def test_bad_flags(scripts, tmp_path, monkeypatch, capsys, flags, message):
     assert message in capsys.readouterr().err
 
 
-NAN = {key: [float("nan")] * 100 for key in ("returns", "costs", "lengths")}
+def played(value: Any) -> dict[str, Any]:
+    """Final episodes whose numbers are all the same."""
+    split = {key: [value] * 100 for key in ("returns", "costs", "lengths")}
+    return {"final": {"stochastic": split, "greedy": split}}
 
 
 @pytest.mark.parametrize(
     ("file", "changes", "message"),
     [
-        ("result.json", {"final": {"stochastic": NAN, "greedy": NAN}}, "not finite"),
-        ("result.json", {"final": {"stochastic": NAN}}, "final greedy has 0 episodes"),
+        ("result.json", played(float("nan")), "no finite numbers"),
+        ("result.json", played("1"), "no finite numbers"),
+        ("result.json", played(-5.0), "negative costs, or lengths below 1"),
+        ("result.json", played(0), "negative costs, or lengths below 1"),
+        ("result.json", {"final": {"stochastic": {}}}, "final greedy has 0 episodes"),
+        ("result.json", {"label": "Best"}, "label is 'Best', not 'CPO'"),
+        ("result.json", {"seconds": None}, "no seconds"),
         ("result.json", {"cost_limit": None}, "cost_limit is None in result.json, not 2"),
         ("result.json", {"n_timesteps": 500}, "500 steps of 600"),
         ("result.json", {"algo": "pcpo"}, "algo is cpo in args.yml, pcpo in result.json"),
@@ -252,6 +262,28 @@ def test_a_row_that_is_not_what_it_says(
     path.write_text(json.dumps(content) if path.suffix == ".json" else yaml.safe_dump(content))
     assert not checks.check(run)
     assert message in capsys.readouterr().out
+
+
+def test_runs_of_the_page_are_not_sent_again(scripts, tmp_path, monkeypatch, capsys):
+    run = sent(tmp_path / "logs")
+    rows = tmp_path / "rows.csv"
+    curve = json.loads((run / "result.json").read_text())["curve"]
+    rows.write_text(f"row,curve\ngrand_table/cpo/A_1,{curve}\n")
+    assert scripts[2].check(run)
+    monkeypatch.setattr(scripts[2], "ROWS", rows)
+    assert not scripts[2].check(run)
+    assert "it has the episodes of grand_table/cpo/A_1" in capsys.readouterr().out
+
+
+def test_no_packed_run_is_lost(scripts, tmp_path):
+    archives = scripts[1]
+    for seed in range(2):
+        run = sent(tmp_path / "logs", seed=seed)
+    archives.pack(tmp_path / "logs", "grid")
+    archives.pack(tmp_path / "logs", "grid")
+    shutil.rmtree(run)
+    with pytest.raises(SystemExit, match=f"{tmp_path / 'logs'} lacks: .* grid/cpo/{run.name}"):
+        archives.pack(tmp_path / "logs", "grid")
 
 
 def test_seeds_have_episodes_of_their_own(scripts, tmp_path, monkeypatch, capsys):

@@ -91,9 +91,10 @@ TRAIN = [
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["-params", "seed:3"], ["use the flag --seed"]),
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
-    (["--gym-packages", "../x"], ["--gym-packages '../x' is a path: name the module, x"]),
-    (["--gym-packages", "robots.py"], ["'robots.py' is a path: name the module, robots,"]),
-    (["--gym-packages", ""], ["--gym-packages: can't import ''"]),
+    (["--gym-packages", "../x"], ["--gym-packages '../x' is not the name of a module"]),
+    (["--gym-packages", "robots.py"], ["'robots.py' is not the name of a module, such as my_rob"]),
+    (["--gym-packages", ".x"], ["--gym-packages: can't import '.x'"]),
+    (["--gym-packages", ""], ["--gym-packages '' is not the name"]),
     (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown argument --sede", "--seed"]),

@@ -345,7 +345,7 @@ def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
     (drawing,) = draw("curves", found)
     heat = next(axis for axis in drawing.figure.axes if "heat" in axis.get_ylabel())
     assert lines(heat)["CPO"] == pytest.approx([4.0] * 6)
-    assert lines(heat)["cost limit, 5"].tolist() == [5, 5] and "TRPO" not in lines(heat)
+    assert lines(heat)["heat limit, 5"].tolist() == [5, 5] and "TRPO" not in lines(heat)
     assert page_of(tmp_path / "logs").count("2: exceeded") == 1
 
 

@@ -65,6 +65,7 @@ def test_shipped_agents_are_small_together_and_what_is_missing_is_said():
 
 def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, capsys):
     """The best certified one of those of an environment; the agent before it is gone."""
+    monkeypatch.syspath_prepend(SCRIPTS)
     script = runpy.run_path(str(SCRIPTS / "pretrain.py"))
     toy = (
         "--env Goal_Point_8Hazards -n 2000 --eval-freq -1 --verbose 0 --device cpu -f "

@@ -47,7 +47,7 @@ def test_a_row_that_went_another_way(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(reproduce, "ROWS", rows)
     assert again(tmp_path, "table/cpo/A_1", *PACKAGES) == 1
     out = capsys.readouterr().out
-    assert "Not the same" in out and "(-1)" in out and "there is of commit abc" in out
+    assert "Not the same" in out and "(-1)" in out and "The run before is of commit abc" in out
     assert again(tmp_path, "table/cpo/A_2") == 2
     assert "did you mean 'table/cpo/A_1'" in capsys.readouterr().err
 
@@ -80,6 +80,27 @@ def test_logs_that_are_not_as_the_run_wrote_them(run, tmp_path, capsys):
     monitor.unlink()
     assert again(tmp_path, str(run), *PACKAGES) == 2
     assert f"can't read {monitor}: No such file" in capsys.readouterr().err
+
+
+def test_a_run_of_an_older_version_has_no_hash(run, tmp_path, capsys):
+    result = json.loads((run / "result.json").read_text())
+    del result["curve"], result["final"]
+    (run / "result.json").write_text(json.dumps(result))
+    assert again(tmp_path, str(run), *PACKAGES) == 0
+    assert "The same return and cost; an older version kept no hash" in capsys.readouterr().out
+    (run / "result.json").write_text(json.dumps(result | {"cost": 0.0}))
+    assert again(tmp_path, str(run), *PACKAGES) == 1
+    out = capsys.readouterr().out
+    assert "Not the same: returns or costs differ" in out and "before 0, now" in out
+    (run / "result.json").write_text(json.dumps(result | {"seconds": "fast"}))
+    assert again(tmp_path, str(run), *PACKAGES) == 2
+    assert "result.json is damaged" in capsys.readouterr().err
+
+
+def test_a_run_is_not_compared_with_itself(run, tmp_path, capsys):
+    assert again(tmp_path, str(run), *PACKAGES) == 0
+    assert again(tmp_path, str(tmp_path / "again/cpo/CostPoint-v0_4"), *PACKAGES) == 2
+    assert "choose another --log-folder" in capsys.readouterr().err
 
 
 def test_a_folder_of_runs_is_told_from_a_run(run, tmp_path, capsys):

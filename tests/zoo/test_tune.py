@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import optuna
@@ -99,6 +100,22 @@ def test_the_first_trial_is_the_shipped_one(algo, env_id):
             **expected["policy_kwargs"],
         }
     assert drawn == expected
+
+
+def test_the_limit_is_to_hold_with_both_kinds_of_actions():
+    """The return is that of the most likely actions, as where the best model is chosen."""
+
+    def evaluate(deterministic):
+        values = (5.0, [1.0, 4.0]) if deterministic else (9.0, [2.0, 3.0])
+        return SimpleNamespace(returns=np.array([values[0]]), limited=np.array([values[1]]))
+
+    training = SimpleNamespace(evaluation=SimpleNamespace(evaluate=evaluate))
+    rows: list = []
+    evaluations = trials.Evaluations(
+        training, SimpleNamespace(n_evaluations=1), rows.extend, lambda: False
+    )
+    evaluations.finish()
+    assert rows == [[5.0, 2.0, 4.0]]
 
 
 def test_an_algorithm_of_a_user_tunes(tmp_path, monkeypatch):

@@ -137,4 +137,10 @@ class LoadsOthers(BaseAlgorithm):
             given = {**ours, **given}
             if policy:
                 given["policy"] = {**filters, **policy}
+        names = self.get_parameters()
+        if exact_match and given.keys() != names.keys():
+            raise ValueError(
+                f"{type(self).__name__}: names of parameters do not match, {', '.join(given)} "
+                f"instead of {', '.join(names)}; load a file with the class that saved it"
+            )
         super().set_parameters(given, exact_match, device)

@@ -177,6 +177,13 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
             reset_num_timesteps or self._last_obs is None
         ):
             self.replay_buffer.cut()  # new episodes begin
+        if total_timesteps + (not reset_num_timesteps) * self.num_timesteps <= self.learning_starts:
+            warnings.warn(
+                f"nothing is learnt in {total_timesteps:,} steps: the first gradient step comes "
+                f"after learning_starts={self.learning_starts:,}",
+                UserWarning,
+                stacklevel=3,
+            )
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
 
     def collect_rollouts(

@@ -172,8 +172,8 @@ class MJCFRobot(Robot):
         for i in np.flatnonzero(~(high > low)).tolist():
             raise ValueError(
                 f"actuator {model.actuator(i).name.removeprefix(prefix)!r} of the robot has no "
-                'ctrlrange: give it one, such as ctrlrange="-1 1", or, if it is a position servo, '
-                'inheritrange="1", which is the range of its joint'
+                'ctrlrange: give it one, such as ctrlrange="-1 1", or, if it is a position servo '
+                'of a joint with a range, inheritrange="1"'
             )
         if not model.nu:
             raise ValueError(f"{self.path()} has no actuators: the robot could not act")

@@ -9,7 +9,7 @@ from itertools import product
 
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.suites.suite import Fields, Suite
-from sb3_guard.ids import OWN
+from sb3_guard.ids import IMPORT_FIRST
 from sb3_guard.spelling import did_you_mean, nearest
 
 LADDER = (1, 2, 4, 8, 16)  # numbers of a constraint's objects, by growing difficulty
@@ -61,11 +61,12 @@ def _unknown(match: re.Match[str], wrong: list[str], known: dict[str, list[str]]
     """What to say of a name of which parts are unknown."""
     kind, name = wrong[0], match.string
     near = {k: nearest(match[k], names) for k, names in known.items()}
-    hint = did_you_mean(match[kind], known[kind]) + OWN
+    hint = did_you_mean(match[kind], known[kind])
     if len(wrong) > 1 and all(near.values()):
         meant = "{task}_{robot}_".format(**near) + match["num"] + str(near["constraint"])
         meant += match["noconti"] or ""
         hint = f"did you mean {meant!r}? allowed: {', '.join(known[kind])}"
+    hint += IMPORT_FIRST
     paper = re.fullmatch(r"(\w+?)s?3Ds?", match["constraint"])  # GUARD's Hazard3Ds
     flat = nearest(f"{paper[1]}s", known["constraint"]) if paper else None
     if wrong == ["constraint"] and flat is not None:

@@ -30,8 +30,9 @@ def export(flags: ExportFlags) -> int:
         evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
         contract = write(agent, flags, path, summary(evaluation))
     print(f"{path}: {', '.join(contract['file']['operators'])}")
-    print(f"{path.with_name(onnx_file.CONTRACT)}: {means(evaluation)}")
-    if agent.path == agent.run.checkpoint:
+    print(f"{path.with_name(onnx_file.CONTRACT)} describes input and output")
+    print(means(evaluation))
+    if not agent.run.result.exists():
         print(
             f"warning: the training has not ended: this is its agent after "
             f"{agent.model.num_timesteps:,} steps",

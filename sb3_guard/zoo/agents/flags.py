@@ -16,8 +16,8 @@ class AgentFlags(Command):
 
     :param algo: algorithm (default: cpo)
     :param env: environment id (default: Goal_Point_8Hazards)
-    :param folder: log folder, or the folder of a run, which says --algo and --env (default: logs)
-    :param exp_id: number of the run; 0: the latest, -1: the log folder itself is the run (default:
+    :param folder: log folder, or the folder of a run, without --algo and --env (default: logs)
+    :param exp_id: number of the run; 0: the latest, -1: <folder>/<algo> itself is the run (default:
         0)
     :param load_best: take the best checkpoint (highest return among those within the limit) instead
         of the last one

@@ -116,6 +116,11 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     :raises UsageError: there is no such agent, or it does not fit the environment
     """
     import_packages(flags.gym_packages)
+    if flags.pretrained and flags.given & {"folder", "exp_id"}:
+        raise UsageError(
+            "--pretrained takes an agent that comes with the package: leave out --folder and "
+            "--exp-id, or leave out --pretrained to take a run of your own"
+        )
     if flags.pretrained:
         run = find_pretrained(flags.env, flags.algo if "algo" in flags.given else None)
         path, flags.algo = weights(run), run.path.parent.name
@@ -123,7 +128,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         if flags.given & {"algo", "env", "exp_id"}:
             raise UsageError(f"{flags.folder} is a run: leave out --algo, --env and --exp-id")
         run = RunFolder(Path(flags.folder))
-        flags.algo, flags.env = run.args()["algo"], run.args()["env"]
+        flags.algo, flags.env = run.flags().algo, run.flags().env
         path, statistics = find_model(run, flags)
     else:
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)

@@ -28,12 +28,12 @@ is a switch, ``bool | None`` has a ``--no-…``, ``list[int]`` takes several, ``
 import argparse
 import dataclasses
 import inspect
+import os
 import re
 import sys
 import types
 import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
 from sb3_guard.spelling import did_you_mean, nearest
@@ -130,7 +130,7 @@ class Command:
             word = unknown[0].split("=")[0]
             flags = (field.name for field, _ in cls._flags() if not field.metadata["positional"])
             near = nearest(word, map(_long, flags))
-            if Path(word).is_dir() and "folder" in cls.__dataclass_fields__:
+            if os.path.isdir(word) and "folder" in cls.__dataclass_fields__:
                 near = f"--folder {word}"
             remedy = f"did you mean {near}?" if near else "see --help"
             raise UsageError(f"unknown argument {word}; {remedy}")

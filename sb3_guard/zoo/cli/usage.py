@@ -86,14 +86,12 @@ def import_packages(names: Sequence[str]) -> None:
     if names and os.getcwd() not in sys.path:  # as with python -m, also for the script sb3-guard
         sys.path.insert(0, os.getcwd())
     for name in names:
-        path = Path(name)
-        if path.suffix == ".py" or path.name != name:
+        if not name.strip(".") or Path(name).name != name or name.endswith((".py", ".pyc")):
             raise UsageError(
-                f"--gym-packages {name!r} is a path: name the module, {path.stem}, and call the "
-                "command in its folder"
+                f"--gym-packages {name!r} is not the name of a module, such as my_robots or "
+                "my_package.robots; call the command in the folder of my_robots.py"
             )
-        errors = ImportError, TypeError, ValueError  # the last two: it is no module's name
-        with explained(f"--gym-packages: can't import {name!r}", *errors):
+        with explained(f"--gym-packages: can't import {name!r}", ImportError, TypeError):
             importlib.import_module(name)
 
 

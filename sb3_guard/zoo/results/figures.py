@@ -105,7 +105,7 @@ def draw_limit(line: Callable[..., Any], data: Data, suite: str, cost: str) -> f
     limits = data.runs.loc[data.runs["suite"] == suite, column].dropna()
     if not len(limits):
         return np.nan
-    name = f"cost limit, {limits.iloc[0]:g}"
+    name = f"{'cost' if cost == 'M_c' else cost[4:]} limit, {limits.iloc[0]:g}"
     line(limits.iloc[0], color=INK, linewidth=1.2, linestyle=(0, (1, 2)), label=name)
     return float(limits.iloc[0])
 
@@ -126,7 +126,9 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
             axis.fill_between(steps, low, high, color=look.color, alpha=0.15, linewidth=0)
     if metric.startswith("M_c"):
         drawn.append(draw_limit(axis.axhline, data, suite, metric))
-    axis.set(xlabel="steps", ylabel=AXES.get(metric) or cost_name(metric))
+    axis.set(
+        xlabel="steps", ylabel=AXES.get(metric) or cost_name(metric).replace(" cost, ", " cost,\n")
+    )
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_xlim(left=0)
     if metric != "J_r" and drawn:

@@ -60,7 +60,8 @@ class Experiment:
         self.algorithm = algorithm(self.flags.algo)
         self.source = source_of(self.flags.env)
         self.setup = build(self.hyperparams)
-        self.cost_keys = tuple(self.setup.model.get("cost_keys", ("cost",)))
+        monitored = self.setup.monitor_kwargs.get("cost_keys", ("cost",))  # of a baseline
+        self.cost_keys = tuple(self.setup.model.get("cost_keys", monitored))
 
     def limits(self) -> np.ndarray:
         """

@@ -138,8 +138,10 @@ class Evaluations(BaseCallback):
 
     def _evaluate(self) -> bool:
         assert self.training.evaluation is not None
-        result = self.training.evaluation.evaluate()
-        row = [float(result.returns.mean()), *result.limited.mean(axis=0).tolist()]
+        # A limit is to hold with both kinds of actions, as that of the best model.
+        evaluations = [self.training.evaluation.evaluate(greedy) for greedy in (True, False)]
+        costs = np.max([played.limited.mean(axis=0) for played in evaluations], axis=0)
+        row = [float(evaluations[0].returns.mean()), *costs.tolist()]
         if not np.isfinite(row).all():
             raise FloatingPointError(f"an evaluation gave {row}")
         self.history.append(row)

@@ -62,7 +62,8 @@ def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
             f"{len(cost_keys)} cost keys {cost_keys}"
         )
     if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):
-        raise ValueError(f"{name}={value!r}: must be finite numbers")
+        order = f", in the order of cost_keys={cost_keys}" if len(cost_keys) > 1 else ""
+        raise ValueError(f"{name}={value!r}: must be finite numbers{order}")
 
 
 def check_choice(name: str, value: Any, *allowed: str) -> None:

@@ -38,6 +38,7 @@ def test_bad_schedules_are_named() -> None:
         ("lin_50", r"cost_limit='lin_50': .*'lin_50_25', a line from 50 to 25"),
         ("lin_5_-5", r"cost_limit=-5.0: must be at least 0"),
         (lambda remaining: "low", "cost_limit='low': must be finite numbers"),
+        ({"cost": 5}, "must be finite numbers"),
     ):
         with pytest.raises(ValueError, match=message):
             TRPOIPO("MlpPolicy", points(), cost_limit=limit)

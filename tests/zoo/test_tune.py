@@ -118,6 +118,24 @@ def test_the_limit_is_to_hold_with_both_kinds_of_actions():
     assert rows == [[5.0, 2.0, 4.0]]
 
 
+def test_an_evaluation_is_of_the_agent_after_its_update(monkeypatch):
+    """Four evaluations in four rollouts see four agents, none of them before it has learnt."""
+    seen: list = []
+    settings = SimpleNamespace(n_evaluations=4, n_timesteps=160)
+    evaluations = trials.Evaluations(SimpleNamespace(), settings, lambda _: True, lambda: False)
+
+    def evaluate() -> bool:
+        seen.append((evaluations.num_timesteps, evaluations.model._n_updates))
+        evaluations.history.append([0.0])
+        return True
+
+    monkeypatch.setattr(evaluations, "_evaluate", evaluate)
+    TRPO("MlpPolicy", CostPoint(10), n_steps=40, seed=0).learn(160, callback=evaluations)
+    evaluations.finish()
+    steps, updates = zip(*seen, strict=True)
+    assert steps[:3] == (40, 80, 120) and updates[0] > 0 and len({*updates}) == 4
+
+
 def test_an_algorithm_of_a_user_tunes(tmp_path, monkeypatch):
     """In the space of its class and those of its bases, and from no file."""
 
@@ -438,7 +456,8 @@ def test_several_costs(tmp_path, folder, drawn, monkeypatch, capsys):
     for one in study_in(folder).trials:
         heat = 50 * one.params["target_kl"]
         assert one.constraints == pytest.approx({"cost": -0.8, "heat": heat - 0.5})
-    assert "cost heat" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "cost heat" in out and "episode cost of at most 1 cost, 0.5 heat\n" in out
 
 
 def test_trains_for_real(tmp_path, folder, monkeypatch, capsys):

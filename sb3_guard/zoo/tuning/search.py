@@ -287,8 +287,10 @@ def _header(
     elif settings.cost_limit is None:
         goal = f"the highest return ({settings.algo} has no cost limit; --cost-limit sets one)"
     else:
-        limits = ", ".join(short(limit) for limit in settings.cost_limit)
-        goal = f"the highest return with an episode cost of at most {limits}"
+        keys = settings.cost_keys if len(settings.cost_keys) > 1 else [""]
+        limits = zip(settings.cost_limit, keys, strict=True)
+        bounds = ", ".join(f"{short(limit)} {key}".rstrip() for limit, key in limits)
+        goal = f"the highest return with an episode cost of at most {bounds}"
     seeds = f" × {len(settings.seeds)} seeds" if len(settings.seeds) > 1 else ""
     pruner = "none" if settings.pareto else flags.pruner
     return "\n".join(

@@ -121,14 +121,16 @@ class Evaluations(BaseCallback):
         self.history: list[list[float]] = []
         self.ended = False
 
+    def _on_rollout_start(self) -> None:
+        # After an update, not in the rollout before it. The last one is made by finish.
+        each = self.settings.n_timesteps / self.settings.n_evaluations
+        due = min(int(self.num_timesteps / each), self.settings.n_evaluations - 1)
+        while len(self.history) < due and not self.ended:
+            self.ended = not self._evaluate()
+
     def _on_step(self) -> bool:
         if self.stopped():
             raise Stopped
-        done = len(self.history) + 1
-        due = done * self.settings.n_timesteps / self.settings.n_evaluations
-        # The last one is for the agent that has learned all it could: see finish.
-        if done < self.settings.n_evaluations and self.num_timesteps >= due:
-            self.ended = not self._evaluate()
         return not self.ended
 
     def finish(self) -> None:

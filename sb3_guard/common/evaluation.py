@@ -378,8 +378,8 @@ class _Tally:
         """What was seen."""
         if not self.reported and not limits:
             warnings.warn(
-                f"no step reported a cost as info[{self.keys[0]!r}], so costs are 0; state its names "
-                "as cost_keys or, for PPO and others without costs, as the monitor's cost_keys",
+                f"no step reported a cost as info[{self.keys[0]!r}], so costs are 0; name them in "
+                "cost_keys or, for PPO and others without costs, in the monitor's cost_keys",
                 stacklevel=3,
             )
         shape = len(self.ended), len(self.keys)

@@ -88,7 +88,7 @@ def published(name: str) -> dict[str, Any]:
                 "result.json is compared."
             )
         with explained(f"{run.result} is damaged"):
-            seconds = float(result.get("seconds") or 0)
+            seconds = timedelta(seconds=result.get("seconds") or 0).total_seconds()
             made = {"final": final_hash(result), "seconds": seconds, **measures(result)}
         return result | made | {"command": run.flags().command()}
     with ROWS.open(newline="", encoding="utf-8") as file:
@@ -115,7 +115,7 @@ def differences(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
         for name, new in measures(result).items()
         if row.get(name) not in (None, "")
     ]
-    if not row.get("curve") and any(before != new for _, before, new in values):
+    if not row.get("curve") and any(str(before) != str(new) for _, before, new in values):
         lines.append("Not the same: returns or costs differ.")
     return lines and lines + [
         f"  {MEASURES[name]}: before {before:.6g}, now {new:.6g} ({new - before:+.6g})"

@@ -87,8 +87,8 @@ def _wrong_flags(run: RunFolder, result: Mapping[str, Any]) -> Iterator[str]:
         if not named == args[name] == result.get(name, named):
             names = f"{args[name]} in args.yml, {result.get(name)} in result.json"
             yield f"{name} is {names}, {named} by the folder's name"
-    if result.get("label") != label_of(args["algo"]):
-        yield f"label is {result.get('label')!r}, not {label_of(args['algo'])!r}"
+    if result.get("label") not in (None, label_of(args["algo"])):
+        yield f"label is {result['label']!r}, not {label_of(args['algo'])!r}"
     if run.name not in ENVIRONMENTS:
         yield f"{run.name} is no environment of `sb3-guard list`"
     for name, what in FLAGS.items():

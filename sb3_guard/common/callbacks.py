@@ -21,7 +21,7 @@ from sb3_guard.common.evaluation import (
     sync_normalization,
 )
 from sb3_guard.common.files import replacing
-from sb3_guard.common.monitor import find_monitor
+from sb3_guard.common.monitor import cost_keys_of, find_monitor
 
 # What a run continues with
 KEPT = (
@@ -161,7 +161,7 @@ class CostEvalCallback(EvalCallback):
     @property
     def cost_keys(self) -> tuple[str, ...]:
         """The entries of info that are the algorithm's costs."""
-        return tuple(getattr(self.model, "cost_keys", ("cost",)))
+        return cost_keys_of(self.model, self.eval_env)
 
     def _init_callback(self) -> None:
         """

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.common.monitor import CostMonitor, find_monitor, total_cost
+from sb3_guard.common.monitor import cost_keys_of, total_cost
 from sb3_guard.costs import RESAMPLES, EpisodeCost, EpisodeCosts, interval, read_costs, verdict
 
 LONG_EPISODE = 20_000  # steps after which evaluate_policy warns that an episode may never end
@@ -196,13 +196,6 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
         normalizer.training = training
 
 
-def _cost_keys(model: PolicyPredictor, env: VecEnv) -> tuple[str, ...]:
-    """The entries of info that are costs, by the model or by the monitor."""
-    if hasattr(model, "cost_keys"):
-        return tuple(model.cost_keys)
-    return find_monitor(env).cost_keys if is_vecenv_wrapped(env, CostMonitor) else ("cost",)
-
-
 def evaluate_policy(
     model: PolicyPredictor,
     env: gym.Env | VecEnv,
@@ -255,7 +248,7 @@ def evaluate_policy(
     if not isinstance(env, VecEnv):
         lone = env
         env = DummyVecEnv([lambda: lone])
-    keys = tuple(_cost_keys(model, env) if cost_keys is None else cost_keys)
+    keys = tuple(cost_keys_of(model, env) if cost_keys is None else cost_keys)
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
@@ -376,7 +369,7 @@ class _Tally:
 
     def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
         """What was seen."""
-        if not self.reported and not limits:
+        if self.keys and not self.reported and not limits:
             warnings.warn(
                 f"no step reported a cost as info[{self.keys[0]!r}], so costs are 0; name them in "
                 "cost_keys or, for PPO and others without costs, in the monitor's cost_keys",

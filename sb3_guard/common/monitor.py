@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.monitor import ResultsWriter
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_guard.checks import NumberError
@@ -205,3 +205,10 @@ def find_monitor(env: VecEnv) -> CostMonitor:
             return layer
         layer = layer.venv
     raise ValueError("the environment is not wrapped in a CostMonitor")
+
+
+def cost_keys_of(model: Any, env: VecEnv) -> tuple[str, ...]:
+    """Entries of info that are costs: those of the model, else of the monitor, else ``cost``."""
+    if hasattr(model, "cost_keys"):
+        return tuple(model.cost_keys)
+    return find_monitor(env).cost_keys if is_vecenv_wrapped(env, CostMonitor) else ("cost",)

@@ -1,5 +1,6 @@
 """RL-Zoo's algorithms on cost environments, and RL-Zoo's own command with ours."""
 
+import json
 import runpy
 import sys
 from pathlib import Path
@@ -56,6 +57,25 @@ def test_trains_with_costs_logged(algo, tmp_path):
     assert np.isfinite(np.load(run / "evaluations.npz")["costs"]).all()
     assert (run / "best_model.zip").is_file()
     assert enjoy.main([*TOY[:4], "--algo", algo, "-f", str(tmp_path), "--n-episodes", "1"]) == 0
+
+
+def test_costs_of_other_names_are_those_of_the_monitor(tmp_path):
+    """In every evaluation, too: PPO itself does not know of costs."""
+    params = ["monitor_kwargs:{'cost_keys': ['heat', 'noise']}", "selection_limit:[1, 2]"]
+    extra = ["--eval-freq", "60"]
+    extra += [
+        "--env-kwargs",
+        "hazard:(-1.0, 0.0)",
+        "cost_keys:('heat', 'noise')",
+        "episode_length:10",
+    ]
+    assert train.main([*arguments("ppo", tmp_path, *params), *extra]) == 0
+    run = tmp_path / "ppo" / "CostPoint-v0_1"
+    costs = np.load(run / "evaluations.npz")["key_costs"]  # [evaluations, episodes, 2]
+    np.testing.assert_allclose(costs[..., 1], 2 * costs[..., 0], rtol=1e-5)
+    assert (costs > 0).all()
+    final = json.loads((run / "result.json").read_text())["final"]["greedy"]
+    assert min(final["costs"]) > 0 and set(final["bounded"]) == {"heat", "noise"}
 
 
 @pytest.mark.parametrize(

@@ -92,9 +92,10 @@ def test_a_run_of_an_older_version_has_no_hash(run, tmp_path, capsys):
     assert again(tmp_path, str(run), *PACKAGES) == 1
     out = capsys.readouterr().out
     assert "Not the same: returns or costs differ" in out and "before 0, now" in out
-    (run / "result.json").write_text(json.dumps(result | {"seconds": "fast"}))
-    assert again(tmp_path, str(run), *PACKAGES) == 2
-    assert "result.json is damaged" in capsys.readouterr().err
+    for seconds in ("fast", float("nan")):
+        (run / "result.json").write_text(json.dumps(result | {"seconds": seconds}))
+        assert again(tmp_path, str(run), *PACKAGES) == 2
+        assert "result.json is damaged" in capsys.readouterr().err
 
 
 def test_a_run_is_not_compared_with_itself(run, tmp_path, capsys):

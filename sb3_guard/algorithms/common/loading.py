@@ -98,9 +98,14 @@ class LoadsOthers(BaseAlgorithm):
             left = sorted(settings.keys() - known)
         elif kwargs.get("policy_kwargs") is not None:  # taken as the constructor took them
             kwargs["policy_kwargs"] = {**cls.policy_defaults, **kwargs["policy_kwargs"]}
-        model = super().load(
-            path, env, device, custom_objects, print_system_info, force_reset, **kwargs
-        )
+        try:
+            model = super().load(
+                path, env, device, custom_objects, print_system_info, force_reset, **kwargs
+            )
+        except KeyError as error:  # SB3 takes every ValueError for a sign of an old file
+            raise (
+                error.__context__ if isinstance(error.__context__, ValueError) else error
+            ) from None
         for name in left:
             delattr(model, name)
         new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
@@ -141,6 +146,7 @@ class LoadsOthers(BaseAlgorithm):
         if exact_match and given.keys() != names.keys():
             raise ValueError(
                 f"{type(self).__name__}: names of parameters do not match, {', '.join(given)} "
-                f"instead of {', '.join(names)}; load a file with the class that saved it"
+                f"instead of {', '.join(names)}; load a file with the class and the arguments of "
+                "the agent that was saved"
             )
         super().set_parameters(given, exact_match, device)

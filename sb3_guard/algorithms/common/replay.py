@@ -19,6 +19,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     RolloutReturn,
+    TrainFreq,
     TrainFrequencyUnit,
 )
 from stable_baselines3.common.vec_env import VecEnv
@@ -177,7 +178,12 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
             reset_num_timesteps or self._last_obs is None
         ):
             self.replay_buffer.cut()  # new episodes begin
-        if total_timesteps + (not reset_num_timesteps) * self.num_timesteps <= self.learning_starts:
+        assert isinstance(self.train_freq, TrainFreq)
+        per_rollout = self.n_envs * self.train_freq.frequency
+        steps = total_timesteps + (0 if reset_num_timesteps else self.num_timesteps)
+        steps = -(-steps // per_rollout) * per_rollout  # of whole rollouts
+        counted = self.train_freq.unit is TrainFrequencyUnit.STEP
+        if counted and steps <= self.learning_starts:
             warnings.warn(
                 f"nothing is learnt in {total_timesteps:,} steps: the first gradient step comes "
                 f"after learning_starts={self.learning_starts:,}",

@@ -128,7 +128,8 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         if flags.given & {"algo", "env", "exp_id"}:
             raise UsageError(f"{flags.folder} is a run: leave out --algo, --env and --exp-id")
         run = RunFolder(Path(flags.folder))
-        flags.algo, flags.env = run.flags().algo, run.flags().env
+        with explained(f"{run.params / 'args.yml'} is damaged"):
+            flags.algo, flags.env = (str(run.args()[name]) for name in ("algo", "env"))
         path, statistics = find_model(run, flags)
     else:
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)

@@ -60,8 +60,9 @@ class Experiment:
         self.algorithm = algorithm(self.flags.algo)
         self.source = source_of(self.flags.env)
         self.setup = build(self.hyperparams)
-        monitored = self.setup.monitor_kwargs.get("cost_keys", ("cost",))  # of a baseline
-        self.cost_keys = tuple(self.setup.model.get("cost_keys", monitored))
+        baseline = not hasattr(self.algorithm, "constrained")
+        keys = (self.setup.monitor_kwargs if baseline else self.setup.model).get("cost_keys")
+        self.cost_keys = tuple(keys or ("cost",))
 
     def limits(self) -> np.ndarray:
         """

@@ -280,10 +280,10 @@ def evaluate_policy(
             )
             observations, rewards, starts, infos = env.step(actions)
             steps += 1
-            last_costs, _ = read_costs(infos, keys, zero_if_missing)
+            last_costs, seen = read_costs(infos, keys, zero_if_missing)
             if on_step is not None:
                 on_step()
-            tally.step(rewards, last_costs, starts, infos)
+            tally.step(rewards, last_costs, starts, infos, seen)
             last_costs[np.flatnonzero(starts)] = 0.0
     return tally.evaluation(
         limit_on=getattr(model, "limit_on", "sum"),
@@ -323,10 +323,11 @@ class _Tally:
         costs: np.ndarray,
         dones: np.ndarray,
         infos: list[dict[str, Any]],
+        reported: bool,
     ) -> None:
         """Add a step of every environment, and the episodes that it ends."""
         self.returns += rewards
-        self.reported = self.reported or any(key in info for info in infos for key in self.keys)
+        self.reported |= reported
         if len(self.keys) == 1:
             totals = costs
         else:

@@ -60,6 +60,14 @@ def test_an_agent_without_limits_and_one_that_limits_the_worst_step():
     assert worst.words()[1] == (f"worst cost of a step {max(costs):.2f}, limit 0.1", True)
 
 
+def test_costs_of_other_names_are_those_of_the_monitor():
+    film, _ = make(keys=KEYS)
+    film.seed(0)
+    film.reset()
+    info = film.step(np.zeros((1, 2)))[3][0]
+    assert film.words()[1:] == [(f"{key} {info[key]:.2f}", False) for key in KEYS]
+
+
 def test_the_last_picture_of_an_episode_stays_with_its_totals():
     film, pictures = make()
     film.reset()

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.costs import read_costs
 from sb3_guard.zoo.cli.usage import UsageError, explained
@@ -36,7 +37,7 @@ class Film(VecEnvWrapper):
     def __init__(self, venv: VecEnv, model: BaseAlgorithm, writer: Any, bar: Any) -> None:
         super().__init__(venv)
         self.writer, self.bar = writer, bar
-        self.keys = tuple(getattr(model, "cost_keys", ("cost",)))
+        self.keys = cost_keys_of(model, venv)
         self.limits: list[float | None] = [None] * len(self.keys)
         if isinstance(model, Constrained) and model.constrained:
             self.limits = model.final_cost_limits.tolist()

@@ -51,6 +51,22 @@ def check_learning_rate(rate: Any) -> None:
         raise ValueError(f"learning_rate={rate!r}: must be a positive number or a schedule")
 
 
+def check_cost_keys(keys: Any) -> None:
+    """
+    :raises ValueError: ``keys`` is not a sequence of different names
+    """
+    if (
+        isinstance(keys, str)
+        or len(keys) < 1
+        or not all(isinstance(key, str) for key in keys)
+        or len(set(keys)) < len(keys)
+    ):
+        raise ValueError(
+            f"cost_keys={keys!r}: must be a sequence of one or more different names of info "
+            "entries, such as ('cost',)"
+        )
+
+
 def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
     """
     :raises ValueError: ``value`` is not one finite number, or one for each cost key

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.monitor import cost_keys_of, total_cost
 from sb3_guard.costs import RESAMPLES, EpisodeCost, EpisodeCosts, interval, read_costs, verdict
 
@@ -248,7 +249,9 @@ def evaluate_policy(
     if not isinstance(env, VecEnv):
         lone = env
         env = DummyVecEnv([lambda: lone])
-    keys = tuple(cost_keys_of(model, env) if cost_keys is None else cost_keys)
+    cost_keys = cost_keys_of(model, env) if cost_keys is None else cost_keys
+    check_cost_keys(cost_keys)
+    keys = tuple(cost_keys)
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)

@@ -12,7 +12,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.checks import NumberError
+from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.vec_budgets import end_rows
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, number, read_costs
 
@@ -52,6 +52,7 @@ class CostMonitor(VecMonitor):
     :param filename: csv to write, see :meth:`log_to`; None: no file
     :param info_keywords: other entries of the last step's info to report as they are
     :param cost_keys: the entries of info that are costs
+    :raises ValueError: ``cost_keys`` is not a sequence of different names
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class CostMonitor(VecMonitor):
         info_keywords: tuple[str, ...] = (),
         cost_keys: Sequence[str] = ("cost",),
     ):
+        check_cost_keys(cost_keys)
         super().__init__(venv, info_keywords=tuple(info_keywords))
         self.cost_keys = tuple(cost_keys)
         self._columns = (

@@ -214,6 +214,21 @@ def test_policies(
     assert all(th.isfinite(value).all() for value in after.values())
 
 
+@pytest.mark.parametrize(("cls", "critic"), [(CPO, "vf"), (ALGORITHMS["sac_lag"], "qf")])
+def test_layers_of_the_cost_critic(cls: type[Any], critic: str) -> None:
+    """Those of "cost" in ``net_arch``, or of the reward's critic."""
+
+    def widths(module: th.nn.Module) -> set[int]:
+        return {width for weights in module.parameters() for width in weights.shape}
+
+    arch: dict[str, list[int]] = {"pi": [11], critic: [17]}
+    model = small(cls, points(), policy_kwargs={"net_arch": {**arch, "cost": [19]}})
+    assert 19 in widths(model.cost_critic) and 17 not in widths(model.cost_critic)
+    assert 17 in widths(model.policy) and 19 not in widths(model.policy)
+    model = small(cls, points(), policy_kwargs={"net_arch": arch})
+    assert 17 in widths(model.cost_critic)
+
+
 class _Normed(FlattenExtractor):
     """Layers that behave in another way while a network is fitted."""
 

@@ -82,6 +82,11 @@ def test_several_costs(tmp_path):
     assert load_results(str(tmp_path))["c_heat"].tolist() == pytest.approx([0.06])
 
 
+def test_a_name_alone_is_no_sequence_of_costs():
+    with pytest.raises(ValueError, match=r"cost_keys='heat': must be a sequence"):
+        make(3, cost_keys="heat")
+
+
 @pytest.mark.parametrize("kind", [float, np.float32, lambda cost: np.array([cost])])
 def test_several_costs_of_every_kind(kind):
     env = make(2, cost_keys=("cost", "heat"))

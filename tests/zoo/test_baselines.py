@@ -74,8 +74,10 @@ def test_costs_of_other_names_are_those_of_the_monitor(tmp_path):
     costs = np.load(run / "evaluations.npz")["key_costs"]  # [evaluations, episodes, 2]
     np.testing.assert_allclose(costs[..., 1], 2 * costs[..., 0], rtol=1e-5)
     assert (costs > 0).all()
-    final = json.loads((run / "result.json").read_text())["final"]["greedy"]
-    assert min(final["costs"]) > 0 and set(final["bounded"]) == {"heat", "noise"}
+    result = json.loads((run / "result.json").read_text())
+    assert min(result["final"]["greedy"]["costs"]) > 0
+    assert set(result["final"]["greedy"]["bounded"]) == set(result["costs"]) == {"heat", "noise"}
+    assert result["costs"]["noise"]["mean"] == pytest.approx(2 * result["costs"]["heat"]["mean"])
 
 
 @pytest.mark.parametrize(

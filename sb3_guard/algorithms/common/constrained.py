@@ -34,7 +34,7 @@ from sb3_guard.algorithms.common.arguments import (
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.limits import CostLimits
 from sb3_guard.algorithms.common.loading import LoadsOthers
-from sb3_guard.checks import is_number
+from sb3_guard.checks import check_cost_keys, is_number
 from sb3_guard.costs import EpisodeCosts, read_costs
 
 _LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
@@ -144,16 +144,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         for name, parameter in inspect.signature(type(self)).parameters.items():
             if name in stated_ones:
                 stated_ones[name].check(name, getattr(self, name), parameter.annotation)
-        if (
-            isinstance(self.cost_keys, str)
-            or len(self.cost_keys) < 1
-            or not all(isinstance(key, str) for key in self.cost_keys)
-            or len(set(self.cost_keys)) < len(self.cost_keys)
-        ):
-            raise ValueError(
-                f"cost_keys={self.cost_keys!r}: must be a sequence of one or more different names "
-                "of info entries, such as ('cost',)"
-            )
+        check_cost_keys(self.cost_keys)
         check_theirs(self)
         self._check_cost_limit()
 

@@ -1,8 +1,8 @@
 """Critics of costs Q_C(s, a) for off-policy algorithms, all networks of them in one product."""
 
 import copy
-from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch as th
 from stable_baselines3.common.policies import BaseModel, BasePolicy
@@ -40,6 +40,8 @@ class Stacked(nn.Module):
 class CostNetworks(BaseModel):
     """n networks of the shape of a policy's critic, which share a features extractor alone.
 
+    ``net_arch={"pi": …, "qf": …, "cost": […]}`` gives them other layers.
+
     :param policy: a policy of SAC's, TD3's or TQC's kind
     :param n: number of networks
     :param outputs: of each
@@ -53,7 +55,10 @@ class CostNetworks(BaseModel):
             features_extractor=kwargs["features_extractor"],
             normalize_images=kwargs["normalize_images"],
         )
-        hidden: Sequence[int] = kwargs["net_arch"]
+        arch: Any = policy.net_arch
+        hidden = kwargs["net_arch"]
+        if isinstance(arch, dict):
+            hidden = arch.get("cost", hidden)
         first = kwargs["features_dim"] + get_action_dim(self.action_space)
         widths = [first, *hidden, outputs]
         layers: list[nn.Module] = []

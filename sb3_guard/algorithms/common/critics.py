@@ -24,8 +24,9 @@ from sb3_guard.algorithms.fast.optimizers import fuse
 class StateNetwork(nn.Module):
     """A function of the observation that is fitted separately from the policy.
 
-    It is built like the policy's own critic (same kind of extractor, same ``net_arch``) but shares
-    nothing with it, so any ``ActorCriticPolicy`` can have one.
+    It is built like the policy's own critic but shares nothing with it, so any
+    ``ActorCriticPolicy`` can have one. ``net_arch={"pi": …, "vf": …, "cost": […]}`` gives it other
+    layers.
 
     :param policy: the policy whose extractor, architecture and optimizer class are taken
     :param n_outputs: number of outputs
@@ -39,7 +40,7 @@ class StateNetwork(nn.Module):
         self.features_extractor = policy.make_features_extractor()
         arch = policy.net_arch
         if isinstance(arch, dict):
-            arch = arch.get("vf", [])  # as SB3's extractor reads it
+            arch = arch.get("cost", arch.get("vf", []))  # as SB3's extractor reads it
         features = self.features_extractor.features_dim
         layers = create_mlp(features + n_extra, n_outputs, arch, policy.activation_fn)
         self.network = nn.Sequential(*layers)

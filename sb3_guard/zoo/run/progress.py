@@ -16,7 +16,7 @@ from tqdm import tqdm
 import sb3_guard
 from sb3_guard.algorithms.common.limits import limits_at
 from sb3_guard.common.evaluation import estimate
-from sb3_guard.common.monitor import find_monitor
+from sb3_guard.common.monitor import cost_keys_of, find_monitor
 from sb3_guard.costs import verdict
 from sb3_guard.zoo.run.folder import EPOCH, cost_words
 
@@ -131,7 +131,7 @@ class Epochs(BaseCallback):
 
     @property
     def _keys(self) -> tuple[str, ...]:
-        return tuple(getattr(self.model, "cost_keys", ("cost",)))
+        return cost_keys_of(self.model, self.training_env)
 
     @property
     def _limits_worst(self) -> bool:

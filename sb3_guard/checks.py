@@ -51,8 +51,9 @@ def check_learning_rate(rate: Any) -> None:
         raise ValueError(f"learning_rate={rate!r}: must be a positive number or a schedule")
 
 
-def check_cost_keys(keys: Any) -> None:
+def check_cost_keys(keys: Any) -> tuple[str, ...]:
     """
+    :return: the keys
     :raises ValueError: ``keys`` is not a sequence of different names
     """
     if (
@@ -65,6 +66,7 @@ def check_cost_keys(keys: Any) -> None:
             f"cost_keys={keys!r}: must be a sequence of one or more different names of info "
             "entries, such as ('cost',)"
         )
+    return tuple(keys)
 
 
 def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:

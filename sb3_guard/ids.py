@@ -10,7 +10,10 @@ from gymnasium.envs.registration import find_highest_version
 ENTRY_POINT = "sb3_guard.envs.gym_env:GuardEnv"
 
 #: Ends messages about unknown names.
-IMPORT_FIRST = "; parts or environments of your own need their module: --gym-packages MODULE"
+IMPORT_FIRST = (
+    "; import the module of parts or environments of your own first (commands: "
+    "--gym-packages MODULE)"
+)
 
 
 class UnknownId(ValueError):

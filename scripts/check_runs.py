@@ -49,10 +49,10 @@ def problems(path: Path) -> Iterator[str]:
     run = RunFolder(path)
     result, config = run.checked_result(), run.hyperparams()
     for name in ("command", "curve", "final", "seconds", "versions"):
-        if not result.get(name):
+        if result.get(name) in (None, ""):
             yield f"result.json has no {name}: train it with this version"
     if result.get("curve") != run.curve_hash():
-        yield "curve in result.json is not the hash of 0.monitor.csv"
+        yield "curve in result.json is not the hash of 0.monitor.csv (packed logs are rounded)"
     with ROWS.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             if row["curve"] == result.get("curve"):

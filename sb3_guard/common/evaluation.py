@@ -249,9 +249,7 @@ def evaluate_policy(
     if not isinstance(env, VecEnv):
         lone = env
         env = DummyVecEnv([lambda: lone])
-    cost_keys = cost_keys_of(model, env) if cost_keys is None else cost_keys
-    check_cost_keys(cost_keys)
-    keys = tuple(cost_keys)
+    keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
@@ -319,6 +317,7 @@ class _Tally:
         self.ended: list[tuple[float, int, EpisodeCost]] = []  # return, steps, costs
         self.successes: list[bool] = []
         self.reported = False  # whether any step reported a cost
+        self.alike: set[str] = set()  # other entries of infos, until then, that may be costs
 
     def step(
         self,
@@ -331,6 +330,8 @@ class _Tally:
         """Add a step of every environment, and the episodes that it ends."""
         self.returns += rewards
         self.reported |= reported
+        if not self.reported:
+            self.alike |= {key for info in infos for key in info if "cost" in str(key).lower()}
         if len(self.keys) == 1:
             totals = costs
         else:
@@ -373,10 +374,13 @@ class _Tally:
 
     def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
         """What was seen."""
-        if self.keys and not self.reported and not limits:
+        expected = self.alike or self.keys != ("cost",)  # most environments have no costs
+        if self.keys and not self.reported and not limits and expected:
+            there = f" (info has {', '.join(sorted(self.alike))})" if self.alike else ""
             warnings.warn(
-                f"no step reported a cost as info[{self.keys[0]!r}], so costs are 0; name them in "
-                "cost_keys or, for PPO and others without costs, in the monitor's cost_keys",
+                f"no step reported a cost as info[{self.keys[0]!r}]{there}, so costs are 0; name "
+                "them in cost_keys or, for PPO and others without costs, in the monitor's: "
+                "-params \"monitor_kwargs:{'cost_keys': ['name']}\"",
                 stacklevel=3,
             )
         shape = len(self.ended), len(self.keys)

@@ -62,9 +62,8 @@ class CostMonitor(VecMonitor):
         info_keywords: tuple[str, ...] = (),
         cost_keys: Sequence[str] = ("cost",),
     ):
-        check_cost_keys(cost_keys)
         super().__init__(venv, info_keywords=tuple(info_keywords))
-        self.cost_keys = tuple(cost_keys)
+        self.cost_keys = check_cost_keys(cost_keys)
         self._columns = (
             [f"c_{key}" for key in self.cost_keys] if self.cost_keys != ("cost",) else []
         )

@@ -97,14 +97,19 @@ def test_a_missing_network_of_sb3s_is_still_an_error(tmp_path):
         filtered.set_parameters({name: given[name] for name in given if name != optimizer})
 
 
-def test_an_agent_of_another_class_of_ours_is_refused(tmp_path):
-    PPOLag("MlpPolicy", CostPoint(10), n_steps=40, batch_size=20, cost_limit=1.0).save(
-        tmp_path / "a"
-    )
-    with pytest.raises(
-        ValueError, match=r"CPO: .*do not match.*multiplier.* load a file with the class"
-    ):
-        CPO.load(tmp_path / "a", env=CostPoint(10))
+class _MyPPOLag(PPOLag):
+    """A user's own."""
+
+
+@pytest.mark.parametrize("saved", [PPOLag, SACLag, _MyPPOLag])
+def test_an_agent_of_another_class_of_ours_is_refused(saved, tmp_path):
+    arguments = {} if saved is SACLag else {"n_steps": 40, "batch_size": 20}
+    saved("MlpPolicy", CostPoint(10), cost_limit=1.0, **arguments).save(tmp_path / "a")
+    said = "do not match.*multiplier" if saved is _MyPPOLag else f"is of {saved.__name__}, whose"
+    for other in (CPO, TRPOLag) if saved is not _MyPPOLag else (CPO,):
+        with pytest.raises(ValueError, match=f"{other.__name__}: .*{said}"):
+            other.load(tmp_path / "a", env=CostPoint(10))
+    _MyPPOLag.load(tmp_path / "a") if saved is PPOLag else saved.load(tmp_path / "a")
 
 
 @pytest.mark.parametrize("beside", ["ppo_vecnormalize.pkl", "run/vecnormalize.pkl", None])

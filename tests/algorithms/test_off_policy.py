@@ -681,7 +681,8 @@ def test_a_training_that_learns_nothing_is_told():
         model.learn(60)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        model.learn(1, reset_num_timesteps=False)
+        for steps in (0, 30, 31):
+            model.learn(steps, reset_num_timesteps=False)  # many parts, of which one learns
         whole = SACLag("MlpPolicy", points(8), cost_limit=1.0, **settings()).learn(60)
     assert model._n_updates == whole._n_updates == 1
 

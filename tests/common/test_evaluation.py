@@ -106,8 +106,14 @@ def test_costs_that_no_step_reports_are_told(recwarn):
     play("cost")
     renamed = play("heat", cost_keys=("heat",))  # the monitor knows the name
     assert renamed.cost_keys == ("heat",) and not recwarn
-    with pytest.warns(UserWarning, match=r"no step reported a cost as info\['cost'\]"):
-        assert play("heat").costs.tolist() == [0.0]
+    evaluate_policy(Idle(), gym.make("CartPole-v1"), n_eval_episodes=1)  # has no costs
+    assert not recwarn
+    with pytest.warns(
+        UserWarning, match=r"as info\['cost'\] \(info has cost_heat\), so costs are 0"
+    ):
+        assert play("cost_heat").costs.tolist() == [0.0]
+    with pytest.warns(UserWarning, match=r"no step reported a cost as info\['noise'\], so"):
+        assert play("heat", cost_keys=("noise",)).costs.tolist() == [0.0]
 
 
 def test_callbacks():

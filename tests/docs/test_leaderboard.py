@@ -139,7 +139,7 @@ def sent(folder: Path, algo: str = "cpo", seed: int = 0, **entries: Any) -> Path
     return path
 
 
-def test_a_run_without_a_limit_can_be_sent_in(scripts, tmp_path, monkeypatch, capsys):
+def test_a_run_without_a_limit_can_be_sent_in(scripts, tmp_path, capsys):
     checks = scripts[2]
     for seed in range(3):
         run = sent(tmp_path / "logs", "ppo", seed, config={"cost_limit": None}, cost_limit=None)
@@ -164,7 +164,7 @@ def test_the_algorithm_is_told_by_the_folder(scripts, tmp_path, monkeypatch, cap
     assert "cpo in result.json, pcpo by the folder's name" in capsys.readouterr().out
 
 
-def test_too_few_seeds_are_no_fault_but_told(scripts, tmp_path, monkeypatch, capsys):
+def test_too_few_seeds_are_no_fault_but_told(scripts, tmp_path, capsys):
     checks = scripts[2]
     for seed in (0, 1, 1):
         sent(tmp_path / "logs", seed=seed)
@@ -172,7 +172,7 @@ def test_too_few_seeds_are_no_fault_but_told(scripts, tmp_path, monkeypatch, cap
     assert "cpo on Goal_Point_8Hazards: 2 of the 3 seeds that" in capsys.readouterr().out
 
 
-def test_hashes_can_be_checked_after_packing(scripts, tmp_path, monkeypatch, capsys):
+def test_hashes_can_be_checked_after_packing(scripts, tmp_path, capsys):
     _, archives, checks = scripts
     sent(tmp_path / "logs")
     archives.pack(tmp_path / "logs", "sent_mine")
@@ -181,7 +181,7 @@ def test_hashes_can_be_checked_after_packing(scripts, tmp_path, monkeypatch, cap
         assert checks.check(Path(path)), capsys.readouterr().out
 
 
-def test_hyperparameters_of_a_file_elsewhere_are_refused(scripts, tmp_path, monkeypatch, capsys):
+def test_hyperparameters_of_a_file_elsewhere_are_refused(scripts, tmp_path, capsys):
     checks = scripts[2]
     sent(tmp_path / "logs", args={"conf_file": "omnisafe"})
     assert checks.check(tmp_path / "logs")
@@ -216,7 +216,7 @@ def test_bad_flags(scripts, tmp_path, monkeypatch, capsys, flags, message):
     run = sent(tmp_path / "logs")
     (checks.DATA / "sent_there.tar.xz").touch()
     flags = [flag.format(run=run, logs=tmp_path / "logs") for flag in flags]
-    monkeypatch.setattr(sys, "argv", ["leaderchecks.py", *flags])
+    monkeypatch.setattr(sys, "argv", ["check_runs.py", *flags])
     with pytest.raises(SystemExit):
         checks.main()
     assert message in capsys.readouterr().err
@@ -253,9 +253,7 @@ def played(value: Any) -> dict[str, Any]:
         ("args.yml", {"env": "Goal_Ant_8Hazards-v0"}, "env is Goal_Ant_8Hazards-v0 in args.yml"),
     ],
 )
-def test_a_row_that_is_not_what_it_says(
-    scripts, tmp_path, monkeypatch, capsys, file, changes, message
-):
+def test_a_row_that_is_not_what_it_says(scripts, tmp_path, capsys, file, changes, message):
     checks = scripts[2]
     run = sent(tmp_path / "logs")
     assert checks.check(run)
@@ -288,7 +286,7 @@ def test_no_packed_run_is_lost(scripts, tmp_path):
         archives.pack(tmp_path / "logs", "grid")
 
 
-def test_seeds_have_episodes_of_their_own(scripts, tmp_path, monkeypatch, capsys):
+def test_seeds_have_episodes_of_their_own(scripts, tmp_path, capsys):
     checks = scripts[2]
     run = sent(tmp_path / "logs", seed=1)
     copy = sent(tmp_path / "logs", seed=2)
@@ -301,7 +299,7 @@ def test_seeds_have_episodes_of_their_own(scripts, tmp_path, monkeypatch, capsys
     assert "the same episodes under several seeds" in capsys.readouterr().out
 
 
-def test_seeds_of_a_row_have_the_same_hyperparameters(scripts, tmp_path, monkeypatch, capsys):
+def test_seeds_of_a_row_have_the_same_hyperparameters(scripts, tmp_path, capsys):
     checks = scripts[2]
     for seed in (1, 2):
         sent(tmp_path / "logs", seed=seed, config={"cost_limit": 2.0, "gamma": 0.9 + seed / 100})
@@ -331,7 +329,7 @@ def test_a_folder_that_is_sent_in_is_checked(scripts, tmp_path, capsys):
     assert said.count(";") == 4 + said.count("not committed; ")
     result = json.loads((run / "result.json").read_text())
     (run / "result.json").write_text(
-        json.dumps(result | {"curve": "0", "command": "x", "final": {}})
+        json.dumps(result | {"curve": "0", "command": "x", "final": None})
     )
     (run / "0.monitor.csv").write_text(
         "\n".join((run / "0.monitor.csv").read_text().splitlines()[:-3]) + "\n"

@@ -142,6 +142,13 @@ def test_enjoy(arguments, parts, capsys, empty):
     refused(enjoy.main, ["--no-render", *arguments], capsys, *parts)
 
 
+def test_a_module_whose_robot_is_refused(capsys, empty, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "odd_robot.py").write_text("raise ValueError('actuator m has no ctrlrange')")
+    said = "--gym-packages: can't import 'odd_robot': actuator m has no ctrlrange"
+    refused(train.main, ["--gym-packages", "odd_robot"], capsys, said)
+
+
 @pytest.mark.parametrize("error", [ValueError, TypeError])
 def test_constructor_of_an_environment(error, capsys, empty, monkeypatch):
     """What a user's environment refuses is one line, however many its message has."""

@@ -124,16 +124,19 @@ def test_an_evaluation_is_of_the_agent_after_its_update(monkeypatch):
     settings = SimpleNamespace(n_evaluations=4, n_timesteps=160)
     evaluations = trials.Evaluations(SimpleNamespace(), settings, lambda _: True, lambda: False)
 
-    def evaluate() -> bool:
+    def evaluate() -> list[float]:
         seen.append((evaluations.num_timesteps, evaluations.model._n_updates))
-        evaluations.history.append([0.0])
-        return True
+        return [0.0]
 
     monkeypatch.setattr(evaluations, "_evaluate", evaluate)
     TRPO("MlpPolicy", CostPoint(10), n_steps=40, seed=0).learn(160, callback=evaluations)
     evaluations.finish()
     steps, updates = zip(*seen, strict=True)
     assert steps[:3] == (40, 80, 120) and updates[0] > 0 and len({*updates}) == 4
+    seen.clear()
+    settings.n_evaluations = 9
+    evaluations.finish()
+    assert len(evaluations.history) == 9 and len(seen) == 1, "of one agent"
 
 
 def test_an_algorithm_of_a_user_tunes(tmp_path, monkeypatch):

@@ -105,6 +105,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._warned: set[str] = set()
+        self.saved_by = type(self).__name__  # what a file says
         # `load` builds the model later, with the limit of the file.
         new = kwargs.get("_init_setup_model", True)
         if self.constrained and new and "cost_limit" not in kwargs:
@@ -144,13 +145,12 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         for name, parameter in inspect.signature(type(self)).parameters.items():
             if name in stated_ones:
                 stated_ones[name].check(name, getattr(self, name), parameter.annotation)
-        check_cost_keys(self.cost_keys)
+        self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
         check_theirs(self)
         self._check_cost_limit()
 
     def _setup_model(self) -> None:
         self._check_hyperparameters()
-        self.cost_keys = tuple(self.cost_keys)  # loading turns tuples into lists
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
+from sb3_guard.algorithms import CLASSES
 from sb3_guard.algorithms.common.arguments import stated
 
 # SB3's buffers have no room for costs.
@@ -90,6 +91,13 @@ class LoadsOthers(BaseAlgorithm):
         if hasattr(path, "seek"):
             path.seek(0)
         left: list[str] = []
+        saved_by = (data or {}).get("saved_by", "TRPO")  # whose agents any other may take over
+        others = {*CLASSES.values()} - {"TRPO", *(base.__name__ for base in cls.__mro__)}
+        if saved_by in others:
+            raise ValueError(
+                f"{cls.__name__}: the file is of {saved_by}, whose hyperparameters mean something "
+                f"else: load it with {saved_by}.load"
+            )
         if data is not None and "cost_keys" not in data:
             custom_objects = {**replacements(cls, data), **(custom_objects or {})}
             blank = cls(custom_objects["policy_class"], env=None, _init_setup_model=False)  # type: ignore[call-arg]

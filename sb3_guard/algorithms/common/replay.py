@@ -180,15 +180,13 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
             self.replay_buffer.cut()  # new episodes begin
         assert isinstance(self.train_freq, TrainFreq)
         per_rollout = self.n_envs * self.train_freq.frequency
-        steps = total_timesteps + (0 if reset_num_timesteps else self.num_timesteps)
-        steps = -(-steps // per_rollout) * per_rollout  # of whole rollouts
+        steps = -(-total_timesteps // per_rollout) * per_rollout  # of whole rollouts
         counted = self.train_freq.unit is TrainFrequencyUnit.STEP
-        if counted and steps <= self.learning_starts:
-            warnings.warn(
+        if reset_num_timesteps and counted and 0 < steps <= self.learning_starts:
+            self._warn_once(
+                "learning_starts",
                 f"nothing is learnt in {total_timesteps:,} steps: the first gradient step comes "
                 f"after learning_starts={self.learning_starts:,}",
-                UserWarning,
-                stacklevel=3,
             )
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
 

@@ -18,7 +18,7 @@ from sb3_guard.zoo.agents.film import filming
 from sb3_guard.zoo.agents.flags import HubFlags
 from sb3_guard.zoo.agents.playback import Agent, means, open_agent, summary
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, packages_flag
-from sb3_guard.zoo.run.folder import RunFolder, claim, folder_name, require_writable
+from sb3_guard.zoo.run.folder import RunFolder, claim, folder_name, is_run, require_writable
 from sb3_guard.zoo.run.make_envs import full_id
 
 # Said before an agent is downloaded.
@@ -184,6 +184,8 @@ def command(agent: Agent) -> str:
 def load(flags: HubFlags) -> int:
     """Download an agent into a new run folder, where ``enjoy`` and ``train -i`` find it."""
     import_packages(flags.gym_packages)
+    if is_run(Path(flags.folder)):
+        raise UsageError(f"--folder {flags.folder!r} is a run: name the folder that gets a new one")
     flags.env = full_id(flags.env)
     name = model_name(flags.algo, flags.env)
     repo_id = f"{flags.organization}/{flags.repo_name or name}"

@@ -91,7 +91,8 @@ def import_packages(names: Sequence[str]) -> None:
                 f"--gym-packages {name!r} is not the name of a module, such as my_robots or "
                 "my_package.robots; call the command in the folder of my_robots.py"
             )
-        with explained(f"--gym-packages: can't import {name!r}", ImportError, TypeError):
+        errors = ImportError, TypeError, ValueError
+        with explained(f"--gym-packages: can't import {name!r}", *errors):
             importlib.import_module(name)
 
 

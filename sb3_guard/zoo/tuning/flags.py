@@ -52,7 +52,7 @@ class TuneFlags(TrainingFlags):
         (default: 10)
     :param n_evaluations: number of evaluations per training (default: one per 100,000 steps, but at
         least 4)
-    :param eval_episodes: episodes per evaluation (default: 5)
+    :param eval_episodes: episodes per evaluation with each kind of actions (default: 5)
 
     Storage and workers:
 

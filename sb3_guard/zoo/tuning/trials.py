@@ -50,7 +50,7 @@ class Settings:
     :param n_timesteps: length of one training
     :param seeds: of the trainings of a trial
     :param n_evaluations: evaluations per training
-    :param eval_episodes: episodes per evaluation
+    :param eval_episodes: episodes per evaluation with each kind of actions
     :param cost_keys: entries of info that are costs
     :param cost_limit: highest feasible episode cost, one per cost key; None: no constraint
     :param pareto: search the trade-off of return and cost instead
@@ -125,8 +125,7 @@ class Evaluations(BaseCallback):
         # After an update, not in the rollout before it. The last one is made by finish.
         each = self.settings.n_timesteps / self.settings.n_evaluations
         due = min(int(self.num_timesteps / each), self.settings.n_evaluations - 1)
-        while len(self.history) < due and not self.ended:
-            self.ended = not self._evaluate()
+        self._evaluate_until(due)
 
     def _on_step(self) -> bool:
         if self.stopped():
@@ -135,10 +134,17 @@ class Evaluations(BaseCallback):
 
     def finish(self) -> None:
         """Evaluate what training came to, unless it was ended."""
-        while len(self.history) < self.settings.n_evaluations and not self.ended:
-            self.ended = not self._evaluate()
+        self._evaluate_until(self.settings.n_evaluations)
 
-    def _evaluate(self) -> bool:
+    def _evaluate_until(self, due: int) -> None:
+        """Have this number of evaluations; those of one agent are the same."""
+        row: list[float] | None = None
+        while len(self.history) < due and not self.ended:
+            row = row or self._evaluate()
+            self.history.append(row)
+            self.ended = not self.after(self.history)
+
+    def _evaluate(self) -> list[float]:
         assert self.training.evaluation is not None
         # A limit is to hold with both kinds of actions, as that of the best model.
         evaluations = [self.training.evaluation.evaluate(greedy) for greedy in (True, False)]
@@ -146,8 +152,7 @@ class Evaluations(BaseCallback):
         row = [float(evaluations[0].returns.mean()), *costs.tolist()]
         if not np.isfinite(row).all():
             raise FloatingPointError(f"an evaluation gave {row}")
-        self.history.append(row)
-        return self.after(self.history)
+        return row
 
 
 class Objective:

@@ -114,7 +114,7 @@ def test_episodes_that_a_wrapper_ended_are_not_judged(tmp_path):
     assert table["split"].tolist() == ["stochastic", "greedy"]
 
 
-@pytest.mark.parametrize(("seeds", "share"), [(1, 0.20), (2, 0.10), (3, 0.07), (5, 0.04)])
+@pytest.mark.parametrize(("seeds", "share"), [(1, 0.20), (2, 0.11), (3, 0.08), (5, 0.04)])
 def test_few_seeds_certify_too_often(seeds, share):
     """The shares of docs/leaderboard.md, those of 10,000 cases."""
     rng = np.random.default_rng(1)

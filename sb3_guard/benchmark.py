@@ -149,7 +149,8 @@ def show_plan(runs: Sequence["Run"]) -> None:
     from sb3_guard.zoo.grids.live import summary
 
     for run in runs:
-        print(f"{run.state:<7} {run.path}  {run.steps:,} steps")
+        without = f", without {', '.join(run.ignored)}" if run.ignored else ""
+        print(f"{run.state:<7} {run.path}  {run.steps:,} steps{without}")
     print(f"{summary(runs)}; {sum(run.steps for run in runs):,} steps in all")
 
 

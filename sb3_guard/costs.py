@@ -11,6 +11,7 @@ from sb3_guard.checks import NumberError
 from sb3_guard.spelling import nearest
 
 RESAMPLES = 2000  # of a bootstrap
+LEAST_EPISODES = 5  # of an interval: one of two says no more than they do
 
 
 def number(value: Any, name: str) -> float:
@@ -65,6 +66,42 @@ def verdict(low: float, high: float, limit: float) -> str:
     if math.isnan(low):
         return ""
     return "kept" if high <= limit else "exceeded" if low > limit else "undecided"
+
+
+class Estimate(NamedTuple):
+    """A mean over episodes, their standard deviation, and an interval for the mean."""
+
+    mean: float
+    std: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        text = f"{self.mean:.3f}" + (f" ± {self.std:.3f}" if self.std else "")
+        if np.isnan(self.low):
+            return text
+        return f"{text} (95 % [{self.low:.3f}, {self.high:.3f}])"
+
+    def against(self, limit: float) -> str:
+        """Whether a cost keeps a limit, as far as the interval tells: ``limit 2: exceeded``."""
+        words = verdict(self.low, self.high, limit)
+        return f"limit {limit:g}" + (f": {words}" if words else "")
+
+
+def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
+    """
+    Mean, standard deviation and :func:`interval` of one value an episode.
+
+    :param values: one value an episode, shape [E], e.g. ``evaluation.costs``
+    :param resamples: number of bootstrap samples
+    :return: NaNs where there are too few episodes (none; for the interval, LEAST_EPISODES)
+    """
+    if len(values) == 0:
+        return Estimate(*[float("nan")] * 4)
+    ends = float("nan"), float("nan")
+    if len(values) >= LEAST_EPISODES:
+        ends = interval([values], resamples=resamples)
+    return Estimate(float(np.mean(values)), float(np.std(values)), *ends)
 
 
 def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ValueError:

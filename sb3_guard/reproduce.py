@@ -138,8 +138,12 @@ def reproduce(flags: Flags) -> int:
     # The command may come from anyone, so the user has to name the modules that it would import.
     require_named(Path(flags.run), flags.gym_packages, run.gym_packages)
     run.gym_packages = flags.gym_packages
-    if is_program(run.conf_file):
-        raise UsageError(f"the run has its hyperparameters from a program, {run.conf_file}")
+    program = str(run.conf_file).removesuffix(".py")
+    if is_program(run.conf_file) and program not in flags.gym_packages:
+        raise UsageError(
+            f"the run has its hyperparameters from a program, {run.conf_file}; if you trust it: "
+            f"--gym-packages {program}"
+        )
     run, values = prepare(run)
     seconds = row.get("seconds")
     took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""

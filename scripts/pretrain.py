@@ -26,7 +26,7 @@ from archives import with_log_folder
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard import evaluate_policy
-from sb3_guard.common.evaluation import estimate
+from sb3_guard.costs import estimate
 from sb3_guard.zoo.agents.pretrained import (
     LIMITS,
     PLAYED,

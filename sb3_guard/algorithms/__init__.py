@@ -78,6 +78,7 @@ def register_algorithm(key: str, algorithm: "type[BaseAlgorithm]") -> None:
         raise TypeError(f"algorithm={algorithm!r}: must be a class derived from SB3's algorithms")
     old = ALGORITHMS.get(key)
     # Imported again, as in a notebook, a class is a new one of the same name.
-    if old is not None and old.__qualname__ != algorithm.__qualname__:
+    ours = key in CLASSES and old is not algorithm
+    if old is not None and (ours or old.__qualname__ != algorithm.__qualname__):
         raise ValueError(f"key={key!r} is {old.__name__} already: choose another one")
     ALGORITHMS[key] = algorithm

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,42 +24,9 @@ from stable_baselines3.common.vec_env import (
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.monitor import cost_keys_of, total_cost
-from sb3_guard.costs import RESAMPLES, EpisodeCost, EpisodeCosts, interval, read_costs, verdict
+from sb3_guard.costs import EpisodeCost, EpisodeCosts, Estimate, estimate, read_costs
 
 LONG_EPISODE = 20_000  # steps after which evaluate_policy warns that an episode may never end
-
-
-class Estimate(NamedTuple):
-    """A mean over episodes, their standard deviation, and an interval for the mean."""
-
-    mean: float
-    std: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        if np.isnan(self.low):  # one episode has no spread
-            return f"{self.mean:.3f}"
-        return f"{self.mean:.3f} ± {self.std:.3f} (95 % [{self.low:.3f}, {self.high:.3f}])"
-
-    def against(self, limit: float) -> str:
-        """Whether a cost keeps a limit, as far as the interval tells: ``limit 2: exceeded``."""
-        words = verdict(self.low, self.high, limit)
-        return f"limit {limit:g}" + (f": {words}" if words else "")
-
-
-def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
-    """
-    Mean, standard deviation and :func:`~sb3_guard.costs.interval` of one value an episode.
-
-    :param values: one value an episode, shape [E], e.g. ``evaluation.costs``
-    :param resamples: number of bootstrap samples
-    :return: NaNs where there are too few episodes (none; for the interval, one)
-    """
-    if len(values) == 0:
-        return Estimate(*[float("nan")] * 4)
-    ends = interval([values], resamples=resamples)
-    return Estimate(float(np.mean(values)), float(np.std(values)), *ends)
 
 
 def bounded_name(key: str, limit_on: str) -> str:
@@ -182,11 +149,12 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
     learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
     normalizer = unwrap_vec_normalize(env)
     if normalizer is None:
-        if learnt_with is not None and learnt_with.norm_obs:
+        normalized = learnt_with is not None and learnt_with.norm_obs
+        if normalized or getattr(model, "learnt_normalized", False):
             raise ValueError(
                 "the model learnt from normalised observations, and env has no VecNormalize: "
-                "evaluate it in model.get_env(), or wrap env in VecNormalize and call "
-                "sync_normalization(model.get_env(), env)"
+                "evaluate it in model.get_env(), wrap env with VecNormalize.load(file, env), or in "
+                "VecNormalize, and call sync_normalization(model.get_env(), env)"
             )
         yield
         return

@@ -215,7 +215,10 @@ def test_what_can_be_registered(monkeypatch: pytest.MonkeyPatch) -> None:
     register_algorithm("ppo_lagrangian", PPOLagrangian)
     register_algorithm("ppo_lagrangian", PPOLagrangian)
     assert table["ppo_lagrangian"].label == "PPOLagrangian"
+    mine = type("CPO", (CPO,), {})  # of the same name
+    register_algorithm("cpo", CPO)
     for key, value, error, named in (
+        ("cpo", mine, ValueError, "'cpo' is CPO already"),
         ("PPO-Lag", PPOLagrangian, ValueError, "'PPO-Lag'"),
         ("cpo", PPOLagrangian, ValueError, "'cpo' is CPO already"),
         ("mine", "PPOLagrangian", TypeError, "'PPOLagrangian'"),

@@ -10,7 +10,18 @@ import torch as th
 from cost_envs import CostPoint
 
 import sb3_guard
-from sb3_guard import CPO, TRPOSL, TRPOUSL, PPOLag, SACLag, TD3Lag, TQCLag, TRPOLag, train
+from sb3_guard import (
+    CPO,
+    TRPOSL,
+    TRPOUSL,
+    PPOLag,
+    SACLag,
+    TD3Lag,
+    TQCLag,
+    TRPOLag,
+    evaluate_policy,
+    train,
+)
 from sb3_guard.algorithms.common.arguments import stated
 from sb3_guard.zoo.run.checkpoint import read_normalizer
 
@@ -95,6 +106,30 @@ def test_a_missing_network_of_sb3s_is_still_an_error(tmp_path):
     optimizer = "policy.action_filter.optimizer"
     with pytest.raises(ValueError, match=optimizer):
         filtered.set_parameters({name: given[name] for name in given if name != optimizer})
+
+
+def test_arguments_of_load_are_checked(tmp_path):
+    CPO("MlpPolicy", CostPoint(10), n_steps=40, cost_limit=1.0).save(tmp_path / "a")
+    model = CPO.load(tmp_path / "a", cost_limit=2.0, num_timesteps=7)
+    assert (model.cost_limit, model.num_timesteps) == (2.0, 7)
+    with pytest.raises(TypeError, match="CPO takes no argument 'cost_limt'; did you mean 'cost_l"):
+        CPO.load(tmp_path / "a", cost_limt=2.0)
+
+
+def test_an_agent_of_normalised_observations_says_so(tmp_path):
+    """Where the environment has no statistics: it would act on something else, and be judged."""
+    venv = sb3.common.vec_env.DummyVecEnv([lambda: CostPoint(10)])
+    env = sb3.common.vec_env.VecNormalize(venv)
+    CPO("MlpPolicy", env, n_steps=40, cost_limit=1.0).learn(40).save(tmp_path / "a")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate_policy(CPO.load(tmp_path / "a", env=env), env, 5)
+    for given in (None, venv):
+        with pytest.warns(UserWarning, match="learnt from normalised observations: wrap its env"):
+            model = CPO.load(tmp_path / "a", env=given)
+        with pytest.raises(ValueError, match="learnt from normalised observations, and env has"):
+            evaluate_policy(model, venv, 5)
+        evaluate_policy(model, env, 5)
 
 
 class _MyPPOLag(PPOLag):

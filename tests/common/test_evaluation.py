@@ -15,11 +15,11 @@ from sb3_guard.algorithms import CPO, TRPOSL
 from sb3_guard.common.evaluation import (
     LONG_EPISODE,
     Evaluation,
-    estimate,
     evaluate_policy,
     sync_normalization,
 )
 from sb3_guard.common.monitor import CostMonitor
+from sb3_guard.costs import estimate, interval
 
 
 class Fixed(gym.Env):
@@ -175,12 +175,12 @@ def evaluation(values) -> Evaluation:
 
 
 def test_estimate_by_hand():
-    mean, std, low, high = evaluation([1, 3]).estimate(np.array([1.0, 3.0]))
-    assert (mean, std) == (2.0, 1.0)
     # Of two values a resample has mean 1, 2 or 3, with probabilities 1/4, 1/2, 1/4.
-    assert (low, high) == (1.0, 3.0)
-    same = evaluation([2, 2, 2]).estimate(np.full(3, 2.0))
-    assert same == (2.0, 0.0, 2.0, 2.0)
+    assert interval([np.array([1.0, 3.0])]) == (1.0, 3.0)
+    # Of five of which one is 5 it has k/5 times 5, k binomial: 0 in 33 %, at most 2 in 94 %.
+    mean, std, low, high = estimate(np.array([0.0, 0.0, 0.0, 0.0, 5.0]))
+    assert (mean, std, low, high) == (1.0, 2.0, 0.0, 3.0)
+    assert estimate(np.full(5, 2.0)) == (2.0, 0.0, 2.0, 2.0)
 
 
 def test_costs_of_one_element_count_like_numbers():
@@ -257,17 +257,19 @@ def test_a_policy_of_several_costs_wants_their_names():
 
 def test_an_evaluation_in_words():
     assert str(evaluation([2.0])).startswith("1 episodes: return 2.000, cost ")
-    words = str(evaluation([1, 3]))
-    assert words.startswith("2 episodes: return 2.000 ± 1.000 (95 % [1.000, 3.000]), cost ")
+    assert str(evaluation([1, 3])).startswith("2 episodes: return 2.000 ± 1.000, cost ")
+    words = str(evaluation([0, 0, 0, 0, 5]))
+    assert words.startswith("5 episodes: return 1.000 ± 2.000 (95 % [0.000, 3.000]), cost ")
     assert "limit" not in words
     model = CPO("MlpPolicy", CostPoint(10), n_steps=20, cost_limit=30.0, seed=0)
-    assert str(evaluate_policy(model, CostPoint(10), 2)).endswith(", limit 30: kept")
+    assert str(evaluate_policy(model, CostPoint(10), 5)).endswith(", limit 30: kept")
+    assert str(evaluate_policy(model, CostPoint(10), 4)).endswith(", limit 30")
 
 
 def test_each_of_several_costs_has_its_limit_in_words():
     keys = ("cost", "heat")
     model = CPO("MlpPolicy", CostPoint(10, cost_keys=keys), cost_keys=keys, cost_limit=[30, 0.0])
-    seen = evaluate_policy(model, CostPoint(10, hazard=(-1, 0), cost_keys=keys), 2)
+    seen = evaluate_policy(model, CostPoint(10, hazard=(-1, 0), cost_keys=keys), 5)
     heat, limit = seen.by_key()["heat"]
     assert limit == 0.0 and heat == estimate(seen.key_costs[:, 1])
     total, *words = str(seen).split("; ")
@@ -280,11 +282,11 @@ def test_each_of_several_costs_has_its_limit_in_words():
 
 @pytest.mark.parametrize(
     ("limit", "words"),
-    [(3.0, "limit 3: kept"), (0.9, "limit 0.9: exceeded"), (2.0, "limit 2: undecided")],
+    [(5.0, "limit 5: kept"), (0.9, "limit 0.9: exceeded"), (2.0, "limit 2: undecided")],
 )
 def test_a_cost_against_its_limit(limit, words):
-    assert estimate(np.array([1.0, 3.0])).against(limit) == words
-    assert estimate(np.array([1.0])).against(2.0) == "limit 2"  # one episode decides nothing
+    assert estimate(np.arange(1.0, 6.0)).against(limit) == words
+    assert estimate(np.arange(1.0, 5.0)).against(5.0) == "limit 5"  # few decide nothing
 
 
 def test_no_interval_from_one_episode_and_nothing_from_none():

@@ -122,6 +122,14 @@ def test_scale_shortens_every_run_alike(tmp_path, capsys):
     assert run.values["warmup"] == pytest.approx(1 / 3)  # a ratio of whatever the length is
 
 
+def test_what_is_left_out_is_seen_beforehand(tmp_path, capsys):
+    arguments = ["--envs", "Goal_Point_8Hazards", "--algos", "cpo", "ppo_lag", "--dry-run"]
+    arguments += ["-params", "clip_range:0.1", "-f", str(tmp_path)]
+    assert benchmark.main(arguments) == 0
+    cpo, ppo_lag, *_ = capsys.readouterr().out.splitlines()
+    assert cpo.endswith(" steps, without clip_range") and ppo_lag.endswith(" steps")
+
+
 def test_a_hyperparameter_goes_to_those_that_have_it():
     args = RunFlags(hyperparams={"cost_limit": 5.0})
     cpo, ppo = grid.expand([("Goal_Point_8Hazards", a) for a in ("cpo", "ppo")], [0], args)
@@ -149,7 +157,7 @@ def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
     assert yaml.safe_load((folder / "grid.yml").read_text())["algos"] == ["trpo"]
     capsys.readouterr()
     assert benchmark.main([*PACKAGE, "-f", str(folder), "--dry-run"]) == 0
-    assert capsys.readouterr().out.startswith(f"done    {run}  60 steps")
+    assert capsys.readouterr().out.startswith(f"done    {run}  60 steps\n")
 
 
 REFUSED = [

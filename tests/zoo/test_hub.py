@@ -16,7 +16,7 @@ from sb3_guard import enjoy, hub, train
 from sb3_guard.zoo.agents import hub as zoo_hub
 from sb3_guard.zoo.agents.flags import EnjoyFlags, HubFlags
 
-WHICH = ["--env", "Filmed-v0", "--gym-packages", "registered_envs", "--n-episodes", "2"]
+WHICH = ["--env", "Filmed-v0", "--gym-packages", "registered_envs", "--n-episodes", "5"]
 
 
 @pytest.fixture(scope="module")

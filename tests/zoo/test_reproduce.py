@@ -115,6 +115,21 @@ def test_a_command_imports_what_the_user_names_only(run, tmp_path, capsys):
     assert not (tmp_path / "again").exists()
 
 
+def test_hyperparameters_of_a_program_are_run_where_it_is_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(
+        "hyperparams = {'CostPoint-v0': dict(policy='MlpPolicy', n_timesteps=400)}"
+    )
+    assert train.main([*TOY, *PACKAGES, "-conf", "mine.py", "-f", "logs"]) == 0
+    arguments = ["logs/cpo/CostPoint-v0_1", *PACKAGES]
+    assert again(tmp_path, *arguments) == 2
+    assert (
+        "from a program, mine.py; if you trust it: --gym-packages mine" in capsys.readouterr().err
+    )
+    assert again(tmp_path, *arguments, "mine") == 0
+
+
 def test_the_packages_own_table_can_be_read(tmp_path, capsys):
     assert again(tmp_path, "nothing/of/that_1") == 2
     assert "is no run folder" in capsys.readouterr().err

@@ -89,7 +89,9 @@ def test_the_first_trial_is_the_shipped_one(algo, env_id):
     base = shipped(algo, env_id)
     search = Search(algo, base)
     study = optuna.create_study()
-    study.enqueue_trial(search.first())
+    first, outside = search.first()
+    assert not outside
+    study.enqueue_trial(first)
     drawn = search.draw(study.ask())
     # What the file leaves to the constructor is that one's default.
     cls = algorithm(algo)
@@ -137,6 +139,17 @@ def test_an_evaluation_is_of_the_agent_after_its_update(monkeypatch):
     settings.n_evaluations = 9
     evaluations.finish()
     assert len(evaluations.history) == 9 and len(seen) == 1, "of one agent"
+
+
+def test_what_the_first_trial_can_not_be_is_told(tmp_path, monkeypatch, capsys):
+    pretend(monkeypatch, by_kl)
+    base = tmp_path / "base.yml"
+    base.write_text("CostPoint-v0: {policy: MlpPolicy, n_timesteps: 60, target_kl: 3.0}")
+    assert run(tmp_path, "-conf", str(base), "--n-trials", "1") == 0
+    assert (
+        "target_kl=3.0 is outside the search space: the first trial draws it"
+        in capsys.readouterr().err
+    )
 
 
 def test_an_algorithm_of_a_user_tunes(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import update_wrapper, wraps
 from types import FunctionType
 from typing import Any, NamedTuple
@@ -193,7 +193,7 @@ def documentation(cls: type, arguments: Mapping[str, inspect.Parameter]) -> str:
     return own[: at[-1]] + "\n" + "\n".join(others) + own[at[-1] :]
 
 
-def check_names(cls: type, given: Mapping[str, Any]) -> None:
+def check_names(cls: type, given: Iterable[str]) -> None:
     """
     :raises TypeError: an argument is none of the class's; the nearest one is named
     """

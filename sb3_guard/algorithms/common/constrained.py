@@ -105,7 +105,9 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._warned: set[str] = set()
-        self.saved_by = type(self).__name__  # what a file says
+        # What a file says of its agent
+        self.saved_by = type(self).__name__
+        self.learnt_normalized = False
         # `load` builds the model later, with the limit of the file.
         new = kwargs.get("_init_setup_model", True)
         if self.constrained and new and "cost_limit" not in kwargs:
@@ -206,6 +208,8 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
         n_costs = len(self.cost_keys)
+        normalizer = self.get_vec_normalize_env()
+        self.learnt_normalized = normalizer is not None and normalizer.norm_obs
         if self.ep_cost_buffer is None or reset_num_timesteps:
             self.ep_cost_buffer = deque(maxlen=self._stats_window_size)
             self.total_costs = np.zeros(n_costs)

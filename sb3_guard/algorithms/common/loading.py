@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_guard.algorithms import CLASSES
-from sb3_guard.algorithms.common.arguments import stated
+from sb3_guard.algorithms.common.arguments import check_names, stated
 
 # SB3's buffers have no room for costs.
 _BUFFERS: dict[str, Any] = {
@@ -85,12 +85,14 @@ class LoadsOthers(BaseAlgorithm):
         :param force_reset: whether the next ``learn`` begins new episodes
         :param kwargs: attributes to change, such as ``cost_limit``
         :return: the agent
+        :raises TypeError: an argument is not known; the message names the nearest one
         :raises ValueError: the file does not fit the environment or the algorithm
         """
         data, parts, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
         if hasattr(path, "seek"):
             path.seek(0)
         left: list[str] = []
+        check_names(cls, kwargs.keys() - (data or {}).keys())
         saved_by = (data or {}).get("saved_by", "TRPO")  # whose agents any other may take over
         others = {*CLASSES.values()} - {"TRPO", *(base.__name__ for base in cls.__mro__)}
         if saved_by in others:
@@ -116,6 +118,14 @@ class LoadsOthers(BaseAlgorithm):
             ) from None
         for name in left:
             delattr(model, name)
+        if getattr(model, "learnt_normalized", False) and model.get_vec_normalize_env() is None:
+            warnings.warn(
+                "the agent learnt from normalised observations: wrap its environment with "
+                "VecNormalize.load(file, env), of what model.get_vec_normalize_env().save(file) "
+                "kept in training",
+                UserWarning,
+                stacklevel=2,
+            )
         new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
         if new:
             limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""  # type: ignore[attr-defined]
@@ -152,9 +162,12 @@ class LoadsOthers(BaseAlgorithm):
                 given["policy"] = {**filters, **policy}
         names = self.get_parameters()
         if exact_match and given.keys() != names.keys():
+            absent, more = (
+                ", ".join(a.keys() - b.keys()) for a, b in ((names, given), (given, names))
+            )
             raise ValueError(
-                f"{type(self).__name__}: names of parameters do not match, {', '.join(given)} "
-                f"instead of {', '.join(names)}; load a file with the class and the arguments of "
-                "the agent that was saved"
+                f"{type(self).__name__}: names of parameters do not match, {absent or 'none'} is "
+                f"absent, {more or 'none'} unknown; load a file with the class and the arguments "
+                "of the agent that was saved"
             )
         super().set_parameters(given, exact_match, device)

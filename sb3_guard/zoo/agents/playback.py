@@ -13,8 +13,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_guard.checks import WorldError
-from sb3_guard.common.evaluation import Estimate, Evaluation, evaluate_policy
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
+from sb3_guard.costs import LEAST_EPISODES, Estimate
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
@@ -281,12 +282,15 @@ def means(evaluation: Evaluation) -> str:
     elif evaluation.limits:
         name = "worst" if evaluation.limit_on == "max" else "cost"
         rows[name] = rows[name][0], evaluation.limits[0]
-    title = f"Mean ± std of {count} episodes, 95 % interval of the mean:"
-    lines = ["One episode:" if count == 1 else title]
+    title = f"Mean ± std of {count} episodes"
+    if count >= LEAST_EPISODES:
+        title += ", 95 % interval of the mean"
+    lines = ["One episode:" if count == 1 else f"{title}:"]
     width = max(map(len, rows))
     for name, (estimate, limit) in rows.items():
         mean, std, low, high = estimate
-        interval = "" if np.isnan(low) else f" ± {std:.3f}   [{low:.3f}, {high:.3f}]"
+        spread = f" ± {std:.3f}" if count > 1 else ""
+        interval = "" if np.isnan(low) else f"   [{low:.3f}, {high:.3f}]"
         end = "" if limit is None else f"   {estimate.against(limit)}"
-        lines.append(f"  {name:<{width}} {mean:9.3f}{interval}{end}")
+        lines.append(f"  {name:<{width}} {mean:9.3f}{spread}{interval}{end}")
     return "\n".join(lines)

@@ -6,8 +6,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard.common.evaluation import Estimate
-from sb3_guard.costs import verdict
+from sb3_guard.costs import Estimate, verdict
 from sb3_guard.ids import with_version
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.markdown import table

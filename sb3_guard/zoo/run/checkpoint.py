@@ -8,6 +8,7 @@ file is a model file of SB3's with one more member, so ``CPO.load("checkpoint.zi
 import pickle
 import random
 import time
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -301,7 +302,10 @@ def load_model(
     :raises UsageError: the file is damaged, of another algorithm, or does not fit the environment
     """
     with explained(f"can't load {path} as {algorithm.__name__}"):
-        model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
+        with warnings.catch_warnings():
+            # whoever gives no environment here makes one with the statistics of the run
+            warnings.filterwarnings("ignore", "the agent learnt from normalised observations")
+            model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
         if env is not None and isinstance(model, OffPolicyAlgorithm):
             with zipfile.ZipFile(path) as archive:
                 if REPLAY_BUFFER in archive.namelist():

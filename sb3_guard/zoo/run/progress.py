@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 import sb3_guard
 from sb3_guard.algorithms.common.limits import limits_at
-from sb3_guard.common.evaluation import estimate
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
-from sb3_guard.costs import verdict
+from sb3_guard.costs import estimate, verdict
 from sb3_guard.zoo.run.folder import EPOCH, cost_words
 
 PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")

@@ -21,12 +21,12 @@ from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
 from sb3_guard.common.evaluation import (
     bounded_name,
-    estimate,
     evaluate_policy,
     sync_normalization,
 )
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
+from sb3_guard.costs import estimate
 from sb3_guard.zoo.cli.usage import (
     TrainingStopped,
     UsageError,
@@ -307,7 +307,7 @@ def summary(
         f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
         *(
             f"  final, {name:<12}return {np.mean(played['returns']):.3f}, cost "
-            f"{estimate(np.array(played['costs']))}"
+            f"{estimate(np.array(played['costs']))}, {len(played['costs'])} episodes"
             for name, played in result["final"].items()
         ),
     ]

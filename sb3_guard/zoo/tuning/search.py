@@ -127,7 +127,12 @@ def open_study(
         study.set_user_attr(SETTINGS, asdict(settings))
     if not begun:
         # So that the best is never worse than the starting point.
-        first = search.first()
+        first, outside = search.first()
+        for hyperparameter, value in outside.items():
+            print(
+                f"{hyperparameter}={value!r} is outside the search space: the first trial draws it",
+                file=sys.stderr,
+            )
         study.enqueue_trial(first, user_attrs={GIVEN: bool(first)}, skip_if_exists=True)
     # Workers that drew the same numbers would try the same things: only the first has the seed.
     seed = flags.seed if not begun and flags.seed >= 0 else None

@@ -221,12 +221,12 @@ class Search:
             values.pop("noise_std", None)
         return dict(sorted(values.items()))
 
-    def first(self) -> dict[str, Any]:
+    def first(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """
         The base's own place in the space, for the first trial, with the algorithm's defaults where
-        the base says nothing; what lies outside is drawn.
+        the base says nothing; and what lies outside, for which the first trial draws another.
         """
-        places = {}
+        places, outside = {}, {}
         cls = algorithm(self.algo)
         defaults = {name: parameter.default for name, parameter in parameters(cls).items()}
         defaults["policy_kwargs"] = getattr(cls, "policy_defaults", {})
@@ -235,7 +235,9 @@ class Search:
             value = get_dotted(defaults, name) if value is None else value
             if _contains(entry, value):
                 places[name] = _label(value)
-        return places
+            elif value is not None:
+                outside[name] = value
+        return places, outside
 
 
 def rl_zoo_sampler(algo: str, base: Mapping[str, Any]) -> Callable[..., dict[str, Any]]:

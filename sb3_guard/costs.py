@@ -77,7 +77,8 @@ class Estimate(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        text = f"{self.mean:.3f}" + (f" ± {self.std:.3f}" if self.std else "")
+        known = self.std or not np.isnan(self.low)  # one episode has no spread
+        text = f"{self.mean:.3f}" + (f" ± {self.std:.3f}" if known else "")
         if np.isnan(self.low):
             return text
         return f"{text} (95 % [{self.low:.3f}, {self.high:.3f}])"

@@ -77,7 +77,7 @@ class Estimate(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        known = self.std or not np.isnan(self.low)  # one episode has no spread
+        known = self.std > 0 or not np.isnan(self.low)  # one episode has no spread
         text = f"{self.mean:.3f}" + (f" ± {self.std:.3f}" if known else "")
         if np.isnan(self.low):
             return text

@@ -138,7 +138,7 @@ def reproduce(flags: Flags) -> int:
     # The command may come from anyone, so the user has to name the modules that it would import.
     require_named(Path(flags.run), flags.gym_packages, run.gym_packages)
     run.gym_packages = flags.gym_packages
-    program = str(run.conf_file).removesuffix(".py")
+    program = str(run.conf_file).removesuffix(".py").replace("/", ".")
     if is_program(run.conf_file) and program not in flags.gym_packages:
         raise UsageError(
             f"the run has its hyperparameters from a program, {run.conf_file}; if you trust it: "

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.loading import lacks_statistics
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.monitor import cost_keys_of, total_cost
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, Estimate, estimate, read_costs
@@ -148,13 +149,18 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
     """
     learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
     normalizer = unwrap_vec_normalize(env)
+    if lacks_statistics(model, env) and learnt_with is None:
+        warnings.warn(
+            "the agent learnt from normalised observations, and env has no VecNormalize of theirs: "
+            "unless it normalises them in another way, these are not its return and cost",
+            stacklevel=4,
+        )
     if normalizer is None:
-        normalized = learnt_with is not None and learnt_with.norm_obs
-        if normalized or getattr(model, "learnt_normalized", False):
+        if learnt_with is not None and learnt_with.norm_obs:
             raise ValueError(
                 "the model learnt from normalised observations, and env has no VecNormalize: "
-                "evaluate it in model.get_env(), wrap env with VecNormalize.load(file, env), or in "
-                "VecNormalize, and call sync_normalization(model.get_env(), env)"
+                "evaluate it in model.get_env(), or wrap env in VecNormalize and call "
+                "sync_normalization(model.get_env(), env)"
             )
         yield
         return
@@ -343,7 +349,7 @@ class _Tally:
     def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
         """What was seen."""
         expected = self.alike or self.keys != ("cost",)  # most environments have no costs
-        if self.keys and not self.reported and not limits and expected:
+        if expected and not self.reported and not limits:
             there = f" (info has {', '.join(sorted(self.alike))})" if self.alike else ""
             warnings.warn(
                 f"no step reported a cost as info[{self.keys[0]!r}]{there}, so costs are 0; name "

@@ -16,6 +16,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_guard.algorithms.common.loading import lacks_statistics
 from sb3_guard.common.files import replacing
 from sb3_guard.deployment.contract import contract
 from sb3_guard.deployment.deployed import Deployed
@@ -69,10 +70,10 @@ def export(
     if path.suffix != ".onnx":
         raise ValueError(f"path={str(path)!r}: must end in .onnx")
     env = env or model.get_env()
-    if env is None:
+    if env is None or lacks_statistics(model, env):
         raise ValueError(
-            "the agent has no environment, so its observation statistics are not known: pass env=, "
-            "environments wrapped as in training (with VecNormalize.load(file, env), if it had any)"
+            "the agent's observation statistics are not known: pass env=, environments "
+            "wrapped as in training (with VecNormalize.load(file, env), if it had any)"
         )
     deployed = Deployed(model, env, sampled)
     file = _converted(deployed)

@@ -681,6 +681,7 @@ def test_a_training_that_learns_nothing_is_told():
         model.learn(60)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        model = SACLag("MlpPolicy", CostPoint(10), cost_limit=1.0, **settings())
         for steps in (0, 30, 31):
             model.learn(steps, reset_num_timesteps=False)  # many parts, of which one learns
         whole = SACLag("MlpPolicy", points(8), cost_limit=1.0, **settings()).learn(60)

@@ -118,16 +118,18 @@ def test_a_command_imports_what_the_user_names_only(run, tmp_path, capsys):
 def test_hyperparameters_of_a_program_are_run_where_it_is_named(tmp_path, capsys, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "mine.py").write_text(
         "hyperparams = {'CostPoint-v0': dict(policy='MlpPolicy', n_timesteps=400)}"
     )
-    assert train.main([*TOY, *PACKAGES, "-conf", "mine.py", "-f", "logs"]) == 0
+    assert train.main([*TOY, *PACKAGES, "-conf", "sub/mine.py", "-f", "logs"]) == 0
     arguments = ["logs/cpo/CostPoint-v0_1", *PACKAGES]
     assert again(tmp_path, *arguments) == 2
     assert (
-        "from a program, mine.py; if you trust it: --gym-packages mine" in capsys.readouterr().err
+        "from a program, sub/mine.py; if you trust it: --gym-packages sub.mine"
+        in capsys.readouterr().err
     )
-    assert again(tmp_path, *arguments, "mine") == 0
+    assert again(tmp_path, *arguments, "sub.mine") == 0
 
 
 def test_the_packages_own_table_can_be_read(tmp_path, capsys):

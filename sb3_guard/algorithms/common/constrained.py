@@ -148,6 +148,11 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
             if name in stated_ones:
                 stated_ones[name].check(name, getattr(self, name), parameter.annotation)
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
+        arch = (self.policy_kwargs or {}).get("net_arch")
+        if isinstance(arch, dict) and "cost" in arch and len(arch) < 3:
+            raise ValueError(
+                f"net_arch={arch!r}: must have the layers of 'pi' and 'vf' or 'qf', too"
+            )
         check_theirs(self)
         self._check_cost_limit()
 
@@ -160,7 +165,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         """Say which buffer SB3 is to make, and what it has to know of the costs."""
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "step_costs"]
+        return [*super()._excluded_save_params(), "step_costs", "_warned"]
 
     # Costs
 

@@ -26,7 +26,7 @@ class StateNetwork(nn.Module):
 
     It is built like the policy's own critic but shares nothing with it, so any
     ``ActorCriticPolicy`` can have one. ``net_arch={"pi": …, "vf": …, "cost": […]}`` gives it other
-    layers.
+    layers, as to the networks of filters and of TRPO-FAC.
 
     :param policy: the policy whose extractor, architecture and optimizer class are taken
     :param n_outputs: number of outputs

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Self
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_guard.algorithms import CLASSES
 from sb3_guard.algorithms.common.arguments import check_names, stated
@@ -22,6 +23,24 @@ _BUFFERS: dict[str, Any] = {
     "replay_buffer_class": None,
     "replay_buffer_kwargs": {},
 }
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, UserWarning, stacklevel=3)  # the line that calls load
+
+
+def _left_behind(cls: Any, data: dict[str, Any], policy_class: Any) -> list[str]:
+    """Settings in the file of an algorithm that knows no cost which the class does not have."""
+    known = {*vars(cls(policy_class, env=None, _init_setup_model=False)), "lr_schedule", "n_envs"}
+    settings = {k: v for k, v in data.items() if callable(v) or isinstance(v, int | float)}
+    return sorted(settings.keys() - known)
+
+
+def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
+    """Whether an agent learnt from normalised observations, and ``env`` does not normalise them."""
+    normalizer = None if env is None else unwrap_vec_normalize(env)
+    learnt = getattr(model, "learnt_normalized", False)
+    return learnt and (normalizer is None or not normalizer.norm_obs)
 
 
 def replacements(cls: Any, data: dict[str, Any]) -> dict[str, Any]:
@@ -93,19 +112,16 @@ class LoadsOthers(BaseAlgorithm):
             path.seek(0)
         left: list[str] = []
         check_names(cls, kwargs.keys() - (data or {}).keys())
-        saved_by = (data or {}).get("saved_by", "TRPO")  # whose agents any other may take over
-        others = {*CLASSES.values()} - {"TRPO", *(base.__name__ for base in cls.__mro__)}
-        if saved_by in others:
-            raise ValueError(
-                f"{cls.__name__}: the file is of {saved_by}, whose hyperparameters mean something "
-                f"else: load it with {saved_by}.load"
+        saved_by = (data or {}).get("saved_by", cls.__name__)
+        ours = {*CLASSES.values()} - {"TRPO"}
+        if saved_by != cls.__name__ and {saved_by, cls.__name__} <= ours:
+            _warn(
+                f"{cls.__name__} goes on with an agent of {saved_by}, and with its hyperparameters "
+                "where load is given no others",
             )
         if data is not None and "cost_keys" not in data:
             custom_objects = {**replacements(cls, data), **(custom_objects or {})}
-            blank = cls(custom_objects["policy_class"], env=None, _init_setup_model=False)  # type: ignore[call-arg]
-            known = {*vars(blank), "lr_schedule", "n_envs"}
-            settings = {k: v for k, v in data.items() if callable(v) or isinstance(v, int | float)}
-            left = sorted(settings.keys() - known)
+            left = _left_behind(cls, data, custom_objects["policy_class"])
         elif kwargs.get("policy_kwargs") is not None:  # taken as the constructor took them
             kwargs["policy_kwargs"] = {**cls.policy_defaults, **kwargs["policy_kwargs"]}
         try:
@@ -118,23 +134,20 @@ class LoadsOthers(BaseAlgorithm):
             ) from None
         for name in left:
             delattr(model, name)
-        if getattr(model, "learnt_normalized", False) and model.get_vec_normalize_env() is None:
-            warnings.warn(
+        model.saved_by = cls.__name__  # type: ignore[attr-defined]
+        if lacks_statistics(model, model.get_env()):
+            _warn(
                 "the agent learnt from normalised observations: wrap its environment with "
                 "VecNormalize.load(file, env), of what model.get_vec_normalize_env().save(file) "
                 "kept in training",
-                UserWarning,
-                stacklevel=2,
             )
         new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
         if new:
             limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""  # type: ignore[attr-defined]
-            warnings.warn(
+            _warn(
                 f"{cls.__name__} takes over an agent of another algorithm: policy and critic are "
                 f"carried over, {', '.join(new)} begin anew, "
                 f"{', '.join(left) or 'nothing'} is left behind{limit}",
-                UserWarning,
-                stacklevel=2,
             )
         return model
 
@@ -163,7 +176,7 @@ class LoadsOthers(BaseAlgorithm):
         names = self.get_parameters()
         if exact_match and given.keys() != names.keys():
             absent, more = (
-                ", ".join(a.keys() - b.keys()) for a, b in ((names, given), (given, names))
+                ", ".join(sorted(a.keys() - b.keys())) for a, b in ((names, given), (given, names))
             )
             raise ValueError(
                 f"{type(self).__name__}: names of parameters do not match, {absent or 'none'} is "

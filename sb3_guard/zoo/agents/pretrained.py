@@ -94,6 +94,7 @@ def load_pretrained(
     normalizer = model.get_vec_normalize_env()
     if normalizer is not None:
         normalizer.training = False
+        model.learnt_normalized = normalizer.norm_obs  # type: ignore[attr-defined]
         statistics: Any = normalizer.obs_rms  # not a dictionary of several
         statistics.mean, statistics.var = (
             saved[name].numpy(force=True) for name in ("mean", "var")

@@ -303,8 +303,8 @@ def load_model(
     """
     with explained(f"can't load {path} as {algorithm.__name__}"):
         with warnings.catch_warnings():
-            # whoever gives no environment here makes one with the statistics of the run
-            warnings.filterwarnings("ignore", "the agent learnt from normalised observations")
+            if env is None:  # whoever plays makes one with the statistics of the run
+                warnings.filterwarnings("ignore", "the agent learnt from normalised observations")
             model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
         if env is not None and isinstance(model, OffPolicyAlgorithm):
             with zipfile.ZipFile(path) as archive:

@@ -133,7 +133,9 @@ def open_study(
                 f"{hyperparameter}={value!r} is outside the search space: the first trial draws it",
                 file=sys.stderr,
             )
-        study.enqueue_trial(first, user_attrs={GIVEN: bool(first)}, skip_if_exists=True)
+        study.enqueue_trial(
+            first, user_attrs={GIVEN: bool(first) and not outside}, skip_if_exists=True
+        )
     # Workers that drew the same numbers would try the same things: only the first has the seed.
     seed = flags.seed if not begun and flags.seed >= 0 else None
     study.sampler = SAMPLERS[flags.sampler](seed, flags.n_startup_trials)

@@ -72,8 +72,8 @@ def export(
     env = env or model.get_env()
     if env is None or lacks_statistics(model, env):
         raise ValueError(
-            "the agent's observation statistics are not known: pass env=, environments "
-            "wrapped as in training (with VecNormalize.load(file, env), if it had any)"
+            "the agent has no environment, or one without its observation statistics: pass env=, "
+            "environments wrapped as in training (with VecNormalize.load(file, env), if it had any)"
         )
     deployed = Deployed(model, env, sampled)
     file = _converted(deployed)

@@ -313,7 +313,7 @@ def test_asked_to_stop(number, undisturbed, tmp_path, monkeypatch, capsys):
     out, err = capsys.readouterr()
     assert "Stopping after this rollout" in err and "Traceback" not in err
     run = runs_of(tmp_path)
-    assert f"continue with      -i {run}" in out
+    assert f"continue with      sb3-guard train -i {run}" in out
     assert (run / "CostPoint-v0.zip").exists() and not (run / "result.json").exists()
     assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 120
     assert train.main(["-i", str(run), *TOY[:2], "--verbose", "0"]) == 0
@@ -336,7 +336,7 @@ def test_processes_of_environments_die(forked, tmp_path, monkeypatch, capsys):
     run = runs_of(tmp_path)
     err = capsys.readouterr().err
     assert "--vec-env subproc has died" in err and "memory" in err
-    assert f"continue with -i {run} --gym-packages registered_envs" in err
+    assert f"continue with: sb3-guard train -i {run} --gym-packages registered_envs" in err
     assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 60
 
 

@@ -153,9 +153,10 @@ def _nobody_reads() -> bool:
 @contextmanager
 def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
     """
-    Let Ctrl-C and SIGTERM ask for an end in good order; a second one ends immediately.
+    Let Ctrl-C and SIGTERM ask for an end in good order; Ctrl-C after that ends immediately.
 
-    A signal that the process ignores, as workers ignore Ctrl-C, is left alone.
+    Another SIGTERM changes nothing: ``timeout`` and batch systems may send two at once. A signal
+    that the process ignores, as workers do, is left alone.
 
     :param stop: called with the number of the first signal, between two steps of whatever runs
     :return: the numbers of the signals received
@@ -167,9 +168,10 @@ def interrupts(stop: Callable[[int], None]) -> Iterator[list[int]]:
 
     def handle(number: int, frame: Any) -> None:
         received.append(number)
-        if len(received) > 1:
+        if len(received) == 1:
+            stop(number)
+        elif number == signal.SIGINT:
             raise KeyboardInterrupt
-        stop(number)
 
     before = {
         number: signal.signal(number, handle)

@@ -10,6 +10,7 @@ started again anywhere.
 import multiprocessing
 import os
 import shlex
+import signal
 import socket
 import sys
 import threading
@@ -136,6 +137,8 @@ def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
 def _begin_worker() -> None:
     """Let a process of this machine's pool end when the grid's process does, however that ends."""
     warnings.simplefilter("ignore")  # which the process that checked the grid has shown
+    # Of a batch system, to all of the grid's processes: the file is what asks the runs to stop.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     grid = multiprocessing.parent_process()
     assert grid is not None
 

@@ -216,8 +216,10 @@ class RunFolder:
         return Path(flags.tensorboard_log) / self.name / name
 
     def again(self, flags: RunFlags) -> str:
-        """The flags of ``train`` that continue the run, for messages."""
-        return f"-i {shlex.quote(str(self.path))}{packages_flag(flags.gym_packages)}"
+        """The command that continues the run, for messages."""
+        return (
+            f"sb3-guard train -i {shlex.quote(str(self.path))}{packages_flag(flags.gym_packages)}"
+        )
 
     def write_config(self, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:
         """Replace what :meth:`create` wrote, e.g. to make a finished run longer."""

@@ -125,14 +125,14 @@ class Training:
                 raise
             raise UsageError(
                 "a process of --vec-env subproc has died, because of an error printed above or for "
-                f"lack of memory; continue with {folder.again(self.flags)}"
+                f"lack of memory; continue with: {folder.again(self.flags)}"
             ) from error
         except OSError as error:
             if not is_disk_error(error):
                 raise
             raise UsageError(
                 f"can't write to {folder.path}: {error.strerror}; what was written before is "
-                f"intact: make room, then continue with {folder.again(self.flags)}"
+                f"intact: make room, then continue with: {folder.again(self.flags)}"
             ) from error
         finally:
             self.close()

@@ -11,7 +11,7 @@ from sb3_guard.checks import NumberError
 from sb3_guard.spelling import nearest
 
 RESAMPLES = 2000  # of a bootstrap
-LEAST_EPISODES = 5  # of an interval: one of two says no more than they do
+LEAST_EPISODES = 5  # of an interval
 
 
 def number(value: Any, name: str) -> float:

@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import json
+import os
 import shlex
 import sys
 from collections.abc import Mapping
@@ -138,12 +139,13 @@ def reproduce(flags: Flags) -> int:
     # The command may come from anyone, so the user has to name the modules that it would import.
     require_named(Path(flags.run), flags.gym_packages, run.gym_packages)
     run.gym_packages = flags.gym_packages
-    program = str(run.conf_file).removesuffix(".py").replace("/", ".")
-    if is_program(run.conf_file) and program not in flags.gym_packages:
-        raise UsageError(
-            f"the run has its hyperparameters from a program, {run.conf_file}; if you trust it: "
-            f"--gym-packages {program}"
-        )
+    if run.conf_file and is_program(run.conf_file):
+        program = ".".join(Path(os.path.relpath(run.conf_file.removesuffix(".py"))).parts)
+        if program not in flags.gym_packages:
+            raise UsageError(
+                f"the run has its hyperparameters from a program, {run.conf_file}; if you trust "
+                f"it: --gym-packages {program}"
+            )
     run, values = prepare(run)
     seconds = row.get("seconds")
     took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""

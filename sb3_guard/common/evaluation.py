@@ -145,23 +145,23 @@ def _own_random_numbers(seed: int | None) -> Iterator[None]:
 def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[None]:
     """Let an evaluation see normalised observations and leave their statistics as they are.
 
-    :raises ValueError: the model learnt from normalised observations, and the environment has none
+    :raises ValueError: the model's own environment normalises observations, and this one nothing
     """
     learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
     normalizer = unwrap_vec_normalize(env)
-    if lacks_statistics(model, env) and learnt_with is None:
+    if normalizer is None and learnt_with is not None and learnt_with.norm_obs:
+        raise ValueError(
+            "the model learnt from normalised observations, and env has no VecNormalize: "
+            "evaluate it in model.get_env(), or wrap env in VecNormalize and call "
+            "sync_normalization(model.get_env(), env)"
+        )
+    if lacks_statistics(model, env):
         warnings.warn(
             "the agent learnt from normalised observations, and env has no VecNormalize of theirs: "
             "unless it normalises them in another way, these are not its return and cost",
             stacklevel=4,
         )
     if normalizer is None:
-        if learnt_with is not None and learnt_with.norm_obs:
-            raise ValueError(
-                "the model learnt from normalised observations, and env has no VecNormalize: "
-                "evaluate it in model.get_env(), or wrap env in VecNormalize and call "
-                "sync_normalization(model.get_env(), env)"
-            )
         yield
         return
     training, normalizer.training = normalizer.training, False
@@ -216,7 +216,7 @@ def evaluate_policy(
     :param on_episode: called with return, cost and length of each counted episode as it ends
     :raises ValueError: ``n_eval_episodes`` is below 1, a cost is not finite or missing where it
         must not be, the policy acts on another number of costs than ``cost_keys`` names, or the
-        model learnt from normalised observations and ``env`` has none
+        model's own environment normalises observations and ``env`` nothing
     """
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")

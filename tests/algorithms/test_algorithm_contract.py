@@ -227,7 +227,7 @@ def test_layers_of_the_cost_critic(cls: type[Any], critic: str) -> None:
     assert 17 in widths(model.policy) and 19 not in widths(model.policy)
     model = small(cls, points(), policy_kwargs={"net_arch": arch})
     assert 17 in widths(model.cost_critic)
-    with pytest.raises(ValueError, match=r"'cost'.*: must have the layers of 'pi' and"):
+    with pytest.raises(ValueError, match=r"'cost'.*: must also have the layers of 'pi' and"):
         small(cls, points(), policy_kwargs={"net_arch": {"cost": [19]}})
 
 

@@ -105,8 +105,6 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._warned: set[str] = set()
-        # What a file says of its agent
-        self.saved_by = type(self).__name__
         self.learnt_normalized = False
         # `load` builds the model later, with the limit of the file.
         new = kwargs.get("_init_setup_model", True)
@@ -149,15 +147,16 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
                 stated_ones[name].check(name, getattr(self, name), parameter.annotation)
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
         arch = (self.policy_kwargs or {}).get("net_arch")
-        if isinstance(arch, dict) and "cost" in arch and len(arch) < 3:
+        if isinstance(arch, dict) and "cost" in arch and len({"pi", "vf", "qf"} & arch.keys()) < 2:
             raise ValueError(
-                f"net_arch={arch!r}: must have the layers of 'pi' and 'vf' or 'qf', too"
+                f"net_arch={arch!r}: must also have the layers of 'pi' and 'vf' or 'qf'"
             )
         check_theirs(self)
         self._check_cost_limit()
 
     def _setup_model(self) -> None:
         self._check_hyperparameters()
+        self.saved_by = type(self).__name__  # for the reader of a file; `load` calls this last
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
 

@@ -30,22 +30,44 @@ def _warn(message: str) -> None:
 
 
 def _left_behind(cls: Any, data: dict[str, Any], policy_class: Any) -> list[str]:
-    """Settings in the file of an algorithm that knows no cost which the class does not have."""
-    known = {*vars(cls(policy_class, env=None, _init_setup_model=False)), "lr_schedule", "n_envs"}
+    """The settings in the file of another algorithm that the class does not have."""
+    names = {*vars(cls(policy_class, env=None, _init_setup_model=False)), "lr_schedule", "n_envs"}
     settings = {k: v for k, v in data.items() if callable(v) or isinstance(v, int | float)}
-    return sorted(settings.keys() - known)
+    return sorted(settings.keys() - names)
 
 
 def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
-    """Whether an agent learnt from normalised observations, and ``env`` does not normalise them."""
+    """Whether an agent learnt from normalised observations, and ``env`` has no means of them."""
+    if not getattr(model, "learnt_normalized", False):
+        return False
     normalizer = None if env is None else unwrap_vec_normalize(env)
-    learnt = getattr(model, "learnt_normalized", False)
-    return learnt and (normalizer is None or not normalizer.norm_obs)
+    if normalizer is None or not normalizer.norm_obs:
+        return True
+    means = normalizer.obs_rms
+    # Those of a new VecNormalize are of no observation.
+    return any(m.count < 1 for m in (means.values() if isinstance(means, dict) else [means]))
+
+
+def check_policy(cls: Any, kind: type) -> None:
+    """
+    Refuse an agent of another kind.
+
+    :param cls: the algorithm that loads its file
+    :param kind: the class of its policy
+    :raises ValueError: it is none that the algorithm can train
+    """
+    kinds = cls.policy_aliases.values()
+    if not any(issubclass(kind, allowed) or issubclass(allowed, kind) for allowed in kinds):
+        names = ", ".join(allowed.__name__ for allowed in kinds)
+        raise ValueError(
+            f"{cls.__name__} can't take over an agent with a {kind.__name__}: allowed are {names} "
+            "and their subclasses"
+        )
 
 
 def replacements(cls: Any, data: dict[str, Any]) -> dict[str, Any]:
     """
-    What takes the place of attributes in the file of an algorithm that knows no cost.
+    What takes the place of attributes in the file of an algorithm without limits.
 
     A hyperparameter that the class states itself has the class's default, since the same name
     may mean something else there: sb3-contrib's ``target_kl`` is a mean over the dimensions of an
@@ -53,23 +75,16 @@ def replacements(cls: Any, data: dict[str, Any]) -> dict[str, Any]:
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
-    :raises ValueError: the agent's policy is of a kind that the algorithm can't train
     """
-    kind, kinds = data["policy_class"], [*cls.policy_aliases.values()]
-    if not any(issubclass(kind, ours) or issubclass(ours, kind) for ours in kinds):
-        names = ", ".join(ours.__name__ for ours in kinds)
-        raise ValueError(
-            f"{cls.__name__} can't take over an agent with a {kind.__name__}: allowed are {names} "
-            "and their subclasses"
-        )
-    policies = [ours for ours in kinds if issubclass(ours, kind)]
     arguments = inspect.signature(cls).parameters
-    defaults = {name: arguments[name].default for name in stated(cls) if name in arguments}
+    names = {*stated(cls), *(["batch_size"] if data.get("batch_size") is None else [])}
+    kind = data["policy_class"]
+    narrower = (ours for ours in cls.policy_aliases.values() if issubclass(ours, kind))
     return {
         **_BUFFERS,
-        **defaults,
+        **{name: arguments[name].default for name in names & arguments.keys()},
         **dict.fromkeys(cls.fixed_arguments, 0.0),
-        **({"policy_class": policies[0]} if policies else {}),
+        "policy_class": next(narrower, kind),
     }
 
 
@@ -90,7 +105,7 @@ class LoadsOthers(BaseAlgorithm):
         force_reset: bool = True,
         **kwargs: Any,
     ) -> Self:
-        """Load an agent as SB3's ``load`` does, also one that an algorithm without costs trained.
+        """Load an agent as SB3's ``load`` does, also one that an algorithm without limits trained.
 
         Then actor, critic of the reward, their optimizers and the hyperparameters that both
         algorithms take from SB3 are those of the file; a warning says what begins anew and what is
@@ -110,16 +125,14 @@ class LoadsOthers(BaseAlgorithm):
         data, parts, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
         if hasattr(path, "seek"):
             path.seek(0)
-        left: list[str] = []
-        check_names(cls, kwargs.keys() - (data or {}).keys())
-        saved_by = (data or {}).get("saved_by", cls.__name__)
-        ours = {*CLASSES.values()} - {"TRPO"}
-        if saved_by != cls.__name__ and {saved_by, cls.__name__} <= ours:
-            _warn(
-                f"{cls.__name__} goes on with an agent of {saved_by}, and with its hyperparameters "
-                "where load is given no others",
-            )
-        if data is not None and "cost_keys" not in data:
+        data, left = data or {}, []
+        saved_by = data.get("saved_by", cls.__name__ if "cost_keys" in data else "")
+        another = saved_by != cls.__name__
+        without_limits = data and another and saved_by in ("", "TRPO")
+        check_names(cls, kwargs.keys() if without_limits else kwargs.keys() - data.keys())
+        if data and another:
+            check_policy(cls, data["policy_class"])
+        if without_limits:
             custom_objects = {**replacements(cls, data), **(custom_objects or {})}
             left = _left_behind(cls, data, custom_objects["policy_class"])
         elif kwargs.get("policy_kwargs") is not None:  # taken as the constructor took them
@@ -134,7 +147,6 @@ class LoadsOthers(BaseAlgorithm):
             ) from None
         for name in left:
             delattr(model, name)
-        model.saved_by = cls.__name__  # type: ignore[attr-defined]
         if lacks_statistics(model, model.get_env()):
             _warn(
                 "the agent learnt from normalised observations: wrap its environment with "
@@ -142,11 +154,17 @@ class LoadsOthers(BaseAlgorithm):
                 "kept in training",
             )
         new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
-        if new:
+        if another and not without_limits and {saved_by, cls.__name__} <= {*CLASSES.values()}:
+            _warn(
+                f"{cls.__name__} goes on with an agent of {saved_by}, and with its hyperparameters "
+                "where load is given no others",
+            )
+        if new or without_limits:
             limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""  # type: ignore[attr-defined]
             _warn(
-                f"{cls.__name__} takes over an agent of another algorithm: policy and critic are "
-                f"carried over, {', '.join(new)} begin anew, "
+                f"{cls.__name__} takes over an agent of another algorithm: policy, critic and "
+                "shared hyperparameters are carried over, "
+                f"{', '.join(new) or 'nothing'} begin anew, "
                 f"{', '.join(left) or 'nothing'} is left behind{limit}",
             )
         return model

@@ -32,7 +32,7 @@ def export(flags: ExportFlags) -> int:
     print(f"{path}: {', '.join(contract['file']['operators'])}")
     print(f"{path.with_name(onnx_file.CONTRACT)} describes input and output")
     print(means(evaluation))
-    if not (agent.run.model.exists() or agent.run.result.exists()):
+    if agent.run.checkpoint.exists() and not agent.run.result.exists():
         print(
             f"warning: the training has not ended: this is its agent after "
             f"{agent.model.num_timesteps:,} steps",

@@ -99,6 +99,7 @@ def load_pretrained(
         statistics.mean, statistics.var = (
             saved[name].numpy(force=True) for name in ("mean", "var")
         )
+        statistics.count = 1.0  # they are of something
     return model
 
 

@@ -126,7 +126,7 @@ def open_study(
         # First of all: a worker may die after any of these lines, and the next one continues.
         study.set_user_attr(SETTINGS, asdict(settings))
     if not begun:
-        # So that the best is never worse than the starting point.
+        # So that the best is not worse than the starting point, as far as the space has it.
         first, outside = search.first()
         for hyperparameter, value in outside.items():
             print(

@@ -119,19 +119,25 @@ def plot(flags: Flags) -> int:
 
 def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
     """Draw figures; 1 if one that was asked for by name could not be drawn."""
-    status = 0
-    kinds = [*FIGURES] if "all" in kinds else kinds
+    status, everything, absent = 0, "all" in kinds, []
+    kinds = [*FIGURES] if everything else kinds
     for drawing in (drawing for kind in kinds for drawing in draw(kind, data)):
+        if drawing.figure is None and everything:
+            absent.append(drawing.name)
+            continue
         if drawing.missing:
             lost = "" if drawing.figure else " is not drawn;"
             print(f"{drawing.name}:{lost} missing: {drawing.missing}", file=sys.stderr)
         if drawing.figure is None:
-            status = status if "all" in flags.figure else 1
+            status = 1
             continue
         for form in dict.fromkeys(flags.format):
             path = Path(flags.output) / f"{drawing.name}.{form}"
             figures.save(drawing.figure, path)
             print(f"wrote {path}")
+    if absent:
+        names = f"{', '.join(absent)}; --figure {absent[0]} says which"
+        print(f"not drawn for want of runs: {names}", file=sys.stderr)
     return status
 
 

@@ -94,8 +94,8 @@ class CostEvalCallback(EvalCallback):
 
     Logs ``eval/mean_reward``, ``eval/mean_ep_length``, ``eval/mean_ep_cost``; where both policies
     are evaluated ``eval/stochastic_reward`` and ``eval/stochastic_ep_cost``; and for several costs,
-    of which that is the total, ``eval/mean_ep_cost/<key>``; and ``eval/mean_max_cost`` of an
-    algorithm that limits the worst step, whose highest costs are what must keep its limit.
+    of which these are totals, ``eval/mean_ep_cost/<key>`` and the like; ``eval/mean_max_cost`` of
+    an algorithm that limits the worst step, whose highest costs are what must keep its limit.
     ``evaluations.npz`` has ``timesteps`` [K], ``results``, ``ep_lengths`` and ``costs`` [K, E], and
     for several costs ``key_costs`` [K, E, m]. Next to ``best_model.zip`` of an agent that was
     trained on normalised observations lies ``best_model_vecnormalize.pkl``.
@@ -229,7 +229,7 @@ class CostEvalCallback(EvalCallback):
         noisy = [self.evaluate(False)] if self.both else []
         for other in noisy:
             self.logger.record("eval/stochastic_reward", float(other.returns.mean()))
-            self.logger.record("eval/stochastic_ep_cost", float(other.costs.mean()))
+            self._log_costs("eval/stochastic_ep_cost", other)
         self.last_mean_reward = float(evaluation.returns.mean())
         self.last_mean_cost = float(evaluation.costs.mean())
 
@@ -253,7 +253,9 @@ class CostEvalCallback(EvalCallback):
             for (name, (cost, _)), limit in rows:
                 beside = f" ({cost.against(limit)})" if np.isfinite(limit) else ""
                 words.append(f"{name} {cost.mean:.2f} ± {cost.std:.2f}{beside}")
-            words += [f"with noise {other.costs.mean():.2f}" for other in noisy]
+            for other in noisy:
+                means = [f"{name} {cost.mean:.2f}" for name, (cost, _) in other.by_key().items()]
+                words.append(f"with noise {', '.join(means)}")
             best = " (best so far)" if is_best else ""
             print(f"Evaluation after {self.num_timesteps} steps: {', '.join(words)}{best}")
         proceed = True
@@ -266,13 +268,17 @@ class CostEvalCallback(EvalCallback):
             proceed = proceed and self._on_event()
         return proceed
 
+    def _log_costs(self, name: str, evaluation: Evaluation) -> None:
+        """The mean of the costs' sum and, where there are several, of each."""
+        self.logger.record(name, float(evaluation.costs.mean()))
+        if len(self.cost_keys) > 1:
+            for key, cost in zip(self.cost_keys, evaluation.key_costs.mean(axis=0), strict=True):
+                self.logger.record(f"{name}/{key}", float(cost))
+
     def _log(self, evaluation: Evaluation) -> None:
         self.logger.record("eval/mean_reward", self.last_mean_reward)
         self.logger.record("eval/mean_ep_length", float(evaluation.lengths.mean()))
-        self.logger.record("eval/mean_ep_cost", self.last_mean_cost)
-        if len(self.cost_keys) > 1:
-            for key, cost in zip(self.cost_keys, evaluation.key_costs.mean(axis=0), strict=True):
-                self.logger.record(f"eval/mean_ep_cost/{key}", float(cost))
+        self._log_costs("eval/mean_ep_cost", evaluation)
         if evaluation.limit_on == "max":
             self.logger.record("eval/mean_max_cost", float(evaluation.worst.mean()))
         if len(evaluation.successes):

@@ -101,7 +101,7 @@ def test_files_that_are_not_hyperparameters(tmp_path, content, message):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("absent.yml", "can't read hyperparameter file absent.yml .*: No such file"),
+        ("absent.yml", "can't read hyperparameter file absent.yml: No such file"),
         ("absent.py", "can't read hyperparameters from absent.py: .*"),
         ("papr", "can't read hyperparameters from papr: .*; give a .yml file.* or 'paper'"),
     ],

@@ -114,14 +114,14 @@ def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
 
     :param command: the command line, for the run folder
     :param stop: a file; once it is there, the run ends after the rollout under way
-    :return: the state it is left in, ``done``, ``stopped``, ``failed`` or ``in use`` by another
-        process; and what went wrong
+    :return: the state it is left in, ``done``, ``stopped``, ``failed``, ``waiting`` if it did not
+        begin, or ``in use`` by another process; and what went wrong
     """
     if not stop.parent.is_dir():
         return "failed", f"{socket.gethostname()} does not see the folder {stop.parent}"
     with _one_at_a_time:
         if stop.exists():
-            return "stopped", ""
+            return "waiting", ""
         try:
             status = complete(run.flags, run.values, command, stop.exists)
         except RunInUse as error:
@@ -228,7 +228,8 @@ def execute(runs: Sequence[Run], executor: Executor, stop: Path, board: Board) -
                 except Exception as error:  # those of runs are caught where they run
                     why = one_line(error).rstrip(".")
                     raise UsageError(f"a worker or scheduler is gone: {why}") from error
-                board.note(run)
+                if run.state != "waiting":
+                    board.note(run)
             board.update()
     if received:
         return 128 + received[0]

@@ -107,8 +107,6 @@ def read_run(path: Path) -> dict[str, Any]:
         ``M_c/<key>``, ``cost_limit/<key>`` and ``verdict/<key>`` of each
     :raises UsageError: the run is not finished, or damaged
     """
-    if not (path / "result.json").exists():
-        raise UsageError("unfinished: it has no result.json")
     folder = RunFolder(path)
     result, args, config = folder.checked_result(), folder.args(), folder.hyperparams()
     env, algo, seed = args.get("env"), args.get("algo"), args.get("seed")

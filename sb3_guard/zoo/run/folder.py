@@ -247,8 +247,10 @@ class RunFolder:
         """
         The result of a complete run.
 
-        :raises UsageError: there is none, or it is damaged
+        :raises UsageError: the run is not finished, or the file is damaged
         """
+        if not self.result.exists():
+            raise UsageError("unfinished: it has no result.json")
         fix = f"sb3-guard train -i {self.path} writes it again"
         with explained("result.json is damaged", fix=fix):
             result: dict[str, Any] = json.loads(self.result.read_bytes())

@@ -305,12 +305,16 @@ def summary(
             for key, cost in ({} if alone else costs).items()
         ),
         f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
-        *(
+    ]
+    for name, played in result["final"].items():
+        lines.append(
             f"  final, {name:<12}return {np.mean(played['returns']):.3f}, cost "
             f"{estimate(np.array(played['costs']))}, {len(played['costs'])} episodes"
-            for name, played in result["final"].items()
-        ),
-    ]
+        )
+        for key, values in played.get("bounded", {}).items():
+            cost, limit = estimate(np.array(values)), costs[key]["limit"]
+            against = "" if limit is None else f"   {cost.against(limit)}"
+            lines.append(f"    {bounded_name(key, limit_on):<16} {cost}{against}")
     packages = packages_flag(flags.gym_packages)
     if not finished:
         lines.append(f"  continue with      {folder.again(flags)}")

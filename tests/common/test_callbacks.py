@@ -209,7 +209,7 @@ def logged_rows(model) -> list[dict]:
     return rows
 
 
-def test_logs_the_costs(tmp_path):
+def test_logs_the_costs(tmp_path, capsys):
     keys = ("cost", "heat")
     model = CPO("MlpPolicy", envs(cost_keys=keys), n_steps=20, cost_keys=keys, n_critic_updates=2)
     rows = logged_rows(model)
@@ -218,13 +218,15 @@ def test_logs_the_costs(tmp_path):
         n_eval_episodes=5,
         eval_freq=15,
         log_path=tmp_path,
-        verbose=0,
     )
     model.learn(40, callback=watcher)
     (row,) = [row for row in rows if "eval/mean_reward" in row]
-    assert row["eval/mean_ep_cost"] == pytest.approx(row["eval/mean_ep_cost/cost"])
+    for name in ("mean", "stochastic"):
+        cost, heat = (row[f"eval/{name}_ep_cost/{key}"] for key in keys)
+        assert cost > 0 and row[f"eval/{name}_ep_cost"] == pytest.approx(cost)
+        assert heat == pytest.approx(2 * cost)
+    assert f"with noise cost {cost:.2f}, heat {heat:.2f}" in capsys.readouterr().out
     assert row["eval/mean_ep_cost"] == watcher.last_mean_cost > 0
-    assert row["eval/mean_ep_cost/heat"] == pytest.approx(2 * row["eval/mean_ep_cost"])
     assert row["time/total_timesteps"] == 30
     costs = np.load(tmp_path / "evaluations.npz")["key_costs"]
     assert costs.shape == (1, 5, 2)

@@ -59,10 +59,10 @@ def test_trains_with_costs_logged(algo, tmp_path):
     assert enjoy.main([*TOY[:4], "--algo", algo, "-f", str(tmp_path), "--n-episodes", "1"]) == 0
 
 
-def test_costs_of_other_names_are_those_of_the_monitor(tmp_path):
+def test_costs_of_other_names_are_those_of_the_monitor(tmp_path, capsys):
     """In every evaluation, too: PPO itself does not know of costs."""
     params = ["monitor_kwargs:{'cost_keys': ['heat', 'noise']}", "selection_limit:[1, 2]"]
-    extra = ["--eval-freq", "60"]
+    extra = ["--eval-freq", "60", "--verbose", "1"]
     extra += [
         "--env-kwargs",
         "hazard:(-1.0, 0.0)",
@@ -76,6 +76,10 @@ def test_costs_of_other_names_are_those_of_the_monitor(tmp_path):
     assert (costs > 0).all()
     result = json.loads((run / "result.json").read_text())
     assert min(result["final"]["greedy"]["costs"]) > 0
+    out = capsys.readouterr().out
+    for name, played in result["final"].items():
+        said = out.partition(f"final, {name}")[2].partition("\n")[2]
+        assert f"    noise            {np.mean(played['bounded']['noise']):.3f}" in said
     assert set(result["final"]["greedy"]["bounded"]) == set(result["costs"]) == {"heat", "noise"}
     assert result["costs"]["noise"]["mean"] == pytest.approx(2 * result["costs"]["heat"]["mean"])
 

@@ -11,7 +11,7 @@ from known_optima import problems, solve
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 
-from sb3_guard.algorithms import TRPO, TRPOFAC, TRPOLag, TrustRegion
+from sb3_guard.algorithms import CPPOPID, TRPO, TRPOFAC, PPOLag, TRPOLag, TrustRegion
 from sb3_guard.algorithms.common.costs import CostEstimate, discounted_limit
 from sb3_guard.algorithms.common.lagrangian import Multiplier
 from sb3_guard.algorithms.trpo_fac import StateMultiplier
@@ -44,6 +44,15 @@ def test_ascent_by_hand() -> None:
     """0 + 0.1·(7-5), then -0.1·3 stops at zero, then 0.1·10."""
     values = follow(Multiplier(1, 0.1), [7.0, 2.0, 15.0, 4.0], 5.0)
     np.testing.assert_allclose(values, [0.2, 0.0, 1.0, 0.9])
+
+
+def test_default_gains_of_cppo_pid_are_those_of_ppo_lagrangian_while_costs_rise() -> None:
+    """As its page says: K x̄ + K (x̄ - x̄') = K x with averages that keep one half."""
+    models = [cls("MlpPolicy", CostPoint(10), cost_limit=10.0) for cls in (CPPOPID, PPOLag)]
+    costs = [4.0, 7.0, 11.0, 18.0, 9.0]
+    pid, plain = (follow(model.multiplier, costs, 10.0) for model in models)
+    np.testing.assert_allclose(pid[:4], plain[:4])
+    assert plain[3] > 0 and pid[4] > plain[4]
 
 
 def test_initial_value_and_bound_by_hand() -> None:

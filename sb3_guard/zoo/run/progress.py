@@ -169,7 +169,7 @@ class Epochs(BaseCallback):
             which any ended (None if none did), their number ``episodes``, ``costs``, for each
             cost key the ``mean`` of what its limit bounds, the 95 % interval of that mean
             (``low``, ``high``), the ``limit`` (None: unconstrained) and the ``verdict``, "kept",
-            "exceeded" or "undecided" (without interval and verdict if fewer than two episodes
+            "exceeded" or "undecided" (without interval and verdict if fewer than five episodes
             ended), ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the
             number of episodes that ended because the physics diverged, ``cost_limit`` (None:
             unconstrained), ``limit_on`` of an algorithm that limits the worst step, ``cut`` where a

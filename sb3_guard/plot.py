@@ -119,11 +119,11 @@ def plot(flags: Flags) -> int:
 
 def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
     """Draw figures; 1 if one that was asked for by name could not be drawn."""
-    status, everything, absent = 0, "all" in kinds, []
+    status, everything, absent = 0, "all" in kinds, dict[str, None]()
     kinds = [*FIGURES] if everything else kinds
-    for drawing in (drawing for kind in kinds for drawing in draw(kind, data)):
+    for name, drawing in ((kind, drawing) for kind in kinds for drawing in draw(kind, data)):
         if drawing.figure is None and everything:
-            absent.append(drawing.name)
+            absent[name] = None
             continue
         if drawing.missing:
             lost = "" if drawing.figure else " is not drawn;"
@@ -136,8 +136,8 @@ def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
             figures.save(drawing.figure, path)
             print(f"wrote {path}")
     if absent:
-        names = f"{', '.join(absent)}; --figure {absent[0]} says which"
-        print(f"not drawn for want of runs: {names}", file=sys.stderr)
+        names = f"{', '.join(absent)}; each tells with --figure what it needs"
+        print(f"not drawn, or not for all: {names}", file=sys.stderr)
     return status
 
 

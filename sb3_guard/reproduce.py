@@ -141,6 +141,11 @@ def reproduce(flags: Flags) -> int:
     run.gym_packages = flags.gym_packages
     if run.conf_file and is_program(run.conf_file):
         program = ".".join(Path(os.path.relpath(run.conf_file.removesuffix(".py"))).parts)
+        if program.startswith(".."):
+            raise UsageError(
+                f"the run has its hyperparameters from a program, {run.conf_file}: call the "
+                "command in a folder that has it"
+            )
         if program not in flags.gym_packages:
             raise UsageError(
                 f"the run has its hyperparameters from a program, {run.conf_file}; if you trust "

@@ -19,7 +19,7 @@ class CPPOPID(PPOLag):
     rise, and both damp the oscillation that the integral alone has. ``lambda_lr`` is K_I.
 
     With K_P = K_D and averages that keep one half, as by default, the two are PPO-Lagrangian's
-    K_P Δ while J̄_C rises (to at most 2 d); where it falls, they are K_P Δ̄.
+    K_P Δ while J̄_C rises from below d (to at most 2 d); where it falls, they are K_P Δ̄.
     """
 
     label, family, paper = "CPPO-PID", "Lagrangian", "Stooke et al. 2020"

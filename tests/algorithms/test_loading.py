@@ -13,6 +13,7 @@ import sb3_guard
 from sb3_guard import (
     CPO,
     CPPOPID,
+    FOCOPS,
     TRPOSL,
     TRPOUSL,
     PPOLag,
@@ -32,6 +33,7 @@ OFF = {"learning_starts": 10, "buffer_size": 100, "batch_size": 8, **SMALL}
 PAIRS = [
     (sb3.PPO, PPOLag, ON | {"n_epochs": 3, "batch_size": 20}),
     (sb3.A2C, PPOLag, ON),
+    (sb3.PPO, FOCOPS, ON | {"batch_size": 20}),
     (sb3.PPO, CPO, ON | {"batch_size": 20}),
     (sb3.PPO, TRPOUSL, ON | {"batch_size": 20}),
     (sb3_contrib.TRPO, CPO, ON),
@@ -48,7 +50,7 @@ def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
     old = theirs("MlpPolicy", CostPoint(10), **arguments)
     old.learn(60)
     old.save(tmp_path / "agent")
-    with pytest.warns(UserWarning, match=f"{ours.__name__} takes over .* begin anew") as said:
+    with pytest.warns(UserWarning, match=f"{ours.__name__} takes over .* to begin anew: ") as said:
         new = ours.load(tmp_path / "agent", env=CostPoint(10, hazard=(-1, 0)), cost_limit=3.0)
     (said,) = (str(one.message) for one in said if "takes over" in str(one.message))
     assert said.endswith("cost_limit is 3.0")
@@ -60,7 +62,7 @@ def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
         new.predict(obs, deterministic=True)[0], old.predict(obs, deterministic=True)[0]
     )
     assert (new.gamma, new.cost_limit) == (0.97, 3.0)
-    assert ("clip_range" in said) == (theirs is sb3.PPO and ours is not PPOLag)
+    assert ("clip_range" in said) == (theirs is sb3.PPO and ours not in (PPOLag, FOCOPS))
     assert ("cost_critic" in said) == (ours is not TRPOUSL)
     new.learn(80)
     assert new.total_cost > 0
@@ -87,11 +89,14 @@ def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
     with pytest.warns(UserWarning, match="takes over"):
         model = CPO.load(tmp_path / "a", env=CostPoint(10))
     assert model.target_kl == stated(CPO)["target_kl"].default and model.n_steps == 40
-    # TRPO knows costs, but no limits.
-    sb3_guard.TRPO("MlpPolicy", CostPoint(10), n_steps=40, target_kl=0.5).save(tmp_path / "b")
+    # Our TRPO knows costs, but no limits.
+    env = CostPoint(10, cost_keys=("cost", "heat"))
+    keys = {"cost_keys": ("cost", "heat"), "target_kl": 0.5}
+    sb3_guard.TRPO("MlpPolicy", env, n_steps=40, **keys).save(tmp_path / "b")
     with pytest.warns(UserWarning, match="PPOLag takes over .* cost_limit is 3.0"):
-        lagrangian = PPOLag.load(tmp_path / "b", env=CostPoint(10), cost_limit=3.0)
+        lagrangian = PPOLag.load(tmp_path / "b", env=env, cost_limit=3.0)
     assert lagrangian.batch_size == 64 and lagrangian.missing_cost == "error"
+    assert lagrangian.cost_keys == ("cost", "heat") and lagrangian.target_kl == 0.5
     with pytest.raises(TypeError, match="CPO takes no argument 'clip_range'"):
         sb3.PPO("MlpPolicy", CostPoint(10)).save(tmp_path / "ppo")
         CPO.load(tmp_path / "ppo", clip_range=0.3)

@@ -393,6 +393,8 @@ def test_a_run_looks_for_the_file_after_each_rollout(tmp_path, here):
     (run,) = grid.expand([("CostPoint-v0", "cpo")], [0], replace(flags, n_timesteps=600))
     assert run.state == "resume"
     assert grid.carry_out(run, "", tmp_path / "elsewhere" / "stop")[0] == "failed"
+    stop.touch()
+    assert grid.carry_out(run, "", stop) == ("waiting", "")
 
 
 # what is shown

@@ -122,14 +122,21 @@ def test_hyperparameters_of_a_program_are_run_where_it_is_named(tmp_path, capsys
     (tmp_path / "sub" / "mine.py").write_text(
         "hyperparams = {'CostPoint-v0': dict(policy='MlpPolicy', n_timesteps=400)}"
     )
-    assert train.main([*TOY, *PACKAGES, "-conf", "sub/mine.py", "-f", "logs"]) == 0
+    assert train.main([*TOY, *PACKAGES, "-conf", "./sub/mine.py", "-f", "logs"]) == 0
     arguments = ["logs/cpo/CostPoint-v0_1", *PACKAGES]
     assert again(tmp_path, *arguments) == 2
     assert (
-        "from a program, sub/mine.py; if you trust it: --gym-packages sub.mine"
+        "from a program, ./sub/mine.py; if you trust it: --gym-packages sub.mine"
         in capsys.readouterr().err
     )
     assert again(tmp_path, *arguments, "sub.mine") == 0
+    monkeypatch.chdir(tmp_path / "logs")
+    file = tmp_path / "logs" / "cpo" / "CostPoint-v0_1" / "CostPoint-v0" / "args.yml"
+    file.write_text(file.read_text().replace("./sub", "../sub"))
+    result = file.parents[1] / "result.json"
+    result.write_text(result.read_text().replace("./sub", "../sub"))
+    assert again(tmp_path, "cpo/CostPoint-v0_1", *PACKAGES) == 2
+    assert "../sub/mine.py: call the command in a folder that" in capsys.readouterr().err
 
 
 def test_the_packages_own_table_can_be_read(tmp_path, capsys):

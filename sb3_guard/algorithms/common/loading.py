@@ -5,7 +5,6 @@ the critic of the reward. What only PPO-Lagrangian has, the cost critic and the 
 anew.
 """
 
-import inspect
 import warnings
 from typing import Any, ClassVar, Self
 
@@ -29,11 +28,10 @@ def _warn(message: str) -> None:
     warnings.warn(message, UserWarning, stacklevel=3)  # the line that calls load
 
 
-def _left_behind(cls: Any, data: dict[str, Any], policy_class: Any) -> list[str]:
-    """The settings in the file of another algorithm that the class does not have."""
-    names = {*vars(cls(policy_class, env=None, _init_setup_model=False)), "lr_schedule", "n_envs"}
-    settings = {k: v for k, v in data.items() if callable(v) or isinstance(v, int | float)}
-    return sorted(settings.keys() - names)
+def _left_behind(data: dict[str, Any], blank: dict[str, Any]) -> list[str]:
+    """The settings in the file of another algorithm that a new model does not have."""
+    settings = {k for k, v in data.items() if callable(v) or isinstance(v, int | float)}
+    return sorted(settings - blank.keys() - {"lr_schedule", "n_envs"})
 
 
 def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
@@ -48,48 +46,49 @@ def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
     return any(m.count < 1 for m in (means.values() if isinstance(means, dict) else [means]))
 
 
-def check_policy(cls: Any, kind: type) -> None:
+def policy_for(cls: Any, kind: type) -> type:
     """
-    Refuse an agent of another kind.
+    The class of the policy that an algorithm goes on with.
 
-    :param cls: the algorithm that loads its file
-    :param kind: the class of its policy
+    :param cls: the algorithm that loads the file of another one
+    :param kind: the policy's class there
+    :return: that one, or the one that the algorithm has in its place
     :raises ValueError: it is none that the algorithm can train
     """
-    kinds = cls.policy_aliases.values()
-    if not any(issubclass(kind, allowed) or issubclass(allowed, kind) for allowed in kinds):
-        names = ", ".join(allowed.__name__ for allowed in kinds)
-        raise ValueError(
-            f"{cls.__name__} can't take over an agent with a {kind.__name__}: allowed are {names} "
-            "and their subclasses"
-        )
+    kinds = [*cls.policy_aliases.values()]
+    if any(issubclass(kind, allowed) for allowed in kinds):
+        return kind
+    for narrower in kinds:
+        if issubclass(narrower, kind):
+            return narrower
+    names = ", ".join(allowed.__name__ for allowed in kinds)
+    raise ValueError(
+        f"{cls.__name__} can't take over an agent with a {kind.__name__}: allowed are {names} "
+        "and their subclasses"
+    )
 
 
-def replacements(cls: Any, data: dict[str, Any]) -> dict[str, Any]:
+def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[str, Any]:
     """
     What takes the place of attributes in the file of an algorithm without limits.
 
     A hyperparameter that the class states itself has the class's default, since the same name
     may mean something else there: sb3-contrib's ``target_kl`` is a mean over the dimensions of an
-    action, ours a sum.
+    action, ours a sum. In the files of our TRPO all means the same, but an absent cost is none.
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
+    :param blank: attributes of a new model of the algorithm
     """
-    arguments = inspect.signature(cls).parameters
-    names = {*stated(cls), *(["batch_size"] if data.get("batch_size") is None else [])}
-    kind = data["policy_class"]
-    narrower = (ours for ours in cls.policy_aliases.values() if issubclass(ours, kind))
-    return {
-        **_BUFFERS,
-        **{name: arguments[name].default for name in names & arguments.keys()},
-        **dict.fromkeys(cls.fixed_arguments, 0.0),
-        "policy_class": next(narrower, kind),
-    }
+    ours = "cost_keys" in data
+    names = {"missing_cost"} if ours else {*stated(cls), *cls.fixed_arguments}
+    if data.get("batch_size") is None:  # the whole rollout, which not every algorithm takes
+        names.add("batch_size")
+    return {**_BUFFERS, **{name: blank[name] for name in names & blank.keys()}}
 
 
 class LoadsOthers(BaseAlgorithm):
-    """Loads agents of algorithms that know no cost. Mixed in before an algorithm."""
+    """Loads agents of algorithms without limits. Mixed in before an algorithm."""
 
     #: Arguments of the policy where ``policy_kwargs`` does not have them.
     policy_defaults: ClassVar[dict[str, Any]] = {}
@@ -117,7 +116,8 @@ class LoadsOthers(BaseAlgorithm):
         :param custom_objects: what replaces attributes in the file
         :param print_system_info: whether to print the versions that the file was written with
         :param force_reset: whether the next ``learn`` begins new episodes
-        :param kwargs: attributes to change, such as ``cost_limit``
+        :param kwargs: arguments to change, such as ``cost_limit``; also attributes, where the file
+            is of an algorithm with limits
         :return: the agent
         :raises TypeError: an argument is not known; the message names the nearest one
         :raises ValueError: the file does not fit the environment or the algorithm
@@ -131,10 +131,13 @@ class LoadsOthers(BaseAlgorithm):
         without_limits = data and another and saved_by in ("", "TRPO")
         check_names(cls, kwargs.keys() if without_limits else kwargs.keys() - data.keys())
         if data and another:
-            check_policy(cls, data["policy_class"])
+            kind = policy_for(cls, data["policy_class"])
         if without_limits:
-            custom_objects = {**replacements(cls, data), **(custom_objects or {})}
-            left = _left_behind(cls, data, custom_objects["policy_class"])
+            new_model: Any = cls  # whose arguments this class does not know
+            blank = vars(new_model(kind, env=None, _init_setup_model=False))
+            taken = {**replacements(cls, data, blank), "policy_class": kind}
+            custom_objects = {**taken, **(custom_objects or {})}
+            left = _left_behind(data, blank)
         elif kwargs.get("policy_kwargs") is not None:  # taken as the constructor took them
             kwargs["policy_kwargs"] = {**cls.policy_defaults, **kwargs["policy_kwargs"]}
         try:
@@ -162,10 +165,9 @@ class LoadsOthers(BaseAlgorithm):
         if new or without_limits:
             limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""  # type: ignore[attr-defined]
             _warn(
-                f"{cls.__name__} takes over an agent of another algorithm: policy, critic and "
-                "shared hyperparameters are carried over, "
-                f"{', '.join(new) or 'nothing'} begin anew, "
-                f"{', '.join(left) or 'nothing'} is left behind{limit}",
+                f"{cls.__name__} takes over policy, critic and shared hyperparameters of an agent "
+                f"of another algorithm; to begin anew: {', '.join(new) or 'nothing'}; left behind: "
+                f"{', '.join(left) or 'nothing'}{limit}",
             )
         return model
 

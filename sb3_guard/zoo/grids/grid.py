@@ -137,8 +137,9 @@ def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
 def _begin_worker() -> None:
     """Let a process of this machine's pool end when the grid's process does, however that ends."""
     warnings.simplefilter("ignore")  # which the process that checked the grid has shown
-    # Of a batch system, to all of the grid's processes: the file is what asks the runs to stop.
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    # A batch system sends it to all processes, and the file asks the runs to stop. It is not
+    # ignored, as processes of environments, which are ended by it, would inherit that.
+    signal.signal(signal.SIGTERM, lambda number, frame: None)
     grid = multiprocessing.parent_process()
     assert grid is not None
 

@@ -124,8 +124,8 @@ class Training:
             if self.flags.vec_env != "subproc":
                 raise
             raise UsageError(
-                "a process of --vec-env subproc has died, because of an error printed above or for "
-                f"lack of memory; continue with: {folder.again(self.flags)}"
+                "a process of --vec-env subproc has died, because of an error printed above, by a "
+                f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
             ) from error
         except OSError as error:
             if not is_disk_error(error):

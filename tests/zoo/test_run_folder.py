@@ -111,6 +111,9 @@ def test_a_dead_owner_is_succeeded(tmp_path):
     with lock(run.path):
         assert owner(run.path)["pid"] == str(os.getpid())
     assert owner(run.path) == {}
+    (run.path / ".lock").touch()  # one that was killed before it wrote who it is
+    with lock(run.path):
+        assert owner(run.path)["pid"] == str(os.getpid())
 
 
 def test_an_owner_elsewhere_may_be_alive(tmp_path, monkeypatch, capsys):

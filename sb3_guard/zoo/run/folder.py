@@ -12,9 +12,10 @@ import shlex
 import socket
 import sys
 import tempfile
+import time
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,8 @@ DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 MEASURES = ("return", "cost", "cost_rate")
 EPOCH = 30_000  # steps, the paper's; of algorithms whose rollouts are a few steps long
 SILENCE = 120.0  # seconds without a sign of life after which another host takes a lock over
-
 WAIT = 1.2 * SILENCE  # seconds in which such a silence is certainly seen
+EMPTY = 2.0  # seconds after which a lock that says nothing is that of a process that died
 
 
 class RunInUse(UsageError):
@@ -277,8 +278,8 @@ def lock(folder: Path) -> Iterator[None]:
     """
     Hold a run's lock, so that no other process writes to it meanwhile.
 
-    The lock of a process that died here is taken over immediately. That of another host shows signs
-    of life; it is taken over after a long silence, for which this waits.
+    The lock of a process that died here is taken over immediately, or within seconds. That of
+    another host shows signs of life; it is taken over after a long silence, for which this waits.
 
     :param folder: it exists, and is a run or about to become one
     :raises RunInUse: another process has it
@@ -292,6 +293,7 @@ def lock(folder: Path) -> Iterator[None]:
         print(f"{folder} has a lock of {holder['host']}: waiting for a sign of life of its process")
     with explained(f"can't write to {folder}", OSError):
         try:
+            _remove_empty(path)
             lease.acquire(timeout=WAIT if elsewhere else 0)
         except Timeout:
             holder = owner(folder)
@@ -303,6 +305,19 @@ def lock(folder: Path) -> Iterator[None]:
         yield
     finally:
         lease.release()
+
+
+def _remove_empty(path: Path) -> None:
+    """Remove the lock of a process that was killed before it wrote who it is.
+
+    filelock leaves it for ever, since older versions held such locks.
+    """
+    end = time.monotonic() + EMPTY
+    with suppress(FileNotFoundError):
+        while path.stat().st_size == 0:
+            if time.monotonic() > end:
+                path.unlink()
+            time.sleep(0.05)
 
 
 def owner(folder: Path) -> dict[str, str]:

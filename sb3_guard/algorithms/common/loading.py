@@ -74,7 +74,8 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
 
     A hyperparameter that the class states itself has the class's default, since the same name
     may mean something else there: sb3-contrib's ``target_kl`` is a mean over the dimensions of an
-    action, ours a sum. In the files of our TRPO all means the same, but an absent cost is none.
+    action, ours a sum. In the files of our TRPO all mean the same; ``missing_cost`` alone, which
+    lets it run where nothing costs, is not taken over.
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file

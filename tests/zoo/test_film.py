@@ -101,12 +101,15 @@ def test_filming_shows_how_far_it_is():
     assert "4/8" in bar.getvalue() and "return" in bar.getvalue() and "cost" in bar.getvalue()
 
 
-@pytest.mark.parametrize("bar", [False, True])
-def test_the_bar_is_on_stderr_if_it_is_asked_for(bar, tmp_path, capsys):
+@pytest.mark.parametrize("bar, terminal", [(True, True), (True, False), (False, True)])
+def test_the_bar_is_on_a_terminal_if_it_is_asked_for(bar, terminal, tmp_path, monkeypatch):
+    stderr = io.StringIO()
+    stderr.isatty = lambda: terminal
+    monkeypatch.setattr("sys.stderr", stderr)
     venv = CostMonitor(DummyVecEnv([lambda: Filmed("rgb_array", episode_length=8)]))
     with filming(venv, None, tmp_path / "film.mp4", bar) as film:
         film.reset()
         for _ in range(3):
             film.step(np.zeros((1, 2)))
     assert (tmp_path / "film.mp4").stat().st_size > 500
-    assert ("Filming" in capsys.readouterr().err) == bar
+    assert ("Filming" in stderr.getvalue()) == (bar and terminal)

@@ -119,7 +119,7 @@ def filming(env: VecEnv, model: BaseAlgorithm, video: Path, bar: bool = False) -
 
     :param env: one environment
     :param video: mp4 to write
-    :param bar: show on stderr how many steps have been played
+    :param bar: show how many steps have been played, if stderr is a terminal
     :raises UsageError: no picture can be rendered, or the file can't be written
     """
     import imageio_ffmpeg
@@ -135,7 +135,7 @@ def filming(env: VecEnv, model: BaseAlgorithm, video: Path, bar: bool = False) -
     with (
         explained(f"can't write {video}", OSError),
         replacing(video) as file,
-        tqdm(desc="Filming", unit=" steps", leave=False, disable=not bar) as progress,
+        tqdm(desc="Filming", unit=" steps", leave=False, disable=None if bar else True) as progress,
     ):
         writer = imageio_ffmpeg.write_frames(
             file.name, (width, height), fps=fps, macro_block_size=2, output_params=["-f", "mp4"]

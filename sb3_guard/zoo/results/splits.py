@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sb3_guard.costs import RESAMPLES, verdict
+from sb3_guard.costs import verdict
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.statistics import judging_limits, last_epochs
 
@@ -61,7 +61,7 @@ def violations(costs: np.ndarray, limit: float) -> tuple[float, float]:
     return len(excess) / len(costs), float(excess.mean()) / (abs(limit) or 1.0)
 
 
-def nested_interval(seeds: Sequence[np.ndarray]) -> tuple[float, float]:
+def nested_interval(seeds: Sequence[np.ndarray], resamples: int = 10_000) -> tuple[float, float]:
     """
     A 95 % percentile bootstrap interval of the mean over seeds and episodes.
 
@@ -69,9 +69,10 @@ def nested_interval(seeds: Sequence[np.ndarray]) -> tuple[float, float]:
     Of a single seed the interval tells nothing about another.
 
     :param seeds: costs of the episodes of each seed, [E_s] each, at least one seed
+    :param resamples: number of bootstrap samples
     """
     rng = np.random.default_rng(0)
-    drawn = rng.integers(len(seeds), size=(RESAMPLES, len(seeds)))
+    drawn = rng.integers(len(seeds), size=(resamples, len(seeds)))
     means = np.zeros(drawn.shape)
     for number, costs in enumerate(seeds):
         here = drawn == number

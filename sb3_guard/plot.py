@@ -122,14 +122,13 @@ def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
     status, everything, absent = 0, "all" in kinds, dict[str, None]()
     kinds = [*FIGURES] if everything else kinds
     for name, drawing in ((kind, drawing) for kind in kinds for drawing in draw(kind, data)):
-        if drawing.figure is None and everything:
+        if drawing.missing and everything:
             absent[name] = None
-            continue
-        if drawing.missing:
+        elif drawing.missing:
             lost = "" if drawing.figure else " is not drawn;"
             print(f"{drawing.name}:{lost} missing: {drawing.missing}", file=sys.stderr)
         if drawing.figure is None:
-            status = 1
+            status = int(not everything)
             continue
         for form in dict.fromkeys(flags.format):
             path = Path(flags.output) / f"{drawing.name}.{form}"
@@ -137,7 +136,7 @@ def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
             print(f"wrote {path}")
     if absent:
         names = f"{', '.join(absent)}; each tells with --figure what it needs"
-        print(f"not drawn, or not for all: {names}", file=sys.stderr)
+        print(f"not drawn, or not whole: {names}", file=sys.stderr)
     return status
 
 

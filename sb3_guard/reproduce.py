@@ -3,7 +3,6 @@
 import csv
 import hashlib
 import json
-import os
 import shlex
 import sys
 from collections.abc import Mapping
@@ -139,18 +138,13 @@ def reproduce(flags: Flags) -> int:
     # The command may come from anyone, so the user has to name the modules that it would import.
     require_named(Path(flags.run), flags.gym_packages, run.gym_packages)
     run.gym_packages = flags.gym_packages
-    if run.conf_file and is_program(run.conf_file):
-        program = ".".join(Path(os.path.relpath(run.conf_file.removesuffix(".py"))).parts)
-        if program.startswith(".."):
-            raise UsageError(
-                f"the run has its hyperparameters from a program, {run.conf_file}: call the "
-                "command in a folder that has it"
-            )
+    if is_program(program := run.conf_file or ""):
         if program not in flags.gym_packages:
             raise UsageError(
-                f"the run has its hyperparameters from a program, {run.conf_file}; if you trust "
-                f"it: --gym-packages {program}"
+                f"the run has its hyperparameters from a program, {program}; if you trust it: "
+                f"--gym-packages {shlex.quote(program)}"
             )
+        run.gym_packages = [name for name in flags.gym_packages if name != program]
     run, values = prepare(run)
     seconds = row.get("seconds")
     took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""
@@ -165,6 +159,8 @@ def reproduce(flags: Flags) -> int:
         return status
     result = RunFolder(path_of(run)).checked_result()
     lines = differences(row, result)
+    if result["return"] is None:
+        lines = ["No episode has ended: there is nothing to compare."]
     same = f"The same: all training episodes agree (curve {result['curve'][:12]}…)."
     if not row.get("curve"):
         same = "The same return and cost; an older version kept no hash of the episodes."

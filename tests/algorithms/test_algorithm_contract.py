@@ -227,8 +227,9 @@ def test_layers_of_the_cost_critic(cls: type[Any], critic: str) -> None:
     assert 17 in widths(model.policy) and 19 not in widths(model.policy)
     model = small(cls, points(), policy_kwargs={"net_arch": arch})
     assert 17 in widths(model.cost_critic)
-    with pytest.raises(ValueError, match=r"'cost'.*: must also have the layers of 'pi' and"):
-        small(cls, points(), policy_kwargs={"net_arch": {"cost": [19]}})
+    for others in {}, {"pi": [11]}, {"pi": [11], {"vf": "qf", "qf": "vf"}[critic]: [17]}:
+        with pytest.raises((ValueError, AssertionError), match=r"must also have the layers|no key"):
+            small(cls, points(), policy_kwargs={"net_arch": {**others, "cost": [19]}})
 
 
 class _Normed(FlattenExtractor):

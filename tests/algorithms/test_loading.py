@@ -97,9 +97,30 @@ def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
         lagrangian = PPOLag.load(tmp_path / "b", env=env, cost_limit=3.0)
     assert lagrangian.batch_size == 64 and lagrangian.missing_cost == "error"
     assert lagrangian.cost_keys == ("cost", "heat") and lagrangian.target_kl == 0.5
+    # The learning rate is of the critics in a trust region, of the actor in PPO.
+    assert lagrangian.learning_rate == 3e-4
+    with pytest.warns(UserWarning, match="CPO takes over"):
+        model = CPO.load(tmp_path / "b", env=env)
+    assert model.cost_gae_lambda == CPO("MlpPolicy", env).cost_gae_lambda == 0.5
+    assert model.learning_rate == 1e-3
     with pytest.raises(TypeError, match="CPO takes no argument 'clip_range'"):
         sb3.PPO("MlpPolicy", CostPoint(10)).save(tmp_path / "ppo")
         CPO.load(tmp_path / "ppo", clip_range=0.3)
+
+
+class _MyTRPO(sb3_guard.TRPO):
+    """A user's own."""
+
+
+@pytest.mark.parametrize("ours", [CPO, FOCOPS, PPOLag, TRPOSL])
+def test_a_users_trpo_is_one(ours, tmp_path):
+    _MyTRPO("MlpPolicy", CostPoint(10), **ON).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match=f"{ours.__name__} takes over .* cost_limit is 3.0"):
+        ours.load(tmp_path / "a", env=CostPoint(10), cost_limit=3.0).learn(40)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _MyTRPO.load(tmp_path / "a")
+        sb3_guard.TRPO.load(tmp_path / "a")
 
 
 class _MyPolicy(sb3.common.policies.ActorCriticPolicy):
@@ -112,6 +133,9 @@ def test_another_kind_of_policy_is_refused(tmp_path):
         for ours in PPOLag, TQCLag, TD3Lag:
             with pytest.raises(ValueError, match=f"{ours.__name__} can't take over .* a {kind}"):
                 ours.load(tmp_path / "sac", env=CostPoint(10))
+    sb3_contrib.RecurrentPPO("MlpLstmPolicy", CostPoint(10)).save(tmp_path / "recurrent")
+    with pytest.raises(ValueError, match=r"CPO can't take over .* a RecurrentActorCriticPolicy"):
+        CPO.load(tmp_path / "recurrent", env=CostPoint(10))
     sb3.PPO(_MyPolicy, CostPoint(10), n_steps=40, batch_size=20).save(tmp_path / "ppo")
     with pytest.warns(UserWarning, match="CPO takes over"):
         assert isinstance(CPO.load(tmp_path / "ppo").policy, _MyPolicy)
@@ -203,6 +227,9 @@ def test_train_goes_on_with_the_statistics_beside_the_agent(tmp_path, capsys, be
     assert capsys.readouterr().out.count(said) == (beside is None)
     (file,) = (tmp_path / "logs" / "ppo_lag").rglob("vecnormalize.pkl")
     assert (read_normalizer(file).obs_rms.count > 5000) == (beside is not None)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "the agent learnt from normalised observations")
+        assert train.main(["-i", str(file.parents[1]), "-n", "120", *run[:2]]) == 0
 
 
 def test_train_goes_on_from_an_agent_of_sb3s(tmp_path):

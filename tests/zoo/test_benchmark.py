@@ -322,6 +322,7 @@ def test_a_failure_leaves_the_others_alone(tmp_path, here, monkeypatch, capsys):
     # Once more: the failed one is tried again, the other is not.
     assert benchmark.main(again) == 0
     assert here.runs[-1].flags.algo == "cpo" and len(here.runs) == 3
+    assert not [*tmp_path.rglob("error.txt")]
     assert f"See the results with: sb3-guard plot {tmp_path}" in capsys.readouterr().out
 
 

@@ -364,7 +364,7 @@ def test_all_of_it(small, tmp_path, capsys):
     made = {path.stem for path in (tmp_path / "f").iterdir()}
     per_suite = {f"{kind}_{POINT}" for kind in PER_SUITE}
     assert made == per_suite | {"iqm", "q1", "q2", "q3", "q4", "q6", "q8"}
-    assert "not drawn, or not for all: q5, q7; each tells with --figure what it needs" in err
+    assert "not drawn, or not whole: q1, q2, q3, q4, q5, q6, q7, q8; each tells" in err
     # One asked for by name that can't be drawn is a failure.
     assert plot.main([str(small), "--figure", "q7", "-o", str(tmp_path / "g")]) == 1
     assert f"q7: is not drawn; missing: TRPO-USL, TRPO-SL on {POINT}" in capsys.readouterr().err

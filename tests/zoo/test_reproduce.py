@@ -118,25 +118,25 @@ def test_a_command_imports_what_the_user_names_only(run, tmp_path, capsys):
 def test_hyperparameters_of_a_program_are_run_where_it_is_named(tmp_path, capsys, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub" / "mine.py").write_text(
+    (tmp_path / "sub.2").mkdir()
+    (tmp_path / "sub.2" / "mine.py").write_text(
         "hyperparams = {'CostPoint-v0': dict(policy='MlpPolicy', n_timesteps=400)}"
     )
-    assert train.main([*TOY, *PACKAGES, "-conf", "./sub/mine.py", "-f", "logs"]) == 0
+    assert train.main([*TOY, *PACKAGES, "-conf", "./sub.2/mine.py", "-f", "logs"]) == 0
     arguments = ["logs/cpo/CostPoint-v0_1", *PACKAGES]
     assert again(tmp_path, *arguments) == 2
     assert (
-        "from a program, ./sub/mine.py; if you trust it: --gym-packages sub.mine"
+        "from a program, ./sub.2/mine.py; if you trust it: --gym-packages ./sub.2/mine.py"
         in capsys.readouterr().err
     )
-    assert again(tmp_path, *arguments, "sub.mine") == 0
-    monkeypatch.chdir(tmp_path / "logs")
-    file = tmp_path / "logs" / "cpo" / "CostPoint-v0_1" / "CostPoint-v0" / "args.yml"
-    file.write_text(file.read_text().replace("./sub", "../sub"))
-    result = file.parents[1] / "result.json"
-    result.write_text(result.read_text().replace("./sub", "../sub"))
-    assert again(tmp_path, "cpo/CostPoint-v0_1", *PACKAGES) == 2
-    assert "../sub/mine.py: call the command in a folder that" in capsys.readouterr().err
+    assert again(tmp_path, *arguments, "./sub.2/mine.py") == 0
+
+
+def test_nothing_is_the_same_if_no_episode_has_ended(tmp_path, capsys):
+    short = [*TOY, *PACKAGES, "-n", "60", "--env-kwargs", "episode_length:500"]
+    assert train.main([*short, "-f", str(tmp_path / "logs")]) == 0
+    assert again(tmp_path, str(tmp_path / "logs/cpo/CostPoint-v0_1"), *PACKAGES) == 1
+    assert "No episode has ended: there is nothing to compare." in capsys.readouterr().out
 
 
 def test_the_packages_own_table_can_be_read(tmp_path, capsys):

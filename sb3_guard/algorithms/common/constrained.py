@@ -33,7 +33,7 @@ from sb3_guard.algorithms.common.arguments import (
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.limits import CostLimits
-from sb3_guard.algorithms.common.loading import LoadsOthers
+from sb3_guard.algorithms.common.loading import LoadsOthers, name_of
 from sb3_guard.checks import check_cost_keys, is_number
 from sb3_guard.costs import EpisodeCosts, read_costs
 
@@ -146,17 +146,12 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
             if name in stated_ones:
                 stated_ones[name].check(name, getattr(self, name), parameter.annotation)
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
-        arch = (self.policy_kwargs or {}).get("net_arch")
-        if isinstance(arch, dict) and "cost" in arch and len({"pi", "vf", "qf"} & arch.keys()) < 2:
-            raise ValueError(
-                f"net_arch={arch!r}: must also have the layers of 'pi' and 'vf' or 'qf'"
-            )
         check_theirs(self)
         self._check_cost_limit()
 
     def _setup_model(self) -> None:
         self._check_hyperparameters()
-        self.saved_by = type(self).__name__  # for the reader of a file; `load` calls this last
+        self.saved_by = name_of(type(self))  # for the reader of a file; `load` calls this last
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
 

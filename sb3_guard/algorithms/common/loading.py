@@ -8,6 +8,7 @@ anew.
 import warnings
 from typing import Any, ClassVar, Self
 
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -46,6 +47,12 @@ def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
     return any(m.count < 1 for m in (means.values() if isinstance(means, dict) else [means]))
 
 
+def name_of(cls: type) -> str:
+    """The name of an algorithm: that of its base in this package, if it has one."""
+    names = [base.__name__ for base in cls.__mro__]
+    return next((name for name in names if name in CLASSES.values()), names[0])
+
+
 def policy_for(cls: Any, kind: type) -> type:
     """
     The class of the policy that an algorithm goes on with.
@@ -56,11 +63,12 @@ def policy_for(cls: Any, kind: type) -> type:
     :raises ValueError: it is none that the algorithm can train
     """
     kinds = [*cls.policy_aliases.values()]
-    if any(issubclass(kind, allowed) for allowed in kinds):
-        return kind
-    for narrower in kinds:
-        if issubclass(narrower, kind):
-            return narrower
+    if not issubclass(kind, RecurrentActorCriticPolicy):
+        if any(issubclass(kind, allowed) for allowed in kinds):
+            return kind
+        for narrower in kinds:
+            if issubclass(narrower, kind):
+                return narrower
     names = ", ".join(allowed.__name__ for allowed in kinds)
     raise ValueError(
         f"{cls.__name__} can't take over an agent with a {kind.__name__}: allowed are {names} "
@@ -74,8 +82,9 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
 
     A hyperparameter that the class states itself has the class's default, since the same name
     may mean something else there: sb3-contrib's ``target_kl`` is a mean over the dimensions of an
-    action, ours a sum. In the files of our TRPO all mean the same; ``missing_cost`` alone, which
-    lets it run where nothing costs, is not taken over.
+    action, ours a sum. In the files of our TRPO they mean the same; ``missing_cost`` alone, which
+    lets it run where nothing costs, is not taken over. ``learning_rate`` is that of the critics in
+    a trust region, elsewhere that of the actor, too.
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
@@ -83,8 +92,10 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
     """
     ours = "cost_keys" in data
     names = {"missing_cost"} if ours else {*stated(cls), *cls.fixed_arguments}
-    if data.get("batch_size") is None:  # the whole rollout, which not every algorithm takes
-        names.add("batch_size")
+    # The whole rollout, and that of the reward, where another algorithm may need another one.
+    names |= {name for name in ("batch_size", "cost_gae_lambda") if data.get(name) is None}
+    if ("clip_range" in data) != ("clip_range" in blank):
+        names.add("learning_rate")
     return {**_BUFFERS, **{name: blank[name] for name in names & blank.keys()}}
 
 
@@ -127,8 +138,8 @@ class LoadsOthers(BaseAlgorithm):
         if hasattr(path, "seek"):
             path.seek(0)
         data, left = data or {}, []
-        saved_by = data.get("saved_by", cls.__name__ if "cost_keys" in data else "")
-        another = saved_by != cls.__name__
+        saved_by = data.get("saved_by", name_of(cls) if "cost_keys" in data else "")
+        another = saved_by != name_of(cls)
         without_limits = data and another and saved_by in ("", "TRPO")
         check_names(cls, kwargs.keys() if without_limits else kwargs.keys() - data.keys())
         if data and another:
@@ -158,7 +169,7 @@ class LoadsOthers(BaseAlgorithm):
                 "kept in training",
             )
         new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
-        if another and not without_limits and {saved_by, cls.__name__} <= {*CLASSES.values()}:
+        if another and not without_limits and {saved_by, name_of(cls)} <= {*CLASSES.values()}:
             _warn(
                 f"{cls.__name__} goes on with an agent of {saved_by}, and with its hyperparameters "
                 "where load is given no others",

@@ -114,6 +114,9 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
                 f"rollout_buffer_class={buffer_class.__name__}: must be a subclass of "
                 "CostRolloutBuffer, or of CostDictRolloutBuffer for Dict observations"
             )
+        arch = (self.policy_kwargs or {}).get("net_arch")
+        if isinstance(arch, dict) and "cost" in arch and not {"pi", "vf"} <= arch.keys():
+            raise ValueError(f"net_arch={arch!r}: must also have the layers of 'pi' and 'vf'")
 
     def _choose_buffer(self) -> None:
         if self.rollout_buffer_class is None:

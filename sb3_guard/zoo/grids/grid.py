@@ -122,14 +122,16 @@ def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
     with _one_at_a_time:
         if stop.exists():
             return "waiting", ""
+        error_file = run.path / "error.txt"
         try:
+            error_file.unlink(missing_ok=True)
             status = complete(run.flags, run.values, command, stop.exists)
         except RunInUse as error:
             return "in use", one_line(error)
         except Exception as error:
             # The grid's summary says it too, so a record that can't be written is no failure.
             with suppress(OSError):
-                (run.path / "error.txt").write_text(traceback.format_exc())
+                error_file.write_text(traceback.format_exc())
             return "failed", one_line(error)
     return "stopped" if status else "done", ""
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
 
 from sb3_guard.algorithms.common.reuse import Reuse, Rollout
 from sb3_guard.common.files import replacing
@@ -303,7 +303,8 @@ def load_model(
     """
     with explained(f"can't load {path} as {algorithm.__name__}"):
         with warnings.catch_warnings():
-            if env is None:  # whoever plays makes one with the statistics of the run
+            # They are restored later; whoever plays makes an environment with those of the run.
+            if env is None or unwrap_vec_normalize(env) is not None:
                 warnings.filterwarnings("ignore", "the agent learnt from normalised observations")
             model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
         if env is not None and isinstance(model, OffPolicyAlgorithm):

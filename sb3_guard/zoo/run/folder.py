@@ -314,7 +314,7 @@ def _remove_empty(path: Path) -> None:
     """
     end = time.monotonic() + EMPTY
     with suppress(FileNotFoundError):
-        while path.stat().st_size == 0:
+        while not path.read_bytes():
             if time.monotonic() > end:
                 path.unlink()
             time.sleep(0.05)

@@ -26,7 +26,7 @@ for _ in range(500):
     values = {"observation": frames[None], "last_cost": np.float32([[cost]])}
     action = policy.run(["action"], {name: values[name] for name in inputs})[0][0]
     late = time.perf_counter() - began > period
-    if missing > 2 or late or not np.isfinite(action).all():
+    if missing > 2 or late or not np.isfinite(np.append(frames, action)).all():
         action, stops = np.zeros_like(action), stops + 1  # the watchdog stops the robot
     action = np.clip(action, bounds["low"], bounds["high"])
     latest, _, terminated, truncated, info = robot.step(action)

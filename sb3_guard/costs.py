@@ -26,7 +26,9 @@ def number(value: Any, name: str) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        raise NumberError(f"{name} is {value!r}: a cost must be a finite number")
+        several = isinstance(value, list | tuple | dict) or getattr(value, "ndim", 0) > 0
+        hint = "; sb3_guard.common.adapters.CostFromInfo takes several" if several else ""
+        raise NumberError(f"{name} is {value!r}: a cost must be a finite number{hint}")
     return number
 
 

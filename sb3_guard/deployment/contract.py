@@ -9,7 +9,7 @@ import stable_baselines3
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.budgets import Highest, Remaining
@@ -126,7 +126,7 @@ def _space(name: str, space: spaces.Space) -> dict[str, Any]:
     if isinstance(space, spaces.Box):
         described |= {"low": _bounds(space.low), "high": _bounds(space.high)}
     elif isinstance(space, spaces.Discrete):
-        described |= {"low": int(space.start), "high": int(space.start + space.n) - 1}
+        described |= {"low": 0, "high": int(space.n) - 1}
     return described
 
 
@@ -187,8 +187,10 @@ def _stack(env: VecEnv, deployed: Deployed) -> dict[str, Any] | None:
     if frames_of(env) == 1:
         return None
     padding = {}
+    normalizer = unwrap_vec_normalize(env)
+    normalized_first = normalizer is not None and frames_of(normalizer) == 1
     for name, space in inputs_of(deployed.space).items():
-        mean = deployed.normalizer.mean(name)  # a normalised zero
+        mean = deployed.normalizer.mean(name) if normalized_first else None  # a normalised zero
         padding[name] = _bounds(np.zeros(space.shape or ()) if mean is None else mean)
     return {"frames": frames_of(env), "order": "oldest first", "padding": padding}
 

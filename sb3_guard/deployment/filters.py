@@ -88,6 +88,7 @@ class Projection(Filter):
         outputs = self.unit * self.network(observations).double()  # slopes, last cost, drift
         slopes, estimate = outputs[:, : self.n_actions], outputs[:, self.n_actions, None]
         last_cost = last_cost.double()
+        last_cost = th.where(last_cost > 1e30, 1e30, last_cost)  # infinity would have no correction
         limits = self.threshold - th.where(th.isnan(last_cost), estimate, last_cost)
         if self.drift:
             limits = limits - outputs[:, -1:]

@@ -62,13 +62,19 @@ def export(
     :param sampled: sample actions, with the random numbers as an input; False: the most likely ones
     :param trained: what the contract shall say of the training, plain data
     :return: the contract
-    :raises ValueError: the agent is of a kind that can't be exported, or has no environment
+    :raises ValueError: the agent is of a kind that can't be exported, or has no environment, or
+        another agent is in the folder
     :raises ImportError: the extra ``export`` is not installed
     """
     check(model, sampled)
     path = Path(path)
     if path.suffix != ".onnx":
         raise ValueError(f"path={str(path)!r}: must end in .onnx")
+    beside = path.with_name(CONTRACT)
+    if beside.is_file():
+        other = path.with_name(json.loads(beside.read_bytes())["file"]["name"])
+        if other != path and other.is_file():
+            raise ValueError(f"{beside} is that of {other}: choose another folder")
     env = env or model.get_env()
     if env is None or lacks_statistics(model, env):
         raise ValueError(
@@ -96,7 +102,7 @@ def export(
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as out:
         out.write(content)
-    with replacing(path.with_name(CONTRACT)) as out:
+    with replacing(beside) as out:
         out.write(_json(described))
     return described
 

@@ -155,6 +155,11 @@ def test_the_safety_filter_is_in_the_file(
     assert 0.05 < corrected < 0.999
     if key == "trpo_sl":  # what it acts on changes with the last cost
         unknown = run(path, {**inputs, "last_cost": np.full_like(last_cost, np.nan)})
+        infinite, huge = (
+            run(path, {**inputs, "last_cost": np.full_like(last_cost, cost)})
+            for cost in (np.inf, 1e30)
+        )
+        np.testing.assert_array_equal(infinite, huge)
         assert (np.abs(filtered - unknown) > 1e-3).any()
 
 
@@ -282,6 +287,20 @@ def test_frames_are_stacked_before_they_are_normalised(tmp_path: Path) -> None:
     inputs = {"observation": np.concatenate([padding[:, :8], frame], axis=1)}
     expected = model.predict(first, deterministic=True)[0]
     assert agreement(run(tmp_path / "policy.onnx", inputs), expected, model.action_space)[0] == 1.0
+
+
+def test_frames_that_are_normalised_together_begin_with_zeros(tmp_path: Path) -> None:
+    env = VecNormalize(VecFrameStack(points(2).venv, 3))
+    model = CPO("MlpPolicy", env, **ON_POLICY).learn(160)
+    env.training = False
+    contract = sb3_guard.export(model, tmp_path / "policy.onnx")
+    first = env.reset()
+    inputs = {"observation": env.get_original_obs()}
+    assert contract["frame_stack"]["padding"]["observation"] == 0.0 == inputs["observation"][0, 0]
+    expected = model.predict(first, deterministic=True)[0]
+    assert agreement(run(tmp_path / "policy.onnx", inputs), expected, model.action_space)[0] == 1.0
+    with pytest.raises(ValueError, match=r"contract.json is that of .*policy.onnx: choose another"):
+        sb3_guard.export(model, tmp_path / "other.onnx")
 
 
 # Our robots, and the contract

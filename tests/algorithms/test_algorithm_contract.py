@@ -168,10 +168,6 @@ def test_spaces(
     """Train, save, load, and act as before."""
     policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
     env = make_vec_env(lambda: RandomCostEnv(observation_space, action_space), 2, seed=0)
-    if isinstance(action_space, spaces.Discrete):
-        other = make_vec_env(lambda: RandomCostEnv(BOX, spaces.Discrete(3, start=-1)), 2)
-        with pytest.raises(ValueError, match=r"must begin at 0|corrects actions|supports"):
-            small(cls, other, policy)
     if cls in FILTERED and not isinstance(action_space, spaces.Box):
         with pytest.raises(ValueError, match=f"{cls.__name__} corrects actions of a Box, not of"):
             small(cls, env, policy)
@@ -180,6 +176,10 @@ def test_spaces(
         with pytest.raises(ValueError, match=f"{cls.__name__} needs continuous actions"):
             small(cls, env, policy)
         return
+    if isinstance(action_space, spaces.Discrete):
+        other = make_vec_env(lambda: RandomCostEnv(BOX, spaces.Discrete(3, start=-1)), 2)
+        with pytest.raises(ValueError, match="must begin at 0"):
+            small(cls, other, policy)
     model = small(cls, env, policy).learn(160)
     observation = env.reset()
     action, _ = model.predict(observation, deterministic=True)

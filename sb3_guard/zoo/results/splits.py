@@ -75,9 +75,10 @@ def nested_interval(seeds: Sequence[np.ndarray], resamples: int = 10_000) -> tup
     drawn = rng.integers(len(seeds), size=(resamples, len(seeds)))
     means = np.zeros(drawn.shape)
     for number, costs in enumerate(seeds):
-        here = drawn == number
-        rows = rng.integers(len(costs), size=(np.count_nonzero(here), len(costs)))
-        means[here] = costs[rows].mean(axis=1)
+        parts = 1 + resamples * len(costs) // 10**7  # so many at once as fit into memory
+        for here in np.array_split(np.argwhere(drawn == number), parts):
+            rows = rng.integers(len(costs), size=(len(here), len(costs)))
+            means[tuple(here.T)] = costs[rows].mean(axis=1)
     low, high = np.quantile(means.mean(axis=1), [0.025, 0.975])
     return float(low), float(high)
 

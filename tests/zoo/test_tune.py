@@ -5,7 +5,9 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +18,7 @@ import pytest
 import yaml
 from cost_envs import CostPoint
 from kills import campaign, faults, work
-from optuna.storages import JournalStorage
+from optuna.storages import InMemoryStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState, create_trial
 from processes import fresh, wait_for
@@ -27,7 +29,7 @@ from sb3_guard.algorithms import ALGORITHMS, TRPO
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import algorithm, baselines
 from sb3_guard.zoo.run.hyperparams import build, check, parameters, read_hyperparams
-from sb3_guard.zoo.tuning import studies, trials
+from sb3_guard.zoo.tuning import search, studies, trials
 from sb3_guard.zoo.tuning.report import Report, best
 from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space, space_of
 
@@ -814,9 +816,29 @@ def test_a_study_whose_beginner_died_is_begun(tmp_path, folder, monkeypatch, met
     with monkeypatch.context() as patch:
         patch.setattr(optuna.Study, method, die)
         assert run(tmp_path, "--n-trials", "2") == 130
+    monkeypatch.setattr(search, "FIRST_TRIAL", 0.1)
     assert run(tmp_path, "--n-trials", "2") == 0
     assert states(folder) == {"COMPLETE": 2}
     assert study_in(folder).trials[0].params["target_kl"] == SHIPPED_KL
+
+
+def test_workers_that_begin_a_study_together_queue_one_first_trial(tmp_path, monkeypatch):
+    add = optuna.Study.add_trial
+
+    def slowly(self, trial):
+        time.sleep(0.5)
+        add(self, trial)
+
+    monkeypatch.setattr(optuna.Study, "add_trial", slowly)
+    flags = search.TuneFlags.parse([*TOY, *SMALL, "-f", str(tmp_path)])
+    _, settings, space = search.prepare(flags)
+    storage = InMemoryStorage()
+    with ThreadPoolExecutor(3) as pool:
+        opened = [
+            pool.submit(search.open_study, flags, settings, space, "one", storage, "memory")
+            for _ in range(3)
+        ]
+    assert len(opened[0].result().trials) == 1
 
 
 def test_help_and_dispatcher(capsys, tmp_path):

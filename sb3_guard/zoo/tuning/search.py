@@ -12,12 +12,13 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
 import optuna
-from optuna.exceptions import ExperimentalWarning
+from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.storages import RDBStorage
 from optuna.study import MaxTrialsCallback, StudyDirection
@@ -38,6 +39,7 @@ from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space
 from sb3_guard.zoo.tuning.studies import Storage, open_storage, repeat_lost_trials
 from sb3_guard.zoo.tuning.trials import GIVEN, Objective, Settings, Stopped
 
+FIRST_TRIAL = 3.0  # seconds in which whoever began a study queues its first trial, unless it dies
 MOST_FAILURES = 3  # in a row, until it is not the hyperparameters' fault
 SETTINGS = "settings"
 
@@ -107,13 +109,20 @@ def open_study(
     directions = [StudyDirection.MAXIMIZE]
     if settings.pareto:
         directions += [StudyDirection.MINIMIZE] * len(settings.cost_keys)
-    study = optuna.create_study(
+    create = partial(
+        optuna.create_study,
         storage=storage,
         study_name=name,
         directions=directions,
-        load_if_exists=True,
         pruner=_pruner(flags, settings),
     )
+    try:
+        study = create()
+    except DuplicatedStudyError:
+        study = create(load_if_exists=True)
+        end = time.monotonic() + FIRST_TRIAL
+        while not study.trials and time.monotonic() < end:
+            time.sleep(0.1)
     saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
     if saved is not None:
         settings.refuse_others(saved, name)

@@ -3,12 +3,13 @@
 The runs below the folder are those that ``scripts/grand_table.py`` writes. A run is
 certified if the 95 % intervals of the mean cost of its final episodes, with sampled actions and
 with the most likely ones, end at or below the limit; of an environment's certified runs that with
-the highest return is taken. It is played again, 300 episodes of other seeds with each kind of
-actions, and shipped if these certify it, too; else the next one is tried. An agent that is shipped
-already is kept if its return is as high. Runs from a packed archive have no model: ``sb3-guard
-reproduce FOLDER`` trains them again, below ``logs/reproduced``. The package gets the run's
-settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get some
-observations and actions, ``tests/data/pretrained.npz``.
+the highest return is taken. With less than a tenth of the best run's return, of whatever cost, it
+hardly does its task and does not count. It is played again, 300 episodes of other seeds with each
+kind of actions, and shipped if these certify it, too; else the next one is tried. An agent that is
+shipped already is kept if its return is as high. Runs from a packed archive have no model:
+``sb3-guard reproduce FOLDER`` trains them again, below ``logs/reproduced``. The package gets the
+run's settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get
+some observations and actions, ``tests/data/pretrained.npz``.
 """
 
 from __future__ import annotations
@@ -55,8 +56,11 @@ DROPPED = ("final", "platform", "seconds")  # of result.json
 
 
 def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
-    """The certified runs on an environment with a return above ``least``, the highest first."""
-    certified = []
+    """The certified runs on an environment that do its task, the highest return first.
+
+    :param least: only those with a higher return
+    """
+    certified, best = [], -np.inf
     for path in find_runs(folder):
         if not is_run(path) or (run := RunFolder(path)).name != env_id:
             continue
@@ -65,11 +69,14 @@ def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
         final = result.get("final", {})
         if not final or result.get("cost_limit") not in (None, LIMITS[env_id]):
             continue
-        mean = float(np.mean(final["stochastic"]["returns"]))
+        means = [float(np.mean(episodes["returns"])) for episodes in final.values()]
         ends = [estimate(np.array(episodes["costs"])).high for episodes in final.values()]
-        if mean > least and max(ends) <= LIMITS[env_id]:
-            certified.append((mean, str(path)))
-    for mean, name in sorted(certified, reverse=True):
+        best = max(best, means[0])
+        if means[0] > least and max(ends) <= LIMITS[env_id]:
+            certified.append((means[0], min(means), str(path)))
+    for mean, lower, name in sorted(certified, reverse=True):
+        if lower < best / 10:
+            continue
         run = RunFolder(Path(name))
         if run.model.exists():
             yield run

@@ -136,7 +136,8 @@ def reproduce(flags: Flags) -> int:
     run = RunFlags.parse(shlex.split(row["command"])[2:])
     run.log_folder, run.verbose = flags.log_folder, 0
     # The command may come from anyone, so the user has to name the modules that it would import.
-    require_named(Path(flags.run), flags.gym_packages, run.gym_packages)
+    own = run.gym_packages
+    require_named(Path(flags.run), flags.gym_packages, own)
     run.gym_packages = flags.gym_packages
     if is_program(program := run.conf_file or ""):
         if program not in flags.gym_packages:
@@ -144,7 +145,7 @@ def reproduce(flags: Flags) -> int:
                 f"the run has its hyperparameters from a program, {program}; if you trust it: "
                 f"--gym-packages {shlex.quote(program)}"
             )
-        run.gym_packages = [name for name in flags.gym_packages if name != program]
+        run.gym_packages = [name for name in flags.gym_packages if name != program or name in own]
     run, values = prepare(run)
     seconds = row.get("seconds")
     took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""

@@ -187,8 +187,7 @@ def _stack(env: VecEnv, deployed: Deployed) -> dict[str, Any] | None:
     if frames_of(env) == 1:
         return None
     padding = {}
-    normalizer = unwrap_vec_normalize(env)
-    normalized_first = normalizer is not None and frames_of(normalizer) == 1
+    normalized_first = frames_of(unwrap_vec_normalize(env) or env) == 1
     for name, space in inputs_of(deployed.space).items():
         mean = deployed.normalizer.mean(name) if normalized_first else None  # a normalised zero
         padding[name] = _bounds(np.zeros(space.shape or ()) if mean is None else mean)

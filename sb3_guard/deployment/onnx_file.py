@@ -7,6 +7,7 @@ import logging
 import re
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,15 +67,8 @@ def export(
         another agent is in the folder
     :raises ImportError: the extra ``export`` is not installed
     """
-    check(model, sampled)
     path = Path(path)
-    if path.suffix != ".onnx":
-        raise ValueError(f"path={str(path)!r}: must end in .onnx")
-    beside = path.with_name(CONTRACT)
-    if beside.is_file():
-        other = path.with_name(json.loads(beside.read_bytes())["file"]["name"])
-        if other != path and other.is_file():
-            raise ValueError(f"{beside} is that of {other}: choose another folder")
+    check(model, sampled, path)
     env = env or model.get_env()
     if env is None or lacks_statistics(model, env):
         raise ValueError(
@@ -102,24 +96,32 @@ def export(
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as out:
         out.write(content)
-    with replacing(beside) as out:
+    with replacing(path.with_name(CONTRACT)) as out:
         out.write(_json(described))
     return described
 
 
-def check(model: BaseAlgorithm, sampled: bool) -> None:
+def check(model: BaseAlgorithm, sampled: bool, path: Path) -> None:
     """
     Find out whether an agent can be exported.
 
     :param model: the agent
     :param sampled: whether its actions are sampled
-    :raises ValueError: it is of a kind that can't be exported
+    :param path: of the file
+    :raises ValueError: it is of a kind that can't be exported, or another agent is in the folder
     :raises ImportError: the extra ``export`` is not installed
     """
     for name in ("onnx", "onnxscript", "onnxruntime"):
         if importlib.util.find_spec(name) is None:
             raise ImportError(f"export needs {name}: pip install 'sb3-guard[export]'")
     Acting(model, sampled)
+    if path.suffix != ".onnx":
+        raise ValueError(f"path={str(path)!r}: must end in .onnx")
+    beside, name = path.with_name(CONTRACT), path.name
+    with suppress(OSError, ValueError, KeyError, TypeError):  # absent, or not one of ours
+        name = str(json.loads(beside.read_bytes())["file"]["name"])
+    if name != path.name and path.with_name(name).is_file():
+        raise ValueError(f"{beside} is that of {name}: choose another folder")
 
 
 def _json(data: Mapping[str, Any]) -> bytes:

@@ -176,8 +176,14 @@ def test_spaces(
         with pytest.raises(ValueError, match=f"{cls.__name__} needs continuous actions"):
             small(cls, env, policy)
         return
-    if isinstance(action_space, spaces.Discrete):
-        other = make_vec_env(lambda: RandomCostEnv(BOX, spaces.Discrete(3, start=-1)), 2)
+    if isinstance(action_space, spaces.Discrete | spaces.MultiDiscrete):
+        one = spaces.Discrete(3, start=-1)
+        shifted = (
+            one
+            if isinstance(action_space, spaces.Discrete)
+            else spaces.MultiDiscrete([2, 2], start=[1, 1])
+        )
+        other = make_vec_env(lambda: RandomCostEnv(BOX, shifted), 2)
         with pytest.raises(ValueError, match="must begin at 0"):
             small(cls, other, policy)
     model = small(cls, env, policy).learn(160)

@@ -108,6 +108,13 @@ def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
         CPO.load(tmp_path / "ppo", clip_range=0.3)
 
 
+def test_the_learning_rate_of_an_actor_is_carried_over(tmp_path):
+    sb3.A2C("MlpPolicy", CostPoint(10), learning_rate=0.02).save(tmp_path / "a")
+    for ours, rate in (PPOLag, 0.02), (CPO, 1e-3):
+        with pytest.warns(UserWarning, match="takes over"):
+            assert ours.load(tmp_path / "a", env=CostPoint(10)).learning_rate == rate
+
+
 class _MyTRPO(sb3_guard.TRPO):
     """A user's own."""
 

@@ -301,6 +301,8 @@ def test_frames_that_are_normalised_together_begin_with_zeros(tmp_path: Path) ->
     assert agreement(run(tmp_path / "policy.onnx", inputs), expected, model.action_space)[0] == 1.0
     with pytest.raises(ValueError, match=r"contract.json is that of .*policy.onnx: choose another"):
         sb3_guard.export(model, tmp_path / "other.onnx")
+    (tmp_path / "contract.json").write_text('{"file": []}')  # of another program
+    sb3_guard.export(model, tmp_path / "other.onnx")
 
 
 # Our robots, and the contract

@@ -46,6 +46,14 @@ def test_the_interval_is_over_seeds_and_episodes():
     assert ends == [2.0, 27.5]
 
 
+def test_each_draw_of_few_seeds_is_taken_equally_often():
+    """Where the costs of a seed do not vary, the mean of the samples is exact."""
+    seeds = [np.full(4, cost) for cost in (0.0, 1.0, 5.0)]
+    draws = [np.mean(draw) for draw in itertools.product((0.0, 1.0, 5.0), repeat=3)]
+    ends = np.quantile(np.repeat(draws, 400), [0.025, 0.975])
+    assert nested_interval(seeds) == pytest.approx(ends)
+
+
 def test_the_interval_of_a_single_seed_is_over_its_episodes():
     costs = np.random.default_rng(1).exponential(10, size=400)
     low, high = nested_interval([costs])

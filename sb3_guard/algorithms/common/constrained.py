@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -153,7 +152,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
     def _setup_model(self) -> None:
         self._check_hyperparameters()
         for space in self.observation_space, self.action_space:
-            if isinstance(space, spaces.Discrete) and space.start != 0:
+            if np.any(getattr(space, "start", 0)):
                 raise ValueError(f"{space}: must begin at 0, where Stable-Baselines3 counts from")
         self.saved_by = name_of(type(self))  # for the reader of a file; `load` calls this last
         self._choose_buffer()

@@ -8,7 +8,6 @@ anew.
 import warnings
 from typing import Any, ClassVar, Self
 
-from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
@@ -62,6 +61,8 @@ def policy_for(cls: Any, kind: type) -> type:
     :return: that one, or the one that the algorithm has in its place
     :raises ValueError: it is none that the algorithm can train
     """
+    from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+
     kinds = [*cls.policy_aliases.values()]
     if not issubclass(kind, RecurrentActorCriticPolicy):
         if any(issubclass(kind, allowed) for allowed in kinds):
@@ -94,7 +95,7 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
     names = {"missing_cost"} if ours else {*stated(cls), *cls.fixed_arguments}
     # The whole rollout, and that of the reward, where another algorithm may need another one.
     names |= {name for name in ("batch_size", "cost_gae_lambda") if data.get(name) is None}
-    if ("clip_range" in data) != ("clip_range" in blank):
+    if ("cg_max_steps" in data) != ("cg_max_steps" in blank):
         names.add("learning_rate")
     return {**_BUFFERS, **{name: blank[name] for name in names & blank.keys()}}
 

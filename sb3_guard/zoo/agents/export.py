@@ -24,7 +24,7 @@ def export(flags: ExportFlags) -> int:
     agent = open_agent(flags, None, min(flags.n_episodes or BATCH, BATCH))
     with closing(agent.env):
         with explained(f"can't export {agent.path}", ValueError, ImportError):
-            onnx_file.check(agent.model, flags.stochastic)
+            onnx_file.check(agent.model, flags.stochastic, path)
         how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
         episodes = flags.n_episodes or max(agent.env.num_envs, 5)
         evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)

@@ -66,13 +66,17 @@ def nested_interval(seeds: Sequence[np.ndarray], resamples: int = 10_000) -> tup
     A 95 % percentile bootstrap interval of the mean over seeds and episodes.
 
     Seeds are drawn with replacement, then episodes of each drawn seed; every seed weighs the same.
-    Of a single seed the interval tells nothing about another.
+    Of few seeds, each of the possible draws is taken equally often. Of a single seed the interval
+    tells nothing about another.
 
     :param seeds: costs of the episodes of each seed, [E_s] each, at least one seed
-    :param resamples: number of bootstrap samples
+    :param resamples: least number of bootstrap samples
     """
-    rng = np.random.default_rng(0)
-    drawn = rng.integers(len(seeds), size=(resamples, len(seeds)))
+    rng, n = np.random.default_rng(0), len(seeds)
+    if n**n <= resamples:
+        drawn = np.tile(np.indices([n] * n).reshape(n, -1).T, (-(-resamples // n**n), 1))
+    else:
+        drawn = rng.integers(n, size=(resamples, n))
     means = np.zeros(drawn.shape)
     for number, costs in enumerate(seeds):
         parts = 1 + resamples * len(costs) // 10**7  # so many at once as fit into memory

@@ -304,7 +304,7 @@ def load_model(
     with explained(f"can't load {path} as {algorithm.__name__}"):
         with warnings.catch_warnings():
             # They are restored later; whoever plays makes an environment with those of the run.
-            if env is None or unwrap_vec_normalize(env) is not None:
+            if env is None or getattr(unwrap_vec_normalize(env), "norm_obs", False):
                 warnings.filterwarnings("ignore", "the agent learnt from normalised observations")
             model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
         if env is not None and isinstance(model, OffPolicyAlgorithm):

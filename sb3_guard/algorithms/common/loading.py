@@ -64,12 +64,12 @@ def policy_for(cls: Any, kind: type) -> type:
     from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 
     kinds = [*cls.policy_aliases.values()]
-    if not issubclass(kind, RecurrentActorCriticPolicy):
-        if any(issubclass(kind, allowed) for allowed in kinds):
-            return kind
-        for narrower in kinds:
-            if issubclass(narrower, kind):
-                return narrower
+    recurrent = issubclass(kind, RecurrentActorCriticPolicy)
+    if not recurrent and any(issubclass(kind, allowed) for allowed in kinds):
+        return kind
+    for narrower in kinds:
+        if issubclass(narrower, kind):
+            return narrower
     names = ", ".join(allowed.__name__ for allowed in kinds)
     raise ValueError(
         f"{cls.__name__} can't take over an agent with a {kind.__name__}: allowed are {names} "

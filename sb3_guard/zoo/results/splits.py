@@ -74,7 +74,8 @@ def nested_interval(seeds: Sequence[np.ndarray], resamples: int = 10_000) -> tup
     """
     rng, n = np.random.default_rng(0), len(seeds)
     if n**n <= resamples:
-        drawn = np.tile(np.indices([n] * n).reshape(n, -1).T, (-(-resamples // n**n), 1))
+        every = np.indices([n] * n).reshape(n, -1).T
+        drawn = np.tile(every, (math.ceil(resamples / n**n), 1))
     else:
         drawn = rng.integers(n, size=(resamples, n))
     means = np.zeros(drawn.shape)

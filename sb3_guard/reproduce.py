@@ -36,7 +36,7 @@ class Flags(Command):
 
     :param run: row of the leaderboard, e.g. grand_table/cpo/SafetyPointGoal1-v0_1, or a run folder
     :param log_folder: log folder of the new run (default: logs/reproduced)
-    :param gym_packages: modules that the run needs
+    :param gym_packages: modules that the run needs; a program of -conf as the run names it
     """
 
     prog: ClassVar[str] = "sb3-guard reproduce"
@@ -160,7 +160,7 @@ def reproduce(flags: Flags) -> int:
         return status
     result = RunFolder(path_of(run)).checked_result()
     lines = differences(row, result)
-    if result["return"] is None:
+    if result["return"] is None and row.get("curve") == result["curve"]:
         lines = ["No episode has ended: there is nothing to compare."]
     same = f"The same: all training episodes agree (curve {result['curve'][:12]}…)."
     if not row.get("curve"):

@@ -16,7 +16,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
         return difflib.SequenceMatcher(None, allowed.lower(), wrong).ratio()
 
     close = max(known, key=likeness, default="")
-    return close if likeness(close) >= 0.5 else None
+    return close if likeness(close) >= 0.6 else None
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -75,7 +75,7 @@ def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
         if means[0] > least and max(ends) <= LIMITS[env_id]:
             certified.append((means[0], min(means), str(path)))
     for mean, lower, name in sorted(certified, reverse=True):
-        if lower < best / 10:
+        if lower < best / 10 and best > 0:
             continue
         run = RunFolder(Path(name))
         if run.model.exists():

@@ -120,7 +120,7 @@ def check(model: BaseAlgorithm, sampled: bool, path: Path) -> None:
     beside, name = path.with_name(CONTRACT), path.name
     with suppress(OSError, ValueError, KeyError, TypeError):  # absent, or not one of ours
         name = str(json.loads(beside.read_bytes())["file"]["name"])
-    if name != path.name and path.with_name(name).is_file():
+    if name != path.name and (path.parent / name).is_file():
         raise ValueError(f"{beside} is that of {name}: choose another folder")
 
 

@@ -183,9 +183,10 @@ def test_spaces(
             if isinstance(action_space, spaces.Discrete)
             else spaces.MultiDiscrete([2, 2], start=[1, 1])
         )
-        other = make_vec_env(lambda: RandomCostEnv(BOX, shifted), 2)
-        with pytest.raises(ValueError, match="must begin at 0"):
-            small(cls, other, policy)
+        for observed, acting in (BOX, shifted), (spaces.Dict(a=BOX, b=one), action_space):
+            other = make_vec_env(lambda o=observed, a=acting: RandomCostEnv(o, a), 2)
+            with pytest.raises(ValueError, match="must begin at 0"):
+                small(cls, other, policy if observed is BOX else "MultiInputPolicy")
     model = small(cls, env, policy).learn(160)
     observation = env.reset()
     action, _ = model.predict(observation, deterministic=True)

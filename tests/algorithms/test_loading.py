@@ -25,6 +25,8 @@ from sb3_guard import (
     train,
 )
 from sb3_guard.algorithms.common.arguments import stated
+from sb3_guard.algorithms.common.loading import name_of
+from sb3_guard.algorithms.common.rollouts import CostRollouts
 from sb3_guard.zoo.run.checkpoint import read_normalizer
 
 SMALL = {"seed": 0, "gamma": 0.97}
@@ -62,7 +64,7 @@ def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
         new.predict(obs, deterministic=True)[0], old.predict(obs, deterministic=True)[0]
     )
     assert (new.gamma, new.cost_limit) == (0.97, 3.0)
-    assert ("clip_range" in said) == (theirs is sb3.PPO and ours not in (PPOLag, FOCOPS))
+    assert ("clip_range" in said) == (theirs is sb3.PPO and ours is not PPOLag)
     assert ("cost_critic" in said) == (ours is not TRPOUSL)
     new.learn(80)
     assert new.total_cost > 0
@@ -110,13 +112,21 @@ def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
 
 def test_the_learning_rate_of_an_actor_is_carried_over(tmp_path):
     sb3.A2C("MlpPolicy", CostPoint(10), learning_rate=0.02).save(tmp_path / "a")
-    for ours, rate in (PPOLag, 0.02), (CPO, 1e-3):
-        with pytest.warns(UserWarning, match="takes over"):
+    for ours, rate, told in (PPOLag, 0.02, " of an agent"), (CPO, 1e-3, ", but for learn"):
+        with pytest.warns(UserWarning, match=f"shared hyperparameters{told}"):
             assert ours.load(tmp_path / "a", env=CostPoint(10)).learning_rate == rate
+    TRPOLag("MlpPolicy", CostPoint(10), n_steps=40).save(tmp_path / "b")
+    with pytest.warns(UserWarning, match="of TRPOLag, .* no others, but for batch_size, learning_"):
+        model = PPOLag.load(tmp_path / "b", env=CostPoint(10))
+    assert (model.batch_size, model.learning_rate) == (64, 3e-4) and model.n_steps == 40
 
 
 class _MyTRPO(sb3_guard.TRPO):
     """A user's own."""
+
+
+class _Costly(CostRollouts, sb3_contrib.TRPO):
+    """A user's own with a cost critic."""
 
 
 @pytest.mark.parametrize("ours", [CPO, FOCOPS, PPOLag, TRPOSL])
@@ -128,6 +138,10 @@ def test_a_users_trpo_is_one(ours, tmp_path):
         warnings.simplefilter("error")
         _MyTRPO.load(tmp_path / "a")
         sb3_guard.TRPO.load(tmp_path / "a")
+
+
+def test_sb3_contribs_trpo_is_not_ours():
+    assert name_of(_MyTRPO) == "TRPO" and name_of(_Costly) == "_Costly"
 
 
 class _MyPolicy(sb3.common.policies.ActorCriticPolicy):

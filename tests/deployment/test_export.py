@@ -29,7 +29,7 @@ from sb3_guard.algorithms.common import action_filters
 from sb3_guard.algorithms.common.action_filters import SafetyLayer, UnrolledSafetyLayer
 from sb3_guard.algorithms.common.policies import FilteredPolicy
 from sb3_guard.deployment import filters
-from sb3_guard.deployment.onnx_file import agreement, predicted
+from sb3_guard.deployment.onnx_file import agreement, check, predicted
 
 #: The operators of a plain multilayer perceptron, as docs/deploying.md lists them.
 PLAIN = {"Cast", "Sub", "Div", "Clip", "Gemm", "Tanh", "Max", "Min", "Add", "Mul"}
@@ -442,6 +442,9 @@ def test_what_can_not_be_exported_is_refused_in_a_line(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="or one without its observation statistics: pass env="):
         sb3_guard.export(normalised, tmp_path / "policy.onnx", env=points(2, normalize=False))
     assert not any(tmp_path.iterdir())
+    for foreign in "null", '{"file": {"name": "a/b.onnx"}}', '{"file": {"name": ""}}':
+        (tmp_path / "contract.json").write_text(foreign)
+        check(td3, False, tmp_path / "policy.onnx")
 
 
 def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -132,6 +132,17 @@ def test_hyperparameters_of_a_program_are_run_where_it_is_named(tmp_path, capsys
     assert again(tmp_path, *arguments, "./sub.2/mine.py") == 0
 
 
+def test_one_module_may_be_program_and_environment(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "both.py").write_text(
+        "from tests.support.registered_envs import *\n"
+        "hyperparams = {'CostPoint-v0': dict(policy='MlpPolicy', n_timesteps=400)}"
+    )
+    flags = [*TOY, "--gym-packages", "both", "-conf", "both", "-f", str(tmp_path / "logs")]
+    assert train.main(flags) == 0
+    assert again(tmp_path, str(tmp_path / "logs/cpo/CostPoint-v0_1"), "--gym-packages", "both") == 0
+
+
 def test_nothing_is_the_same_if_no_episode_has_ended(tmp_path, capsys):
     short = [*TOY, *PACKAGES, "-n", "60", "--env-kwargs", "episode_length:500"]
     assert train.main([*short, "-f", str(tmp_path / "logs")]) == 0

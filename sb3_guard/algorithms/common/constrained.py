@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -151,7 +152,9 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_hyperparameters()
-        for space in self.observation_space, self.action_space:
+        observed = self.observation_space
+        parts = observed.values() if isinstance(observed, spaces.Dict) else [observed]
+        for space in *parts, self.action_space:
             if np.any(getattr(space, "start", 0)):
                 raise ValueError(f"{space}: must begin at 0, where Stable-Baselines3 counts from")
         self.saved_by = name_of(type(self))  # for the reader of a file; `load` calls this last

@@ -6,7 +6,7 @@ anew.
 """
 
 import warnings
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -26,6 +26,10 @@ _BUFFERS: dict[str, Any] = {
 
 def _warn(message: str) -> None:
     warnings.warn(message, UserWarning, stacklevel=3)  # the line that calls load
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names) or "nothing"
 
 
 def _left_behind(data: dict[str, Any], blank: dict[str, Any]) -> list[str]:
@@ -48,8 +52,8 @@ def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
 
 def name_of(cls: type) -> str:
     """The name of an algorithm: that of its base in this package, if it has one."""
-    names = [base.__name__ for base in cls.__mro__]
-    return next((name for name in names if name in CLASSES.values()), names[0])
+    ours = [b.__name__ for b in cls.__mro__ if b.__module__.startswith("sb3_guard.algorithms.")]
+    return next((name for name in ours if name in CLASSES.values()), cls.__name__)
 
 
 def policy_for(cls: Any, kind: type) -> type:
@@ -79,25 +83,26 @@ def policy_for(cls: Any, kind: type) -> type:
 
 def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[str, Any]:
     """
-    What takes the place of attributes in the file of an algorithm without limits.
+    What takes the place of hyperparameters in the file of another algorithm.
 
-    A hyperparameter that the class states itself has the class's default, since the same name
-    may mean something else there: sb3-contrib's ``target_kl`` is a mean over the dimensions of an
-    action, ours a sum. In the files of our TRPO they mean the same; ``missing_cost`` alone, which
-    lets it run where nothing costs, is not taken over. ``learning_rate`` is that of the critics in
-    a trust region, elsewhere that of the actor, too.
+    Where that one knows no costs, what the class states itself has the class's default, since the
+    same name may mean something else there: sb3-contrib's ``target_kl`` is a mean over the
+    dimensions of an action, ours a sum. ``missing_cost``, which lets our TRPO run where nothing
+    costs, is not taken over. ``learning_rate`` is that of the critics in a trust region, elsewhere
+    that of the actor, too.
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
     :param blank: attributes of a new model of the algorithm
     """
-    ours = "cost_keys" in data
-    names = {"missing_cost"} if ours else {*stated(cls), *cls.fixed_arguments}
+    names = set() if "cost_keys" in data else {*stated(cls), *cls.fixed_arguments}
+    if data.get("saved_by") == "TRPO":
+        names.add("missing_cost")
     # The whole rollout, and that of the reward, where another algorithm may need another one.
     names |= {name for name in ("batch_size", "cost_gae_lambda") if data.get(name) is None}
     if ("cg_max_steps" in data) != ("cg_max_steps" in blank):
         names.add("learning_rate")
-    return {**_BUFFERS, **{name: blank[name] for name in names & blank.keys()}}
+    return {name: blank[name] for name in names & blank.keys()}
 
 
 class LoadsOthers(BaseAlgorithm):
@@ -120,8 +125,8 @@ class LoadsOthers(BaseAlgorithm):
         """Load an agent as SB3's ``load`` does, also one that an algorithm without limits trained.
 
         Then actor, critic of the reward, their optimizers and the hyperparameters that both
-        algorithms take from SB3 are those of the file; a warning says what begins anew and what is
-        left behind.
+        algorithms take from SB3 are those of the file, but for the learning rate between a trust
+        region and another; a warning says so, what begins anew and what is left behind.
 
         :param path: the file
         :param env: environment to train in; None: to predict only
@@ -138,29 +143,28 @@ class LoadsOthers(BaseAlgorithm):
         data, parts, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
         if hasattr(path, "seek"):
             path.seek(0)
-        data, left = data or {}, []
+        data, left, but = data or {}, [], ""
         saved_by = data.get("saved_by", name_of(cls) if "cost_keys" in data else "")
         another = saved_by != name_of(cls)
         without_limits = data and another and saved_by in ("", "TRPO")
         check_names(cls, kwargs.keys() if without_limits else kwargs.keys() - data.keys())
         if data and another:
             kind = policy_for(cls, data["policy_class"])
-        if without_limits:
-            new_model: Any = cls  # whose arguments this class does not know
-            blank = vars(new_model(kind, env=None, _init_setup_model=False))
-            taken = {**replacements(cls, data, blank), "policy_class": kind}
-            custom_objects = {**taken, **(custom_objects or {})}
-            left = _left_behind(data, blank)
-        elif kwargs.get("policy_kwargs") is not None:  # taken as the constructor took them
+            blank = vars(cast(Any, cls)(kind, env=None, _init_setup_model=False))
+            taken = replacements(cls, data, blank)
+            shared = taken.keys() & data.keys() - kwargs.keys()
+            own = ", ".join(sorted(name for name in shared if taken[name] != data[name]))
+            if without_limits:
+                taken |= _BUFFERS
+                left = _left_behind(data, blank)
+            but = own and f", but for {own}"
+            custom_objects = {**taken, "policy_class": kind, **(custom_objects or {})}
+        if not without_limits and kwargs.get("policy_kwargs") is not None:
+            # taken as the constructor took them
             kwargs["policy_kwargs"] = {**cls.policy_defaults, **kwargs["policy_kwargs"]}
-        try:
-            model = super().load(
-                path, env, device, custom_objects, print_system_info, force_reset, **kwargs
-            )
-        except KeyError as error:  # SB3 takes every ValueError for a sign of an old file
-            raise (
-                error.__context__ if isinstance(error.__context__, ValueError) else error
-            ) from None
+        model = cls._load(
+            path, env, device, custom_objects, print_system_info, force_reset, **kwargs
+        )
         for name in left:
             delattr(model, name)
         if lacks_statistics(model, model.get_env()):
@@ -173,16 +177,26 @@ class LoadsOthers(BaseAlgorithm):
         if another and not without_limits and {saved_by, name_of(cls)} <= {*CLASSES.values()}:
             _warn(
                 f"{cls.__name__} goes on with an agent of {saved_by}, and with its hyperparameters "
-                "where load is given no others",
+                f"where load is given no others{but}",
             )
         if new or without_limits:
-            limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""  # type: ignore[attr-defined]
+            limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""
             _warn(
-                f"{cls.__name__} takes over policy, critic and shared hyperparameters of an agent "
-                f"of another algorithm; to begin anew: {', '.join(new) or 'nothing'}; left behind: "
-                f"{', '.join(left) or 'nothing'}{limit}",
+                f"{cls.__name__} takes over policy, critic and shared hyperparameters{but} of an "
+                f"agent of another algorithm; to begin anew: {_listed(new)}; left behind: "
+                f"{_listed(left)}{limit}",
             )
         return model
+
+    @classmethod
+    def _load(cls, *args: Any, **kwargs: Any) -> Any:
+        """SB3's ``load``, which takes every ValueError for a sign of an old file."""
+        try:
+            return super().load(*args, **kwargs)
+        except KeyError as error:
+            raise (
+                error.__context__ if isinstance(error.__context__, ValueError) else error
+            ) from None
 
     def set_parameters(
         self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto"

@@ -39,7 +39,7 @@ from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space
 from sb3_guard.zoo.tuning.studies import Storage, open_storage, repeat_lost_trials
 from sb3_guard.zoo.tuning.trials import GIVEN, Objective, Settings, Stopped
 
-FIRST_TRIAL = 3.0  # seconds in which whoever began a study queues its first trial, unless it dies
+FIRST_TRIAL = 10.0  # seconds in which whoever began a study queues its first trial
 MOST_FAILURES = 3  # in a row, until it is not the hyperparameters' fault
 SETTINGS = "settings"
 

@@ -119,16 +119,16 @@ def plot(flags: Flags) -> int:
 
 def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
     """Draw figures; 1 if one that was asked for by name could not be drawn."""
-    status, everything, absent = 0, "all" in kinds, dict[str, None]()
-    kinds = [*FIGURES] if everything else kinds
-    for name, drawing in ((kind, drawing) for kind in kinds for drawing in draw(kind, data)):
-        if drawing.missing and everything:
+    status, absent = 0, dict[str, None]()
+    wanted = FIGURES if "all" in kinds else kinds
+    for name, drawing in ((kind, drawing) for kind in wanted for drawing in draw(kind, data)):
+        if drawing.missing and name not in kinds:
             absent[name] = None
         elif drawing.missing:
             lost = "" if drawing.figure else " is not drawn;"
             print(f"{drawing.name}:{lost} missing: {drawing.missing}", file=sys.stderr)
         if drawing.figure is None:
-            status = int(not everything)
+            status |= name in kinds
             continue
         for form in dict.fromkeys(flags.format):
             path = Path(flags.output) / f"{drawing.name}.{form}"

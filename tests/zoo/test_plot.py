@@ -369,6 +369,8 @@ def test_all_of_it(small, tmp_path, capsys):
     assert plot.main([str(small), "--figure", "q7", "-o", str(tmp_path / "g")]) == 1
     assert f"q7: is not drawn; missing: TRPO-USL, TRPO-SL on {POINT}" in capsys.readouterr().err
     assert not (tmp_path / "g").exists()
+    assert plot.main([str(small), "--figure", "all", "q7", "-o", str(tmp_path / "g")]) == 1
+    assert "q7: is not drawn; missing: TRPO-USL" in capsys.readouterr().err
 
 
 def test_a_table_of_runs_has_those_asked_for(small, tmp_path, capsys):

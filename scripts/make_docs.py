@@ -48,13 +48,13 @@ GROUPS: dict[str, dict[str, type[Part]]] = {
 CAPTIONS = {
     "robot": "Each in `Goal_<Robot>_8Hazards`. The ring of beads is its lidar: the more opaque a "
     "bead, the closer the object in that direction. The dart on the floor shows where the robot "
-    "faces. Point is the package's CPO agent; the others are TRPO after 500,000 steps, "
+    "faces. Point is the package's TRPO-USL agent; the others are TRPO after 500,000 steps, "
     "with noise.",
-    "task": "Each with Point among eight hazards: in Goal the package's CPO agent, elsewhere TRPO, "
-    "which ignores cost, after 500,000 steps.",
-    "constraint": "Each with Point and the task Goal: among hazards and ghosts the package's CPO "
-    "agents, elsewhere TRPO, which ignores cost, after 200,000 steps. While a robot incurs a cost, "
-    "it and the border of the arena turn red.",
+    "task": "Each with Point among eight hazards: in Goal the package's TRPO-USL agent, elsewhere "
+    "TRPO, which ignores cost, after 500,000 steps.",
+    "constraint": "Each with Point and the task Goal: the package's TRPO-USL agent among hazards, "
+    "CPO among ghosts, elsewhere TRPO, which ignores cost, after 200,000 steps. While a robot "
+    "incurs a cost, it and the border of the arena turn red.",
 }
 LOOKS = {
     "constraint_ghosts_spatial": "Ghosts in the air: `Goal_Drone_8Ghosts`",
@@ -223,8 +223,9 @@ def gallery() -> str:
     """The page that shows everything."""
     parts = [
         "# Gallery",
-        "![TRPO, which ignores cost, and CPO in the same place](images/trained.gif)",
-        "Two of the package's agents in the same place: TRPO ignores cost, CPO keeps a limit. "
+        "![TRPO, which ignores cost, and TRPO-USL in the same place](images/trained.gif)",
+        "Two of the package's agents in the same place: TRPO ignores cost, TRPO-USL keeps a "
+        "limit. "
         "`sb3-guard show Goal_Ant_8Ghosts --window` opens any environment in MuJoCo's viewer, and "
         "`sb3-guard enjoy --pretrained --env Goal_Point_8Hazards --record` films an agent. "
         "The pictures are made by `python scripts/render_gallery.py`.",

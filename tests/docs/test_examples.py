@@ -29,7 +29,7 @@ SAYS = {
     "custom_robot": (["26 observations, 2 actions", "return "], ["puck.xml"]),
     "custom_task": (["metres: ["], []),
     "deploy": (
-        ["limit 5.0 per episode; stopped "],
+        ["limit 2.0 per episode; stopped "],
         ["contract.json", "costs.csv", "policy.onnx"],
     ),
     "domain_randomization": (["drawn: {'hazards.num': ", "mass × 0.5: ", "mass × 2.0: "], []),

@@ -87,8 +87,10 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
             final["greedy"]["returns"] = [0.5] * 5
         file.write_text(json.dumps(result | {"final": final}))
     there = tmp_path / "pretrained"
-    before = there / "cpo" / "Goal_Point_8Hazards-v0_1"  # at a limit of 5
-    shutil.copytree(pretrained.PRETRAINED / "cpo" / before.name, before)
+    before = there / "trpo_usl" / "Goal_Point_8Hazards-v0_1"
+    shutil.copytree(pretrained.PRETRAINED / "trpo_usl" / before.name, before)
+    result = json.loads((before / "result.json").read_text())
+    (before / "result.json").write_text(json.dumps(result | {"cost_limit": 5}))
     names = script["main"].__globals__
     estimates = {"return": Estimate(6, 0, 6, 6), "cost": Estimate(1.5, 0, 1.4, 1.6)}
     monkeypatch.setitem(names, "played", lambda run: dict.fromkeys(pretrained.PLAYED, estimates))
@@ -155,7 +157,7 @@ def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert enjoy.main(["--pretrained", "--env", POINT, "-n", "20", "--no-render"]) == 0
     out = capsys.readouterr().out
-    assert f"{POINT}-v0_1" in out and f"on {POINT}-v0, trained at limit 3\n" in out
+    assert f"{POINT}-v0_1" in out and f"on {POINT}-v0, trained at limit 2\n" in out
     which = ["--algo", "trpo", "--env", POINT, "--no-render"]
     short = ["--n-episodes", "1", "--env-kwargs", "max_episode_steps:30"]
     assert enjoy.main([*which, "--pretrained", *short, "--json", "played.json"]) == 0

@@ -312,8 +312,8 @@ def command_line() -> str:
     parts = [
         "# Command line",
         "`sb3-guard <command>` and `python -m sb3_guard.<command>` are the same (`export`: "
-        "`sb3_guard.export_agent`). `--help` prints "
-        "these tables, and a misspelled flag or value is an error that names the nearest one. "
+        "`sb3_guard.export_agent`). `--help` prints these tables, "
+        "and a misspelled flag or value is an error that names the nearest one or all. "
         "Flags that take KEY:VALUE take Python literals: `-params n_envs:10 normalize:True`.",
         table(
             ["command", "what it does"],

@@ -208,6 +208,9 @@ def test_several_steps_survive_saving(tmp_path: Path) -> None:
     assert type(one.replay_buffer) is CostReplayBuffer
     with pytest.raises(ValueError, match=r"n_steps=1: .* was saved by a model with more than one"):
         one.load_replay_buffer(tmp_path / "buffer")
+    SAC("MlpPolicy", points(), buffer_size=100).save_replay_buffer(tmp_path / "theirs")
+    with pytest.raises(ValueError, match="the replay buffer has no costs"):
+        one.load_replay_buffer(tmp_path / "theirs")
     one.save(tmp_path / "one")
     assert isinstance(
         SACLag.load(tmp_path / "one", env=points(), n_steps=5).replay_buffer, CostNStepReplayBuffer

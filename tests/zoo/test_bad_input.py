@@ -295,6 +295,7 @@ def test_corrupt_model(capsys, run, tmp_path):
         (["--algo", "trpo"], ["algo = trpo contradicts cpo"]),
         (["--env", "NoCost-v0"], ["env = NoCost-v0 contradicts CostPoint-v0"]),
         (["-params", "n_steps:31"], ["n_steps = 31 contradicts 30"]),
+        (["-params", "gamma:0.9"], ["gamma = 0.9 contradicts unset, with which"]),
         (["-params", "gama:1"], ["no hyperparameter 'gama'", "'gamma'"]),
         (["-f", "elsewhere"], ["contradicts"]),
         (["-n", "30"], ["-n 30 is less than the 60 steps"]),

@@ -295,7 +295,7 @@ def test_a_warm_start_is_another_run(tmp_path, here, capsys):
     assert train.main([*one, "--seed", "0", "-i", model, "-f", str(tmp_path / "grid")]) == 0
     refused(
         train.main, [*one, "--seeds", "0", "-f", str(tmp_path / "grid")], capsys,
-        "holds another run", f"trained_agent: {model} there, none here",
+        "holds another run", f"trained_agent: {model} there, unset here",
     )  # fmt: skip
 
 

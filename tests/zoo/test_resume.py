@@ -343,7 +343,7 @@ def test_processes_of_environments_die(forked, tmp_path, monkeypatch, capsys):
 def test_an_expression_in_the_files_of_an_older_run_is_the_mapping_that_it_stands_for():
     old, new = {"policy_kwargs": "dict(net_arch=(8, 8))"}, {"policy_kwargs": {"net_arch": [8, 8]}}
     assert not differences(old, new)
-    assert differences(old, {}) == [("policy_kwargs", {"net_arch": [8, 8]}, "none")]
+    assert differences(old, {}) == [("policy_kwargs", {"net_arch": [8, 8]}, "unset")]
 
 
 def test_a_state_of_another_environment_is_refused_in_a_line():

@@ -156,6 +156,10 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
 
     def load_replay_buffer(self, path: Any, *args: Any, **kwargs: Any) -> None:
         super().load_replay_buffer(path, *args, **kwargs)
+        if not isinstance(self.replay_buffer, CostColumns):
+            raise ValueError(
+                "the replay buffer has no costs: the algorithm that saved it knew none"
+            )
         several = isinstance(self.replay_buffer, CostNStepReplayBuffer)
         if several != issubclass(self.replay_buffer_class, CostNStepReplayBuffer):  # type: ignore[arg-type]
             raise ValueError(

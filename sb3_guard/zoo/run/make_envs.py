@@ -123,8 +123,9 @@ def make_envs(
             env = cls(env, **arguments)
         return ResumableEnv(env)
 
+    drawn = f" with render_mode={render_mode!r}" if render_mode else ""
     with (
-        explained(f"can't make {source.env_id}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
+        explained(f"can't make {source.env_id}{drawn}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
         interrupts_ignored(),  # a rollout under way can be finished
     ):
         env = make_vec_env(

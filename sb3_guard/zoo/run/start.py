@@ -134,10 +134,10 @@ def complete(
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """What differs between two runs: name and both values, ``none`` for those that are absent."""
+    """What differs between two runs: name and both values, ``unset`` for those that are absent."""
 
     def shown(value: Any) -> Any:
-        return "none" if value in ("", None) else value
+        return "unset" if value in ("", None) else value
 
     # As data: files of older runs have expressions as text.
     there, here = (

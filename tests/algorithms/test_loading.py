@@ -41,6 +41,8 @@ PAIRS = [
     (sb3_contrib.TRPO, CPO, ON),
     (sb3_contrib.TRPO, TRPOLag, ON),
     (sb3_guard.TRPO, CPO, ON),
+    (sb3_guard.TRPO, PPOLag, ON),
+    (sb3_contrib.TRPO, FOCOPS, ON),
     (sb3.SAC, SACLag, OFF),
     (sb3.TD3, TD3Lag, OFF),
     (sb3_contrib.TQC, TQCLag, OFF),
@@ -68,6 +70,11 @@ def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
     assert ("cost_critic" in said) == (ours is not TRPOUSL)
     new.learn(80)
     assert new.total_cost > 0
+    (moved,) = (
+        name for name in weights if name.endswith(("action_net.weight", "actor.mu.weight"))
+        or name == "actor.mu.4.weight"
+    )  # fmt: skip
+    assert not th.equal(new.policy.state_dict()[moved], old.policy.state_dict()[moved])
     # From then on it is an agent like others.
     new.save(tmp_path / "safe")
     with warnings.catch_warnings():
@@ -98,9 +105,9 @@ def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
     with pytest.warns(UserWarning, match="PPOLag takes over .* cost_limit is 3.0"):
         lagrangian = PPOLag.load(tmp_path / "b", env=env, cost_limit=3.0)
     assert lagrangian.batch_size == 64 and lagrangian.missing_cost == "error"
-    assert lagrangian.cost_keys == ("cost", "heat") and lagrangian.target_kl == 0.5
-    # The learning rate is of the critics in a trust region, of the actor in PPO.
-    assert lagrangian.learning_rate == 3e-4
+    assert lagrangian.cost_keys == ("cost", "heat") and lagrangian.target_kl == 0.02
+    # Gradient steps are of the critics in a trust region, of the actor in PPO.
+    assert (lagrangian.learning_rate, lagrangian.max_grad_norm) == (3e-4, 0.5)
     with pytest.warns(UserWarning, match="CPO takes over"):
         model = CPO.load(tmp_path / "b", env=env)
     assert model.cost_gae_lambda == CPO("MlpPolicy", env).cost_gae_lambda == 0.5
@@ -119,6 +126,10 @@ def test_the_learning_rate_of_an_actor_is_carried_over(tmp_path):
     with pytest.warns(UserWarning, match="of TRPOLag, .* no others, but for batch_size, learning_"):
         model = PPOLag.load(tmp_path / "b", env=CostPoint(10))
     assert (model.batch_size, model.learning_rate) == (64, 3e-4) and model.n_steps == 40
+    assert (model.vf_coef, model.max_grad_norm, model.target_kl) == (0.5, 0.5, 0.02)
+    PPOLag("MlpPolicy", CostPoint(10), target_kl=None).save(tmp_path / "c")
+    with pytest.warns(UserWarning, match="but for .*target_kl"):
+        assert TRPOLag.load(tmp_path / "c", env=CostPoint(10)).max_grad_norm == 0
 
 
 class _MyTRPO(sb3_guard.TRPO):

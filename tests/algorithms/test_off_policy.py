@@ -211,6 +211,7 @@ def test_several_steps_survive_saving(tmp_path: Path) -> None:
     SAC("MlpPolicy", points(), buffer_size=100).save_replay_buffer(tmp_path / "theirs")
     with pytest.raises(ValueError, match="the replay buffer has no costs"):
         one.load_replay_buffer(tmp_path / "theirs")
+    assert type(one.replay_buffer) is CostReplayBuffer
     one.save(tmp_path / "one")
     assert isinstance(
         SACLag.load(tmp_path / "one", env=points(), n_steps=5).replay_buffer, CostNStepReplayBuffer

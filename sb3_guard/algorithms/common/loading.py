@@ -24,6 +24,10 @@ _BUFFERS: dict[str, Any] = {
 }
 
 
+# What means something else in a trust region.
+GRADIENT_STEPS = {"learning_rate", "target_kl", "ent_coef", "vf_coef", "max_grad_norm"}
+
+
 def _warn(message: str) -> None:
     warnings.warn(message, UserWarning, stacklevel=3)  # the line that calls load
 
@@ -88,8 +92,8 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
     Where that one knows no costs, what the class states itself has the class's default, since the
     same name may mean something else there: sb3-contrib's ``target_kl`` is a mean over the
     dimensions of an action, ours a sum. ``missing_cost``, which lets our TRPO run where nothing
-    costs, is not taken over. ``learning_rate`` is that of the critics in a trust region, elsewhere
-    that of the actor, too.
+    costs, is not taken over. Those of gradient steps are of the critics alone in a trust region:
+    its ``max_grad_norm`` of 0 would keep any other algorithm from learning.
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
@@ -101,7 +105,7 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
     # The whole rollout, and that of the reward, where another algorithm may need another one.
     names |= {name for name in ("batch_size", "cost_gae_lambda") if data.get(name) is None}
     if ("cg_max_steps" in data) != ("cg_max_steps" in blank):
-        names.add("learning_rate")
+        names |= GRADIENT_STEPS
     return {name: blank[name] for name in names & blank.keys()}
 
 
@@ -125,8 +129,8 @@ class LoadsOthers(BaseAlgorithm):
         """Load an agent as SB3's ``load`` does, also one that an algorithm without limits trained.
 
         Then actor, critic of the reward, their optimizers and the hyperparameters that both
-        algorithms take from SB3 are those of the file, but for the learning rate between a trust
-        region and another; a warning says so, what begins anew and what is left behind.
+        algorithms take from SB3 are those of the file, but for those of gradient steps between a
+        trust region and another; a warning says which, what begins anew and what is left behind.
 
         :param path: the file
         :param env: environment to train in; None: to predict only
@@ -152,14 +156,14 @@ class LoadsOthers(BaseAlgorithm):
             kind = policy_for(cls, data["policy_class"])
             blank = vars(cast(Any, cls)(kind, env=None, _init_setup_model=False))
             taken = replacements(cls, data, blank)
-            shared = taken.keys() & data.keys() - kwargs.keys()
+            shared = taken.keys() & data.keys() - kwargs.keys() - (custom_objects or {}).keys()
             own = ", ".join(sorted(name for name in shared if taken[name] != data[name]))
             if without_limits:
                 taken |= _BUFFERS
                 left = _left_behind(data, blank)
             but = own and f", but for {own}"
             custom_objects = {**taken, "policy_class": kind, **(custom_objects or {})}
-        if not without_limits and kwargs.get("policy_kwargs") is not None:
+        if "cost_keys" in data and kwargs.get("policy_kwargs") is not None:
             # taken as the constructor took them
             kwargs["policy_kwargs"] = {**cls.policy_defaults, **kwargs["policy_kwargs"]}
         model = cls._load(

@@ -155,17 +155,16 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         return [*state_dicts, "cost_critic", "cost_critic.optimizer"], tensors
 
     def load_replay_buffer(self, path: Any, *args: Any, **kwargs: Any) -> None:
+        before = self.replay_buffer
         super().load_replay_buffer(path, *args, **kwargs)
+        several, wrong = isinstance(self.replay_buffer, CostNStepReplayBuffer), ""
         if not isinstance(self.replay_buffer, CostColumns):
-            raise ValueError(
-                "the replay buffer has no costs: the algorithm that saved it knew none"
-            )
-        several = isinstance(self.replay_buffer, CostNStepReplayBuffer)
-        if several != issubclass(self.replay_buffer_class, CostNStepReplayBuffer):  # type: ignore[arg-type]
-            raise ValueError(
-                f"n_steps={self.n_steps}: the replay buffer was saved by a model with "
-                f"{'more than one step' if several else 'n_steps=1'}"
-            )
+            wrong = "has no costs: the algorithm that saved it knew none"
+        elif several != issubclass(self.replay_buffer_class, CostNStepReplayBuffer):  # type: ignore[arg-type]
+            wrong = f"was saved by a model with {'more than one step' if several else 'n_steps=1'}"
+        if wrong:
+            self.replay_buffer = before
+            raise ValueError(f"n_steps={self.n_steps}: the replay buffer {wrong}")
         for name in N_STEP_ARGUMENTS if several else ():
             setattr(self.replay_buffer, name, self.replay_buffer_kwargs[name])
 

@@ -100,10 +100,10 @@ def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
     popen = {"subprocess.Popen": {"args": f"touch {trap}", "shell": True}}
     enter(run, "config.yml", callback=[popen])
     assert enjoy.main(play) == 0  # nobody calls a callback there
-    refused(train.main, go_on, capsys, "contradicts none, with which")
+    refused(train.main, go_on, capsys, "contradicts unset, with which")
     enter(run, "config.yml", callback=None, env_wrapper="hostile.Wrapper")
     refused(enjoy.main, play, capsys, "add --gym-packages hostile")
-    refused(train.main, go_on, capsys, "contradicts none, with which")
+    refused(train.main, go_on, capsys, "contradicts unset, with which")
     enter(run, "config.yml", env_wrapper=None)
     enter(run, "args.yml", gym_packages=["hostile"])
     without = [word for word in play if word not in TOY[:2]]

@@ -162,7 +162,8 @@ def reproduce(flags: Flags) -> int:
     lines = differences(row, result)
     if result["return"] is None and row.get("curve") == result["curve"]:
         lines = ["No episode has ended: there is nothing to compare."]
-    same = f"The same: all training episodes agree (curve {result['curve'][:12]}…)."
+    kinds = "training and final" if row.get("final") else "training"
+    same = f"The same: all {kinds} episodes agree (curve {result['curve'][:12]}…)."
     if not row.get("curve"):
         same = "The same return and cost; an older version kept no hash of the episodes."
     print("\n".join(lines) or same)

@@ -14,6 +14,7 @@ from sb3_guard import (
     CPO,
     CPPOPID,
     FOCOPS,
+    SCPO,
     TRPOSL,
     TRPOUSL,
     PPOLag,
@@ -54,9 +55,9 @@ def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
     old = theirs("MlpPolicy", CostPoint(10), **arguments)
     old.learn(60)
     old.save(tmp_path / "agent")
-    with pytest.warns(UserWarning, match=f"{ours.__name__} takes over .* to begin anew: ") as said:
+    with pytest.warns(UserWarning, match=f"{ours.__name__} goes on .* to begin anew: ") as said:
         new = ours.load(tmp_path / "agent", env=CostPoint(10, hazard=(-1, 0)), cost_limit=3.0)
-    (said,) = (str(one.message) for one in said if "takes over" in str(one.message))
+    (said,) = (str(one.message) for one in said if "goes on" in str(one.message))
     assert said.endswith("cost_limit is 3.0")
     weights = new.policy.state_dict()
     for name, values in old.policy.state_dict().items():
@@ -95,20 +96,20 @@ def test_arguments_of_the_policy_are_given_again_as_they_were(ours, arguments, t
 def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
     """sb3-contrib's KL is a mean over the dimensions of an action, ours a sum."""
     sb3_contrib.TRPO("MlpPolicy", CostPoint(10), target_kl=0.5, n_steps=40).save(tmp_path / "a")
-    with pytest.warns(UserWarning, match="takes over"):
+    with pytest.warns(UserWarning, match="goes on"):
         model = CPO.load(tmp_path / "a", env=CostPoint(10))
     assert model.target_kl == stated(CPO)["target_kl"].default and model.n_steps == 40
     # Our TRPO knows costs, but no limits.
     env = CostPoint(10, cost_keys=("cost", "heat"))
     keys = {"cost_keys": ("cost", "heat"), "target_kl": 0.5}
     sb3_guard.TRPO("MlpPolicy", env, n_steps=40, **keys).save(tmp_path / "b")
-    with pytest.warns(UserWarning, match="PPOLag takes over .* cost_limit is 3.0"):
+    with pytest.warns(UserWarning, match="PPOLag goes on .* cost_limit is 3.0"):
         lagrangian = PPOLag.load(tmp_path / "b", env=env, cost_limit=3.0)
     assert lagrangian.batch_size == 64 and lagrangian.missing_cost == "error"
     assert lagrangian.cost_keys == ("cost", "heat") and lagrangian.target_kl == 0.02
     # Gradient steps are of the critics in a trust region, of the actor in PPO.
     assert (lagrangian.learning_rate, lagrangian.max_grad_norm) == (3e-4, 0.5)
-    with pytest.warns(UserWarning, match="CPO takes over"):
+    with pytest.warns(UserWarning, match="CPO goes on"):
         model = CPO.load(tmp_path / "b", env=env)
     assert model.cost_gae_lambda == CPO("MlpPolicy", env).cost_gae_lambda == 0.5
     assert model.learning_rate == 1e-3
@@ -117,19 +118,57 @@ def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
         CPO.load(tmp_path / "ppo", clip_range=0.3)
 
 
-def test_the_learning_rate_of_an_actor_is_carried_over(tmp_path):
-    sb3.A2C("MlpPolicy", CostPoint(10), learning_rate=0.02).save(tmp_path / "a")
-    for ours, rate, told in (PPOLag, 0.02, " of an agent"), (CPO, 1e-3, ", but for learn"):
-        with pytest.warns(UserWarning, match=f"shared hyperparameters{told}"):
-            assert ours.load(tmp_path / "a", env=CostPoint(10)).learning_rate == rate
+def test_gradient_steps_are_the_classs_own_between_a_trust_region_and_others(tmp_path):
+    theirs = {"learning_rate": 0.02, "ent_coef": 0.01, "batch_size": 20, "n_steps": 40}
+    sb3.PPO("MlpPolicy", CostPoint(10), **theirs).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match="an agent of another algorithm; to begin anew: cost_crit"):
+        model = PPOLag.load(tmp_path / "a", env=CostPoint(10))
+    assert (model.learning_rate, model.ent_coef, model.batch_size) == (0.02, 0.01, 20)
+    told = "but for batch_size=None, ent_coef=0.0, learning_rate=0.001, max_grad_norm=0.0, target"
+    with pytest.warns(UserWarning, match=told):
+        model = CPO.load(tmp_path / "a", env=CostPoint(10))
+    assert (model.learning_rate, model.ent_coef, model.batch_size) == (1e-3, 0.0, None)
     TRPOLag("MlpPolicy", CostPoint(10), n_steps=40).save(tmp_path / "b")
-    with pytest.warns(UserWarning, match="of TRPOLag, .* no others, but for batch_size, learning_"):
+    with pytest.warns(UserWarning, match="of TRPOLag, but for batch_size=64, learning_rate=0"):
         model = PPOLag.load(tmp_path / "b", env=CostPoint(10))
     assert (model.batch_size, model.learning_rate) == (64, 3e-4) and model.n_steps == 40
     assert (model.vf_coef, model.max_grad_norm, model.target_kl) == (0.5, 0.5, 0.02)
     PPOLag("MlpPolicy", CostPoint(10), target_kl=None).save(tmp_path / "c")
     with pytest.warns(UserWarning, match="but for .*target_kl"):
         assert TRPOLag.load(tmp_path / "c", env=CostPoint(10)).max_grad_norm == 0
+    # What PPO-Lagrangian left behind, no later file has: it is not taken for a trust region.
+    model.learning_rate = 1e-4
+    model.save(tmp_path / "d")
+    with pytest.warns(UserWarning, match="CPPOPID goes on"):
+        assert CPPOPID.load(tmp_path / "d", env=CostPoint(10)).learning_rate == 1e-4
+
+
+def test_what_an_algorithm_fixes_is_no_hyperparameter_of_the_next(tmp_path):
+    CPO("MlpPolicy", CostPoint(10), n_steps=40, cost_gamma=0.9).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match=r"but for cost_gamma=1\.0"):
+        SCPO.load(tmp_path / "a", env=CostPoint(10)).save(tmp_path / "b")
+    with pytest.warns(UserWarning, match="but for cost_gamma=None"):
+        CPO.load(tmp_path / "b", env=CostPoint(10))
+    with pytest.raises(TypeError, match="CPO takes no argument 'vf_coef'"):
+        CPO.load(tmp_path / "a", vf_coef=0.3)
+
+
+class _SafePPO(CostRollouts, sb3.PPO):
+    """A user's own that learns what things cost."""
+
+    def train(self):
+        super().train()
+        self.fit_cost_critic()
+
+
+def test_a_users_algorithm_is_told_what_it_goes_on_with(tmp_path):
+    given = {"policy_kwargs": {"net_arch": [16]}}
+    CPO("MlpPolicy", CostPoint(10), n_steps=40, **given).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match=r"of CPO, but for batch_size=64, learning_rate=0\.0003"):
+        model = _SafePPO.load(tmp_path / "a", env=CostPoint(10), **given)
+    model.save(tmp_path / "b")
+    with pytest.warns(UserWarning, match="CPO goes on with .* an agent of _SafePPO, but for"):
+        CPO.load(tmp_path / "b", env=CostPoint(10), **given)
 
 
 class _MyTRPO(sb3_guard.TRPO):
@@ -143,7 +182,7 @@ class _Costly(CostRollouts, sb3_contrib.TRPO):
 @pytest.mark.parametrize("ours", [CPO, FOCOPS, PPOLag, TRPOSL])
 def test_a_users_trpo_is_one(ours, tmp_path):
     _MyTRPO("MlpPolicy", CostPoint(10), **ON).save(tmp_path / "a")
-    with pytest.warns(UserWarning, match=f"{ours.__name__} takes over .* cost_limit is 3.0"):
+    with pytest.warns(UserWarning, match=f"{ours.__name__} goes on .* cost_limit is 3.0"):
         ours.load(tmp_path / "a", env=CostPoint(10), cost_limit=3.0).learn(40)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -169,7 +208,7 @@ def test_another_kind_of_policy_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"CPO can't take over .* a RecurrentActorCriticPolicy"):
         CPO.load(tmp_path / "recurrent", env=CostPoint(10))
     sb3.PPO(_MyPolicy, CostPoint(10), n_steps=40, batch_size=20).save(tmp_path / "ppo")
-    with pytest.warns(UserWarning, match="CPO takes over"):
+    with pytest.warns(UserWarning, match="CPO goes on"):
         assert isinstance(CPO.load(tmp_path / "ppo").policy, _MyPolicy)
 
 
@@ -229,9 +268,9 @@ def test_an_agent_of_another_class_of_ours_is_told(tmp_path):
     PPOLag("MlpPolicy", CostPoint(10), cost_limit=1.0, **sizes).save(tmp_path / "a")
     with pytest.raises(ValueError, match=r"CPO: .* do not match, none is absent, multiplier, mult"):
         CPO.load(tmp_path / "a", env=CostPoint(10))
-    with pytest.warns(UserWarning, match="CPPOPID goes on with an agent of PPOLag"):
+    with pytest.warns(UserWarning, match="CPPOPID goes on with .* agent of PPOLag; to begin"):
         CPPOPID.load(tmp_path / "a").save(tmp_path / "b")
-    with pytest.warns(UserWarning, match="PPOLag goes on with an agent of CPPOPID"):
+    with pytest.warns(UserWarning, match="PPOLag goes on with .* an agent of CPPOPID"):
         PPOLag.load(tmp_path / "b")  # of that one since then
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -253,7 +292,7 @@ def test_train_goes_on_with_the_statistics_beside_the_agent(tmp_path, capsys, be
     run += "-params n_envs:2 n_steps:30 batch_size:60 cost_limit:4.0 normalize:True".split()
     run += ["--algo", "ppo_lag", "-n", "60", "--eval-freq", "-1", "--device", "cpu"]
     run += ["-f", str(tmp_path / "logs"), "-i", str(tmp_path / "ppo.zip")]
-    with pytest.warns(UserWarning, match="PPOLag takes over"):
+    with pytest.warns(UserWarning, match="PPOLag goes on"):
         assert train.main(run) == 0
     said = "ppo.zip: observation statistics begin anew"
     assert capsys.readouterr().out.count(said) == (beside is None)
@@ -271,7 +310,7 @@ def test_train_goes_on_from_an_agent_of_sb3s(tmp_path):
     run += "-params n_envs:2 n_steps:30 batch_size:60 cost_limit:4.0 normalize:False".split()
     run += ["--algo", "ppo_lag", "-n", "60", "--eval-freq", "-1", "--verbose", "0"]
     run += ["--device", "cpu", "-f", str(tmp_path / "logs"), "-i", str(tmp_path / "ppo.zip")]
-    with pytest.warns(UserWarning, match="PPOLag takes over"):
+    with pytest.warns(UserWarning, match="PPOLag goes on"):
         assert train.main([*run, "--save-freq", "60"]) == 0
     (folder,) = (tmp_path / "logs" / "ppo_lag").iterdir()
     assert (folder / "result.json").exists()

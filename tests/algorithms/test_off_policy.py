@@ -206,11 +206,14 @@ def test_several_steps_survive_saving(tmp_path: Path) -> None:
     assert changed.replay_buffer.cost_gamma == 0.7
     one = SACLag.load(tmp_path / "model", env=points(), n_steps=1)
     assert type(one.replay_buffer) is CostReplayBuffer
-    with pytest.raises(ValueError, match=r"n_steps=1: .* was saved by a model with more than one"):
+    with pytest.raises(ValueError, match=r"was saved by .* more than one step, and .* n_steps=1"):
         one.load_replay_buffer(tmp_path / "buffer")
     SAC("MlpPolicy", points(), buffer_size=100).save_replay_buffer(tmp_path / "theirs")
     with pytest.raises(ValueError, match="the replay buffer has no costs"):
         one.load_replay_buffer(tmp_path / "theirs")
+    two = TD3Lag("MlpPolicy", points(), cost_keys=("cost", "heat"), n_steps=3, cost_limit=1.0)
+    with pytest.raises(ValueError, match="has 1 costs for each step, and the model 2"):
+        two.load_replay_buffer(tmp_path / "buffer")
     assert type(one.replay_buffer) is CostReplayBuffer
     one.save(tmp_path / "one")
     assert isinstance(

@@ -142,11 +142,19 @@ def test_enjoy(arguments, parts, capsys, empty):
     refused(enjoy.main, ["--no-render", *arguments], capsys, *parts)
 
 
-def test_a_module_whose_robot_is_refused(capsys, empty, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        ("raise ValueError('actuator m has no ctrlrange')", "actuator m has no ctrlrange"),
+        ("open('dog.xml')", "No such file or directory"),
+        ("robot.register()", "NameError: name 'robot' is not defined"),
+    ],
+)
+def test_a_module_that_fails(program, said, capsys, empty, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "odd_robot.py").write_text("raise ValueError('actuator m has no ctrlrange')")
-    said = "--gym-packages: can't import 'odd_robot': actuator m has no ctrlrange"
-    refused(train.main, ["--gym-packages", "odd_robot"], capsys, said)
+    (tmp_path / "odd_robot.py").write_text(program)
+    said = f"--gym-packages: can't import 'odd_robot': {said}"
+    refused(train.main, ["--gym-packages", "odd_robot"], capsys, said, "python -c 'import odd_ro")
 
 
 @pytest.mark.parametrize("error", [ValueError, TypeError])

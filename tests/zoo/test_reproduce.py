@@ -28,7 +28,7 @@ def test_a_run_goes_the_same_way(run, tmp_path, capsys):
     assert again(tmp_path, str(run), *PACKAGES) == 0
     out = capsys.readouterr().out
     result = json.loads((run / "result.json").read_text())
-    assert result["command"] in out and "The same: all training episodes agree" in out
+    assert result["command"] in out and "The same: all training and final episodes agree" in out
     new = json.loads((tmp_path / "again" / "cpo" / "CostPoint-v0_4" / "result.json").read_text())
     assert new["final"] == result["final"] and "trained already" not in out
     assert again(tmp_path, str(run), *PACKAGES) == 0  # trains nothing, and says so

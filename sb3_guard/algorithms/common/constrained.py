@@ -77,8 +77,6 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
     limit_on: ClassVar[Literal["sum", "max"]] = "sum"
     #: Default values of keyword arguments, where they differ from those of the bases.
     defaults: ClassVar[dict[str, Any]] = {}
-    #: Arguments of SB3's constructors that the class fills in itself.
-    fixed_arguments: ClassVar[frozenset[str]] = frozenset()
 
     missing_cost: Literal["error", "zero"] = hyperparameter("error")
 

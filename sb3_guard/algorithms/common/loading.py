@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_guard import algorithms
 from sb3_guard.algorithms import CLASSES
 from sb3_guard.algorithms.common.arguments import check_names, stated
 
@@ -25,7 +26,9 @@ _BUFFERS: dict[str, Any] = {
 
 
 # What means something else in a trust region.
-GRADIENT_STEPS = {"learning_rate", "target_kl", "ent_coef", "vf_coef", "max_grad_norm"}
+GRADIENT_STEPS = {
+    "batch_size", "learning_rate", "target_kl", "ent_coef", "vf_coef", "max_grad_norm"
+}  # fmt: skip
 
 
 def _warn(message: str) -> None:
@@ -33,7 +36,7 @@ def _warn(message: str) -> None:
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(names) or "nothing"
+    return ", ".join(name for name in names if not name.startswith("_")) or "nothing"
 
 
 def _left_behind(data: dict[str, Any], blank: dict[str, Any]) -> list[str]:
@@ -89,17 +92,20 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
     """
     What takes the place of hyperparameters in the file of another algorithm.
 
-    Where that one knows no costs, what the class states itself has the class's default, since the
-    same name may mean something else there: sb3-contrib's ``target_kl`` is a mean over the
-    dimensions of an action, ours a sum. ``missing_cost``, which lets our TRPO run where nothing
-    costs, is not taken over. Those of gradient steps are of the critics alone in a trust region:
-    its ``max_grad_norm`` of 0 would keep any other algorithm from learning.
+    What one of the two fixes has the class's default; where that one knows no costs, all that the
+    class states itself, since the same name may mean something else there: sb3-contrib's
+    ``target_kl`` is a mean over the dimensions of an action, ours a sum. ``missing_cost``, which
+    lets our TRPO run where nothing costs, is not taken over. Those of gradient steps are of the
+    critics alone in a trust region: its ``max_grad_norm`` of 0 would keep any other algorithm from
+    learning, and there are hundreds of PPO's minibatches in its rollouts.
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
     :param blank: attributes of a new model of the algorithm
     """
-    names = set() if "cost_keys" in data else {*stated(cls), *cls.fixed_arguments}
+    names = {*cls.fixed_arguments} | ({*()} if "cost_keys" in data else {*stated(cls)})
+    if data.get("saved_by") in CLASSES.values():
+        names |= getattr(algorithms, data["saved_by"]).fixed_arguments
     if data.get("saved_by") == "TRPO":
         names.add("missing_cost")
     # The whole rollout, and that of the reward, where another algorithm may need another one.
@@ -112,8 +118,8 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
 class LoadsOthers(BaseAlgorithm):
     """Loads agents of algorithms without limits. Mixed in before an algorithm."""
 
-    #: Arguments of the policy where ``policy_kwargs`` does not have them.
-    policy_defaults: ClassVar[dict[str, Any]] = {}
+    #: Arguments of SB3's constructors that the class fills in itself.
+    fixed_arguments: ClassVar[frozenset[str]] = frozenset()
 
     @classmethod
     def load(
@@ -147,25 +153,27 @@ class LoadsOthers(BaseAlgorithm):
         data, parts, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
         if hasattr(path, "seek"):
             path.seek(0)
-        data, left, but = data or {}, [], ""
+        data = data or {}
         saved_by = data.get("saved_by", name_of(cls) if "cost_keys" in data else "")
-        another = saved_by != name_of(cls)
-        without_limits = data and another and saved_by in ("", "TRPO")
-        check_names(cls, kwargs.keys() if without_limits else kwargs.keys() - data.keys())
-        if data and another:
+        another = bool(data) and saved_by != name_of(cls)
+        without_limits = another and saved_by in ("", "TRPO")
+        known = {*()} if without_limits else data.keys() - cls.fixed_arguments
+        check_names(cls, kwargs.keys() - known)
+        if (kwargs.get("policy_kwargs") or {}).items() <= data.get("policy_kwargs", {}).items():
+            kwargs.pop("policy_kwargs", None)  # again those of the file
+        left, but = [], ""
+        if another:
             kind = policy_for(cls, data["policy_class"])
-            blank = vars(cast(Any, cls)(kind, env=None, _init_setup_model=False))
+            blank = vars(cast(Any, cls)(policy=kind, env=None, _init_setup_model=False))
             taken = replacements(cls, data, blank)
             shared = taken.keys() & data.keys() - kwargs.keys() - (custom_objects or {}).keys()
-            own = ", ".join(sorted(name for name in shared if taken[name] != data[name]))
-            if without_limits:
-                taken |= _BUFFERS
-                left = _left_behind(data, blank)
-            but = own and f", but for {own}"
-            custom_objects = {**taken, "policy_class": kind, **(custom_objects or {})}
-        if "cost_keys" in data and kwargs.get("policy_kwargs") is not None:
-            # taken as the constructor took them
-            kwargs["policy_kwargs"] = {**cls.policy_defaults, **kwargs["policy_kwargs"]}
+            own = [
+                f"{name}={taken[name]!r}" for name in sorted(shared) if taken[name] != data[name]
+            ]
+            but = f", but for {', '.join(own)}" if own else ""
+            left = _left_behind(data, blank)
+            buffers = {} if "cost_keys" in data else _BUFFERS
+            custom_objects = {**taken, **buffers, "policy_class": kind, **(custom_objects or {})}
         model = cls._load(
             path, env, device, custom_objects, print_system_info, force_reset, **kwargs
         )
@@ -177,18 +185,13 @@ class LoadsOthers(BaseAlgorithm):
                 "VecNormalize.load(file, env), of what model.get_vec_normalize_env().save(file) "
                 "kept in training",
             )
-        new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
-        if another and not without_limits and {saved_by, name_of(cls)} <= {*CLASSES.values()}:
-            _warn(
-                f"{cls.__name__} goes on with an agent of {saved_by}, and with its hyperparameters "
-                f"where load is given no others{but}",
-            )
-        if new or without_limits:
+        if another:
+            new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
             limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""
             _warn(
-                f"{cls.__name__} takes over policy, critic and shared hyperparameters{but} of an "
-                f"agent of another algorithm; to begin anew: {_listed(new)}; left behind: "
-                f"{_listed(left)}{limit}",
+                f"{cls.__name__} goes on with policy, critics and hyperparameters of an agent of "
+                f"{saved_by or 'another algorithm'}{but}; to begin anew: {_listed(new)}; left "
+                f"behind: {_listed(left)}{limit}",
             )
         return model
 

@@ -155,16 +155,20 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         return [*state_dicts, "cost_critic", "cost_critic.optimizer"], tensors
 
     def load_replay_buffer(self, path: Any, *args: Any, **kwargs: Any) -> None:
-        before = self.replay_buffer
+        before, n_costs = self.replay_buffer, len(self.cost_keys)
         super().load_replay_buffer(path, *args, **kwargs)
-        several, wrong = isinstance(self.replay_buffer, CostNStepReplayBuffer), ""
-        if not isinstance(self.replay_buffer, CostColumns):
+        loaded, wrong = self.replay_buffer, ""
+        several = isinstance(loaded, CostNStepReplayBuffer)
+        if not isinstance(loaded, CostColumns):
             wrong = "has no costs: the algorithm that saved it knew none"
+        elif (there := loaded.costs.shape[-1]) != n_costs:
+            wrong = f"has {there} costs for each step, and the model {n_costs}"
         elif several != issubclass(self.replay_buffer_class, CostNStepReplayBuffer):  # type: ignore[arg-type]
-            wrong = f"was saved by a model with {'more than one step' if several else 'n_steps=1'}"
+            kind = "more than one step" if several else "n_steps=1"
+            wrong = f"was saved by a model with {kind}, and this one has n_steps={self.n_steps}"
         if wrong:
             self.replay_buffer = before
-            raise ValueError(f"n_steps={self.n_steps}: the replay buffer {wrong}")
+            raise ValueError(f"the replay buffer {wrong}")
         for name in N_STEP_ARGUMENTS if several else ():
             setattr(self.replay_buffer, name, self.replay_buffer_kwargs[name])
 

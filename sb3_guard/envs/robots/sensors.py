@@ -16,7 +16,7 @@ _UNITS = {
     _SENSOR.mjSENS_RANGEFINDER: "m",
     _SENSOR.mjSENS_BALLANGVEL: "rad/s",
     _SENSOR.mjSENS_FRAMEPOS: "m",
-    _SENSOR.mjSENS_FRAMEQUAT: "quaternion",
+    _SENSOR.mjSENS_FRAMEQUAT: "quaternion (w, x, y, z)",
     _SENSOR.mjSENS_FRAMEXAXIS: "direction",
     _SENSOR.mjSENS_FRAMEYAXIS: "direction",
     _SENSOR.mjSENS_FRAMEZAXIS: "direction",

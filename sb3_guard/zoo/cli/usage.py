@@ -92,8 +92,8 @@ def import_packages(names: Sequence[str]) -> None:
                 f"--gym-packages {name!r} is not the name of a module, such as my_robots or "
                 "my_package.robots; call the command in the folder of my_robots.py"
             )
-        errors = ImportError, TypeError, ValueError
-        with explained(f"--gym-packages: can't import {name!r}", *errors):
+        fix = f"python -c 'import {name}' shows where"
+        with explained(f"--gym-packages: can't import {name!r}", fix=fix):
             importlib.import_module(name)
 
 

@@ -68,20 +68,21 @@ class Drawing(NamedTuple):
 # Elements
 
 
-def fit_costs(axis: Axes, values: Iterable[Any], way: str = "y") -> None:
+def fit_costs(axis: Axes, values: Iterable[Any], limit: float = np.nan, way: str = "y") -> None:
     """
     Begin a cost axis at 0, and end it where one outlier does not squash all others.
 
     :param values: all lines and points that are drawn, arrays or numbers; bands may be cut
+    :param limit: the cost limit, which is always shown; nan without one
     :param way: which axis, ``x`` or ``y``
     """
-    finite = np.concatenate([np.ravel(np.asarray(part, float)) for part in values])
+    finite = np.concatenate([np.ravel(np.asarray(part, float)) for part in (*values, limit)])
     finite = finite[np.isfinite(finite)]
     set_limits, end = getattr(axis, f"set_{way}lim"), getattr(axis, f"get_{way}lim")()[1]
     set_limits(0, end)
     if not len(finite) or not finite.max() > 0:
         return
-    highest, enough = finite.max(), 5 * np.quantile(finite, 0.75)
+    highest, enough = finite.max(), np.fmax(5 * np.quantile(finite, 0.75), limit)
     set_limits(0, min(end, 1.5 * highest))
     if 0 < enough < highest:
         set_limits(0, min(1.5 * finite[finite <= enough].max(), 1.05 * enough))
@@ -112,7 +113,7 @@ def draw_limit(line: Callable[..., Any], data: Data, suite: str, cost: str) -> f
 
 def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
     """Draw one figure of merit against steps: means of the seeds, shaded ± their deviation."""
-    drawn: list[Any] = []
+    drawn, limit = list[Any](), np.nan
     for algo in data.algos(suite):
         curves = [curve for curve in data.curves(suite, algo) if metric in curve]
         if not curves:
@@ -125,14 +126,14 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
             low, high = table["mean"] - table["std"], table["mean"] + table["std"]
             axis.fill_between(steps, low, high, color=look.color, alpha=0.15, linewidth=0)
     if metric.startswith("M_c"):
-        drawn.append(draw_limit(axis.axhline, data, suite, metric))
+        limit = draw_limit(axis.axhline, data, suite, metric)
     axis.set(
         xlabel="steps", ylabel=AXES.get(metric) or cost_name(metric).replace(" cost, ", " cost,\n")
     )
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_xlim(left=0)
     if metric != "J_r" and drawn:
-        fit_costs(axis, drawn)
+        fit_costs(axis, drawn, limit)
 
 
 def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
@@ -150,7 +151,7 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
         )  # fmt: skip
     axis.set(xlabel=cost_name(cost), ylabel="return", title=title_of(data, suite))
     axis.margins(0.08)
-    fit_costs(axis, [means[cost], limit], "x")
+    fit_costs(axis, [means[cost]], limit, "x")
     end = axis.get_xlim()[1]
     axis.set_xlim(-0.03 * end, end)
     if not np.isnan(limit) and limit < end:

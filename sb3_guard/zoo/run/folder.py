@@ -251,7 +251,7 @@ class RunFolder:
         :raises UsageError: the run is not finished, or the file is damaged
         """
         if not self.result.exists():
-            raise UsageError("unfinished: it has no result.json")
+            raise UsageError(f"unfinished: sb3-guard train -i {self.path} continues it")
         fix = f"sb3-guard train -i {self.path} writes it again"
         with explained("result.json is damaged", fix=fix):
             result: dict[str, Any] = json.loads(self.result.read_bytes())

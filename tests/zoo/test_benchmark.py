@@ -1,6 +1,7 @@
 """Grids: refused in full or carried out in full, whatever dies meanwhile."""
 
 import csv
+import gc
 import json
 import os
 import random
@@ -24,11 +25,13 @@ from rich.console import Console
 from typed import TOY, refused
 
 from sb3_guard import benchmark, cli, enjoy, train
+from sb3_guard.algorithms.common.replay_buffers import CostReplayBuffer
 from sb3_guard.zoo.grids import grid
 from sb3_guard.zoo.grids.live import Board, read_progress
 from sb3_guard.zoo.grids.presets import PRESETS, preset
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, lock
+from sb3_guard.zoo.run.start import complete
 
 SUPPORT = Path(__file__).parents[1] / "support"
 PACKAGE = TOY[:2]
@@ -376,6 +379,29 @@ def test_asked_to_stop(tmp_path, here, capsys):
     assert results(tmp_path) == {} and not (tmp_path / "stop").exists()
     here.before = lambda run: None
     assert benchmark.main(arguments) == 0 and len(results(tmp_path)) == 2
+
+
+def test_a_worker_forgets_the_run_before(tmp_path, monkeypatch):
+    """A replay buffer may have a gigabyte, and a worker of a grid trains dozens of runs."""
+
+    def buffers():
+        return sum(isinstance(one, CostReplayBuffer) for one in gc.get_objects())
+
+    gc.collect()
+    before, least = buffers(), []
+    flags = RunFlags(log_folder=str(tmp_path), gym_packages=["registered_envs"], eval_freq=-1)
+    flags.hyperparams = {"n_envs": 2, "cost_limit": 2.0, "n_steps": 1, "buffer_size": 100}
+    runs = grid.expand([("CostPoint-v0", "sac_lag")], [0, 1], replace(flags, n_timesteps=20))
+    monkeypatch.setattr(
+        grid, "complete", lambda *args: least.append(buffers() - before) or complete(*args)
+    )
+    gc.disable()  # Python's own, which comes some time or other
+    try:
+        for run in runs:
+            assert grid.carry_out(run, "", tmp_path / "stop") == ("done", "")
+    finally:
+        gc.enable()
+    assert least == [0, 0]
 
 
 def test_a_run_looks_for_the_file_after_each_rollout(tmp_path, here):

@@ -7,6 +7,7 @@ a run is under way, ``result.json``, written last, that it is done. So a grid ca
 started again anywhere.
 """
 
+import gc
 import multiprocessing
 import os
 import shlex
@@ -123,6 +124,7 @@ def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
         if stop.exists():
             return "waiting", ""
         error_file = run.path / "error.txt"
+        gc.collect()  # the run before: a model refers to itself, and Python seldom looks for that
         try:
             error_file.unlink(missing_ok=True)
             status = complete(run.flags, run.values, command, stop.exists)

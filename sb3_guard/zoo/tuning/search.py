@@ -182,7 +182,10 @@ class Work:
     def _optimize(self, n_trials: int | None = None) -> None:
         enough = [] if n_trials else [MaxTrialsCallback(self.flags.n_trials, states=FINISHED)]
         with suppress(Stopped):
-            self.study.optimize(self.objective, n_trials, callbacks=[self._after, *enough])
+            # A model refers to itself, and Python seldom looks for that.
+            self.study.optimize(
+                self.objective, n_trials, callbacks=[self._after, *enough], gc_after_trial=True
+            )
 
     def _count(self, *states: TrialState) -> int:
         return len(self.study.get_trials(deepcopy=False, states=states))

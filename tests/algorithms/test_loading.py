@@ -105,6 +105,7 @@ def test_hyperparameters_of_ours_are_not_taken_from_another_algorithm(tmp_path):
     sb3_guard.TRPO("MlpPolicy", env, n_steps=40, **keys).save(tmp_path / "b")
     with pytest.warns(UserWarning, match="PPOLag goes on .* cost_limit is 3.0"):
         lagrangian = PPOLag.load(tmp_path / "b", env=env, cost_limit=3.0)
+    assert lagrangian.rollout_buffer_kwargs["returns"] == "lambda"
     assert lagrangian.batch_size == 64 and lagrangian.missing_cost == "error"
     assert lagrangian.cost_keys == ("cost", "heat") and lagrangian.target_kl == 0.02
     # Gradient steps are of the critics in a trust region, of the actor in PPO.

@@ -5,6 +5,7 @@ the critic of the reward. What only PPO-Lagrangian has, the cost critic and the 
 anew.
 """
 
+import inspect
 import warnings
 from typing import Any, ClassVar, Self, cast
 
@@ -16,7 +17,7 @@ from sb3_guard import algorithms
 from sb3_guard.algorithms import CLASSES
 from sb3_guard.algorithms.common.arguments import check_names, stated
 
-# SB3's buffers have no room for costs.
+# SB3's buffers have no room for costs, and those of ours may hold other returns.
 _BUFFERS: dict[str, Any] = {
     "rollout_buffer_class": None,
     "rollout_buffer_kwargs": {},
@@ -172,8 +173,10 @@ class LoadsOthers(BaseAlgorithm):
             ]
             but = f", but for {', '.join(own)}" if own else ""
             left = _left_behind(data, blank)
-            buffers = {} if "cost_keys" in data else _BUFFERS
-            custom_objects = {**taken, **buffers, "policy_class": kind, **(custom_objects or {})}
+            if "cost_keys" in data:  # what else it has may be a user's
+                ours = getattr(algorithms, saved_by) if saved_by in CLASSES.values() else object
+                left = [name for name in left if name in inspect.signature(ours).parameters]
+            custom_objects = {**taken, **_BUFFERS, "policy_class": kind, **(custom_objects or {})}
         model = cls._load(
             path, env, device, custom_objects, print_system_info, force_reset, **kwargs
         )

@@ -157,9 +157,17 @@ def test_what_an_algorithm_fixes_is_no_hyperparameter_of_the_next(tmp_path):
 class _SafePPO(CostRollouts, sb3.PPO):
     """A user's own that learns what things cost."""
 
+    def _setup_model(self):
+        super()._setup_model()
+        self.scale = 2.0
+
     def train(self):
         super().train()
         self.fit_cost_critic()
+
+
+class _SafePPO2(_SafePPO):
+    """The same with another name."""
 
 
 def test_a_users_algorithm_is_told_what_it_goes_on_with(tmp_path):
@@ -170,6 +178,8 @@ def test_a_users_algorithm_is_told_what_it_goes_on_with(tmp_path):
     model.save(tmp_path / "b")
     with pytest.warns(UserWarning, match="CPO goes on with .* an agent of _SafePPO, but for"):
         CPO.load(tmp_path / "b", env=CostPoint(10), **given)
+    with pytest.warns(UserWarning, match="_SafePPO2 goes on with .* left behind: nothing"):
+        assert _SafePPO2.load(tmp_path / "b", env=CostPoint(10)).scale == 2.0
 
 
 class _MyTRPO(sb3_guard.TRPO):

@@ -17,7 +17,7 @@ from sb3_guard import algorithms
 from sb3_guard.algorithms import CLASSES
 from sb3_guard.algorithms.common.arguments import check_names, stated
 
-# SB3's buffers have no room for costs, and those of ours may hold other returns.
+# SB3's buffers have no room for costs.
 _BUFFERS: dict[str, Any] = {
     "rollout_buffer_class": None,
     "rollout_buffer_kwargs": {},
@@ -37,12 +37,21 @@ def _warn(message: str) -> None:
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(name for name in names if not name.startswith("_")) or "nothing"
+    return ", ".join(names) or "nothing"
+
+
+def _saver(data: dict[str, Any]) -> Any:
+    """The class of this package that a file was saved by, ``object`` if by none."""
+    name = data.get("saved_by", "")
+    return getattr(algorithms, name) if name in CLASSES.values() else object
 
 
 def _left_behind(data: dict[str, Any], blank: dict[str, Any]) -> list[str]:
     """The settings in the file of another algorithm that a new model does not have."""
-    settings = {k for k, v in data.items() if callable(v) or isinstance(v, int | float)}
+    if "cost_keys" in data:  # what is no hyperparameter of ours may be a user's
+        settings = data.keys() & inspect.signature(_saver(data)).parameters
+    else:
+        settings = {k for k, v in data.items() if callable(v) or isinstance(v, int | float)}
     return sorted(settings - blank.keys() - {"lr_schedule", "n_envs"})
 
 
@@ -104,9 +113,9 @@ def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[
     :param data: attributes in the file
     :param blank: attributes of a new model of the algorithm
     """
-    names = {*cls.fixed_arguments} | ({*()} if "cost_keys" in data else {*stated(cls)})
-    if data.get("saved_by") in CLASSES.values():
-        names |= getattr(algorithms, data["saved_by"]).fixed_arguments
+    names = {*cls.fixed_arguments, *getattr(_saver(data), "fixed_arguments", ())}
+    if "cost_keys" not in data:
+        names |= stated(cls).keys()
     if data.get("saved_by") == "TRPO":
         names.add("missing_cost")
     # The whole rollout, and that of the reward, where another algorithm may need another one.
@@ -173,10 +182,8 @@ class LoadsOthers(BaseAlgorithm):
             ]
             but = f", but for {', '.join(own)}" if own else ""
             left = _left_behind(data, blank)
-            if "cost_keys" in data:  # what else it has may be a user's
-                ours = getattr(algorithms, saved_by) if saved_by in CLASSES.values() else object
-                left = [name for name in left if name in inspect.signature(ours).parameters]
-            custom_objects = {**taken, **_BUFFERS, "policy_class": kind, **(custom_objects or {})}
+            buffers = {} if "cost_keys" in data else _BUFFERS
+            custom_objects = {**taken, **buffers, "policy_class": kind, **(custom_objects or {})}
         model = cls._load(
             path, env, device, custom_objects, print_system_info, force_reset, **kwargs
         )

@@ -127,8 +127,8 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             self.rollout_buffer_class = CostDictRolloutBuffer if dictionary else CostRolloutBuffer
         gamma, gae_lambda = self.cost_gamma, self.cost_gae_lambda
         self.rollout_buffer_kwargs = {
-            "returns": self.returns,
             **self.rollout_buffer_kwargs,
+            "returns": self.returns,
             "n_costs": len(self.cost_keys),
             "cost_gamma": self.gamma if gamma is None else gamma,
             "cost_gae_lambda": self.gae_lambda if gae_lambda is None else gae_lambda,

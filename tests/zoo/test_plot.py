@@ -12,12 +12,13 @@ import pytest
 from fake_runs import LABELS, fake_run
 from matplotlib.colors import to_rgb
 
-from sb3_guard import cli, plot
+from sb3_guard import algorithms, cli, plot
+from sb3_guard.algorithms import CLASSES
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.suites.guard import SUITE_ROBOTS
 from sb3_guard.zoo.grids.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.results import figures
-from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
+from sb3_guard.zoo.results.figure_data import COLORS, INK, PLACES, Data
 from sb3_guard.zoo.results.figures import fit_costs, inline_svg, save
 from sb3_guard.zoo.results.paper import FIGURES, draw
 from sb3_guard.zoo.results.report import report
@@ -191,6 +192,19 @@ def test_one_outlier_does_not_squash_a_cost_axis(values, limit, end, text):
     assert (text in said) if text else "↑" not in said
 
 
+def test_costs_below_0_are_shown(tmp_path):
+    """At least so much of something is a negative limit."""
+    fake_run(tmp_path, "cpo", cost=-40.0, cost_limit=-30.0)
+    data = read(tmp_path)
+    for kind, way in (("curves", "y"), ("pareto", "x")):
+        (drawing,) = draw(kind, data)
+        axes = [
+            axis for axis in drawing.figure.axes if "cost" in getattr(axis, f"get_{way}label")()
+        ]
+        low, high = getattr(axes[0], f"get_{way}lim")()
+        assert low < -40 < -30 < high <= 0.1 * (high - low)
+
+
 # What is missing
 
 
@@ -257,6 +271,15 @@ def test_no_two_algorithms_look_alike_and_ones_own_has_a_name(tmp_path):
         assert len({one(look) for look in own}) == len(LABELS)
     assert looks["mine"].label == "My own" and looks["trpo"].color == INK
     assert looks["mine"].dashes == looks["trpo_lag"].dashes != looks["cpo"].dashes
+
+
+def test_no_two_algorithms_of_a_family_have_one_colour():
+    ours = [
+        (getattr(algorithms, CLASSES[key]).family, PLACES[key][0])
+        for key in PLACES
+        if key in CLASSES
+    ]
+    assert len({*ours}) == len(ours) == len(CLASSES) - 1  # TRPO is grey
 
 
 @pytest.mark.parametrize("kind", FIGURES)

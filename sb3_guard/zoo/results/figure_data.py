@@ -35,7 +35,7 @@ PLACES = {
     "focops": (4, "^"), "cup": (5, "P"), "cppo_pid": (6, "*"), "p3o": (7, "X"), "crpo": (8, "p"),
     "ppo": (9, "h"), "trpo_fac": (4, "<"), "trpo_ipo": (5, ">"), "trpo_sl": (6, "H"),
     "trpo_usl": (7, "8"), "rcpo": (8, "s"), "scpo": (9, "D"), "sac_lag": (0, "v"),
-    "td3_lag": (1, "^"), "tqc_lag": (2, "P"), "sac": (3, "X"), "td3": (4, "d"), "tqc": (5, "D"),
+    "td3_lag": (1, "^"), "tqc_lag": (7, "P"), "sac": (3, "X"), "td3": (4, "d"), "tqc": (5, "D"),
 }  # fmt: skip
 FAMILIES = ("CPO-based", "Lagrangian", "hierarchical", "First-order", "Primal", "State-wise")
 

@@ -70,7 +70,8 @@ class Drawing(NamedTuple):
 
 def fit_costs(axis: Axes, values: Iterable[Any], limit: float = np.nan, way: str = "y") -> None:
     """
-    Begin a cost axis at 0, and end it where one outlier does not squash all others.
+    Begin a cost axis at 0, or below it at the lowest value, and end it where one outlier does not
+    squash all others.
 
     :param values: all lines and points that are drawn, arrays or numbers; bands may be cut
     :param limit: the cost limit, which is always shown; nan without one
@@ -79,13 +80,14 @@ def fit_costs(axis: Axes, values: Iterable[Any], limit: float = np.nan, way: str
     finite = np.concatenate([np.ravel(np.asarray(part, float)) for part in (*values, limit)])
     finite = finite[np.isfinite(finite)]
     set_limits, end = getattr(axis, f"set_{way}lim"), getattr(axis, f"get_{way}lim")()[1]
-    set_limits(0, end)
+    start = 1.1 * finite.min(initial=0)
+    set_limits(start, end)
     if not len(finite) or not finite.max() > 0:
         return
     highest, enough = finite.max(), np.fmax(5 * np.quantile(finite, 0.75), limit)
-    set_limits(0, min(end, 1.5 * highest))
+    set_limits(start, min(end, 1.5 * highest))
     if 0 < enough < highest:
-        set_limits(0, min(1.5 * finite[finite <= enough].max(), 1.05 * enough))
+        set_limits(start, min(1.5 * finite[finite <= enough].max(), 1.05 * enough))
         if way == "y":
             say_highest(axis, f"↑ up to {highest:.3g}", 0.98, "top")
 
@@ -152,8 +154,8 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
     axis.set(xlabel=cost_name(cost), ylabel="return", title=title_of(data, suite))
     axis.margins(0.08)
     fit_costs(axis, [means[cost]], limit, "x")
-    end = axis.get_xlim()[1]
-    axis.set_xlim(-0.03 * end, end)
+    start, end = axis.get_xlim()
+    axis.set_xlim(start - 0.03 * (end - start), end)
     if not np.isnan(limit) and limit < end:
         axis.axvspan(limit, end, color=INK, alpha=0.1, linewidth=0, label="above the limit")
     name_points(axis, data, means, cost)

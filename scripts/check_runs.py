@@ -55,10 +55,13 @@ def problems(path: Path) -> Iterator[str]:
         yield "curve in result.json is not the hash of 0.monitor.csv (packed logs are rounded)"
     with ROWS.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
-            if row["curve"] == result.get("curve"):
+            same = row["row"].split("/")[1] == run.path.resolve().parent.name
+            if same and row["curve"] == result.get("curve"):
                 yield f"it has the episodes of {row['row']}"
     if "command" in result and result["command"] != run.flags().command():
         yield "command in result.json is not that of args.yml"
+    if result.get("learned"):
+        yield "it went on after it had finished: a run of that length from the start may be another"
     if str(result.get("commit")).endswith("-dirty"):
         yield "it was trained with changes that are not committed"
     yield from _wrong_flags(run, result)

@@ -8,6 +8,7 @@ that were sent in, ``docs/data/sent_*.tar.xz`` (``scripts/check_runs.py``).
 import argparse
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -76,27 +77,33 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
         seeds; and those of the package, a row per run
     """
     pages, runs = [], []
-    for name in packed():
-        with unpacked(name) as found:
-            all_ = with_safety(found.runs)
-            all_["row"] = [f"{Path(path).parents[1].name}/{Path(path).parent.name}/"
-                            f"{Path(path).name}" for path in all_["path"]]  # fmt: skip
-            for run in all_.to_dict("records"):
-                result = RunFolder(Path(run["path"])).checked_result()
-                if "curve" in result:
-                    kept = {key: result.get(key) for key in ("command", "curve", "commit")}
-                    kept |= {"final": final_hash(result), "seconds": round(result["seconds"])}
-                    runs.append({"row": run["row"], **kept, **measures(result)})
-            all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)
-            for budget, group in all_.groupby("budget"):
-                own = select(group)
-                extra = own.groupby(["suite", "algo"]).agg(
-                    cost_total=("cost_total", "mean"), row=("row", "first"), there=("seed", list)
-                )
-                judged = judge(own, own["suite"].map(limit_of))
-                judged = judged.merge(extra.reset_index(), on=["suite", "algo"])
-                pages.append(judged.assign(budget=budget))
-    return pd.concat(pages) if pages else pd.DataFrame(), pd.DataFrame(runs)
+    with ExitStack() as stack:
+        grids = [stack.enter_context(unpacked(name)).runs.assign(grid=name) for name in packed()]
+        if not grids:
+            return pd.DataFrame(), pd.DataFrame()
+        all_ = with_safety(pd.concat(grids, ignore_index=True))
+        all_["row"] = [f"{Path(path).parents[1].name}/{Path(path).parent.name}/"
+                        f"{Path(path).name}" for path in all_["path"]]  # fmt: skip
+        for run in all_.to_dict("records"):
+            result = RunFolder(Path(run["path"])).checked_result()
+            if "curve" in result:
+                kept = {key: result.get(key) for key in ("command", "curve", "commit")}
+                kept |= {"final": final_hash(result), "seconds": round(result["seconds"])}
+                runs.append({"row": run["row"], **kept, **measures(result)})
+        all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)
+        # A seed that was sent in joins the row that lacks it.
+        kind = ["suite", "algo", "budget", "config"]
+        firsts = all_.groupby(kind)["grid"].transform("first")
+        all_["grid"] = all_["grid"].where(all_.duplicated([*kind, "seed"]), firsts)
+        for (_, budget), group in all_.groupby(["grid", "budget"], sort=False):
+            own = select(group)
+            extra = own.groupby(["suite", "algo"]).agg(
+                cost_total=("cost_total", "mean"), row=("row", "first"), there=("seed", list)
+            )
+            judged = judge(own, own["suite"].map(limit_of))
+            judged = judged.merge(extra.reset_index(), on=["suite", "algo"])
+            pages.append(judged.assign(budget=budget))
+    return pd.concat(pages), pd.DataFrame(runs)
 
 
 def leaderboard(rows: pd.DataFrame) -> str:

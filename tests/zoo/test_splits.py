@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from fake_runs import fake_run
 
+from sb3_guard.zoo.results import splits
 from sb3_guard.zoo.results.figure_data import Data
 from sb3_guard.zoo.results.figures import TIER_STYLES
 from sb3_guard.zoo.results.paper import draw
@@ -210,3 +211,20 @@ def test_agents_with_other_limits_are_told_from_those_without(tmp_path):
     (drawing,) = draw("tiers", Data(with_safety(read_results([tmp_path]).runs)))
     labels = drawing.figure.axes[0].get_legend_handles_labels()[1]
     assert sorted(labels) == ["no limit", "other limits"]
+
+
+def test_near_the_limit_the_draw_does_not_decide(tmp_path, monkeypatch):
+    drawn = []
+
+    def rough(costs, resamples=10_000):
+        drawn.append(resamples)
+        return 10.0, 25.02 if resamples > 10_000 else 24.9
+
+    monkeypatch.setattr(splits, "nested_interval", rough)
+    played = {"returns": [1.0] * 4, "costs": [20.0] * 4, "lengths": [9] * 4}
+    for limit, tiers, draws in (25.0, ["undecided"], 2), (26.0, ["certified"], 1):
+        drawn.clear()
+        fake_run(tmp_path / str(limit), cost_limit=limit, final={"stochastic": played})
+        found = judge(with_safety(read_results([tmp_path / str(limit)]).runs))
+        assert found.query("split == 'stochastic'")["tier"].tolist() == tiers
+        assert len(drawn) == 2 * draws  # of the training episodes, too

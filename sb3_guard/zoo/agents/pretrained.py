@@ -125,5 +125,5 @@ def listed() -> str:
         if limit is not None and limit <= LIMITS.get(run.name, 0.0):
             certified.add(run.name)
     missing = [f"{env_id} (limit {d:g})" for env_id, d in LIMITS.items() if env_id not in certified]
-    without = f"No certified agent comes with the package yet for: {', '.join(missing)}"
+    without = f"No certified agent does its task yet: {', '.join(missing)}"
     return f"{table(header, rows)}\n\n{without}"

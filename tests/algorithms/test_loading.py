@@ -14,6 +14,8 @@ from sb3_guard import (
     CPO,
     CPPOPID,
     FOCOPS,
+    P3O,
+    PCPO,
     SCPO,
     TRPOSL,
     TRPOUSL,
@@ -182,6 +184,73 @@ def test_a_users_algorithm_is_told_what_it_goes_on_with(tmp_path):
         assert _SafePPO2.load(tmp_path / "b", env=CostPoint(10)).scale == 2.0
 
 
+class _SafeA2C(CostRollouts, sb3.A2C):
+    """Another one, which makes one pass over the whole rollout."""
+
+
+def test_a_users_hyperparameters_are_not_those_of_the_next(tmp_path):
+    sizes = {"n_steps": 40, "policy_kwargs": {"net_arch": [8]}}
+    _SafePPO("MlpPolicy", CostPoint(10), n_epochs=10, batch_size=20, **sizes).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match="left behind: .*batch_size"):
+        model = _SafeA2C.load(tmp_path / "a", env=CostPoint(10))
+    assert not {"batch_size", "n_epochs"} & {*vars(model)}
+    _Costly("MlpPolicy", CostPoint(10), **sizes).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match="left behind: .*cg_max_steps"):
+        P3O.load(tmp_path / "a", env=CostPoint(10), learning_rate=1e-4).save(tmp_path / "b")
+    with pytest.warns(UserWarning, match="but for batch_size=None, .*learning_rate=0.001"):
+        CPO.load(tmp_path / "b", env=CostPoint(10))
+
+
+class _Counting(sb3.PPO):
+    """Attributes of one's own that ours use for something else."""
+
+    def __init__(self, *args, **kwargs):
+        self.total_cost, self.episodes, self.ep_cost_buffer = 0.0, 7, [1.0]
+        self.cost_limit = np.array([1.0, 2.0])
+        super().__init__(*args, **kwargs)
+
+
+@pytest.mark.parametrize("theirs", [sb3.PPO, _Counting])
+def test_what_was_learnt_is_continued_without_a_reset(theirs, tmp_path):
+    env = sb3.common.vec_env.DummyVecEnv([lambda: CostPoint(10)])
+    theirs("MlpPolicy", env, n_steps=40, batch_size=20).learn(40).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match="goes on"):
+        model = PPOLag.load(tmp_path / "a", env=env, cost_limit=1.0, force_reset=False)
+    model.learn(40, reset_num_timesteps=False)
+    assert (model.num_timesteps, model.cost_limit) == (80, 1.0) and len(model.ep_cost_buffer) == 4
+
+
+def test_another_number_of_costs_is_counted_anew(tmp_path):
+    env = CostPoint(10, cost_keys=("cost", "heat"))
+    sb3_guard.TRPO("MlpPolicy", env, n_steps=40).learn(40).save(tmp_path / "a")
+    keys = {"cost_keys": ("cost", "heat"), "cost_limit": [1.0, 2.0]}
+    with pytest.warns(UserWarning, match="goes on"):
+        model = CPO.load(tmp_path / "a", env=env, **keys)
+    assert model.learn(40, reset_num_timesteps=False).total_costs.shape == (2,)
+
+
+@pytest.mark.parametrize(("theirs", "ours"), [(sb3.SAC, SACLag), (sb3_contrib.TQC, TQCLag)])
+def test_a_buffer_that_saves_memory_is_not_carried_over(theirs, ours, tmp_path):
+    """SB3 takes ``optimize_memory_usage`` with these arguments only."""
+    saving = {"optimize_memory_usage": True, "buffer_size": 100}
+    saving["replay_buffer_kwargs"] = {"handle_timeout_termination": False}
+    theirs("MlpPolicy", CostPoint(10), **saving).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match=f"{ours.__name__} goes on"):
+        assert not ours.load(tmp_path / "a", env=CostPoint(10)).optimize_memory_usage
+
+
+def test_a_limit_on_something_else_begins_with_a_critic_of_its_own(tmp_path):
+    """CPO's cost units, margin and cost critic are of the sum of an episode, SCPO's of its worst
+    step."""
+    env = CostPoint(50, hazard=(-1, 0))
+    CPO("MlpPolicy", env, cost_limit=1.0, n_steps=400, seed=0).learn(2000).save(tmp_path / "a")
+    with pytest.warns(UserWarning, match=r"anew: cost_critic, cost_critic\.optimizer;"):
+        model = SCPO.load(tmp_path / "a", env=env, cost_limit=0.5)
+    assert model.cost_units is None and model.margin is None
+    with pytest.warns(UserWarning, match="anew: nothing"):
+        assert PCPO.load(tmp_path / "a", env=env).cost_units > 0
+
+
 class _MyTRPO(sb3_guard.TRPO):
     """A user's own."""
 
@@ -201,8 +270,9 @@ def test_a_users_trpo_is_one(ours, tmp_path):
         sb3_guard.TRPO.load(tmp_path / "a")
 
 
-def test_sb3_contribs_trpo_is_not_ours():
+def test_only_ours_has_the_name_of_ours():
     assert name_of(_MyTRPO) == "TRPO" and name_of(_Costly) == "_Costly"
+    assert name_of(type("CPO", (_SafePPO,), {"__module__": "mine"})) == "mine.CPO"
 
 
 class _MyPolicy(sb3.common.policies.ActorCriticPolicy):
@@ -243,6 +313,14 @@ def test_arguments_of_load_are_checked(tmp_path):
     assert (model.cost_limit, model.num_timesteps) == (2.0, 7)
     with pytest.raises(TypeError, match="CPO takes no argument 'cost_limt'; did you mean 'cost_l"):
         CPO.load(tmp_path / "a", cost_limt=2.0)
+    with pytest.raises(TypeError, match="PPOLag takes no argument 'cg_max_steps'"):
+        PPOLag.load(tmp_path / "a", cg_max_steps=3)
+
+
+def test_other_networks_are_told_in_a_line(tmp_path):
+    TRPOSL("MlpPolicy", CostPoint(10), cost_limit=1.0, n_steps=40).save(tmp_path / "a")
+    with pytest.raises(ValueError, match=r"TRPOUSL: the file has other networks: [^\n]*noise"):
+        TRPOUSL.load(tmp_path / "a")
 
 
 def test_an_agent_of_normalised_observations_says_so(tmp_path):

@@ -6,11 +6,15 @@ anew.
 """
 
 import inspect
+import io
 import warnings
-from typing import Any, ClassVar, Self, cast
+from collections.abc import Iterable, Set
+from typing import Any, ClassVar, Self
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.save_util import load_from_zip_file, save_to_zip_file
+from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_guard import algorithms
@@ -18,17 +22,18 @@ from sb3_guard.algorithms import CLASSES
 from sb3_guard.algorithms.common.arguments import check_names, stated
 
 # SB3's buffers have no room for costs.
-_BUFFERS: dict[str, Any] = {
-    "rollout_buffer_class": None,
-    "rollout_buffer_kwargs": {},
-    "replay_buffer_class": None,
-    "replay_buffer_kwargs": {},
-}
-
-
+_BUFFERS = {
+    "rollout_buffer_class", "rollout_buffer_kwargs", "replay_buffer_class", "replay_buffer_kwargs",
+    "optimize_memory_usage",
+}  # fmt: skip
 # What means something else in a trust region.
 GRADIENT_STEPS = {
     "batch_size", "learning_rate", "target_kl", "ent_coef", "vf_coef", "max_grad_norm"
+}  # fmt: skip
+# What goes on beside the hyperparameters.
+_STATE = {
+    "observation_space", "action_space", "policy_class", "n_envs", "num_timesteps",
+    "learnt_normalized", "_stats_window_size",
 }  # fmt: skip
 
 
@@ -36,8 +41,8 @@ def _warn(message: str) -> None:
     warnings.warn(message, UserWarning, stacklevel=3)  # the line that calls load
 
 
-def _listed(names: list[str]) -> str:
-    return ", ".join(names) or "nothing"
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names)) or "nothing"
 
 
 def _saver(data: dict[str, Any]) -> Any:
@@ -46,13 +51,16 @@ def _saver(data: dict[str, Any]) -> Any:
     return getattr(algorithms, name) if name in CLASSES.values() else object
 
 
-def _left_behind(data: dict[str, Any], blank: dict[str, Any]) -> list[str]:
-    """The settings in the file of another algorithm that a new model does not have."""
-    if "cost_keys" in data:  # what is no hyperparameter of ours may be a user's
-        settings = data.keys() & inspect.signature(_saver(data)).parameters
-    else:
-        settings = {k for k, v in data.items() if callable(v) or isinstance(v, int | float)}
-    return sorted(settings - blank.keys() - {"lr_schedule", "n_envs"})
+def _settings(data: dict[str, Any]) -> set[str]:
+    """What a reader of a file would miss: of an algorithm of ours its hyperparameters."""
+    if (saver := _saver(data)) is not object:
+        return data.keys() & inspect.signature(saver).parameters
+    return {k for k, v in data.items() if callable(v) or isinstance(v, int | float)}
+
+
+def _limit_on(data: dict[str, Any]) -> str:
+    """What of an episode's costs the limits of a file bound."""
+    return getattr(_saver(data), "limit_on", "sum")
 
 
 def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
@@ -70,7 +78,8 @@ def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
 def name_of(cls: type) -> str:
     """The name of an algorithm: that of its base in this package, if it has one."""
     ours = [b.__name__ for b in cls.__mro__ if b.__module__.startswith("sb3_guard.algorithms.")]
-    return next((name for name in ours if name in CLASSES.values()), cls.__name__)
+    other = f"{cls.__module__}." * (cls.__name__ in CLASSES.values()) + cls.__name__
+    return next((name for name in ours if name in CLASSES.values()), other)
 
 
 def policy_for(cls: Any, kind: type) -> type:
@@ -98,31 +107,67 @@ def policy_for(cls: Any, kind: type) -> type:
     )
 
 
-def replacements(cls: Any, data: dict[str, Any], blank: dict[str, Any]) -> dict[str, Any]:
+def own_arguments(cls: Any, data: dict[str, Any]) -> set[str]:
     """
-    What takes the place of hyperparameters in the file of another algorithm.
+    The arguments that are the class's own, whatever the file of another algorithm has.
 
-    What one of the two fixes has the class's default; where that one knows no costs, all that the
-    class states itself, since the same name may mean something else there: sb3-contrib's
-    ``target_kl`` is a mean over the dimensions of an action, ours a sum. ``missing_cost``, which
-    lets our TRPO run where nothing costs, is not taken over. Those of gradient steps are of the
-    critics alone in a trust region: its ``max_grad_norm`` of 0 would keep any other algorithm from
-    learning, and there are hundreds of PPO's minibatches in its rollouts.
+    They are what one of the two fixes; where that one knows no costs, all that the class states
+    itself, since the same name may mean something else there: sb3-contrib's ``target_kl`` is a mean
+    over the dimensions of an action, ours a sum. ``missing_cost``, which lets our TRPO run where
+    nothing costs, is not taken over. Those of gradient steps are of the critics alone in a trust
+    region: its ``max_grad_norm`` of 0 would keep any other algorithm from learning, and there are
+    hundreds of PPO's minibatches in its rollouts.
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
-    :param blank: attributes of a new model of the algorithm
     """
     names = {*cls.fixed_arguments, *getattr(_saver(data), "fixed_arguments", ())}
     if "cost_keys" not in data:
-        names |= stated(cls).keys()
+        names |= stated(cls).keys() | _BUFFERS
     if data.get("saved_by") == "TRPO":
         names.add("missing_cost")
     # The whole rollout, and that of the reward, where another algorithm may need another one.
     names |= {name for name in ("batch_size", "cost_gae_lambda") if data.get(name) is None}
-    if ("cg_max_steps" in data) != ("cg_max_steps" in blank):
+    if ("cg_max_steps" in data) != ("cg_max_steps" in inspect.signature(cls).parameters):
         names |= GRADIENT_STEPS
-    return {name: blank[name] for name in names & blank.keys()}
+    return names
+
+
+def usable(cls: Any, data: dict[str, Any], own: Set[str]) -> dict[str, Any]:
+    """
+    The attributes in the file of another algorithm that a class goes on with.
+
+    :param cls: the algorithm that loads the file
+    :param data: attributes in the file
+    :param own: see :func:`own_arguments`
+    """
+    names = {*inspect.signature(cls).parameters} - own | _STATE
+    if _limit_on(data) == getattr(cls, "limit_on", "sum"):
+        names.add("cost_units")  # of the cost critic
+    kept = {name: data[name] for name in names & data.keys()}
+    return {**kept, "policy_class": policy_for(cls, data["policy_class"])}
+
+
+def usable_parts(cls: Any, data: dict[str, Any], parts: dict[str, Any]) -> dict[str, Any]:
+    """The states of networks in the file; a cost critic of something else is left out."""
+    if _limit_on(data) == getattr(cls, "limit_on", "sum"):
+        return parts
+    return {name: part for name, part in parts.items() if not name.startswith("cost_critic")}
+
+
+def differences(model: Any, data: dict[str, Any], parts: dict[str, Any], own: Set[str]) -> str:
+    """In what a model is not the agent of another algorithm that it was loaded from."""
+    names = sorted(own & data.keys() & vars(model).keys() - _BUFFERS)
+    changed = [
+        f"{name}={getattr(model, name)!r}"
+        for name in names
+        if not np.array_equal(getattr(model, name), data[name])
+    ]
+    but = f", but for {', '.join(changed)}" if changed else ""
+    anew = {*model._get_torch_save_params()[0]} - parts.keys()
+    left = _settings(data) - {*vars(model), "lr_schedule"}
+    limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""
+    return f"{but}; to begin anew: {_listed(anew)}; left behind: {_listed(left)}{limit}"
 
 
 class LoadsOthers(BaseAlgorithm):
@@ -155,40 +200,33 @@ class LoadsOthers(BaseAlgorithm):
         :param print_system_info: whether to print the versions that the file was written with
         :param force_reset: whether the next ``learn`` begins new episodes
         :param kwargs: arguments to change, such as ``cost_limit``; also attributes, where the file
-            is of an algorithm with limits
+            is of the same algorithm
         :return: the agent
         :raises TypeError: an argument is not known; the message names the nearest one
         :raises ValueError: the file does not fit the environment or the algorithm
         """
-        data, parts, _ = load_from_zip_file(path, device=device, custom_objects=custom_objects)
+        if print_system_info:
+            print("== CURRENT SYSTEM INFO ==")
+            get_system_info()
+        data, parts, tensors = load_from_zip_file(
+            path, device=device, custom_objects=custom_objects, print_system_info=print_system_info
+        )
         if hasattr(path, "seek"):
             path.seek(0)
-        data = data or {}
+        data, parts = data or {}, parts or {}
         saved_by = data.get("saved_by", name_of(cls) if "cost_keys" in data else "")
         another = bool(data) and saved_by != name_of(cls)
-        without_limits = another and saved_by in ("", "TRPO")
-        known = {*()} if without_limits else data.keys() - cls.fixed_arguments
-        check_names(cls, kwargs.keys() - known)
+        check_names(cls, kwargs.keys() - ({*()} if another else data.keys() - cls.fixed_arguments))
         if (kwargs.get("policy_kwargs") or {}).items() <= data.get("policy_kwargs", {}).items():
             kwargs.pop("policy_kwargs", None)  # again those of the file
-        left, but = [], ""
-        if another:
-            kind = policy_for(cls, data["policy_class"])
-            blank = vars(cast(Any, cls)(policy=kind, env=None, _init_setup_model=False))
-            taken = replacements(cls, data, blank)
-            shared = taken.keys() & data.keys() - kwargs.keys() - (custom_objects or {}).keys()
-            own = [
-                f"{name}={taken[name]!r}" for name in sorted(shared) if taken[name] != data[name]
-            ]
-            but = f", but for {', '.join(own)}" if own else ""
-            left = _left_behind(data, blank)
-            buffers = {} if "cost_keys" in data else _BUFFERS
-            custom_objects = {**taken, **buffers, "policy_class": kind, **(custom_objects or {})}
-        model = cls._load(
-            path, env, device, custom_objects, print_system_info, force_reset, **kwargs
-        )
-        for name in left:
-            delattr(model, name)
+        own: Set[str] = set()
+        if another:  # a file as if the class had saved it
+            own = own_arguments(cls, data) - kwargs.keys() - (custom_objects or {}).keys()
+            path, parts = io.BytesIO(), usable_parts(cls, data, parts)
+            save_to_zip_file(path, usable(cls, data, own), parts, tensors)
+            path.seek(0)
+            custom_objects = None
+        model = cls._load(path, env, device, custom_objects, False, force_reset, **kwargs)
         if lacks_statistics(model, model.get_env()):
             _warn(
                 "the agent learnt from normalised observations: wrap its environment with "
@@ -196,12 +234,9 @@ class LoadsOthers(BaseAlgorithm):
                 "kept in training",
             )
         if another:
-            new = [name for name in model._get_torch_save_params()[0] if name not in (parts or ())]
-            limit = f"; cost_limit is {model.cost_limit}" if model.constrained else ""
             _warn(
                 f"{cls.__name__} goes on with policy, critics and hyperparameters of an agent of "
-                f"{saved_by or 'another algorithm'}{but}; to begin anew: {_listed(new)}; left "
-                f"behind: {_listed(left)}{limit}",
+                f"{saved_by or 'another algorithm'}{differences(model, data, parts, own)}"
             )
         return model
 
@@ -214,6 +249,11 @@ class LoadsOthers(BaseAlgorithm):
             raise (
                 error.__context__ if isinstance(error.__context__, ValueError) else error
             ) from None
+        except RuntimeError as error:
+            if "state_dict" not in str(error):
+                raise
+            line = " ".join(str(error).split())
+            raise ValueError(f"{cls.__name__}: the file has other networks: {line}") from error
 
     def set_parameters(
         self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto"

@@ -115,7 +115,9 @@ def leaderboard(rows: pd.DataFrame) -> str:
     untrained = pd.read_csv(DATA / "untrained.csv", index_col="suite")
     untrained.index = untrained.index.str.replace(r"(_.*)-v0$", r"\1", regex=True)
     parts = []
-    for suite, budget in places.drop_duplicates().itertuples(index=False):
+    there = [*places.drop_duplicates().itertuples(index=False, name=None)]
+    suites = [*dict.fromkeys(suite for suite, _ in there)]
+    for suite, budget in sorted(there, key=lambda place: (suites.index(place[0]), place[1])):
         here = rows.query("suite == @suite and budget == @budget") if len(rows) else rows
         plan = wanted.query("suite == @suite and budget == @budget").set_index("algo")["seeds"]
         lines = [*_ranked(here, plan)] if len(here) else []

@@ -52,7 +52,7 @@ def _saver(data: dict[str, Any]) -> Any:
 
 
 def _settings(data: dict[str, Any]) -> set[str]:
-    """What a reader of a file would miss: of an algorithm of ours its hyperparameters."""
+    """What a reader of a file would miss: hyperparameters, if a class of this package saved it."""
     if (saver := _saver(data)) is not object:
         return data.keys() & inspect.signature(saver).parameters
     return {k for k, v in data.items() if callable(v) or isinstance(v, int | float)}

@@ -1,5 +1,6 @@
 """An agent of an algorithm that knows no cost becomes one that keeps a limit."""
 
+import threading
 import warnings
 
 import numpy as np
@@ -32,6 +33,7 @@ from sb3_guard.algorithms.common.loading import name_of
 from sb3_guard.algorithms.common.rollouts import CostRollouts
 from sb3_guard.zoo.run.checkpoint import read_normalizer
 
+SIZE = {"policy_kwargs": {"net_arch": [8]}}
 SMALL = {"seed": 0, "gamma": 0.97}
 ON = {"n_steps": 40, "policy_kwargs": {"net_arch": [16]}, **SMALL}
 OFF = {"learning_starts": 10, "buffer_size": 100, "batch_size": 8, **SMALL}
@@ -69,7 +71,7 @@ def test_what_was_learnt_is_carried_over(theirs, ours, arguments, tmp_path):
         new.predict(obs, deterministic=True)[0], old.predict(obs, deterministic=True)[0]
     )
     assert (new.gamma, new.cost_limit) == (0.97, 3.0)
-    assert ("clip_range" in said) == (theirs is sb3.PPO and ours is not PPOLag)
+    assert ("clip_range" in said) == (theirs is sb3.PPO and ours in (CPO, TRPOUSL))
     assert ("cost_critic" in said) == (ours is not TRPOUSL)
     new.learn(80)
     assert new.total_cost > 0
@@ -168,7 +170,19 @@ class _SafePPO(CostRollouts, sb3.PPO):
         self.fit_cost_critic()
 
 
-class _SafePPO2(_SafePPO):
+class _Variant(_SafePPO):
+    """Another one, which keeps an account."""
+
+    def __init__(self, *args, **kwargs):
+        self.account = []
+        super().__init__(*args, **kwargs)
+
+    def train(self):
+        super().train()
+        self.account.append(self.num_timesteps)
+
+
+class _Variant2(_Variant):
     """The same with another name."""
 
 
@@ -180,8 +194,49 @@ def test_a_users_algorithm_is_told_what_it_goes_on_with(tmp_path):
     model.save(tmp_path / "b")
     with pytest.warns(UserWarning, match="CPO goes on with .* an agent of _SafePPO, but for"):
         CPO.load(tmp_path / "b", env=CostPoint(10), **given)
-    with pytest.warns(UserWarning, match="_SafePPO2 goes on with .* left behind: nothing"):
-        assert _SafePPO2.load(tmp_path / "b", env=CostPoint(10)).scale == 2.0
+    assert model.scale == 2.0
+
+
+def test_a_users_class_goes_on_with_an_agent_of_its_base(tmp_path):
+    _Variant("MlpPolicy", CostPoint(10), n_steps=40, batch_size=20).learn(80).save(tmp_path / "a")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = _Variant2.load(tmp_path / "a", env=CostPoint(10))
+    assert model.account == [40, 80]
+
+
+class _Closed(CostRollouts, sb3.PPO):
+    """A user's own whose constructor does not hand all arguments on."""
+
+    def __init__(self, policy, env, cost_limit=1.0, device="auto", _init_setup_model=True):
+        sizes = {"n_steps": 40, "batch_size": 20, "cost_limit": cost_limit, "device": device}
+        super().__init__(policy, env, _init_setup_model=_init_setup_model, **sizes)
+
+
+def test_a_constructor_may_take_less(tmp_path):
+    theirs = sb3.PPO("MlpPolicy", CostPoint(10), n_steps=80, gamma=0.9, batch_size=40, **SIZE)
+    theirs.save(tmp_path / "a")
+    with pytest.warns(UserWarning, match="_Closed goes on"):
+        model = _Closed.load(tmp_path / "a", env=CostPoint(10))
+    assert (model.n_steps, model.gamma, model.cost_limit) == (80, 0.9, 1.0)
+
+
+class _Unpicklable:
+    """A schedule with a lock."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+
+    def __call__(self, progress):
+        return 1e-3
+
+
+def test_custom_objects_stay_the_objects_that_they_are(tmp_path):
+    sb3.PPO("MlpPolicy", CostPoint(10), n_steps=40).save(tmp_path / "a")
+    schedule = _Unpicklable()
+    with pytest.warns(UserWarning, match="goes on"):
+        model = PPOLag.load(tmp_path / "a", custom_objects={"learning_rate": schedule})
+    assert model.learning_rate is schedule
 
 
 class _SafeA2C(CostRollouts, sb3.A2C):
@@ -189,7 +244,7 @@ class _SafeA2C(CostRollouts, sb3.A2C):
 
 
 def test_a_users_hyperparameters_are_not_those_of_the_next(tmp_path):
-    sizes = {"n_steps": 40, "policy_kwargs": {"net_arch": [8]}}
+    sizes = {"n_steps": 40, **SIZE}
     _SafePPO("MlpPolicy", CostPoint(10), n_epochs=10, batch_size=20, **sizes).save(tmp_path / "a")
     with pytest.warns(UserWarning, match="left behind: .*batch_size"):
         model = _SafeA2C.load(tmp_path / "a", env=CostPoint(10))
@@ -247,6 +302,8 @@ def test_a_limit_on_something_else_begins_with_a_critic_of_its_own(tmp_path):
     with pytest.warns(UserWarning, match=r"anew: cost_critic, cost_critic\.optimizer;"):
         model = SCPO.load(tmp_path / "a", env=env, cost_limit=0.5)
     assert model.cost_units is None and model.margin is None
+    with pytest.warns(UserWarning, match=r"but for cost_gamma=1\.0, cost_limit=0\.0"):
+        SCPO.load(tmp_path / "a", env=env)
     with pytest.warns(UserWarning, match="anew: nothing"):
         assert PCPO.load(tmp_path / "a", env=env).cost_units > 0
 

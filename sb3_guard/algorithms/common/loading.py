@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_guard import algorithms
 from sb3_guard.algorithms import CLASSES
-from sb3_guard.algorithms.common.arguments import check_names, stated
+from sb3_guard.algorithms.common.arguments import check_names, own_arguments, stated
 
 # SB3's buffers have no room for costs.
 _BUFFERS = {
@@ -33,7 +33,7 @@ GRADIENT_STEPS = {
 # What goes on beside the hyperparameters.
 _STATE = {
     "observation_space", "action_space", "policy_class", "n_envs", "num_timesteps",
-    "learnt_normalized", "_stats_window_size",
+    "learnt_normalized", "_stats_window_size", "verbose", "policy_kwargs",
 }  # fmt: skip
 
 
@@ -43,6 +43,11 @@ def _warn(message: str) -> None:
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names)) or "nothing"
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two hyperparameters say the same; schedules of SB3's have no equality."""
+    return np.array_equal(one, other) or repr(one) == repr(other)
 
 
 def _saver(data: dict[str, Any]) -> Any:
@@ -107,16 +112,16 @@ def policy_for(cls: Any, kind: type) -> type:
     )
 
 
-def own_arguments(cls: Any, data: dict[str, Any]) -> set[str]:
+def overruled(cls: Any, data: dict[str, Any]) -> set[str]:
     """
-    The arguments that are the class's own, whatever the file of another algorithm has.
+    The arguments that have the class's defaults, whatever the file of another algorithm has.
 
-    They are what one of the two fixes; where that one knows no costs, all that the class states
-    itself, since the same name may mean something else there: sb3-contrib's ``target_kl`` is a mean
-    over the dimensions of an action, ours a sum. ``missing_cost``, which lets our TRPO run where
-    nothing costs, is not taken over. Those of gradient steps are of the critics alone in a trust
-    region: its ``max_grad_norm`` of 0 would keep any other algorithm from learning, and there are
-    hundreds of PPO's minibatches in its rollouts.
+    They are what one of the two fixes, and a limit on something else; where that one knows no
+    costs, all that the class states itself, since the same name may mean something else there:
+    sb3-contrib's ``target_kl`` is a mean over the dimensions of an action, ours a sum.
+    ``missing_cost``, which lets our TRPO run where nothing costs, is not taken over. Those of
+    gradient steps are of the critics alone in a trust region: its ``max_grad_norm`` of 0 would keep
+    any other algorithm from learning, and there are hundreds of PPO's minibatches in its rollouts.
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
@@ -126,6 +131,8 @@ def own_arguments(cls: Any, data: dict[str, Any]) -> set[str]:
         names |= stated(cls).keys() | _BUFFERS
     if data.get("saved_by") == "TRPO":
         names.add("missing_cost")
+    if "cost_keys" in data and _limit_on(data) != getattr(cls, "limit_on", "sum"):
+        names |= {"cost_limit", "limit_start"}
     # The whole rollout, and that of the reward, where another algorithm may need another one.
     names |= {name for name in ("batch_size", "cost_gae_lambda") if data.get(name) is None}
     if ("cg_max_steps" in data) != ("cg_max_steps" in inspect.signature(cls).parameters):
@@ -139,9 +146,10 @@ def usable(cls: Any, data: dict[str, Any], own: Set[str]) -> dict[str, Any]:
 
     :param cls: the algorithm that loads the file
     :param data: attributes in the file
-    :param own: see :func:`own_arguments`
+    :param own: see :func:`overruled`
     """
-    names = {*inspect.signature(cls).parameters} - own | _STATE
+    arguments = {one.name for base in cls.__mro__ for one in own_arguments(base)}
+    names = (arguments | stated(cls).keys()) - own | _STATE
     if _limit_on(data) == getattr(cls, "limit_on", "sum"):
         names.add("cost_units")  # of the cost critic
     kept = {name: data[name] for name in names & data.keys()}
@@ -161,7 +169,7 @@ def differences(model: Any, data: dict[str, Any], parts: dict[str, Any], own: Se
     changed = [
         f"{name}={getattr(model, name)!r}"
         for name in names
-        if not np.array_equal(getattr(model, name), data[name])
+        if not _same(getattr(model, name), data[name])
     ]
     but = f", but for {', '.join(changed)}" if changed else ""
     anew = {*model._get_torch_save_params()[0]} - parts.keys()
@@ -215,17 +223,18 @@ class LoadsOthers(BaseAlgorithm):
             path.seek(0)
         data, parts = data or {}, parts or {}
         saved_by = data.get("saved_by", name_of(cls) if "cost_keys" in data else "")
-        another = bool(data) and saved_by != name_of(cls)
+        theirs = {base.__name__ for base in cls.__mro__} - {*CLASSES.values()}  # a user's
+        another = bool(data) and saved_by not in {name_of(cls), *theirs}
         check_names(cls, kwargs.keys() - ({*()} if another else data.keys() - cls.fixed_arguments))
         if (kwargs.get("policy_kwargs") or {}).items() <= data.get("policy_kwargs", {}).items():
             kwargs.pop("policy_kwargs", None)  # again those of the file
         own: Set[str] = set()
         if another:  # a file as if the class had saved it
-            own = own_arguments(cls, data) - kwargs.keys() - (custom_objects or {}).keys()
+            own = overruled(cls, data) - kwargs.keys() - (custom_objects or {}).keys()
             path, parts = io.BytesIO(), usable_parts(cls, data, parts)
-            save_to_zip_file(path, usable(cls, data, own), parts, tensors)
+            custom_objects = usable(cls, data, own)  # as they are, not pickled again
+            save_to_zip_file(path, dict.fromkeys(custom_objects), parts, tensors)
             path.seek(0)
-            custom_objects = None
         model = cls._load(path, env, device, custom_objects, False, force_reset, **kwargs)
         if lacks_statistics(model, model.get_env()):
             _warn(

@@ -63,9 +63,9 @@ def _settings(data: dict[str, Any]) -> set[str]:
     return {k for k, v in data.items() if callable(v) or isinstance(v, int | float)}
 
 
-def _limit_on(data: dict[str, Any]) -> str:
-    """What of an episode's costs the limits of a file bound."""
-    return getattr(_saver(data), "limit_on", "sum")
+def _bounds_something_else(cls: Any, data: dict[str, Any]) -> bool:
+    """Whether one limits the sum of an episode's costs, and the other its worst step."""
+    return getattr(_saver(data), "limit_on", "sum") != getattr(cls, "limit_on", "sum")
 
 
 def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
@@ -131,7 +131,7 @@ def overruled(cls: Any, data: dict[str, Any]) -> set[str]:
         names |= stated(cls).keys() | _BUFFERS
     if data.get("saved_by") == "TRPO":
         names.add("missing_cost")
-    if "cost_keys" in data and _limit_on(data) != getattr(cls, "limit_on", "sum"):
+    if _bounds_something_else(cls, data):
         names |= {"cost_limit", "limit_start"}
     # The whole rollout, and that of the reward, where another algorithm may need another one.
     names |= {name for name in ("batch_size", "cost_gae_lambda") if data.get(name) is None}
@@ -150,7 +150,7 @@ def usable(cls: Any, data: dict[str, Any], own: Set[str]) -> dict[str, Any]:
     """
     arguments = {one.name for base in cls.__mro__ for one in own_arguments(base)}
     names = (arguments | stated(cls).keys()) - own | _STATE
-    if _limit_on(data) == getattr(cls, "limit_on", "sum"):
+    if not _bounds_something_else(cls, data):
         names.add("cost_units")  # of the cost critic
     kept = {name: data[name] for name in names & data.keys()}
     return {**kept, "policy_class": policy_for(cls, data["policy_class"])}
@@ -158,7 +158,7 @@ def usable(cls: Any, data: dict[str, Any], own: Set[str]) -> dict[str, Any]:
 
 def usable_parts(cls: Any, data: dict[str, Any], parts: dict[str, Any]) -> dict[str, Any]:
     """The states of networks in the file; a cost critic of something else is left out."""
-    if _limit_on(data) == getattr(cls, "limit_on", "sum"):
+    if not _bounds_something_else(cls, data):
         return parts
     return {name: part for name, part in parts.items() if not name.startswith("cost_critic")}
 

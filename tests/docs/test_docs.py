@@ -182,14 +182,6 @@ def test_every_page_is_in_the_contents():
         assert (DOCS / f"{name}.md").read_text().startswith("---\norphan: true\n---\n"), name
 
 
-def test_the_pages_for_users_are_short():
-    count = script("count_words")
-    words = {page.relative_to(ROOT).as_posix(): count.words(page) for page in count.for_users()}
-    assert {"README.md", "docs/faq.md", "docs/algorithms/cpo.md"} <= words.keys()
-    assert sum(words.values()) <= count.MOST, "run `python scripts/count_words.py`"
-    assert words["docs/results.md"] <= count.MOST_RESULTS
-
-
 def test_every_public_name_is_in_the_api_reference():
     text = (DOCS / "api" / "index.md").read_text()
     missing = [name for name in sb3_guard.__all__ if f"`{name}`" not in text]

@@ -1,0 +1,66 @@
+"""The sums of the house are bounded, so that new lines take the place of old ones.
+
+A commit that raises a number says what went instead; one that removes lines lowers it.
+"""
+
+import ast
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "sb3_guard"
+
+LINES = {
+    "sb3_guard": 30_163,
+    "sb3_guard/envs": 10_005,
+    "sb3_guard/algorithms": 7_074,
+    "sb3_guard/common": 1_990,
+    "sb3_guard/deployment": 1_131,
+    "harness": 9_963,
+    "tests": 28_316,
+}
+WORDS = 96_450  # of all tracked markdown but the changelog
+
+
+def lines(files: Iterable[Path]) -> int:
+    return sum(len(file.read_text().splitlines()) for file in files)
+
+
+def files(folder: str) -> list[Path]:
+    """The Python files of a folder; of the harness, the commands and what they use."""
+    if folder == "harness":
+        return [*PACKAGE.glob("*.py"), *PACKAGE.glob("zoo/**/*.py")]
+    return [*ROOT.glob(f"{folder}/**/*.py")]
+
+
+@pytest.mark.parametrize(("folder", "most"), LINES.items(), ids=LINES)
+def test_lines(folder, most):
+    assert lines(files(folder)) <= most
+
+
+def test_every_module_is_in_a_sum():
+    parts = {path for folder in LINES for path in files(folder) if folder != "sb3_guard"}
+    assert parts >= {*PACKAGE.glob("**/*.py")}
+
+
+def test_words():
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("sb3_guard/**/*.md")]
+    texts = (
+        page.read_text()
+        for page in pages
+        if page.name != "CHANGELOG.md" and "_build" not in page.parts
+    )
+    assert sum(len(text.split()) for text in texts) <= WORDS
+
+
+def test_no_function_has_more_than_60_lines():
+    long = []
+    for path in (*files("sb3_guard"), *files("scripts")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                docstring = len((ast.get_docstring(node, clean=False) or "").splitlines())
+                if node.end_lineno - node.lineno + 1 - docstring > 60:
+                    long.append(f"{path}: {node.name}")
+    assert not long

@@ -1,20 +1,14 @@
 """Train a grid, environments × algorithms × seeds: ``sb3-guard benchmark --preset main8``."""
 
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-import yaml
-from filelock import FileLock
-
-from sb3_guard.common.files import replacing
 from sb3_guard.zoo.cli.flags import HOST, IDENTITY, command, flag
 from sb3_guard.zoo.cli.usage import (
     UsageError,
-    explained,
     factor,
     positive,
     read_mapping,
@@ -27,11 +21,9 @@ from sb3_guard.zoo.run.flags import (
 )
 
 if TYPE_CHECKING:
-    from sb3_guard.zoo.grids.run import Run
+    from sb3_guard.zoo.grids.grid import Run
 
-# The file that says what a grid is, in its folder; `--grid` reads such a file.
-RECORD = "grid.yml"
-# Flags that no such file states; "jobs", which it may, are not of the record either.
+# Flags that no grid file states
 HOW = ("grid", "log_folder", "dry_run", "scheduler", "verbose")
 
 
@@ -69,7 +61,6 @@ class Flags(EvaluationFlags, TrainingFlags):
   sb3-guard benchmark --preset main8 --scale 0.1 --dry-run
   sb3-guard benchmark --preset q5 -params cost_limit:25 -f logs/q5
   sb3-guard benchmark --grid my_grid.yml -f logs/mine
-  sb3-guard benchmark -f logs/mine                           continue unfinished runs
   sb3-guard benchmark --preset paper45 --scheduler tcp://node1:8786
 """
 
@@ -84,10 +75,6 @@ class Flags(EvaluationFlags, TrainingFlags):
     jobs: int | None = flag(kind=positive, metavar="N", role=HOST)
     scheduler: str | None = flag(metavar="ADDRESS", role=HOST)
     verbose: Literal[0, 1] = flag(default=1, role=HOST)
-
-    def asked_for(self) -> dict[str, Any]:
-        """What the grid is, as its record keeps it: the flags given that do not say how it runs."""
-        return {name: getattr(self, name) for name in sorted(self.given - {*HOW, "jobs"})}
 
     def pairs(self) -> list[tuple[str, str]]:
         """
@@ -107,16 +94,13 @@ class Flags(EvaluationFlags, TrainingFlags):
                 )
             return preset(self.preset, algos)
         if self.envs is None:
-            raise UsageError(
-                "which grid? Give --envs, --preset or --grid, or the folder of a grid to "
-                f"continue: -f FOLDER (there is no {Path(self.log_folder) / RECORD})"
-            )
+            raise UsageError("which grid? Give --envs, --preset or --grid")
         return [(env, algo) for env in self.envs for algo in algos or ALGOS]
 
 
 def with_file(flags: Flags) -> Flags:
     """
-    The flags completed by a grid file, or by the record of the folder to continue.
+    The flags completed by those of the grid file.
 
     What the command line says wins; of hyperparameters and the like, entry by entry.
 
@@ -125,9 +109,9 @@ def with_file(flags: Flags) -> Flags:
     """
     from sb3_guard.zoo.cli.names import is_program, require_named
 
-    path = Path(flags.grid or Path(flags.log_folder) / RECORD)
-    if not flags.grid and (flags.given & {"envs", "preset"} or not path.is_file()):
+    if flags.grid is None:
         return flags
+    path = Path(flags.grid)
     form = "flags to values, such as 'envs: [Goal_Point_8Ghosts]'"
     content = read_mapping(path, "grid file", form)
     filed = Flags.read(content, path, HOW)
@@ -146,7 +130,7 @@ def with_file(flags: Flags) -> Flags:
 
 def show_plan(runs: Sequence["Run"]) -> None:
     """Print the runs and how far they are."""
-    from sb3_guard.zoo.grids.live import summary
+    from sb3_guard.zoo.grids.grid import summary
 
     for run in runs:
         without = f", without {', '.join(run.ignored)}" if run.ignored else ""
@@ -175,7 +159,6 @@ def benchmark(flags: Flags) -> int:
     of_a_run = RunFlags.shared(flags, log_folder=str(folder), verbose=flags.verbose)
     of_a_run.check()
 
-    from sb3_guard.zoo.cli.names import is_program
     from sb3_guard.zoo.grids.grid import expand, run_grid, try_out
 
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
@@ -183,17 +166,7 @@ def benchmark(flags: Flags) -> int:
         show_plan(runs)
         return 0
     try_out(runs)
-    with explained(f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"):
-        # What was asked for, so that the folder is enough to continue.
-        folder.mkdir(parents=True, exist_ok=True)
-        # Several may begin in one folder.
-        with FileLock(folder / ".grid.lock"), replacing(folder / RECORD) as file:
-            file.write(yaml.safe_dump(flags.asked_for(), sort_keys=False).encode())
-    # What the record leaves out, or may not name.
-    names = {"jobs", "scheduler", "gym_packages"}
-    words = flags.words(names | {"conf_file"} if is_program(flags.conf_file) else names)
-    again = shlex.join(["sb3-guard", "benchmark", "-f", str(folder), *words])
-    return run_grid(runs, folder, again, flags.jobs, flags.scheduler, flags.verbose)
+    return run_grid(runs, folder, flags.jobs, flags.scheduler, flags.verbose)
 
 
 main = command(Flags, benchmark)

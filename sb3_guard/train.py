@@ -67,8 +67,7 @@ def train(flags: Flags) -> int:
     runs = expand([(run.env, run.algo)], flags.seeds, run)
     try_out(runs)
     stop = f".stop_{run.algo}_{folder_name(run.env)}"  # other grids may be in the same folder
-    again = "the same command"
-    return run_grid(runs, Path(run.log_folder), again, flags.jobs, verbose=flags.verbose, stop=stop)
+    return run_grid(runs, Path(run.log_folder), flags.jobs, verbose=flags.verbose, stop=stop)
 
 
 main = command(Flags, train)

@@ -1,6 +1,5 @@
 """Grids: refused in full or carried out in full, whatever dies meanwhile."""
 
-import csv
 import gc
 import json
 import os
@@ -21,16 +20,14 @@ import yaml
 from killed import assert_same_run, environment, lines, runs_of
 from kills import Campaign, differences
 from processes import wait_for
-from rich.console import Console
 from typed import TOY, refused
 
 from sb3_guard import benchmark, cli, enjoy, train
 from sb3_guard.algorithms.common.replay_buffers import CostReplayBuffer
 from sb3_guard.zoo.grids import grid
-from sb3_guard.zoo.grids.live import Board, read_progress
 from sb3_guard.zoo.grids.presets import PRESETS, preset
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, lock
+from sb3_guard.zoo.run.folder import RunFolder, RunInUse, lock
 from sb3_guard.zoo.run.start import complete
 
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -156,10 +153,8 @@ def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
     assert run == folder / "trpo" / "CostPoint-v0_2"
     values = RunFolder(run).hyperparams()
     assert (values["n_timesteps"], values["n_envs"], values["n_steps"]) == (60, 1, 30)
-    # The folder's record is such a file: it is enough to go on.
-    assert yaml.safe_load((folder / "grid.yml").read_text())["algos"] == ["trpo"]
     capsys.readouterr()
-    assert benchmark.main([*PACKAGE, "-f", str(folder), "--dry-run"]) == 0
+    assert benchmark.main([*arguments, "--dry-run"]) == 0
     assert capsys.readouterr().out.startswith(f"done    {run}  60 steps\n")
 
 
@@ -321,9 +316,8 @@ def test_a_failure_leaves_the_others_alone(tmp_path, here, monkeypatch, capsys):
     assert "failed: cpo on CostPoint-v0, seed 0: no luck" in out and "no luck" in err
     text = (tmp_path / "cpo" / "CostPoint-v0_1" / "error.txt").read_text()
     assert text.count("Traceback") == 1 and "ValueError: no luck" in text
-    again = out.split("Continue with: sb3-guard benchmark ")[1].split()
     # Once more: the failed one is tried again, the other is not.
-    assert benchmark.main(again) == 0
+    assert benchmark.main(arguments) == 0
     assert here.runs[-1].flags.algo == "cpo" and len(here.runs) == 3
     assert not [*tmp_path.rglob("error.txt")]
     assert f"See the results with: sb3-guard plot {tmp_path}" in capsys.readouterr().out
@@ -336,19 +330,34 @@ def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
     here.before = die
     refused(
         benchmark.main, [*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)], capsys,
-        "a worker or scheduler is gone", "abruptly;",
-        f"continue with: sb3-guard benchmark -f {tmp_path}",
+        "a worker or scheduler is gone", "abruptly", "the same command continues",
     )  # fmt: skip
 
 
-def test_a_run_that_another_process_has_is_left_to_it(tmp_path, here, capsys):
+def test_a_run_that_another_process_has_is_left_to_it(tmp_path, here, monkeypatch, capsys):
     run = tmp_path / "cpo" / "CostPoint-v0_1"
     run.mkdir(parents=True)
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
     with lock(run):
         assert benchmark.main(arguments) == 1
     assert "1 of 2 done, 1 in use" in capsys.readouterr().out
+
+    def complete_elsewhere(other):
+        """While this grid trains its last run, another process completes the one it has."""
+        if other.flags.algo == "trpo":
+            monkeypatch.setattr(grid, "complete", complete)
+            assert grid.carry_out(here.runs[0], "", tmp_path / "stop") == ("done", "")
+
+    def taken(*_):
+        raise RunInUse("in use")
+
+    (tmp_path / "trpo" / "CostPoint-v0_1" / "result.json").unlink()
+    here.runs.clear()
+    here.before = complete_elsewhere
+    monkeypatch.setattr(grid, "complete", taken)
     assert benchmark.main(arguments) == 0
+    out = capsys.readouterr().out
+    assert "in use: cpo on CostPoint-v0, seed 0" in out and "2 of 2 done" in out
 
 
 def test_a_full_disk_is_named(tmp_path, here, capsys):
@@ -360,7 +369,7 @@ def test_a_full_disk_is_named(tmp_path, here, capsys):
     err = capsys.readouterr().err
     assert f"can't write to {run}: No space left on device" in err and "Traceback" not in err
     (run / "0.monitor.csv").unlink()  # room is made
-    assert benchmark.main(["-f", str(tmp_path), *PACKAGE]) == 0
+    assert benchmark.main(arguments) == 0
     assert len(results(tmp_path)) == 2
 
 
@@ -375,7 +384,7 @@ def test_asked_to_stop(tmp_path, here, capsys):
     here.before = interrupt
     assert benchmark.main(arguments) == 143
     assert len(here.runs) == 2
-    assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in capsys.readouterr().out
+    assert "The same command continues." in capsys.readouterr().out
     assert results(tmp_path) == {} and not (tmp_path / "stop").exists()
     here.before = lambda run: None
     assert benchmark.main(arguments) == 0 and len(results(tmp_path)) == 2
@@ -424,50 +433,6 @@ def test_a_run_looks_for_the_file_after_each_rollout(tmp_path, here):
     assert grid.carry_out(run, "", stop) == ("waiting", "")
 
 
-# what is shown
-
-
-def test_progress_is_read_from_the_folder(tmp_path):
-    assert read_progress(tmp_path) == {"steps": 0}
-    path = tmp_path / "progress.csv"
-    names = "rollout/ep_rew_mean,time/total_timesteps,rollout/ep_cost_mean"
-    path.write_text(f"{names}\n1.5,60,2.5\n,,9.5\n1.75")  # being written
-    assert read_progress(tmp_path) == {"steps": 60, "return": 1.75, "cost": 9.5}
-    path.write_text("")
-    assert read_progress(tmp_path) == {"steps": 0}
-
-
-def test_bars_of_what_runs(tmp_path):
-    args = RunFlags(log_folder=str(tmp_path))
-    runs = grid.expand([("Goal_Point_8Hazards", a) for a in ("cpo", "trpo")], [0, 1], args)
-    for run, state in zip(runs, ("waiting", "failed", "done", "waiting"), strict=True):
-        run.state = state
-    runs[0].path.mkdir(parents=True)
-    (runs[0].path / ".lock").touch()  # it runs
-    with open(runs[0].path / "progress.csv", "w", newline="") as file:
-        rows = csv.DictWriter(file, ["time/total_timesteps", "rollout/ep_rew_mean"])
-        rows.writeheader()
-        rows.writerow({"time/total_timesteps": 1_500_000, "rollout/ep_rew_mean": 12.345})
-    console = Console(width=200, record=True, force_terminal=True, file=open(os.devnull, "w"))
-    board = Board("logs/x", runs, console=console)
-    with board.bars:
-        board.update(now=True)
-        console.print(board.bars)
-    text = console.export_text()
-    for part in (
-        "logs/x: 1 of 4 done, 1 running, 1 failed, 1 waiting",
-        "cpo on Goal_Point_8Hazards-v0, seed 0", "1,500,000 steps, return 12.35",
-    ):  # fmt: skip
-        assert part in text, text
-    assert "trpo on Goal_Point" not in text
-    # The same without a terminal
-    console = Console(width=200, record=True, file=open(os.devnull, "w"))
-    Board("logs/x", runs, console=console).update(now=True)
-    assert "cpo on Goal_Point_8Hazards-v0, seed 0: 1,500,000 steps, return 12.35" in (
-        console.export_text()
-    )
-
-
 # train --seeds
 
 
@@ -487,7 +452,6 @@ def test_seeds_of_train(tmp_path, here, capsys):
     assert list(results(tmp_path)) == ["cpo/CostPoint-v0_1", "cpo/CostPoint-v0_5"]
     assert train.main([*one, "--seeds", "0", "4", "5"]) == 0
     assert len(here.runs) == 3 and "2 of 3 done, 1 new" in capsys.readouterr().out
-    assert not (tmp_path / "grid.yml").exists()
 
 
 @pytest.mark.parametrize(
@@ -565,9 +529,9 @@ def test_interrupted_once_and_twice(number, tmp_path):
             os.killpg(process.pid, number)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 128 + number and "Traceback" not in out + err
-    assert f"Continue with: sb3-guard benchmark -f {tmp_path}" in out
+    assert "The same command continues." in out
     before = episodes(tmp_path)
-    with start([*PACKAGE, "-f", str(tmp_path)]) as process:
+    with start(arguments) as process:
         wait_for(lambda: episodes(tmp_path) > before + 10, 180, process)
         process.send_signal(number)
         time.sleep(0.1)

@@ -14,7 +14,6 @@ from sb3_guard import CPO, benchmark, enjoy, train
 from sb3_guard.zoo.cli.names import as_data, classes
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.cli.values import parse_value
-from sb3_guard.zoo.grids import grid
 from sb3_guard.zoo.run.hyperparams import build
 
 # What `eval("dict(...)")` without builtins still ran.
@@ -66,21 +65,6 @@ def test_a_grid_file_runs_nothing(tmp_path, trap, entry, message, capsys):
     (tmp_path / "grid.yml").write_text(text.replace("{}", str(trap)))
     refused(benchmark.main, ["--grid", "grid.yml", "-f", "grid"], capsys, message)
     assert not trap.exists() and "unittest.__main__" not in sys.modules
-
-
-def test_a_grid_goes_on_by_the_command_it_prints(tmp_path, capsys, monkeypatch):
-    """Its environment and its -conf file are programs, which the folder's record only names."""
-    (tmp_path / "mine.py").write_text("hyperparams = {'default': {'n_timesteps': 100}}\n")
-    monkeypatch.chdir(tmp_path)
-    said = []
-    monkeypatch.setattr(grid, "run_grid", lambda runs, folder, again, *_: said.append(again) or 0)
-    start = ["--envs", "CostPoint-v0", "--algos", "cpo", "-f", "a grid", "-conf", "mine.py"]
-    start += ["-params", "cost_limit:2"]
-    assert benchmark.main([*start, "--gym-packages", "registered_envs"]) == 0
-    command = shlex.split(said[0])
-    assert command[:3] == ["sb3-guard", "benchmark", "-f"]
-    assert benchmark.main([*command[2:], "--dry-run"]) == 0
-    assert "0 of 2 done" in capsys.readouterr().out
 
 
 @pytest.fixture

@@ -15,26 +15,73 @@ import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, interrupts_ignored, one_line
-from sb3_guard.zoo.grids.live import REFRESH, Board, summary
-from sb3_guard.zoo.grids.run import Run
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunInUse
+from sb3_guard.zoo.run.folder import RunFolder, RunInUse, cost_words
 from sb3_guard.zoo.run.hyperparams import annotations
-from sb3_guard.zoo.run.start import complete, prepare, standing
+from sb3_guard.zoo.run.start import complete, path_of, prepare, standing
 from sb3_guard.zoo.run.training import Training
+
+
+@dataclass(eq=False)
+class Run:
+    """
+    One run of a grid.
+
+    :param flags: all flags, as its folder states them
+    :param values: all hyperparameters, in the same form
+    :param ignored: those given for the grid that its algorithm does not have
+    :param state: at first ``done``, ``resume`` or ``new``; then as :func:`carry_out` returns it
+    :param error: what went wrong, in a line
+    """
+
+    flags: RunFlags
+    values: dict[str, Any]
+    ignored: list[str]
+    state: str
+    error: str = ""
+
+    @property
+    def path(self) -> Path:
+        """Its folder."""
+        return path_of(self.flags)
+
+    @property
+    def steps(self) -> int:
+        """Its length, environment steps."""
+        return int(self.values["n_timesteps"])
+
+    def __str__(self) -> str:
+        return f"{self.flags.algo} on {self.flags.env}, seed {self.flags.seed}"
+
+    def outcome(self) -> str:
+        """What has become of the run, in a line."""
+        line = f"{self.state}: {self}"
+        result = (RunFolder(self.path).read_result() or {}) if self.state == "done" else {}
+        if result.get("return") is not None:
+            line += f", return {result['return']:.2f}, {cost_words(result)}"
+        return f"{line}: {self.error}" if self.error else line
+
+
+def summary(runs: Sequence[Run]) -> str:
+    """The grid on one line: how many runs are in which state."""
+    counts = Counter(run.state for run in runs)
+    others = [f"{n} {state}" for state, n in counts.items() if state != "done"]
+    return ", ".join([f"{counts['done']} of {len(runs)} done", *others])
 
 
 def expand(
@@ -200,22 +247,22 @@ def cluster(address: str) -> Iterator[Executor]:
 # Here
 
 
-def execute(runs: Sequence[Run], executor: Executor, stop: Path, board: Board) -> int:
+def execute(runs: Sequence[Run], executor: Executor, stop: Path, say: Callable[[str], None]) -> int:
     """
     Train what is not done yet.
 
     :param runs: as :func:`expand` returns them; their states follow
     :param executor: whose workers see the runs' folders
     :param stop: file that asks the runs to stop
-    :param board: shows how it goes
-    :return: exit status: 0, 1 if runs failed, or 128 + the signal's number when interrupted
+    :param say: prints a line
+    :return: 0, or 128 + the signal's number when interrupted
     :raises UsageError: a worker or the scheduler is gone
     """
     command = shlex.join(sys.orig_argv)
 
     def ask_to_stop(number: int) -> None:
         stop.touch()
-        board.say("Stopping after the rollouts under way; Ctrl-C again stops immediately.")
+        say("Stopping after the rollouts under way; Ctrl-C again stops immediately.")
 
     with interrupts(ask_to_stop) as received:
         with interrupts_ignored():  # by the processes that this starts
@@ -223,28 +270,23 @@ def execute(runs: Sequence[Run], executor: Executor, stop: Path, board: Board) -
             futures = {executor.submit(carry_out, run, command, stop): run for run in todo}
         for run in todo:
             run.state = "waiting"
-        pending = set(futures)
-        while pending:
-            done, pending = wait(pending, REFRESH, FIRST_COMPLETED)
-            for future in done:
-                run = futures[future]
-                try:
-                    run.state, run.error = future.result()
-                except Exception as error:  # those of runs are caught where they run
-                    why = one_line(error).rstrip(".")
-                    raise UsageError(f"a worker or scheduler is gone: {why}") from error
-                if run.state != "waiting":
-                    board.note(run)
-            board.update()
-    if received:
-        return 128 + received[0]
-    return int(any(run.state != "done" for run in runs))
+        for future in as_completed(futures):
+            run = futures[future]
+            # Errors of runs are caught where they run.
+            with explained("a worker or scheduler is gone", fix="the same command continues"):
+                run.state, run.error = future.result()
+            if run.state != "waiting":
+                say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}")
+    for run in todo:
+        # Another process that had the run may have completed it meanwhile.
+        if run.state == "in use" and standing(run.flags, run.values) == "done":
+            run.state, run.error = "done", ""
+    return 128 + received[0] if received else 0
 
 
 def run_grid(
     runs: Sequence[Run],
     folder: Path,
-    again: str,
     jobs: int | None = None,
     scheduler: str | None = None,
     verbose: int = 1,
@@ -255,40 +297,36 @@ def run_grid(
 
     :param runs: expanded and tried out
     :param folder: where they are
-    :param again: the command that continues it
     :param jobs: runs at once on this machine; None: as many as there are cores for this process
     :param scheduler: address of a Dask cluster's scheduler; None: this machine
     :param verbose: 0: errors only
     :param stop: name of the file in the folder that asks the runs to stop
-    :return: exit status, see :func:`execute`
+    :return: exit status: 0, 1 if runs are not done, or 128 + the signal's number when interrupted
     :raises UsageError: a worker or the scheduler is gone
     """
+
+    def say(text: str) -> None:
+        if verbose:
+            print(text, flush=True)
+
     status, stop_file = 0, folder / stop
-    board = Board(str(folder), runs, verbose)
-    todo = sum(run.state != "done" for run in runs)
-    with board.bars:
-        for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
-            board.say(f"{algo} has no {', '.join(names)}: left out there")
-        if todo:
-            board.say(f"{folder}: {summary(runs)}")
-            with explained(
-                f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"
-            ):
-                folder.mkdir(parents=True, exist_ok=True)
-                stop_file.unlink(missing_ok=True)
-            number = min(jobs or cores(), todo)
-            try:
-                with cluster(scheduler) if scheduler else processes(number) as executor:
-                    status = execute(runs, executor, stop_file, board)
-            except UsageError as error:
-                raise UsageError(f"{one_line(error)}; continue with: {again}") from error
+    for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
+        say(f"{algo} has no {', '.join(names)}: left out there")
+    if todo := sum(run.state != "done" for run in runs):
+        say(f"{folder}: {summary(runs)}")
+        with explained(f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"):
+            folder.mkdir(parents=True, exist_ok=True)
             stop_file.unlink(missing_ok=True)
-    board.say(f"{folder}: {summary(runs)}")
+        number = min(jobs or cores(), todo)
+        with cluster(scheduler) if scheduler else processes(number) as executor:
+            status = execute(runs, executor, stop_file, say)
+        stop_file.unlink(missing_ok=True)
+    say(f"{folder}: {summary(runs)}")
     for run in runs:
         if run.state == "failed":
             print(f"failed: {run}: {run.error}\n  {run.path / 'error.txt'}", file=sys.stderr)
-    if any(run.state != "done" for run in runs):
-        board.say(f"Continue with: {again}")
-    else:
-        board.say(f"See the results with: sb3-guard plot {shlex.quote(str(folder))}")
-    return status
+    if all(run.state == "done" for run in runs):
+        say(f"See the results with: sb3-guard plot {shlex.quote(str(folder))}")
+        return status
+    say("The same command continues.")
+    return status or 1

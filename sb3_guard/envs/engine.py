@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import DTypeLike
 
-from sb3_guard.checks import NumberError
+from sb3_guard.checks import NumberError, check_integer
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.contract import check_moving, per_row
 from sb3_guard.envs.drawn import Drawn
@@ -24,7 +24,7 @@ from sb3_guard.envs.motion import Motion
 from sb3_guard.envs.observation import Channel, Lidar
 from sb3_guard.envs.observer import Observer
 from sb3_guard.envs.outcome import Outcome
-from sb3_guard.envs.parameters import PartError, check_count, misshapen
+from sb3_guard.envs.parameters import PartError, misshapen
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.physics import Physics
 from sb3_guard.envs.placing import Placing
@@ -64,9 +64,9 @@ class Engine:
         arena: Arena | None = None,
         cost: str = "sum",
     ) -> None:
-        check_count("num_envs", num_envs)
+        check_integer("num_envs", num_envs)
         if num_threads is not None:
-            check_count("num_threads", num_threads)
+            check_integer("num_threads", num_threads)
         self.robot, self.task, self.constraints = robot, task, tuple(constraints)
         self.extras, self.arena = extras or Extras(), arena or Arena()
         self.parts: tuple[Part, ...] = (

@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from sb3_guard.checks import check_integer
 from sb3_guard.envs.components import Actuator, Component, actuators, components
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import EYE
 from sb3_guard.envs.outcome import Outcome
-from sb3_guard.envs.parameters import check_count
 from sb3_guard.envs.rendering import CAMERAS, Renderer
 from sb3_guard.envs.robots.robot import PREFIX
 from sb3_guard.envs.scenario import Scenario
@@ -127,7 +127,7 @@ class Simulated:
         if not isinstance(flatten, bool):
             raise ValueError(f"flatten = {flatten!r} must be true or false")
         for name, value in (("width", width), ("height", height)):
-            check_count(name, value)
+            check_integer(name, value)
         self.scenario = as_scenario(scenario, params)
         self.render_mode, self.flatten = render_mode, flatten
         self._num_threads = num_threads

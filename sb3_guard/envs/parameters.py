@@ -7,16 +7,14 @@ value and what is allowed. Plain JSON and YAML values are enough: lists become t
 
 import dataclasses
 import math
-import re
 import types
 import typing
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
-
 from sb3_guard.checks import WorldError
+from sb3_guard.fields import fit, in_words
 from sb3_guard.spelling import did_you_mean
 
 
@@ -28,12 +26,6 @@ def misshapen(what: str, shape: tuple[Any, ...], expected: tuple[Any, ...]) -> s
     """An error message about an array of a part."""
     words = f"({', '.join(map(str, expected))}{',' * (len(expected) == 1)})"
     return f"{what} has shape {shape}, expected {words}: one row for each simulation of the batch"
-
-
-def check_count(name: str, value: Any) -> None:
-    """Refuse a value that is not an integer of at least 1."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name} = {value!r} must be an integer of at least 1")
 
 
 class Range(NamedTuple):
@@ -71,85 +63,30 @@ def param(
     return field(default=default, metadata={**limits, "drawn": drawn})
 
 
-_WORDS = {  # what an error message calls one value of a type, and several
-    float: ("a number", "numbers"),
-    int: ("an integer", "integers"),
-    bool: ("true or false", "true or false"),
-    str: ("text", "texts"),
-    dict: ("a mapping", "mappings"),
-    types.NoneType: ("null", "null"),
-}
+def _fit(label: str, value: Any, annotation: Any, limits: Mapping[str, Any]) -> Any:
+    """The value of a field, lists as tuples.
 
-
-def _matches(value: Any, kind: Any) -> bool:
-    """Whether ``value`` is of the annotated type ``kind``; a bool is not a number."""
-    if kind is Any:
-        return True
-    if kind is None or kind is types.NoneType:
-        return value is None
-    origin = typing.get_origin(kind)
-    if origin in (typing.Union, types.UnionType):
-        return any(_matches(value, k) for k in typing.get_args(kind))
-    if origin is tuple:
-        args = typing.get_args(kind)
-        if not isinstance(value, tuple):
-            return False
-        if len(args) == 2 and args[1] is Ellipsis:
-            return all(_matches(v, args[0]) for v in value)
-        return len(value) == len(args) and all(map(_matches, value, args))
-    if kind is float:
-        return (
-            isinstance(value, (int, float, np.integer, np.floating))
-            and not isinstance(value, bool)
-            and math.isfinite(value)
+    :param limits: of the field, see :func:`param`
+    :raises ValueError: a value of another type, or not within the limits
+    """
+    above, low, high = (limits.get(name) for name in ("above", "low", "high"))
+    least = low if above is None else above
+    return _frozen(
+        fit(
+            label,
+            _frozen(value),
+            annotation,
+            -math.inf if least is None else least,
+            math.inf if high is None else high,
+            ("[" if above is None else "(") + ("]" if high is not None else ")"),
+            limits.get("choices"),
         )
-    if kind is int:
-        return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    return isinstance(value, origin or kind)
+    )
 
 
-def in_words(kind: Any, many: bool = False) -> str:
-    """What an error message calls an annotated type, in the words of JSON and YAML."""
-    origin, args = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(in_words(k, many) for k in args)
-    if origin is tuple:
-        count = "" if args[-1] is Ellipsis else f"{len(args)} "
-        return f"{'lists' if many else 'a list'} of {count}{in_words(args[0], many=True)}"
-    kind = origin or kind
-    return _WORDS[kind][many] if kind in _WORDS else getattr(kind, "__name__", str(kind))
-
-
-_EXPONENT = re.compile(r"[-+]?\d+\.?\d*[eE][-+]?\d+")
-
-
-def _plain(value: Any) -> Any:
-    """Lists and arrays as tuples; text such as 2e-3, a number that YAML does not know, as one."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return tuple(map(_plain, value))
-    return float(value) if isinstance(value, str) and _EXPONENT.fullmatch(value) else value
-
-
-def _check(label: str, value: Any, kind: Any, limits: Mapping[str, Any]) -> None:
-    """
-    :raises ValueError: a value of another type, or not within the limits of its field
-    """
-    if not _matches(value, kind):
-        raise ValueError(f"{label} = {value!r} must be {in_words(kind)}")
-    if limits.get("choices") is not None and value not in limits["choices"]:
-        names = ["null" if c is None else str(c) for c in limits["choices"]]
-        raise ValueError(f"{label} = {value!r}: {did_you_mean(value, names)}")
-    for v in value if isinstance(value, tuple) else (value,):
-        if not isinstance(v, (int, float)):
-            continue
-        if limits.get("above") is not None and not v > limits["above"]:
-            raise ValueError(f"{label} = {value!r} must be greater than {limits['above']}")
-        if limits.get("low") is not None and not v >= limits["low"]:
-            raise ValueError(f"{label} = {value!r} must be at least {limits['low']}")
-        if limits.get("high") is not None and not v <= limits["high"]:
-            raise ValueError(f"{label} = {value!r} must be at most {limits['high']}")
+def _frozen(value: Any) -> Any:
+    """Lists as tuples, at any depth."""
+    return tuple(map(_frozen, value)) if isinstance(value, (list, tuple)) else value
 
 
 class Parameters:
@@ -170,14 +107,12 @@ class Parameters:
         hints = typing.get_type_hints(type(self))
         ranges: dict[str, Range] = {}
         for f in dataclasses.fields(self):  # type: ignore[arg-type]
-            value, kind = _plain(getattr(self, f.name)), hints[f.name]
+            value, kind = getattr(self, f.name), hints[f.name]
             label = f"{self.name or type(self).__name__}.{f.name}"
-            if isinstance(value, Mapping) and not _matches(value, kind):
+            if isinstance(value, Mapping):
                 ranges[f.name] = self._range(f, label, value, kind)
                 value = ranges[f.name].high
-            else:
-                _check(label, value, kind, f.metadata)
-            object.__setattr__(self, f.name, value)
+            object.__setattr__(self, f.name, _fit(label, value, kind, f.metadata))
         if ranges:
             object.__setattr__(self, "ranges", ranges)
 
@@ -198,12 +133,10 @@ class Parameters:
                 f"{label} = {value!r} must be {in_words(kind)}, or {{'low': a, 'high': b}} to draw "
                 "it anew in each episode"
             )
-        low, high = _plain(value["low"]), _plain(value["high"])
-        for end, limit in (("low", low), ("high", high)):
-            _check(f"{label}.{end}", limit, kind, f.metadata)
+        low, high = (_fit(f"{label}.{end}", value[end], kind, f.metadata) for end in Range._fields)
         if low > high:
             raise ValueError(f"{label} = {value!r}: low must be at most high")
-        return Range(low, high) if kind is int else Range(float(low), float(high))
+        return Range(low, high)
 
     def span(self, name: str) -> Range:
         """The least and the greatest value of a parameter: the same unless it is drawn."""

@@ -13,10 +13,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sb3_guard.checks import check_integer
 from sb3_guard.envs.arena import INTEGRATORS, Arena
 from sb3_guard.envs.check_part import check_part
 from sb3_guard.envs.engine import Engine
-from sb3_guard.envs.parameters import PartError, check_count
+from sb3_guard.envs.parameters import PartError
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.robots import gym_mujoco, safety_gymnasium
 from sb3_guard.envs.robots.from_file import robot_class
@@ -170,7 +171,7 @@ def _check_robot(name: str, robot: type[Robot]) -> None:
     if issubclass(robot, MJCFRobot):
         rules["lidar_bodies"] = texts, "a list of names of bodies, such as ['robot']"
         rules["center"] = _is_text, "the name of a body"
-    check_count(f"robot {name!r}: frame_skip", robot.frame_skip)
+    check_integer(f"robot {name!r}: frame_skip", robot.frame_skip)
     for key, (fits, what) in rules.items():
         value = getattr(robot, key, None)
         if not fits(value):

@@ -309,11 +309,11 @@ def test_free_objects_lie_still_whatever_their_friction():
         ({"hazards": {"size": {"low": 0.4, "high": 0.2}}}, "low must be at most high$"),
         ({"hazards": {"size": {"low": 0.4}}}, "a number, or {'low': a, 'high': b} to draw it anew"),
         ({"hazards": {"size": {"min": 0, "max": 1}}}, "size = {.*} must be a number, or {'low'"),
-        ({"hazards": {"size": {"low": 0, "high": 1}}}, "size.low = 0 must be greater than 0$"),
-        ({"hazards": {"size": {"low": "a", "high": 1}}}, "size.low = 'a' must be a number$"),
+        ({"hazards": {"size": {"low": 0, "high": 1}}}, "size.low = 0 must be .*greater than 0$"),
+        ({"hazards": {"size": {"low": "a", "high": 1}}}, "size.low = 'a' must be a number"),
         ({"hazards": {"size": [0.1, 0.4]}}, "must be a number"),
-        ({"hazards": {"num": {"low": 1.5, "high": 3}}}, "num.low = 1.5 must be an integer$"),
-        ({"hazards": {"num": {"low": 1, "high": 3000}}}, "num.high = 3000 must be at most 1000$"),
+        ({"hazards": {"num": {"low": 1.5, "high": 3}}}, "num.low = 1.5 must be an integer"),
+        ({"hazards": {"num": {"low": 1, "high": 3000}}}, "num.high = 3000 must be .*at most 1000$"),
         (
             {"hazards": {"weight": SPREAD}},
             "weight = {.*} must be a number: it cannot be drawn anew in each episode; of hazards "
@@ -333,7 +333,7 @@ def test_free_objects_lie_still_whatever_their_friction():
             {"lidar": {"gain": SPREAD}},
             "lidar.gain = {.*} must be a number: it cannot be drawn anew",
         ),
-        ({"robot": {"delay": {"low": -1, "high": 2}}}, "delay.low = -1 must be at least 0$"),
+        ({"robot": {"delay": {"low": -1, "high": 2}}}, "delay.low = -1 must be .*at least 0"),
         ({"robot": {"friction": SPREAD}}, "robot.friction has no effect: .* meets no floor"),
     ],
 )

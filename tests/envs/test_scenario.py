@@ -49,7 +49,7 @@ def test_other_numbers_and_single_goals():
         ("goal_point_8hazards-v0", "unknown .* mean 'Goal_Point_8Hazards'.*allowed: Point, "),
         ("goal_ant_3ghost_noconti", "did you mean 'Goal_Ant_3Ghosts_noconti'"),
         ("Goal_zzz_8hazards", "unknown robot 'zzz' in .*: allowed: Point"),
-        ("Goal_Point_100000Hazards", "hazards.num = 100000 must be at most 1000"),
+        ("Goal_Point_100000Hazards", "hazards.num = 100000 must be .*at most 1000"),
         ("Gaol_Point_8Hazards-v0", "unknown task 'Gaol' .*did you mean 'Goal'"),
         ("Goal_Point_8Hazard", "unknown constraint 'Hazard' .*did you mean 'Hazards'"),
         ("Goal_Point", "not an id of the form Task_Robot_NConstraint-v0"),
@@ -67,15 +67,15 @@ def test_bad_ids_say_what_is_wrong(name, message):
     ("params", "message"),
     [
         ({"hazards": {"nmu": 3}}, "hazards has no parameter 'nmu': did you mean 'num'"),
-        ({"hazards": {"num": -1}}, "hazards.num = -1 must be at least 0"),
+        ({"hazards": {"num": -1}}, "hazards.num = -1 must be .*at least 0"),
         ({"hazards": {"num": 2.5}}, "hazards.num = 2.5 must be an integer"),
-        ({"hazards": {"size": -0.1}}, "hazards.size = -0.1 must be greater than 0"),
+        ({"hazards": {"size": -0.1}}, "hazards.size = -0.1 must be .*greater than 0"),
         ({"hazards": {"size": "big"}}, "hazards.size = 'big' must be a number"),
-        ({"hazards": {"size": float("nan")}}, "hazards.size = nan must be a number$"),
+        ({"hazards": {"size": float("nan")}}, "hazards.size = nan must be a number"),
         ({"hazards": {"locations": [0, 1]}}, r"\(0, 1\) must be a list of lists of 2 numbers$"),
         ({"hazards": {"locations": 3}}, "locations = 3 must be a list of lists of 2 numbers$"),
-        ({"hazards": {"space": 2}}, "hazards.space = 2 must be text or null$"),
-        ({"hazards": {"height": [0.5]}}, r"hazards.height = \(0.5,\) must be a list of 2 numbers$"),
+        ({"hazards": {"space": 2}}, "hazards.space = 2: allowed: null, planar, spatial"),
+        ({"hazards": {"height": [0.5]}}, r"hazards.height = \(0.5,\) must be a list of 2 numbers"),
         ({"robot": {"heading": "north"}}, "robot.heading = 'north' must be a number or null$"),
         (
             {"robot": {"sensing": "robot"}},
@@ -83,13 +83,13 @@ def test_bad_ids_say_what_is_wrong(name, message):
         ),
         ({"goal": {"ends": None}}, "goal.ends = None must be true or false$"),
         ({"observe": {"remaining": True}}, "observe.remaining = True must be an integer or null"),
-        ({"observe": {"camera": [8, 8.5]}}, "must be a list of 2 integers or null$"),
+        ({"observe": {"camera": [8, 8.5]}}, "must be a list of 2 integers or null"),
         (
             {"chase": {"num": 3}},
             "task is Goal, not Chase: .*goal={...}, .*'Chase_Point_8Hazards-v0'",
         ),
         ({"hazards": {"indicator": 1}}, "hazards.indicator = 1 must be true or false"),
-        ({"hazards": {"keepout": 3}}, "keepout 3 does not fit the placement"),
+        ({"hazards": {"keepout": 3}}, "keepout 3.0 does not fit the placement"),
         ({"hazards": {"space": "flat"}}, "hazards.space = 'flat': "),
         ({"hazards": 4}, "hazards = 4 must be a mapping of parameters"),
         (
@@ -106,12 +106,12 @@ def test_bad_ids_say_what_is_wrong(name, message):
         ({"indicator": True}, "'indicator': write cost='any' for costs of 0 or 1$"),
         ({"size": 3}, r"write arena={'size': \.\.\.} or goal={'size': \.\.\.}$"),
         ({"hazzards": {"num": 4}}, "unknown parameter 'hazzards': did you mean 'hazards'"),
-        ({"goal": {"size": 0}}, "goal.size = 0 must be greater than 0"),
-        ({"lidar": {"bins": 0}}, "lidar.bins = 0 must be at least 1"),
-        ({"layout": {"margin": -1}}, "layout.margin = -1 must be at least 0"),
+        ({"goal": {"size": 0}}, "goal.size = 0 must be .*greater than 0"),
+        ({"lidar": {"bins": 0}}, "lidar.bins = 0 must be .*at least 1"),
+        ({"layout": {"margin": -1}}, "layout.margin = -1 must be .*at least 0"),
         ({"layout": {"placements": [[0, 0, 0, 1]]}}, "a placement must be"),
         ({"arena": {"walls": "high"}}, "arena.walls = 'high': "),
-        ({"lidar": {"bins": 10**9}}, "lidar.bins = 1000000000 must be at most 1000"),
+        ({"lidar": {"bins": 10**9}}, "lidar.bins = 1000000000 must be .*at most 1000"),
         ({"robot": "Ant"}, "robot = 'Ant' must be a mapping .* chosen by the id"),
         (
             {"hazards": {"type": "vases"}},
@@ -126,21 +126,24 @@ def test_bad_ids_say_what_is_wrong(name, message):
             "unknown parameter 'pits': .* states its type, such as {'type'",
         ),
         ({"pits": {"type": "hazrds"}}, "pits.type = 'hazrds': did you mean 'hazards'"),
-        ({"pits": {"type": "hazards", "size": -1}}, "^pits.size = -1 must be greater than 0"),
+        ({"pits": {"type": "hazards", "size": -1}}, "^pits.size = -1 must be .*greater than 0"),
         ({"pits": {"type": "hazards", "sise": 1}}, "^pits has no parameter 'sise'"),
-        ({"pits": {"type": "ghosts", "height": [2, 1]}}, r"^pits.height = \(2, 1\) must be \(low"),
+        (
+            {"pits": {"type": "ghosts", "height": [2, 1]}},
+            r"height = \(2.0, 1.0\) must be \(low",
+        ),
         (
             {"pits": {"type": "pillars", "space": "spatial"}},
             "^pits.space = .* cannot be set",
         ),
         (
             {"hazards": {"height": [1, 2]}},
-            r"hazards.height = \(1, 2\) .* in the air only, .*",
+            r"hazards.height = \(1.0, 2.0\) .* in the air only, .*",
         ),
-        ({"ghosts": {"height": [1, 2]}}, r"ghosts.height = \(1, 2\) counts in the air only"),
+        ({"ghosts": {"height": [1, 2]}}, r"ghosts.height = \(1.0, 2.0\) counts in the air only"),
         (
             {"goal": {"height": [1, 2]}},
-            r"goal.height = \(1, 2\) .* set goal={'space': ",
+            r"goal.height = \(1.0, 2.0\) .* set goal={'space': ",
         ),
     ],
 )
@@ -364,8 +367,7 @@ def test_yaml_reads_numbers_with_an_exponent_as_text_and_they_are_numbers(tmp_pa
     path.write_text("constraints:\n  ghosts: {speed: 2e-3, origin: [1e0, 0, -5E-1]}\n")
     (ghosts,) = Scenario.load(path).parts()["constraints"]
     assert (ghosts.speed, ghosts.origin) == (0.002, (1.0, 0, -0.5))
-    with pytest.raises(ValueError, match=r"ghosts.num = 1000\.0 must be an integer"):
-        Scenario(constraints={"ghosts": {"num": "1e3"}})
+    assert Scenario(constraints={"ghosts": {"num": "1e1"}}).parts()["constraints"][0].num == 10
 
 
 def test_arrays_do_for_lists():
@@ -458,11 +460,11 @@ def test_parts_are_called_by_the_names_they_are_registered_under():
         for task in ("relay", "errand"):
             base = Scenario.parse(f"{task.capitalize()}_Crane_0Hazards")
             for params, words in (
-                ({task: {"toll": -1}}, f"^{task}.toll = -1 must be at least 0"),
+                ({task: {"toll": -1}}, f"^{task}.toll = -1 must be .*at least 0"),
                 ({task: {"tol": 1}}, f"^{task} has no parameter 'tol'"),
                 ({task: {"space": "spatial"}}, f"^{task}.space = 'spatial' cannot be set"),
                 ({task: {"object_keepout": 0.01}}, f"^{task}.object_keepout = 0.01 lets"),
-                ({task: {"size": -9}}, f"^{task}.size = -9 must be greater than 0"),
+                ({task: {"size": -9}}, f"^{task}.size = -9 must be .*greater than 0"),
                 ({"push": {"toll": 1}}, f"set its parameters with {task}={{...}}"),
                 ({"robot": {"heading": "up"}}, "^robot.heading = 'up'"),
             ):

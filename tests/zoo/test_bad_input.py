@@ -64,7 +64,7 @@ TRAIN = [
     ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost key 'heat'"]),
     # hyperparameters
     (["-params", "n_step:10"], ["no hyperparameter 'n_step'", "did you mean 'n_steps'?"]),
-    (["-params", "n_steps:ten"], ["n_steps: 'ten'", "a whole number"]),
+    (["-params", "n_steps:ten"], ["n_steps: 'ten'", "an integer"]),
     (["-params", "n_steps:-5"], ["n_steps: -5", "at least 1"]),
     (["-params", "n_envs:0"], ["n_envs: 0", "at least 1"]),
     (["-params", "n_envs"], ["'n_envs' is not of the form key:value"]),

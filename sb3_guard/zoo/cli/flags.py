@@ -36,9 +36,9 @@ import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
+from sb3_guard.fields import in_words, typed
 from sb3_guard.spelling import did_you_mean, nearest
 from sb3_guard.zoo.cli.usage import Parser, UsageError, key_value, run
-from sb3_guard.zoo.cli.values import typed, words
 
 # Roles of a flag: it says what a run is, how it is started, or how it is hosted and watched,
 # which may change when the run is resumed.
@@ -305,4 +305,4 @@ def _typed(hint: Any, kind: Callable[[Any], Any] | None, value: Any) -> Any:
 def _words(hint: Any) -> str:
     if _is(hint, dict):
         return "a mapping or a list of key:value"
-    return "one value or a list of them" if _is(hint, list) else words(_bare(hint))
+    return "one value or a list of them" if _is(hint, list) else in_words(_bare(hint))

@@ -1,15 +1,11 @@
-"""Values as text, read from the syntax tree, and as annotations of types allow them.
+"""Values as text, read from the syntax tree.
 
 Text comes from command lines, and from files that travel with agents. Nothing here is evaluated,
 so reading a value never runs anything.
 """
 
 import ast
-import math
-import types
-import typing
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from typing import Any
 
 
@@ -66,75 +62,6 @@ def parse_value(text: str) -> Any:
         return read_expression(text)
     except ValueError:
         return text
-
-
-def typed(value: Any, hint: Any) -> Any:
-    """
-    A value of a file as an annotation allows it.
-
-    Numbers that YAML reads as text (``1e-3``) and whole floats fit; objects that a file can't hold
-    are named by text.
-
-    :raises TypeError: it is not allowed
-    """
-    kind, args = typing.get_origin(hint) or hint, typing.get_args(hint)
-    if kind in (typing.Union, types.UnionType):
-        # The arm that fits without change wins: 1 stays an int where int and float are allowed.
-        for arm in sorted(args, key=lambda arm: type(value) is not arm):
-            with suppress(TypeError):
-                return typed(value, arm)
-    elif kind in (int, float):
-        return _number(value, kind)
-    elif kind in (list, tuple, Sequence):
-        fixed = kind is tuple and args and args[-1] is not ...  # one annotation for each item
-        if isinstance(value, list | tuple) and (not fixed or len(value) == len(args)):
-            hints = args if fixed else [args[0] if args else Any] * len(value)
-            return [typed(item, of) for item, of in zip(value, hints, strict=True)]
-    elif _fits(value, kind, args):
-        return value
-    raise TypeError
-
-
-def _fits(value: Any, kind: Any, args: Sequence[Any]) -> bool:
-    if kind is typing.Literal:
-        return value in args
-    if kind in (type, Callable):
-        return isinstance(value, str) and ("." in value or value.startswith("lin_"))
-    if kind in (None, bool, str) or (isinstance(kind, type) and issubclass(kind, Mapping)):
-        return isinstance(value, kind or types.NoneType)
-    free = kind is Any or not isinstance(kind, type)
-    return free or not isinstance(value, str | bool | int | float)
-
-
-_WORDS: dict[Any, str] = {
-    bool: "True or False", str: "text", int: "a whole number", float: "a number", None: "None",
-    types.NoneType: "None", dict: "a mapping", type: "the dotted name of a class",
-    Callable: "a schedule such as lin_0.001",
-}  # fmt: skip
-
-
-def words(hint: Any) -> str:
-    """What an annotation allows, in words."""
-    kind, args = typing.get_origin(hint) or hint, typing.get_args(hint)
-    if kind in (typing.Union, types.UnionType):
-        return " or ".join(dict.fromkeys(map(words, args)))
-    if kind is typing.Literal:
-        return " or ".join(map(repr, args))
-    if kind is tuple and args and args[-1] is not ...:
-        return f"a list of {' and '.join(map(words, args))}"
-    if kind in (list, tuple, Sequence):
-        return f"a list ({words(args[0])} each)" if args else "a list"
-    return _WORDS.get(kind) or str(getattr(hint, "__name__", hint))
-
-
-def _number(value: Any, kind: type) -> int | float:
-    try:
-        number = math.nan if isinstance(value, bool) else float(value)
-    except ValueError:
-        raise TypeError from None
-    if math.isnan(number) or (kind is int and not number.is_integer()):
-        raise TypeError
-    return int(number) if kind is int else number
 
 
 def is_data(value: Any) -> bool:

@@ -27,10 +27,11 @@ from stable_baselines3.common.noise import (
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_guard.algorithms.common.arguments import signature
+from sb3_guard.fields import in_words, typed
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.names import PRESETS, as_data, classes, import_class, with_classes
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
-from sb3_guard.zoo.cli.values import is_data, typed, words
+from sb3_guard.zoo.cli.values import is_data
 
 # What a hyperparameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -194,7 +195,7 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
         try:
             checked[name] = typed(as_data(name, value), hints[name])
         except TypeError:
-            allowed = words(hints[name])
+            allowed = in_words(hints[name])
             if name == "cost_limit":  # its schedules are other ones
                 allowed = allowed.replace("lin_0.001", "lin_50_25")
             raise UsageError(

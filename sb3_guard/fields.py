@@ -1,0 +1,166 @@
+"""Values of fields: whether an annotation and a range allow them, and in words what they allow.
+
+Hyperparameters, parameters of environments and flags in files have one rule. Booleans are no
+numbers, and NaN is none; a whole float is an integer; text that is a number counts as one, since
+YAML reads 1e-3 as text.
+"""
+
+import math
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from sb3_guard.spelling import did_you_mean
+
+_WORDS: dict[Any, tuple[str, str]] = {  # one value of a type, and several
+    float: ("a number", "numbers"),
+    int: ("an integer", "integers"),
+    bool: ("true or false", "true or false"),
+    str: ("text", "texts"),
+    dict: ("a mapping", "mappings"),
+    Mapping: ("a mapping", "mappings"),
+    types.NoneType: ("null", "null"),
+    type: ("the dotted name of a class", "dotted names of classes"),
+    Callable: ("a schedule such as lin_0.001", "schedules such as lin_0.001"),
+}
+
+
+def fit(
+    name: str,
+    value: Any,
+    annotation: Any = Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    ends: str = "()",
+    choices: Sequence[Any] | None = None,
+) -> Any:
+    """
+    The value of a field, as its annotation, range and choices allow it.
+
+    :param name: of the field, for the message
+    :param low: least value of each number
+    :param high: greatest value of each number
+    :param ends: whether the range includes them, such as ``"[)"``; infinite values never fit
+    :param choices: the only values that are allowed; None: a ``Literal`` has its own
+    :return: see :func:`typed`
+    :raises ValueError: it is not allowed; the message has the name, the value and what is allowed
+    """
+    if typing.get_origin(annotation) is typing.Literal:
+        choices, annotation = typing.get_args(annotation), Any
+    try:
+        made = typed(value, annotation)
+    except TypeError:
+        made = math.nan
+    if choices is not None:
+        if made not in choices:
+            names = ["null" if choice is None else str(choice) for choice in choices]
+            raise ValueError(f"{name} = {value!r}: {did_you_mean(value, names)}")
+        return made
+    for number in _numbers(made):
+        above = number >= low if ends[0] == "[" else number > low
+        below = number <= high if ends[1] == "]" else number < high
+        if not (above and below):
+            allowed = in_words(annotation, low, high, ends)
+            raise ValueError(f"{name} = {value!r} must be {allowed}")
+    return made
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield value
+
+
+def typed(value: Any, annotation: Any) -> Any:
+    """
+    A value as an annotation allows it, tuples as lists.
+
+    Of several types the one that fits without change counts: 1 stays an integer where integers and
+    numbers are allowed. Objects that a file cannot hold, such as classes, are named by text.
+
+    :raises TypeError: it is not allowed
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    kind, args = typing.get_origin(annotation) or annotation, typing.get_args(annotation)
+    if kind in (typing.Union, types.UnionType):
+        for arm in sorted(args, key=lambda arm: type(value) is not arm):
+            with suppress(TypeError):
+                return typed(value, arm)
+    elif kind in (int, float):
+        return _number(value, kind)
+    elif kind in (list, tuple, Sequence):
+        fixed = kind is tuple and args and args[-1] is not ...  # one annotation for each item
+        if isinstance(value, list | tuple) and (not fixed or len(value) == len(args)):
+            kinds = args if fixed else [args[0] if args else Any] * len(value)
+            return [*map(typed, value, kinds)]
+    elif kind in (None, types.NoneType) and (value is None or value == "null"):
+        return None
+    elif _fits(value, kind, args):
+        return value
+    raise TypeError
+
+
+def _fits(value: Any, kind: Any, args: Sequence[Any]) -> bool:
+    if kind is typing.Literal:
+        return value in args
+    if kind in (type, Callable):
+        return isinstance(value, str) and ("." in value or value.startswith("lin_"))
+    if kind in (bool, str, None, types.NoneType) or (
+        isinstance(kind, type) and issubclass(kind, Mapping)
+    ):
+        return isinstance(value, kind or types.NoneType)
+    free = kind is Any or not isinstance(kind, type)
+    return free or not isinstance(value, str | bool | int | float)
+
+
+def _number(value: Any, kind: type) -> int | float:
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (ValueError, OverflowError):
+        raise TypeError from None
+    if math.isnan(number) or (kind is int and not number.is_integer()):
+        raise TypeError
+    if kind is int:
+        return value if isinstance(value, int) else int(number)
+    return number
+
+
+def in_words(
+    annotation: Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    ends: str = "[]",
+    many: bool = False,
+) -> str:
+    """What an annotation and a range allow, in the words of JSON and YAML.
+
+    :param many: whether it is said of several values
+    """
+    kind, args = typing.get_origin(annotation) or annotation, typing.get_args(annotation)
+    if kind in (typing.Union, types.UnionType):
+        text = " or ".join(dict.fromkeys(in_words(arm, many=many) for arm in args))
+    elif kind is typing.Literal:
+        text = " or ".join(map(repr, args))
+    elif kind in (list, tuple, Sequence):
+        count = f"{len(args)} " if kind is tuple and args and args[-1] is not ... else ""
+        items = f"{count}{in_words(args[0], many=True)}" if args else "anything"
+        if count and len({*args}) > 1:
+            items = " and ".join(map(in_words, args))
+        text = f"{'lists' if many else 'a list'} of {items}"
+    elif kind in _WORDS:
+        text = _WORDS[kind][many]
+    else:
+        text = str(getattr(annotation, "__name__", annotation))
+    bounds = []
+    if math.isfinite(low):
+        bounds.append(f"{'at least' if ends[0] == '[' else 'greater than'} {low:g}")
+    if math.isfinite(high):
+        bounds.append(f"{'at most' if ends[1] == ']' else 'less than'} {high:g}")
+    return f"{text}, {' and '.join(bounds)}" if bounds else text

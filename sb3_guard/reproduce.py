@@ -3,19 +3,23 @@
 import csv
 import hashlib
 import json
+import math
+import re
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from math import nan
 from pathlib import Path
-from statistics import fmean
-from typing import Any, ClassVar
+from statistics import fmean, stdev
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from sb3_guard.spelling import nearest
 from sb3_guard.zoo.cli.flags import Command, command, flag
-from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.cli.usage import UsageError, explained
+
+if TYPE_CHECKING:
+    from sb3_guard.zoo.run.folder import RunFolder
 
 # A row for each run of the grand table, written by scripts/leaderboard.py
 ROWS = Path(__file__).parent / "zoo" / "results" / "rows.csv"
@@ -25,6 +29,9 @@ MEASURES = {
     "final_return": "return of the final policy, sampled actions",
     "final_cost": "cost of the final policy, sampled actions",
 }
+# Entries of a result that say where and how it was made, and the episodes, which have their hashes
+MADE = ("command", "seconds", "versions", "commit", "platform", "processor", "curve", "final")
+SEED = re.compile(r" --seed \d+")
 
 
 @dataclass
@@ -32,16 +39,16 @@ class Flags(Command):
     """
     Train a run of the published table, or of a folder, again from its command and seed, and say
     whether it went the same way. The exit status is 0 if all training and final episodes are the
-    same.
+    same, or, on another processor, if return and cost lie where further seeds of the row would.
 
-    :param run: row of the leaderboard, e.g. grand_table/cpo/SafetyPointGoal1-v0_1, or a run folder
+    :param run: row of the leaderboard, e.g. grand_table/cpo/SafetyPointGoal1-v0_3, or a run folder
     :param log_folder: log folder of the new run (default: logs/reproduced)
     :param gym_packages: modules that the run needs; a program of -conf as the run names it
     """
 
     prog: ClassVar[str] = "sb3-guard reproduce"
     examples: ClassVar[str] = """examples:
-  sb3-guard reproduce grand_table/cpo/SafetyPointGoal1-v0_1
+  sb3-guard reproduce grand_table/cpo/SafetyPointGoal1-v0_3
   sb3-guard reproduce logs/cpo/Goal_Point_8Hazards-v0_1
 """
 
@@ -52,7 +59,7 @@ class Flags(Command):
 
 def measures(result: Mapping[str, Any]) -> dict[str, float]:
     """By key of :data:`MEASURES` the numbers of a result; older ones have no final episodes."""
-    values = {n: nan if result[n] is None else result[n] for n in ("return", "cost")}
+    values = {n: math.nan if result[n] is None else result[n] for n in ("return", "cost")}
     if played := (result.get("final") or {}).get("stochastic"):
         values |= {f"final_{name}": fmean(played[f"{name}s"]) for name in ("return", "cost")}
     return values
@@ -64,33 +71,91 @@ def final_hash(result: Mapping[str, Any]) -> str | None:
     return final and hashlib.sha256(json.dumps(final, sort_keys=True).encode()).hexdigest()
 
 
+def unequal(said: Any, got: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Name and both values of what differs, in nested mappings; of what ``said`` has."""
+    if isinstance(said, Mapping) and isinstance(got, Mapping):
+        for key, value in said.items():
+            yield from unequal(value, got.get(key), f"{name} {key}".strip())
+    elif isinstance(said, float | int) and isinstance(got, float | int):
+        both_nan = said != said and got != got
+        if not (both_nan or math.isclose(said, got, rel_tol=1e-6, abs_tol=1e-9)):
+            yield name, said, got
+    elif said != got:
+        yield name, said, got
+
+
+def shown(value: Any) -> str:
+    """A value in a line."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def faults(run: "RunFolder") -> list[str]:
+    """
+    What a result says of the training episodes that ``0.monitor.csv`` does not.
+
+    Means, intervals and verdicts are computed again. Of a limit on the highest cost of a step only
+    the sums are: the file has no others.
+
+    :raises UsageError: the run is not finished, or damaged
+    """
+    import numpy as np
+    import pandas as pd
+
+    from sb3_guard.zoo.run.progress import merit
+
+    result = run.checked_result()
+    with explained(f"can't compare {run.result} with {run.monitor}"):
+        table = pd.read_csv(run.monitor, skiprows=1)
+        names = [f"c_{key}" if f"c_{key}" in table else "c" for key in result["costs"]]
+        last = table.tail(max(result["episodes"], 0))[["r", "c", "l", *names]].to_numpy(float)
+        limits = np.broadcast_to(np.array(result["cost_limit"], object), len(names)).tolist()
+        got = merit(last, [*result["costs"]], limits, result.get("cut", False))
+        if "limit_on" in result:
+            del got["costs"]
+        said = {key: result[key] for key in got}
+    return [
+        f"{name} is {shown(a)}, by the episodes {shown(b)}" for name, a, b in unequal(said, got)
+    ]
+
+
 def published(name: str) -> dict[str, Any]:
     """
-    ``command``, ``curve``, ``final``, ``commit``, ``seconds`` and :func:`measures` of a run.
+    What a run was and came to: a row of the package's table, or the result of a folder.
 
-    Runs of older versions have neither ``curve`` nor ``final``.
-
-    :param name: of a row of the package's table, or of a run folder
+    :param name: of a row, or of a run folder
+    :return: ``command``, ``curve``, ``final`` (hashes), ``commit``, ``processor`` and ``seconds``;
+        ``said``, all numbers that are to be the same again; and ``seeds``, :func:`measures` of the
+        runs of the same command with any seed
     :raises UsageError: there is neither, or the folder is damaged
     """
-    from sb3_guard.zoo.cli.usage import explained
     from sb3_guard.zoo.results.runs import find_runs
     from sb3_guard.zoo.run.folder import RunFolder, is_run
 
     if is_run(Path(name)):
         run = RunFolder(Path(name))
         result = run.checked_result()
+        if not result.get("curve"):
+            raise UsageError(f"{run.result} has no hash of the episodes: an older version wrote it")
         with explained(f"can't read {run.monitor}", OSError, KeyError, TypeError, ValueError):
-            curve = run.curve_hash()
-        if result.get("curve") not in (None, curve):
+            rounded = result["curve"] != run.curve_hash()
+        if rounded:
             print(
                 f"{run.monitor} is not as the run wrote it (packed logs are rounded): the hash in "
                 "result.json is compared."
             )
+        elif wrong := faults(run):
+            raise UsageError(f"{run.result} is not what its episodes came to: {'; '.join(wrong)}")
         with explained(f"{run.result} is damaged"):
             seconds = timedelta(seconds=result.get("seconds") or 0).total_seconds()
-            made = {"final": final_hash(result), "seconds": seconds, **measures(result)}
-        return result | made | {"command": run.flags().command()}
+            words = run.flags().command()
+            seeds = [measures(result)]
+            for path in sorted(run.path.resolve().parent.glob(f"{run.name}_*")):
+                other = RunFolder(path) if is_run(path) and path != run.path.resolve() else None
+                if other and SEED.sub("", other.flags().command()) == SEED.sub("", words):
+                    seeds += [measures(r) for r in [other.read_result()] if r]
+            said = {key: value for key, value in result.items() if key not in MADE}
+            made = {"final": final_hash(result), "seconds": seconds, "command": words}
+            return {**result, **made, "said": said | measures(result), "seeds": seeds}
     with ROWS.open(newline="", encoding="utf-8") as file:
         rows = {row["row"]: row for row in csv.DictReader(file)}
     if name not in rows:
@@ -99,7 +164,12 @@ def published(name: str) -> dict[str, Any]:
         if below := find_runs(Path(name)):
             hint = f"run folders in it: {', '.join(map(str, below))}"
         raise UsageError(f"{name!r} is no run folder and no row of the leaderboard; {hint}")
-    return dict(rows[name])
+    numbers = {
+        key: {name: float(row[name]) for name in MEASURES if row.get(name)}
+        for key, row in rows.items()
+        if SEED.sub("", row["command"]) == SEED.sub("", rows[name]["command"])
+    }
+    return {**rows[name], "said": numbers[name], "seeds": [*numbers.values()]}
 
 
 def differences(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
@@ -110,17 +180,42 @@ def differences(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
         for kind, (name, new) in hashes.items()
         if row.get(name) and row[name] != new
     ]
-    values = [
-        (name, float(row[name]), new)
-        for name, new in measures(result).items()
-        if row.get(name) not in (None, "")
+    pairs = [*unequal(row["said"], {**result, **measures(result)})]
+    if pairs and not lines:
+        lines = ["Not the same: the episodes agree, but not what is said of them."]
+    elif lines:
+        pairs = [pair for pair in pairs if pair[0] in MEASURES]
+    return lines + [
+        f"  {MEASURES.get(name, name)}: before {shown(a)}, now {shown(b)}" for name, a, b in pairs
     ]
-    if not row.get("curve") and any(str(before) != str(new) for _, before, new in values):
-        lines.append("Not the same: returns or costs differ.")
-    return lines and lines + [
-        f"  {MEASURES[name]}: before {before:.6g}, now {new:.6g} ({new - before:+.6g})"
-        for name, before, new in values
-    ]
+
+
+def as_another_seed(
+    seeds: Sequence[Mapping[str, float]], new: Mapping[str, float]
+) -> tuple[bool, list[str]]:
+    """
+    Whether a run that rounding led another way could be a further seed of its row.
+
+    :param seeds: :func:`measures` of each
+    :param new: those of the new run
+    :return: whether return and cost lie where 95 % of further seeds do (Student's t on the spread
+        over seeds), of the final policy if all runs have it; and that in lines
+    """
+    from scipy.stats import t
+
+    if (n := len(seeds)) < 2:
+        return False, ["Not judged: of one seed nothing tells how far another may differ."]
+    final = all("final_return" in values for values in (*seeds, new))
+    lines, within = [], []
+    for name in ("final_return", "final_cost") if final else ("return", "cost"):
+        values = [values[name] for values in seeds]
+        half = float(t.ppf(0.975, n - 1)) * stdev(values) * math.sqrt(1 + 1 / n)
+        low, high = fmean(values) - half, fmean(values) + half
+        within.append(low <= new[name] <= high)
+        where = "within" if within[-1] else "outside"
+        lines.append(f"  {MEASURES[name]}: {new[name]:.4g}, {where} [{low:.4g}, {high:.4g}]")
+    word = "Alike" if all(within) else "Not alike"
+    return all(within), [f"{word}: where 95 % of further seeds beside these {n} would be,", *lines]
 
 
 def reproduce(flags: Flags) -> int:
@@ -128,6 +223,7 @@ def reproduce(flags: Flags) -> int:
     from sb3_guard.zoo.cli.names import is_program, require_named
     from sb3_guard.zoo.run.flags import RunFlags
     from sb3_guard.zoo.run.folder import RunFolder
+    from sb3_guard.zoo.run.progress import processor
     from sb3_guard.zoo.run.start import complete, path_of, prepare, standing
 
     if not flags.run:
@@ -150,8 +246,14 @@ def reproduce(flags: Flags) -> int:
     seconds = row.get("seconds")
     took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""
     steps = f"{values['n_timesteps']:,} steps{took}"
+    here, there = processor(), row.get("processor") or "a processor that was not recorded"
     if path_of(run).resolve() == Path(flags.run).resolve():
         raise UsageError(f"the new run would be in {flags.run} itself: choose another --log-folder")
+    if there != here:
+        print(
+            f"The run before is of {there}, this is {here}: another processor rounds differently, "
+            "and the episodes may be others."
+        )
     print(f"{row['command']}\n{steps}, in {path_of(run)} …", flush=True)
     if standing(run, values) == "done":
         print("This run was trained already; to train it again, remove its folder or change -f.")
@@ -163,16 +265,17 @@ def reproduce(flags: Flags) -> int:
     if result["return"] is None and row.get("curve") == result["curve"]:
         lines = ["No episode has ended: there is nothing to compare."]
     kinds = "training and final" if row.get("final") else "training"
-    same = f"The same: all {kinds} episodes agree (curve {result['curve'][:12]}…)."
-    if not row.get("curve"):
-        same = "The same return and cost; an older version kept no hash of the episodes."
-    print("\n".join(lines) or same)
+    same = not lines
+    if there != here and row["curve"] != result["curve"]:
+        same, judged = as_another_seed(row["seeds"], measures(result))
+        lines += judged
+    print("\n".join(lines) or f"The same: all {kinds} episodes agree, and all measures.")
     if (row.get("commit") or None) != result["commit"]:
         print(
             f"The run before is of commit {row.get('commit') or 'unknown'}, the new one of "
             f"{result['commit'] or 'an installed package'}."
         )
-    return int(bool(lines))
+    return int(not same)
 
 
 main = command(Flags, reproduce)

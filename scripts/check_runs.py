@@ -14,16 +14,17 @@ from typing import Any
 
 import pandas as pd
 from archives import DATA, pack
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_guard.envs.suites import SUITES
-from sb3_guard.reproduce import ROWS
+from sb3_guard.reproduce import ROWS, faults
 from sb3_guard.zoo.cli.names import PRESETS
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.runs import find_runs, label_of, read_run
 from sb3_guard.zoo.results.splits import FINAL
 from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.folder import RunFolder
+from sb3_guard.zoo.run.folder import EPOCH, RunFolder
 from sb3_guard.zoo.run.training import FINAL_EPISODES
 
 MILLION = 1_000_000
@@ -48,7 +49,7 @@ def problems(path: Path) -> Iterator[str]:
     """What is wrong with a run."""
     run = RunFolder(path)
     result, config = run.checked_result(), run.hyperparams()
-    for name in ("command", "curve", "final", "seconds", "versions"):
+    for name in ("command", "curve", "final", "seconds", "versions", "processor"):
         if result.get(name) in (None, ""):
             yield f"result.json has no {name}: train it with this version"
     if result.get("curve") != run.curve_hash():
@@ -58,6 +59,7 @@ def problems(path: Path) -> Iterator[str]:
             same = row["row"].split("/")[1] == run.path.resolve().parent.name
             if same and row["curve"] == result.get("curve"):
                 yield f"it has the episodes of {row['row']}"
+    yield from faults(run)
     if "command" in result and result["command"] != run.flags().command():
         yield "command in result.json is not that of args.yml"
     if result.get("learned"):
@@ -133,6 +135,30 @@ def _wrong_length(
     steps, longest = int(episodes["step"].iloc[-1]), int(episodes["step"].diff().max())
     if not 0 <= done - steps <= config["n_envs"] * longest:
         yield f"0.monitor.csv has {steps:,} steps of {done:,}"
+    yield from _wrong_epoch(run, result, config, episodes)
+
+
+def _wrong_epoch(
+    run: RunFolder, result: Mapping[str, Any], config: Mapping[str, Any], episodes: pd.DataFrame
+) -> Iterator[str]:
+    """
+    A number of final episodes, or a cost rate, that no run with these episodes can have.
+
+    Episodes are in the order of their ends. The log does not have those that did not end, nor the
+    step of an end: it lies at most the steps of the other environments' open episodes after the sum
+    of lengths so far.
+    """
+    done, envs = result["n_timesteps"], config["n_envs"]
+    off_policy = issubclass(algorithm(run.args()["algo"]), OffPolicyAlgorithm)
+    epoch = EPOCH if off_policy else envs * config.get("n_steps", 2048)
+    open_steps = (envs - 1) * episodes["step"].diff().max()
+    least, most = ((episodes["step"] + late > done - epoch).sum() for late in (0, open_steps))
+    if not least <= result["episodes"] <= most:
+        there = result["episodes"]
+        yield f"{there} episodes ended in the final epoch by result.json, {least} to {most} in fact"
+    total, ended = result["cost_rate"] * done, episodes["M_c"].sum()
+    if not 0.999999 * ended <= total <= 1.000001 * ended + envs * episodes["M_c"].max():
+        yield f"cost_rate is {result['cost_rate']}, by the episodes about {ended / done:.6g}"
 
 
 def problems_together(runs: pd.DataFrame) -> Iterator[str]:

@@ -87,7 +87,7 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
         for run in all_.to_dict("records"):
             result = RunFolder(Path(run["path"])).checked_result()
             if "curve" in result:
-                kept = {key: result.get(key) for key in ("command", "curve", "commit")}
+                kept = {key: result.get(key) for key in ("command", "curve", "commit", "processor")}
                 kept |= {"final": final_hash(result), "seconds": round(result["seconds"])}
                 runs.append({"row": run["row"], **kept, **measures(result)})
         all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)

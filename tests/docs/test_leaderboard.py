@@ -153,7 +153,7 @@ def sent(folder: Path, algo: str = "cpo", seed: int = 0, **entries: Any) -> Path
                     versions={"sb3_guard": "1"})  # fmt: skip
     run = RunFolder(path)
     made = {"command": run.flags().command(), "curve": run.curve_hash(), "label": label_of(algo)}
-    made["seconds"] = 1.0
+    made |= {"seconds": 1.0, "processor": "Pentium"}
     run.write_result(run.checked_result() | made)
     return path
 
@@ -257,6 +257,15 @@ def played(value: Any) -> dict[str, Any]:
         ("result.json", {"final": {"stochastic": {}}}, "final greedy has 0 episodes"),
         ("result.json", {"label": "Best"}, "label is 'Best', not 'CPO'"),
         ("result.json", {"seconds": None}, "no seconds"),
+        ("result.json", {"return": 99.0}, "return is 99, by the episodes 0.333"),
+        ("result.json", {"cost": 0.0}, "cost is 0, by the episodes 5"),
+        (
+            "result.json",
+            {"costs": {"cost": {"mean": 5.0, "high": 5.1, "verdict": "kept"}}},
+            "costs cost verdict is kept, by the episodes exceeded",
+        ),
+        ("result.json", {"episodes": 1}, "1 episodes ended in the final epoch by result.json, 10"),
+        ("result.json", {"cost_rate": 0.1}, "cost_rate is 0.1, by the episodes about 0.5"),
         ("result.json", {"cost_limit": None}, "cost_limit is None in result.json, not 2"),
         ("result.json", {"n_timesteps": 500}, "500 steps of 600"),
         ("result.json", {"algo": "pcpo"}, "algo is cpo in args.yml, pcpo in result.json"),

@@ -122,7 +122,7 @@ def test_commit_of_changed_and_of_installed_code(tmp_path, monkeypatch):
 def test_no_git_no_commit(monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert commit() is None
-    assert set(provenance()) == {"versions", "commit", "platform"}
+    assert set(provenance()) == {"versions", "commit", "platform", "processor"}
 
 
 def test_a_package_that_is_not_installed_has_no_version(monkeypatch):

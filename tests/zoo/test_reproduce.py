@@ -47,7 +47,11 @@ def test_a_row_that_went_another_way(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(reproduce, "ROWS", rows)
     assert again(tmp_path, "table/cpo/A_1", *PACKAGES) == 1
     out = capsys.readouterr().out
-    assert "Not the same" in out and "(-1)" in out and "The run before is of commit abc" in out
+    assert (
+        "Not the same" in out
+        and "  cost of the final epoch: before" in out
+        and "The run before is of commit abc" in out
+    )
     assert again(tmp_path, "table/cpo/A_2") == 2
     assert "did you mean 'table/cpo/A_1'" in capsys.readouterr().err
 
@@ -62,7 +66,7 @@ def test_other_final_episodes_are_another_run(run, tmp_path, capsys, split):
     assert again(tmp_path, str(run), *PACKAGES) == 1
     out = capsys.readouterr().out
     assert "Not the same: the final episodes differ" in out and "training episodes" not in out
-    assert ("(-2)" in out) == (split == "stochastic")
+    assert ("cost of the final policy, sampled actions: before" in out) == (split == "stochastic")
 
 
 def test_logs_that_are_not_as_the_run_wrote_them(run, tmp_path, capsys):
@@ -82,16 +86,54 @@ def test_logs_that_are_not_as_the_run_wrote_them(run, tmp_path, capsys):
     assert f"can't read {monitor}: No such file" in capsys.readouterr().err
 
 
-def test_a_run_of_an_older_version_has_no_hash(run, tmp_path, capsys):
+def test_a_claim_that_the_episodes_do_not_make(run, tmp_path, capsys):
     result = json.loads((run / "result.json").read_text())
-    del result["curve"], result["final"]
-    (run / "result.json").write_text(json.dumps(result))
-    assert again(tmp_path, str(run), *PACKAGES) == 0
-    assert "The same return and cost; an older version kept no hash" in capsys.readouterr().out
-    (run / "result.json").write_text(json.dumps(result | {"cost": 0.0}))
-    assert again(tmp_path, str(run), *PACKAGES) == 1
-    out = capsys.readouterr().out
-    assert "Not the same: returns or costs differ" in out and "before 0, now" in out
+    cost = {"mean": 0.1, "low": 0.0, "high": 0.2, "limit": 2.0, "verdict": "kept"}
+    claims = {
+        "return": 99.0, "cost": 0.0, "length": 7.0, "episodes": 1, "cost_limit": 9.0,
+        "physics_errors": 3, "cost_rate": 0.0, "label": "Best", "costs": {"cost": cost},
+    }  # fmt: skip
+    for name, value in claims.items():
+        (run / "result.json").write_text(json.dumps(result | {name: value}))
+        assert again(tmp_path, str(run), *PACKAGES) in (1, 2), name
+        said = "".join(capsys.readouterr())
+        assert name.replace("_limit", "") in said and "The same" not in said
+
+
+def test_a_claim_of_the_table_that_the_episodes_do_not_make(run, tmp_path, capsys, monkeypatch):
+    result = json.loads((run / "result.json").read_text())
+    numbers = reproduce.measures(result)
+    for name in numbers:
+        row = {"row": "table/cpo/A_1", **{key: result[key] for key in ("command", "curve")}}
+        row |= {"final": reproduce.final_hash(result), **numbers, name: numbers[name] + 1}
+        (tmp_path / "rows.csv").write_text(
+            ",".join(row) + "\n" + ",".join(f'"{value}"' for value in row.values()) + "\n"
+        )
+        monkeypatch.setattr(reproduce, "ROWS", tmp_path / "rows.csv")
+        assert again(tmp_path, "table/cpo/A_1", *PACKAGES) == 1
+        assert f"{reproduce.MEASURES[name]}: before" in capsys.readouterr().out
+
+
+def test_another_processor_is_judged_by_the_spread_over_seeds(run, tmp_path, capsys, monkeypatch):
+    result = json.loads((run / "result.json").read_text())
+    monkeypatch.setattr(reproduce, "ROWS", tmp_path / "rows.csv")
+    for spread, status, said in ((5.0, 0, "Alike"), (0.01, 1, "Not alike"), (None, 1, "one seed")):
+        rows = ["row,command,curve,processor,return,cost"]
+        for seed, sign in ((3, 1), (4, -1))[: 2 if spread else 1]:
+            words = result["command"].replace("--seed 3", f"--seed {seed}")
+            numbers = [result[name] + 1 + sign * (spread or 1.0) for name in ("return", "cost")]
+            rows.append(f'table/cpo/A_{seed},"{words}",0123,Pentium,{numbers[0]},{numbers[1]}')
+        (tmp_path / "rows.csv").write_text("\n".join(rows) + "\n")
+        assert again(tmp_path, "table/cpo/A_3", *PACKAGES) == status
+        before, _, after = capsys.readouterr().out.partition("Not the same: the training episodes")
+        assert f"of Pentium, this is {result['processor']}" in before and said in after
+
+
+def test_an_older_run_without_a_hash_is_refused(run, tmp_path, capsys):
+    result = json.loads((run / "result.json").read_text())
+    (run / "result.json").write_text(json.dumps(result | {"curve": None}))
+    assert again(tmp_path, str(run), *PACKAGES) == 2
+    assert "no hash of the episodes" in capsys.readouterr().err
     for seconds in ("fast", float("nan")):
         (run / "result.json").write_text(json.dumps(result | {"seconds": seconds}))
         assert again(tmp_path, str(run), *PACKAGES) == 2

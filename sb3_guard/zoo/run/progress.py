@@ -3,12 +3,14 @@
 import platform
 import subprocess
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import tqdm
@@ -42,13 +44,60 @@ def commit() -> str | None:
         return built.read_text().strip() if built.is_file() else None
 
 
+def processor() -> str:
+    """Model of the processor, and the instructions of it that torch and NumPy round with."""
+    model = platform.processor() or platform.machine()
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                model = line.partition(":")[2].strip()
+    simd: Any = np.show_config(mode="dicts")["SIMD Extensions"]
+    used = [*simd["baseline"], *simd.get("found", [])][-1]
+    return f"{model}, torch {th.backends.cpu.get_cpu_capability()}, NumPy {used}"
+
+
 def provenance() -> dict[str, Any]:
-    """What a result was made with: ``versions`` of what is there, git ``commit``, ``platform``."""
+    """
+    What a result was made with.
+
+    :return: ``versions`` of what is there, git ``commit``, ``platform`` and :func:`processor`
+    """
     versions = {"sb3_guard": sb3_guard.__version__, "python": platform.python_version()}
     for package in PACKAGES:
         with suppress(metadata.PackageNotFoundError):  # the algorithms train without MuJoCo, too
             versions[package] = metadata.version(package)
-    return {"versions": versions, "commit": commit(), "platform": platform.platform()}
+    return {
+        "versions": versions,
+        "commit": commit(),
+        "platform": platform.platform(),
+        "processor": processor(),
+    }
+
+
+def merit(
+    episodes: np.ndarray, keys: Sequence[str], limits: Sequence[float | None], cut: bool = False
+) -> dict[str, Any]:
+    """
+    What a result says of the episodes of the last epoch, see :meth:`Epochs.result`.
+
+    :param episodes: return, cost, length, and what each of the m limits bounds, [E, 3 + m]
+    :param keys: of the m costs
+    :param limits: of the m costs; None: there is none
+    :param cut: a wrapper ended the episodes early, which leaves no verdict
+    :return: ``return``, ``cost``, ``length``, ``costs`` and the number of ``episodes``
+    """
+    means = episodes.mean(axis=0).tolist() if len(episodes) else [None] * (3 + len(keys))
+    costs = {}
+    for key, limit, mean, values in zip(keys, limits, means[3:], episodes.T[3:], strict=True):
+        interval = estimate(values)
+        cost: dict[str, Any] = {"mean": mean, "limit": limit}
+        if not np.isnan(interval.low):
+            cost |= {"low": interval.low, "high": interval.high}
+            if limit is not None and not cut:
+                cost["verdict"] = verdict(interval.low, interval.high, limit)
+        costs[key] = cost
+    measures = dict(zip(("return", "cost", "length"), means, strict=False))
+    return {**measures, "costs": costs, "episodes": len(episodes)}
 
 
 class Epochs(BaseCallback):
@@ -122,9 +171,11 @@ class Epochs(BaseCallback):
 
     def _describe(self) -> None:
         if self.show and len(self.last):
-            earned, cost = self.last[:, :2].mean(axis=0)
+            earned, cost, _, *means = self.last.mean(axis=0).tolist()
+            rows = zip(self._keys, means, self._limits, strict=True)
+            costs = {key: {"mean": mean, "limit": limit} for key, mean, limit in rows}
             self.bar.set_postfix_str(
-                f"return {earned:.2f}, {cost_words({'cost': cost, 'costs': self._costs()})}, "
+                f"return {earned:.2f}, {cost_words({'cost': cost, 'costs': costs})}, "
                 f"rate {self._cost_rate():.4f}"
             )
 
@@ -140,25 +191,11 @@ class Epochs(BaseCallback):
         monitor = find_monitor(self.training_env)
         return monitor.total_cost / monitor.total_steps if monitor.total_steps else None
 
-    def _costs(self) -> dict[str, dict[str, Any]]:
-        """Mean of what its limit bounds, and limit, by cost key."""
+    @property
+    def _limits(self) -> list[float | None]:
         model: Any = self.model
         constrained = getattr(model, "constrained", False)
-        limits = model.final_cost_limits.tolist() if constrained else [None] * len(self._keys)
-        means = self.last[:, 3:].mean(axis=0).tolist() if len(self.last) else [None] * len(limits)
-        rows = zip(self._keys, means, limits, strict=True)
-        return {key: {"mean": mean, "limit": limit} for key, mean, limit in rows}
-
-    def _verdicts(self) -> dict[str, dict[str, Any]]:
-        """The same with the 95 % interval of the mean, and whether the limit is kept."""
-        costs = self._costs()
-        for cost, episodes in zip(costs.values(), self.last[:, 3:].T, strict=False):
-            interval = estimate(episodes)
-            if not np.isnan(interval.low):
-                cost |= {"low": interval.low, "high": interval.high}
-                if cost["limit"] is not None and not self.cut:
-                    cost["verdict"] = verdict(interval.low, interval.high, cost["limit"])
-        return costs
+        return model.final_cost_limits.tolist() if constrained else [None] * len(self._keys)
 
     def result(self) -> dict[str, Any]:
         """
@@ -178,17 +215,15 @@ class Epochs(BaseCallback):
             was made longer, since warm-up and schedules were those of shorter runs until then
         """
         monitor = find_monitor(self.training_env)
-        means = self.last[:, :3].mean(axis=0).tolist() if len(self.last) else [None] * 3
+        episodes = self.last if len(self.last) else np.zeros((0, 3 + len(self._keys)))
         constrained = getattr(self.model, "constrained", False)
         limit = limits_at(getattr(self.model, "cost_limit", None), 0.0) if constrained else None
         algorithm = type(self.model)
         return {
             "label": getattr(algorithm, "label", None),
             "family": getattr(algorithm, "family", None),
-            **dict(zip(("return", "cost", "length"), means, strict=True)),
-            "costs": self._verdicts(),
+            **merit(episodes, self._keys, self._limits, self.cut),
             "cost_rate": self._cost_rate(),
-            "episodes": len(self.last),
             "n_timesteps": self.model.num_timesteps,
             "physics_errors": monitor.physics_errors,
             "cost_limit": limit,

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from sb3_guard.checks import NumberError
+from sb3_guard.checks import ContractError, NumberError
 from sb3_guard.spelling import nearest
 
 RESAMPLES = 2000  # of a bootstrap
@@ -107,7 +107,7 @@ def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
     return Estimate(float(np.mean(values)), float(np.std(values)), *ends)
 
 
-def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ValueError:
+def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ContractError:
     """What to raise where a cost is not in ``info``.
 
     :param whose: what the message calls ``info``
@@ -115,7 +115,7 @@ def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ValueErro
     present = sorted(map(str, info))
     near = nearest(key, present)
     hint = "" if near is None else f" (nearest: {near!r})"
-    return ValueError(
+    return ContractError(
         f"{whose} has no cost key {key!r}; its keys are {present}{hint}. Name the right one, as "
         "with cost_keys=(...), or pass missing_cost='zero' if the key appears only when there is a "
         "cost; sb3_guard.common.adapters has wrappers for a cost that is elsewhere or has to be "
@@ -124,15 +124,19 @@ def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ValueErro
 
 
 def read_costs(
-    infos: Sequence[Mapping[str, Any]], keys: Sequence[str], zero_if_missing: bool = False
+    infos: Sequence[Mapping[str, Any]],
+    keys: Sequence[str],
+    zero_if_missing: bool = False,
+    lengths: Sequence[int] | np.ndarray = (),
 ) -> tuple[np.ndarray, bool]:
     """Costs of one step of every environment.
 
     :param infos: one dictionary per environment
     :param keys: the m entries that hold costs
     :param zero_if_missing: whether an absent entry means that nothing was charged
+    :param lengths: steps of the episodes under way before this one, for messages, shape (n_envs,)
     :return: costs, shape (n_envs, m), and whether any of the entries was there
-    :raises ValueError: an entry is missing and may not be
+    :raises ContractError: an entry is missing and may not be
     :raises NumberError: one is not a finite number
     """
     shape, seen = (len(infos), len(keys)), True
@@ -142,7 +146,7 @@ def read_costs(
         for i, info in enumerate(infos):
             for key in keys if not zero_if_missing else ():
                 if key not in info:
-                    raise missing(info, key, f"info of environment {i}") from None
+                    raise missing(info, key, f"info of {_row(i, lengths)}") from None
         rows = [[info.get(key, 0.0) for key in keys] for info in infos]
         seen = any(key in info for info in infos for key in keys)
     try:
@@ -150,10 +154,16 @@ def read_costs(
     except ValueError:  # of several shapes
         costs = np.array(None)
     if costs.dtype.kind not in "biuf" or not np.isfinite(costs).all():
-        places = [f"info[{key!r}] of environment {i}" for i in range(len(infos)) for key in keys]
+        rows_of = range(len(infos))
+        places = [f"info[{key!r}] of {_row(i, lengths)}" for i in rows_of for key in keys]
         values = itertools.chain(*rows)
         costs = np.array([*map(number, values, places)]).reshape(shape)
     return costs.astype(np.float64), seen
+
+
+def _row(i: int, lengths: Sequence[int] | np.ndarray) -> str:
+    step = f" in step {lengths[i] + 1} of its episode" if len(lengths) else ""
+    return f"environment {i}{step}"
 
 
 class EpisodeCost(NamedTuple):

@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.limits import limits_at
+from sb3_guard.checked_env import refuse_vector_env
 from sb3_guard.common.evaluation import (
     Evaluation,
     evaluate_policy,
@@ -53,6 +54,11 @@ def selection_limits(
             f"keys {cost_keys}"
         )
     return np.broadcast_to(limits, (m,))
+
+
+def _mean(values: np.ndarray) -> Any:
+    """Mean over episodes; NaN where none has ended."""
+    return (values.mean(axis=0) if len(values) else np.full(values.shape[1:], np.nan)).tolist()
 
 
 class LogCosts(BaseCallback):
@@ -136,6 +142,7 @@ class CostEvalCallback(EvalCallback):
         deterministic: bool | None = None,
         verbose: int = 1,
     ):
+        refuse_vector_env(eval_env)
         super().__init__(
             eval_env,
             callback_on_new_best=callback_on_new_best,
@@ -194,6 +201,8 @@ class CostEvalCallback(EvalCallback):
 
         :param evaluations: of one model; the return of the first counts, the costs of all
         """
+        if not all(map(len, evaluations)):  # no episode has ended
+            return (False, -np.inf)
         violation = 0.0
         for evaluation in evaluations:
             costs, n = evaluation.limited, len(evaluation)
@@ -228,17 +237,17 @@ class CostEvalCallback(EvalCallback):
         evaluation = self.evaluate(self.deterministic)
         noisy = [self.evaluate(False)] if self.both else []
         for other in noisy:
-            self.logger.record("eval/stochastic_reward", float(other.returns.mean()))
+            self.logger.record("eval/stochastic_reward", _mean(other.returns))
             self._log_costs("eval/stochastic_ep_cost", other)
-        self.last_mean_reward = float(evaluation.returns.mean())
-        self.last_mean_cost = float(evaluation.costs.mean())
+        self.last_mean_reward = _mean(evaluation.returns)
+        self.last_mean_cost = _mean(evaluation.costs)
 
         self.evaluations_timesteps.append(self.num_timesteps)
-        self.evaluations_results.append(evaluation.returns.tolist())
-        self.evaluations_length.append(evaluation.lengths.tolist())
-        self.evaluations_costs.append(evaluation.costs.tolist())
+        self.evaluations_results.append(self._row(evaluation.returns))
+        self.evaluations_length.append(self._row(evaluation.lengths))
+        self.evaluations_costs.append(self._row(evaluation.costs))
         if len(self.cost_keys) > 1:
-            self.evaluations_key_costs.append(evaluation.key_costs.tolist())
+            self.evaluations_key_costs.append(self._row(evaluation.key_costs))
         if len(evaluation.successes):
             self.evaluations_successes.append(evaluation.successes.tolist())
         self.write_history()
@@ -268,19 +277,24 @@ class CostEvalCallback(EvalCallback):
             proceed = proceed and self._on_event()
         return proceed
 
+    def _row(self, values: np.ndarray) -> list[Any]:
+        """A value of each episode, NaN of those that were given up."""
+        absent = np.full((self.n_eval_episodes - len(values), *values.shape[1:]), np.nan)
+        return (np.concatenate([values, absent]) if len(absent) else values).tolist()
+
     def _log_costs(self, name: str, evaluation: Evaluation) -> None:
         """The mean of the costs' sum and, where there are several, of each."""
-        self.logger.record(name, float(evaluation.costs.mean()))
+        self.logger.record(name, _mean(evaluation.costs))
         if len(self.cost_keys) > 1:
-            for key, cost in zip(self.cost_keys, evaluation.key_costs.mean(axis=0), strict=True):
-                self.logger.record(f"{name}/{key}", float(cost))
+            for key, cost in zip(self.cost_keys, _mean(evaluation.key_costs), strict=True):
+                self.logger.record(f"{name}/{key}", cost)
 
     def _log(self, evaluation: Evaluation) -> None:
         self.logger.record("eval/mean_reward", self.last_mean_reward)
-        self.logger.record("eval/mean_ep_length", float(evaluation.lengths.mean()))
+        self.logger.record("eval/mean_ep_length", _mean(evaluation.lengths))
         self._log_costs("eval/mean_ep_cost", evaluation)
         if evaluation.limit_on == "max":
-            self.logger.record("eval/mean_max_cost", float(evaluation.worst.mean()))
+            self.logger.record("eval/mean_max_cost", _mean(evaluation.worst))
         if len(evaluation.successes):
             self.logger.record("eval/success_rate", float(evaluation.successes.mean()))
         # Written at once, so that the row bears the step of the evaluation.

@@ -1,15 +1,17 @@
 """How good and how safe a policy is: returns and costs of episodes, with their uncertainty."""
 
 import copy
+import inspect
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import PolicyPredictor
@@ -17,17 +19,19 @@ from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecEnv,
     VecMonitor,
+    VecNormalize,
     is_vecenv_wrapped,
     unwrap_vec_normalize,
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.loading import lacks_statistics
-from sb3_guard.checks import check_cost_keys
+from sb3_guard.checked_env import checked
+from sb3_guard.checks import NumberError, check_cost_keys, is_number
 from sb3_guard.common.monitor import cost_keys_of, total_cost
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, Estimate, estimate, read_costs
 
-LONG_EPISODE = 20_000  # steps after which evaluate_policy warns that an episode may never end
+LONGEST = 20_000  # steps of an episode that nothing ends, after which it is given up
 
 
 def bounded_name(key: str, limit_on: str) -> str:
@@ -46,8 +50,8 @@ class Evaluation:
     :param lengths: steps of each episode, shape [E]
     :param key_costs: episode cost of each of the cost keys asked for, shape [E, m]
     :param successes: ``info["is_success"]`` at the end of the episodes that report one
-    :param unfinished: return, cost and steps of the episodes that ``max_steps`` cut short,
-        shape [K, 3]; they are in none of the others
+    :param unfinished: return, cost and steps of the episodes that ``max_steps`` cut short or that
+        were given up, shape [K, 3]; they are in none of the others
     :param max_costs: highest cost of a step, by key, shape [E, m]; 0 where none is above it
     :param limit_on: what of the costs the model's limits bound, their ``"sum"`` or ``"max"``
     :param limits: the model's limits, one for each cost key; empty if it has none
@@ -119,6 +123,70 @@ def sync_normalization(env: VecEnv, eval_env: VecEnv) -> None:
     for name in ("obs_rms", "ret_rms"):
         if hasattr(training, name):
             setattr(evaluation, name, copy.deepcopy(getattr(training, name)))
+
+
+def check_agent(model: Any, env: VecEnv) -> None:
+    """
+    Refuse what can't be played: every place that plays or exports an agent asks here.
+
+    :param model: an algorithm or a policy
+    :param env: environments to play it in
+    :raises NumberError: a weight is not finite
+    :raises ValueError: the statistics of observations do not fit, see :func:`check_normalizer`
+    """
+    policy = getattr(model, "policy", model)
+    if isinstance(policy, th.nn.Module):
+        for name, weights in policy.state_dict().items():
+            if not th.isfinite(weights).all():
+                raise NumberError(
+                    f"the agent can't act: its weights {name!r} are not finite; take an earlier "
+                    "model, or train it again with a lower learning_rate"
+                )
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is not None:
+        check_normalizer(normalizer, normalizer.venv.observation_space)
+
+
+def check_normalizer(normalizer: Any, space: spaces.Space) -> None:
+    """
+    Refuse statistics of observations that belong to others, or are none.
+
+    :param normalizer: what ``vecnormalize.pkl`` has
+    :param space: of the observations
+    :raises ValueError: it is no VecNormalize, or the means and variances of its observations have
+        another shape or are not numbers
+    """
+    if not isinstance(normalizer, VecNormalize):
+        raise ValueError(
+            f"observation statistics are a {type(normalizer).__name__}, no VecNormalize"
+        )
+    if not normalizer.norm_obs:
+        return
+    statistics: Any = getattr(normalizer, "obs_rms", None)
+    shapes: dict[Any, Any] = {None: space.shape}
+    if isinstance(space, spaces.Dict):
+        shapes = {key: space[key].shape for key in normalizer.norm_obs_keys or () if key in space}
+    else:
+        statistics = {None: statistics}
+    if not isinstance(statistics, dict) or statistics.keys() != shapes.keys():
+        raise ValueError(f"observation statistics are those of other observations than {space}")
+    for key, shape in shapes.items():
+        for name in ("mean", "var"):
+            values = getattr(statistics[key], name, None)
+            if not isinstance(values, np.ndarray) or values.dtype.kind != "f":
+                fault = f"is {values!r}, no array of numbers"
+            elif values.shape != shape:
+                fault = f"has shape {values.shape}, and the observations have {shape}"
+            elif not np.isfinite(values).all() or (name == "var" and (values < 0.0).any()):
+                fault = "has numbers that are not finite, or variances below 0"
+            else:
+                continue
+            of = "" if key is None else f" of {key!r}"
+            raise ValueError(f"observation statistics do not fit: their {name}{of} {fault}")
+    for name in ("clip_obs", "epsilon"):
+        value: Any = getattr(normalizer, name, None)
+        if not (is_number(value) and float(value) > 0.0):
+            raise ValueError(f"observation statistics do not fit: {name} is {value!r}, not above 0")
 
 
 def share_environment(one: VecEnv, other: VecEnv) -> bool:
@@ -195,7 +263,8 @@ def evaluate_policy(
 
     A policy that corrects its actions by the cost of the last step has a true attribute
     ``acts_on_cost`` and is given these costs, shape [n_envs, m], zeros at the start of an
-    episode, as ``predict(..., state=(costs,))``.
+    episode, as ``predict(..., state=(costs,))``. One whose ``predict`` takes ``action_masks``, as
+    sb3-contrib's MaskablePPO, is given those of environments that have the method.
 
     A model's own training environment will do: if ``learn`` is called again, it begins new
     episodes. In a callback, which runs during ``learn``, evaluate in another environment. The
@@ -203,7 +272,9 @@ def evaluate_policy(
 
     :param model: anything with ``predict``: an algorithm or a policy
     :param env: a single or a vectorised environment; it is reset first
-    :param n_eval_episodes: number of episodes
+    :param n_eval_episodes: number of episodes. One that has not ended after 20,000 steps, or the
+        environment's own limit if that is higher, is given up with a warning, as are those that
+        were to follow it
     :param deterministic: take the most likely action instead of sampling
     :param seed: seed of the episodes and of sampled actions. With the same seed, the same policy
         has the same evaluation, and training is not affected; None: continue from where the
@@ -221,9 +292,13 @@ def evaluate_policy(
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
     if not isinstance(env, VecEnv):
-        lone = env
+        lone = checked(env)
         env = DummyVecEnv([lambda: lone])
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
+    checked(env, keys)
+    check_agent(model, env)
+    masked = "action_masks" in inspect.signature(model.predict).parameters
+    masked = masked and env.has_attr("action_masks")
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
@@ -238,6 +313,7 @@ def evaluate_policy(
         model.begin_anew |= share_environment(model.env, env)
 
     tally = _Tally(env, n_eval_episodes, keys, on_episode)
+    longest = _longest_episode(env) if max_steps is None else None
     with _constant_normalization(model, env), _own_random_numbers(seed):
         if seed is not None:
             env.seed(seed)
@@ -252,20 +328,40 @@ def evaluate_policy(
                 state=(last_costs,) if acts_on_cost else state,
                 episode_start=starts,
                 deterministic=deterministic,
+                **({"action_masks": np.stack(env.env_method("action_masks"))} if masked else {}),
             )
             observations, rewards, starts, infos = env.step(actions)
             steps += 1
-            last_costs, seen = read_costs(infos, keys, zero_if_missing)
+            last_costs, seen = read_costs(infos, keys, zero_if_missing, tally.costs.lengths)
             if on_step is not None:
                 on_step()
             tally.step(rewards, last_costs, starts, infos, seen)
             last_costs[np.flatnonzero(starts)] = 0.0
+            if longest is not None:
+                tally.give_up(longest)
+    if len(tally.ended) < n_eval_episodes and longest is not None:
+        warnings.warn(
+            f"{n_eval_episodes - len(tally.ended)} of {n_eval_episodes} episodes are left out: one "
+            f"had not ended after {longest:,} steps; limit their length, with "
+            "gymnasium.wrappers.TimeLimit(env, 1000) or, in commands, --env-kwargs "
+            "max_episode_steps:1000",
+            stacklevel=2,
+        )
     return tally.evaluation(
         limit_on=getattr(model, "limit_on", "sum"),
         limits=tuple(model.final_cost_limits.tolist())
         if isinstance(model, Constrained) and model.constrained and keys == tuple(model.cost_keys)
         else (),
     )
+
+
+def _longest_episode(env: VecEnv) -> int:
+    """Steps after which an episode is given up."""
+    limits: list[Any] = []
+    for name in ("_max_episode_steps", "max_episode_steps"):  # of TimeLimit, and of our batches
+        with suppress(NotImplementedError):  # a vectorised environment need not tell
+            limits += env.get_attr(name) if env.has_attr(name) else []
+    return max([LONGEST, *(int(limit) for limit in limits if is_number(limit))])
 
 
 class _Tally:
@@ -289,6 +385,7 @@ class _Tally:
         self.returns = np.zeros(n)
         self.costs = EpisodeCosts(n, len(keys) + 1)  # each of the keys, then all costs
         self.ended: list[tuple[float, int, EpisodeCost]] = []  # return, steps, costs
+        self.unfinished: list[np.ndarray] = []
         self.successes: list[bool] = []
         self.reported = False  # whether any step reported a cost
         self.alike: set[str] = set()  # other entries of infos, until then, that may be costs
@@ -315,12 +412,18 @@ class _Tally:
             over[i] = self._is_over(infos[i])
         for cost in self.costs.step(np.hstack([costs, totals]), over):
             self._end(cost, infos[cost.row])
-        if (self.costs.lengths[self.left > 0] == LONG_EPISODE).any():
-            warnings.warn(
-                f"an episode has not ended in {LONG_EPISODE:,} steps; if it may never end, limit "
-                "its length: gymnasium.wrappers.TimeLimit(env, 1000)",
-                stacklevel=3,
-            )
+
+    def give_up(self, longest: int) -> None:
+        """Wait no longer for the end of episodes that have so many steps."""
+        rows = (self.left > 0) & (self.costs.lengths >= longest)
+        if rows.any():
+            self.unfinished.append(self._under_way(rows))
+            self.left[rows] = 0
+
+    def _under_way(self, rows: np.ndarray) -> np.ndarray:
+        """Return, cost and steps so far of some rows, shape [K, 3]."""
+        lengths = self.costs.lengths
+        return np.stack([self.returns, self.costs.totals[:, -1], lengths], axis=1)[rows]
 
     def _is_over(self, info: dict[str, Any]) -> bool:
         """Whether an episode that a step ended has come to its true end.
@@ -358,15 +461,14 @@ class _Tally:
                 stacklevel=3,
             )
         shape = len(self.ended), len(self.keys)
-        lengths = self.costs.lengths
-        under_way = np.stack([self.returns, self.costs.totals[:, -1], lengths], axis=1)
+        left = self._under_way((self.left > 0) & (self.costs.lengths > 0))
         return Evaluation(
             returns=np.array([earned for earned, _, _ in self.ended]),
             costs=np.array([cost.total[-1] for _, _, cost in self.ended]),
             lengths=np.array([steps for _, steps, _ in self.ended], dtype=np.int64),
             key_costs=np.array([cost.total[:-1] for _, _, cost in self.ended]).reshape(shape),
             successes=np.array(self.successes, dtype=bool),
-            unfinished=under_way[(self.left > 0) & (lengths > 0)],
+            unfinished=np.concatenate([*self.unfinished, left]),
             max_costs=np.array([cost.highest[:-1] for _, _, cost in self.ended]).reshape(shape),
             limit_on=limit_on,
             limits=limits,

@@ -12,6 +12,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_guard.checked_env import checked
 from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.vec_budgets import end_rows
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, number, read_costs
@@ -62,8 +63,8 @@ class CostMonitor(VecMonitor):
         info_keywords: tuple[str, ...] = (),
         cost_keys: Sequence[str] = ("cost",),
     ):
-        super().__init__(venv, info_keywords=tuple(info_keywords))
         self.cost_keys = check_cost_keys(cost_keys)
+        super().__init__(checked(venv, self.cost_keys), info_keywords=tuple(info_keywords))
         self._columns = (
             [f"c_{key}" for key in self.cost_keys] if self.cost_keys != ("cost",) else []
         )
@@ -112,7 +113,7 @@ class CostMonitor(VecMonitor):
         totals = [total_cost(info, self.cost_keys) for info in infos]
         costs = np.array(totals, np.float64)[:, None]
         if self._columns:
-            keys, _ = read_costs(infos, self.cost_keys, zero_if_missing=True)
+            keys, _ = read_costs(infos, self.cost_keys, True, self.episodes.lengths)
             costs = np.hstack([costs, keys])
         self.episode_returns += rewards
         self.total_cost += sum(totals)

@@ -14,6 +14,8 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
+from sb3_guard.checked_env import checked, refuse_vector_env
+from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.common.sources import Source, find
 from sb3_guard.spelling import did_you_mean
@@ -69,6 +71,12 @@ def make_vec_env(
         kwargs["render_mode"] = render_mode
     if max_episode_steps is not None:
         kwargs["max_episode_steps"] = max_episode_steps
+    refuse_vector_env(env_id)
+    if isinstance(env_id, gymnasium.Env | VecEnv):
+        raise TypeError(
+            f"{type(env_id).__name__} is one environment, made already: give its class, or a "
+            f"function that makes another one, as make_vec_env({type(env_id).__name__}, n_envs=4)"
+        )
     source = env_id if isinstance(env_id, Source) else find(env_id)
     batched = source.batch is not None and wrapper_class is None
     vec_env = vec_env or ("native" if batched else "dummy")
@@ -86,10 +94,11 @@ def make_vec_env(
             )
         venv = source.batch(n_envs, num_threads=num_threads, **kwargs)
     elif vec_env in VEC_ENVS:
+        keys = check_cost_keys((monitor_kwargs or {}).get("cost_keys", ("cost",)))
 
         def make_one() -> gymnasium.Env:
             env = source.make(**kwargs)
-            return env if wrapper_class is None else wrapper_class(env)
+            return checked(env if wrapper_class is None else wrapper_class(env), keys)
 
         venv = VEC_ENVS[vec_env]([make_one] * int(n_envs))
     else:

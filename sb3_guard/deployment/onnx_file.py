@@ -18,6 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.loading import lacks_statistics
+from sb3_guard.common.evaluation import check_agent
 from sb3_guard.common.files import replacing
 from sb3_guard.deployment.contract import contract
 from sb3_guard.deployment.deployed import Deployed
@@ -75,6 +76,7 @@ def export(
             "the agent has no environment, or one without its observation statistics: pass env=, "
             "environments wrapped as in training (with VecNormalize.load(file, env), if it had any)"
         )
+    check_agent(model, env)
     deployed = Deployed(model, env, sampled)
     file = _converted(deployed)
     share, largest = _parity(deployed, file, model)

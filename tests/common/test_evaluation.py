@@ -13,7 +13,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_guard.algorithms import CPO, TRPOSL
 from sb3_guard.common.evaluation import (
-    LONG_EPISODE,
     Evaluation,
     evaluate_policy,
     sync_normalization,
@@ -88,14 +87,6 @@ def test_stops_after_max_steps():
     result = evaluate_policy(Idle(), fixed(2, 5), n_eval_episodes=100, max_steps=4)
     assert result.lengths.tolist() == [2, 2]
     assert result.unfinished[:, [0, 2]].tolist() == [[4.0, 4.0]]  # return and steps of the other
-
-
-def test_episodes_without_an_end_are_told(recwarn):
-    evaluate_policy(Idle(), Fixed(LONG_EPISODE), n_eval_episodes=1)
-    evaluate_policy(Idle(), fixed(-1, 1), n_eval_episodes=1)  # nobody waits for the first
-    assert not recwarn
-    with pytest.warns(UserWarning, match="episode has not ended in 20,000 steps.*TimeLimit"):
-        evaluate_policy(Idle(), fixed(3, -1), n_eval_episodes=2, max_steps=LONG_EPISODE)
 
 
 def test_costs_that_no_step_reports_are_told(recwarn):

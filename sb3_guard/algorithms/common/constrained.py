@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import (
     EventCallback,
 )
 from stable_baselines3.common.type_aliases import MaybeCallback
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_guard.algorithms.common.arguments import (
     check_names,
@@ -35,6 +35,7 @@ from sb3_guard.algorithms.common.arguments import (
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.limits import CostLimits
 from sb3_guard.algorithms.common.loading import LoadsOthers, name_of
+from sb3_guard.checked_env import checked
 from sb3_guard.checks import check_cost_keys, is_number
 from sb3_guard.costs import EpisodeCosts, read_costs
 
@@ -159,6 +160,10 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
 
+    @staticmethod
+    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return BaseAlgorithm._wrap_env(checked(env), verbose, monitor_wrapper)
+
     def _choose_buffer(self) -> None:
         """Say which buffer SB3 is to make, and what it has to know of the costs."""
 
@@ -211,6 +216,7 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
         n_costs = len(self.cost_keys)
+        checked(self.env, self.cost_keys)
         normalizer = self.get_vec_normalize_env()
         self.learnt_normalized = normalizer is not None and normalizer.norm_obs
         if self.ep_cost_buffer is None or reset_num_timesteps:
@@ -249,7 +255,8 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         assert dones is not None
         # A vectorised environment without anything to say may leave infos out.
         infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
-        costs, seen = read_costs(infos, self.cost_keys, self.missing_cost == "zero")
+        zero = self.missing_cost == "zero"
+        costs, seen = read_costs(infos, self.cost_keys, zero, self.episodes.lengths)
         for episode in self.episodes.step(costs, dones):
             self._ended_costs.append(episode.bounded)
             self._ended_lengths.append(episode.length)

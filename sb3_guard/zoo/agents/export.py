@@ -13,6 +13,7 @@ from sb3_guard.zoo.agents.flags import AgentFlags, ExportFlags
 from sb3_guard.zoo.agents.playback import BATCH, Agent, means, open_agent, summary
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.folder import require_writable
+from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
 
 
 def export(flags: ExportFlags) -> int:
@@ -27,7 +28,8 @@ def export(flags: ExportFlags) -> int:
             onnx_file.check(agent.model, flags.stochastic, path)
         how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
         episodes = flags.n_episodes or max(agent.env.num_envs, 5)
-        evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
+        with explained(f"can't play {agent.path}", *BAD_NUMBERS):
+            evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
         contract = write(agent, flags, path, summary(evaluation))
     print(f"{path}: {', '.join(contract['file']['operators'])}")
     print(f"{path.with_name(onnx_file.CONTRACT)} describes input and output")

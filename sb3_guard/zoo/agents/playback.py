@@ -12,7 +12,6 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_guard.checks import WorldError
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.costs import LEAST_EPISODES, Estimate
@@ -26,7 +25,7 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_writable
 from sb3_guard.zoo.run.hyperparams import build, check
-from sb3_guard.zoo.run.make_envs import full_id, make_envs, source_of
+from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, full_id, make_envs, source_of
 
 BATCH = 30  # episodes at once: as many as tell whether a limit is kept
 VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
@@ -201,7 +200,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     stage: AbstractContextManager[VecEnv] = nullcontext(agent.env)
     if video is not None:
         stage = filming(agent.env, agent.model, video, bar=flags.verbose > 0)
-    with closing(agent.env), explained(f"can't play {agent.env_id}", WorldError), stage as env:
+    with closing(agent.env), explained(f"can't play {agent.path}", *BAD_NUMBERS), stage as env:
         evaluation = evaluate_policy(
             agent.model,
             env,

@@ -9,7 +9,8 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
-from sb3_guard.checks import WorldError
+from sb3_guard.checks import ContractError, WorldError
+from sb3_guard.common.evaluation import check_normalizer
 from sb3_guard.common.sources import Source, find
 from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, interrupts_ignored
@@ -17,7 +18,7 @@ from sb3_guard.zoo.run.hyperparams import Setup
 from sb3_guard.zoo.run.resumable import ResumableEnv
 
 # What ends a training in a line: the message says all that a traceback would, and the remedy.
-BAD_NUMBERS = (FloatingPointError, WorldError)
+BAD_NUMBERS = (FloatingPointError, WorldError, ContractError)
 # What constructors of environments and models raise when their arguments are wrong.
 BAD_ARGUMENTS = (
     ValueError, TypeError, AssertionError, KeyError, ImportError, gym.error.Error, WorldError
@@ -163,6 +164,7 @@ def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: VecNormalize 
     for cls, arguments in _wrappers(setup.vec_env_wrapper, evaluation):
         env = cls(env, **arguments)
     if normalizer is not None:
+        check_normalizer(normalizer, env.observation_space)
         normalizer.set_venv(env)
         env = normalizer
     elif setup.normalize is not None:

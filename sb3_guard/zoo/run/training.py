@@ -232,9 +232,9 @@ class Training:
                     episodes,
                     deterministic=name == "greedy",
                     seed=evaluation_seed(self.flags.seed, 1),
-                    # Nothing says that an episode of the greedy policy ends.
-                    max_steps=self.model.num_timesteps // env.num_envs,
                 )
+                if not len(played):  # no episode of the greedy policy ends
+                    continue
                 final[name] = {
                     "returns": _rounded(played.returns),
                     "costs": _rounded(played.costs),

@@ -1,0 +1,361 @@
+"""Environments that break their contract, lose costs or never end, and agents that can't act."""
+
+import copy
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from cost_envs import CostPoint
+from gymnasium import spaces
+from gymnasium.wrappers import MaxAndSkipObservation, TimeLimit
+from sb3_contrib import MaskablePPO, RecurrentPPO
+from stable_baselines3 import PPO
+from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_guard import CPO, CostEvalCallback, evaluate_policy, make_vec_env
+from sb3_guard.common import evaluation
+from sb3_guard.common.budgets import RemainingBudget
+from sb3_guard.common.callbacks import LogCosts
+from sb3_guard.common.monitor import CostMonitor
+
+SMALL: dict[str, Any] = {"n_steps": 20, "n_critic_updates": 1, "cost_limit": 5.0, "seed": 0}
+
+
+class Late(gym.Env):
+    """Every step costs 1; from the seventh on, what it returns is wrong.
+
+    :param fault: entries of a step that replace the right ones, by their number
+    """
+
+    def __init__(self, fault: dict[int, Any] | None = None, length: int | None = 40) -> None:
+        self.observation_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
+        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.fault, self.length, self.steps = fault or {}, length, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        over = self.steps == self.length
+        values = [np.zeros(3, np.float32), 1.0, False, over, {"cost": 1.0}]
+        if self.steps >= 7:
+            for i, value in self.fault.items():
+                values[i] = value
+        return tuple(values[: self.fault.get(-1, 5)]) if self.steps >= 7 else tuple(values)
+
+
+class Still:
+    """A policy that does nothing."""
+
+    missing_cost = "zero"
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.zeros((len(observation), 1), np.float32), state
+
+
+FAULTS = {
+    "no cost": ({4: {}}, "no cost key 'cost'"),
+    "shape": ({0: np.zeros((1, 3), np.float32)}, r"shape \(1, 3\)"),
+    "word": ({0: "left"}, "'left'"),
+    "rows": ({0: [[1.0], [1.0, 2.0]]}, "observation is"),
+    "truncated": ({3: "no"}, "truncated is 'no'"),
+    "terminated": ({2: None}, "terminated is None"),
+    "reward": ({1: "much"}, "reward is 'much'"),
+    "rewards": ({1: np.ones(1)}, r"reward is array\(\[1.\]\)"),
+    "info": ({4: None}, "5 values"),
+    "four values": ({-1: 4}, "4 values"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *((name, "evaluation") for name in FAULTS),
+        *(("truncated", kind) for kind in ("evaluation of many", "make_vec_env", "algorithm")),
+        *((name, "algorithm") for name in ("no cost", "four values")),
+    ],
+)
+def test_what_breaks_the_contract_later_than_at_the_first_step_is_a_line(name, kind):
+    fault, message = FAULTS[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        if kind == "algorithm":
+            CPO("MlpPolicy", Late(fault), **SMALL).learn(40)
+        elif kind == "make_vec_env":
+            CPO("MlpPolicy", make_vec_env(Late, 2, env_kwargs={"fault": fault}), **SMALL).learn(80)
+        else:
+            env = Late(fault)
+            still = Still()
+            still.missing_cost = "error"  # as the algorithms
+            evaluate_policy(still, env if kind == "evaluation" else DummyVecEnv([lambda: env]))
+    assert "step 7 of" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("space", "good", "bad"),
+    [
+        (spaces.Discrete(3), 2, 3),
+        (spaces.MultiBinary(3), np.ones(3, np.int8), np.ones(4, np.int8)),
+        (spaces.Dict({"a": spaces.Discrete(3)}), {"a": 1}, {"b": 1}),
+        (spaces.Dict({"a": spaces.Discrete(3)}), {"a": 1}, 1),
+        (spaces.Box(0, 255, (2, 2), np.uint8), [[1, 2], [3, 4]], [1, 2]),
+    ],
+)
+def test_observations_of_every_kind_of_space(space, good, bad):
+    env = Late({0: bad})
+    env.observation_space = space
+    step, reset = env.step, env.reset
+    env.reset = lambda **kwargs: (good, reset(**kwargs)[1])  # type: ignore[method-assign]
+
+    def stepped(action):
+        obs, *rest = step(action)
+        return obs if env.steps >= 7 else good, *rest
+
+    env.step = stepped  # type: ignore[method-assign]
+    watched = make_vec_env(lambda: env)
+    watched.reset()
+    with pytest.raises(ValueError, match="step 7 of an episode: the observation"):
+        for _ in range(7):
+            watched.step(np.zeros((1, 1)))
+
+
+def test_right_environments_are_let_through_and_reached():
+    """Numbers of every kind pass, and what is asked for or set is the environment's."""
+    kinds = {1: np.array(1.0), 2: np.bool_(False), 3: np.array(False), 4: {"cost": np.int64(1)}}
+    env = make_vec_env(Late, 2, env_kwargs={"fault": kinds, "length": 9})
+    env.set_attr("length", 8)
+    assert [lone.length for lone in env.unwrapped.envs] == env.get_attr("length") == [8, 8]
+    assert copy.deepcopy(env.unwrapped.envs[0]).length == 8
+    env.set_attr("fault", {**kinds, 3: np.array(True)})
+    assert evaluate_policy(Still(), env, 2).lengths.tolist() == [7, 7]
+
+
+# Repeated steps
+
+
+class Twice(gym.Wrapper):
+    """A user's own: rewards add up, and costs if he thought of them."""
+
+    def __init__(self, env, adds_up=False):
+        super().__init__(env)
+        self.adds_up = adds_up
+
+    def step(self, action):
+        first = self.env.step(action)
+        obs, reward, *ends, info = self.env.step(action)
+        if self.adds_up:
+            info = {**info, "cost": info["cost"] + first[4]["cost"]}
+        return obs, reward + first[1], *ends, info
+
+
+LOSING = {
+    "Gymnasium's": lambda env: MaxAndSkipObservation(env, 4),
+    "RepeatAction": lambda env: gym.wrappers.RepeatAction(env, 2),
+    "SB3's": lambda env: MaxAndSkipEnv(env, 4),
+    "a user's": Twice,
+    "inside others": lambda env: TimeLimit(Twice(TimeLimit(env, 30)), 10),
+    "a budget outside": lambda env: RemainingBudget(Twice(env), 100.0),
+    "twice": lambda env: Twice(Twice(env), adds_up=True),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *((name, "evaluate") for name in LOSING),
+        *(("Gymnasium's", kind) for kind in ("learn", "DummyVecEnv", "CostMonitor")),
+    ],
+)
+def test_costs_of_repeated_steps_are_not_lost(name, kind):
+    env = LOSING[name](Late())
+    with pytest.raises(ValueError, match=r"info\['cost'\] is 1, but .* took . steps, which cost"):
+        if kind == "learn":
+            CPO("MlpPolicy", env, **SMALL).learn(20)
+        elif kind == "CostMonitor":
+            watched = make_vec_env(Late, wrapper_class=LOSING[name])
+            watched.reset()
+            watched.step(np.zeros((1, 1)))
+        else:
+            evaluate_policy(Still(), env if kind == "evaluate" else DummyVecEnv([lambda: env]), 1)
+
+
+@pytest.mark.parametrize("wrap", [lambda env: Twice(env, adds_up=True), lambda env: env])
+def test_costs_that_add_up_are_right(wrap):
+    seen = evaluate_policy(Still(), wrap(Late()), 2)
+    assert seen.returns.tolist() == seen.costs.tolist() == [40.0, 40.0]
+
+
+# Episodes without an end
+
+
+def endless(*lengths: int | None) -> DummyVecEnv:
+    return DummyVecEnv([lambda length=length: Late(length=length) for length in lengths])
+
+
+def test_an_episode_without_an_end_is_given_up_and_those_that_ended_count():
+    with pytest.warns(UserWarning, match="3 of 6 episodes .* 20,000 steps; .*max_episode_steps"):
+        seen = evaluate_policy(Still(), endless(5, None), 6)
+    assert seen.lengths.tolist() == [5, 5, 5]
+    assert seen.unfinished.tolist() == [[20_000.0, 20_000.0, 20_000.0]]
+
+
+def test_an_environment_may_say_that_its_episodes_are_longer(recwarn):
+    env = TimeLimit(Late(length=None), 20_010)
+    assert evaluate_policy(Still(), env, 1).lengths.tolist() == [20_010]
+    assert not recwarn
+
+
+def test_the_best_model_is_chosen_by_the_episodes_that_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "LONGEST", 60)
+    model = CPO("MlpPolicy", Late(), **{**SMALL, "cost_limit": 50.0})
+    watcher = CostEvalCallback(
+        endless(5, None), eval_freq=20, n_eval_episodes=2, deterministic=True, log_path=tmp_path,
+        verbose=0,
+    )  # fmt: skip
+    with pytest.warns(UserWarning, match="1 of 2 episodes are left out"):
+        model.learn(20, callback=watcher)
+    assert watcher.best_score == (True, 5.0)
+    np.testing.assert_array_equal(np.load(tmp_path / "evaluations.npz")["results"], [[5, np.nan]])
+
+
+def test_where_no_episode_ends_no_model_is_the_best(monkeypatch):
+    monkeypatch.setattr(evaluation, "LONGEST", 60)
+    model = CPO("MlpPolicy", Late(), **SMALL)
+    watcher = CostEvalCallback(endless(None), eval_freq=20, n_eval_episodes=1, verbose=0)
+    with pytest.warns(UserWarning, match="1 of 1 episodes are left out"):
+        model.learn(20, callback=watcher)
+    assert watcher.best_score == (False, -np.inf)
+
+
+# What is no environment of Stable-Baselines3
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda env: CPO("MlpPolicy", env, **SMALL),
+        make_vec_env,
+        CostEvalCallback,
+        lambda env: evaluate_policy(Still(), env),
+        CostMonitor,
+    ],
+)
+@pytest.mark.parametrize("name", ["CartPole-v1", "Goal_Point_8Hazards-v0"])
+def test_vector_environments_of_gymnasium_are_refused_with_what_to_do(use, name):
+    env = gym.make_vec(name, num_envs=2)
+    with pytest.raises(TypeError, match=rf"vector environment of Gymnasium.*make_vec_env\('{name}"):
+        use(env)
+    env.close()
+
+
+@pytest.mark.parametrize("env", [Late(), TimeLimit(Late(), 5), endless(5)])
+def test_an_environment_that_is_made_already(env):
+    with pytest.raises(TypeError, match="give its class"):
+        make_vec_env(env, 4)
+
+
+# What an agent needs beside the observation
+
+
+class Masked(gym.Env):
+    """Only the first action is allowed; another one costs 1. A step observes nothing."""
+
+    def __init__(self) -> None:
+        self.observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.action_space, self.steps = spaces.Discrete(4), 0
+
+    def action_masks(self) -> np.ndarray:
+        return np.array([True, False, False, False])
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(2, np.float32), 1.0, False, self.steps == 10, {"cost": float(action > 0)}
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_masks_reach_the_agent_in_evaluations_and_the_best_models(n_envs):
+    model = MaskablePPO("MlpPolicy", make_vec_env(Masked, n_envs), n_steps=20, batch_size=20)
+    watcher = CostEvalCallback(make_vec_env(Masked, n_envs), eval_freq=20, verbose=0)
+    model.learn(20 * n_envs, callback=[watcher, LogCosts()])
+    assert watcher.last_mean_cost == 0.0
+    for agent in (model, model.policy):
+        for env in (Masked(), make_vec_env(Masked, n_envs)):
+            assert evaluate_policy(agent, env, 4, deterministic=False).costs.tolist() == [0.0] * 4
+    other = make_vec_env(lambda: CostPoint(5))  # has no masks
+    actions = PPO("MlpPolicy", other, n_steps=10, batch_size=10)
+    assert len(evaluate_policy(actions, other, 2)) == 2
+
+
+def test_recurrent_agents_remember_within_an_episode():
+    env = make_vec_env(Late, 2, env_kwargs={"length": 6})
+    model = RecurrentPPO("MlpLstmPolicy", env, n_steps=8, batch_size=8, seed=0).learn(32)
+    seen: list[np.ndarray] = []
+    predict = model.predict
+
+    def listened(*args, **kwargs):
+        actions, state = predict(*args, **kwargs)
+        seen.append(actions.ravel())
+        return actions, state
+
+    model.predict = listened  # type: ignore[method-assign]
+    evaluate_policy(model, env, 4)
+    state, starts = None, np.ones(2, bool)
+    for k, actions in enumerate(seen):
+        starts[:] = k % 6 == 0
+        expected, state = predict(np.zeros((2, 3), np.float32), state, starts, True)
+        np.testing.assert_array_equal(actions, expected.ravel())
+    assert len({float(actions[0]) for actions in seen[:6]}) == 6  # each step is another memory
+
+
+# Agents that can't act
+
+
+def test_weights_that_are_not_finite_are_named(tmp_path):
+    model = PPO("MlpPolicy", CostPoint(5), n_steps=10, batch_size=10)
+    with th.no_grad():
+        model.policy.action_net.bias[0] = np.nan
+    model.save(tmp_path / "agent.zip")
+    for agent in (model, PPO.load(tmp_path / "agent.zip"), model.policy):
+        with pytest.raises(ValueError, match=r"weights 'action_net\.bias' are not finite"):
+            evaluate_policy(agent, CostPoint(5), 1)
+
+
+def spoil(normalizer: Any, **values: Any) -> None:
+    for name, value in values.items():
+        of = normalizer if hasattr(normalizer, name) else normalizer.obs_rms
+        setattr(of, name, value)
+
+
+UNFIT = {
+    "another shape": {"mean": np.zeros(3)},
+    "one number": {"var": np.ones(())},
+    "nan": {"mean": np.array([0, 0, np.nan, 0])},
+    "infinite": {"var": np.full(4, np.inf)},
+    "negative": {"var": -np.ones(4)},
+    "list": {"mean": [0.0] * 4},
+    "words": {"mean": np.array(["a"] * 4)},
+    "none": {"obs_rms": None},
+    "of a dictionary": {"obs_rms": {"a": None}},
+    "clip": {"clip_obs": np.nan},
+    "epsilon": {"epsilon": -1.0},
+}
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_a_normalizer_that_does_not_fit_is_refused(name):
+    env = VecNormalize(make_vec_env(CostPoint, 2, env_kwargs={"episode_length": 5}))
+    model = CPO("MlpPolicy", env, **SMALL)
+    assert len(evaluate_policy(model, env, 2)) == 2
+    spoil(env, **UNFIT[name])
+    with pytest.raises(ValueError, match="observation statistics"):
+        evaluate_policy(model, env, 2)

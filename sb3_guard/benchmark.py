@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 # Flags that no grid file states
 HOW = ("grid", "log_folder", "dry_run", "scheduler", "verbose")
+# Flags that name files, folders or programs: what a file says of them is not followed.
+FOLLOWED = ("gym_packages", "conf_file", "tensorboard_log")
 
 
 @dataclass
@@ -104,10 +106,10 @@ def with_file(flags: Flags) -> Flags:
 
     What the command line says wins; of hyperparameters and the like, entry by entry.
 
-    :raises UsageError: the file can't be read, has an unknown entry, or names modules that the
-        command line does not name
+    :raises UsageError: the file can't be read, has an unknown entry, or names files or modules that
+        the command line does not name
     """
-    from sb3_guard.zoo.cli.names import is_program, require_named
+    from sb3_guard.zoo.cli.names import refuse_places, require_named
 
     if flags.grid is None:
         return flags
@@ -116,12 +118,8 @@ def with_file(flags: Flags) -> Flags:
     content = read_mapping(path, "grid file", form)
     filed = Flags.read(content, path, HOW)
     given = {name: getattr(filed, name) for name in filed.given}
-    require_named(path, flags.gym_packages, filed.gym_packages)
-    if not flags.conf_file and is_program(filed.conf_file):
-        raise UsageError(
-            f"{path} has conf_file: {filed.conf_file}, a program, which only the command line may "
-            f"name; look at it, then add -conf {filed.conf_file}"
-        )
+    require_named(path, flags, filed, *FOLLOWED)
+    refuse_places(path, filed.hyperparams or {})
     for name in flags.given:
         value, old = getattr(flags, name), given.get(name)
         given[name] = {**old, **value} if isinstance(old, dict) else value

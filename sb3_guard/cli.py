@@ -50,7 +50,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"error: unknown command {name!r}; {did_you_mean(name, COMMANDS)}", file=sys.stderr)
         return 2
-    return importlib.import_module(module_of(name)).main(rest)
+    try:
+        return importlib.import_module(module_of(name)).main(rest)
+    except KeyboardInterrupt:  # while it is imported
+        return 130
 
 
 if __name__ == "__main__":

@@ -43,7 +43,9 @@ class Flags(Command):
 
     :param run: row of the leaderboard, e.g. grand_table/cpo/SafetyPointGoal1-v0_3, or a run folder
     :param log_folder: log folder of the new run (default: logs/reproduced)
-    :param gym_packages: modules that the run needs; a program of -conf as the run names it
+    :param gym_packages: modules that the run needs
+    :param conf_file: file of hyperparameters that the run names
+    :param trained_agent: model.zip that the run began with
     """
 
     prog: ClassVar[str] = "sb3-guard reproduce"
@@ -55,6 +57,8 @@ class Flags(Command):
     run: str = flag(default="", positional=True, metavar="ROW|FOLDER")
     log_folder: str = flag("-f", default="logs/reproduced", metavar="DIR")
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
+    conf_file: str | None = flag("-conf", metavar="FILE")
+    trained_agent: str = flag("-i", default="", metavar="PATH")
 
 
 def measures(result: Mapping[str, Any]) -> dict[str, float]:
@@ -220,7 +224,7 @@ def as_another_seed(
 
 def reproduce(flags: Flags) -> int:
     """Train the run again and compare."""
-    from sb3_guard.zoo.cli.names import is_program, require_named
+    from sb3_guard.zoo.cli.names import refuse_places, require_named
     from sb3_guard.zoo.run.flags import RunFlags
     from sb3_guard.zoo.run.folder import RunFolder
     from sb3_guard.zoo.run.progress import processor
@@ -231,17 +235,12 @@ def reproduce(flags: Flags) -> int:
     row = published(flags.run)
     run = RunFlags.parse(shlex.split(row["command"])[2:])
     run.log_folder, run.verbose = flags.log_folder, 0
-    # The command may come from anyone, so the user has to name the modules that it would import.
-    own = run.gym_packages
-    require_named(Path(flags.run), flags.gym_packages, own)
-    run.gym_packages = flags.gym_packages
-    if is_program(program := run.conf_file or ""):
-        if program not in flags.gym_packages:
-            raise UsageError(
-                f"the run has its hyperparameters from a program, {program}; if you trust it: "
-                f"--gym-packages {shlex.quote(program)}"
-            )
-        run.gym_packages = [name for name in flags.gym_packages if name != program or name in own]
+    # The command may come from anyone: the user names the files and modules that it leads to.
+    followed = ("gym_packages", "conf_file", "trained_agent")
+    require_named(flags.run, flags, run, *followed)
+    refuse_places(flags.run, run.hyperparams or {})
+    for name in followed:
+        setattr(run, name, getattr(flags, name) or getattr(run, name))
     run, values = prepare(run)
     seconds = row.get("seconds")
     took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""

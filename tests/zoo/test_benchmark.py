@@ -27,7 +27,7 @@ from sb3_guard.algorithms.common.replay_buffers import CostReplayBuffer
 from sb3_guard.zoo.grids import grid
 from sb3_guard.zoo.grids.presets import PRESETS, preset
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, RunInUse, lock
+from sb3_guard.zoo.run.folder import RunFolder, lock
 from sb3_guard.zoo.run.start import complete
 
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -334,30 +334,26 @@ def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
     )  # fmt: skip
 
 
-def test_a_run_that_another_process_has_is_left_to_it(tmp_path, here, monkeypatch, capsys):
+def test_a_run_that_another_process_has_is_awaited(tmp_path, here, capsys):
+    """Two grids in one folder both come to their end."""
     run = tmp_path / "cpo" / "CostPoint-v0_1"
     run.mkdir(parents=True)
-    arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
     with lock(run):
-        assert benchmark.main(arguments) == 1
-    assert "1 of 2 done, 1 in use" in capsys.readouterr().out
+        held = (run / ".lock").read_text()
+    (run / ".lock").write_text(held)
+    asked = []
 
-    def complete_elsewhere(other):
-        """While this grid trains its last run, another process completes the one it has."""
-        if other.flags.algo == "trpo":
-            monkeypatch.setattr(grid, "complete", complete)
-            assert grid.carry_out(here.runs[0], "", tmp_path / "stop") == ("done", "")
+    def free_at_last(other):
+        asked.append(other.flags.algo)
+        if len(asked) == 4:
+            (run / ".lock").unlink()
 
-    def taken(*_):
-        raise RunInUse("in use")
-
-    (tmp_path / "trpo" / "CostPoint-v0_1" / "result.json").unlink()
-    here.runs.clear()
-    here.before = complete_elsewhere
-    monkeypatch.setattr(grid, "complete", taken)
+    here.before = free_at_last
+    arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
     assert benchmark.main(arguments) == 0
     out = capsys.readouterr().out
-    assert "in use: cpo on CostPoint-v0, seed 0" in out and "2 of 2 done" in out
+    assert out.count("in use: cpo on") == 1 and "2 of 2 done" in out
+    assert asked == ["cpo", "trpo", "cpo", "cpo"]
 
 
 def test_a_full_disk_is_named(tmp_path, here, capsys):

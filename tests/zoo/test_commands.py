@@ -1,11 +1,17 @@
 """The commands as users type them."""
 
 import json
+import multiprocessing
 import os
 import re
+import signal
 import subprocess
 import sys
+import threading
+import time
+import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
@@ -21,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from typed import LENGTH, PLAY, SMALL, TOY, require_rendering, trained
 from worlds import own_parts
 
-from sb3_guard import CPO, cli, enjoy, train
+from sb3_guard import CPO, cli, enjoy, make_vec_env, train
 from sb3_guard.envs import Scenario, register, register_constraint
 from sb3_guard.envs.part import Constraint
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
@@ -349,6 +355,62 @@ def test_record_writes_a_video(logs, tmp_path):
     pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
     assert len(pictures) == 12
     assert pictures[0].max() > 200 and abs(int(np.median(pictures[0])) - 60) < 10
+
+
+def test_an_interrupt_while_environments_are_made(tmp_path, monkeypatch):
+    """It comes when they are made, and nothing is written."""
+    made = []
+
+    def make(*args, **kwargs):
+        os.kill(os.getpid(), signal.SIGINT)
+        made.append(make_vec_env(*args, **kwargs))
+        return made[-1]
+
+    monkeypatch.setattr("sb3_guard.zoo.run.make_envs.make_vec_env", make)
+    assert train.main([*TOY, *SMALL, "-f", str(tmp_path / "logs")]) == 130
+    assert len(made) == 1 and not (tmp_path / "logs").exists()
+
+
+def ignores_an_interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.1)
+    sys.exit(7)
+
+
+@pytest.mark.parametrize("method", ["fork", "forkserver", "spawn"])
+def test_processes_see_no_interrupt(method):
+    """Nor is it lost here, where other threads might take it."""
+    threading.Thread(target=time.sleep, args=(5.0,), daemon=True).start()
+    process = multiprocessing.get_context(method).Process(target=ignores_an_interrupt)
+    reached = False
+    with pytest.raises(KeyboardInterrupt), usage.interrupts_held():
+        process.start()
+        os.kill(os.getpid(), signal.SIGINT)
+        process.join()
+        reached = True
+    assert reached and process.exitcode == 7
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_an_interrupt_while_python_imports(tmp_path, monkeypatch, capsys):
+    root = Path(cli.__file__).parents[1]
+    script = tomllib.loads((root / "pyproject.toml").read_text())["project"]["scripts"]["sb3-guard"]
+    module, _, function = script.partition(":")
+    (tmp_path / "sb3_guard").mkdir()
+    (tmp_path / "sb3_guard" / "__init__.py").write_text("raise KeyboardInterrupt")
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys, {module}; sys.exit({module}.{function}())"],
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{root}"},
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+    )
+    assert (done.returncode, done.stderr) == (130, b"")
+
+    def interrupted(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.importlib, "import_module", interrupted)
+    assert cli.main(["train"]) == 130 and capsys.readouterr().err == ""
 
 
 def test_packages_are_found_in_the_current_folder(tmp_path, monkeypatch):

@@ -2,15 +2,17 @@
 
 import json
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 import yaml
 from cost_envs import CostPoint
-from typed import SMALL, TOY, refused, trained
+from typed import LENGTH, SMALL, TOY, refused, trained
 
-from sb3_guard import CPO, benchmark, enjoy, train
+from sb3_guard import CPO, benchmark, enjoy, reproduce, train
 from sb3_guard.zoo.cli.names import as_data, classes
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.cli.values import parse_value
@@ -21,6 +23,8 @@ ESCAPE = (
     "dict(a=[c for c in ().__class__.__base__.__subclasses__() if c.__name__ == 'Popen'][0]"
     "('touch {}', shell=True))"
 )
+SHORTEST = {"n_timesteps": 1, "seeds": [0]}
+MONITOR = "stable_baselines3.common.monitor.Monitor"
 COST = "sb3_guard.common.adapters.CostFromFunction"
 
 
@@ -51,8 +55,11 @@ def test_values_are_read_not_evaluated(trap):
         ({"env_kwargs": {"a": ESCAPE}}, "unknown"),
         ({"gym_packages": ["hostile"]}, "then add --gym-packages hostile"),
         ({"gym_packages": ["unittest.__main__"]}, "then add --gym-packages unittest.__main__"),
-        ({"conf_file": "hostile.py"}, "then add -conf hostile.py"),
-        ({"conf_file": "hostile"}, "then add -conf hostile"),
+        ({"conf_file": "hostile.py"}, "then add --conf-file hostile.py"),
+        ({"conf_file": "hostile"}, "then add --conf-file hostile"),
+        ({"conf_file": "my.yml"}, "then add --conf-file my.yml"),
+        ({"tensorboard_log": "events"}, "then add --tensorboard-log events"),
+        ({"hyperparams": {"env_wrapper": {MONITOR: {"filename": "{}"}}}}, "filename = "),
         ({"envs": ["hostile:X-v0"]}, "write --gym-packages hostile --env X-v0"),
         ({"hyperparams": {"env_wrapper": "hostile.Wrapper"}}, "add --gym-packages hostile"),
         ({"hyperparams": {"policy": "hostile.Policy"}}, "add --gym-packages hostile"),
@@ -61,7 +68,7 @@ def test_values_are_read_not_evaluated(trap):
     ],
 )
 def test_a_grid_file_runs_nothing(tmp_path, trap, entry, message, capsys):
-    text = yaml.safe_dump({"envs": ["Goal_Point_8Hazards"], "algos": ["cpo"], **entry})
+    text = yaml.safe_dump({"envs": ["Goal_Point_8Hazards"], "algos": ["cpo"], **SHORTEST, **entry})
     (tmp_path / "grid.yml").write_text(text.replace("{}", str(trap)))
     refused(benchmark.main, ["--grid", "grid.yml", "-f", "grid"], capsys, message)
     assert not trap.exists() and "unittest.__main__" not in sys.modules
@@ -91,11 +98,80 @@ def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
     enter(run, "config.yml", env_wrapper=None)
     enter(run, "args.yml", gym_packages=["hostile"])
     without = [word for word in play if word not in TOY[:2]]
-    refused(enjoy.main, without, capsys, f"{run} needs modules", "add --gym-packages hostile")
+    refused(enjoy.main, without, capsys, f"{run} needs gym_packages", "add --gym-packages hostile")
     refused(train.main, [*go_on[:2], "-n", "240"], capsys, "then add --gym-packages hostile")
     assert not trap.exists()
     enjoy.main([*without, "--gym-packages", "hostile"])
     assert trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "argument"),
+    [
+        ("env_wrapper", MONITOR, "filename"),
+        ("env_wrapper", "gymnasium.wrappers.RecordVideo", "video_folder"),
+        ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecMonitor", "filename"),
+        ("vec_env_wrapper", "sb3_guard.common.monitor.CostMonitor", "filename"),
+        ("callback", "stable_baselines3.common.callbacks.CheckpointCallback", "save_path"),
+        ("callback", "sb3_guard.common.callbacks.CostEvalCallback", "log_path"),
+    ],
+)
+def test_a_file_names_no_place_to_write(name, path, argument, tmp_path, trap, run, capsys):
+    play = ["-f", str(run), *TOY[:2], "--no-render", "--n-episodes", "1"]
+    go_on = ["-i", str(run), *TOY[:2], "-n", "240", "--verbose", "0"]
+    hyperparams = {name: [{path: {argument: str(trap)}}]}
+    if name == "callback":
+        hyperparams[name][0][path]["save_freq"] = 10
+    parts = (name, argument, str(trap), "only the command line may name")
+    enter(run, "config.yml", **hyperparams)
+    refused(train.main, go_on, capsys, *parts)
+    if name != "callback":  # nobody makes one there
+        refused(enjoy.main, play, capsys, *parts)
+        enter(run, "config.yml", **{name: str(hyperparams[name][0])})  # a mapping as text
+        refused(enjoy.main, play, capsys, *parts)
+    enter(run, "args.yml", hyperparams=hyperparams)
+    again = [str(run), "-f", str(tmp_path / "again"), *TOY[:2]]
+    refused(reproduce.main, again, capsys, *parts)
+    (tmp_path / "conf.yml").write_text(yaml.safe_dump({"default": hyperparams}))
+    refused(train.main, [*TOY, *SMALL, "-conf", "conf.yml"], capsys, *parts)
+    assert not list(tmp_path.rglob("trap*"))
+
+
+def test_reproduce_follows_the_files_that_the_user_names(tmp_path, trap, run, capsys):
+    agent = shutil.copy(run / "CostPoint-v0.zip", tmp_path / "agent.zip")
+    again = [str(run), "-f", str(tmp_path / "again"), *TOY[:2]]
+    enter(run, "args.yml", trained_agent=str(agent))
+    refused(reproduce.main, again, capsys, f"then add --trained-agent {agent}")
+    enter(run, "args.yml", trained_agent="", conf_file="hostile.py")
+    refused(reproduce.main, again, capsys, "then add --conf-file hostile.py")
+    assert not trap.exists() and not (tmp_path / "again").exists()
+    reproduce.main([*again, "-conf", "hostile.py"])
+    assert trap.exists()
+
+
+@pytest.mark.parametrize("conf", ["both", "both.py", "./both.py"])
+def test_a_module_of_parts_and_hyperparameters_registers_once(conf, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "both.py").write_text(
+        "import gymnasium\n"
+        "gymnasium.register('Both-v0', 'cost_envs:CostPoint')\n"
+        "made = open('made', 'a').write('once ')\n"
+        "hyperparams = {'default': {'n_timesteps': 60, 'cost_limit': 2}}\n"
+    )
+    short = [*SMALL, "-conf", conf, "--eval-freq", "-1", "--verbose", "0"]
+    try:
+        own = ["--gym-packages", "both", "--env", "Both-v0"]
+        assert train.main([*short, *own, *LENGTH]) == 0
+        assert (tmp_path / "made").read_text() == "once "
+        command = ["--envs", "CostPoint-v0", "NoCost-v0", "--algos", "cpo", "trpo", "--dry-run"]
+        if conf != "both":
+            sys.modules.pop("both")  # the file alone, for each of four runs
+            assert benchmark.main([*command, *TOY[:2], "-conf", conf]) == 0
+            assert (tmp_path / "made").read_text() == "once once "
+    finally:
+        sys.modules.pop("both", None)
+        gymnasium.registry.pop("Both-v0", None)
 
 
 @pytest.mark.parametrize("vec_env", ["dummy", "subproc"])

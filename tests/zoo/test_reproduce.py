@@ -167,11 +167,8 @@ def test_hyperparameters_of_a_program_are_run_where_it_is_named(tmp_path, capsys
     assert train.main([*TOY, *PACKAGES, "-conf", "./sub.2/mine.py", "-f", "logs"]) == 0
     arguments = ["logs/cpo/CostPoint-v0_1", *PACKAGES]
     assert again(tmp_path, *arguments) == 2
-    assert (
-        "from a program, ./sub.2/mine.py; if you trust it: --gym-packages ./sub.2/mine.py"
-        in capsys.readouterr().err
-    )
-    assert again(tmp_path, *arguments, "./sub.2/mine.py") == 0
+    assert "then add --conf-file ./sub.2/mine.py" in capsys.readouterr().err
+    assert again(tmp_path, *arguments, "-conf", "./sub.2/mine.py") == 0
 
 
 def test_one_module_may_be_program_and_environment(tmp_path, monkeypatch):
@@ -182,7 +179,8 @@ def test_one_module_may_be_program_and_environment(tmp_path, monkeypatch):
     )
     flags = [*TOY, "--gym-packages", "both", "-conf", "both", "-f", str(tmp_path / "logs")]
     assert train.main(flags) == 0
-    assert again(tmp_path, str(tmp_path / "logs/cpo/CostPoint-v0_1"), "--gym-packages", "both") == 0
+    arguments = [str(tmp_path / "logs/cpo/CostPoint-v0_1"), "--gym-packages", "both"]
+    assert again(tmp_path, *arguments, "-conf", "both") == 0
 
 
 def test_nothing_is_the_same_if_no_episode_has_ended(tmp_path, capsys):

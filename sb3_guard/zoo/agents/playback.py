@@ -19,10 +19,11 @@ from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
 from sb3_guard.zoo.agents.pretrained import PRETRAINED, find_pretrained, load_pretrained, weights
-from sb3_guard.zoo.cli.names import packages_flag, require_named
-from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
+from sb3_guard.zoo.cli.names import refuse_places, require_named
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, packages_flag
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
+from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_writable
 from sb3_guard.zoo.run.hyperparams import build, check
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, full_id, make_envs, source_of
@@ -134,10 +135,13 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     else:
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
         path, statistics = find_model(run, flags)
-    require_named(run.path, flags.gym_packages, run.args().get("gym_packages") or [])
+    filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
+    require_named(run.path, flags, filed, "gym_packages")
     cls, source = algorithm(flags.algo), source_of(flags.env)
     env_id, ours = str(source.env_id), source.batch is not None
-    setup = build(check(flags.algo, cls, {**run.hyperparams(), "callback": None}))
+    hyperparams = {**run.hyperparams(), "callback": None}
+    refuse_places(run.path, hyperparams)
+    setup = build(check(flags.algo, cls, hyperparams))
     if flags.num_threads > 0:
         th.set_num_threads(flags.num_threads)
     normalizer = None

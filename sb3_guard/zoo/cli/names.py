@@ -8,19 +8,23 @@ file may name classes of :data:`KNOWN` packages only, and of modules that the co
 import importlib
 import inspect
 import operator
+import re
+import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag
+from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.cli.values import read_expression
+
+if TYPE_CHECKING:
+    from sb3_guard.zoo.cli.flags import Command
 
 KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
 # Files of what differs from an algorithm's own file, which `-conf NAME` reads; not code.
@@ -29,6 +33,8 @@ PRESETS = {"paper": "the paper", "omnisafe": "the settings that OmniSafe has pub
 BASES: dict[str, type] = {
     "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
 }  # fmt: skip
+# Names of arguments that say where to write: filename, save_path, video_folder, log_dir.
+PLACE = re.compile("(path|file|file_?name|folder|dir|directory)$")
 
 
 def import_class(name: str, path: str, base: type) -> Any:
@@ -143,24 +149,44 @@ def with_classes(name: str, value: Any) -> Any:
     return value
 
 
-def require_named(where: Path, named: Sequence[str], modules: Sequence[str]) -> None:
+def require_named(where: object, given: "Command", filed: "Command", *names: str) -> None:
     """
-    Refuse modules that only a file names, before any of them is imported.
+    Refuse files and programs that only a file names, before any of them is followed.
 
     :param where: the folder or file
-    :param named: the modules that the command line names, which replace the file's
-    :param modules: those that the file names
-    :raises UsageError: the command line names none of them
+    :param given: flags of this command line, which replace the file's
+    :param filed: those that the file states
+    :param names: flags that name files, folders or modules
+    :raises UsageError: the file states one of them, and the command line does not
     """
-    if modules and not named:
-        raise UsageError(
-            f"{where} needs modules, which only the command line may name; look at them, then add"
-            + packages_flag(modules)
-        )
+    for name in names:
+        value = getattr(filed, name)
+        if value and str(value) not in PRESETS and not getattr(given, name):
+            raise UsageError(
+                f"{where} needs {name}, which only the command line may name; look at that, then "
+                f"add {shlex.join(filed.words({name}))}"
+            )
 
 
-def is_program(conf_file: str | None) -> bool:
-    """Whether ``-conf`` has a Python file or module run, rather than a YAML file read."""
-    return bool(conf_file) and not (
-        conf_file in PRESETS or str(conf_file).endswith((".yml", ".yaml"))
-    )
+def refuse_places(where: object, hyperparams: Mapping[str, Any]) -> None:
+    """
+    Refuse arguments of monitors, wrappers and callbacks that say where to write.
+
+    :param where: the file that states the hyperparameters
+    :raises UsageError: there is one
+    """
+    for name in ("monitor_kwargs", *BASES):
+        for argument, place in _places(as_data(name, hyperparams.get(name))):
+            raise UsageError(
+                f"{where}: {name} has {argument} = {place!r}, a place to write to, which only the "
+                f"command line may name (train -params {name}:…); remove it from the file"
+            )
+
+
+def _places(value: Any) -> Iterator[tuple[str, str]]:
+    for item in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(item, Mapping):
+            for key, inner in item.items():
+                if isinstance(inner, str) and PLACE.search(str(key).lower()):
+                    yield key, inner
+                yield from _places(inner)

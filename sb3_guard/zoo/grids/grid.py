@@ -20,14 +20,14 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, interrupts_ignored, one_line
+from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, interrupts_held, one_line
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
@@ -265,22 +265,22 @@ def execute(runs: Sequence[Run], executor: Executor, stop: Path, say: Callable[[
         say("Stopping after the rollouts under way; Ctrl-C again stops immediately.")
 
     with interrupts(ask_to_stop) as received:
-        with interrupts_ignored():  # by the processes that this starts
+        with interrupts_held():  # by the processes that this starts
             todo = [run for run in runs if run.state != "done"]
             futures = {executor.submit(carry_out, run, command, stop): run for run in todo}
         for run in todo:
             run.state = "waiting"
-        for future in as_completed(futures):
-            run = futures[future]
-            # Errors of runs are caught where they run.
-            with explained("a worker or scheduler is gone", fix="the same command continues"):
-                run.state, run.error = future.result()
-            if run.state != "waiting":
-                say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}")
-    for run in todo:
-        # Another process that had the run may have completed it meanwhile.
-        if run.state == "in use" and standing(run.flags, run.values) == "done":
-            run.state, run.error = "done", ""
+        while futures:
+            for future in wait(futures, return_when=FIRST_COMPLETED).done:
+                run = futures.pop(future)
+                before = run.state
+                # Errors of runs are caught where they run.
+                with explained("a worker or scheduler is gone", fix="the same command continues"):
+                    run.state, run.error = future.result()
+                if run.state not in ("waiting", before):
+                    say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}")
+                if run.state == "in use":  # until whoever has it is done with it, or dead
+                    futures[executor.submit(carry_out, run, command, stop)] = run
     return 128 + received[0] if received else 0
 
 

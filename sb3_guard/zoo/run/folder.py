@@ -6,21 +6,17 @@ import glob
 import hashlib
 import json
 import math
-import os
 import re
 import shlex
-import socket
-import sys
 import tempfile
-import time
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
-from filelock import SoftFileLease, Timeout
+from filelock import SoftFileLock, Timeout
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.cli.flags import IDENTITY
@@ -33,9 +29,7 @@ DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 # What a result measures: return, episode cost and cost rate; null where no episode has ended.
 MEASURES = ("return", "cost", "cost_rate")
 EPOCH = 30_000  # steps, the paper's; of algorithms whose rollouts are a few steps long
-SILENCE = 120.0  # seconds without a sign of life after which another host takes a lock over
-WAIT = 1.2 * SILENCE  # seconds in which such a silence is certainly seen
-EMPTY = 2.0  # seconds after which a lock that says nothing is that of a process that died
+PATIENCE = 1.0  # seconds after which a lock that says nothing is that of a process that died
 
 
 class RunInUse(UsageError):
@@ -255,6 +249,7 @@ class RunFolder:
         fix = f"sb3-guard train -i {self.path} writes it again"
         with explained("result.json is damaged", fix=fix):
             result: dict[str, Any] = json.loads(self.result.read_bytes())
+            shlex.split("" + result.get("command", ""))  # as others will: it is text, and whole
             for key, value in {key: result[key] for key in ("n_timesteps", *MEASURES)}.items():
                 if value is not None and not math.isfinite(value):
                     raise ValueError(f"{key} = {value!r} should be a number")
@@ -278,66 +273,33 @@ def lock(folder: Path) -> Iterator[None]:
     """
     Hold a run's lock, so that no other process writes to it meanwhile.
 
-    The lock of a process that died here is taken over immediately, or within seconds. That of
-    another host shows signs of life; it is taken over after a long silence, for which this waits.
+    The lock of a process that died on this host is taken over; that of another host, of which
+    nothing is known, stays until somebody removes it.
 
     :param folder: it exists, and is a run or about to become one
     :raises RunInUse: another process has it
     :raises UsageError: the folder can't be written to
     """
     path = folder / ".lock"
-    holder = owner(folder)
-    elsewhere = holder.get("host", socket.gethostname()) != socket.gethostname()
-    lease = SoftFileLease(path, lease_duration=SILENCE, on_compromise=_lost, is_singleton=False)
-    if elsewhere:
-        print(f"{folder} has a lock of {holder['host']}: waiting for a sign of life of its process")
+    held = SoftFileLock(path, timeout=PATIENCE, is_singleton=False)
     with explained(f"can't write to {folder}", OSError):
         try:
-            _remove_empty(path)
-            lease.acquire(timeout=WAIT if elsewhere else 0)
+            held.acquire()
         except Timeout:
-            holder = owner(folder)
-            raise RunInUse(
-                f"{folder} is in use by process {holder.get('pid')} on {holder.get('host')}; "
-                f"if that is gone, remove {path}"
-            ) from None
+            with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
+                file.write(b"x")  # a dead process's lock on a full disk can't be taken over either
+            owner = path.read_text().split("\n")
+            if owner != [""]:
+                raise RunInUse(
+                    f"{folder} is in use by process {owner[0]} on {owner[1]}; if that is gone, "
+                    f"remove {path}"
+                ) from None
+            path.unlink()  # its process died before it wrote who it is
+            held.acquire()
     try:
         yield
     finally:
-        lease.release()
-
-
-def _remove_empty(path: Path) -> None:
-    """Remove the lock of a process that was killed before it wrote who it is.
-
-    filelock leaves it for ever, since older versions held such locks.
-    """
-    end = time.monotonic() + EMPTY
-    with suppress(FileNotFoundError):
-        while not path.read_bytes():
-            if time.monotonic() > end:
-                path.unlink()
-            time.sleep(0.05)
-
-
-def owner(folder: Path) -> dict[str, str]:
-    """Who has the lock of a run, or had it when it died: ``host``, ``pid``; empty: nobody."""
-    try:
-        lines = (folder / ".lock").read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        return {}
-    return {key: value for key, _, value in (line.partition("=") for line in lines) if value}
-
-
-def _lost(compromise: Any) -> None:
-    """End the process, which slept so long that another host took its run over."""
-    print(
-        f"{compromise.lock_file} was taken over while this process gave no sign of life; "
-        "it ends here",
-        file=sys.stderr,
-        flush=True,
-    )
-    os._exit(1)
+        held.release()
 
 
 def _write_config(params: Path, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:

@@ -9,9 +9,11 @@ it.
 import importlib
 import inspect
 import runpy
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,7 +31,14 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_guard.algorithms.common.arguments import signature
 from sb3_guard.fields import in_words, typed
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.cli.names import PRESETS, as_data, classes, import_class, with_classes
+from sb3_guard.zoo.cli.names import (
+    PRESETS,
+    as_data,
+    classes,
+    import_class,
+    refuse_places,
+    with_classes,
+)
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
 from sb3_guard.zoo.cli.values import is_data
 
@@ -83,11 +92,27 @@ def read_file(path: str | Path) -> dict[str, Any]:
         fix = f"give a .yml file, a Python file or module, or {' or '.join(map(repr, PRESETS))}"
         with explained(f"can't read hyperparameters from {name}", fix=fix):
             python = name.endswith(".py")
-            module = runpy.run_path(name) if python else vars(importlib.import_module(name))
+            module = (
+                _module(Path(name).resolve()) if python else vars(importlib.import_module(name))
+            )
         content = module.get("hyperparams", {None: None})
     if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
         raise UsageError(f"{name} must map {form}")
     return content
+
+
+def _module(path: Path) -> dict[str, Any]:
+    """The names in a Python file, of the module where it is imported: it registers parts once."""
+    for module in [*sys.modules.values()]:
+        file = getattr(module, "__file__", None)
+        if file is not None and Path(file).resolve() == path:
+            return vars(module)
+    return _ran(path, path.stat().st_mtime_ns)
+
+
+@cache
+def _ran(path: Path, modified: int) -> dict[str, Any]:
+    return runpy.run_path(str(path))
 
 
 def shipped_file(algo: str) -> Path:
@@ -142,6 +167,8 @@ def read_hyperparams(
         raise UsageError(
             f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
         )
+    if str(path).endswith((".yml", ".yaml")):  # a program says what it likes
+        refuse_places(path, values)
     return {**values, **changes, **(overrides or {})}
 
 

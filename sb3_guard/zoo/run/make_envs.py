@@ -13,7 +13,7 @@ from sb3_guard.checks import ContractError, WorldError
 from sb3_guard.common.evaluation import check_normalizer
 from sb3_guard.common.sources import Source, find
 from sb3_guard.common.vec_env import make_vec_env
-from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, interrupts_ignored
+from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, interrupts_held
 from sb3_guard.zoo.run.hyperparams import Setup
 from sb3_guard.zoo.run.resumable import ResumableEnv
 
@@ -125,26 +125,25 @@ def make_envs(
         return ResumableEnv(env)
 
     drawn = f" with render_mode={render_mode!r}" if render_mode else ""
-    with (
-        explained(f"can't make {source.env_id}{drawn}", *BAD_ARGUMENTS, *PROCESS_DIED, MemoryError),
-        interrupts_ignored(),  # a rollout under way can be finished
-    ):
-        env = make_vec_env(
-            source,
-            n_envs,
-            seed,
-            vec_env=vec_env,
-            env_kwargs=dict(env_kwargs),
-            num_threads=num_threads,
-            render_mode=render_mode,
-            wrapper_class=wrap if vec_env != "native" or setup.env_wrapper else None,
-            monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
-        )
-    with ExitStack() as made, explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
-        made.callback(env.close)
-        wrapped = _wrap(env, setup, evaluation, normalizer)
+    errors = (*BAD_ARGUMENTS, *PROCESS_DIED, MemoryError)
+    with ExitStack() as made:
+        with explained(f"can't make {source.env_id}{drawn}", *errors), interrupts_held():
+            env = make_vec_env(
+                source,
+                n_envs,
+                seed,
+                vec_env=vec_env,
+                env_kwargs=dict(env_kwargs),
+                num_threads=num_threads,
+                render_mode=render_mode,
+                wrapper_class=wrap if vec_env != "native" or setup.env_wrapper else None,
+                monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
+            )
+            made.callback(env.close)
+        with explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
+            env = _wrap(env, setup, evaluation, normalizer)
         made.pop_all()
-    return wrapped
+    return env
 
 
 def _wrappers(

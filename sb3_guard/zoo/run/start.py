@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sb3_guard.zoo.cli.flags import START
-from sb3_guard.zoo.cli.names import as_data, require_named
+from sb3_guard.zoo.cli.names import as_data, refuse_places, require_named
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
@@ -161,7 +161,7 @@ def resume(given: RunFlags) -> int:
     folder = RunFolder(Path(given.trained_agent))
     with lock(folder.path):
         saved, values = folder.flags(), folder.hyperparams()
-        require_named(folder.path, given.gym_packages, saved.gym_packages)
+        require_named(folder.path, given, saved, "gym_packages")
         import_packages(given.gym_packages)
         state = read_checkpoint(folder.checkpoint)
         cls, done = algorithm(saved.algo), state["num_timesteps"]
@@ -175,7 +175,9 @@ def resume(given: RunFlags) -> int:
             )
         if given.n_timesteps > 0:
             values["n_timesteps"] = given.n_timesteps
-        values = check(saved.algo, cls, {**values, **(given.hyperparams or {})})
+        overrides = given.hyperparams or {}
+        refuse_places(folder.path, {n: v for n, v in values.items() if n not in overrides})
+        values = check(saved.algo, cls, {**values, **overrides})
         flags = dataclasses.replace(saved, **changed)
         was = {**saved.values(START), **state["identity"], "n_timesteps": None}
         now = {**flags.values(START), **identity(flags, values), "n_timesteps": None}

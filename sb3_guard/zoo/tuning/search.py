@@ -24,7 +24,7 @@ from optuna.storages import RDBStorage
 from optuna.study import MaxTrialsCallback, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_guard.zoo.cli.usage import UsageError, interrupts, interrupts_ignored, run
+from sb3_guard.zoo.cli.usage import UsageError, interrupts, interrupts_held, run
 from sb3_guard.zoo.run import start
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.experiment import Experiment
@@ -281,7 +281,7 @@ def _other_workers(flags: TuneFlags, n: int) -> Iterator[list[BaseProcess]]:
     others: list[BaseProcess] = [
         context.Process(target=_work_beside, args=(flags,)) for _ in range(n)
     ]
-    with interrupts_ignored():  # by those that inherit it; Ctrl-C reaches this process
+    with interrupts_held():  # by those that inherit it; Ctrl-C reaches this process
         for process in others:
             process.start()
     try:

@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 # module -> the public names that it has
 _EXPORTS = {
     "sb3_guard.algorithms": (*CLASSES.values(), "ALGORITHMS", "register_algorithm"),
+    "sb3_guard.algorithms.common.warm_start": ("warm_start",),
     "sb3_guard.common.callbacks": ("CostEvalCallback", "LogCosts"),
     "sb3_guard.common.evaluation": ("evaluate_policy",),
     "sb3_guard.common.monitor": ("CostMonitor",),

@@ -340,7 +340,7 @@ def hyperparameter_tables() -> str:
     ]
     for path in sorted(hyperparams_folder().glob("*.yml")):
         if (
-            path.stem in ("paper", "omnisafe")
+            path.stem == "paper"
             or not (ROOT / "docs" / "algorithms" / path.name).with_suffix(".md").is_file()
         ):
             continue

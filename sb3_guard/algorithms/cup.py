@@ -1,6 +1,6 @@
 """CUP: an update improves the policy as PPO does, then projects it towards the limits."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.distributions import Distribution
@@ -28,7 +28,6 @@ class CUP(Lagrangian, FirstOrder):
     second by its distance from π_{k+½}. A KL divergence grows with the square of the distance: at 4
     the second may take back what the first has done, and go as far again to the other side.
 
-    :param projection_kl: ``"forward"`` as above; ``"reverse"`` for KL(π ‖ π_{k+½})
     :param projection_reach: KL from π_{k+½} at which the second step stops, in ``target_kl``;
         without ``target_kl`` nothing stops it
     """
@@ -49,7 +48,6 @@ class CUP(Lagrangian, FirstOrder):
 
     fuse_adam = True  # it takes twice as many steps as PPO's
 
-    projection_kl: Literal["forward", "reverse"] = hyperparameter("forward")
     projection_reach: float = hyperparameter(4.0, ends="()")
 
     def _check_hyperparameters(self) -> None:
@@ -80,8 +78,7 @@ class CUP(Lagrangian, FirstOrder):
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution
     ) -> th.Tensor:
         """What the second step descends on a minibatch: a scalar."""
-        pair = self._improved.at(batch.places), distribution
-        divergence = kl(*(pair if self.projection_kl == "forward" else pair[::-1]))
+        divergence = kl(self._improved.at(batch.places), distribution)
         cost = ratio * (batch.cost_advantages @ self._weight)
         return (divergence + self.factor * cost).mean()
 

@@ -1,8 +1,7 @@
 """P3O: PPO with an exact penalty on the violation, and no multiplier."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution
 
@@ -23,10 +22,10 @@ class P3O(FirstOrder):
     within each minibatch, so that at the old policy the penalty is κ Σ max(0, (J_Ci - d_i) / T)
     and nothing else: the mean of 64 advantages alone would move it back and forth.
 
+    A_C and the violation are divided by the standard deviation of A_C, and multiplied by that of A
+    unless ``normalize_advantage`` makes it 1, so that the units of cost and reward do not matter.
+
     :param penalty: κ, in standard deviations of A per standard deviation of A_C
-    :param penalty_units: ``"relative"`` divides A_C and the violation by the standard deviation of
-        A_C, and multiplies them by that of A unless ``normalize_advantage`` makes it 1, so that
-        the units of cost and reward do not matter; ``"cost"`` leaves them as they are
     """
 
     label, family, paper = "P3O", "First-order", "Zhang et al. 2022"
@@ -35,12 +34,9 @@ class P3O(FirstOrder):
     }
 
     penalty: float = hyperparameter(20.0, ends="()")
-    penalty_units: Literal["relative", "cost"] = hyperparameter("relative")
 
     def train(self) -> None:
         unit = self.advantage_unit() * self.centre_costs()
-        if self.penalty_units == "cost":
-            unit = np.ones_like(unit)
         self._unit = th.as_tensor(unit, dtype=th.float32, device=self.device)
         violation = th.as_tensor(self.costs.violation, dtype=th.float32, device=self.device)
         self._violation = violation * self._unit

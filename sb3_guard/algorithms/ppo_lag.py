@@ -1,12 +1,11 @@
 """PPO-Lagrangian: PPO with a multiplier for each cost, which follows the violation."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3 import PPO
 
-from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.first_order import FirstOrder, check_ppo, mean_kl
 from sb3_guard.algorithms.common.lagrangian import RELATIVE, Lagrangian
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
@@ -24,10 +23,9 @@ class PPOLag(Lagrangian, CostRollouts, PPO):
     Then SB3's PPO learns from ``A - Σ λ_i A_Ci``, each in its standard deviation. While no limit
     is exceeded the run equals PPO's, bit for bit.
 
-    :param target_kl: where the passes over a rollout stop; None for never
-    :param kl_stop: ``"minibatch"`` stops before the first minibatch whose KL exceeds
-        1.5 ``target_kl``, as SB3 does; ``"epoch"`` after the first pass at whose end the mean over
-        the rollout exceeds ``target_kl``, as OmniSafe does. Losses are logged of the last pass
+    :param target_kl: the passes over a rollout end with the first one after which the mean KL over
+        the rollout exceeds it, where SB3's PPO looks at single minibatches; None for never. Losses
+        are logged of the last pass
     """
 
     label, family, paper = "PPO-Lagrangian", "Lagrangian", "Ray et al. 2019"
@@ -39,8 +37,6 @@ class PPOLag(Lagrangian, CostRollouts, PPO):
     defaults: ClassVar[dict[str, Any]] = {**FirstOrder.defaults, **RELATIVE}
     policy_defaults: ClassVar[dict[str, Any]] = CALM
 
-    kl_stop: Literal["minibatch", "epoch"] = hyperparameter("epoch")
-
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
         check_ppo(self)
@@ -49,7 +45,7 @@ class PPOLag(Lagrangian, CostRollouts, PPO):
         """SB3's update on weighted advantages, then the cost critic."""
         self.reweigh()
         try:
-            if self.kl_stop == "epoch" and self.target_kl is not None:
+            if self.target_kl is not None:
                 self._take_passes(self.n_epochs, self.target_kl)
             else:
                 super().train()

@@ -1,13 +1,12 @@
 """TQC-Lagrangian: TQC with critics of the costs' distributions, and multipliers."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
 from sb3_contrib import TQC
 from sb3_contrib.common.utils import quantile_huber_loss
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.cost_critics import CostQ
 from sb3_guard.algorithms.common.soft import SoftActorCritic
 
@@ -23,7 +22,6 @@ class CostQuantiles(CostQ):
     :param n_costs: number m of costs
     :param learning_rate: at the beginning
     :param drop: quantiles to drop per network
-    :param quantile: which quantile a cost counts for; None for the mean
     """
 
     def __init__(
@@ -32,7 +30,6 @@ class CostQuantiles(CostQ):
         n_costs: int,
         learning_rate: float,
         drop: int,
-        quantile: float | None = None,
     ) -> None:
         kwargs: dict[str, Any] = policy.critic_kwargs  # type: ignore[assignment]
         networks, outputs = kwargs["n_critics"], kwargs["n_quantiles"]
@@ -43,13 +40,10 @@ class CostQuantiles(CostQ):
             )
         super().__init__(policy, n_costs, learning_rate, networks, outputs)
         self.dropped = drop * networks
-        self.index = None if quantile is None else int(quantile * outputs)
 
     def value(self, predicted: th.Tensor) -> th.Tensor:
-        """Mean over the networks of their means, or of their estimates of the quantile."""
-        if self.index is None:
-            return predicted.mean(dim=(2, 3))
-        return predicted[..., self.index].mean(dim=2)
+        """Mean over networks and quantiles."""
+        return predicted.mean(dim=(2, 3))
 
     def samples(self, predicted: th.Tensor) -> th.Tensor:
         """The quantiles of all networks without the lowest ones."""
@@ -70,23 +64,16 @@ class TQCLag(SoftActorCritic, TQC):
         max_π min_{λ ≥ 0}   J(π) + α H(π) - Σ λ_i (J_Ci(π) - d_i)
 
     Returns-to-go and costs-to-go are learnt as distributions. The actor descends
-    ``(α log π - Q + Σ λ_i Q_Ci) / (1 + Σ λ_i)`` with the means of both, or an upper quantile of the
-    costs; the multipliers follow the mean cost of the latest episodes. With ``ent_coef="auto"`` and
-    while no limit is exceeded the run equals SB3-contrib's TQC, bit for bit.
-
-    :param cost_quantile: which quantile of the cost-to-go the actor avoids, above 0 and below 1,
-        such as 0.9, which avoids rare high costs; None for the mean, which is what the limit bounds
+    ``(α log π - Q + Σ λ_i Q_Ci) / (1 + Σ λ_i)`` with the means of both; the multipliers follow the
+    mean cost of the latest episodes. With ``ent_coef="auto"`` and while no limit is exceeded the
+    run equals SB3-contrib's TQC, bit for bit.
     """
 
     label, family, paper = "TQC-Lagrangian", "Lagrangian", "Kuznetsov et al. 2020"
 
-    search_space: ClassVar[dict[str, Any]] = {"cost_quantile": [None, 0.7, 0.9]}
-
-    cost_quantile: float | None = hyperparameter(None, high=1.0, ends="()")
-
     def make_cost_critic(self) -> CostQ:
         rate, drop = self.lr_schedule(1), self.top_quantiles_to_drop_per_net
-        return CostQuantiles(self.policy, len(self.cost_keys), rate, drop, self.cost_quantile)
+        return CostQuantiles(self.policy, len(self.cost_keys), rate, drop)
 
     def next_values(self, values: th.Tensor) -> th.Tensor:
         dropped = self.top_quantiles_to_drop_per_net * self.critic.n_critics

@@ -25,7 +25,6 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.algorithms.common.loading import lacks_statistics
 from sb3_guard.checked_env import checked
 from sb3_guard.checks import NumberError, check_cost_keys, is_number
 from sb3_guard.common.monitor import cost_keys_of, total_cost
@@ -207,6 +206,18 @@ def _own_random_numbers(seed: int | None) -> Iterator[None]:
     with th.random.fork_rng():
         th.manual_seed(seed)
         yield
+
+
+def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
+    """Whether an agent learnt from normalised observations, and ``env`` has no means of them."""
+    if not getattr(model, "learnt_normalized", False):
+        return False
+    normalizer = None if env is None else unwrap_vec_normalize(env)
+    if normalizer is None or not normalizer.norm_obs:
+        return True
+    means = normalizer.obs_rms
+    # Those of a new VecNormalize are of no observation.
+    return any(m.count < 1 for m in (means.values() if isinstance(means, dict) else [means]))
 
 
 @contextmanager

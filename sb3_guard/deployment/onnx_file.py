@@ -17,8 +17,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms.common.loading import lacks_statistics
-from sb3_guard.common.evaluation import check_agent
+from sb3_guard.common.evaluation import check_agent, lacks_statistics
 from sb3_guard.common.files import replacing
 from sb3_guard.deployment.contract import contract
 from sb3_guard.deployment.deployed import Deployed

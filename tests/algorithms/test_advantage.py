@@ -28,15 +28,6 @@ def test_gae_by_hand() -> None:
     np.testing.assert_allclose(returns, [[2.0], [2.0], [6.5], [7.0]])
 
 
-def test_traces_weigh_what_later_actions_add() -> None:
-    """The four steps above: errors 1, 1, 2.5, 5, of which steps 1 and 3 count by 0.4 and 0.2."""
-    rewards = np.array([[1.0], [2.0], [3.0], [4.0]])
-    values = np.array([[0.5], [1.0], [1.5], [2.0]])
-    starts, traces = np.array([[1], [0], [1], [0]]), np.array([[9.0], [0.4], [9.0], [0.2]])
-    got = gae(rewards, values, starts, np.array([6.0]), np.array([False]), 0.5, 0.5, traces)
-    np.testing.assert_allclose(got, [[1 + 0.25 * 0.4], [1.0], [2.5 + 0.25 * 0.2 * 5], [5.0]])
-
-
 def test_last_step_that_ends_is_not_bootstrapped() -> None:
     rewards, values = np.ones((1, 1)), np.zeros((1, 1))
     args = (np.ones((1, 1)), np.array([9.0]), np.array([True]))

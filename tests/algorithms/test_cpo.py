@@ -369,27 +369,6 @@ def test_cost_advantages_are_centred_and_not_scaled() -> None:
     assert batches[0].advantages.std().item() == pytest.approx(1.0, rel=1e-4)
 
 
-@pytest.mark.parametrize("cls", [CPO, PCPO])
-@pytest.mark.parametrize("limit", [10.0, -10.0])
-def test_after_a_violation_it_recovers_to_a_lower_limit(
-    limit: float, cls: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    env = make_vec_env(lambda: CostPoint(), 2, seed=0)
-    arguments = {"n_steps": 40, "n_critic_updates": 1, "margin_lr": 0.0}
-    model = cls("MlpPolicy", env, cost_limit=limit, recover_to=0.8, **arguments)
-    model.set_logger(Logger(None, []))
-    monkeypatch.setattr(TrustRegion, "train", lambda self: None)
-    for excess, recovering in ((-0.5, 0), (0.5, 1), (-1.5, 1), (-2.0, 0), (-0.5, 0), (0.1, 1)):
-        cost = np.array([limit + excess])
-        model.costs = CostEstimate(cost, 10.0, np.array([excess / 10.0]))
-        model.train()
-        assert model.violation() * 10.0 == pytest.approx(excess + 2.0 * recovering)
-        assert model.logger.name_to_value["train/recovering"] == recovering
-        model.recover_to = 1.0
-        assert model.violation() == pytest.approx(model.costs.violation)
-        model.recover_to = 0.8
-
-
 @pytest.mark.parametrize("limit", [2.0, 0.0])
 def test_the_margin_follows_what_was_missed(limit: float) -> None:
     env = make_vec_env(lambda: CostPoint(), 2, seed=0)

@@ -202,7 +202,7 @@ def test_hashes_can_be_checked_after_packing(scripts, tmp_path, capsys):
 
 def test_hyperparameters_of_a_file_elsewhere_are_refused(scripts, tmp_path, capsys):
     checks = scripts[2]
-    sent(tmp_path / "logs", args={"conf_file": "omnisafe"})
+    sent(tmp_path / "logs", args={"conf_file": "paper"})
     assert checks.check(tmp_path / "logs")
     sent(tmp_path / "logs", args={"conf_file": "mine.yml"})
     assert not checks.check(tmp_path / "logs")

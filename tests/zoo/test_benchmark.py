@@ -216,7 +216,7 @@ def test_bad_grid_file(content, part, capsys, tmp_path):
 
 
 def test_a_preset_in_a_grid_file_is_no_program(capsys, tmp_path):
-    grid = "envs: [Goal_Point_8Hazards]\nalgos: [cpo]\nconf_file: omnisafe"
+    grid = "envs: [Goal_Point_8Hazards]\nalgos: [cpo]\nconf_file: paper"
     (tmp_path / "g.yml").write_text(grid)
     assert benchmark.main(["--grid", str(tmp_path / "g.yml"), "--dry-run"]) == 0
 

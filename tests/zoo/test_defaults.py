@@ -133,12 +133,14 @@ def test_make_model_takes_what_a_file_cannot_hold() -> None:
     assert scenario.constraints["hazards"]["size"] == 0.2
 
 
-def test_sizes_of_a_file_are_not_warned_of() -> None:
-    """OmniSafe's minibatches of 64 leave a smaller one at the end of a rollout of 20,000 steps."""
+def test_sizes_of_a_file_are_not_warned_of(tmp_path) -> None:
+    """Minibatches of 64 leave a smaller one at the end of a rollout of 20,000 steps."""
+    (tmp_path / "my.yml").write_text("default: {n_envs: 20, n_steps: 1000, batch_size: 64}")
+    file = str(tmp_path / "my.yml")
     with warnings.catch_warnings(action="error"):
-        make_model("ppo_lag", "Goal_Point_8Hazards", conf="omnisafe", seed=0)
+        make_model("ppo_lag", "Goal_Point_8Hazards", conf=file, cost_limit=2.0, seed=0)
     with pytest.warns(UserWarning, match="mini-batch size of 64"):
-        make_model("ppo_lag", "Goal_Point_8Hazards", conf="omnisafe", n_steps=999, seed=0)
+        make_model("ppo_lag", "Goal_Point_8Hazards", conf=file, cost_limit=2.0, n_steps=999, seed=0)
 
 
 @pytest.mark.parametrize("algo", [key for key in baselines() if key not in ("dqn", "qrdqn")])

@@ -1,12 +1,10 @@
 """Hyperparameters: which entry is read, what is refused, what becomes of the values."""
 
-import re
 from typing import Any
 
 import gymnasium as gym
 import pytest
 import torch
-import yaml
 from torch import nn
 
 from sb3_guard.algorithms import ALGORITHMS, CPO, SACLag
@@ -409,38 +407,6 @@ def test_the_paper_has_no_other_algorithm():
         UsageError, match=r"-conf paper: 'ppo' is not in the paper; .*allowed: trpo"
     ):
         read_hyperparams("ppo", "Goal_Point_8Hazards-v0", PAPER)
-
-
-def omnisafe() -> dict[str, dict[str, Any]]:
-    """The table of docs/omnisafe.md, where later rows replace what earlier ones say."""
-    page = (hyperparams_folder().parent / "docs" / "omnisafe.md").read_text()
-    found: dict[str, dict[str, Any]] = {}
-    for algos, settings in re.findall(r"^\| (`[^|]+) \| (`[^|]+) \|$", page, re.MULTILINE):
-        pairs = re.findall(r"`(\w+)` ([^`]+?)(?=, `|$)", settings)
-        for algo in re.findall(r"\w+", algos):
-            found.setdefault(algo, {}).update((name, yaml.safe_load(one)) for name, one in pairs)
-    return found
-
-
-def test_the_omnisafe_preset_is_the_table_of_its_page():
-    assert read_file(hyperparams_folder() / "omnisafe.yml") == omnisafe()
-
-
-@pytest.mark.parametrize("algo", omnisafe())
-def test_the_omnisafe_preset_makes_a_model(algo):
-    env_id = "Goal_Point_8Hazards-v0"
-    values = check(algo, ALGORITHMS[algo], read_hyperparams(algo, env_id, "omnisafe"))
-    on_policy = "learning_starts" not in values
-    assert not on_policy or values["n_envs"] * values["n_steps"] == 20_000
-    model = ALGORITHMS[algo](env=make_vec_env(env_id, 1), **build(values).model)
-    rates = [model.lr_schedule(left) for left in (1.0, 0.5, 0.0)]
-    falls = on_policy and "n_epochs" in values
-    assert rates == ([3e-4, 1.5e-4, 0.0] if falls else [values["learning_rate"]] * 3)
-    if "lambda_lr" in values:
-        multiplier = model.multiplier
-        assert not multiplier.relative and model.lambda_update == "before"
-        assert multiplier.maximum == values["lambda_max"]
-        assert multiplier.derivative == values.get("derivative_gain", 0.0)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

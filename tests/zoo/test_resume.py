@@ -33,7 +33,7 @@ from sb3_guard.common.vec_env import VEC_ENVS
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run import resumable
 from sb3_guard.zoo.run import training as experiment
-from sb3_guard.zoo.run.checkpoint import Checkpoints, read_checkpoint
+from sb3_guard.zoo.run.checkpoint import read_checkpoint
 from sb3_guard.zoo.run.folder import RunFolder
 from sb3_guard.zoo.run.progress import Epochs
 from sb3_guard.zoo.run.start import differences
@@ -81,14 +81,12 @@ VARIANTS = {
     ],
     "rare logs": ["--log-interval", "2"],
 }
-REUSE = "--algo pcpo -params normalize:True reuse:2".split()
 
 
 @pytest.mark.parametrize(
     "variant",
     [
         pytest.param(EVERYTHING, id="everything"),
-        pytest.param(REUSE, id="earlier rollouts"),
         *(pytest.param(v, id=name, marks=pytest.mark.slow) for name, v in VARIANTS.items()),
     ],
 )
@@ -100,31 +98,6 @@ def test_killed_and_resumed(variant, tmp_path, monkeypatch):
     crash(monkeypatch, ["-i", str(runs_of(tmp_path / "cut")), *TOY[:2]], 206)
     assert train.main(["-i", str(runs_of(tmp_path / "cut") / "checkpoint.zip"), *TOY[:2]]) == 0
     assert_same_run(tmp_path / "whole", tmp_path / "cut")
-
-
-def test_each_earlier_rollout_is_written_once(tmp_path, monkeypatch, capsys):
-    written = []
-
-    def write(checkpoints):
-        folder = checkpoints.path.parent / "earlier"
-        before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*")}
-        names = write_earlier(checkpoints)
-        after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*")}
-        written.extend(name for name in names if before.get(name) != after[name])
-        return names
-
-    write_earlier = Checkpoints._write_earlier
-    monkeypatch.setattr(Checkpoints, "_write_earlier", write)
-    assert train.main([*TOY, *SHORT, *SMALL, *REUSE, "-n", "300", "-f", str(tmp_path)]) == 0
-    assert written == ["60.pkl", "120.pkl", "180.pkl", "240.pkl", "300.pkl"]
-    run = runs_of(tmp_path)
-    kept = sorted(path.name for path in (run / "earlier").iterdir())
-    assert kept == ["240.pkl", "300.pkl"]
-    (run / "earlier" / "240.pkl").unlink()
-    assert train.main(["-i", str(run), "-n", "360", *TOY[:2]]) == 2
-    said = capsys.readouterr().err
-    assert f"can't read the earlier rollouts in {run / 'earlier'}" in said
-    assert "start the run again without -i" in said
 
 
 def test_the_log_folder_may_be_written_otherwise(tmp_path, capsys):

@@ -21,7 +21,6 @@ def gae(
     dones: np.ndarray,
     gamma: float,
     gae_lambda: float,
-    traces: np.ndarray | None = None,
 ) -> np.ndarray:
     """Generalised advantage estimates (Schulman et al., 2016, equation 16).
 
@@ -32,8 +31,6 @@ def gae(
     :param dones: whether the last step ended an episode, shape [n]
     :param gamma: discount factor
     :param gae_lambda: 0 for one-step errors, 1 for returns minus values
-    :param traces: by how much the errors from step t on count for the steps before, shape [T, n]:
-        below 1 where another policy acts, min(1, π/μ) in Retrace (Munos et al., 2016); None for 1
     :return: advantages, shape [T, n, …]
     """
     continues = _continues(episode_starts, dones, rewards.ndim)
@@ -41,9 +38,6 @@ def gae(
     errors = rewards + gamma * continues * next_values - values
     advantages = np.empty_like(errors)
     running = np.zeros_like(errors[0])
-    if traces is not None:
-        later = np.concatenate([traces[1:], np.ones_like(traces[:1])])
-        continues = continues * later.reshape(continues.shape)
     for t in reversed(range(len(errors))):
         running = errors[t] + gamma * gae_lambda * continues[t] * running
         advantages[t] = running

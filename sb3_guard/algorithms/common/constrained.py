@@ -34,7 +34,6 @@ from sb3_guard.algorithms.common.arguments import (
 )
 from sb3_guard.algorithms.common.costs import CostEstimate
 from sb3_guard.algorithms.common.limits import CostLimits
-from sb3_guard.algorithms.common.loading import LoadsOthers, name_of
 from sb3_guard.checked_env import checked
 from sb3_guard.checks import check_cost_keys, is_number
 from sb3_guard.costs import EpisodeCosts, read_costs
@@ -52,7 +51,7 @@ def _within(callback: BaseCallback) -> Iterator[BaseCallback]:
         yield from _within(one)
 
 
-class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
+class Constrained(CostLimits, BaseAlgorithm):
     """Cost keys, limits and episode costs in addition to an algorithm of Stable-Baselines3.
 
     Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. A subclass states its
@@ -76,6 +75,8 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
     constrained: ClassVar[bool] = True
     #: What of an episode's costs the limits bound, see :class:`~sb3_guard.costs.EpisodeCosts`.
     limit_on: ClassVar[Literal["sum", "max"]] = "sum"
+    #: Arguments of SB3's constructors that the class fills in itself.
+    fixed_arguments: ClassVar[frozenset[str]] = frozenset()
     #: Default values of keyword arguments, where they differ from those of the bases.
     defaults: ClassVar[dict[str, Any]] = {}
 
@@ -139,6 +140,34 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
 
     # Construction
 
+    @classmethod
+    def load(
+        cls,
+        path: Any,
+        env: Any = None,
+        device: Any = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """SB3's ``load``, which takes an argument that is misspelt without a word.
+
+        :param path: a file that an algorithm of this class has saved
+        :param env: environment to train in; None: to predict only
+        :param device: torch device
+        :param custom_objects: what replaces attributes in the file
+        :param print_system_info: whether to print the versions that the file was written with
+        :param force_reset: whether the next ``learn`` begins new episodes
+        :param kwargs: arguments to change, such as ``cost_limit``
+        :return: the agent
+        :raises TypeError: an argument is not known; the message names the nearest one
+        """
+        check_names(cls, kwargs)
+        return super().load(
+            path, env, device, custom_objects, print_system_info, force_reset, **kwargs
+        )
+
     def _check_hyperparameters(self) -> None:
         """Refuse values that could only fail later or silently do harm."""
         stated_ones = stated(type(self))
@@ -156,7 +185,6 @@ class Constrained(LoadsOthers, CostLimits, BaseAlgorithm):
         for space in *parts, self.action_space:
             if np.any(getattr(space, "start", 0)):
                 raise ValueError(f"{space}: must begin at 0, where Stable-Baselines3 counts from")
-        self.saved_by = name_of(type(self))  # for the reader of a file; `load` calls this last
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
 

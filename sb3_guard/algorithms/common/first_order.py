@@ -1,12 +1,12 @@
 """Epochs of minibatches, as in SB3's PPO, on a custom loss.
 
-What differs from PPO is one hook, ``loss``. Critic, entropy bonus, gradient clipping, early
-stopping and logs are PPO's, bit for bit: with the loss it comes with, the class is PPO. Algorithms
+What differs from PPO is one hook, ``loss``. Critic, entropy bonus, gradient clipping and
+logs are PPO's, bit for bit: with the loss it comes with, the class is PPO. Algorithms
 that need no other loss than PPO's, as PPO-Lagrangian, inherit from SB3's own ``PPO`` instead.
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -16,7 +16,6 @@ from stable_baselines3.common.utils import explained_variance
 from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.actor import Before
-from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
@@ -31,10 +30,8 @@ Loss = Callable[[CostRolloutBufferSamples, th.Tensor, Distribution], th.Tensor]
 class FirstOrder(CostRollouts, PPO):
     """SB3's PPO with a cost critic, whose loss a subclass replaces.
 
-    :param target_kl: where the passes over a rollout stop; None for never
-    :param kl_stop: ``"minibatch"`` stops before the first minibatch whose KL exceeds
-        1.5 ``target_kl``, as SB3 does; ``"epoch"`` after the first pass at whose end the mean over
-        the rollout exceeds ``target_kl``, as OmniSafe does
+    :param target_kl: the passes over a rollout end with the first one after which the mean KL over
+        the rollout exceeds it, where SB3's PPO looks at single minibatches; None for never
     """
 
     search_space: ClassVar[dict[str, Any]] = {
@@ -51,8 +48,6 @@ class FirstOrder(CostRollouts, PPO):
     # λ = 0.97 and the stop by the KL of the rollout: what robots with episodes of 1,000 steps need.
     defaults: ClassVar[dict[str, Any]] = {"gae_lambda": 0.97, "target_kl": 0.02}
     policy_defaults: ClassVar[dict[str, Any]] = CALM
-
-    kl_stop: Literal["minibatch", "epoch"] = hyperparameter("epoch")
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -137,7 +132,6 @@ class FirstOrder(CostRollouts, PPO):
         reach: float,
     ) -> bool:
         """One pass; whether it was the last."""
-        furthest = np.inf if self.target_kl is None else reach * self.target_kl
         names = "policy_gradient_loss", "approx_kl"
         loss_name, kl_name = names if values else ("projection_loss", "projection_kl")
         history[kl_name] = []  # of the last pass alone, as SB3 logs it
@@ -166,17 +160,12 @@ class FirstOrder(CostRollouts, PPO):
             for name, value in {**losses, kl_name: divergence}.items():
                 history.setdefault(name, []).append(number := value.item())
                 self._check_finite(name, number)
-            if self.kl_stop == "minibatch" and float(divergence) > 1.5 * furthest:
-                return True
             self.policy.optimizer.zero_grad()
             total.backward()
             th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
             self.policy.optimizer.step()
-        return (
-            self.kl_stop == "epoch"
-            and self.target_kl is not None  # the distance takes time
-            and mean_kl(self, start) > furthest
-        )
+        # The distance takes time.
+        return self.target_kl is not None and mean_kl(self, start) > reach * self.target_kl
 
     def _value_loss(self, batch: CostRolloutBufferSamples, values: th.Tensor) -> th.Tensor:
         if self.clip_range_vf is not None:

@@ -1,6 +1,6 @@
 """Lagrange multipliers that follow the violation, for on- and off-policy algorithms."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -10,14 +10,6 @@ from torch import nn
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
-
-
-def _only_of_its_kind(optimizer: th.optim.Optimizer, state: dict[str, Any]) -> dict[str, Any]:
-    """The state to load: begun afresh where it is SGD's and the optimizer Adam, or vice versa."""
-    both = optimizer.param_groups, state["param_groups"]
-    adam, was_adam = ("betas" in groups[0] for groups in both)
-    return state if adam == was_adam else optimizer.state_dict()
-
 
 # Gains that keep positive limits whatever the unit of cost, for policies that learn from rollouts.
 RELATIVE = {"lambda_lr": 0.2, "proportional_gain": 0.5, "lambda_units": "relative"}
@@ -33,7 +25,7 @@ class Multiplier(nn.Module):
     With violation Δ = J_C - d, in units of an episode's cost or of the limit, an update is
 
         I ← clip(I + η Δ, 0, max)
-        λ ← clip(I + K_P Δ̄ + K_D max(0, J̄_C - J̄_C some updates before), 0, max)
+        λ ← clip(I + K_P Δ̄ + K_D max(0, J̄_C - J̄_C one update before), 0, max)
 
     where a bar is an exponential average that begins at its first value. With both gains zero this
     is projected gradient ascent of the Lagrangian; otherwise the controller of Stooke et al. (2020,
@@ -43,11 +35,9 @@ class Multiplier(nn.Module):
     :param rate: η
     :param init: λ before the first update
     :param maximum: bound on λ and I; None for none
-    :param adam: let Adam scale the ascent of I instead of taking it as it is
     :param proportional: K_P
     :param derivative: K_D
     :param smoothing: share of its old value that an average keeps in an update; 0 for none
-    :param delay: number of updates over which the rise of J_C is measured
     :param relative: measure costs in units of the limit (of a slow average of J_C where that is 0)
         and count violations of more than one unit as one, so that neither the unit of cost nor how
         far away training begins matters; J̄_C is in units of the slow average where that is larger
@@ -60,11 +50,9 @@ class Multiplier(nn.Module):
         *,
         init: float = 0.0,
         maximum: float | None = None,
-        adam: bool = False,
         proportional: float = 0.0,
         derivative: float = 0.0,
         smoothing: float = 0.0,
-        delay: int = 1,
         relative: bool = False,
     ) -> None:
         super().__init__()
@@ -79,24 +67,14 @@ class Multiplier(nn.Module):
         self.register_buffer("value", start.clone())
         self.register_buffer("slow_cost", unknown.clone())
         self.register_buffer("violation", unknown.clone())
-        # Averages of the last updates, the latest first; before them nothing has risen.
-        self.register_buffer("last_costs", unknown.repeat(delay, 1))
-        kind = th.optim.Adam if adam else th.optim.SGD
-        self.optimizer = kind([self.integral], lr=rate)
-        self.optimizer.register_load_state_dict_pre_hook(_only_of_its_kind)
+        # The average of the last update; before the first one nothing has risen.
+        self.register_buffer("last_costs", unknown[None].clone())
+        self.optimizer = th.optim.SGD([self.integral], lr=rate)
 
     value: th.Tensor
     slow_cost: th.Tensor
     violation: th.Tensor
     last_costs: th.Tensor
-
-    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
-        """Also that of another ``delay``: the latest averages are kept, earlier ones unknown."""
-        saved, delay = state_dict.get("last_costs"), len(self.last_costs)
-        if saved is not None:
-            unknown = saved.new_full((delay, *saved.shape[1:]), np.inf)
-            state_dict = {**state_dict, "last_costs": th.cat([saved, unknown])[:delay]}
-        return super().load_state_dict(state_dict, *args, **kwargs)
 
     @th.no_grad()
     def update(self, cost: np.ndarray, limit: np.ndarray) -> None:
@@ -118,8 +96,8 @@ class Multiplier(nn.Module):
         self.integral.clamp_(0.0, self.maximum)
         self.violation.copy_(_average(self.violation, violation, self.smoothing))
         smooth = _average(self.last_costs[0], now, self.smoothing)
-        rise = (smooth - self.last_costs[-1]).clamp_(min=0.0)
-        self.last_costs.copy_(th.cat([smooth[None], self.last_costs[:-1]]))
+        rise = (smooth - self.last_costs[0]).clamp_(min=0.0)
+        self.last_costs.copy_(smooth[None])
         correction = self.proportional * self.violation + self.derivative * rise
         self.value.copy_(self.integral + correction)
         self.value.clamp_(0.0, self.maximum)
@@ -140,14 +118,12 @@ class Lagrangian(Constrained):
     :param lambda_lr: η, what the multipliers gain per unit of violation and step
     :param lambda_init: multipliers before the first update
     :param lambda_max: bound on the multipliers; None for 5 in relative units, none in those of cost
-    :param lambda_optimizer: ``"sgd"`` for plain ascent, ``"adam"`` lets Adam choose the steps
     :param lambda_update: whether the multipliers follow a rollout ``"before"`` the policy learns
         from it or ``"after"``
     :param proportional_gain: with ``derivative_gain``, turns the ascent into a PID controller
         (Stooke et al., 2020, arXiv 2007.03964) whose integral gain is ``lambda_lr``
     :param derivative_gain: of the rise of J_C
     :param lambda_smoothing: share that the averages behind those two gains keep in a step
-    :param lambda_delay: steps over which the rise of J_C is taken
     :param lambda_units: ``"relative"`` measures violations in units of the limit and λ in standard
         deviations of the advantages, so that a run with all costs and limits multiplied by a number
         is the same run; ``"cost"`` takes both as they are
@@ -163,12 +139,10 @@ class Lagrangian(Constrained):
     lambda_lr: float = hyperparameter(0.005)
     lambda_init: float = hyperparameter(0.0)
     lambda_max: float | None = hyperparameter(None)
-    lambda_optimizer: Literal["sgd", "adam"] = hyperparameter("sgd")
     lambda_update: Literal["before", "after"] = hyperparameter("before")
     proportional_gain: float = hyperparameter(0.0)
     derivative_gain: float = hyperparameter(0.0)
     lambda_smoothing: float = hyperparameter(0.0, high=1.0)
-    lambda_delay: int = hyperparameter(1)
     lambda_units: Literal["relative", "cost"] = hyperparameter("cost")
 
     def _check_hyperparameters(self) -> None:
@@ -190,11 +164,9 @@ class Lagrangian(Constrained):
             self.lambda_lr,
             init=self.lambda_init,
             maximum=highest,
-            adam=self.lambda_optimizer == "adam",
             proportional=self.proportional_gain,
             derivative=self.derivative_gain,
             smoothing=self.lambda_smoothing,
-            delay=self.lambda_delay,
             relative=relative,
         )
 

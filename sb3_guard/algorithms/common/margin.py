@@ -1,15 +1,15 @@
 """A safety margin below the limits, learnt from what updates really bring."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.reuse import Reuse
+from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 
-class Margin(Reuse):
+class Margin(TrustRegion):
     """Trust-region steps that aim below the limits by what they have missed them so far.
 
     ::
@@ -23,46 +23,23 @@ class Margin(Reuse):
     the largest possible decrease and leaves the rest of the region to the reward: a limit that
     nothing keeps does not end all learning.
 
-    Once a limit is exceeded, steps may aim at a lower one until that is kept (``recover_to``), so
-    that the next step does not lead out again.
-
-    :param recover_to: share of the limit that J_C has to come down to once it has exceeded it:
-        d - (1 - recover_to) abs(d) is the limit until it is kept; 1 for d itself, as in the papers
     :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the papers
     :param recovery: share of the largest possible decrease of a cost that a step asks for where the
         limit is out of reach; 1 for all of it, as in the papers
     """
 
     signed_limits = True
-    search_space: ClassVar[dict[str, Any]] = {"recover_to": [0.8, 0.9, 1.0]}
 
-    recover_to: float = hyperparameter(1.0, high=1.0, ends="[]")
     margin_lr: float = hyperparameter(0.1)
     recovery: float = hyperparameter(0.98, high=1.0, ends="(]")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.margin: np.ndarray | None = None  # m, in units of an episode's cost, shape (m,)
-        #: whether a limit has been exceeded and J_C not yet come down to ``recover_to``, shape (m,)
-        self.recovering: np.ndarray | None = None
         super().__init__(*args, **kwargs)
-
-    @property
-    def _lower(self) -> np.ndarray:
-        """By how much the limit of recovery is below the limit, shape (m,)."""
-        return (1.0 - self.recover_to) * np.abs(self.cost_limits)
-
-    def train(self) -> None:
-        excess = self.costs.episode_cost - self.cost_limits
-        before = False if self.recovering is None else self.recovering
-        self.recovering = (excess > 0.0) | (before & (excess > -self._lower))
-        if self.recover_to < 1.0:
-            self._record_per_cost("train/recovering", self.recovering)
-        super().train()
 
     def violation(self) -> np.ndarray:
         margin = 0.0 if self.margin is None else self.margin
-        lower = 0.0 if self.recovering is None else self.recovering * self._lower
-        return self.costs.violation + (margin + lower) / self.costs.horizon
+        return self.costs.violation + margin / self.costs.horizon
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         limits = self.cost_limits

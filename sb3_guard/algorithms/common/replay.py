@@ -7,7 +7,7 @@ Q_C(s, a) = c + γ_C Q_C(s', a'); the latest episodes tell J_C.
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -41,6 +41,7 @@ from sb3_guard.checks import check_integer, check_learning_rate, check_number
 # What is chosen where the user names no buffer, and what the last of them alone takes.
 AUTOMATIC = (CostReplayBuffer, CostDictReplayBuffer, CostNStepReplayBuffer)
 N_STEP_ARGUMENTS = ("n_steps", "gamma", "cost_gamma")
+WINDOW = 50  # episodes whose mean cost the multipliers follow
 
 
 class CostReplay(Constrained, OffPolicyAlgorithm):
@@ -302,17 +303,14 @@ class LagrangianReplay(Lagrangian, CostReplay):
     has ceased to.
 
     A single episode is a poor estimate of J_C, so each that ends moves the multipliers by the mean
-    cost of the latest ones: the same way whether one environment or many have brought them, but
-    not more often than there were gradient steps. Episodes that end while random actions fill the
-    buffer do not count.
+    cost of the latest 50: the same way whether one environment or many have brought them. Episodes
+    that end while random actions fill the buffer do not count.
 
-    :param lambda_lr: η, what the multipliers gain per unit of violation
-    :param lambda_lr_per: ``"training"`` gives an episode that ends its share of the steps so far,
-        η T / t, so that the multipliers move as far in a short training as in a long one, and
-        settle; ``"episode"`` gives each episode η
+    :param lambda_lr: η, what the multipliers gain per unit of violation. An episode that ends gives
+        them its share of the steps t so far, η T / t, so that they move as far in a short training
+        as in a long one, and settle
     :param lambda_starts: when the multipliers begin to move: after that many steps, or below 1
         after that share of the training. Before it the policy learns its task at ``lambda_init``
-    :param lambda_window: number of episodes in that mean
     :param safety_margin: how far below a limit d the multipliers keep J_C, as a share of abs(d):
         they follow J_C - (d - safety_margin abs(d))
     """
@@ -330,9 +328,7 @@ class LagrangianReplay(Lagrangian, CostReplay):
         "lambda_units": "relative",
     }
 
-    lambda_lr_per: Literal["training", "episode"] = hyperparameter("training")
     lambda_starts: float = hyperparameter(0.15)
-    lambda_window: int = hyperparameter(50)
     safety_margin: float = hyperparameter(0.0, high=1.0)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -344,7 +340,7 @@ class LagrangianReplay(Lagrangian, CostReplay):
 
     def _estimate_costs(self, rate: np.ndarray | None = None) -> bool:
         for cost in self._ended_costs:
-            self.latest_costs = [*self.latest_costs, cost][-self.lambda_window :]
+            self.latest_costs = [*self.latest_costs, cost][-WINDOW:]
             self.unfollowed.append(np.mean(self.latest_costs, axis=0))
         if not super()._estimate_costs(rate):
             return False
@@ -361,16 +357,13 @@ class LagrangianReplay(Lagrangian, CostReplay):
             super().ascend()
 
     def multiplier_rate(self) -> float:
-        if self.lambda_lr_per == "episode":
-            return self.lambda_lr
         return self.lambda_lr * self.costs.horizon / self.num_timesteps
 
     def costs_to_follow(self) -> list[np.ndarray]:
         margin = self.safety_margin * np.abs(self.cost_limits)
         means = [mean + margin for mean in self.unfollowed]
-        steps = self._n_updates - self.followed_at
         self.unfollowed, self.followed_at = [], self._n_updates
-        return means[-steps:] if self.lambda_lr_per == "episode" else means
+        return means
 
     def penalized(
         self,

@@ -46,36 +46,12 @@ class Trial(NamedTuple):
     cost_change: np.ndarray
 
 
-class CostSurrogates:
-    """mean(ratio · cost advantage) of each cost on the rollout, as functions of the policy.
-
-    :param actor: the policy on the rollout's N rows
-    :param advantages: centred cost advantages, shape (N, m)
-    """
-
-    def __init__(self, actor: Actor, advantages: th.Tensor) -> None:
-        self.actor, self.advantages = actor, advantages
-
-    def gradients(self) -> th.Tensor:
-        """At the old policy, shape (m, P)."""
-        weights = self.advantages / len(self.advantages)
-        return th.stack([self.actor.score(column) for column in weights.unbind(dim=1)])
-
-    def changes(self, ratio: th.Tensor) -> th.Tensor:
-        """From the old policy to the actor's present one, shape (m,).
-
-        :param ratio: its likelihood ratios on the rollout, shape (N,)
-        """
-        return ((ratio - 1.0) @ self.advantages) / len(ratio)
-
-
 @dataclass(eq=False)
 class Region:
     """The update's local picture: a linear surrogate inside a quadratic trust region.
 
     :param actor: the policy on the batch
     :param batch: the batch
-    :param costs: the cost surrogates
     :param gradient: of the surrogate at the old policy, shape (P,)
     :param violation: of the cost limits, in units of the cost surrogates, shape (m,)
     :param delta: bound on the mean KL
@@ -85,7 +61,6 @@ class Region:
 
     actor: Actor
     batch: CostRolloutBufferSamples
-    costs: CostSurrogates
     gradient: th.Tensor
     violation: np.ndarray
     delta: float
@@ -95,7 +70,16 @@ class Region:
     @cached_property
     def cost_gradients(self) -> th.Tensor:
         """Gradients of mean(ratio · cost advantage) at the old policy, shape (m, P)."""
-        return self.costs.gradients()
+        weights = self.batch.cost_advantages / len(self.batch.cost_advantages)
+        return th.stack([self.actor.score(column) for column in weights.unbind(dim=1)])
+
+    def cost_changes(self, ratio: th.Tensor) -> np.ndarray:
+        """By how much mean(ratio · cost advantage) differs from the old policy's, shape (m,).
+
+        :param ratio: likelihood ratios of the actor's present policy, shape (N,)
+        """
+        change = ((ratio - 1.0) @ self.batch.cost_advantages) / len(ratio)
+        return change.cpu().numpy().astype(np.float64)
 
     def product(self, vector: th.Tensor) -> th.Tensor:
         """F · vector, damped, shape (P,)."""
@@ -292,7 +276,6 @@ class TrustRegion(CostRollouts):
         region = Region(
             actor,
             batch,
-            self.cost_surrogates(actor, batch),
             actor.score(weights),
             self.violation(),
             self.target_kl,
@@ -339,9 +322,8 @@ class TrustRegion(CostRollouts):
                     # So far off that torch refuses the distribution: a scale of 0, a mean of nan.
                     fraction *= self.line_search_shrinking_factor
                     continue
-                change = region.costs.changes(ratio)
                 improvement = float(self.surrogate(batch, ratio)) - before
-                trial = Trial(kl, improvement, change.cpu().numpy().astype(np.float64))
+                trial = Trial(kl, improvement, region.cost_changes(ratio))
                 accepted = self.accept(trial)
                 if accepted:
                     return fraction, trial
@@ -359,10 +341,6 @@ class TrustRegion(CostRollouts):
         self.logger.record("train/value_loss", loss)
         if self.uses_cost_critic:
             self.fit_cost_critic(self.n_critic_updates)
-
-    def cost_surrogates(self, actor: Actor, batch: CostRolloutBufferSamples) -> CostSurrogates:
-        """What steps and line searches know of the costs: here, what this rollout says."""
-        return CostSurrogates(actor, batch.cost_advantages)
 
     # What an algorithm may replace
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
 # Files of what differs from an algorithm's own file, which `-conf NAME` reads; not code.
-PRESETS = {"paper": "the paper", "omnisafe": "the settings that OmniSafe has published"}
+PRESETS = {"paper": "the paper"}
 # Hyperparameters that name classes, one or several, perhaps with arguments; and of what kind.
 BASES: dict[str, type] = {
     "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback

@@ -8,7 +8,6 @@ file is a model file of SB3's with one more member, so ``CPO.load("checkpoint.zi
 import pickle
 import random
 import time
-import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,9 +19,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from sb3_guard.algorithms.common.reuse import Reuse, Rollout
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.cli.usage import UsageError, explained
@@ -33,12 +31,11 @@ from sb3_guard.zoo.run.resumable import capture, restore
 MEMBER = "run_state.pkl"
 NORMALIZER = "vecnormalize.pkl"
 REPLAY_BUFFER = "replay_buffer.pkl"
-EARLIER = "earlier"  # folder beside the checkpoint: earlier rollouts, each written once
-# Checkpoints take at most this share of the time: replay buffers and earlier rollouts are large.
+# Checkpoints take at most this share of the time: replay buffers are large.
 LARGEST_SHARE = 0.05
 # The tensors with gSDE's noise, of all environments and of one each.
 GSDE_NOISE = "exploration_mat", "exploration_matrices"
-FORMAT = 8  # increased when the content changes: no other can be continued
+FORMAT = 9  # increased when the content changes: no other can be continued
 
 
 class Interrupted(Exception):
@@ -151,7 +148,6 @@ class Checkpoints(BaseCallback):
         assert isinstance(self.logger, RunLogger)
         began = time.monotonic()
         exploration = _exploration(self.model) if at_rollout else None
-        earlier = self._write_earlier()
         state = {
             "format": FORMAT,
             "identity": self.identity,
@@ -175,7 +171,6 @@ class Checkpoints(BaseCallback):
             "elapsed": (time.time_ns() - self.model.start_time) / 1e9,
             "start": self.model._num_timesteps_at_start,
             "action_noise": self.model.action_noise,
-            "earlier": earlier,
         }
         with replacing(self.path) as file:
             self.model.save(file)
@@ -188,30 +183,8 @@ class Checkpoints(BaseCallback):
                 if isinstance(self.model, OffPolicyAlgorithm):
                     with archive.open(REPLAY_BUFFER, "w", force_zip64=True) as member:
                         pickle.dump(self.model.replay_buffer, member, pickle.HIGHEST_PROTOCOL)
-        self._keep_earlier(earlier)
         self._last = time.monotonic()
         self._took = self._last - began
-
-    @property
-    def _earlier(self) -> Path:
-        return self.path.parent / EARLIER
-
-    def _write_earlier(self) -> list[str]:
-        """Write those earlier rollouts of the next update that are not yet there; names of all."""
-        rollouts = self.model.earlier if isinstance(self.model, Reuse) else []
-        for rollout in rollouts:
-            self._earlier.mkdir(exist_ok=True)
-            path = self._earlier / f"{rollout.number}.pkl"
-            if not path.exists():
-                with replacing(path) as file:
-                    pickle.dump(tuple(rollout), file, pickle.HIGHEST_PROTOCOL)
-        return [f"{rollout.number}.pkl" for rollout in rollouts]
-
-    def _keep_earlier(self, names: Sequence[str]) -> None:
-        """Remove the rollouts that no checkpoint needs any longer."""
-        for file in self._earlier.glob("*"):
-            if file.name not in names:
-                file.unlink()
 
     def _evaluation_envs(self) -> list[VecEnv]:
         return [other.eval_env for other in self.others if isinstance(other, EvalCallback)]
@@ -222,7 +195,6 @@ class Checkpoints(BaseCallback):
 
         :param model: as loaded from the same checkpoint, with its environment
         :param state: as :func:`read_checkpoint` returns it
-        :raises UsageError: an earlier rollout that an update uses is absent or damaged
         """
         self._resumed = state
         self.rollouts = state["rollouts"]
@@ -233,14 +205,6 @@ class Checkpoints(BaseCallback):
         for evaluation, parts in zip(self._evaluation_envs(), state["evaluation"], strict=True):
             evaluation.reset()
             restore(evaluation, parts)
-        if isinstance(model, Reuse):
-            fix = f"start the run again without -i, or, in a grid, after removing {self.path}"
-            with explained(f"can't read the earlier rollouts in {self._earlier}", fix=fix):
-                model.earlier = [
-                    Rollout(*pickle.loads((self._earlier / name).read_bytes()))
-                    for name in state["earlier"]
-                ]
-            self._keep_earlier(state["earlier"])
         env = model.get_env()
         assert env is not None
         env.reset()
@@ -301,12 +265,12 @@ def load_model(
     :param env: environment to continue training in; None: to predict only
     :raises UsageError: the file is damaged, of another algorithm, or does not fit the environment
     """
-    with explained(f"can't load {path} as {algorithm.__name__}"):
-        with warnings.catch_warnings():
-            # They are restored later; whoever plays makes an environment with those of the run.
-            if env is None or getattr(unwrap_vec_normalize(env), "norm_obs", False):
-                warnings.filterwarnings("ignore", "the agent learnt from normalised observations")
-            model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
+    fix = (
+        "if it is another algorithm's, sb3_guard.warm_start(model, file) takes over its networks "
+        "in Python"
+    )
+    with explained(f"can't load {path} as {algorithm.__name__}", fix=fix):
+        model = algorithm.load(path, env=env, device=device, force_reset=False, **changes)
         if env is not None and isinstance(model, OffPolicyAlgorithm):
             with zipfile.ZipFile(path) as archive:
                 if REPLAY_BUFFER in archive.namelist():

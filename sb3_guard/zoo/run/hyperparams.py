@@ -153,7 +153,7 @@ def read_hyperparams(
     :param env_id: its own entry is taken, with or without a version, else the first pattern that
         fits, else ``default``
     :param conf_file: file to read instead of the shipped one, or a preset: ``paper`` for the
-        paper's table, ``omnisafe`` for OmniSafe's published settings
+        paper's table
     :param overrides: what the command line says
     :raises UsageError: the file can't be read, or has no entry that fits
     """

@@ -49,7 +49,7 @@ def make_model(
 
     :param algo: what ``--algo`` takes: an algorithm of this package, or one of RL-Zoo as a baseline
     :param env_id: an environment; its version may be left out
-    :param conf: hyperparameters: ``"paper"``, ``"omnisafe"`` or a file; None for the defaults in
+    :param conf: hyperparameters: ``"paper"`` or a file; None for the defaults in
         ``hyperparams/<algo>.yml``
     :param seed: of networks and environments; None for a random one
     :param env_kwargs: parameters of the environment, such as ``{"hazards": {"num": 4}}``

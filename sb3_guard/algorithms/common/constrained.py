@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from gymnasium import spaces
+from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
@@ -137,6 +138,12 @@ class Constrained(CostLimits, BaseAlgorithm):
         self.timing: dict[str, float] = {}
         self._begin_statistics()
         super().__init__(*args, **kwargs)
+        if new and self.env is not None and is_masking_supported(self.env):
+            self._warn_once(
+                "action masks",
+                f"{type(self).__name__} does not use the environment's action_masks: it takes "
+                "actions that they exclude, too; sb3-contrib's MaskablePPO keeps to them",
+            )
 
     # Construction
 
@@ -202,7 +209,10 @@ class Constrained(CostLimits, BaseAlgorithm):
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """Called by SB3 before each update: a limit may be another one then."""
-        super()._update_current_progress_remaining(num_timesteps, total_timesteps)
+        # The last rollout may go beyond the training's end, which no schedule knows of.
+        super()._update_current_progress_remaining(
+            min(num_timesteps, total_timesteps), total_timesteps
+        )
         if self.costs is not None and self.limits_change:
             cost, horizon, _ = self.costs
             self.costs = CostEstimate(cost, horizon, (cost - self.cost_limits) / horizon)

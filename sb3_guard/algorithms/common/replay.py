@@ -167,6 +167,16 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         elif several != issubclass(self.replay_buffer_class, CostNStepReplayBuffer):  # type: ignore[arg-type]
             kind = "more than one step" if several else "n_steps=1"
             wrong = f"was saved by a model with {kind}, and this one has n_steps={self.n_steps}"
+        elif loaded.n_envs != self.n_envs:
+            wrong = f"is of {loaded.n_envs} environments, and the model has {self.n_envs}"
+        elif (loaded.observation_space, loaded.action_space) != (
+            self.observation_space,
+            self.action_space,
+        ):
+            wrong = (
+                f"has observations {loaded.observation_space} and actions {loaded.action_space}, "
+                f"and the model {self.observation_space} and {self.action_space}"
+            )
         if wrong:
             self.replay_buffer = before
             raise ValueError(f"the replay buffer {wrong}")

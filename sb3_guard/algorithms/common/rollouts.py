@@ -104,6 +104,8 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         self._timeouts: list[tuple[int, int, Any]] = []
         own_policy = kwargs.pop("policy_kwargs", None) or {}
         super().__init__(*args, policy_kwargs={**self.policy_defaults, **own_policy}, **kwargs)
+        if hasattr(self, "policy"):  # `load` makes it later, and it has learnt
+            self._check_reach()
 
     # Construction and saving
 
@@ -120,6 +122,21 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         arch = (self.policy_kwargs or {}).get("net_arch")
         if isinstance(arch, dict) and "cost" in arch and not {"pi", "vf"} <= arch.keys():
             raise ValueError(f"net_arch={arch!r}: must also have the layers of 'pi' and 'vf'")
+
+    def _check_reach(self) -> None:
+        """Warn of a box that a first policy, a Gaussian around 0, hardly ever acts in."""
+        box, policy = self.action_space, self.policy
+        if not isinstance(box, spaces.Box) or policy.squash_output:
+            return
+        deviation = np.exp(policy.log_std_init)
+        far = np.maximum(-box.low, box.high) > 10.0 * deviation
+        if np.any(far | (box.low > 0.0) | (box.high < 0.0)):
+            self._warn_once(
+                "actions",
+                f"a first policy acts around 0 with a standard deviation of {deviation:.2g}, and "
+                f"the actions go from {box.low.min():g} to {box.high.max():g}: wrap the "
+                "environment in gymnasium.wrappers.RescaleAction(env, -1.0, 1.0)",
+            )
 
     def _choose_buffer(self) -> None:
         if self.rollout_buffer_class is None:

@@ -343,8 +343,8 @@ def build(values: Mapping[str, Any]) -> Setup:
 
 
 def _schedule(name: str, value: str) -> Callable[[float], float]:
-    from rl_zoo3 import linear_schedule
-
     what = f"hyperparameter {name}: {value!r} is not a schedule"
     with explained(what, ValueError, fix="write e.g. lin_0.001"):
-        return linear_schedule(value.removeprefix("lin_"))
+        initial = float(value.removeprefix("lin_"))
+    # The last rollout may go beyond the training's end.
+    return lambda remaining: max(remaining, 0.0) * initial

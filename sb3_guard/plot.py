@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,23 +98,21 @@ def plot(flags: Flags) -> int:
     if not (means or flags.figure or flags.report or by_default):
         return 0
     runs = reading.select(chosen)
-    notes = reading.notices(chosen, runs)
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
     data = Data(runs)
     for file in means:
-        tables.write_tables(file, data, notes)
+        tables.write_tables(file, data)
         print(f"wrote {file}")
     status = _draw(data, ["curves"] if by_default else flags.figure, flags)
     if flags.report:
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
-        page = report(data, title, results.left_out, notes)
+        page = report(data, title, results.left_out)
         with tables.written(flags.report) as handle:
             handle.write(page.encode())
         print(f"wrote {flags.report}")
     if by_default:
         for title, table in tables.tables(data).items():
-            print(f"\n{title}\n\n{tables.terminal(table)}")
+            print(f"\n{title}\n\n{tables.terminal(table)}\n")
+            print(textwrap.fill(tables.CAPTIONS[title], 100))
     return status
 
 

@@ -67,7 +67,7 @@ def limits() -> Figure:
     for algo in ("cpo", "trpo_lag", "ppo_lag"):
         for axis, name in ((left, "return_last"), (right, "cost_last")):
             rows = [means[limit].loc[algo] for limit in order]
-            spread = np.nan_to_num([row[f"{name}_se"] * row["seeds"] ** 0.5 for row in rows])
+            spread = np.nan_to_num([row[f"{name}_std"] for row in rows])
             axis.errorbar(
                 order, [row[name] for row in rows], spread, capsize=2, marker=looks[algo].marker,
                 **looks[algo].line,

@@ -133,7 +133,7 @@ def percent(share: float) -> str:
 
 def deviation(row: Any, name: str, digits: int) -> str:
     """A mean over seeds ± their standard deviation; of a single one the number alone."""
-    return spread(row[name], row[f"{name}_se"] * row["seeds"] ** 0.5, digits)
+    return spread(row[name], row[f"{name}_std"], digits)
 
 
 def grey(rows: pd.DataFrame, columns: dict[str, Any]) -> str:

@@ -1,6 +1,7 @@
 """Agents for the hub: what is uploaded, what becomes of a download, and no network."""
 
 import json
+import os
 import pickle
 import shlex
 import sys
@@ -64,15 +65,16 @@ def test_the_commands_of_the_card_are_commands(logs, tmp_path):
     assert again[:2] == ["sb3-guard", "train"] and train.Flags.parse(again[2:])
 
 
-def test_no_path_of_this_machine_is_uploaded(logs, tmp_path):
-    run = logs / "cpo" / "Filmed-v0_1"
-    result = json.loads((run / "result.json").read_text())
-    command = f"sb3-guard train --algo cpo --env Filmed-v0 -i {logs}/old.zip"
-    (run / "result.json").write_text(json.dumps(result | {"command": command}))
-    assert staged(logs, tmp_path, "--no-video") == 0
-    assert str(logs) in (run / "Filmed-v0" / "args.yml").read_text()
-    expected = "sb3-guard train --algo cpo --env Filmed-v0 -i old.zip"
-    assert (tmp_path / "command.txt").read_text() == expected
+def test_no_path_of_this_machine_is_uploaded(logs, tmp_path, monkeypatch):
+    args = logs / "cpo" / "Filmed-v0_1" / "Filmed-v0" / "args.yml"
+    before = args.read_text()
+    args.write_text(yaml.safe_dump(yaml.safe_load(before) | {"trained_agent": f"{logs}/old.zip"}))
+    try:
+        assert staged(logs, tmp_path, "--no-video") == 0
+        assert str(logs) in args.read_text()
+    finally:
+        args.write_text(before)
+    assert " -i old.zip" in (tmp_path / "command.txt").read_text().replace("--trained-agent", "-i")
     for file in ("args.yml", "command.txt", "config.yml", "README.md"):
         assert str(logs.parent) not in (tmp_path / file).read_text(), file
     flags = yaml.safe_load((tmp_path / "args.yml").read_text())
@@ -163,6 +165,31 @@ def test_a_repository_of_another_agent(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "hub"))
     assert hub.main(["load", "-orga", "me", "-f", str(tmp_path / "logs")]) == 2
     assert "cpo-Goal_Point_8Hazards-v0.zip, but ppo-X-v0.zip; name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["cpo-Filmed-v0.zip", "args.yml"])
+@pytest.mark.parametrize("kind", ["folder", "fifo", "dangling link"])
+def test_what_is_no_file_is_not_loaded(tmp_path, monkeypatch, capsys, name, kind):
+    (tmp_path / "hub").mkdir()
+    for file in {"cpo-Filmed-v0.zip", "args.yml", "config.yml"} - {name}:
+        (tmp_path / "hub" / file).touch()
+    path = tmp_path / "hub" / name
+    {"folder": path.mkdir, "fifo": lambda: os.mkfifo(path),
+     "dangling link": lambda: path.symlink_to("nowhere")}[kind]()  # fmt: skip
+    monkeypatch.setattr("huggingface_hub.snapshot_download", lambda repo: str(tmp_path / "hub"))
+    assert hub.main(["load", *WHICH[:4], "-orga", "me", "-f", str(tmp_path / "logs")]) == 2
+    assert f"the repository has no file {name}, but " in capsys.readouterr().err
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_broken_command_in_a_result_does_no_harm(logs, tmp_path):
+    file = logs / "cpo" / "Filmed-v0_1" / "result.json"
+    before = file.read_text()
+    file.write_text(json.dumps(json.loads(before) | {"command": "train 'open"}))
+    try:
+        assert staged(logs, tmp_path, "--no-video") == 0
+    finally:
+        file.write_text(before)
 
 
 def test_whose_repository(capsys):

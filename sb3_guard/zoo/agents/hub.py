@@ -175,9 +175,7 @@ def card(agent: Agent, flags: HubFlags, evaluation: Evaluation, results: Mapping
 
 def command(agent: Agent) -> str:
     """The command line of a run, with the names of files, but not where they lie here."""
-    result = agent.run.read_result() or {}
-    default = f"sb3-guard train --algo {agent.run.path.parent.name} --env {agent.env_id}"
-    words = shlex.split(result.get("command", default))
+    words = shlex.split(agent.run.flags().command())
     return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
 
@@ -208,13 +206,11 @@ def install(downloaded: Path, name: str, flags: HubFlags) -> RunFolder:
     :param name: name of the model
     :raises UsageError: the model or its settings are not there
     """
-    needed = {f"{name}.zip", "config.yml", "args.yml"}
-    absent = needed - {path.name for path in downloaded.iterdir()}
-    if absent:
-        there = ", ".join(sorted(path.name for path in downloaded.iterdir())) or "nothing"
+    files = {path.name for path in downloaded.iterdir() if path.is_file()}
+    if absent := {f"{name}.zip", "config.yml", "args.yml"} - files:
         raise UsageError(
-            f"the repository has no {', '.join(sorted(absent))}, but {there}; name the agent's own "
-            "--algo and --env"
+            f"the repository has no file {', '.join(sorted(absent))}, but "
+            f"{', '.join(sorted(files)) or 'nothing'}; name the agent's own --algo and --env"
         )
     env = folder_name(flags.env)
     parent = Path(flags.folder) / flags.algo
@@ -223,7 +219,7 @@ def install(downloaded: Path, name: str, flags: HubFlags) -> RunFolder:
     (path / env).mkdir()
     shutil.copyfile(downloaded / f"{name}.zip", path / f"{env}.zip")
     for file, target in layout(path, env).items():
-        if (downloaded / file).is_file():
+        if file in files:
             shutil.copyfile(downloaded / file, target)
     return RunFolder(path)
 

@@ -300,8 +300,9 @@ def tiers(data: Data, suite: str) -> Figure | None:
     algos = data.algos(suite)[::-1]
     figure, panels = _split_axes(data, suite, height=1.4 + 0.28 * len(algos))
     limited = {*data.runs.loc[data.runs["suite"] == suite].dropna(subset=["limits"])["algo"]}
+    totals = data.splits[(data.splits["suite"] == suite) & (data.splits["key"] == "")]
     for split, axis in panels.items():
-        rows = data.splits[(data.splits["suite"] == suite) & (data.splits["split"] == split)]
+        rows = totals[totals["split"] == split]
         for row in rows.to_dict("records"):
             name = row["tier"] or ("other limits" if row["algo"] in limited else "no limit")
             y, (color, marker) = algos.index(row["algo"]), TIER_STYLES[name]

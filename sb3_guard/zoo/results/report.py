@@ -1,6 +1,6 @@
 """A page about runs: one HTML file that needs nothing else, on screens of any width."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import jinja2
 import pandas as pd
@@ -10,17 +10,16 @@ from sb3_guard.zoo.results.figure_data import Data
 from sb3_guard.zoo.results.figures import inline_svg
 from sb3_guard.zoo.results.paper import FIGURES, draw
 from sb3_guard.zoo.results.runs import VERSIONS
-from sb3_guard.zoo.results.tables import RUNS, spelled, tables
+from sb3_guard.zoo.results.tables import CAPTIONS, RUNS, spelled, tables
 
 
-def report(data: Data, title: str, left_out: Mapping[str, str], notes: Sequence[str]) -> str:
+def report(data: Data, title: str, left_out: Mapping[str, str]) -> str:
     """
     The page.
 
     :param data: the runs
     :param title: what the page is called
     :param left_out: why a run could not be read, by its path
-    :param notes: what a reader of the means should know
     :return: HTML
     """
     loader = jinja2.PackageLoader("sb3_guard.zoo.results", ".")
@@ -36,9 +35,9 @@ def report(data: Data, title: str, left_out: Mapping[str, str], notes: Sequence[
         runs=data.runs,
         made={name: sorted(data.runs[name].dropna().unique()) for name in (*VERSIONS, "commit")},
         version=sb3_guard.__version__,
-        notes=notes,
         left_out=left_out,
         tables={heading: _html(table) for heading, table in tables(data).items()},
+        captions=CAPTIONS,
         figures=figures,
         run_table=_html(spelled(data.runs, RUNS)),
     )

@@ -140,7 +140,7 @@ def read_run(path: Path) -> dict[str, Any]:
         "epoch": math.nan if None in rollout else math.prod(rollout),
         "world": _text(config.get("env_kwargs") or {}),
         "wrappers": _text([config.get(f"{kind}env_wrapper") for kind in ("", "vec_")]),
-        "started_from": args.get("trained_agent") or None,
+        "started_from": args.get("trained_agent") or "",
         "config": _digest(config, result.get("learned")),
         **{name: versions.get(name) for name in VERSIONS},
         "commit": result.get("commit"),
@@ -257,6 +257,13 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
         ("world", "env_kwargs", ["suite"], "give the folders of one kind only"),
         ("steps", "length", ["suite", "algo"], "choose one, such as --steps {}"),
         ("wrappers", "wrappers", ["suite", "algo"], "give the folders of one kind only"),
+        (
+            "started_from",
+            "the model they started from",
+            ["suite", "algo"],
+            "give the folders of one kind only",
+        ),
+        ("config", "hyperparameters", ["suite", "algo"], "give the folders of one kind only"),
     ):
         for key, group in runs.groupby(keys):
             values = _values(group[column])
@@ -276,39 +283,6 @@ def _values(column: "pd.Series[Any]") -> list[Any]:
 
 def _joined(values: Iterable[Any]) -> str:
     return ", ".join(map(str, values))
-
-
-def notices(runs: pd.DataFrame, selected: pd.DataFrame) -> list[str]:
-    """
-    What a reader of the means should know: repeated runs, and in what those compared differ.
-
-    :param runs: see :func:`choose`
-    :param selected: what :func:`select` made of them
-    """
-    again = runs[runs.duplicated(_SAME, keep="last") & runs["suite"].isin({*selected["suite"]})]
-    lines = [f"{path} was repeated with the same seed: the later run counts"
-             for path in again["path"]]  # fmt: skip
-    for suite, group in selected.groupby("suite"):
-        lines += [f"{suite}: {line}" for line in _differences(group)]
-        none = group.loc[group["J_r"].isna(), "path"]
-        if len(none):
-            lines.append(f"{suite}: no episode ended in {_joined(none)}")
-    return lines
-
-
-def _differences(group: pd.DataFrame) -> Iterable[str]:
-    """In what the runs of one environment differ."""
-    for name in ("steps", "started_from", "sb3_guard", "mujoco", "commit"):
-        values = _values(group[name].fillna("none"))
-        if len(values) > 1:
-            yield f"runs differ in {name}: {_joined(values)}"
-    for algo, seeds in group.groupby("algo"):
-        if seeds["config"].nunique() > 1:
-            paths = _joined(seeds.drop_duplicates("config")["path"])
-            yield f"runs of {algo} differ in hyperparameters or in how they were extended: {paths}"
-        twice = _values(seeds.loc[seeds.duplicated("seed"), "seed"])
-        if twice:
-            yield f"runs of {algo} count twice or more for one seed: {_joined(twice)}"
 
 
 def compared(table: pd.DataFrame) -> "pd.Series[bool]":

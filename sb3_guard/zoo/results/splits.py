@@ -32,17 +32,19 @@ def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataF
 
     :param path: the run folder
     :param epoch: steps, as for :func:`~sb3_guard.zoo.results.statistics.last_epochs`
-    :return: for each of :data:`SPLITS` that the run has, its episodes' ``J_r`` and ``M_c``: of
-        training those of the last ten epochs, if no wrapper ended them early. Runs of older
-        versions have no final ones
+    :return: for each of :data:`SPLITS` that the run has, its episodes' ``J_r``, ``M_c`` and, of
+        several costs, ``M_c/<key>``: of training those of the last ten epochs, if no wrapper ended
+        them early. Runs of older versions have no final ones
     :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
     """
     result = json.loads((Path(path) / "result.json").read_bytes())
     splits = {}
     if not result.get("cut"):
-        splits["training"] = last_epochs(read_episodes(path), epoch)[["J_r", "M_c"]]
+        splits["training"] = last_epochs(read_episodes(path), epoch).filter(regex="^(J_r|M_c)")
     for split, episodes in result.get("final", {}).items():
-        splits[split] = pd.DataFrame({"J_r": episodes["returns"], "M_c": episodes["costs"]})
+        keys = {} if "limit_on" in result else episodes.get("bounded", {})
+        costs = {"M_c": episodes["costs"], **{f"M_c/{key}": keys[key] for key in keys}}
+        splits[split] = pd.DataFrame({"J_r": episodes["returns"], **costs})
     return splits
 
 
@@ -97,15 +99,16 @@ def tier(low: float, high: float, limit: float) -> str:
 
 def judge(runs: pd.DataFrame, limits: "pd.Series[float] | None" = None) -> pd.DataFrame:
     """
-    How agents of an algorithm keep their limit, a row per suite, algorithm and split.
+    How agents of an algorithm keep their limits, a row per suite, algorithm, split and cost.
 
     :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
-    :param limits: by which each run is judged; None: its own, an unconstrained one by that of the
-        others
-    :return: ``suite``, ``algo``, ``label``, ``split``, ``seeds``, ``limit`` (NaN: none), ``return``
-        and ``cost``, means over seeds of their episodes' means, with ``_std`` (over seeds; NaN for
-        one), ``low`` and ``high`` of the cost (:func:`nested_interval`), ``tier``, ``above`` and
-        ``excess`` (:func:`violations`, of all seeds' episodes)
+    :param limits: of the total cost, by which each run is judged; None: its own, an unconstrained
+        one by that of the others
+    :return: ``suite``, ``algo``, ``label``, ``split``, ``key`` of a cost with a limit of its own
+        (empty: the total), ``seeds``, ``limit`` (NaN: none), ``return`` and ``cost``, means over
+        seeds of their episodes' means, with ``_std`` (over seeds; NaN for one), ``low`` and
+        ``high`` of the cost (:func:`nested_interval`), ``tier``, ``above`` and ``excess``
+        (:func:`violations`, of all seeds' episodes)
     """
     rows = []
     limited = runs.assign(judged_by=judging_limits(runs) if limits is None else limits)
@@ -113,17 +116,22 @@ def judge(runs: pd.DataFrame, limits: "pd.Series[float] | None" = None) -> pd.Da
         seeds = group[["path", "epoch"]].itertuples(index=False)
         played = [read_splits(path, epoch) for path, epoch in seeds]
         names = {"suite": suite, "algo": algo, "label": group["label"].iloc[0]}
+        columns = {"": group["judged_by"].iloc[0]}
+        own = group.filter(regex="^cost_limit/").dropna(axis=1, how="all")
+        columns |= {name.removeprefix("cost_limit"): own[name].iloc[0] for name in map(str, own)}
         for split in SPLITS:
             episodes = [splits[split] for splits in played if split in splits]
-            if episodes:
-                rows.append({**names, "split": split, **_row(episodes, group["judged_by"].iloc[0])})
-    return pd.DataFrame(rows)
+            for end, limit in columns.items():
+                if episodes and all(f"M_c{end}" in seed for seed in episodes):
+                    row = _row(episodes, f"M_c{end}", limit)
+                    rows.append({**names, "split": split, "key": end[1:], **row})
+    return pd.DataFrame(rows, columns=None if rows else ["suite", "algo", "split", "key", "tier"])
 
 
-def _row(seeds: Sequence[pd.DataFrame], limit: float) -> dict[str, object]:
-    """The statistics of a split."""
+def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, object]:
+    """The statistics of a cost in a split."""
     means = pd.DataFrame([episodes.mean() for episodes in seeds])
-    costs = [episodes["M_c"].to_numpy(float) for episodes in seeds]
+    costs = [episodes[column].to_numpy(float) for episodes in seeds]
     low, high = nested_interval(costs)
     if min(abs(low - limit), abs(high - limit)) < 0.02 * (high - low):  # else the draw decides
         low, high = nested_interval(costs, 1_000_000)
@@ -133,8 +141,8 @@ def _row(seeds: Sequence[pd.DataFrame], limit: float) -> dict[str, object]:
         "limit": limit,
         "return": means["J_r"].mean(),
         "return_std": means["J_r"].std(),
-        "cost": means["M_c"].mean(),
-        "cost_std": means["M_c"].std(),
+        "cost": means[column].mean(),
+        "cost_std": means[column].std(),
         "low": low,
         "high": high,
         "tier": tier(low, high, limit),

@@ -106,27 +106,27 @@ def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
     Means over seeds, a row per environment and algorithm.
 
     :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
-    :return: ``suite``, ``algo``, ``label``, ``family``, limits, verdicts (of a single seed),
-        ``seeds``, ``steps``, and for each of :data:`~sb3_guard.zoo.results.runs.METRICS`, and
-        ``M_c/<key>`` if the runs have it, its mean, ``_std`` (of the sample; NaN for one
-        seed), ``_low`` and ``_high`` (95 % bootstrap interval of the mean). If the runs have
-        :data:`SAFETY`: their means, ``_se`` (standard error: ``_std`` ÷ √seeds), and the greatest
-        ``cost_max``
+    :return: ``suite``, ``algo``, ``label``, ``family``, limits, ``seeds``, ``steps``, and for each
+        of :data:`~sb3_guard.zoo.results.runs.METRICS`, and ``M_c/<key>`` and :data:`SAFETY` if the
+        runs have it, its mean (of ``cost_max`` the greatest) and ``_std`` (of the sample; NaN for
+        one seed)
     """
     groups = runs.groupby(["suite", "algo"], sort=False)
-    stated = runs.filter(regex="^(label|family|limits|cost_limit|verdict)").columns
-    parts = [groups[list(stated)].first(), groups["seed"].nunique()]
-    parts.append(groups["steps"].max())
-    for name in (*METRICS, *runs.filter(regex="^M_c/")):
-        ends = [interval([group.dropna().to_numpy()]) for _, group in groups[name]]
-        low, high = np.array(ends).reshape(-1, 2).T
-        part = groups[name].agg(["mean", "std"]).assign(low=low, high=high)
-        parts.append(part.set_axis([name, *(f"{name}_{end}" for end in ("std", "low", "high"))],
-                                   axis=1))  # fmt: skip
-    if "return_last" in runs:
-        parts.append(groups[list(SAFETY)].mean().assign(cost_max=groups["cost_max"].max()))
-        parts.append(groups[list(SAFETY[:2])].sem().add_suffix("_se"))
-    return pd.concat(parts, axis=1).reset_index().rename(columns={"seed": "seeds"})
+    stated = runs.filter(regex="^(label|family|limits|cost_limit)").columns
+    measured = [*METRICS, *runs.filter(regex="^M_c/"), *(name for name in SAFETY if name in runs)]
+    table = pd.concat(
+        [
+            groups[list(stated)].first(),
+            groups["seed"].nunique().rename("seeds"),
+            groups["steps"].max(),
+            groups[measured].mean(),
+            groups[measured].std().add_suffix("_std"),
+        ],
+        axis=1,
+    )
+    if "cost_max" in runs:
+        table["cost_max"] = groups["cost_max"].max()
+    return table.reset_index()
 
 
 def mean_curve(curves: Sequence[pd.DataFrame], name: str) -> pd.DataFrame:

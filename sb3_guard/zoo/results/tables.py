@@ -1,8 +1,10 @@
 """Tables that read well in a terminal, in Markdown, in LaTeX and on a web page."""
 
 import io
+import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+import unicodedata
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BufferedRandom
 from pathlib import Path
@@ -15,7 +17,6 @@ from rich.table import Table
 from rich.text import Text
 
 from sb3_guard.common.files import replacing
-from sb3_guard.costs import verdict
 from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.results.figure_data import Data
@@ -33,7 +34,27 @@ SCORE_HEADINGS = {
     "cost": "cost / TRPO",
     "cost_rate": "cost rate / TRPO",
 }
-_LATEX = {"±": r"$\pm$", "−": "$-$", "ρ": r"$\rho$", "–": "--", "\N{NO-BREAK SPACE}": "~"}
+#: What the caption of each table says; ± and brackets mean the same in all of them.
+SPREAD = "± is the standard deviation over seeds."
+INTERVAL = "Brackets are the 95 % bootstrap interval of the mean."
+CAPTIONS = {
+    "Results": "Means over the episodes of the final epoch of training, with sampled actions. "
+    f"{SPREAD} Limits have the tier of the final stochastic episodes.",
+    "Safety": "The last ten epochs of training; the cost of training is that of all epochs. "
+    f"{SPREAD}",
+    "Tiers": f"{SPREAD} {INTERVAL} A limit is certified if the interval lies at or below it, "
+    "violating if above it, else undecided. D⁺ is the mean relative excess of the episodes above "
+    "the limit.",
+    "Relative to TRPO": "Return, cost and cost rate of the final epoch relative to TRPO's.",
+    "Families, relative to TRPO": "Means over the algorithms of a family.",
+    "All environments, relative to TRPO": "Means over environments (their number), and "
+    f"interquartile means over runs. {INTERVAL}",
+}
+# What pdfTeX does not take in UTF-8, and what reads better as mathematics
+_LATEX = {
+    "±": r"$\pm$", "−": "$-$", "–": "--", "\N{NO-BREAK SPACE}": "~", "⁺": "$^+$",
+    r" J\_r": " $J_r$", r" M\_c": " $M_c$", r"$\rho$\_c": r"$\rho_c$",
+}  # fmt: skip
 
 
 def terminal(data: pd.DataFrame) -> str:
@@ -54,17 +75,25 @@ def markdown(data: pd.DataFrame) -> str:
     return table(list(data.columns), data.astype(str).map(escaped).to_numpy().tolist())
 
 
-def latex(data: pd.DataFrame) -> str:
-    """A table of text in LaTeX; it needs ``\\usepackage{booktabs}``."""
+def latex(data: pd.DataFrame, caption: str) -> str:
+    """A table of text that pdfLaTeX takes; it needs ``\\usepackage{booktabs}``."""
     style = (
         data.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis=1)
     )
-    text = style.to_latex(hrules=True, column_format="l" * len(data.columns)).strip()
+    text = style.to_latex(
+        hrules=True, position_float="centering", column_format="l" * len(data.columns),
+        caption=caption.replace("%", r"\%"),
+    ).strip()  # fmt: skip
+    text = re.sub("[Α-Ωα-ω]", _greek, text)
     for plain, symbol in _LATEX.items():
         text = text.replace(plain, symbol)
-    for plain, symbol in ((r"J\_r", "$J_r$"), (r"M\_c", "$M_c$"), (r"$\rho$\_c", r"$\rho_c$")):
-        text = text.replace(f" {plain}", f" {symbol}")
     return text
+
+
+def _greek(letter: re.Match[str]) -> str:
+    """A Greek letter as mathematics."""
+    _, case, *_, name = unicodedata.name(letter[0]).replace("LAMDA", "LAMBDA").split()
+    return f"$\\{name.lower() if case == 'SMALL' else name.capitalize()}$"
 
 
 # Numbers
@@ -106,47 +135,38 @@ def whole(name: str) -> Callable[[Any], str]:
     return lambda row: number(row[name], 0)
 
 
-def _with_interval(name: str, middle: str = "") -> Callable[[Any], str]:
-    """A cell with a value, its standard deviation if there is one, and its interval."""
-    digits = DIGITS.get(name, 2)
+def _deviation(name: str, digits: int = 2) -> Callable[[Any], str]:
+    """A cell with a mean and its standard deviation over seeds."""
+    return lambda row: spread(row[name], row[f"{name}_std"], digits)
+
+
+def _interval(row: Any, name: str, digits: int = 2) -> str:
+    """The interval of a mean in brackets; empty: there is none."""
+    low, high = (row[end] for end in (f"{name}low", f"{name}high"))
+    return "" if pd.isna(low) else f" [{number(low, digits)}, {number(high, digits)}]"
+
+
+def _limits(splits: pd.DataFrame) -> Callable[[Any], str]:
+    """
+    A cell with the limits of an algorithm and the tier of its final stochastic episodes.
+
+    Runs of older versions have the tier of their training; several costs have the worst.
+    """
 
     def cell(row: Any) -> str:
-        text = spread(row[name + middle], row.get(f"{name}_std"), digits)
-        low, high = (row[f"{name}_{end}"] for end in ("low", "high"))
-        return text if pd.isna(low) else f"{text} [{number(low, digits)}, {number(high, digits)}]"
+        here = splits[(splits["suite"] == row["suite"]) & (splits["algo"] == row["algo"])]
+        for split in ("stochastic", "training"):
+            tiers = {*here.loc[here["split"] == split, "tier"]} - {""}
+            if tiers and not pd.isna(row["limits"]):
+                return f"{row['limits']}: {max(tiers)}"  # certified < undecided < violating
+        return "–" if pd.isna(row["limits"]) else str(row["limits"])
 
     return cell
 
 
-def _limit(row: Any, end: str = "") -> str:
-    """A limit, and whether the mean over seeds keeps it; of one seed, the run's own verdict."""
-    limit, low = row[f"cost_limit{end}"], row.get(f"M_c{end}_low")
-    name = f"{limit:g}" if end else row["limits"]
-    if pd.isna(name):
-        return "–"
-    words = row[f"verdict{end}"]
-    if not pd.isna(low):
-        words = None if pd.isna(limit) else verdict(low, row[f"M_c{end}_high"], limit)
-    return name if pd.isna(words) else f"{name}: {words}"
-
-
-def _limits(means: pd.DataFrame) -> pd.DataFrame:
-    """Where limits are on other costs than the total: a row for each of them."""
-    parts = []
-    for name in map(str, means.filter(regex="^cost_limit/")):
-        end = name.removeprefix("cost_limit")
-        columns: Columns = {
-            "environment": "suite", "algorithm": "label", "cost": lambda row, end=end: end[1:],  # type: ignore[misc]
-            "mean of an episode": _with_interval(f"M_c{end}"),
-            "limit": lambda row, end=end: _limit(row, end),  # type: ignore[misc]
-        }  # fmt: skip
-        parts.append(spelled(means.dropna(subset=[name]), columns))
-    return pd.concat(parts).sort_values("environment", kind="stable") if parts else pd.DataFrame()
-
-
 SAFETY_HEADINGS: Columns = {
-    "return, last epochs": lambda row: spread(row["return_last"], row["return_last_se"]),
-    "cost, last epochs": lambda row: spread(row["cost_last"], row["cost_last_se"]),
+    "return, last epochs": _deviation("return_last"),
+    "cost, last epochs": _deviation("cost_last"),
     "above limit, %": lambda row: number(100 * row["above_limit"], 1),
     "95 % of costs": "cost_p95",
     "worst cost": "cost_max",
@@ -155,17 +175,12 @@ SAFETY_HEADINGS: Columns = {
 }
 
 
-def _interval_of_costs(row: Any) -> str:
-    """Mean cost of a split's episodes, over seeds, and its interval."""
-    ends = f"[{number(row['low'], 1)}, {number(row['high'], 1)}]"
-    return f"{spread(row['cost'], row['cost_std'], 1)} {ends}"
-
-
 TIER_HEADINGS: Columns = {
     "episodes": lambda row: SPLITS[row["split"]],
+    "cost key": lambda row: row["key"] or "total",
     "seeds": whole("seeds"),
-    "return": lambda row: spread(row["return"], row["return_std"]),
-    "cost": _interval_of_costs,
+    "return": _deviation("return"),
+    "cost": lambda row: spread(row["cost"], row["cost_std"], 1) + _interval(row, "", 1),
     "limit": lambda row: "–" if pd.isna(row["limit"]) else f"{row['limit']:g}: {row['tier']}",
     "above limit, %": lambda row: number(100 * row["above"], 1),
     "D⁺": "excess",
@@ -181,15 +196,24 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
     """
     who: Columns = {"environment": "suite", "algorithm": "label"}
     shown: Columns = {heading: score for score, heading in SCORE_HEADINGS.items()}
-    means = {heading: _with_interval(name) for name, heading in HEADINGS.items()}
+    means = {h: _deviation(name, DIGITS.get(name, 2)) for name, h in HEADINGS.items()}
+    splits = data.splits
+    several = splits.groupby(["suite", "algo"])["key"].transform("max") != ""
+    splits = splits[(splits["key"] != "") | ~several]
+    tiers = {h: c for h, c in TIER_HEADINGS.items() if h != "cost key" or splits["key"].any()}
     result = {
         "Results": spelled(
             data.means,
-            {**who, "limit": _limit, "seeds": whole("seeds"), "steps": whole("steps"), **means},
+            {
+                **who,
+                "limit": _limits(splits),
+                "seeds": whole("seeds"),
+                "steps": whole("steps"),
+                **means,
+            },
         ),
-        "Limits": _limits(data.means),
         "Safety": spelled(data.means, {**who, **SAFETY_HEADINGS}),
-        "Tiers": spelled(data.splits, {**who, **TIER_HEADINGS}),
+        "Tiers": spelled(splits, {**who, **tiers}),
     }
     scores = normalize(data.means, data.means)
     if scores[["reward", "cost"]].notna().any(axis=None):
@@ -202,14 +226,17 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
             columns: Columns = {"algorithm": "label"}
             for score, heading in SCORE_HEADINGS.items():
                 columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"  # type: ignore[misc]
-                columns[f"{heading}, IQM"] = _with_interval(score, "_iqm")
+                columns[f"{heading}, IQM"] = lambda row, s=score: (  # type: ignore[misc]
+                    number(row[f"{s}_iqm"]) + _interval(row, f"{s}_")
+                )
             table = spelled(overall(data.runs, data.means), columns)
             result["All environments, relative to TRPO"] = table
     return {title: table for title, table in result.items() if len(table)}
 
 
 RUNS: Columns = {
-    "environment": "suite", "algorithm": "label", "seed": whole("seed"), "limit": _limit,
+    "environment": "suite", "algorithm": "label", "seed": whole("seed"),
+    "limit": lambda row: "–" if pd.isna(row["limits"]) else row["limits"],
     "steps": whole("steps"), **{heading: name for name, heading in HEADINGS.items()},
     "physics errors": whole("physics_errors"), "seconds": whole("seconds"),
     "commit": lambda row: "–" if pd.isna(row["commit"])
@@ -234,21 +261,19 @@ def written(path: Path) -> Iterator[BufferedRandom]:
             yield file
 
 
-def write_tables(path: Path, data: Data, notes: Sequence[str] = ()) -> None:
+def write_tables(path: Path, data: Data) -> None:
     """
     Write the tables of means and scores in the format that the file's name says.
 
     :param path: ``.md`` or ``.tex``
     :param data: see :func:`tables`
-    :param notes: what a reader of the means should know; written below them
     :raises UsageError: the file can't be written
     """
-    if path.suffix == ".md":
-        parts = [f"## {title}\n\n{markdown(table)}" for title, table in tables(data).items()]
-        lines = [f"- {escaped(note)}" for note in notes]
-    else:
-        parts = [f"% {title}\n{latex(table)}" for title, table in tables(data).items()]
-        lines = [f"% {note}" for note in notes]
+    parts = [
+        f"## {title}\n\n{CAPTIONS[title]}\n\n{markdown(table)}"
+        if path.suffix == ".md"
+        else latex(table, f"{title}. {CAPTIONS[title]}")
+        for title, table in tables(data).items()
+    ]
     with written(path) as file:
-        text = "\n\n".join([*parts, "\n".join(lines)]).rstrip()
-        file.write(f"{text}\n".encode())
+        file.write(("\n\n".join(parts) + "\n").encode())

@@ -13,6 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_guard.checks import ContractError
 from sb3_guard.costs import number
 
+BROKEN = "contract_error"  # entry of info
+
 
 class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
     """An environment whose every step is checked, so that nothing false is learnt from.
@@ -27,11 +29,16 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
 
     :param env: the environment, with its wrappers
     :param cost_keys: entries of info that are costs
+    :param raises: whether a broken contract is raised; False, in another process: it is told as
+        ``info["contract_error"]``, which a ``CostMonitor`` raises
     """
 
-    def __init__(self, env: gym.Env, cost_keys: Sequence[str] = ("cost",)) -> None:
-        RecordConstructorArgs.__init__(self, cost_keys=tuple(cost_keys))
+    def __init__(
+        self, env: gym.Env, cost_keys: Sequence[str] = ("cost",), raises: bool = True
+    ) -> None:
+        RecordConstructorArgs.__init__(self, cost_keys=tuple(cost_keys), raises=raises)
         gym.Wrapper.__init__(self, env)
+        self._raises = raises
         self._cost_keys = {"cost", *cost_keys}
         self._space = env.observation_space
         self._steps = 0
@@ -65,6 +72,14 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
         :raises ContractError: the five values are not what Gymnasium wants, or costs were lost
         """
         self._steps += 1
+        try:
+            return self._checked_step(action)
+        except ContractError as error:
+            if self._raises:
+                raise
+            return self._space.sample(), 0.0, False, False, {BROKEN: str(error)}
+
+    def _checked_step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         values: Any
         if self._repeats or self._steps == 1:
             values = self._compared(action)
@@ -90,12 +105,12 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
             )
             if absent:
                 have = "" if isinstance(observation, Mapping) else f" but {_brief(observation)}"
-                self._refuse(f"{name} has no {sorted(absent)}{have}", f"its space is {space}")
+                self._refuse(f"{name} has no {sorted(absent)}{have}", f"it must fit {space}")
             for key, part in space.spaces.items():
                 self._check(observation[key], part, f"{name}'s {key!r}")
         elif isinstance(space, spaces.Discrete):
             if not space.contains(observation):
-                self._refuse(f"{name} is {_brief(observation)}", f"its space is {space}")
+                self._refuse(f"{name} is {_brief(observation)}", f"it must fit {space}")
         elif isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
             try:
                 values = np.asarray(observation)
@@ -105,7 +120,7 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
                 shown = f"has shape {values.shape}"
                 if values.dtype.kind not in "biuf":
                     shown = f"is {_brief(observation)}"
-                self._refuse(f"{name} {shown}", f"its space is {space}")
+                self._refuse(f"{name} {shown}", f"it must fit {space}")
 
     def _compared(self, action: Any) -> Any:
         """A step in which all layers are listened to.
@@ -197,7 +212,7 @@ def checked(env: Any, cost_keys: Sequence[str] = ("cost",)) -> Any:
         if isinstance(inner, DummyVecEnv):
             inner.envs = [checked(lone, cost_keys) for lone in inner.envs]
     elif isinstance(env, gym.Env):
-        inside = unwrap_wrapper(env, CheckedEnv)
+        inside: Any = unwrap_wrapper(env, CheckedEnv)
         if inside is None:
             return CheckedEnv(env, cost_keys)
         inside._cost_keys |= {*cost_keys}

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from sb3_guard.checked_env import checked, refuse_vector_env
+from sb3_guard.checked_env import CheckedEnv, refuse_vector_env
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.common.sources import Source, find
@@ -98,7 +98,8 @@ def make_vec_env(
 
         def make_one() -> gymnasium.Env:
             env = source.make(**kwargs)
-            return checked(env if wrapper_class is None else wrapper_class(env), keys)
+            env = env if wrapper_class is None else wrapper_class(env)
+            return CheckedEnv(env, keys, raises=vec_env != "subproc")
 
         venv = VEC_ENVS[vec_env]([make_one] * int(n_envs))
     else:

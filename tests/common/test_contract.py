@@ -78,6 +78,7 @@ FAULTS = {
     [
         *((name, "evaluation") for name in FAULTS),
         *(("truncated", kind) for kind in ("evaluation of many", "make_vec_env", "algorithm")),
+        ("shape", "subproc"),
         *((name, "algorithm") for name in ("no cost", "four values")),
     ],
 )
@@ -86,8 +87,10 @@ def test_what_breaks_the_contract_later_than_at_the_first_step_is_a_line(name, k
     with pytest.raises(ValueError, match=message) as caught:
         if kind == "algorithm":
             CPO("MlpPolicy", Late(fault), **SMALL).learn(40)
-        elif kind == "make_vec_env":
-            CPO("MlpPolicy", make_vec_env(Late, 2, env_kwargs={"fault": fault}), **SMALL).learn(80)
+        elif kind in ("make_vec_env", "subproc"):
+            vec_env = "subproc" if kind == "subproc" else None
+            env = make_vec_env(Late, 2, vec_env=vec_env, env_kwargs={"fault": fault})
+            CPO("MlpPolicy", env, **SMALL).learn(80)
         else:
             env = Late(fault)
             still = Still()

@@ -20,8 +20,7 @@ from sb3_guard.envs import GuardVectorEnv, env_spec, register_robot
 from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.rendering import RenderingError
-from sb3_guard.envs.robots.file_robot import FileRobot
-from sb3_guard.envs.robots.model_file import GAINS, NoActuators
+from sb3_guard.envs.robots.robot import MJCFRobot
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
@@ -54,7 +53,7 @@ def action_table(env: GuardVectorEnv) -> str:
     return table(["action", "actuator", "range", "control"], rows)
 
 
-def register_file(path: Path, stated: dict[str, Any]) -> tuple[str, type[FileRobot]]:
+def register_file(path: Path, stated: dict[str, Any]) -> tuple[str, type[MJCFRobot]]:
     """Register the robot of a file for this process.
 
     :param stated: what the file does not say, by argument of :func:`register_robot`
@@ -68,24 +67,25 @@ def register_file(path: Path, stated: dict[str, Any]) -> tuple[str, type[FileRob
     return name, robot
 
 
-def file_table(robot: type[FileRobot]) -> str:
+def file_table(robot: type[MJCFRobot]) -> str:
     """What was taken from a robot's file: how it is placed, and each joint's range and start."""
-    model = robot.file.standing()[0]
-    base = ", ".join(joint.name for joint in robot.file.base) or "none, it stands on a fixed base"
+    file = robot.model_file()
+    model, data = file.standing()
+    base = ", ".join(joint.name for joint in file.base) or "none, it stands on a fixed base"
     about = [
-        ["outermost body", robot.file.root],
+        ["outermost body", file.root],
         ["joints of its place", base],
         ["position", robot.tip or robot.center],
         ["keepout, arena", f"{robot.keepout:g} m, {robot.defaults['arena']['size']:g} m"]
-        if robot.file.base
+        if file.base
         else ["reach", f"{robot.reach:g} m"],
-        ["left out of the file", ", ".join(robot.file.left_out) or "nothing"],
+        ["left out of the file", ", ".join(file.left_out) or "nothing"],
     ]
     rows = []
     for i in range(model.njnt):
         joint = model.joint(i)
         low, high = joint.range if model.jnt_limited[i] else (-np.inf, np.inf)
-        start = " ".join(f"{value:.3g}" for value in robot.file.start[joint.name])
+        start = " ".join(f"{value:.3g}" for value in data.joint(joint.name).qpos)
         rows.append([joint.name, f"[{low:.3g}, {high:.3g}]", start])
     return table(["robot", ""], about) + "\n\n" + table(["joint", "range", "start"], rows)
 
@@ -149,7 +149,7 @@ class Flags(Command):
   sb3-guard show my_scenario.yml -o mine.png
   sb3-guard show SafetyPointGoal1-v0 --mjcf point.xml
   sb3-guard show Goal_Drone_8Hazards --env-kwargs "ghosts:{'num': 4}" --camera track
-  sb3-guard show go1.xml --robot-kwargs "actuators:{'kp': 35, 'kd': 1}" "action:'offset'"
+  sb3-guard show go1.xml --robot-kwargs "root:'trunk'" "keyframe:'home'"
 """
     env: str = flag(positional=True)
     env_kwargs: dict[str, Any] | None = flag()
@@ -188,13 +188,7 @@ def show(flags: Flags) -> int:
     if file.suffix in (".xml", ".urdf"):
         stated = {**(flags.robot_kwargs or {})}
         with explained("can't show it", ValueError, TypeError, OSError):
-            try:
-                name, robot = register_file(file, stated)
-            except NoActuators:
-                stated["actuators"] = GAINS
-                name, robot = register_file(file, stated)
-                print(f"{file} has no actuators, so these position servos stand in; state those of "
-                      f"your robot with --robot-kwargs \"actuators:{GAINS}\"\n")  # fmt: skip
+            name, robot = register_file(file, stated)
         flags.env = f"Goal_{name}_0Hazards"
         arguments = "".join(f", {key}={value!r}" for key, value in stated.items())
         print(f"sb3_guard.register_robot({name!r}, xml={str(file)!r}{arguments})\n")

@@ -42,13 +42,16 @@ class WorldSpec:
         """State the contacts with the floor of all geoms from ``body`` on, as pairs of geoms.
 
         Each pair has what MuJoCo would give the contact itself, so that nothing changes but that
-        its friction is one row of ``pair_friction``.
+        its friction is one row of ``pair_friction``. Pairs that a file states stay.
 
         :return: how many there can be
         """
-        count = 0
+        count, stated = 0, [{pair.geomname1, pair.geomname2} for pair in self.spec.pairs]
         for geom in self.spec.body(body).find_all("geom"):
             for floor in self._floors:
+                if {geom.name, floor.name} in stated:
+                    count += 1
+                    continue
                 if not (geom.contype & floor.conaffinity or floor.contype & geom.conaffinity):
                     continue
                 geom.name = geom.name or f"{body}/rubs{count}"

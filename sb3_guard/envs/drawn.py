@@ -54,7 +54,8 @@ class Drawn:
         self._scaled: list[tuple[str, Array, Array]] = []  # field, its rows, factors
         for part, name, kind in self._factors:
             bodies = _below(model, part.roots)
-            rubs = np.isin(model.geom_bodyid[model.pair_geom2], bodies)
+            ends = model.geom_bodyid[[model.pair_geom1, model.pair_geom2]]
+            rubs = np.isin(ends, bodies).any(axis=0) & (ends == 0).any(axis=0)
             rows = np.array(bodies) if kind == "mass" else np.flatnonzero(rubs)
             self._scaled += [(field, rows, part.current(name)) for field in FIELDS[kind]]
         self._weighs = any(kind == "mass" for *_, kind in self._factors)

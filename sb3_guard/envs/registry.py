@@ -13,6 +13,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
+import mujoco
+
 from sb3_guard.checks import check_integer
 from sb3_guard.envs.arena import INTEGRATORS, Arena
 from sb3_guard.envs.check_part import check_part
@@ -112,19 +114,24 @@ OPTIONS = (  # of functions that make environments
 
 
 def register_robot(
-    name: str, robot: type[Robot] | None = None, *, xml: str | Path | None = None, **attributes: Any
+    name: str,
+    robot: type[Robot] | None = None,
+    *,
+    xml: str | Path | mujoco.MjSpec | None = None,
+    **attributes: Any,
 ) -> None:
     """Make a robot known under ``name``.
 
     A file may be as its maker wrote it: the arena takes the place of its floor and lights, its
     options and sensors stay, and what the joints do is observed unless sensors cover it
-    (:mod:`sb3_guard.envs.robots.file_robot`).
+    (:mod:`sb3_guard.envs.robots.robot`). What it lacks, such as servos or a keyframe, is added to
+    its MjSpec, which is given in its place.
 
     :param name: what ids and scenarios call it
     :param robot: a :class:`~sb3_guard.envs.part.Robot` class
-    :param xml: or the robot's MJCF file
-    :param attributes: with ``xml``, what the file does not say, such as ``pose`` or ``actuators``;
-        the page *Parameters* lists them with their units and defaults
+    :param xml: or the robot's MJCF file, or a :class:`mujoco.MjSpec`, which is not changed
+    :param attributes: with ``xml``, what the file does not say, such as ``center``; the page
+        *Parameters* lists them with their units and defaults
     :raises ValueError: neither or both of ``robot`` and ``xml`` are given, an attribute is unknown
         or bad, the file has no robot that can act, or the name is not usable
     """
@@ -135,10 +142,10 @@ def register_robot(
             f"register_robot({name!r}, xml='{name.lower()}.xml')"
         )
     if robot is None:
-        file = Path(str(xml)).resolve()
-        if not file.is_file():
+        source = xml if isinstance(xml, mujoco.MjSpec) else Path(str(xml)).resolve()
+        if isinstance(source, Path) and not source.is_file():
             raise ValueError(f"robot {name!r}: there is no file {str(xml)!r}")
-        robot = robot_class(name, file, attributes)
+        robot = robot_class(name, source, attributes)
     elif attributes:
         raise ValueError(f"robot {name!r}: {sorted(attributes)} go with xml, not with a class")
     _check_class(name, robot, Robot)

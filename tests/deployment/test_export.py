@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import onnx
 import onnxruntime
@@ -14,7 +15,7 @@ import pytest
 import torch as th
 from cost_envs import CostPoint, RandomCostEnv
 from gymnasium import spaces
-from robot_models import DOG
+from robot_models import DOG, add_pose, add_servos
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -344,10 +345,11 @@ def test_the_contract_of_a_file_names_joints_units_and_delay(tmp_path: Path) -> 
     (tmp_path / "dog.xml").write_text(
         DOG.format(keys="").replace('<joint name="fan"/>', '<joint name="fan" type="slide"/>')
     )
-    servos = {"*_thigh": {"kp": 40, "kd": 2}, "front_calf": {"kp": 40, "kd": 2}}
-    stated = {"root": "trunk", "actuators": servos, "pose": {"*_thigh": 0.5, "front_calf": -1}}
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "dog.xml"))
+    add_servos(spec, joints=["front_thigh", "front_calf", "back_thigh"])
+    add_pose(spec, front_thigh=0.5, front_calf=-1, back_thigh=0.5)
     with own_parts():
-        sb3_guard.register_robot("Dog", xml=tmp_path / "dog.xml", **stated)
+        sb3_guard.register_robot("Dog", xml=spec, root="trunk")
         kwargs = {"robot": {"delay": 2}, "hazards": None}
         model = sb3_guard.make_model("cpo", "Goal_Dog_1Hazards", env_kwargs=kwargs, n_envs=2)
         contract = sb3_guard.export(model, tmp_path / "policy.onnx")

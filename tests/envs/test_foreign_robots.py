@@ -50,7 +50,7 @@ def test_a_file_is_a_robot_as_it_is(name):
     path, before = file(name), file(name).read_bytes()
     with own_parts(), warnings.catch_warnings():
         warnings.simplefilter("error")
-        register_robot(name, xml=path, **SOURCES[name].needed)
+        register_robot(name, xml=SCRIPT["robot"](SOURCES[name]), **SOURCES[name].needed)
         engine = Scenario.parse(f"Goal_{name}_8Hazards").build(3)
         robot = ROBOTS[name]
         for task in SOURCES[name].tasks.partition(" with ")[0].strip(",").split(", "):
@@ -74,7 +74,7 @@ def test_a_file_is_a_robot_as_it_is(name):
         assert np.isfinite(outcome.obs).all() and not outcome.physics_error.any()
     assert (np.abs(np.sum(rewards, axis=0)) > 0).all()  # its position moves
     assert unsteady(engine) is None
-    assert robot.file.root and not any("light" in words for words in robot.file.left_out)
+    assert not any("light" in words for words in robot.model_file().left_out)
 
 
 @pytest.mark.slow

@@ -126,7 +126,6 @@ def test_options_of_the_file_hold_unless_the_class_states_them(cart):
     option = cart(options=options).build().model.opt
     assert (option.timestep, option.gravity[2], option.density) == (0.004, -1.62, 1.2)
     assert option.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    assert option.jacobian == mujoco.mjtJacobian.mjJAC_DENSE  # the file says nothing of it
     stated = cart(options=options, timestep=0.001, integrator="Euler").build().model.opt
     assert (stated.timestep, stated.integrator) == (0.001, mujoco.mjtIntegrator.mjINT_EULER)
 

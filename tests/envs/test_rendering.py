@@ -9,7 +9,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from robot_models import DOG
+from robot_models import DOG, add_servos
 from typed import require_rendering
 from worlds import own_parts
 
@@ -214,7 +214,8 @@ def test_cameras_of_a_robots_file_are_chosen_by_their_names(tmp_path):
     camera = '<camera name="nose" pos="0.4 0 0" xyaxes="0 -1 0 0 0 1"/><site name="imu"/>'
     file.write_text(DOG.format(keys="").replace('<site name="imu"/>', camera))
     with own_parts():
-        register_robot("Dog", xml=file, root="trunk", actuators={"kp": 40, "kd": 2})
+        spec = add_servos(mujoco.MjSpec.from_file(str(file)))
+        register_robot("Dog", xml=spec, root="trunk")
         frames = []
         for camera in ("nose", "fixed"):
             env = GuardEnv("Goal_Dog_2Hazards", render_mode="rgb_array", camera=camera)

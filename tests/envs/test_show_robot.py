@@ -5,7 +5,7 @@ import re
 import mujoco
 import numpy as np
 import pytest
-from robot_models import ARM, DOG
+from robot_models import ARM, DOG, add_servos
 from worlds import own_parts
 
 from sb3_guard import show
@@ -15,8 +15,11 @@ from sb3_guard.envs import GuardEnv, env_spec
 @pytest.fixture
 def run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "my_dog.xml").write_text(DOG.format(keys=""))
-    (tmp_path / "crane.xml").write_text(ARM)
+    for name, text in (("my_dog.xml", DOG.format(keys="")), ("crane.xml", ARM)):
+        spec = add_servos(mujoco.MjSpec.from_string(text))
+        spec.compile()
+        spec.to_file(str(tmp_path / name))
+    (tmp_path / "still.xml").write_text(ARM)
     (tmp_path / "dog.urdf").write_text('<robot name="dog"/>')
 
     def call(*words):
@@ -32,44 +35,33 @@ def run(tmp_path, monkeypatch, capsys):
 
 
 def test_it_prints_what_was_taken_from_the_file_and_draws_it(run, tmp_path):
-    stated = ["actuators:{'kp': 40, 'kd': 2}", "root:'trunk'", "action:'offset'"]
-    status, out, _ = run("my_dog.xml", "--robot-kwargs", *stated)
+    status, out, _ = run("my_dog.xml", "--robot-kwargs", "root:'trunk'", "frame_skip:5")
     assert status == 0 and (tmp_path / "picture.png").is_file()
-    assert "sb3_guard.register_robot('Mydog', xml='my_dog.xml', actuators={'kp': 40" in out
+    assert "sb3_guard.register_robot('Mydog', xml='my_dog.xml', root='trunk', frame_skip=5" in out
     for row in (
         "| outermost body       | trunk ",
         "| left out of the file | body ball, geom ground, sensor to_ball |",
         "| front_calf  | [-2.62, -0.524] | -1.57 ",
-        "| 1      | front_calf  | [-1, 1] | [-1.8208, -1.3208]",
+        "| 1      | front_calf  | [-1, 1] | [-2.61799, -0.523599]",
     ):
         assert row in out
 
 
 def test_an_arm_says_how_far_it_reaches(run):
-    words = ["actuators:{'kp': 40, 'kd': 2}", "center:'hand'"]
-    status, out, _ = run("crane.xml", "--robot-kwargs", *words)
+    status, out, _ = run("crane.xml", "--robot-kwargs", "center:'hand'")
     assert status == 0 and "| reach                | 0.5" in out
     assert "none, it stands on a fixed base" in out
-
-
-def test_a_file_without_actuators_is_shown_with_servos_that_stand_in(run, tmp_path):
-    status, out, _ = run("my_dog.xml", "--robot-kwargs", "root:'trunk'")
-    assert status == 0 and (tmp_path / "picture.png").is_file()
-    assert out.startswith(
-        "my_dog.xml has no actuators, so these position servos stand in; state those of your robot "
-        "with --robot-kwargs \"actuators:{'kp': 35, 'kd': 1}\"\n"
-    )
-    assert "xml='my_dog.xml', root='trunk', actuators={'kp': 35, 'kd': 1})" in out
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["crane.xml"], "crane.xml stands on a fixed base, .* name its end effector, .*='hand'"),
-        (["dog.urdf"], "dog.urdf is URDF, not MJCF: convert it once with"),
+        (["still.xml"], "still.xml has no actuators: docs/robot_files.md adds servos"),
+        (["dog.urdf"], "dog.urdf: it is URDF, not MJCF: convert it once with"),
         (["none.xml"], "there is no file 'none.xml'"),
         (["my_dog.xml"], "2 outermost bodies with joints, 'trunk', 'ball': .* root='trunk'"),
-        (["Goal_Ant_8Hazards", "--robot-kwargs", "action:'offset'"], "goes with a robot's file"),
+        (["Goal_Ant_8Hazards", "--robot-kwargs", "frame_skip:5"], "goes with a robot's file"),
         (["crane.xml", "--robot-kwargs", "colour:3"], "robot 'Crane' has no 'colour': "),
     ],
 )
@@ -105,12 +97,13 @@ def test_the_model_refers_to_the_meshes_of_the_robots_file(run, tmp_path):
     corners, faces = ("0 0 0", "1 0 0", "0 1 0", "0 0 1"), ("1 3 2", "1 2 4", "2 3 4", "1 4 3")
     lines = [f"v {corner}" for corner in corners] + [f"f {face}" for face in faces]
     (tmp_path / "shapes" / "wedge.obj").write_text("\n".join(lines))
-    text = ARM.replace("<worldbody>", '<asset><mesh file="wedge.obj"/></asset><worldbody>', 1)
+    text = (tmp_path / "crane.xml").read_text()
+    text = text.replace("<worldbody>", '<asset><mesh file="wedge.obj"/></asset><worldbody>', 1)
     text = text.replace("<worldbody>", '<compiler meshdir="shapes"/><worldbody>', 1)
     (tmp_path / "crane.xml").write_text(text)
     (tmp_path / "out").mkdir()
-    stated = ["actuators:{'kp': 40, 'kd': 2}", "center:'hand'"]
-    status, *_ = run("crane.xml", "--mjcf", "out/model.xml", "--robot-kwargs", *stated)
+    stated = "--robot-kwargs", "center:'hand'"
+    status, *_ = run("crane.xml", "--mjcf", "out/model.xml", *stated)
     assert status == 0
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml")).nmesh == 1
 

@@ -1,4 +1,36 @@
-"""MJCF files of robots as others might have written them."""
+"""MJCF files of robots as others might have written them, and what MjSpec adds to them."""
+
+import math
+
+import mujoco
+
+
+def add_servos(spec, kp=40.0, kv=2.0, joints=None):
+    """Position servos of hinges and slides, within their ranges or half a turn either way."""
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE or joint.name not in (joints or [joint.name]):
+            continue
+        servo = spec.add_actuator(
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
+        limited = joint.range[0] < joint.range[1]
+        servo.set_to_position(kp=kp, kv=kv, inheritrange=limited)
+        if not limited:
+            servo.ctrlrange = [-math.pi, math.pi]
+    return spec
+
+
+def add_pose(spec, **joints):
+    """A keyframe with these positions, rad or m; a free robot is on the floor."""
+    data = mujoco.MjData(spec.compile())
+    for name, value in joints.items():
+        data.joint(name).qpos = value
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+            data.joint(joint.id).qpos[2] = 0.0
+    spec.add_key(name="home", qpos=data.qpos)
+    return spec
+
 
 # a dog of two legs whose file is in degrees, beside a ball on a floor of its own
 DOG = """

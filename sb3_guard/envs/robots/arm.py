@@ -1,4 +1,4 @@
-"""What arms share: they stand still and are as near to things as their nearest link."""
+"""Arms stand still and are as near to things as their nearest link."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -41,3 +41,34 @@ class Arm(MJCFRobot):
         gap = geometry.segment_distance(start, end, geometry.by_coordinate(points)[:size])
         gap -= self._radii  # [L, K, N]
         return gap.min(axis=0).T.copy()
+
+
+@dataclass
+class FileArm(MJCFRobot):
+    """An arm of anybody's file: a link is the capsule around a geom that meets something."""
+
+    def bind(self, sim: Simulation) -> None:
+        super().bind(sim)
+        model = sim.model
+        meets = (model.geom_contype | model.geom_conaffinity) != 0
+        geoms = np.flatnonzero(np.isin(model.geom_bodyid, self.bodies(model)) & meets)
+        middle, half = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]
+        longest, rows = half.argmax(axis=1), np.arange(len(geoms))
+        radii = np.sort(half, axis=1)[:, 1]
+        ends = np.zeros_like(half)
+        ends[rows, longest] = half[rows, longest] - radii
+        self._links, self._radii = geoms, radii[:, None, None]
+        self._ends = middle - ends, middle + ends  # [L, 3] m each, in the geoms' frames
+
+    def clearance(self, points: Array, planar: bool) -> Array:
+        """Distance of points from the nearest link, [N, K] m."""
+        size, batch = 2 if planar else 3, self.sim.batch
+        places = batch.bind("geom_xpos")[:, self._links]  # [N, L, 3]
+        axes = batch.bind("geom_xmat")[:, self._links].reshape(*places.shape, 3)
+        start, end = (
+            geometry.by_coordinate(places + np.einsum("nlij,lj->nli", axes, e))[:size]
+            for e in self._ends
+        )
+        gap = geometry.segment_distance(start, end, geometry.by_coordinate(points)[:size])
+        nearest: Array = (gap - self._radii).min(axis=0).T.copy()  # of [L, K, N]
+        return nearest

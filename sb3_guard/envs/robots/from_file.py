@@ -10,29 +10,20 @@ import mujoco
 import numpy as np
 
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.robots.file_robot import FileRobot
+from sb3_guard.envs.robots.arm import FileArm
 from sb3_guard.envs.robots.measure import radius, reached
 from sb3_guard.envs.robots.model_file import ModelFile, settle
-from sb3_guard.envs.robots.robot import PREFIX
+from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
 from sb3_guard.spelling import did_you_mean
 
-OF_FILE = ("root", "complete", "keyframe", "pose", "actuators")  # what settle() is told
+OF_FILE = ("root", "complete", "keyframe")  # what settle() is told
 #: What a user may state: what holds if it is not stated, and what it is.
 ATTRIBUTES: dict[str, tuple[str, str]] = {
     "root": ("the only one with joints", "the robot's outermost body"),
     "complete": ("False", "True: the file's world is kept: its floor, options and names are used, "
         "and the robot begins where the file puts it"),
     "keyframe": ("start, home or the only one", "the keyframe in which it starts"),
-    "pose": ("0, or the middle of a range without 0", "positions of hinges (rad) and slides (m) at "
-        'the start, by names or patterns of joints: {"*_thigh_joint": 0.9}'),
-    "actuators": ("the file's", 'gains of position servos, {"kp": 35, "kd": 1} (N·m/rad, '
-        'N·m·s/rad), with "force" for a limit (N·m), or a mapping of joints to gains'),
-    "action": ('"range"', 'what [−1, 1] means: "range", the control range; "offset", an offset '
-        "from the first pose, for position servos"),
-    "action_scale": ("0.25", "the offset at 1, rad or m"),
     "scaled": ("True", "False: actions are the controls themselves"),
-    "observe": ("the sensors, and what they do not cover", "names of what is observed: sensors, "
-        "joint_pos, joint_turn, joint_vel, base_linvel, base_angvel, gravity, last_action"),
     "center": ("the outermost body", "the body or site whose place is the robot's position: of an "
         "arm, its end effector"),
     "reach": ("infinite; of an arm, measured", "how far an arm reaches from its base, m; goals are "
@@ -45,9 +36,9 @@ ATTRIBUTES: dict[str, tuple[str, str]] = {
     "lidar_bodies": ("the body of center", "bodies that carry lidar and compass"),
     "eye": ("on that body or the outermost, ahead", "the body that carries the observed camera, "
         "where on it (m) and which way it looks"),
-    "timestep": ("the file's, 0.002", "of one physics step, s"),
+    "timestep": ("the file's", "of one physics step, s"),
     "frame_skip": ("10", "physics steps in a control step"),
-    "integrator": ('the file\'s, "implicitfast"', '"Euler", "RK4", "implicit" or "implicitfast"'),
+    "integrator": ("the file's", '"Euler", "RK4", "implicit" or "implicitfast"'),
     "floor": ("True", "False: it slides at a fixed height and never meets the floor, which saves "
         "time"),
 }  # fmt: skip
@@ -56,18 +47,6 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "center": (lambda v: v is None or isinstance(v, str), "the name of a body or site"),
     "keyframe": (lambda v: v is None or isinstance(v, str), "the name of a keyframe"),
     "complete": (lambda v: isinstance(v, bool), "True or False"),
-    "action": (lambda v: v in ("range", "offset"), "'range' or 'offset'"),
-    "action_scale": (
-        lambda v: isinstance(v, (int, float)) and not isinstance(v, bool) and 0 < v < math.inf,
-        "a positive number, of rad or m",
-    ),
-    "observe": (
-        lambda v: (
-            v is None
-            or (isinstance(v, (list, tuple)) and bool(v) and all(isinstance(n, str) for n in v))
-        ),
-        "a list of names, such as ['joint_pos', 'gravity']",
-    ),
     "keepout": (
         lambda v: isinstance(v, (int, float)) and not isinstance(v, bool) and 0 <= v < math.inf,
         "a number of metres, at least 0",
@@ -79,11 +58,13 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
 }
 
 
-def robot_class(name: str, path: Path, stated: Mapping[str, Any]) -> type[FileRobot]:
-    """A robot from an MJCF file; what is not stated follows from the file.
+def robot_class(
+    name: str, source: Path | mujoco.MjSpec, stated: Mapping[str, Any]
+) -> type[MJCFRobot]:
+    """A robot from an MJCF file or an MjSpec; what is not stated follows from it.
 
     :param name: of the class
-    :param path: the file
+    :param source: the file, or the MjSpec
     :param stated: attributes, by name
     :raises ValueError: an attribute is unknown or bad, or the file has no such robot
     """
@@ -93,36 +74,38 @@ def robot_class(name: str, path: Path, stated: Mapping[str, Any]) -> type[FileRo
         if key in _RULES and not _RULES[key][0](value):
             raise ValueError(f"robot {name!r}: {key} = {value!r} must be {_RULES[key][1]}")
     grounded = stated.get("workspace", "planar") == "planar"
-    file = settle(path, grounded=grounded, **{k: stated[k] for k in OF_FILE if k in stated})
+    file = settle(
+        source, grounded=grounded, **{key: stated[key] for key in OF_FILE if key in stated}
+    )
     model, data = file.standing()
-    prefix = "" if stated.get("complete") else PREFIX
+    complete = stated.get("complete", False)
+    prefix = "" if complete else PREFIX
     center = stated.get("center") or file.root
     body, tip = _center(model, file, center)
     size = radius(model, data, file.root)
-    worked_out: dict[str, Any] = {
-        "asset": "",
-        "__doc__": f"The robot of {path.name}.",
-        "path": classmethod(lambda cls: path),
-        "file": file,
+    attributes: dict[str, Any] = {
+        "__doc__": f"The robot of {Path(file.label).name}.",
+        "path": classmethod(lambda cls: Path(file.label)),
+        "model_file": classmethod(lambda cls: file),
+        "aware": True,
         "lidar_bodies": (body,),
         "eye": (prefix + body, (0.0, 0.0, 0.1), (1.0, 0.0, 0.0)),
         "keepout": math.ceil(100 * size) / 100,
         "defaults": {"arena": {"size": max(2.0, round(5 * size, 1))}},
     }
-    if not file.base and not stated.get("complete"):
-        worked_out |= _arm(model, file, center, tip is not None)
-    attributes = {k: v for k, v in stated.items() if k not in OF_FILE or k == "complete"}
-    defaults = {
-        part: {**worked_out["defaults"].get(part, {}), **stated.get("defaults", {}).get(part, {})}
-        for part in {**worked_out["defaults"], **stated.get("defaults", {})}
-    }
-    named = {"root": prefix + file.root, "center": body, "tip": tip, "defaults": defaults}
-    attributes = {**worked_out, **attributes, **named}
+    arm = not file.base and not complete
+    if arm:
+        attributes |= _arm(model, file, center, tip is not None)
+    defaults = {key: {**params} for key, params in attributes["defaults"].items()}
+    for key, params in stated.get("defaults", {}).items():
+        defaults[key] = {**defaults.get(key, {}), **params}
+    attributes |= {k: v for k, v in stated.items() if k not in OF_FILE or k == "complete"}
+    attributes |= {"root": prefix + file.root, "center": body, "tip": tip, "defaults": defaults}
     keepout = param(
         attributes["keepout"], "radius kept clear around the robot at the start, m", low=0
     )
     attributes |= {"keepout": keepout, "__annotations__": {"keepout": float}}
-    return dataclass(type(name, (FileRobot,), attributes))
+    return dataclass(type(name, (FileArm if arm else MJCFRobot,), attributes))
 
 
 def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, str | None]:
@@ -135,7 +118,7 @@ def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, s
     names = [name for name in (*bodies, *sites) if name]
     if center not in names:
         raise ValueError(
-            f"center names no body or site {center!r} of {file.path.name}: "
+            f"center names no body or site {center!r} of {Path(file.label).name}: "
             f"{did_you_mean(center, names)}"
         )
     tip = None if center in bodies else center
@@ -145,7 +128,7 @@ def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, s
         moving += [n for n in bodies[::-1] if n and model.body_weldid[model.body(n).id]]
         others = f"; others are {', '.join(moving[1:9])}" if moving[1:] else ""
         raise ValueError(
-            f"{file.path} stands on a fixed base, and {center!r}, whose place is the robot's "
+            f"{file.label} stands on a fixed base, and {center!r}, whose place is the robot's "
             f"position, cannot move: name its end effector, a body or site, center={moving[0]!r}"
             + others
         )
@@ -160,7 +143,8 @@ def _arm(model: mujoco.MjModel, file: ModelFile, center: str, site: bool) -> dic
     places = reached(model, center, site)
     if places[:, 2].max() <= 0:
         raise ValueError(
-            f"{file.path}: {center!r} never gets above the floor, z = 0 m: raise body {file.root!r}"
+            f"{file.label}: {center!r} never gets above the floor, z = 0 m: raise body "
+            f"{file.root!r}"
         )
     reach = 0.9 * float(np.sqrt((places**2).sum(axis=1)).max())
     low, high = np.quantile(places[places[:, 2] > 0, 2], [0.2, 0.8]).tolist()

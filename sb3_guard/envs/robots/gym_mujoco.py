@@ -62,18 +62,15 @@ class GymRobot(MJCFRobot):
 
         Floor, light and sky look like the arena's.
         """
-        spec = mjcf.read(self.path(), self.root, True)
+        spec = mjcf.load(self.path())
         for geom in spec.geoms:  # within a file, all have the same margin
             geom.margin /= 2
         return furnish(spec)
 
-    def bind(self, sim: Simulation) -> None:
-        super().bind(sim)
-        self._qvel = sim.batch.bind("qvel")
-
     def reset(self, ids: Array, rngs: Generators) -> None:
         for i in ids.tolist():
-            self._qpos[i] = self._start + rngs[i].uniform(-self.noise, self.noise, len(self._start))
+            start = self._start["qpos"]
+            self._qpos[i] = start + rngs[i].uniform(-self.noise, self.noise, len(start))
             n = self._qvel.shape[1]
             if self.normal:
                 self._qvel[i] = self.noise * rngs[i].standard_normal(n)

@@ -35,11 +35,10 @@ def reached(model: mujoco.MjModel, center: str, site: bool) -> Array:
     return places
 
 
-def lowest(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Height of the lowest point of the geoms that meet something, m."""
-    kinds, lowest = mujoco.mjtGeom, math.inf
-    meets = (model.geom_contype | model.geom_conaffinity) != 0
-    for i in np.flatnonzero(meets).tolist():
+def lowest(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Height of each geom's lowest point, [ngeom] m."""
+    kinds, heights = mujoco.mjtGeom, np.empty(model.ngeom)
+    for i in range(model.ngeom):
         up, size = data.geom_xmat[i].reshape(3, 3)[2], model.geom_size[i]
         match int(model.geom_type[i]):
             case kinds.mjGEOM_SPHERE:
@@ -57,5 +56,5 @@ def lowest(model: mujoco.MjModel, data: mujoco.MjData) -> float:
                 sunk = -float((points * up).sum(axis=1).min())
             case _:
                 sunk = float(np.abs(up) @ size)
-        lowest = min(lowest, float(data.geom_xpos[i, 2] - sunk))
-    return 0.0 if lowest == math.inf else lowest
+        heights[i] = data.geom_xpos[i, 2] - sunk
+    return heights

@@ -1,55 +1,76 @@
-"""A robot's MJCF file on its way into a world: read, looked over, given its contact bits."""
+"""Reading an MJCF file, and what a world takes over from it: options, contact bits."""
 
+import os
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from sb3_guard.envs.types import FLOOR, ROBOT
+from sb3_guard.envs.types import Array
 
-SHIFT = 2  # a robot's own contact bits begin after ROBOT and FLOOR
-NEAR = 1e-6  # m: geoms whose height is fixed meet the floor if they are as near
-_PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 _FREE, _SLIDE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE
+_TAGS = re.compile(r"<(\w+)([^<>]*)>")
+_FILES = re.compile(r"\bfile\w*\s*=\s*[\"']([^\"']+)")
+_FOLDERS = re.compile(r"\b(?:mesh|texture|asset)dir\s*=\s*[\"']([^\"']+)")
 
 
-def load(path: Path) -> mujoco.MjSpec:
-    """An MJCF file that compiles: attach() silently drops what refers to something missing.
+def label_of(source: Path | mujoco.MjSpec) -> str:
+    """What to call a file, or an MjSpec, in messages."""
+    return str(source) if isinstance(source, Path) else f"MjSpec {source.modelname!r}"
+
+
+def load(source: Path | mujoco.MjSpec) -> mujoco.MjSpec:
+    """A file, or a copy of an MjSpec, that compiles: attach() drops what refers to nothing.
 
     :raises ValueError: it cannot be read, or is URDF
     """
+    label = label_of(source)
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        if isinstance(source, Path):
+            _check_files(source)
+            spec = mujoco.MjSpec.from_file(str(source))
+        else:
+            spec = source.copy()
         if spec.compiler.settotalmass > 0:
             _state_masses(spec)
-        spec.compile()
+        _state_paths(spec, spec.compile())
     except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
-    shapes = (*spec.meshes, *spec.hfields, *spec.skins)
-    for asset in (*shapes, *spec.textures):  # a world forgets the folder of a file it takes in
-        if asset.file:
-            folder = spec.texturedir if isinstance(asset, mujoco.MjsTexture) else spec.meshdir
-            asset.file = str(path.parent.resolve() / folder / asset.file)
+        raise ValueError(f"{label}: {' '.join(str(error).split())}") from None
     return spec
 
 
-def read(path: Path, root: str, complete: bool) -> mujoco.MjSpec:
-    """A robot's file.
+def _check_files(path: Path) -> None:
+    """Refuse what MuJoCo would wait for, or read for ever, in a file and what it brings in.
 
-    :param root: name of the robot's outermost body
-    :param complete: whether the file is a whole world
-    :raises ValueError: it cannot be read, has no such body, or has a floor that it must not have
+    :raises ValueError: it is URDF, or names a pipe or a device
     """
-    spec = load(path)
-    if spec.body(root) is None:
-        raise ValueError(f"{path} has no body called {root!r}: give its outermost body this name")
-    floors = [geom.name for geom in spec.worldbody.geoms if geom.type == _PLANE]
-    if floors and not complete:
+    if path.suffix == ".urdf" or re.search(r"<robot\b", path.read_text(errors="replace")):
         raise ValueError(
-            f"{path} has a floor, geom {floors[0]!r}, and the arena has one: remove it, or keep "
-            f"the file's own world with complete=True, root={root!r}"
+            "it is URDF, not MJCF: convert it once with mujoco.MjSpec.from_file("
+            f"{path.name!r}).to_file('robot.xml'), and give its outermost body <freejoint/> if it "
+            "can go anywhere"
         )
-    return spec
+    for file in _named(path, [path.parent], set()):
+        if not file.is_dir():
+            raise ValueError(f"{file} is a pipe or a device: name a regular file")
+
+
+def _named(path: Path, folders: list[Path], seen: set[Path]) -> Iterator[Path]:
+    """What a file and those that it brings in name and is there, but is no regular file."""
+    seen.add(path)
+    text = path.read_text(errors="replace")
+    folders = [*folders, path.parent]
+    folders += [folder / name for name in _FOLDERS.findall(text) for folder in folders]
+    for tag, attributes in _TAGS.findall(text):
+        names = [part for name in _FILES.findall(attributes) for part in (name, Path(name).name)]
+        for file in {folder / name for folder in folders for name in names}:
+            if os.path.isfile(file):
+                if tag in ("include", "model") and file not in seen:
+                    yield from _named(file, folders, seen)
+            elif os.path.exists(file):
+                yield file
 
 
 def _state_masses(spec: mujoco.MjSpec) -> None:
@@ -64,15 +85,30 @@ def _state_masses(spec: mujoco.MjSpec) -> None:
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
 
 
-def honour_options(option: mujoco.MjOption, world: mujoco.MjOption) -> None:
-    """Set in ``world`` what the ``<option>`` of a file sets to something else than its default."""
-    usual = mujoco.MjSpec().option
-    for name in dir(usual):
-        value = getattr(usual, name)
-        if not name.startswith("_") and not callable(value):
-            own = getattr(option, name)
-            if not np.array_equal(own, value):
-                setattr(world, name, own)
+def _state_paths(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Write out where MuJoCo found the files: a world strips no paths and is written elsewhere."""
+    if spec.strippath:
+        for texture in spec.textures:
+            texture.cubefiles = [Path(name).name for name in texture.cubefiles]
+    for assets, addresses in (
+        (spec.meshes, model.mesh_pathadr),
+        (spec.hfields, model.hfield_pathadr),
+        (spec.textures, model.tex_pathadr),
+        (spec.skins, model.skin_pathadr),
+    ):
+        for asset in assets:
+            first = int(addresses[asset.id]) if 0 <= asset.id < len(addresses) else -1
+            path = model.paths[first:].partition(b"\0")[0].decode() if first >= 0 else ""
+            if asset.file and Path(path).name == Path(asset.file).name:
+                asset.file = path
+    spec.strippath = False
+
+
+def copy_options(option: mujoco.MjOption, world: mujoco.MjOption) -> None:
+    """Set every ``<option>`` of a world to what a file compiles with."""
+    for name in dir(option):
+        if not name.startswith("_") and not callable(getattr(option, name)):
+            setattr(world, name, getattr(option, name))
 
 
 def agree(spec: mujoco.MjSpec, world: mujoco.MjSpec) -> None:
@@ -87,62 +123,15 @@ def agree(spec: mujoco.MjSpec, world: mujoco.MjSpec) -> None:
                 setattr(theirs, name, getattr(ours, name))
 
 
-def set_contact_bits(spec: mujoco.MjSpec, floor: bool, label: str) -> None:
-    """Let a robot's geoms meet the objects of a world, and its floor where they can come near it.
-
-    The bits of the file keep saying which of its geoms meet each other. A geom without bits meets
-    nothing. The floor is left out by geoms that slide at a fixed height above it: each pair of a
-    planar robot with the floor costs time.
-
-    :param spec: the robot
-    :param floor: whether it meets the floor at all
-    :param label: what to call the robot in messages
-    :raises ValueError: the robot would fall forever
-    """
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    if model.nkey:
-        data.qpos[:] = model.key_qpos[0]
-    mujoco.mj_kinematics(model, data)
-    low = _lowest(model, data)
-    supported = False
-    for i, geom in enumerate(sorted(spec.geoms, key=lambda g: g.id)):
-        if not geom.contype and not geom.conaffinity:
-            continue
-        meets = floor and (_rises(model, data, int(model.geom_bodyid[i])) or low[i] <= NEAR)
-        supported |= meets
-        if max(geom.contype, geom.conaffinity) >= 1 << (31 - SHIFT):
-            raise ValueError(f"{label}: contact bits of geom {geom.name!r} must be below 2^29")
-        geom.contype <<= SHIFT
-        geom.conaffinity = geom.conaffinity << SHIFT | ROBOT | (FLOOR if meets else 0)
-    if not supported and _FREE in model.jnt_type:
-        raise ValueError(
-            f"{label} has a free joint, but no geom that meets the floor: it would fall forever; "
-            'give one contype="1" conaffinity="1", or the robot other joints'
-        )
-
-
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Height of each geom's lowest point, with its margin, or less, [ngeom] m."""
-    rotation = data.geom_xmat.reshape(-1, 3, 3)
-    middle = np.einsum("gij,gj->gi", rotation, model.geom_aabb[:, :3]) + data.geom_xpos
-    sunk = np.einsum("gj,gj->g", np.abs(rotation[:, 2]), model.geom_aabb[:, 3:])
-    round_ones = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
-    sunk[round_ones] = model.geom_size[round_ones, 0]
-    lowest: np.ndarray = middle[:, 2] - sunk - model.geom_margin
-    return lowest
-
-
-def _rises(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> bool:
-    """Whether a joint may change the height of a body's points."""
-    while body:
-        first = int(model.body_jntadr[body])
-        for joint in range(first, first + int(model.body_jntnum[body])):
-            level = abs(data.xaxis[joint, 2])
-            kind = model.jnt_type[joint]
-            if kind == _SLIDE and level > 1e-9:
-                return True
-            if kind != _SLIDE and (kind != mujoco.mjtJoint.mjJNT_HINGE or level < 1 - 1e-9):
-                return True
-        body = int(model.body_parentid[body])
-    return False
+def rising(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Whether a joint may change the height of each geom, [ngeom] bool."""
+    level = np.abs(data.xaxis[:, 2])
+    slides = model.jnt_type == _SLIDE
+    upright = slides | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
+    lifts = np.where(slides, level > 1e-9, ~upright | (level < 1 - 1e-9))
+    rises = np.zeros(model.nbody, dtype=bool)
+    for body in range(1, model.nbody):  # parents come before their children
+        joints = lifts[model.jnt_bodyid == body]
+        rises[body] = rises[model.body_parentid[body]] or joints.any()
+    risen: Array = rises[model.geom_bodyid]
+    return risen

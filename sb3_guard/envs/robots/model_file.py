@@ -1,51 +1,63 @@
-"""A robot's MJCF file as its maker wrote it: the robot in it, how it stands, what moves it.
-
-:func:`settle` takes the robot out of its world, gives its joints servos where the file has no
-actuators, and says in which pose an episode begins.
-"""
+"""A robot that was taken out of an MJCF file, as its maker wrote it: :func:`settle`."""
 
 import math
-import re
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from sb3_guard.envs.robots import mjcf
 from sb3_guard.envs.robots.measure import lowest
 from sb3_guard.envs.robots.references import drop_references
-from sb3_guard.envs.types import Array
-from sb3_guard.spelling import did_you_mean, matching
+from sb3_guard.envs.types import FLOOR, ROBOT, Array
+from sb3_guard.spelling import did_you_mean
 
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 ROUNDED = 1e-3  # rad or m by which a keyframe may be out of a joint's range
-GAINS = {"kp": 35, "kd": 1}  # of the examples in messages, N m / rad and N m s / rad
-
-
-class NoActuators(ValueError):
-    """Nothing in a file moves the robot, and no gains were given."""
+SHIFT = 2  # a robot's own contact bits begin after ROBOT and FLOOR
+SUNK = 0.05  # share of a robot's extent by which a keyframe may have it in the floor
+NEAR = 1e-6  # m: geoms whose height is fixed meet the floor if they are as near
+CONTACT = (  # a floor's share in its contacts
+    "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap", "adhesion",
+    "surfacevel",
+)  # fmt: skip
+_NAMES = ("name", "geomname1", "geomname2", "objname", "refname")
+STATE = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")  # what a keyframe holds
+_PLANE, _HFIELD = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD
+_PLAIN = (  # types of attributes that are copied from one element to another
+    int, float, str, np.ndarray, mujoco.mjtSensor, mujoco.mjtObj, mujoco.mjtDataType,
+    mujoco.mjtStage,
+)  # fmt: skip
+_DYN = mujoco.mjtDyn
+# controls that are the servo's target itself, not its rate
+_DIRECT = [int(kind) for kind in (_DYN.mjDYN_NONE, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT)]
+SERVOS = "docs/robot_files.md adds servos in three lines of MjSpec"
 
 
 @dataclass(frozen=True)
 class ModelFile:
     """A robot that was taken out of a file.
 
-    :param path: the file
+    :param label: what to call the file in messages
     :param spec: the robot alone, without lights and keyframes; of a whole world, all of it
     :param root: name of its outermost body
-    :param start: qpos of each joint, by name, when an episode begins
+    :param start: fields of MjData when an episode begins, by name, as the robot alone has them
     :param left_out: what of the file is not in ``spec``, in words
+    :param floors: the geoms that it stood on, in whose place is the arena's floor: attributes
+    :param on_floor: pairs and sensors that refer to them: kind and attributes
     """
 
-    path: Path
+    label: str
     spec: mujoco.MjSpec
     root: str
     start: Mapping[str, Array]
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...] = ()
+    floors: tuple[Mapping[str, Any], ...] = ()
+    on_floor: tuple[tuple[str, Mapping[str, Any]], ...] = ()
 
     @property
     def base(self) -> list[mujoco.MjsJoint]:
@@ -59,79 +71,207 @@ class ModelFile:
         joints = self.spec.body(self.root).find_all("joint")
         return [joint.name for joint in joints if joint.name not in base]
 
-    def pose(self, model: mujoco.MjModel, prefix: str = "") -> Array:
-        """qpos of a model with this robot when an episode begins, [nq].
-
-        :param prefix: of the names of its joints in the model
-        """
-        qpos: Array = model.qpos0.copy()
-        for name, values in self.start.items():
-            first = int(model.jnt_qposadr[model.joint(prefix + name).id])
-            qpos[first : first + len(values)] = values
-        return qpos
-
     def standing(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """The robot alone, as it stands when an episode begins."""
         model = self.spec.compile()
         data = mujoco.MjData(model)
-        data.qpos[:] = self.pose(model)
+        for name, values in self.start.items():
+            getattr(data, name)[:] = values
         mujoco.mj_forward(model, data)
         return model, data
 
+    def paired(self, model: mujoco.MjModel) -> Array:
+        """Whether each geom meets a floor of the file by a pair, [ngeom] bool."""
+        pairs = [values for kind, values in self.on_floor if kind == "pair"]
+        names = {values[end] for values in pairs for end in ("geomname1", "geomname2")}
+        return np.array([model.geom(i).name in names for i in range(model.ngeom)], dtype=bool)
+
+    def meeting(self, model: mujoco.MjModel) -> Array:
+        """Whether each geom's contact bits let it meet the floor, [ngeom] bool.
+
+        As in the file, if it has a floor; else a geom that meets anything does.
+        """
+        meets = (model.geom_contype | model.geom_conaffinity) != 0
+        if self.floors:
+            meets &= np.logical_or.reduce([
+                (model.geom_contype & floor["conaffinity"])
+                | (model.geom_conaffinity & floor["contype"])
+                for floor in self.floors
+            ])  # fmt: skip
+        return meets
+
+    def enter(self, world: mujoco.MjSpec, prefix: str, floor: bool, spawn: str) -> None:
+        """Put the robot into a world; the world's floor has the part that the file's had.
+
+        :param world: whose options become the file's
+        :param prefix: of the robot's names in the world
+        :param floor: whether it meets the floor at all
+        :param spawn: name of the mocap body that carries a robot which is not free
+        :raises ValueError: it would fall for ever
+        """
+        spec = self.spec.copy()
+        mjcf.copy_options(spec.option, world.option)
+        mjcf.agree(spec, world)
+        self._set_contact_bits(spec, floor)
+        free = [joint.type for joint in spec.body(self.root).joints][:1] == [FREE]
+        place = world.worldbody if free else world.worldbody.add_body(name=spawn, mocap=True)
+        world.attach(spec, prefix=prefix, frame=place.add_frame())
+        if not floor or not self.floors:
+            return
+        ours = world.geom("floor")
+        for name in CONTACT:
+            setattr(ours, name, self.floors[0][name])
+        floors = {values["name"] for values in self.floors}
+        for kind, values in self.on_floor:
+            names = {
+                key: "floor" if value in floors else prefix + value
+                for key, value in values.items()
+                if key in _NAMES and value
+            }
+            getattr(world, f"add_{kind}")(**{**values, **names})
+
+    def _set_contact_bits(self, spec: mujoco.MjSpec, floor: bool) -> None:
+        """Let a robot's geoms meet a world's objects, and its floor where they can come near it.
+
+        The bits of the file keep saying which of its geoms meet each other. A geom without bits
+        meets nothing, but by pairs. The floor is left out by geoms that slide at a fixed height
+        above it: each pair of a planar robot with the floor costs time.
+
+        :raises ValueError: the robot would fall for ever
+        """
+        model, data = self.standing()
+        low = lowest(model, data) - model.geom_margin
+        meets = self.meeting(model) & (mjcf.rising(model, data) | (low <= NEAR)) & floor
+        for geom in spec.geoms:
+            if not geom.contype and not geom.conaffinity:
+                continue
+            if max(geom.contype, geom.conaffinity) >= 1 << (31 - SHIFT):
+                raise ValueError(
+                    f"{self.label}: contact bits of geom {geom.name!r} must be below 2^29"
+                )
+            geom.contype <<= SHIFT
+            bits = ROBOT | (FLOOR if meets[geom.id] else 0)
+            geom.conaffinity = geom.conaffinity << SHIFT | bits
+        supported = meets | (self.paired(model) & floor)
+        if FREE in model.jnt_type and not supported.any():
+            raise ValueError(
+                f"{self.label} has a free joint, but no geom that meets the floor: it would fall "
+                'forever; give one contype="1" conaffinity="1", or the robot other joints'
+            )
+
 
 def settle(
-    path: Path,
+    source: Path | mujoco.MjSpec,
     root: str | None = None,
     complete: bool = False,
     grounded: bool = True,
     keyframe: str | None = None,
-    pose: Mapping[str, float] | None = None,
-    actuators: Mapping[str, Any] | None = None,
+    as_written: bool = False,
 ) -> ModelFile:
-    """Make a robot of a file that knows nothing of our worlds.
+    """Take the robot out of a file.
 
-    :param path: MJCF file
+    :param source: MJCF file, or an MjSpec, which is not changed
     :param root: its outermost body; None: the only one with joints
     :param complete: whether the world around the robot is kept
     :param grounded: whether a robot on a free joint is put on the floor, unless a keyframe has it
         higher
     :param keyframe: in which it begins; None: ``start``, ``home`` or the only one, if there is one
-    :param pose: positions of hinges and slides, rad and m, by names or patterns of joints
-    :param actuators: gains ``{"kp": N m / rad, "kd": N m s / rad, "force": N m}`` of position
-        servos, or a mapping of joints' names or patterns to such gains; ``force`` may be left out
+    :param as_written: whether the file was written for our worlds: it begins as the file says, even
+        out of a joint's range or above the floor, and with controls of 0
     :raises ValueError: there is no such robot in the file, in one line
     """
-    if path.suffix == ".urdf" or re.search(r"<robot\b", path.read_text(errors="replace")):
-        raise ValueError(
-            f"{path} is URDF, not MJCF: convert it once with mujoco.MjSpec.from_file({path.name!r})"
-            ".to_file('robot.xml'), and give its outermost body <freejoint/> if it can go anywhere"
-        )
-    spec = mjcf.load(path)
+    spec, label = mjcf.load(source), mjcf.label_of(source)
     _name_all(spec)
-    root = _find_root(spec, path, root)
-    if actuators is None:
-        _check_commanded(spec, path, root)
-    key = _keyframe(spec, path, keyframe)
-    model, names = spec.compile(), [joint.name for joint in spec.body(root).find_all("joint")]
-    limits = _limits(model, names)
-    start = _start(model, names, limits, path, key, {} if pose is None else pose)
+    root = _find_root(spec, label, root)
+    _check_commanded(spec, label, root)
+    key = _keyframe(spec, label, keyframe)
+    whole = spec.compile()
+    before = mujoco.MjData(whole)
+    if key is not None:
+        mujoco.mj_resetDataKeyframe(whole, before, whole.key(key).id)
+    if not as_written:
+        _check_ranges(spec, root, whole, before, label, key)
     left_out = tuple(f"keyframe {frame.name}" for frame in spec.keys if frame.name != key)
     for frame in spec.keys:
         spec.delete(frame)
     spec.nkey = 0  # MuJoCo would fill up to it
-    left_out += () if complete else _take_out(spec, path, root)
-    if complete:
-        for i in range(model.njnt):
-            joint = model.joint(i)
-            start.setdefault(joint.name, _slice(model, i, _qpos(model, key)))
-    if actuators is not None:
-        _add_servos(spec, path, limits, start, actuators)
-    file = ModelFile(path, spec, root, start, left_out)
-    base = file.base
-    if grounded and not complete and base and int(base[0].type) == FREE:
-        height = lowest(*file.standing())  # a keyframe may hold it above the floor, not in it
-        start[base[0].name][2] -= height if key is None else min(height, 0.0)
-    return file
+    floors: tuple[Mapping[str, Any], ...] = ()
+    on_floor: tuple[tuple[str, Mapping[str, Any]], ...] = ()
+    height = 0.0
+    if not complete:
+        mujoco.mj_kinematics(whole, before)
+        found = _floors(spec, whole, before, root)
+        height = min((float(before.geom_xpos[geom.id, 2]) for geom in found), default=0.0)
+        floors = tuple(_attributes(geom) for geom in found)
+        on_floor = tuple(_on_floor(spec, root, {values["name"] for values in floors}))
+        left_out += _take_out(spec, label, root, on_floor)
+    model = spec.compile()
+    data = _carried(whole, before, model)
+    file = ModelFile(label, spec, root, {}, left_out, floors, on_floor)
+    free = bool(file.base) and int(file.base[0].type) == FREE
+    place = data.joint(file.base[0].name).qpos[2:3] if free else spec.body(root).pos[2:3]
+    place -= height
+    if grounded and free and not (complete or as_written):
+        mujoco.mj_kinematics(model, data)
+        touching = file.meeting(model) | file.paired(model)
+        if touching.any():
+            low = float(lowest(model, data)[touching].min())
+            # a keyframe may hold it higher, or as deep as soft contacts let it sink
+            if key is None or low < -SUNK * model.stat.extent:
+                place -= low
+    if key is None and not as_written:
+        _hold(model, data)
+    start = {name: getattr(data, name).copy() for name in STATE}
+    return ModelFile(label, spec, root, start, left_out, floors, on_floor)
+
+
+def servos(model: mujoco.MjModel) -> Array:
+    """Whether each actuator is a position servo, whose control is its target, [nu] bool."""
+    targets: Array = _targets(model) & np.isin(model.actuator_dyntype, _DIRECT)
+    return targets
+
+
+def _targets(model: mujoco.MjModel) -> Array:
+    """Whether each actuator pulls towards a length: its control or its activation, [nu] bool."""
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1]
+    pulls: Array = (gain > 0) & (bias == -gain)
+    return pulls
+
+
+def _hold(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Let position servos hold the robot as it is, by their controls and activations."""
+    mujoco.mj_forward(model, data)
+    direct, lengths = servos(model), data.actuator_length  # what a servo compares its target with
+    limited = np.clip(lengths, *model.actuator_ctrlrange.T)
+    targets = np.where(direct & (model.actuator_ctrllimited != 0), limited, lengths)
+    data.ctrl[:] = np.where(direct, targets, 0.0)
+    for i in np.flatnonzero(_targets(model) & (model.actuator_actnum == 1)).tolist():
+        low, high = (
+            model.actuator_actrange[i] if model.actuator_actlimited[i] else (-np.inf, np.inf)
+        )
+        data.act[model.actuator_actadr[i]] = np.clip(targets[i], low, high)
+
+
+def _carried(old: mujoco.MjModel, before: mujoco.MjData, model: mujoco.MjModel) -> mujoco.MjData:
+    """The state of what is left in a model, by the names of joints and actuators."""
+    data = mujoco.MjData(model)
+    if (old.nq, old.nu, old.nmocap) == (model.nq, model.nu, model.nmocap):
+        for name in STATE:
+            getattr(data, name)[:] = getattr(before, name)
+        return data
+    for i in range(model.njnt):
+        name = model.joint(i).name
+        data.joint(name).qpos, data.joint(name).qvel = (
+            before.joint(name).qpos,
+            before.joint(name).qvel,
+        )
+    for i in range(model.nu):
+        name, count = model.actuator(i).name, int(model.actuator_actnum[i])
+        data.ctrl[i] = before.actuator(name).ctrl[0]
+        first, at = int(model.actuator_actadr[i]), int(old.actuator_actadr[old.actuator(name).id])
+        if count:
+            data.act[first : first + count] = before.act[at : at + count]
+    return data
 
 
 def _name_all(spec: mujoco.MjSpec) -> None:
@@ -149,7 +289,7 @@ def _name_all(spec: mujoco.MjSpec) -> None:
                 taken.add(element.name)
 
 
-def _find_root(spec: mujoco.MjSpec, path: Path, root: str | None) -> str:
+def _find_root(spec: mujoco.MjSpec, label: str, root: str | None) -> str:
     """The robot's outermost body.
 
     :raises ValueError: there is none, or several
@@ -160,38 +300,37 @@ def _find_root(spec: mujoco.MjSpec, path: Path, root: str | None) -> str:
         if root in outer:
             return root
         if spec.body(root) is None:
-            raise ValueError(f"{path} has no body {root!r}: {did_you_mean(root, outer)}")
-        raise ValueError(f"{path}: body {root!r} is not an outermost one: root may be {outer}")
+            raise ValueError(f"{label} has no body {root!r}: {did_you_mean(root, outer)}")
+        raise ValueError(f"{label}: body {root!r} is not an outermost one: root may be {outer}")
     if "robot" in outer or len(moved) == 1:
         return "robot" if "robot" in outer else moved[0]
     if not moved:
-        raise ValueError(f"{path} has no body with joints: a robot needs joints to move by")
+        raise ValueError(f"{label} has no body with joints: a robot needs joints to move by")
     moved.sort(key=lambda name: -len(spec.body(name).find_all("joint")))
     raise ValueError(
-        f"{path} has {len(moved)} outermost bodies with joints, {', '.join(map(repr, moved))}: say "
-        f"which is the robot, root={moved[0]!r}"
+        f"{label} has {len(moved)} outermost bodies with joints, {', '.join(map(repr, moved))}: "
+        f"say which is the robot, root={moved[0]!r}"
     )
 
 
-def _check_commanded(spec: mujoco.MjSpec, path: Path, root: str) -> None:
+def _check_commanded(spec: mujoco.MjSpec, label: str, root: str) -> None:
     """
     :raises ValueError: nothing acts on the robot, or a mocap body does
     """
     names = {body.name for body in spec.body(root).find_all("body")} | {root}
     mocap = {body.name for body in spec.bodies if body.mocap}
-    servos = f"give its joints position servos, actuators={GAINS}"
     for weld in spec.equalities:
         ends = {weld.name1, weld.name2}
         if weld.type == mujoco.mjtEq.mjEQ_WELD and ends & mocap and ends & names:
             raise ValueError(
-                f"{path} moves the robot by a weld to mocap body {(ends & mocap).pop()!r}, which "
-                f"no action commands: take the weld out and {servos}"
+                f"{label} moves the robot by a weld to mocap body {(ends & mocap).pop()!r}, which "
+                f"no action commands: take the weld out; {SERVOS}"
             )
     if not spec.actuators:
-        raise NoActuators(f"{path} has no actuators: {servos}")
+        raise ValueError(f"{label} has no actuators: {SERVOS}")
 
 
-def _keyframe(spec: mujoco.MjSpec, path: Path, keyframe: str | None) -> str | None:
+def _keyframe(spec: mujoco.MjSpec, label: str, keyframe: str | None) -> str | None:
     """The name of the keyframe in which the robot begins.
 
     :raises ValueError: there is no such keyframe
@@ -200,76 +339,94 @@ def _keyframe(spec: mujoco.MjSpec, path: Path, keyframe: str | None) -> str | No
         key.name = key.name or f"keyframe_{i}"
     names = [key.name for key in spec.keys]
     if keyframe is not None and keyframe not in names:
-        hint = did_you_mean(keyframe, names) if names else "it has none; pose={...} sets joints"
-        raise ValueError(f"{path} has no keyframe {keyframe!r}: {hint}")
+        raise ValueError(f"{label} has no keyframe {keyframe!r}: {did_you_mean(keyframe, names)}")
     usual = [name for name in ("start", "home") if name in names]
     only = names if len(names) == 1 else []
     return keyframe or next(iter([*usual, *only]), None)
 
 
-def _qpos(model: mujoco.MjModel, key: str | None) -> Array:
-    qpos: Array = model.qpos0 if key is None else model.key(key).qpos
-    return qpos
-
-
-def _slice(model: mujoco.MjModel, joint: int, qpos: Array) -> Array:
-    """A joint's numbers in qpos, a copy."""
-    size = {FREE: 7, BALL: 4}.get(int(model.jnt_type[joint]), 1)
-    first = int(model.jnt_qposadr[joint])
-    return qpos[first : first + size].copy()
-
-
-def _limits(model: mujoco.MjModel, names: list[str]) -> dict[str, tuple[float, float]]:
-    """Least and greatest position of each hinge and slide, rad or m."""
-    limits = {}
-    for joint in map(model.joint, names):
-        if joint.type[0] in (HINGE, SLIDE):
-            low, high = joint.range if model.jnt_limited[joint.id] else (-math.inf, math.inf)
-            limits[joint.name] = float(low), float(high)
-    return limits
-
-
-def _start(
+def _check_ranges(
+    spec: mujoco.MjSpec,
+    root: str,
     model: mujoco.MjModel,
-    names: list[str],
-    limits: Mapping[str, tuple[float, float]],
-    path: Path,
+    data: mujoco.MjData,
+    label: str,
     key: str | None,
-    pose: Mapping[str, float],
-) -> dict[str, Array]:
-    """qpos of the robot's joints when an episode begins.
+) -> None:
+    """Put joints without a keyframe that are out of their ranges into their middles.
 
-    :raises ValueError: the pose names no joint, or it or the keyframe is out of a joint's range
+    :raises ValueError: a keyframe is out of a joint's range
     """
-    start = {name: _slice(model, model.joint(name).id, _qpos(model, key)) for name in names}
-    for name, (low, high) in limits.items() if key is None else ():
-        if not low <= start[name][0] <= high:
-            start[name][0] = (low + high) / 2
-    if not isinstance(pose, Mapping):
-        raise ValueError(f"pose = {pose!r} must be a mapping of joints to rad or m")
-    for pattern, value in pose.items():
-        if isinstance(value, bool) or not isinstance(value, Real):
-            raise ValueError(f"pose[{pattern!r}] = {value!r} must be a number, rad or m")
-        for name in matching(f"pose of {path.name}", pattern, limits):
-            low, high = limits[name]
-            if not low <= value <= high:
-                raise ValueError(
-                    f"pose[{pattern!r}] = {value!r} is out of the range of joint {name!r}: allowed "
-                    f"are {low:g} to {high:g}"
-                )
-            start[name][0] = value
-    for name, (low, high) in limits.items():
-        if not low - ROUNDED <= start[name][0] <= high + ROUNDED:
+    for joint in spec.body(root).find_all("joint"):
+        limited = model.joint(joint.name)
+        if int(joint.type) not in (HINGE, SLIDE) or not model.jnt_limited[limited.id]:
+            continue
+        low, high = limited.range
+        at = data.joint(joint.name).qpos
+        if key is None and not low <= at[0] <= high:
+            at[0] = (low + high) / 2
+        if not low - ROUNDED <= at[0] <= high + ROUNDED:
             raise ValueError(
-                f"keyframe {key!r} of {path} puts joint {name!r} at {start[name][0]:g}, out of its "
-                f"range, {low:g} to {high:g}: set it with pose={{{name!r}: ...}}"
+                f"keyframe {key!r} of {label} puts joint {joint.name!r} at {at[0]:g}, out of its "
+                f"range, {low:g} to {high:g}: name another, keyframe=..."
             )
-    return start
 
 
-def _take_out(spec: mujoco.MjSpec, path: Path, root: str) -> tuple[str, ...]:
+def _floors(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, data: mujoco.MjData, root: str
+) -> list[mujoco.MjsGeom]:
+    """What the robot stands on in its file: level planes and height fields that do not move."""
+    own = {geom.id for geom in spec.body(root).find_all("geom")}
+    floors = []
+    for geom in spec.geoms:
+        still = model.body_weldid[model.geom_bodyid[geom.id]] == 0
+        level = data.geom_xmat[geom.id, 8] > math.cos(0.1)
+        if geom.type in (_PLANE, _HFIELD) and still and level and geom.id not in own:
+            geom.name = geom.name or f"floor_{geom.id}"
+            floors.append(geom)
+    return floors
+
+
+def _on_floor(
+    spec: mujoco.MjSpec, root: str, floors: Collection[str]
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Pairs and sensors of the robot with what it stands on: kind and attributes."""
+    kinds, body = mujoco.mjtObj, spec.body(root)
+    bodies = {root, *(other.name for other in body.find_all("body"))}
+    own = {
+        kinds.mjOBJ_GEOM: {geom.name for geom in body.find_all("geom")},
+        kinds.mjOBJ_SITE: {site.name for site in body.find_all("site")},
+        kinds.mjOBJ_BODY: bodies,
+        kinds.mjOBJ_XBODY: bodies,
+        kinds.mjOBJ_UNKNOWN: {""},
+    }
+    for pair in spec.pairs:
+        names = {pair.geomname1, pair.geomname2}
+        if names & set(floors) and names & own[kinds.mjOBJ_GEOM]:
+            yield "pair", _attributes(pair)
+    for sensor in spec.sensors:
+        ends = [(sensor.objtype, sensor.objname), (sensor.reftype, sensor.refname)]
+        others = [end for end in ends if end[0] != kinds.mjOBJ_GEOM or end[1] not in floors]
+        if len(others) == 1 and others[0][1] in own.get(others[0][0], ()):
+            yield "sensor", _attributes(sensor)
+
+
+def _attributes(element: Any) -> dict[str, Any]:
+    """The attributes of an element of an MjSpec, with which another like it is made."""
+    values = {name: getattr(element, name) for name in dir(element) if not name.startswith("_")}
+    return {
+        name: np.copy(value) if isinstance(value, np.ndarray) else value
+        for name, value in values.items()
+        if isinstance(value, _PLAIN) and name not in ("id", "info", "signature")
+    }
+
+
+def _take_out(
+    spec: mujoco.MjSpec, label: str, root: str, on_floor: Collection[tuple[str, Mapping[str, Any]]]
+) -> tuple[str, ...]:
     """Leave nothing but the robot in a file: floor, lights and others belong to the arena.
 
+    :param on_floor: what the arena's floor takes over
     :return: what was left out, in words
     """
 
@@ -278,9 +435,14 @@ def _take_out(spec: mujoco.MjSpec, path: Path, root: str) -> tuple[str, ...]:
             "actuator": spec.actuators, "sensor": spec.sensors, "equality": spec.equalities,
             "tendon": spec.tendons,
         }  # fmt: skip
-        return {f"{kind} {element.name}" for kind, of in kinds.items() for element in of}
+        pairs = {f"pair {pair.geomname1} {pair.geomname2}" for pair in spec.pairs}
+        return pairs | {f"{kind} {element.name}" for kind, of in kinds.items() for element in of}
 
-    before, world, left_out = names(), spec.worldbody, []
+    kept = {
+        f"pair {v['geomname1']} {v['geomname2']}" if kind == "pair" else f"sensor {v['name']}"
+        for kind, v in on_floor
+    }
+    before, world, left_out = names() - kept, spec.worldbody, []
     drop_references(spec)
     for body in world.bodies:
         if body.name != root:
@@ -292,89 +454,10 @@ def _take_out(spec: mujoco.MjSpec, path: Path, root: str) -> tuple[str, ...]:
             spec.delete(element)
     for light in spec.lights:
         spec.delete(light)
-    body = spec.body(root)
-    body.pos[:2] = 0.0  # the layout says where it is
+    spec.body(root).pos[:2] = 0.0  # the layout says where it is
     try:
         spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise ValueError(f"{path} needs more than body {root!r}: {reason}") from None
+        raise ValueError(f"{label} needs more than body {root!r}: {reason}") from None
     return (*left_out, *sorted(before - names()))
-
-
-def _add_servos(
-    spec: mujoco.MjSpec,
-    path: Path,
-    limits: Mapping[str, tuple[float, float]],
-    start: Mapping[str, Array],
-    gains: Mapping[str, Any],
-) -> None:
-    """Give joints position servos.
-
-    :param limits: of the robot's hinges and slides
-    :raises ValueError: no such joint, or no such gains
-    """
-    if spec.actuators:
-        raise ValueError(
-            f"{path} has {len(spec.actuators)} actuators of its own: leave out actuators={{...}}"
-        )
-    if not isinstance(gains, Mapping) or not gains:
-        raise ValueError(f"actuators = {gains!r} must be gains such as {GAINS}")
-    if not limits:
-        raise ValueError(f"{path} has no hinges or slides, which position servos need")
-    common = any(key in gains for key in ("kp", "kd", "force"))
-    chosen: dict[str, Mapping[str, float]] = {}
-    for pattern, values in ({"*": gains} if common else gains).items():
-        label = "actuators" if common else f"actuators[{pattern!r}]"
-        _check_gains(label, values)
-        for name in matching(f"actuators of {path.name}", pattern, limits):
-            chosen[name] = values
-    for name in limits:  # in the order of the joints
-        if name in chosen:
-            _add_servo(spec, name, limits[name], float(start[name][0]), chosen[name])
-
-
-def _check_gains(label: str, gains: Any) -> None:
-    """
-    :raises ValueError: they are no gains
-    """
-    if not isinstance(gains, Mapping):
-        raise ValueError(f"{label} = {gains!r} must be gains such as {GAINS}")
-    for key in gains:
-        if key not in ("kp", "kd", "force"):
-            hint = did_you_mean(key, ["kp", "kd", "force"])
-            raise ValueError(f"{label} has no gain {key!r}: {hint}")
-    for key in ("kp", "kd"):
-        if key not in gains:
-            raise ValueError(f"{label} = {dict(gains)!r} lacks {key!r}: gains are {GAINS}")
-    for key, value in gains.items():
-        real = isinstance(value, Real) and not isinstance(value, bool)
-        if not real or not 0 <= value < math.inf or (value == 0 and key != "kd"):
-            least = "at least 0" if key == "kd" else "greater than 0"
-            raise ValueError(f"{label}[{key!r}] = {value!r} must be a number {least}")
-
-
-def _add_servo(
-    spec: mujoco.MjSpec,
-    name: str,
-    limits: tuple[float, float],
-    rest: float,
-    gains: Mapping[str, float],
-) -> None:
-    """A position servo within the joint's range; half a turn either way of a hinge without."""
-    low, high = limits
-    if low == -math.inf:
-        if int(spec.joint(name).type) == SLIDE:
-            raise ValueError(
-                f"slide {name!r} has no range, which a position servo needs: give it one, or name "
-                "the joints that have servos, actuators={'...': {...}}"
-            )
-        low, high = rest - math.pi, rest + math.pi
-    servo = spec.add_actuator(
-        name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrlrange=[low, high]
-    )
-    servo.set_to_position(kp=gains["kp"], kv=gains["kd"])
-    servo.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
-    if "force" in gains:
-        servo.forcerange = [-gains["force"], gains["force"]]
-        servo.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE

@@ -58,3 +58,17 @@ def bounds(model: mujoco.MjModel, name: str) -> tuple[float, float, str]:
     else:
         unit = _UNITS.get(kind, "")
     return 0.0 if kind == _SENSOR.mjSENS_TOUCH else -math.inf, math.inf, unit
+
+
+def bodies(model: mujoco.MjModel, sensor: int) -> set[int]:
+    """The bodies that a sensor is on or relates something to."""
+    found = set()
+    for kind, i in (
+        (model.sensor_objtype[sensor], int(model.sensor_objid[sensor])),
+        (model.sensor_reftype[sensor], int(model.sensor_refid[sensor])),
+    ):
+        if kind in (mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_XBODY):
+            found.add(i)
+        elif kind == mujoco.mjtObj.mjOBJ_SITE:
+            found.add(int(model.site_bodyid[i]))
+    return found

@@ -203,7 +203,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         print(f"Playing {agent.path} on {agent.env_id}{trained_at}")
     stage: AbstractContextManager[VecEnv] = nullcontext(agent.env)
     if video is not None:
-        stage = filming(agent.env, agent.model, video, bar=flags.verbose > 0)
+        stage = filming(agent.env, agent.model, video)
     with closing(agent.env), explained(f"can't play {agent.path}", *BAD_NUMBERS), stage as env:
         evaluation = evaluate_policy(
             agent.model,

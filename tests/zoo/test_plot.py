@@ -14,12 +14,10 @@ from matplotlib.colors import to_rgb
 
 from sb3_guard import algorithms, cli, plot
 from sb3_guard.algorithms import CLASSES
-from sb3_guard.envs import Scenario
-from sb3_guard.envs.suites.guard import SUITE_ROBOTS
 from sb3_guard.zoo.grids.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.results import figures
 from sb3_guard.zoo.results.figure_data import COLORS, INK, PLACES, Data
-from sb3_guard.zoo.results.figures import fit_costs, inline_svg, save
+from sb3_guard.zoo.results.figures import fit_costs, save
 from sb3_guard.zoo.results.paper import FIGURES, draw
 from sb3_guard.zoo.results.report import report
 from sb3_guard.zoo.results.runs import read_results, select
@@ -95,15 +93,10 @@ def test_curves_are_means_of_seeds_with_bands(data):
 
 def test_q2_shows_trpos_costs_and_the_slopes(data):
     (drawing,) = draw("q2", data)
-    bars, reward, cost = drawing.figure.axes
+    bars, cost = drawing.figure.axes
     assert [bar.get_height() for bar in bars.patches] == pytest.approx([4.0] * 2 * len(ROBOTS))
+    # Hazards have two seeds, Ghosts one.
     assert lines(cost)["TRPO-USL"] == pytest.approx([1.5, 1.5])
-    costlier = data.runs["suite"].str.endswith("Ghosts")
-    runs = data.runs.assign(M_c=data.runs["M_c"].where(~costlier, 2 * data.runs["M_c"]))
-    (drawing,) = draw("q2", Data(runs))
-    assert drawing.figure.axes[0].get_ylim()[1] > 8  # no bar is cut
-    # Hazards have two seeds: 5.5 of TRPO's 10.5; Ghosts one: 5 of 10
-    assert lines(reward)["CPO"] == pytest.approx([5.5 / 10.5, 0.5])
 
 
 def test_q3_has_a_polygon_per_family_and_trpos_at_1(data):
@@ -135,22 +128,15 @@ def test_q8_has_a_spider_per_algorithm(data):
     assert usl["cost"] == pytest.approx([1.5] * 6) and usl["reward"][2:5] == pytest.approx([1] * 3)
 
 
-def test_robots_are_in_the_order_of_their_actions():
-    actual = {robot: Scenario(robot=robot).build().robot.action_size for robot in SUITE_ROBOTS}
-    assert actual == ROBOTS and list(ROBOTS.values()) == sorted(ROBOTS.values())
-
-
 def test_pareto_names_the_points_and_shades_the_infeasible_side(small):
-    (drawing,) = draw("pareto", read(small))
-    (axis,) = drawing.figure.axes
-    assert drawing.name == f"pareto_{POINT}"
-    assert "cost limit, 0" in lines(axis)
     found = read(small)
+    (drawing,) = draw("pareto", found)
+    (axis,) = drawing.figure.axes
+    assert drawing.name == f"pareto_{POINT}" and "cost limit, 0" in lines(axis)
     labels = {found.looks[algo].label for algo in found.runs["algo"]}
-    assert {text.get_text() for text in axis.texts} == labels
+    assert labels < {text.get_text() for text in drawing.figure.legends[0].get_texts()}
     (shade,) = axis.patches
     assert shade.get_x() == 0.0 and shade.get_width() == axis.get_xlim()[1]
-    assert POINT in axis.get_title() and "seed" in axis.get_title() and "steps" in axis.get_title()
 
 
 def test_curves_and_pareto_say_seeds_and_steps(small):
@@ -282,19 +268,6 @@ def test_no_two_algorithms_of_a_family_have_one_colour():
     assert len({*ours}) == len(ours) == len(CLASSES) - 1  # TRPO is grey
 
 
-@pytest.mark.parametrize("kind", FIGURES)
-def test_legends_cover_no_data(kind, small):
-    for drawing in draw(kind, read(small)):
-        if drawing.figure is None or not drawing.figure.legends:
-            continue
-        drawing.figure.draw_without_rendering()
-        (legend,) = drawing.figure.legends
-        box = legend.get_window_extent()
-        assert box.width <= drawing.figure.bbox.width
-        for axis in drawing.figure.axes:
-            assert not box.overlaps(axis.get_window_extent()), (kind, axis)
-
-
 @pytest.mark.parametrize("form", figures.FORMATS)
 def test_formats(small, tmp_path, form):
     found = read(small)
@@ -330,12 +303,6 @@ def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys, monkeyp
     results = printed.partition("\nSafety")[0].splitlines()
     (row,) = (line.split() for line in results if "CPO  " in line and "0:" in line)
     assert row[:5] == [POINT, "CPO", "0:", "violating", "2"]
-
-
-def test_without_folders_it_reads_logs(small, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert plot.main(["--table", "r.md"]) == 0
-    assert "CPO" in (tmp_path / "r.md").read_text()
 
 
 def limited(folder, seed: int) -> None:
@@ -459,20 +426,6 @@ def test_wrong_usage(small, tmp_path, monkeypatch, capsys, arguments, message):
     assert [path.name for path in elsewhere.iterdir()] == ["file"]
 
 
-def test_only_unfinished_runs(tmp_path, capsys):
-    (fake_run(tmp_path) / "result.json").unlink()
-    assert plot.main([str(tmp_path)]) == 2
-    err = capsys.readouterr().err
-    assert "unfinished" in err and "there is no finished run below" in err
-
-
-def test_help_shows_examples_and_figures(capsys):
-    with pytest.raises(SystemExit):
-        plot.main(["--help"])
-    out = capsys.readouterr().out
-    assert "sb3-guard plot logs" in out and "Feasibility projection: CPO against PCPO." in out
-
-
 # The page
 
 
@@ -507,12 +460,6 @@ def test_page_is_complete_and_by_itself(small):
     assert page.index("Results</h2>") < page.index("page by sb3_guard")
     assert page.count("<table") == 6 and page.count("<svg") > 8
     assert f"<td>{small / 'trpo' / POINT}-v0_1</td>" in page  # nothing is abbreviated
-
-
-def test_inline_figures_are_labelled(small):
-    (drawing,) = draw("pareto", read(small))
-    text = inline_svg(drawing.figure, "title")
-    assert 'role="img" aria-label="title"' in text and ET.fromstring(text) is not None
 
 
 def test_the_command_runs_as_a_module_and_loads_no_torch(small, tmp_path):

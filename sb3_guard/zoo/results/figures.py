@@ -143,13 +143,12 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
     means = data.means[(data.means["suite"] == suite)].dropna(subset=[cost, "J_r"])
     limit = draw_limit(axis.axvline, data, suite, cost)
     for row in means.to_dict("records"):
-        look = data.looks[row["algo"]]
-        seeds = data.runs_of(suite, row["algo"])
+        look, seeds = data.looks[row["algo"]], data.runs_of(suite, row["algo"])
         style: dict[str, Any] = {"color": look.color, "marker": look.marker}
         axis.scatter(seeds[cost], seeds["J_r"], s=14, alpha=0.6, **style)
         axis.errorbar(
             row[cost], row["J_r"], row["J_r_std"], row[f"{cost}_std"], markersize=8.5,
-            elinewidth=0.9, capsize=2, zorder=3, **style,
+            elinewidth=0.9, capsize=2, zorder=3, linestyle="none", label=look.label, **style,
         )  # fmt: skip
     axis.set(xlabel=cost_name(cost), ylabel="return", title=title_of(data, suite))
     axis.margins(0.08)
@@ -158,39 +157,12 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
     axis.set_xlim(start - 0.03 * (end - start), end)
     if not np.isnan(limit) and limit < end:
         axis.axvspan(limit, end, color=INK, alpha=0.1, linewidth=0, label="above the limit")
-    name_points(axis, data, means, cost)
-
-
-def name_points(axis: Axes, data: Data, means: Any, cost: str) -> None:
-    """Write each algorithm's name next to its mean, where it covers no other name or mean."""
-    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
-    figure = axis.get_figure()
-    assert figure is not None
-    # Points of a panel, less what labels and margins take.
-    size = 0.86 * 72 * np.array([figure.bbox.width, figure.bbox.height]) / figure.dpi
-    inside = means[cost].where(means[cost] <= right, right - 0.03 * (right - left))
-    at = np.stack([(inside - left) / (right - left), (means["J_r"] - low) / (high - low)], axis=1)
-    at *= size
-    taken = np.concatenate([at - 5, at + 5], axis=1)  # boxes, [n, 4]: left, low, right, high
-    for row, x, place in zip(means.to_dict("records"), inside, at, strict=True):
+    edge = end - 0.03 * (end - start)
+    for row in means[means[cost] > end].to_dict("records"):
         look = data.looks[row["algo"]]
-        text = f"{look.label}, {row[cost]:.3g} →" if row[cost] > x else look.label
-        width = 4.6 * len(text)
-        tried: list[Any] = []
-        for side, up in ((8, 9), (8, -9), (-8 - width, 9), (-8 - width, -9), (8, 20), (8, -20),
-                         (-8 - width, 20), (-8 - width, -20), (8, 0), (-8 - width, 0)):  # fmt: skip
-            box = np.tile(place, 2) + np.array([side, up - 5, side + width, up + 5])
-            covers = (box[:2] < taken[:, 2:]).all(axis=1) & (taken[:, :2] < box[2:]).all(axis=1)
-            outside = (box[:2] < 0).any() or (box[2:] > size).any()
-            tried.append((covers.sum() + 3 * outside, len(tried), (side, up), box))
-        _, _, offset, box = min(tried, key=lambda place: place[:2])
-        taken = np.vstack([taken, box])
-        if row[cost] > x:
-            axis.scatter(x, row["J_r"], s=80, color=look.color, marker=look.marker, zorder=3)
-        axis.annotate(
-            text, (x, row["J_r"]), offset, textcoords="offset points", color=look.color,
-            fontsize=8, va="center", zorder=4,
-        )  # fmt: skip
+        axis.scatter(edge, row["J_r"], s=80, color=look.color, marker=look.marker, zorder=3)
+        axis.annotate(f"{row[cost]:.3g} →", (edge, row["J_r"]), (0, 8), textcoords="offset points",
+                      ha="right", color=look.color)  # fmt: skip
 
 
 def finish(figure: Figure, missing: str) -> None:

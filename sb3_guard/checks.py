@@ -4,8 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from sb3_guard.fields import fit
-
 
 class NumberError(FloatingPointError, ValueError):
     """A reward, cost, observation, action or loss is a number that nothing can be learnt from."""
@@ -29,7 +27,9 @@ def check_integer(name: str, value: Any, least: int = 1) -> None:
     """
     :raises ValueError: ``value`` is not an integer of at least ``least``
     """
-    fit(name, value, int, least, ends="[)")
+    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not (integer and value >= least):
+        raise ValueError(f"{name}={value!r}: must be an integer of at least {least}")
 
 
 def check_number(
@@ -39,7 +39,12 @@ def check_number(
     :param ends: brackets of the interval from ``low`` to ``high``, such as ``"[)"``
     :raises ValueError: ``value`` is not a number of the interval
     """
-    fit(name, value, float, low, high, ends)
+    above = is_number(value) and (value >= low if ends[0] == "[" else value > low)
+    below = is_number(value) and (value <= high if ends[1] == "]" else value < high)
+    if not (above and below):
+        raise ValueError(
+            f"{name}={value!r}: must be a number in {ends[0]}{low:g}, {high:g}{ends[1]}"
+        )
 
 
 def check_learning_rate(rate: Any) -> None:
@@ -87,4 +92,6 @@ def check_choice(name: str, value: Any, *allowed: str) -> None:
     """
     :raises ValueError: ``value`` is none of the allowed words
     """
-    fit(name, value, choices=allowed)
+    if value not in allowed:
+        words = " or ".join(repr(each) for each in allowed)
+        raise ValueError(f"{name}={value!r}: must be {words}")

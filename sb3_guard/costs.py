@@ -59,24 +59,32 @@ def interval(
     return float(low), float(high)
 
 
-def verdict(low: float, high: float, limit: float) -> str:
+def verdict(low: float, high: float, limit: float, diverged: int = 0) -> str:
     """Whether a cost keeps a limit, as far as the interval of its mean tells; empty: there is none.
 
     :param low: lower end of the interval, NaN if there is none
     :param high: upper end
+    :param diverged: episodes that are not in it, since a physics error ended them; no limit is kept
+        where there are any, for breaking the simulation would be the cheapest way to keep it
     """
     if math.isnan(low):
         return ""
-    return "kept" if high <= limit else "exceeded" if low > limit else "undecided"
+    if low > limit:
+        return "exceeded"
+    return "kept" if high <= limit and not diverged else "undecided"
 
 
 class Estimate(NamedTuple):
-    """A mean over episodes, their standard deviation, and an interval for the mean."""
+    """A mean over episodes, their standard deviation, and an interval for the mean.
+
+    :param diverged: further episodes, whose cost is not known since a physics error ended them
+    """
 
     mean: float
     std: float
     low: float
     high: float
+    diverged: int = 0
 
     def __str__(self) -> str:
         known = self.std > 0 or not np.isnan(self.low)  # one episode has no spread
@@ -87,24 +95,32 @@ class Estimate(NamedTuple):
 
     def against(self, limit: float) -> str:
         """Whether a cost keeps a limit, as far as the interval tells: ``limit 2: exceeded``."""
-        words = verdict(self.low, self.high, limit)
-        return f"limit {limit:g}" + (f": {words}" if words else "")
+        words = verdict(self.low, self.high, limit, self.diverged)
+        return f"limit {limit:g}" + (f": {words}" if words else "") + beside(self.diverged)
+
+
+def beside(diverged: int) -> str:
+    """What is said beside a cost and its verdict of episodes that a physics error ended."""
+    return f" ({diverged} more ended in a physics error)" if diverged else ""
 
 
 def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
     """
     Mean, standard deviation and :func:`interval` of one value an episode.
 
-    :param values: one value an episode, shape [E], e.g. ``evaluation.costs``
+    :param values: one value an episode, shape [E], e.g. ``evaluation.costs``; NaN where it is not
+        known, since a physics error ended the episode
     :param resamples: number of bootstrap samples
     :return: NaNs where there are too few episodes (none; for the interval, LEAST_EPISODES)
     """
+    unknown = np.isnan(values)
+    values, diverged = values[~unknown], int(unknown.sum())
     if len(values) == 0:
-        return Estimate(*[float("nan")] * 4)
+        return Estimate(math.nan, math.nan, math.nan, math.nan, diverged)
     ends = float("nan"), float("nan")
     if len(values) >= LEAST_EPISODES:
         ends = interval([values], resamples=resamples)
-    return Estimate(float(np.mean(values)), float(np.std(values)), *ends)
+    return Estimate(float(np.mean(values)), float(np.std(values)), *ends, diverged)
 
 
 def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ContractError:
@@ -181,6 +197,16 @@ class EpisodeCost(NamedTuple):
     highest: np.ndarray
     bounded: np.ndarray
     length: int
+
+    def known(self, info: Mapping[str, Any]) -> "EpisodeCost":
+        """The same; NaNs of an episode that a physics error ended: nobody knows its cost.
+
+        :param info: of its last step
+        """
+        if not info.get("physics_error"):
+            return self
+        nans = np.full_like(self.total, math.nan)
+        return self._replace(total=nans, highest=nans, bounded=nans)
 
 
 class EpisodeCosts:

@@ -103,6 +103,8 @@ def typed(value: Any, annotation: Any) -> Any:
     elif kind in (None, types.NoneType) and (value is None or value == "null"):
         return None
     elif _fits(value, kind, args):
+        if args and isinstance(value, Mapping):
+            return {key: typed(item, args[1]) for key, item in value.items()}
         return value
     raise TypeError
 

@@ -16,9 +16,9 @@ import gymnasium
 import numpy as np
 import yaml
 
-from sb3_guard.envs import GuardVectorEnv, env_spec, register_robot
+from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.check_part import unsteady
-from sb3_guard.envs.registry import ROBOTS
+from sb3_guard.envs.registry import ROBOTS, robot_of_file
 from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.envs.robots.robot import MJCFRobot
 from sb3_guard.zoo.cli.flags import Command, command, flag
@@ -62,8 +62,8 @@ def register_file(path: Path, stated: dict[str, Any]) -> tuple[str, type[MJCFRob
     name = re.sub(r"[^A-Za-z0-9]|^[0-9]+", "", path.stem).capitalize() or "Robot"
     if name.lower() in map(str.lower, ROBOTS):
         name += "File"
-    register_robot(name, xml=path, **stated)
-    robot: Any = ROBOTS[name]
+    robot: Any = robot_of_file(name, path, stated)
+    ROBOTS[name] = robot  # also one that explodes: it is shown, with a warning
     return name, robot
 
 

@@ -57,7 +57,8 @@ def selection_limits(
 
 
 def _mean(values: np.ndarray) -> Any:
-    """Mean over episodes; NaN where none has ended."""
+    """Mean over episodes, but for those that a physics error ended; NaN: there are none."""
+    values = values[~np.isnan(values.reshape(len(values), -1)).any(axis=1)]
     return (values.mean(axis=0) if len(values) else np.full(values.shape[1:], np.nan)).tolist()
 
 
@@ -78,8 +79,8 @@ class LogCosts(BaseCallback):
         monitor = find_monitor(self.training_env)
         episodes = self.model.ep_info_buffer
         if episodes:
-            costs = [episode["c"] for episode in episodes]
-            self.logger.record("rollout/ep_cost_mean", float(np.mean(costs)))
+            costs = np.array([episode["c"] for episode in episodes])
+            self.logger.record("rollout/ep_cost_mean", _mean(costs))
         if monitor.total_steps:
             self.logger.record("rollout/cost_rate", monitor.total_cost / monitor.total_steps)
 
@@ -200,6 +201,8 @@ class CostEvalCallback(EvalCallback):
         """How two models compare: the greater tuple is the better model.
 
         :param evaluations: of one model; the return of the first counts, the costs of all
+        :return: whether it keeps its limits, and the return, or minus the violation: NaN, so that
+            it is never the best one, if a physics error ended an episode
         """
         if not all(map(len, evaluations)):  # no episode has ended
             return (False, -np.inf)

@@ -28,7 +28,7 @@ from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.checked_env import checked
 from sb3_guard.checks import NumberError, check_cost_keys, is_number
 from sb3_guard.common.monitor import cost_keys_of, total_cost
-from sb3_guard.costs import EpisodeCost, EpisodeCosts, Estimate, estimate, read_costs
+from sb3_guard.costs import EpisodeCost, EpisodeCosts, Estimate, beside, estimate, read_costs
 
 LONGEST = 20_000  # steps of an episode that nothing ends, after which it is given up
 
@@ -45,7 +45,8 @@ class Evaluation:
 
     :param returns: undiscounted return of each episode, shape [E]
     :param costs: undiscounted cost of each episode, shape [E]: of the one cost key, or, where
-        several are asked for, of all: the sum of ``info["cost"]``, else of the keys
+        several are asked for, of all: the sum of ``info["cost"]``, else of the keys. NaN, as all
+        its costs, of an episode that a physics error ended (``info["physics_error"]``)
     :param lengths: steps of each episode, shape [E]
     :param key_costs: episode cost of each of the cost keys asked for, shape [E, m]
     :param successes: ``info["is_success"]`` at the end of the episodes that report one
@@ -74,6 +75,8 @@ class Evaluation:
     def __str__(self) -> str:
         returns, costs = self.estimate(self.returns), self.estimate(self.costs)
         text = f"{len(self)} episodes: return {returns}, cost {costs}"
+        if not self.limits:
+            text += beside(costs.diverged)
         if self.limit_on == "sum" and len(self.cost_keys) == 1:
             return text + "".join(f", {costs.against(limit)}" for limit in self.limits)
         return text + "".join(
@@ -453,6 +456,7 @@ class _Tally:
             episode = info.get("episode")
             if episode is not None:
                 earned, steps = float(episode["r"]), int(episode["l"])
+            cost = cost.known(info)
             self.ended.append((earned, steps, cost))
             if "is_success" in info:
                 self.successes.append(bool(info["is_success"]))

@@ -43,8 +43,9 @@ class CostMonitor(VecMonitor):
     ``info["episode"]`` has ``r`` (return), ``l`` (steps), ``t`` (seconds since the start) and
     ``c``, the undiscounted sum of ``info["cost"]`` over the episode. When an environment has
     several costs, each of ``cost_keys`` is summed too, as ``c_<key>``. ``max`` and ``max_<key>``,
-    which are not in the csv, are the highest costs of a step, 0 where none is above it. The csv is
-    what :func:`stable_baselines3.common.monitor.load_results` reads.
+    which are not in the csv, are the highest costs of a step, 0 where none is above it. All of them
+    are NaN of an episode whose last info has a true ``physics_error``: nobody knows what it would
+    have cost. The csv is what :func:`stable_baselines3.common.monitor.load_results` reads.
 
     The sums of the episodes under way are part of :meth:`state`, so that a resumed training run
     reports the episodes in which it was stopped as if nothing had happened.
@@ -136,6 +137,7 @@ class CostMonitor(VecMonitor):
     def _report(self, ended: EpisodeCost, infos: list[dict[str, Any]]) -> None:
         """Put an episode that has ended into its last info, and into the csv."""
         info = infos[ended.row]
+        ended = ended.known(info)
         cost, *keys = ended.total.tolist()
         episode: dict[str, Any] = {
             "r": float(self.episode_returns[ended.row]),

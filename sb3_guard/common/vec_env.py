@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
-import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_guard.checked_env import CheckedEnv, refuse_vector_env
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.common.sources import Source, find
+from sb3_guard.fields import fit
 from sb3_guard.spelling import did_you_mean
 
 if TYPE_CHECKING:
@@ -64,8 +64,7 @@ def make_vec_env(
     :raises ValueError: unknown names or bad values, with what is allowed
     :raises gymnasium.error.DependencyNotInstalled: the package that has the environment is absent
     """
-    if isinstance(n_envs, bool) or not isinstance(n_envs, (int, np.integer)) or n_envs < 1:
-        raise ValueError(f"n_envs = {n_envs!r} must be an integer of at least 1")
+    fit("n_envs", n_envs, int, 1, 10**6, "[]")
     kwargs = dict(env_kwargs or {})
     if render_mode is not None:
         kwargs["render_mode"] = render_mode

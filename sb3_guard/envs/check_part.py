@@ -1,8 +1,9 @@
-"""The contract of a part, checked once instead of in every step.
+"""The contract of a part, checked once instead of in every step; and robots that explode.
 
 :func:`check_part` runs a part in a small world of random subsets of rows and staggered resets, as
-Stable-Baselines3's ``check_env`` does with an environment. Registering a part calls it, and so may
-a test of yours.
+Stable-Baselines3's ``check_env`` does with an environment. A test of yours calls it::
+
+    check_part(Scenario(task="Leave").build)
 """
 
 from __future__ import annotations
@@ -21,19 +22,19 @@ if TYPE_CHECKING:
 ROWS, STEPS = 3, 12
 
 
-def exploded(engine: Engine, outcome: Outcome) -> bool:
-    """Whether a step ended in a state that no robot is in: diverged, or at more than 50 m/s."""
-    return bool(outcome.physics_error.any() or np.abs(engine.robot.velocity).max() > 50)
+def exploded(engine: Engine, outcome: Outcome, speed: float = 50.0) -> bool:
+    """Whether a step ended in a state that no robot is in: diverged, or faster than this, m/s."""
+    return bool(outcome.physics_error.any() or np.abs(engine.robot.velocity).max() > speed)
 
 
-def check_part(make: Callable[[int], Engine], name: str) -> None:
-    """Run a world and see whether one of its parts keeps the contract of :mod:`.part`.
+def check_part(make: Callable[[int], Engine], name: str = "a part") -> None:
+    """Run a world and see whether its parts keep the contract of :mod:`.part`.
 
     Rows of a batch must be what lone simulations are, bit for bit; what is read twice must be the
     same; and a restored state must continue as the saved one did.
 
     :param make: makes an engine with the part and this number of rows
-    :param name: what to call the part in messages
+    :param name: what messages call the part
     :raises PartError: what is not so, and what to do
     """
     batch, lone, restored = make(ROWS), make(1), make(ROWS)
@@ -100,12 +101,22 @@ def _check_reading(engine: Engine, name: str) -> None:
 
 def unsteady(engine: Engine) -> str | None:
     """What is wrong with a robot after a second alone, or of random actions: it falls, explodes."""
-    return _watch(engine, alone=True) or _watch(engine, alone=False)
+    return explodes(engine) or _sinks(engine) or explodes(engine, alone=False)
 
 
-def _watch(engine: Engine, alone: bool) -> str | None:
+def diverges(engine: Engine) -> str | None:
+    """What is wrong if the physics diverges within a second in which nobody acts."""
+    return explodes(engine, speed=np.inf)
+
+
+def explodes(engine: Engine, alone: bool = True, speed: float = 50.0) -> str | None:
+    """What is wrong with a robot that explodes within a second; None: it does not.
+
+    :param engine: in which episodes begin
+    :param alone: whether its actions are the middle of their range; False: they are random
+    :param speed: m/s that no robot has
+    """
     rng = np.random.default_rng(0)
-    how = "left alone" if alone else "given random actions"
     low, high = engine.robot.action_range
     shape = engine.num_envs, engine.robot.action_size
     rest = np.broadcast_to((np.asarray(low) + high) / 2, shape)
@@ -114,19 +125,24 @@ def _watch(engine: Engine, alone: bool) -> str | None:
     engine.reset(np.arange(engine.num_envs))
     for step in range(1, round(1 / engine.control_step) + 1):
         outcome = engine.step(rest if alone else rng.uniform(low, high, shape))
-        seconds = f"{step * engine.control_step:.2g} s"
-        if exploded(engine, outcome):
+        if exploded(engine, outcome, speed):
             return (
-                f"the robot, {how}, explodes within {seconds}: reduce its timestep (now "
+                f"the robot, {'left alone' if alone else 'given random actions'}, explodes within "
+                f"{step * engine.control_step:.2g} s: reduce its timestep (now "
                 f"{engine.model.opt.timestep:g} s), or the stiffness of its joints and the gears, "
                 "gains and control ranges of its actuators (of servos in rad, also where a file "
                 "has degrees), or move apart geoms that overlap"
             )
-        if alone and engine.robot.position[0, 2] < -0.1:
-            return (
-                f"the robot, left alone, falls through the floor within {seconds}: its geoms need "
-                "contype and conaffinity of 1, and its class floor=True"
-            )
         if outcome.terminated[0]:
             break
     return None
+
+
+def _sinks(engine: Engine) -> str | None:
+    """What is wrong with a robot that was left alone and is below the floor now."""
+    if engine.robot.position[0, 2] >= -0.1:
+        return None
+    return (
+        "the robot, left alone, falls through the floor within a second: its geoms need contype "
+        "and conaffinity of 1, and its class floor=True"
+    )

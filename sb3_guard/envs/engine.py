@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import DTypeLike
 
-from sb3_guard.checks import NumberError, check_integer
+from sb3_guard.checks import NumberError
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.contract import check_moving, per_row
 from sb3_guard.envs.drawn import Drawn
@@ -29,6 +29,7 @@ from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.physics import Physics
 from sb3_guard.envs.placing import Placing
 from sb3_guard.envs.types import Array
+from sb3_guard.fields import fit
 from sb3_guard.spelling import did_you_mean
 
 CLEAN_STARTS = 100  # layouts drawn before a start with a cost is an error
@@ -64,9 +65,9 @@ class Engine:
         arena: Arena | None = None,
         cost: str = "sum",
     ) -> None:
-        check_integer("num_envs", num_envs)
+        fit("num_envs", num_envs, int, 1, 10**6, "[]")
         if num_threads is not None:
-            check_integer("num_threads", num_threads)
+            fit("num_threads", num_threads, int, 1, ends="[)")
         self.robot, self.task, self.constraints = robot, task, tuple(constraints)
         self.extras, self.arena = extras or Extras(), arena or Arena()
         self.parts: tuple[Part, ...] = (
@@ -104,6 +105,7 @@ class Engine:
         self.spec = world.spec  # its to_xml() is the world as MJCF
         self.model = self.spec.compile()
         frame_skip = self.arena.frame_skip or self.robot.frame_skip
+        fit("frame_skip", frame_skip, int, 1, 1000, "[]")
         self.control_step = frame_skip * float(self.model.opt.timestep)
         self.batch = Physics(
             self.model, self.num_envs, self.num_threads, frame_skip, int(self.robot.stage)

@@ -44,7 +44,10 @@ class Extras(Part):
         "everything, in alphabetical order; constraints that are added or removed join or leave it",
     )
     camera: tuple[int, int] | None = param(
-        None, "width and height, pixels, of an image from the robot; needs flatten=False", low=1
+        None,
+        "width and height, pixels, of an image from the robot; needs flatten=False",
+        low=1,
+        high=10_000,
     )
 
     def __post_init__(self) -> None:

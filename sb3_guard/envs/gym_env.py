@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from sb3_guard.checks import check_integer
 from sb3_guard.envs.components import Actuator, Component, actuators, components
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import EYE
@@ -19,6 +18,7 @@ from sb3_guard.envs.rendering import CAMERAS, Renderer
 from sb3_guard.envs.robots.robot import PREFIX
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.types import Array
+from sb3_guard.fields import fit
 from sb3_guard.spelling import did_you_mean
 
 ROW = np.zeros(1, dtype=np.int32)
@@ -127,7 +127,7 @@ class Simulated:
         if not isinstance(flatten, bool):
             raise ValueError(f"flatten = {flatten!r} must be true or false")
         for name, value in (("width", width), ("height", height)):
-            check_integer(name, value)
+            fit(name, value, int, 1, 10_000, "[]")
         self.scenario = as_scenario(scenario, params)
         self.render_mode, self.flatten = render_mode, flatten
         self._num_threads = num_threads

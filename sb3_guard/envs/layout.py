@@ -49,6 +49,7 @@ class Layout(Parameters):
         "layouts begun anew where an object finds no room, before others make room for it; the "
         "distribution is then that of blind draws, object by object",
         low=0,
+        high=10**6,
     )
     overlap: bool = param(False, "whether keep-outs may let solid objects begin inside each other")
     randomize: bool = param(True, "false: all episodes of an environment are the same")

@@ -145,7 +145,6 @@ class Part(Parameters):
     every: str = "control"  # before which steps before_step is called: "control" or "physics"
     solid: bool = False  # whether its objects are bodies that the robot bumps into
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
-    tried_with: ClassVar[str | None] = None  # the robot with which a new part is tried; None: any
     family: ClassVar[str] = "guard"  # of suites; a part of GUARD's has a page of its own
 
     @classmethod

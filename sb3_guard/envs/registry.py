@@ -4,22 +4,18 @@ Adding one to its table here, or with :func:`register_robot`, :func:`register_ta
 :func:`register_constraint` from outside, is all it takes to use it in ids, scenarios and commands.
 """
 
-import dataclasses
 import inspect
-import math
-import warnings
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
 import mujoco
 
-from sb3_guard.checks import check_integer
-from sb3_guard.envs.arena import INTEGRATORS, Arena
-from sb3_guard.envs.check_part import check_part
+from sb3_guard.envs.arena import Arena
+from sb3_guard.envs.check_part import diverges
 from sb3_guard.envs.engine import Engine
-from sb3_guard.envs.parameters import PartError
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.robots import gym_mujoco, safety_gymnasium
 from sb3_guard.envs.robots.from_file import robot_class
@@ -133,92 +129,53 @@ def register_robot(
     :param attributes: with ``xml``, what the file does not say, such as ``center``; the page
         *Parameters* lists them with their units and defaults
     :raises ValueError: neither or both of ``robot`` and ``xml`` are given, an attribute is unknown
-        or bad, the file has no robot that can act, or the name is not usable
+        or bad, the file has no robot that can act or one that explodes when it is left alone, or
+        the name is not usable
     """
-    _check_name(name)
     if (robot is None) == (xml is None):
         raise ValueError(
             f"robot {name!r} needs a class or an xml file, one of the two: "
-            f"register_robot({name!r}, xml='{name.lower()}.xml')"
+            f"register_robot({name!r}, xml='{name}.xml')"
         )
     if robot is None:
-        source = xml if isinstance(xml, mujoco.MjSpec) else Path(str(xml)).resolve()
-        if isinstance(source, Path) and not source.is_file():
-            raise ValueError(f"robot {name!r}: there is no file {str(xml)!r}")
-        robot = robot_class(name, source, attributes)
+        robot = robot_of_file(name, xml, attributes)
+        own: Any = robot.from_params({}, "robot")
+        goal = TASKS["Goal"].from_params(own.defaults.get("goal", {}))
+        arena = Arena.from_params(own.defaults.get("arena", {}))
+        unsteady = diverges(Engine(own, goal, arena=arena))
+        if unsteady is not None:
+            raise ValueError(f"robot {name!r}: {unsteady}")
     elif attributes:
         raise ValueError(f"robot {name!r}: {sorted(attributes)} go with xml, not with a class")
-    _check_class(name, robot, Robot)
-    _check_robot(name, robot)
-    _check_contract(name, robot)
-    _add(ROBOTS, name, robot)
+    _add(ROBOTS, name, robot, Robot)
 
 
-def _check_robot(name: str, robot: type[Robot]) -> None:
-    """Refuse attributes of a robot that are missing or that no robot can have."""
-
-    def positive(value: Any) -> bool:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and value > 0
-
-    def finite(value: Any) -> bool:
-        return value is None or (positive(value) and value < math.inf)
-
-    def texts(value: Any) -> bool:
-        return isinstance(value, (list, tuple)) and bool(value) and all(map(_is_text, value))
-
-    rules: dict[str, tuple[Callable[[Any], bool], str]] = {
-        "timestep": (finite, "a positive number of seconds, such as 0.002"),
-        "integrator": (lambda v: v in (None, *INTEGRATORS), f"one of {', '.join(INTEGRATORS)}"),
-        "workspace": (lambda v: v in ("planar", "spatial"), "'planar' or 'spatial'"),
-        "reach": (
-            positive,
-            "a positive number of metres; leave it out for a robot that can go anywhere",
-        ),
-    }
-    if issubclass(robot, MJCFRobot):
-        rules["lidar_bodies"] = texts, "a list of names of bodies, such as ['robot']"
-        rules["center"] = _is_text, "the name of a body"
-    check_integer(f"robot {name!r}: frame_skip", robot.frame_skip)
-    for key, (fits, what) in rules.items():
-        value = getattr(robot, key, None)
-        if not fits(value):
-            raise ValueError(f"robot {name!r}: {key} = {value!r} must be {what}")
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
+def robot_of_file(
+    name: str, xml: str | Path | mujoco.MjSpec, attributes: Mapping[str, Any]
+) -> type[MJCFRobot]:
+    """The robot of a file, not registered, see :func:`register_robot`."""
+    source = xml if isinstance(xml, mujoco.MjSpec) else Path(xml).resolve()
+    if isinstance(source, Path) and not source.is_file():
+        raise ValueError(f"robot {name!r}: there is no file {str(xml)!r}")
+    return robot_class(name, source, attributes)
 
 
 def register_task(name: str, task: type[Task]) -> None:
     """Make a task known under ``name`` to ids, scenarios and commands.
 
-    :raises ValueError: the class is not a complete task, or the name is not usable
+    :raises ValueError: the class is not a task, or the name is not usable
     """
-    _check_name(name)
     _check_keyword(name, CONSTRAINTS)
-    _check_class(name, task, Task, "reward")
-    _check_contract(name, task)
-    _add(TASKS, name, task)
+    _add(TASKS, name, task, Task)
 
 
 def register_constraint(name: str, constraint: type[Constraint]) -> None:
     """Make a constraint known under ``name`` to ids, scenarios and commands.
 
-    :raises ValueError: the class is not a complete constraint, or the name is not usable
+    :raises ValueError: the class is not a constraint, or the name is not usable
     """
-    _check_name(name)
     _check_keyword(name, TASKS)
-    _check_class(name, constraint, Constraint, "cost")
-    _check_contract(name, constraint)
-    _add(CONSTRAINTS, name, constraint)
-
-
-def _check_name(name: Any) -> None:
-    if not _is_text(name) or not name.isidentifier() or not name.isascii() or "_" in name:
-        raise ValueError(
-            f"{name!r} cannot be part of an id: use letters and digits, a letter first and no "
-            "underscore"
-        )
+    _add(CONSTRAINTS, name, constraint, Constraint)
 
 
 def _check_keyword(name: str, others: Iterable[str]) -> None:
@@ -226,7 +183,7 @@ def _check_keyword(name: str, others: Iterable[str]) -> None:
 
     :param others: the parts of other kinds that have keywords of their own
     """
-    key = name.lower()
+    key = str(name).lower()
     if key in (*KEYWORDS, *OPTIONS, *map(str.lower, others)):
         raise ValueError(
             f"{name!r} cannot name a part: its parameters would be set with {key}=..., which means "
@@ -234,66 +191,26 @@ def _check_keyword(name: str, others: Iterable[str]) -> None:
         )
 
 
-def _check_class(name: str, part: Any, kind: type, verb: str = "") -> None:
-    """Refuse what cannot be used as a part of this kind.
+def _add(table: dict[str, Any], name: str, part: Any, kind: type[Part]) -> None:
+    """Make a part known; one that is defined again, as by a notebook's cell, takes its place.
 
-    :param verb: a method that it must have of its own
+    :raises ValueError: this is no name for an id, or no class of this kind
     """
+    if not isinstance(name, str) or re.fullmatch("[A-Za-z][A-Za-z0-9]*", name) is None:
+        raise ValueError(
+            f"{name!r} cannot be part of an id: use letters and digits, a letter first and no "
+            "underscore"
+        )
     if not isinstance(part, type) or not issubclass(part, kind):
-        given = getattr(part, "__name__", repr(part))
         hint = "; a file is given as xml=..." if kind is Robot else ""
-        raise ValueError(f"{name!r} = {given} must be a subclass of {kind.__name__}{hint}")
-    parameters = [
-        key for key, what in inspect.get_annotations(part).items() if "ClassVar" not in str(what)
-    ]
-    if "name" in parameters:
-        raise ValueError(
-            f"class {part.__name__}: name is not a parameter; write it without a type, name = ..."
-        )
-    decorated = "__dataclass_params__" in vars(part)
-    if not dataclasses.is_dataclass(part) or (parameters and not decorated):
-        unread = f": its parameters {', '.join(parameters)} are not read" if parameters else ""
-        raise ValueError(
-            f"class {part.__name__} is not a dataclass{unread}; write @dataclass in the line above "
-            f"class {part.__name__}"
-        )
-    if verb and getattr(part, verb) is getattr(kind, verb):
-        raise ValueError(f"class {part.__name__} must define {verb}(), as every {kind.__name__}")
-
-
-def _check_contract(name: str, part: type[Part]) -> None:
-    """Run a part with its defaults in a small world, and warn if it can't be in one.
-
-    :raises PartError: it does not keep its contract
-    """
-
-    def make(rows: int) -> Engine:
-        one: Any = part.from_params({}, name.lower() if not issubclass(part, Robot) else None)
-        if isinstance(one, Robot):
-            goal = TASKS["Goal"].from_params(one.defaults.get("goal", {}))
-            arena = Arena.from_params(one.defaults.get("arena", {}))
-            return Engine(one, goal, num_envs=rows, num_threads=1, arena=arena)
-        robot = ROBOTS[part.tried_with or ("Point" if "planar" in part.spaces else "Drone")]()
-        if isinstance(one, Task):
-            return Engine(robot, one, num_envs=rows, num_threads=1)
-        return Engine(robot, TASKS["Goal"](), [one], num_envs=rows, num_threads=1)
-
-    try:
-        check_part(make, name)
-    except PartError:
-        raise
-    except Exception as error:  # it may need other company
-        if isinstance(error, ValueError) and issubclass(part, MJCFRobot):
-            raise  # its file is at fault
-        warnings.warn(
-            f"{name} was not tried: a small world with it raised {type(error).__name__}: {error}; "
-            "it is registered, but may not work",
-            stacklevel=4,
-        )
-
-
-def _add(table: dict[str, Any], name: str, part: type[Part]) -> None:
-    """Make a part known; one that is defined again, as by a notebook's cell, takes its place."""
+        raise ValueError(f"{name!r} = {part!r} must be a subclass of {kind.__name__}{hint}")
+    fields: Any = getattr(part, "__dataclass_fields__", ())
+    for key, annotation in inspect.get_annotations(part).items():
+        if key not in fields and "ClassVar" not in str(annotation):
+            raise ValueError(
+                f"class {part.__name__} is not a dataclass, so its parameter {key} is not read: "
+                f"write @dataclass in the line above class {part.__name__}"
+            )
     for other, known in table.items():
         if name.lower() == other.lower() and not (name == other and _same(part, known)):
             raise ValueError(f"{other!r} is already taken by another class: use another name")

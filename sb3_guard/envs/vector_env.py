@@ -11,7 +11,6 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from sb3_guard.checks import check_integer
 from sb3_guard.envs.gym_env import (
     Simulated,
     action_space,
@@ -22,6 +21,7 @@ from sb3_guard.envs.outcome import Outcome
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.suites import EPISODE_STEPS, episode_steps
 from sb3_guard.envs.types import Array
+from sb3_guard.fields import fit
 
 
 @dataclass
@@ -85,7 +85,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         if max_episode_steps is None:
             steps = episode_steps(scenario) if isinstance(scenario, str) else EPISODE_STEPS
             max_episode_steps = steps
-        check_integer("max_episode_steps", max_episode_steps)
+        fit("max_episode_steps", max_episode_steps, int, 1, ends="[)")
         self._simulate(
             scenario, params, num_envs, num_threads, render_mode, flatten, width, height, camera
         )

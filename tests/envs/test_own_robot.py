@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from worlds import own_parts, world
 
-from sb3_guard.envs import GuardVectorEnv, Scenario, register_constraint, register_robot
+from sb3_guard.envs import GuardVectorEnv, Scenario, register_constraint
 from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.part import Constraint
-from sb3_guard.envs.registry import ROBOTS
+from sb3_guard.envs.registry import ROBOTS, robot_of_file
 
 CART = """
 <mujoco>
@@ -48,7 +48,7 @@ def cart(tmp_path):
     def write(change=lambda text: text, options="", ground="", **attributes):
         path = tmp_path / "cart.xml"
         path.write_text(change(CART.format(options=options, floor=ground)))
-        register_robot("Cart", xml=path, **attributes)
+        ROBOTS["Cart"] = robot_of_file("Cart", path, attributes)  # also one that explodes
         return Scenario(robot="Cart")
 
     with own_parts():
@@ -133,7 +133,7 @@ def test_options_of_the_file_hold_unless_the_class_states_them(cart):
 @pytest.mark.parametrize(
     ("joint", "attributes", "words"),
     [
-        ('type="slide" axis="0 0 1"', {"floor": False}, "falls through the floor within 0."),
+        ('type="slide" axis="0 0 1"', {"floor": False}, "falls through the floor"),
         ('type="hinge" axis="1 0 0" stiffness="1e7" ref="1"', {"timestep": 0.05}, "explodes"),
         ('type="slide" axis="0 0 1"', {}, None),
     ],

@@ -296,6 +296,8 @@ class Constrained(CostLimits, BaseAlgorithm):
         zero = self.missing_cost == "zero"
         costs, seen = read_costs(infos, self.cost_keys, zero, self.episodes.lengths)
         for episode in self.episodes.step(costs, dones):
+            if infos[episode.row].get("physics_error"):
+                continue  # nobody knows what it would have cost
             self._ended_costs.append(episode.bounded)
             self._ended_lengths.append(episode.length)
             self.ep_cost_buffer.append(episode.total)

@@ -21,7 +21,6 @@ class FloorContact(RobotLimit):
 
     name = "floorcontact"
     unit = "N"
-    tried_with = "Ant"
 
     limit: float = param(1.0, "greatest force that is free, N", low=0)
     bodies: tuple[str, ...] = param(

@@ -55,8 +55,6 @@ class RobotLimit(Constraint):
 class JointLimit(RobotLimit):
     """Cost ``weight`` in each step at whose end a joint is beyond ``limit``."""
 
-    tried_with = "Ant"
-
     joints: tuple[str, ...] = param(
         (),
         "names or patterns of the hinges and slides that count, such as *_knee; empty: all hinges "

@@ -21,7 +21,6 @@ class SelfCollision(RobotLimit):
 
     name = "selfcollision"
     unit = "N"
-    tried_with = "Ant"
 
     limit: float = param(1.0, "greatest force that is free, N", low=0)
 

@@ -1,10 +1,10 @@
 """The class of a robot that is made of a file and what its user states of it."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -14,6 +14,7 @@ from sb3_guard.envs.robots.arm import FileArm
 from sb3_guard.envs.robots.measure import radius, reached
 from sb3_guard.envs.robots.model_file import ModelFile, settle
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
+from sb3_guard.fields import fit
 from sb3_guard.spelling import did_you_mean
 
 OF_FILE = ("root", "complete", "keyframe")  # what settle() is told
@@ -42,19 +43,19 @@ ATTRIBUTES: dict[str, tuple[str, str]] = {
     "floor": ("True", "False: it slides at a fixed height and never meets the floor, which saves "
         "time"),
 }  # fmt: skip
-_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "root": (lambda v: v is None or isinstance(v, str), "the name of an outermost body"),
-    "center": (lambda v: v is None or isinstance(v, str), "the name of a body or site"),
-    "keyframe": (lambda v: v is None or isinstance(v, str), "the name of a keyframe"),
-    "complete": (lambda v: isinstance(v, bool), "True or False"),
-    "keepout": (
-        lambda v: isinstance(v, (int, float)) and not isinstance(v, bool) and 0 <= v < math.inf,
-        "a number of metres, at least 0",
-    ),
-    "defaults": (
-        lambda v: isinstance(v, Mapping) and all(isinstance(p, Mapping) for p in v.values()),
-        "a mapping such as {'goal': {'size': 0.05}}",
-    ),
+#: What they may be, see :func:`~sb3_guard.fields.fit`.
+RULES: dict[str, tuple[Any, ...]] = {
+    "root": (str | None,),
+    "center": (str | None,),
+    "keyframe": (str | None,),
+    "complete": (bool,),
+    "keepout": (float, 0, math.inf, "[)"),
+    "defaults": (dict[str, dict[str, Any]],),
+    "timestep": (float | None, 0),
+    "reach": (float, 0),
+    "integrator": (Literal["Euler", "RK4", "implicit", "implicitfast"] | None,),
+    "workspace": (Literal["planar", "spatial"],),
+    "lidar_bodies": (list[str],),
 }
 
 
@@ -71,8 +72,8 @@ def robot_class(
     for key, value in stated.items():
         if key not in ATTRIBUTES:
             raise ValueError(f"robot {name!r} has no {key!r}: {did_you_mean(key, ATTRIBUTES)}")
-        if key in _RULES and not _RULES[key][0](value):
-            raise ValueError(f"robot {name!r}: {key} = {value!r} must be {_RULES[key][1]}")
+        if key in RULES:
+            fit(f"robot {name!r}: {key}", value, *RULES[key])
     grounded = stated.get("workspace", "planar") == "planar"
     file = settle(
         source, grounded=grounded, **{key: stated[key] for key in OF_FILE if key in stated}

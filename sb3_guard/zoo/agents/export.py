@@ -68,7 +68,7 @@ def write(
         "env_kwargs": settings.get("env_kwargs") or {},
         "cost_limit": settings.get("cost_limit"),
         "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
-        "measured": {"episodes": measured["episodes"], **means},
+        "measured": {name: n for name, n in measured.items() if isinstance(n, int)} | means,
     }
     with explained(f"can't export {agent.path}", ValueError, ImportError):
         return onnx_file.export(

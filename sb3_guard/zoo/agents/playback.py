@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
-from sb3_guard.costs import LEAST_EPISODES, Estimate
+from sb3_guard.costs import LEAST_EPISODES, Estimate, beside
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
@@ -249,13 +249,17 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
     :return: the number of ``episodes``, and for ``return``, ``cost`` and ``length``, and ``worst``,
         the highest cost of a step, of an agent that limits that, the ``mean``,
         ``std``, the 95 % interval of the mean (``low``, ``high``) and the ``values``, one an
-        episode; None where there are too few episodes for it
+        episode; None where there are too few episodes for it, or where it is not known, of the
+        ``physics_errors`` episodes that one ended
     """
     out: dict[str, Any] = {"episodes": len(evaluation)}
     for name, values in _columns(evaluation).items():
         estimate = evaluation.estimate(values)._asdict()
+        if diverged := estimate.pop("diverged"):
+            out["physics_errors"] = diverged
         finite = {key: None if np.isnan(value) else value for key, value in estimate.items()}
-        out[name] = {**finite, "values": values.tolist()}
+        known = [None if np.isnan(value) else value for value in values.tolist()]
+        out[name] = {**finite, "values": known}
     return out
 
 
@@ -291,9 +295,9 @@ def means(evaluation: Evaluation) -> str:
     lines = ["One episode:" if count == 1 else f"{title}:"]
     width = max(map(len, rows))
     for name, (estimate, limit) in rows.items():
-        mean, std, low, high = estimate
+        mean, std, low, high, diverged = estimate
         spread = f" ± {std:.3f}" if count > 1 else ""
         interval = "" if np.isnan(low) else f"   [{low:.3f}, {high:.3f}]"
-        end = "" if limit is None else f"   {estimate.against(limit)}"
+        end = beside(diverged) if limit is None else f"   {estimate.against(limit)}"
         lines.append(f"  {name:<{width}} {mean:9.3f}{spread}{interval}{end}")
     return "\n".join(lines)

@@ -15,16 +15,18 @@ def read_episodes(path: str | Path) -> pd.DataFrame:
     """
     All training episodes of a run.
 
-    :return: ``step`` at which the episode ended, ``J_r``, ``M_c``, of several costs also
-        ``M_c/<key>``, and ``rho_c`` (cumulative cost ÷ steps until then)
+    :return: ``step`` at which the episode ended, ``J_r``, ``M_c`` (NaN where a physics error ended
+        it), of several costs also ``M_c/<key>``, and ``rho_c`` (cumulative cost ÷ steps until then)
     :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
     """
     file = Path(path) / "0.monitor.csv"
     with explained(f"can't read {file}", OSError, ValueError, KeyError):
-        table = pd.read_csv(file, skiprows=1).filter(regex="^([rlc]|c_.*)$").astype(float)
+        text = pd.read_csv(file, skiprows=1, keep_default_na=False, dtype=str)
+        text = text.filter(regex="^([rlc]|c_.*)$")
+        table = text.astype(float)
         steps = table.pop("l").cumsum()
         rate = table["c"].cumsum() / steps
-    if not len(table) or table.isna().any(axis=None):
+    if not len(table) or text.isna().any(axis=None) or table["r"].isna().any():
         raise UsageError(f"can't use {file}: it has no episodes, or is truncated")
     names = {"r": "J_r", "c": "M_c"}
     table.columns = [names.get(name, f"M_c/{name[2:]}") for name in map(str, table)]

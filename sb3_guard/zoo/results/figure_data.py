@@ -94,7 +94,7 @@ class Data:
         """The costs of all seeds' episodes of a split, in their order; none: there are none."""
         seeds = self.runs_of(suite, algo)[["path", "epoch"]].itertuples(index=False)
         played = [read_splits(path, epoch) for path, epoch in seeds]
-        costs = [splits[split]["M_c"] for splits in played if split in splits]
+        costs = [splits[split]["M_c"].dropna() for splits in played if split in splits]
         return np.sort(np.concatenate([np.zeros(0), *costs]))
 
     @cached_property

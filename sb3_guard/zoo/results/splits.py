@@ -44,7 +44,8 @@ def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataF
     for split, episodes in result.get("final", {}).items():
         keys = {} if "limit_on" in result else episodes.get("bounded", {})
         costs = {"M_c": episodes["costs"], **{f"M_c/{key}": keys[key] for key in keys}}
-        splits[split] = pd.DataFrame({"J_r": episodes["returns"], **costs})
+        # NaN: a physics error ended it
+        splits[split] = pd.DataFrame({"J_r": episodes["returns"], **costs}, dtype=float)
     return splits
 
 
@@ -90,11 +91,11 @@ def nested_interval(seeds: Sequence[np.ndarray], resamples: int = 10_000) -> tup
     return float(low), float(high)
 
 
-def tier(low: float, high: float, limit: float) -> str:
-    """Certified, undecided or violating, by the interval of the mean cost; empty: no limit."""
+def tier(low: float, high: float, limit: float, diverged: int = 0) -> str:
+    """Certified, undecided or violating, see :func:`~sb3_guard.costs.verdict`; empty: no limit."""
     if math.isnan(limit):
         return ""
-    return TIERS.get(verdict(low, high, limit), "undecided")
+    return TIERS.get(verdict(low, high, limit, diverged), "undecided")
 
 
 def judge(runs: pd.DataFrame, limits: "pd.Series[float] | None" = None) -> pd.DataFrame:
@@ -107,7 +108,8 @@ def judge(runs: pd.DataFrame, limits: "pd.Series[float] | None" = None) -> pd.Da
     :return: ``suite``, ``algo``, ``label``, ``split``, ``key`` of a cost with a limit of its own
         (empty: the total), ``seeds``, ``limit`` (NaN: none), ``return`` and ``cost``, means over
         seeds of their episodes' means, with ``_std`` (over seeds; NaN for one), ``low`` and
-        ``high`` of the cost (:func:`nested_interval`), ``tier``, ``above`` and ``excess``
+        ``high`` of the cost (:func:`nested_interval`), ``tier``, ``diverged`` (further
+        episodes, which a physics error ended), ``above`` and ``excess``
         (:func:`violations`, of all seeds' episodes)
     """
     rows = []
@@ -131,8 +133,9 @@ def judge(runs: pd.DataFrame, limits: "pd.Series[float] | None" = None) -> pd.Da
 def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, object]:
     """The statistics of a cost in a split."""
     means = pd.DataFrame([episodes.mean() for episodes in seeds])
-    costs = [episodes[column].to_numpy(float) for episodes in seeds]
-    low, high = nested_interval(costs)
+    costs = [episodes[column].dropna().to_numpy(float) for episodes in seeds]
+    diverged = sum(map(len, seeds)) - sum(map(len, costs))
+    low, high = nested_interval(costs) if all(map(len, costs)) else (math.nan, math.nan)
     if min(abs(low - limit), abs(high - limit)) < 0.02 * (high - low):  # else the draw decides
         low, high = nested_interval(costs, 1_000_000)
     above, excess = violations(np.concatenate(costs), limit)
@@ -145,7 +148,8 @@ def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, 
         "cost_std": means[column].std(),
         "low": low,
         "high": high,
-        "tier": tier(low, high, limit),
+        "tier": tier(low, high, limit, diverged),
+        "diverged": diverged,
         "above": math.nan if math.isnan(limit) else above,
         "excess": excess,
     }

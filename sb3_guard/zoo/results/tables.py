@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sb3_guard.common.files import replacing
+from sb3_guard.costs import beside
 from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.results.figure_data import Data
@@ -181,7 +182,11 @@ TIER_HEADINGS: Columns = {
     "seeds": whole("seeds"),
     "return": _deviation("return"),
     "cost": lambda row: spread(row["cost"], row["cost_std"], 1) + _interval(row, "", 1),
-    "limit": lambda row: "–" if pd.isna(row["limit"]) else f"{row['limit']:g}: {row['tier']}",
+    "limit": lambda row: (
+        "–"
+        if pd.isna(row["limit"])
+        else f"{row['limit']:g}: {row['tier']}" + beside(row["diverged"])
+    ),
     "above limit, %": lambda row: number(100 * row["above"], 1),
     "D⁺": "excess",
 }

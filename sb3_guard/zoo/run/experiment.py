@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_guard.common.callbacks import CostEvalCallback, selection_limits
 from sb3_guard.common.sources import Source
 from sb3_guard.costs import read_costs
-from sb3_guard.zoo.cli.usage import explained
+from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
@@ -179,6 +179,14 @@ class Experiment:
         with closing(env), explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
             env.reset()
             infos = env.step(np.array([env.action_space.sample()]))[3]
+        if self.source.batch is not None:
+            from sb3_guard.envs.check_part import diverges
+
+            world: Any = self.source.batch(1, **env_kwargs)
+            with closing(world):
+                unsteady = diverges(world.envs.engine)
+            if unsteady is not None:
+                raise UsageError(f"{self.flags.env}: {unsteady}")
         if getattr(self.algorithm, "constrained", False):
             optional = self.setup.model.get("missing_cost") == "zero"
             with explained(f"{self.flags.env} reports no such cost", ValueError):

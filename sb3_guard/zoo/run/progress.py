@@ -17,10 +17,12 @@ from tqdm import tqdm
 
 import sb3_guard
 from sb3_guard.algorithms.common.limits import limits_at
+from sb3_guard.checks import NumberError
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
 from sb3_guard.costs import estimate, verdict
 from sb3_guard.zoo.run.folder import EPOCH, cost_words
 
+DIVERGED = 10  # episodes in a row that a physics error ended, after which training stops
 PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")
 
 
@@ -80,12 +82,15 @@ def merit(
     """
     What a result says of the episodes of the last epoch, see :meth:`Epochs.result`.
 
-    :param episodes: return, cost, length, and what each of the m limits bounds, [E, 3 + m]
+    :param episodes: return, cost, length, and what each of the m limits bounds, [E, 3 + m]; costs
+        are NaN of those that a physics error ended: they are in no mean
     :param keys: of the m costs
     :param limits: of the m costs; None: there is none
     :param cut: a wrapper ended the episodes early, which leaves no verdict
     :return: ``return``, ``cost``, ``length``, ``costs`` and the number of ``episodes``
     """
+    known = ~np.isnan(episodes[:, 1])
+    episodes, diverged = episodes[known], int((~known).sum())
     means = episodes.mean(axis=0).tolist() if len(episodes) else [None] * (3 + len(keys))
     costs = {}
     for key, limit, mean, values in zip(keys, limits, means[3:], episodes.T[3:], strict=True):
@@ -94,7 +99,9 @@ def merit(
         if not np.isnan(interval.low):
             cost |= {"low": interval.low, "high": interval.high}
             if limit is not None and not cut:
-                cost["verdict"] = verdict(interval.low, interval.high, limit)
+                cost["verdict"] = verdict(interval.low, interval.high, limit, diverged)
+        if diverged:
+            cost["physics_errors"] = diverged
         costs[key] = cost
     measures = dict(zip(("return", "cost", "length"), means, strict=False))
     return {**measures, "costs": costs, "episodes": len(episodes)}
@@ -125,6 +132,7 @@ class Epochs(BaseCallback):
         self._episodes: list[list[float]] = []
         #: the same without the step, of the last epoch in which any ended, [E, 3 + m]
         self.last = np.zeros((0, 4))
+        self._diverged = 0  # episodes in a row that a physics error ended
         # Taken now: what lies on disk may change while the run continues.
         self._provenance = provenance()
         #: steps after each part of the run that was to be shorter than it came to be
@@ -152,6 +160,7 @@ class Epochs(BaseCallback):
             costs = [episode.get(f"{bounded}_{key}", episode[bounded]) for key in self._keys]
             totals = [episode[name] for name in "rcl"]
             self._episodes.append([self.model.num_timesteps, *totals, *costs])
+            self._diverged = self._diverged + 1 if np.isnan(episode["c"]) else 0
         self.bar.update(self.model.num_timesteps - self.bar.n)
         return True
 
@@ -162,6 +171,12 @@ class Epochs(BaseCallback):
         if self._episodes:
             self.last = np.array(self._episodes)[:, 1:]
             self._describe()
+        if self._diverged >= DIVERGED:
+            raise NumberError(
+                f"the last {self._diverged} episodes all ended in a physics error, and nothing can "
+                "be learnt from them: reduce the robot's timestep, or the gears, gains and control "
+                "ranges of its actuators"
+            )
         errors = find_monitor(self.training_env).physics_errors
         if errors:
             self.logger.record("rollout/physics_errors", errors)
@@ -171,7 +186,7 @@ class Epochs(BaseCallback):
 
     def _describe(self) -> None:
         if self.show and len(self.last):
-            earned, cost, _, *means = self.last.mean(axis=0).tolist()
+            earned, cost, _, *means = np.nanmean(self.last, axis=0).tolist()
             rows = zip(self._keys, means, self._limits, strict=True)
             costs = {key: {"mean": mean, "limit": limit} for key, mean, limit in rows}
             self.bar.set_postfix_str(
@@ -207,7 +222,8 @@ class Epochs(BaseCallback):
             cost key the ``mean`` of what its limit bounds, the 95 % interval of that mean
             (``low``, ``high``), the ``limit`` (None: unconstrained) and the ``verdict``, "kept",
             "exceeded" or "undecided" (without interval and verdict if fewer than five episodes
-            ended), ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the
+            ended), and the number of further episodes that ended in ``physics_errors``, if any did,
+            ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the
             number of episodes that ended because the physics diverged, ``cost_limit`` (None:
             unconstrained), ``limit_on`` of an algorithm that limits the worst step, ``cut`` where a
             wrapper ended the episodes early, which leaves no verdict, ``seconds`` of training, and
@@ -239,6 +255,7 @@ class Epochs(BaseCallback):
         """What a resumed run needs to tell the same result."""
         return {
             "last": self.last,
+            "diverged": self._diverged,
             "episodes": self._episodes,
             "total": self.total,
             "steps": self.model.num_timesteps,
@@ -248,6 +265,7 @@ class Epochs(BaseCallback):
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state`."""
         self.last, self._episodes = state["last"], list(state["episodes"])
+        self._diverged = state["diverged"]
         self.learned = list(state["learned"])
         if state["total"] != self.total:
             self.learned.append(state["steps"])

@@ -26,7 +26,7 @@ from sb3_guard.common.evaluation import (
 )
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
-from sb3_guard.costs import estimate
+from sb3_guard.costs import beside, estimate
 from sb3_guard.zoo.cli.usage import (
     TrainingStopped,
     UsageError,
@@ -271,9 +271,9 @@ class Training:
         return True
 
 
-def _rounded(values: np.ndarray) -> list[float]:
-    """Numbers of six significant digits, for a file."""
-    return [float(f"{value:.6g}") for value in values]
+def _rounded(values: np.ndarray) -> list[float | None]:
+    """Numbers of six significant digits, for a file; None: it is not known."""
+    return [None if np.isnan(value) else float(f"{value:.6g}") for value in values]
 
 
 def summary(
@@ -290,7 +290,8 @@ def summary(
             text += f"   [{cost['low']:.3f}, {cost['high']:.3f}]"
         if cost["limit"] is not None:
             text += f"   limit {cost['limit']:g}"
-        return text + (f": {cost['verdict']}" if "verdict" in cost else "")
+        text += f": {cost['verdict']}" if "verdict" in cost else ""
+        return text + beside(cost.get("physics_errors", 0))
 
     costs, limit_on = result["costs"], result.get("limit_on", "sum")
     alone = len(costs) == 1 and limit_on == "sum"
@@ -309,10 +310,11 @@ def summary(
     for name, played in result["final"].items():
         lines.append(
             f"  final, {name:<12}return {np.mean(played['returns']):.3f}, cost "
-            f"{estimate(np.array(played['costs']))}, {len(played['costs'])} episodes"
+            f"{(cost := estimate(np.array(played['costs'], float)))}, {len(played['costs'])} "
+            f"episodes{beside(cost.diverged)}"
         )
         for key, values in played.get("bounded", {}).items():
-            cost, limit = estimate(np.array(values)), costs[key]["limit"]
+            cost, limit = estimate(np.array(values, float)), costs[key]["limit"]
             against = "" if limit is None else f"   {cost.against(limit)}"
             lines.append(f"    {bounded_name(key, limit_on):<16} {cost}{against}")
     packages = packages_flag(flags.gym_packages)

@@ -21,7 +21,7 @@ from sb3_guard.zoo.run.flags import (
 )
 
 if TYPE_CHECKING:
-    from sb3_guard.zoo.grids.grid import Run
+    from sb3_guard.zoo.grids.grid import GridRun
 
 # Flags that no grid file states
 HOW = ("grid", "log_folder", "dry_run", "scheduler", "verbose")
@@ -126,7 +126,7 @@ def with_file(flags: Flags) -> Flags:
     return Flags.of(given)
 
 
-def show_plan(runs: Sequence["Run"]) -> None:
+def show_plan(runs: Sequence["GridRun"]) -> None:
     """Print the runs and how far they are."""
     from sb3_guard.zoo.grids.grid import summary
 

@@ -228,38 +228,38 @@ def reproduce(flags: Flags) -> int:
     from sb3_guard.zoo.run.flags import RunFlags
     from sb3_guard.zoo.run.folder import RunFolder
     from sb3_guard.zoo.run.progress import processor
-    from sb3_guard.zoo.run.start import complete, path_of, prepare, standing
+    from sb3_guard.zoo.run.run import Run
 
     if not flags.run:
         raise UsageError("which run? Give a row of the leaderboard, or a run folder")
     row = published(flags.run)
-    run = RunFlags.parse(shlex.split(row["command"])[2:])
-    run.log_folder, run.verbose = flags.log_folder, 0
+    again = RunFlags.parse(shlex.split(row["command"])[2:])
+    again.log_folder, again.verbose = flags.log_folder, 0
     # The command may come from anyone: the user names the files and modules that it leads to.
     followed = ("gym_packages", "conf_file", "trained_agent")
-    require_named(flags.run, flags, run, *followed)
-    refuse_places(flags.run, run.hyperparams or {})
+    require_named(flags.run, flags, again, *followed)
+    refuse_places(flags.run, again.hyperparams or {})
     for name in followed:
-        setattr(run, name, getattr(flags, name) or getattr(run, name))
-    run, values = prepare(run)
+        setattr(again, name, getattr(flags, name) or getattr(again, name))
+    run = Run.check(again)
     seconds = row.get("seconds")
     took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""
-    steps = f"{values['n_timesteps']:,} steps{took}"
+    steps = f"{run.setup.n_timesteps:,} steps{took}"
     here, there = processor(), row.get("processor") or "a processor that was not recorded"
-    if path_of(run).resolve() == Path(flags.run).resolve():
+    if run.path.resolve() == Path(flags.run).resolve():
         raise UsageError(f"the new run would be in {flags.run} itself: choose another --log-folder")
     if there != here:
         print(
             f"The run before is of {there}, this is {here}: another processor rounds differently, "
             "and the episodes may be others."
         )
-    print(f"{row['command']}\n{steps}, in {path_of(run)} …", flush=True)
-    if standing(run, values) == "done":
+    print(f"{row['command']}\n{steps}, in {run.path} …", flush=True)
+    if run.standing() == "done":
         print("This run was trained already; to train it again, remove its folder or change -f.")
-    if status := complete(run, values, row["command"], lambda: False):
+    if status := run.complete(row["command"]):
         print("The same command continues it.")
         return status
-    result = RunFolder(path_of(run)).checked_result()
+    result = RunFolder(run.path).checked_result()
     lines = differences(row, result)
     if result["return"] is None and row.get("curve") == result["curve"]:
         lines = ["No episode has ended: there is nothing to compare."]

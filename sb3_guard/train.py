@@ -41,22 +41,22 @@ class Flags(RunFlags):
 def train(flags: Flags) -> int:
     """Start a run, continue one, or start one for each of several seeds."""
     flags.check()
-    given = flags.given
     if flags.progress is None:
         flags.progress = sys.stderr.isatty() and flags.verbose > 0
     run = RunFlags.shared(flags)
-    run.given = given
+    run.given = flags.given
     if flags.seeds is None:
         if flags.jobs is not None:
             raise UsageError("--jobs goes with several seeds, such as --seeds 0 1 2")
 
         from sb3_guard.zoo.run.folder import CHECKPOINT
-        from sb3_guard.zoo.run.start import resume, start
+        from sb3_guard.zoo.run.run import Run
 
         # Any other archive is a model to begin from.
         path = Path(run.trained_agent)
         model = path.suffix == ".zip" and path.name != CHECKPOINT
-        return start(run) if model or not run.trained_agent else resume(run)
+        new = model or not run.trained_agent
+        return Run.check(run).start() if new else Run.resume(run)
     for name, value in (("-i", run.trained_agent), ("--uuid", run.uuid)):
         if value:
             raise UsageError(f"{name} is for a single run; leave it out, or --seeds")

@@ -25,7 +25,7 @@ from sb3_guard.zoo.results.runs import find_runs, label_of, read_run
 from sb3_guard.zoo.results.splits import FINAL
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import EPOCH, RunFolder
-from sb3_guard.zoo.run.training import FINAL_EPISODES
+from sb3_guard.zoo.run.run import FINAL_EPISODES
 
 MILLION = 1_000_000
 BUDGETS = (1, 2, 10)  # millions of steps

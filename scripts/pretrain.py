@@ -38,11 +38,10 @@ from sb3_guard.zoo.agents.pretrained import (
     weights,
 )
 from sb3_guard.zoo.results.runs import find_runs
-from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
+from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, is_run, run_path
-from sb3_guard.zoo.run.hyperparams import build
-from sb3_guard.zoo.run.make_envs import make_envs, source_of
+from sb3_guard.zoo.run.run import Run
 
 RECORDED = Path(__file__).parents[1] / "tests" / "data" / "pretrained.npz"
 EPISODES = 300
@@ -93,13 +92,10 @@ def shipped_return(env_id: str) -> float:
 
 def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
     """The agent of a run as it was saved, with environments to play in."""
-    setup = build(run.hyperparams())
-    env = make_envs(
-        source_of(run.name), setup, n_envs=n_envs, seed=seed, vec_env="native",
-        env_kwargs=setup.env_kwargs, evaluation=True,
-        normalizer=None if setup.normalize is None else read_normalizer(run.normalizer),
-    )  # fmt: skip
-    return load_model(algorithm(run.args()["algo"]), run.model, env, "cpu")
+    played = Run(RunFlags.of({"algo": run.args()["algo"], "env": run.name}), run.hyperparams())
+    normalizer = None if played.setup.normalize is None else read_normalizer(run.normalizer)
+    env = played.make_envs(n_envs, seed, vec_env="native", evaluation=True, normalizer=normalizer)
+    return load_model(played.algorithm, run.model, env, "cpu")
 
 
 def played(run: RunFolder) -> dict[str, Any]:

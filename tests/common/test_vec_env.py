@@ -17,7 +17,7 @@ from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.common.sources import find
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.make_envs import full_id
-from sb3_guard.zoo.run.start import prepare
+from sb3_guard.zoo.run.run import Run
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_foreign_environments_go_through_gymnasium():
 def test_a_missing_version_is_the_latest_everywhere(name, full):
     """In Python, in Gymnasium, in commands and in the entries of hyperparameter files."""
     assert find(name).env_id == full_id(name) == full
-    assert prepare(RunFlags(algo="ppo", env=name))[0].env == full
+    assert Run.check(RunFlags(algo="ppo", env=name)).flags.env == full
     if name in gymnasium.registry or full in gymnasium.registry:
         assert make_vec_env(name).get_attr("spec")[0].id == full
         with warnings.catch_warnings(action="ignore"):

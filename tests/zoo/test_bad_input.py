@@ -177,7 +177,7 @@ def test_more_environments_than_memory_holds(capsys, empty, monkeypatch):
     def refuse(*_: object, **__: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("sb3_guard.zoo.run.make_envs.make_vec_env", refuse)
+    monkeypatch.setattr("sb3_guard.zoo.run.run.make_vec_env", refuse)
     refused(train.main, [*TOY, *SMALL], capsys, "can't make CostPoint-v0: MemoryError")
 
 
@@ -357,7 +357,7 @@ def test_unwritable_video(record, parts, capsys, run, tmp_path, monkeypatch):
     def nothing(*args, **kwargs):
         raise AssertionError("played before the file was known to be writable")
 
-    monkeypatch.setattr(playback, "make_envs", nothing)
+    monkeypatch.setattr(playback.Run, "make_envs", nothing)
     refused(enjoy.main, [*TOY, "-f", str(tmp_path), "--record", record], capsys, *parts)
 
 

@@ -28,7 +28,7 @@ from sb3_guard.zoo.grids import grid
 from sb3_guard.zoo.grids.presets import PRESETS, preset
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, lock
-from sb3_guard.zoo.run.start import complete
+from sb3_guard.zoo.run.run import Run
 
 SUPPORT = Path(__file__).parents[1] / "support"
 PACKAGE = TOY[:2]
@@ -45,8 +45,8 @@ class Here(Executor):
 
     def __init__(self) -> None:
         #: the runs carried out, in their order
-        self.runs: list[grid.Run] = []
-        self.before: Callable[[grid.Run], object] = lambda run: None
+        self.runs: list[grid.GridRun] = []
+        self.before: Callable[[grid.GridRun], object] = lambda run: None
 
     def submit(self, function, run, /, *args) -> Future:
         self.runs.append(run)
@@ -119,7 +119,7 @@ def test_scale_shortens_every_run_alike(tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
     flags = RunFlags(conf_file="paper")
     (run,) = grid.expand([("Goal_Point_8Hazards", "trpo_sl")], [0], flags, scale=0.5)
-    assert run.values["warmup"] == pytest.approx(1 / 3)  # a ratio of whatever the length is
+    assert run.hyperparams["warmup"] == pytest.approx(1 / 3)  # a ratio of whatever the length is
 
 
 def test_what_is_left_out_is_seen_beforehand(tmp_path, capsys):
@@ -133,8 +133,8 @@ def test_what_is_left_out_is_seen_beforehand(tmp_path, capsys):
 def test_a_hyperparameter_goes_to_those_that_have_it():
     args = RunFlags(hyperparams={"cost_limit": 5.0})
     cpo, ppo = grid.expand([("Goal_Point_8Hazards", a) for a in ("cpo", "ppo")], [0], args)
-    assert (cpo.values["cost_limit"], cpo.ignored) == (5.0, [])
-    assert ("cost_limit" in ppo.values, ppo.ignored) == (False, ["cost_limit"])
+    assert (cpo.hyperparams["cost_limit"], cpo.ignored) == (5.0, [])
+    assert ("cost_limit" in ppo.hyperparams, ppo.ignored) == (False, ["cost_limit"])
 
 
 def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
@@ -199,7 +199,7 @@ GRID_FILES = [
         "envs: [Goal_Point_8Hazards]\nscale: [1, 2]",
         "scale: [1, 2] is not allowed; it must be",
     ),
-    ("envs: [Goal_Point_8Hazards]\ntrack: maybe", "'maybe' is not allowed; it must be True or"),
+    ("envs: [Goal_Point_8Hazards]\ntrack: maybe", "'maybe' is not allowed; it must be true or"),
     ("envs: [Goal_Point_8Hazards]\nn_timesteps: true", "n_timesteps: True is not allowed"),
     ("envs: [Goal_Point_8Hazards]\nhyperparams: [a]", "not of the form key:value"),
     ("envs: [Goal_Point_8Hazards]\nseeds: [zero]", "g.yml: seeds: ['zero'] is not allowed"),
@@ -298,15 +298,15 @@ def test_a_warm_start_is_another_run(tmp_path, here, capsys):
 
 
 def test_a_failure_leaves_the_others_alone(tmp_path, here, monkeypatch, capsys):
-    complete, left = grid.complete, [1]
+    complete, left = Run.complete, [1]
 
-    def failing(flags, *rest):
-        if flags.algo == "cpo" and left:
+    def failing(run, *rest):
+        if run.flags.algo == "cpo" and left:
             left.pop()
             raise ValueError("no luck")
-        return complete(flags, *rest)
+        return complete(run, *rest)
 
-    monkeypatch.setattr(grid, "complete", failing)
+    monkeypatch.setattr(Run, "complete", failing)
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
     (tmp_path / "cpo" / "CostPoint-v0_1").mkdir(parents=True)
     assert benchmark.main(arguments) == 1
@@ -397,8 +397,9 @@ def test_a_worker_forgets_the_run_before(tmp_path, monkeypatch):
     flags = RunFlags(log_folder=str(tmp_path), gym_packages=["registered_envs"], eval_freq=-1)
     flags.hyperparams = {"n_envs": 2, "cost_limit": 2.0, "n_steps": 1, "buffer_size": 100}
     runs = grid.expand([("CostPoint-v0", "sac_lag")], [0, 1], replace(flags, n_timesteps=20))
+    complete = Run.complete
     monkeypatch.setattr(
-        grid, "complete", lambda *args: least.append(buffers() - before) or complete(*args)
+        Run, "complete", lambda *args: least.append(buffers() - before) or complete(*args)
     )
     gc.disable()  # Python's own, which comes some time or other
     try:

@@ -33,11 +33,8 @@ from sb3_guard.envs.part import Constraint
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.zoo.agents import playback
 from sb3_guard.zoo.cli import usage
-from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.hyperparams import build, check
-from sb3_guard.zoo.run.make_envs import make_envs, source_of
-from sb3_guard.zoo.run.start import prepare
+from sb3_guard.zoo.run.run import Run
 
 
 def test_track_sends_what_tensorboard_gets_and_goes_on(tmp_path, monkeypatch):
@@ -335,11 +332,8 @@ def test_enjoy_normalises_as_training_did(tmp_path, capsys):
 
 @pytest.mark.parametrize("evaluation", [True, False])
 def test_only_training_adds_to_the_statistics(evaluation):
-    setup = build(check("cpo", CPO, {"n_timesteps": 1, "normalize": True}))
-    env = make_envs(
-        source_of("CartPole-v1"), setup, n_envs=2, seed=0, vec_env="dummy", env_kwargs={},
-        evaluation=evaluation,
-    )  # fmt: skip
+    flags = RunFlags(algo="ppo", env="CartPole-v1", hyperparams={"normalize": True})
+    env = Run.check(flags).make_envs(2, seed=0, evaluation=evaluation)
     assert (env.training, env.norm_reward) == (not evaluation, not evaluation)
 
 
@@ -366,7 +360,7 @@ def test_an_interrupt_while_environments_are_made(tmp_path, monkeypatch):
         made.append(make_vec_env(*args, **kwargs))
         return made[-1]
 
-    monkeypatch.setattr("sb3_guard.zoo.run.make_envs.make_vec_env", make)
+    monkeypatch.setattr("sb3_guard.zoo.run.run.make_vec_env", make)
     assert train.main([*TOY, *SMALL, "-f", str(tmp_path / "logs")]) == 130
     assert len(made) == 1 and not (tmp_path / "logs").exists()
 
@@ -697,10 +691,8 @@ def test_an_overspent_budget_changes_the_rewards_of_the_training_alone(kind, eva
     wrappers = {f"sb3_guard.common.{kind}": {"budget": 0.01, "unsafe_reward": -100.0}}
     setup = {"cost_limit": 1.0, f"{'vec_' * kind.startswith('vec')}env_wrapper": wrappers}
     here = {"gym_packages": ["registered_envs"], "env_kwargs": {"hazard": (-1.0, 0.0)}}
-    flags, values = prepare(
-        RunFlags(algo="cpo", env="CostPoint-v0", seed=0, hyperparams=setup, **here)
-    )
-    env = Experiment(flags, values).make_envs(4, seed=0, evaluation=evaluation)
+    run = Run.check(RunFlags(algo="cpo", env="CostPoint-v0", seed=0, hyperparams=setup, **here))
+    env = run.make_envs(4, seed=0, evaluation=evaluation)
     env.reset()
     rewards = [env.step(np.zeros((4, *env.action_space.shape)))[1] for _ in range(10)]
     assert (np.min(rewards) == -100.0) == (not evaluation)

@@ -133,7 +133,7 @@ def test_a_file_names_no_place_to_write(name, path, argument, tmp_path, trap, ru
     again = [str(run), "-f", str(tmp_path / "again"), *TOY[:2]]
     refused(reproduce.main, again, capsys, *parts)
     (tmp_path / "conf.yml").write_text(yaml.safe_dump({"default": hyperparams}))
-    refused(train.main, [*TOY, *SMALL, "-conf", "conf.yml"], capsys, *parts)
+    refused(train.main, [*TOY, *SMALL, "-n", "60", "-conf", "conf.yml"], capsys, *parts)
     assert not list(tmp_path.rglob("trap*"))
 
 

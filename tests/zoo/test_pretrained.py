@@ -14,9 +14,9 @@ from typed import require_rendering
 
 from sb3_guard import cli, enjoy, evaluate_policy, load_pretrained, train
 from sb3_guard.costs import Estimate
-from sb3_guard.zoo.agents import playback, pretrained
+from sb3_guard.zoo.agents import pretrained
 from sb3_guard.zoo.run.folder import RunFolder
-from sb3_guard.zoo.run.make_envs import make_envs
+from sb3_guard.zoo.run.run import Run
 
 POINT = "Goal_Point_8Hazards"
 SHIPPED = pretrained.pretrained()
@@ -136,8 +136,9 @@ def test_a_shipped_agent_keeps_its_limit(run, noise, tmp_path):
 
 def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):
     made = []
+    make_envs = Run.make_envs
     monkeypatch.setattr(
-        playback,
+        Run,
         "make_envs",
         lambda *args, **kwargs: made.append(make_envs(*args, **kwargs)) or made[-1],
     )

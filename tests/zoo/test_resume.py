@@ -32,11 +32,11 @@ from sb3_guard import make_vec_env, train
 from sb3_guard.common.vec_env import VEC_ENVS
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run import resumable
-from sb3_guard.zoo.run import training as experiment
+from sb3_guard.zoo.run import run as run_module
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
 from sb3_guard.zoo.run.folder import RunFolder
 from sb3_guard.zoo.run.progress import Epochs
-from sb3_guard.zoo.run.start import differences
+from sb3_guard.zoo.run.run import differences
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +183,7 @@ def test_finished_run_goes_on_as_a_longer_one(undisturbed, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("owner", "name", "result_is_left"),
-    [(experiment, "RunLogger", True), (RunFolder, "write_config", False)],
+    [(run_module, "RunLogger", True), (RunFolder, "write_config", False)],
 )
 def test_a_result_is_always_that_of_its_configuration(
     owner, name, result_is_left, tmp_path, monkeypatch

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from registered_envs import CostPoint  # which registers the environments
 
-from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.make_envs import evaluation_seed, row_seeds
-from sb3_guard.zoo.run.start import prepare
-from sb3_guard.zoo.run.training import Training
+from sb3_guard.zoo.run.run import Run
 
 
 def test_no_seed_is_drawn_twice():
@@ -27,14 +25,14 @@ def test_first_observations_of_seeds_0_and_1_differ(algo, vec_env):
     for seed in (0, 1):
         params = {"n_envs": 4, "n_timesteps": 8}
         params |= {"buffer_size": 40} if algo == "sac" else {}
-        flags, values = prepare(
+        run = Run.check(
             RunFlags(algo=algo, env=env, seed=seed, device="cpu", hyperparams=params, eval_freq=1,
                      n_eval_envs=4)
         )  # fmt: skip
-        training = Training(Experiment(flags, values))
+        training = run.make()
         training.evaluation.eval_env.seed(evaluation_seed(seed))
         firsts += [training.env.reset(), training.evaluation.eval_env.reset()]
-        again = Training(Experiment(flags, values))
+        again = Run(run.flags, run.hyperparams).make()
         np.testing.assert_array_equal(again.env.reset(), firsts[-2])
         again.close()
         training.close()
@@ -42,17 +40,16 @@ def test_first_observations_of_seeds_0_and_1_differ(algo, vec_env):
     assert len(np.unique(rows, axis=0)) == len(rows) == 16
 
 
-def test_only_a_tried_out_experiment_takes_a_step(monkeypatch):
+def test_only_a_tried_out_run_takes_a_step(monkeypatch):
     steps = []
     step = CostPoint.step
     monkeypatch.setattr(CostPoint, "step", lambda *args: steps.append(1) or step(*args))
-    flags, values = prepare(
-        RunFlags(algo="cpo", env="CostPoint-v0", seed=0, hyperparams={"cost_limit": 0}, verbose=0)
+    flags = RunFlags(
+        algo="cpo", env="CostPoint-v0", seed=0, hyperparams={"cost_limit": 0}, verbose=0
     )
-    experiment = Experiment(flags, values)
-    training = Training(experiment)
-    np.testing.assert_array_equal(experiment.limits(), training.evaluation.limits())
+    run = Run.check(flags).make()
+    np.testing.assert_array_equal(run.limits(), run.evaluation.limits())
     assert not steps
-    experiment.try_out()
+    run.try_out()
     assert len(steps) == 1
-    training.close()
+    run.close()

@@ -25,8 +25,9 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_writable
-from sb3_guard.zoo.run.hyperparams import build, check
-from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, full_id, make_envs, source_of
+from sb3_guard.zoo.run.hyperparams import check
+from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, full_id
+from sb3_guard.zoo.run.run import Run
 
 BATCH = 30  # episodes at once: as many as tell whether a limit is kept
 VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
@@ -137,30 +138,29 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         path, statistics = find_model(run, flags)
     filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
     require_named(run.path, flags, filed, "gym_packages")
-    cls, source = algorithm(flags.algo), source_of(flags.env)
-    env_id, ours = str(source.env_id), source.batch is not None
     hyperparams = {**run.hyperparams(), "callback": None}
     refuse_places(run.path, hyperparams)
-    setup = build(check(flags.algo, cls, hyperparams))
+    hyperparams = check(flags.algo, algorithm(flags.algo), hyperparams)
+    named = {"algo": flags.algo, "env": flags.env, "gym_packages": flags.gym_packages}
+    played = Run(RunFlags.of(named), hyperparams)
+    setup, source = played.setup, played.source
+    env_id, ours = str(source.env_id), source.batch is not None
     if flags.num_threads > 0:
         th.set_num_threads(flags.num_threads)
     normalizer = None
     if flags.pretrained:
         model = load_pretrained(env_id, flags.algo, device=flags.device)
     else:
-        model = load_model(cls, path, None, flags.device)
+        model = load_model(played.algorithm, path, None, flags.device)
         normalizer = None if setup.normalize is None else read_normalizer(statistics)
     # A batch has no window, and no wrappers of single environments.
     native = ours and not setup.env_wrapper and render_mode != "human"
     size = VIDEO if ours and render_mode else {}
-    env = make_envs(
-        source,
-        setup,
-        n_envs=n_envs if native else 1,
-        seed=flags.seed,
+    env = played.make_envs(
+        n_envs if native else 1,
+        flags.seed,
         vec_env="native" if native else "dummy",
         env_kwargs={**size, **setup.env_kwargs, **(flags.env_kwargs or {})},
-        cost_keys=getattr(model, "cost_keys", ("cost",)),
         evaluation=True,
         normalizer=normalizer,
         render_mode=render_mode,

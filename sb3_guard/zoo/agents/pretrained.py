@@ -11,9 +11,9 @@ from sb3_guard.ids import with_version
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError
-from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder
+from sb3_guard.zoo.run.run import Run
 
 #: A log folder, written by ``scripts/pretrain.py``; instead of a model a run has ``<env>.pth``.
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
@@ -87,7 +87,7 @@ def load_pretrained(
     values = {**run.hyperparams(), "n_envs": n_envs}
     if "cost_limit" in values:  # that of the training may be lower
         values["cost_limit"] = result["cost_limit"]
-    model = Experiment(flags, values).make_model()
+    model = Run(flags, values).make_model()
     model.num_timesteps = result["n_timesteps"]
     saved = th.load(weights(run), map_location=model.device, weights_only=True)
     model.set_parameters({"policy": saved["policy"]}, exact_match=False, device=model.device)

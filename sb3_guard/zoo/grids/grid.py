@@ -22,48 +22,37 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, interrupts_held, one_line
 from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, RunInUse, cost_words
 from sb3_guard.zoo.run.hyperparams import annotations
-from sb3_guard.zoo.run.start import complete, path_of, prepare, standing
-from sb3_guard.zoo.run.training import Training
+from sb3_guard.zoo.run.run import Run
 
 
 @dataclass(eq=False)
-class Run:
+class GridRun(Run):
     """
     One run of a grid.
 
-    :param flags: all flags, as its folder states them
-    :param values: all hyperparameters, in the same form
     :param ignored: those given for the grid that its algorithm does not have
     :param state: at first ``done``, ``resume`` or ``new``; then as :func:`carry_out` returns it
     :param error: what went wrong, in a line
     """
 
-    flags: RunFlags
-    values: dict[str, Any]
-    ignored: list[str]
-    state: str
+    ignored: list[str] = field(default_factory=list)
+    state: str = ""
     error: str = ""
-
-    @property
-    def path(self) -> Path:
-        """Its folder."""
-        return path_of(self.flags)
 
     @property
     def steps(self) -> int:
         """Its length, environment steps."""
-        return int(self.values["n_timesteps"])
+        return int(self.hyperparams["n_timesteps"])
 
     def __str__(self) -> str:
         return f"{self.flags.algo} on {self.flags.env}, seed {self.flags.seed}"
@@ -77,7 +66,7 @@ class Run:
         return f"{line}: {self.error}" if self.error else line
 
 
-def summary(runs: Sequence[Run]) -> str:
+def summary(runs: Sequence[GridRun]) -> str:
     """The grid on one line: how many runs are in which state."""
     counts = Counter(run.state for run in runs)
     others = [f"{n} {state}" for state, n in counts.items() if state != "done"]
@@ -89,7 +78,7 @@ def expand(
     seeds: Sequence[int],
     flags: RunFlags,
     scale: float = 1.0,
-) -> list[Run]:
+) -> list[GridRun]:
     """
     The runs of a grid, checked, and how far they are; those of the first seed come first.
 
@@ -112,20 +101,23 @@ def expand(
     flags = replace(flags, progress=False, num_threads=max(flags.num_threads, 1))
     for env_id, algo in pairs:
         hyperparams = {name: value for name, value in given.items() if name in taken[algo]}
-        run, values = prepare(
+        run = Run.check(
             replace(flags, env=env_id, algo=algo, seed=0, hyperparams=hyperparams or None)
         )
-        run.n_timesteps = values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
-        first[run.env, algo] = run, values, sorted(given.keys() - hyperparams.keys())
-    seeded = [
-        (replace(run, seed=seed), values, ignored)
+        shared, values = run.flags, run.hyperparams
+        shared.n_timesteps = values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
+        first[shared.env, algo] = shared, values, sorted(given.keys() - hyperparams.keys())
+    runs = [
+        GridRun(replace(shared, seed=seed), values, ignored=ignored)
         for seed in dict.fromkeys(seeds)
-        for run, values, ignored in first.values()
+        for shared, values, ignored in first.values()
     ]
-    return [Run(run, values, ignored, standing(run, values)) for run, values, ignored in seeded]
+    for run in runs:
+        run.state = run.standing()
+    return runs
 
 
-def try_out(runs: Sequence[Run]) -> None:
+def try_out(runs: Sequence[GridRun]) -> None:
     """
     Make each environment and each algorithm once, so that a bad value ends the grid before it
     begins.
@@ -146,7 +138,7 @@ def try_out(runs: Sequence[Run]) -> None:
         try:
             if flags.device != "auto":
                 th.device(flags.device)
-            Training(Experiment(here, run.values).try_out()).close()
+            Run(here, run.hyperparams).try_out().make().close()
         except (UsageError, RuntimeError) as error:
             raise UsageError(f"{flags.algo} on {flags.env}: {one_line(error)}") from error
 
@@ -156,7 +148,7 @@ def try_out(runs: Sequence[Run]) -> None:
 _one_at_a_time = threading.Lock()  # random generators and thread counts belong to the process
 
 
-def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
+def carry_out(run: GridRun, command: str, stop: Path) -> tuple[str, str]:
     """
     Complete a run; what goes wrong is also written to ``error.txt`` in its folder.
 
@@ -174,7 +166,7 @@ def carry_out(run: Run, command: str, stop: Path) -> tuple[str, str]:
         gc.collect()  # the run before: a model refers to itself, and Python seldom looks for that
         try:
             error_file.unlink(missing_ok=True)
-            status = complete(run.flags, run.values, command, stop.exists)
+            status = run.complete(command, stop.exists)
         except RunInUse as error:
             return "in use", one_line(error)
         except Exception as error:
@@ -247,7 +239,9 @@ def cluster(address: str) -> Iterator[Executor]:
 # Here
 
 
-def execute(runs: Sequence[Run], executor: Executor, stop: Path, say: Callable[[str], None]) -> int:
+def execute(
+    runs: Sequence[GridRun], executor: Executor, stop: Path, say: Callable[[str], None]
+) -> int:
     """
     Train what is not done yet.
 
@@ -285,7 +279,7 @@ def execute(runs: Sequence[Run], executor: Executor, stop: Path, say: Callable[[
 
 
 def run_grid(
-    runs: Sequence[Run],
+    runs: Sequence[GridRun],
     folder: Path,
     jobs: int | None = None,
     scheduler: str | None = None,

@@ -19,7 +19,6 @@ import yaml
 from filelock import SoftFileLock, Timeout
 
 from sb3_guard.common.files import replacing
-from sb3_guard.zoo.cli.flags import IDENTITY
 from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag, read_mapping
 from sb3_guard.zoo.run.flags import RunFlags
 
@@ -50,11 +49,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     return [plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def identity(flags: RunFlags, hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """What makes a run the run it is: flags of that role, and hyperparameters."""
-    return plain({**flags.values(IDENTITY), **hyperparams})
 
 
 def read_data(path: Path) -> dict[str, Any]:

@@ -1,21 +1,12 @@
-"""Environments for the commands: found, made, and wrapped as a run's hyperparameters say."""
-
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from typing import Any
+"""Where the environments of the commands come from, and how they are seeded."""
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.checks import ContractError, WorldError
-from sb3_guard.common.evaluation import check_normalizer
 from sb3_guard.common.sources import Source, find
-from sb3_guard.common.vec_env import make_vec_env
-from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, interrupts_held
-from sb3_guard.zoo.run.hyperparams import Setup
-from sb3_guard.zoo.run.resumable import ResumableEnv
+from sb3_guard.zoo.cli.usage import UsageError, explained
 
 # What ends a training in a line: the message says all that a traceback would, and the remedy.
 BAD_NUMBERS = (FloatingPointError, WorldError, ContractError)
@@ -82,96 +73,3 @@ def full_id(env_id: str) -> str:
     :raises UsageError: it is unknown
     """
     return str(source_of(env_id).env_id)
-
-
-def make_envs(
-    source: Source,
-    setup: Setup,
-    *,
-    n_envs: int,
-    seed: int | None,
-    vec_env: str,
-    env_kwargs: Mapping[str, Any],
-    cost_keys: Sequence[str] = ("cost",),
-    num_threads: int | None = None,
-    packages: Sequence[str] = (),
-    evaluation: bool = False,
-    normalizer: VecNormalize | None = None,
-    render_mode: str | None = None,
-) -> VecEnv:
-    """
-    Make environments and wrap them: monitor, ``vec_env_wrapper``, VecNormalize, frame stack.
-
-    :param source: where they come from, see :func:`source_of`
-    :param setup: the run's hyperparameters
-    :param n_envs: how many
-    :param seed: the environments get seed, seed + 1, …
-    :param vec_env: native, dummy or subproc; native is refused where it is not possible
-    :param env_kwargs: arguments of the environment
-    :param cost_keys: entries of info that are costs
-    :param num_threads: threads of the native engine; None: its own choice
-    :param packages: modules whose functions wrappers name, to be imported in each process
-    :param evaluation: observations are normalised with given statistics, rewards not at all, and
-        wrappers that are ``training_only`` and their ``training_arguments`` are left out
-    :param normalizer: statistics to begin with; it is given the environment
-    :param render_mode: as for :func:`gymnasium.make`
-    :raises UsageError: the environment refuses an argument, or can't be made
-    """
-
-    def wrap(env: gym.Env) -> gym.Env:
-        import_packages(packages)
-        for cls, arguments in _wrappers(setup.env_wrapper, evaluation):
-            env = cls(env, **arguments)
-        return ResumableEnv(env)
-
-    drawn = f" with render_mode={render_mode!r}" if render_mode else ""
-    errors = (*BAD_ARGUMENTS, *PROCESS_DIED, MemoryError)
-    with ExitStack() as made:
-        with explained(f"can't make {source.env_id}{drawn}", *errors), interrupts_held():
-            env = make_vec_env(
-                source,
-                n_envs,
-                seed,
-                vec_env=vec_env,
-                env_kwargs=dict(env_kwargs),
-                num_threads=num_threads,
-                render_mode=render_mode,
-                wrapper_class=wrap if vec_env != "native" or setup.env_wrapper else None,
-                monitor_kwargs={"cost_keys": tuple(cost_keys), **setup.monitor_kwargs},
-            )
-            made.callback(env.close)
-        with explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
-            env = _wrap(env, setup, evaluation, normalizer)
-        made.pop_all()
-    return env
-
-
-def _wrappers(
-    wrappers: list[tuple[Any, dict[str, Any]]], evaluation: bool
-) -> list[tuple[Any, dict[str, Any]]]:
-    """Evaluation is without what ends episodes early, or changes rewards."""
-    if not evaluation:
-        return wrappers
-    return [
-        (cls, {k: v for k, v in given.items() if k not in getattr(cls, "training_arguments", ())})
-        for cls, given in wrappers
-        if not getattr(cls, "training_only", False)
-    ]
-
-
-def _wrap(env: VecEnv, setup: Setup, evaluation: bool, normalizer: VecNormalize | None) -> VecEnv:
-    for cls, arguments in _wrappers(setup.vec_env_wrapper, evaluation):
-        env = cls(env, **arguments)
-    if normalizer is not None:
-        check_normalizer(normalizer, env.observation_space)
-        normalizer.set_venv(env)
-        env = normalizer
-    elif setup.normalize is not None:
-        env = VecNormalize(env, **setup.normalize)
-    if evaluation and isinstance(env, VecNormalize):
-        env.training = False
-        env.norm_reward = False
-    if setup.frame_stack is not None:
-        env = VecFrameStack(env, setup.frame_stack)
-    # SB3 would transpose images itself, but training and evaluation are to be wrapped alike.
-    return BaseAlgorithm._wrap_env(env, monitor_wrapper=False)

@@ -10,10 +10,9 @@ from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.cli.values import is_data
 from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.hyperparams import annotations
-from sb3_guard.zoo.run.start import prepare
+from sb3_guard.zoo.run.run import Run
 
 # Hyperparameters of a run that are none of its model, and what takes them.
 ELSEWHERE = {
@@ -90,9 +89,9 @@ def make_model(
         # What a file can't hold is not checked as data; the constructor looks at it.
         objects = {n: v for n, v in hyperparams.items() if n in names and not is_data(v)}
         flags.hyperparams = {n: v for n, v in hyperparams.items() if n not in objects}
-        experiment = Experiment(*prepare(flags))
-        experiment.setup.model.update(objects)
-        model = experiment.make_model()
+        run = Run.check(flags)
+        run.setup.model.update(objects)
+        model = run.make_model()
     except UsageError as error:
         raise ValueError(str(error)) from error
     if monitor_path is not None:

@@ -1,9 +1,10 @@
 """What a person watching a run wants to see: how far it is, how well it does, how safely."""
 
 import platform
+import shlex
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -18,9 +19,12 @@ from tqdm import tqdm
 import sb3_guard
 from sb3_guard.algorithms.common.limits import limits_at
 from sb3_guard.checks import NumberError
+from sb3_guard.common.evaluation import bounded_name
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
-from sb3_guard.costs import estimate, verdict
-from sb3_guard.zoo.run.folder import EPOCH, cost_words
+from sb3_guard.costs import beside, estimate, verdict
+from sb3_guard.zoo.cli.usage import packages_flag
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import EPOCH, RunFolder, cost_words
 
 DIVERGED = 10  # episodes in a row that a physics error ended, after which training stops
 PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")
@@ -269,3 +273,60 @@ class Epochs(BaseCallback):
         self.learned = list(state["learned"])
         if state["total"] != self.total:
             self.learned.append(state["steps"])
+
+
+def rounded(values: np.ndarray) -> list[float | None]:
+    """Numbers of six significant digits, for a file; None: it is not known."""
+    return [None if np.isnan(value) else float(f"{value:.6g}") for value in values]
+
+
+def summary(
+    folder: RunFolder, flags: RunFlags, result: Mapping[str, Any], seconds: float, finished: bool
+) -> str:
+    """What a run came to, as the paper measures it, on a few lines."""
+
+    def number(value: float | None, digits: int) -> str:
+        return "– (no episode has ended)" if value is None else f"{value:.{digits}f}"
+
+    def bounded(cost: Mapping[str, Any]) -> str:
+        text = number(cost["mean"], 3)
+        if "low" in cost:
+            text += f"   [{cost['low']:.3f}, {cost['high']:.3f}]"
+        if cost["limit"] is not None:
+            text += f"   limit {cost['limit']:g}"
+        text += f": {cost['verdict']}" if "verdict" in cost else ""
+        return text + beside(cost.get("physics_errors", 0))
+
+    costs, limit_on = result["costs"], result.get("limit_on", "sum")
+    alone = len(costs) == 1 and limit_on == "sum"
+    lines = [
+        f"{'Finished' if finished else 'Interrupted'} at {result['n_timesteps']:,} steps, "
+        f"{seconds:.0f} s",
+        f"  run folder         {folder.path}",
+        f"  return       J_r   {number(result['return'], 3)}",
+        f"  episode cost M_c   {bounded(*costs.values()) if alone else number(result['cost'], 3)}",
+        *(
+            f"    {bounded_name(key, limit_on):<16} {bounded(cost)}"
+            for key, cost in ({} if alone else costs).items()
+        ),
+        f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
+    ]
+    for name, played in result["final"].items():
+        lines.append(
+            f"  final, {name:<12}return {np.mean(played['returns']):.3f}, cost "
+            f"{(cost := estimate(np.array(played['costs'], float)))}, {len(played['costs'])} "
+            f"episodes{beside(cost.diverged)}"
+        )
+        for key, values in played.get("bounded", {}).items():
+            cost, limit = estimate(np.array(values, float)), costs[key]["limit"]
+            against = "" if limit is None else f"   {cost.against(limit)}"
+            lines.append(f"    {bounded_name(key, limit_on):<16} {cost}{against}")
+    packages = packages_flag(flags.gym_packages)
+    if not finished:
+        lines.append(f"  continue with      {folder.again(flags)}")
+    elif (exp_id := folder.path.name[len(folder.name) + 1 :]).isdigit():
+        lines.append(
+            f"  see the agent      sb3-guard enjoy --algo {flags.algo} --env {flags.env} "
+            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {exp_id}{packages}"
+        )
+    return "\n".join(lines)

@@ -25,13 +25,10 @@ from optuna.study import MaxTrialsCallback, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_guard.zoo.cli.usage import UsageError, interrupts, interrupts_held, run
-from sb3_guard.zoo.run import start
-from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import folder_name, is_disk_error, require_writable
 from sb3_guard.zoo.run.hyperparams import check
-from sb3_guard.zoo.run.training import Training
+from sb3_guard.zoo.run.run import Run
 from sb3_guard.zoo.tuning import studies
 from sb3_guard.zoo.tuning.flags import TuneFlags
 from sb3_guard.zoo.tuning.report import FINISHED, Report, short
@@ -58,8 +55,8 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         limit = flags.cost_limit
         hyperparams["selection_limit"] = limit[0] if len(limit) == 1 else limit
     how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "verbose": 0, "progress": False}
-    run, values = start.prepare(RunFlags.shared(flags, **how))
-    n_timesteps = values["n_timesteps"]
+    run = Run.check(RunFlags.shared(flags, **how))
+    values, n_timesteps = run.hyperparams, run.setup.n_timesteps
     n_evaluations = flags.n_evaluations or max(n_timesteps // 100_000, 4)
     if n_evaluations > n_timesteps:
         raise UsageError(
@@ -68,24 +65,23 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     space = read_space(flags.search_space) if flags.search_space else None
     search = Search(flags.algo, values, space, fixed)
     for corner in search.corners():
-        check(run.algo, algorithm(run.algo), corner)
-    experiment = Experiment(run, values)
-    Training(experiment.try_out()).close()
-    limits = experiment.limits().tolist()
+        check(flags.algo, run.algorithm, corner)
+    run.try_out().make().close()
+    limits = run.limits().tolist()
     settings = Settings(
-        algo=run.algo,
-        env=run.env,
+        algo=run.flags.algo,
+        env=run.flags.env,
         hyperparams=values,
         space=search.description(),
         n_timesteps=n_timesteps,
         seeds=flags.seeds,
         n_evaluations=n_evaluations,
         eval_episodes=flags.eval_episodes,
-        cost_keys=list(experiment.cost_keys),
+        cost_keys=list(run.cost_keys),
         cost_limit=limits if np.isfinite(limits).all() else None,
         pareto=flags.pareto,
     )
-    return run, settings, search
+    return run.flags, settings, search
 
 
 def _pruner(flags: TuneFlags, settings: Settings) -> BasePruner:

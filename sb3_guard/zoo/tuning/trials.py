@@ -20,12 +20,10 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.experiment import Experiment
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.hyperparams import check
 from sb3_guard.zoo.run.make_envs import PROCESS_DIED
-from sb3_guard.zoo.run.start import differences
-from sb3_guard.zoo.run.training import Training
+from sb3_guard.zoo.run.run import Run, differences
 from sb3_guard.zoo.tuning.flags import TuneFlags
 from sb3_guard.zoo.tuning.report import short
 from sb3_guard.zoo.tuning.spaces import Search
@@ -111,7 +109,7 @@ class Evaluations(BaseCallback):
 
     def __init__(
         self,
-        training: Training,
+        training: Run,
         settings: Settings,
         after: Callable[[list[list[float]]], bool],
         stopped: Callable[[], bool],
@@ -264,8 +262,7 @@ class Objective:
         """One training: its evaluations, and whether it went to the end."""
         settings = self.settings
         checked = check(settings.algo, algorithm(settings.algo), values)
-        experiment = Experiment(replace(self.training, seed=seed), checked)
-        training = Training(experiment.try_out())
+        training = Run(replace(self.training, seed=seed), checked).try_out().make()
 
         evaluations = Evaluations(training, settings, after, self.stopped)
         try:

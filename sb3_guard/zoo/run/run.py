@@ -1,0 +1,751 @@
+"""One training run: checked in full first, then made and trained, started or continued.
+
+RL-Zoo's ``ExperimentManager`` makes the run folder before it has looked at the hyperparameters,
+and resets counters, seeds and environments when it continues; so its pieces are used here
+(schedules, run numbers, file layout, flags) and its class is not.
+"""
+
+import copy
+import dataclasses
+import shlex
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
+
+from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.common.callbacks import CostEvalCallback, LogCosts, selection_limits
+from sb3_guard.common.evaluation import check_normalizer, evaluate_policy, sync_normalization
+from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import find_monitor
+from sb3_guard.common.sources import Source
+from sb3_guard.common.vec_env import make_vec_env
+from sb3_guard.costs import read_costs
+from sb3_guard.zoo.cli.flags import IDENTITY, START
+from sb3_guard.zoo.cli.names import as_data, refuse_places, require_named
+from sb3_guard.zoo.cli.usage import (
+    TrainingStopped,
+    UsageError,
+    explained,
+    import_packages,
+    interrupts,
+    interrupts_held,
+    one_line,
+)
+from sb3_guard.zoo.run.algos import algorithm
+from sb3_guard.zoo.run.checkpoint import (
+    Checkpoints,
+    Interrupted,
+    load_model,
+    read_checkpoint,
+    read_normalizer,
+)
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.folder import (
+    RunFolder,
+    is_disk_error,
+    is_run,
+    lock,
+    plain,
+    require_writable,
+    run_path,
+)
+from sb3_guard.zoo.run.hyperparams import Setup, build, check, read_hyperparams
+from sb3_guard.zoo.run.logger import RunLogger, cut
+from sb3_guard.zoo.run.make_envs import (
+    BAD_ARGUMENTS,
+    BAD_NUMBERS,
+    PROCESS_DIED,
+    evaluation_seed,
+    seed_rows,
+    source_of,
+)
+from sb3_guard.zoo.run.progress import Epochs, rounded, summary
+from sb3_guard.zoo.run.resumable import ResumableEnv
+from sb3_guard.zoo.run.tracking import ID, track
+
+FINAL_EPISODES = 100  # of each policy, after training
+#: what is played after training: the policy that was trained, and its most likely actions
+SPLITS = ("stochastic", "greedy")
+
+
+@dataclass
+class Run:
+    """
+    One training run: its flags and hyperparameters, which its folder states, are all that it is.
+
+    The algorithm, the source of environments and the objects that hyperparameters name are looked
+    up once, when they are first needed; :meth:`make` makes the rest.
+
+    :param flags: all flags, as :meth:`check` completes them
+    :param hyperparams: all hyperparameters, plain data
+    :param folder: the folder of the run to continue; None: a new run
+    """
+
+    flags: RunFlags
+    hyperparams: dict[str, Any] = field(default_factory=dict)
+    folder: RunFolder | None = None
+
+    def __post_init__(self) -> None:
+        if self.flags.track and not self.flags.tensorboard_log:
+            self.flags = dataclasses.replace(self.flags, tensorboard_log="runs")
+        self.model: BaseAlgorithm
+        self.env: VecEnv
+        self.callbacks: list[BaseCallback]
+        self.evaluation: CostEvalCallback | None = None
+        self.tracker: Any = None
+        #: what to continue from
+        self.begun: dict[str, Any] | None = None
+
+    @cached_property
+    def algorithm(self) -> type[BaseAlgorithm]:
+        """The class of ``--algo``; raises :class:`UsageError` where there is none."""
+        return algorithm(self.flags.algo)
+
+    @cached_property
+    def source(self) -> Source:
+        """The environments of ``--env``; raises :class:`UsageError` where there are none."""
+        return source_of(self.flags.env)
+
+    @cached_property
+    def setup(self) -> Setup:
+        """Hyperparameters as objects; raises :class:`UsageError` where a name means nothing."""
+        return build(self.hyperparams)
+
+    @property
+    def constrained(self) -> bool:
+        """Whether the algorithm keeps a cost limit."""
+        return getattr(self.algorithm, "constrained", False)
+
+    @property
+    def cost_keys(self) -> tuple[str, ...]:
+        """Entries of info that are costs."""
+        ours = hasattr(self.algorithm, "constrained")
+        values = self.setup.model if ours else self.setup.monitor_kwargs
+        return tuple(values.get("cost_keys") or ("cost",))
+
+    # Checked
+
+    @classmethod
+    def check(cls, flags: RunFlags) -> Self:
+        """
+        A new run, checked as far as that goes without making anything.
+
+        :param flags: those given; the rest follows from files and defaults
+        :raises UsageError: anything is wrong with them
+        """
+        flags = dataclasses.replace(flags)
+        import_packages(flags.gym_packages)  # which may register algorithms, too
+        run = cls(flags)
+        flags = run.flags
+        algo = run.algorithm
+        flags.env = str(run.source.env_id)
+        if flags.seed < 0:
+            flags.seed = int(np.random.default_rng().integers(2**31))
+        overrides = dict(flags.hyperparams or {})
+        if flags.n_timesteps > 0:
+            overrides["n_timesteps"] = flags.n_timesteps
+        values = read_hyperparams(flags.algo, flags.env, flags.conf_file, overrides)
+        values = run.hyperparams = check(flags.algo, algo, values)
+        if run.constrained and "cost_limit" not in values:
+            raise UsageError(
+                f"no cost limit is known for {flags.env}: give cost_limit, the highest cost of an "
+                "episode that you accept, such as half of what an episode costs PPO "
+                "(-params cost_limit:25)"
+            )
+        if flags.env_kwargs:
+            values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
+        # What wraps single environments needs single ones.
+        native = run.source.batch is not None and values.get("env_wrapper") is None
+        flags.vec_env = flags.vec_env or ("native" if native else "dummy")
+        return run
+
+    def limits(self) -> np.ndarray:
+        """
+        Episode cost up to which a model of this run counts as safe, one per cost key.
+
+        :raises UsageError: ``selection_limit`` does not fit the cost keys
+        """
+        cost_limit = self.setup.model.get("cost_limit") if self.constrained else None
+        with explained("hyperparameter", ValueError):
+            return selection_limits(self.setup.selection_limit, cost_limit, self.cost_keys)
+
+    def try_out(self) -> Self:
+        """
+        Check what no value shows: the folder of events, and a step of the environment.
+
+        :return: the same run
+        :raises UsageError: one is not there, or the environment refuses a value or has no cost
+        """
+        flags = self.flags
+        if flags.tensorboard_log:
+            require_writable(Path(flags.tensorboard_log), "--tensorboard-log")
+        self._try_environment(self.setup.env_kwargs)
+        if flags.eval_freq > 0 and flags.eval_env_kwargs is not None:
+            self._try_environment(flags.eval_env_kwargs)
+        return self
+
+    def _try_environment(self, env_kwargs: Mapping[str, Any]) -> None:
+        """Make one environment and take a step, so that nothing fails later for want of a cost."""
+        vec_env = "dummy" if self.flags.vec_env == "subproc" else self.flags.vec_env
+        env = self.make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
+        env.action_space.seed(self.flags.seed)
+        with closing(env), explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
+            env.reset()
+            infos = env.step(np.array([env.action_space.sample()]))[3]
+        if self.source.batch is not None:
+            from sb3_guard.envs.check_part import diverges
+
+            world: Any = self.source.batch(1, **env_kwargs)
+            with closing(world):
+                unsteady = diverges(world.envs.engine)
+            if unsteady is not None:
+                raise UsageError(f"{self.flags.env}: {unsteady}")
+        if self.constrained:
+            optional = self.setup.model.get("missing_cost") == "zero"
+            with explained(f"{self.flags.env} reports no such cost", ValueError):
+                read_costs(infos, self.cost_keys, zero_if_missing=optional)
+
+    # Made
+
+    def make(self) -> Self:
+        """
+        Make model, environments, callbacks and evaluation; nothing is written.
+
+        :return: the same run, whose :meth:`close` releases them
+        :raises UsageError: something can't be made, or is not there
+        """
+        flags = self.flags
+        self.callbacks = self.setup.callbacks()
+        if self.folder is not None:
+            self.begun = read_checkpoint(self.folder.checkpoint)
+        self.model = self.make_model()
+        self.env = self.model.get_env()  # type: ignore[assignment]
+        try:
+            self.model.verbose = max(flags.verbose - 1, 0)
+            if flags.eval_freq > 0:
+                self.evaluation = self._make_evaluation()
+            if flags.track:
+                self.tracker = track(flags, self.hyperparams, self.folder)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def close(self) -> None:
+        """Release the environments, and let Weights & Biases have what it has not yet."""
+        evaluation = [] if self.evaluation is None else [self.evaluation.eval_env]
+        for env in (self.env, *evaluation):
+            with suppress(*PROCESS_DIED):
+                env.close()
+        if self.tracker is not None:
+            self.tracker.finish()
+
+    def make_envs(
+        self,
+        n_envs: int,
+        seed: int | None,
+        *,
+        vec_env: str | None = None,
+        env_kwargs: Mapping[str, Any] | None = None,
+        evaluation: bool = False,
+        normalizer: VecNormalize | None = None,
+        render_mode: str | None = None,
+    ) -> VecEnv:
+        """
+        Environments of this run: monitor, ``vec_env_wrapper``, VecNormalize, frame stack.
+
+        :param n_envs: how many
+        :param seed: the environments get seed, seed + 1, …
+        :param vec_env: native, dummy or subproc; None: that of the flags
+        :param env_kwargs: arguments of the environment; None: those of training
+        :param evaluation: observations are normalised with given statistics, rewards not at all,
+            and wrappers that are ``training_only`` and their ``training_arguments`` are left out
+        :param normalizer: statistics to begin with; it is given the environment
+        :param render_mode: as for :func:`gymnasium.make`
+        :raises UsageError: the environment refuses an argument, or can't be made
+        """
+        flags, setup, source = self.flags, self.setup, self.source
+        vec_env = vec_env or flags.vec_env
+        packages, single = flags.gym_packages, _wrappers(setup.env_wrapper, evaluation)
+
+        def wrap(env: gym.Env) -> gym.Env:
+            import_packages(packages)  # which a process of its own has not imported
+            for cls, arguments in single:
+                env = cls(env, **arguments)
+            return ResumableEnv(env)
+
+        drawn = f" with render_mode={render_mode!r}" if render_mode else ""
+        errors = (*BAD_ARGUMENTS, *PROCESS_DIED, MemoryError)
+        with ExitStack() as made:
+            # Processes see no interrupt, so that a rollout under way can be finished.
+            with explained(f"can't make {source.env_id}{drawn}", *errors), interrupts_held():
+                env = make_vec_env(
+                    source,
+                    n_envs,
+                    seed,
+                    vec_env=vec_env,
+                    env_kwargs=setup.env_kwargs if env_kwargs is None else env_kwargs,
+                    num_threads=flags.num_threads if flags.num_threads > 0 else None,
+                    render_mode=render_mode,
+                    wrapper_class=wrap if vec_env != "native" or setup.env_wrapper else None,
+                    monitor_kwargs={"cost_keys": self.cost_keys, **setup.monitor_kwargs},
+                )
+                made.callback(env.close)
+            with explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
+                for cls, arguments in _wrappers(setup.vec_env_wrapper, evaluation):
+                    env = cls(env, **arguments)
+                beside = self._statistics_beside()
+                if normalizer is None and beside is not None:
+                    normalizer = read_normalizer(beside)
+                if normalizer is not None:
+                    check_normalizer(normalizer, env.observation_space)
+                    normalizer.set_venv(env)
+                    env = normalizer
+                elif setup.normalize is not None:
+                    env = VecNormalize(env, **setup.normalize)
+                if evaluation and isinstance(env, VecNormalize):
+                    env.training = False
+                    env.norm_reward = False
+                if setup.frame_stack is not None:
+                    env = VecFrameStack(env, setup.frame_stack)
+                # SB3 would transpose images itself, but evaluation is wrapped like training.
+                env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
+            made.pop_all()
+        return env
+
+    def make_evaluation_envs(self, episodes: int) -> VecEnv:
+        """
+        Environments to play so many episodes in, with costs and observations as in training.
+
+        :raises UsageError: the environment refuses a value
+        """
+        flags, number = self.flags, self.flags.n_eval_envs
+        if number is None:
+            # All episodes at once where that is cheap; a process each would not be.
+            number = episodes if flags.vec_env == "native" else 1
+        seed, kwargs = evaluation_seed(flags.seed), flags.eval_env_kwargs
+        return self.make_envs(number, seed, evaluation=True, env_kwargs=kwargs)
+
+    def _make_evaluation(self) -> CostEvalCallback:
+        """The callback that evaluates the model while it trains, in environments of its own."""
+        flags = self.flags
+        self.limits()
+        evaluation = CostEvalCallback(
+            self.make_evaluation_envs(flags.eval_episodes),
+            selection_limit=self.setup.selection_limit,
+            seed=evaluation_seed(flags.seed),
+            n_eval_episodes=flags.eval_episodes,
+            eval_freq=max(flags.eval_freq // self.setup.n_envs, 1),
+            verbose=int(flags.verbose > 0 and self._prints_tables),
+        )
+        evaluation.model = self.model
+        return evaluation
+
+    def make_model(self) -> BaseAlgorithm:
+        """
+        The model with its environments, seeded: what ``learn`` does next is settled.
+
+        :raises UsageError: the environment, the algorithm or a wrapper refuses a value, or the
+            device is not there
+        """
+        flags = self.flags
+        # SB3 would train on the CPU instead of a GPU that is not there.
+        with explained(f"device {flags.device!r} is not allowed"):
+            th.empty(0, device="cpu" if flags.device == "auto" else flags.device)
+        if flags.num_threads > 0:
+            th.set_num_threads(flags.num_threads)
+        set_random_seed(flags.seed)
+        env = self.make_envs(self.setup.n_envs, flags.seed)
+        try:
+            model = self._make_model(env)
+            seed_rows(env, flags.seed)
+        except BaseException:
+            env.close()
+            raise
+        return model
+
+    def _make_model(self, env: VecEnv) -> BaseAlgorithm:
+        flags = self.flags
+        if self.folder is not None:
+            return load_model(self.algorithm, self.folder.checkpoint, env, flags.device)
+        arguments = copy.deepcopy(self.setup.model)  # some algorithms add to their policy_kwargs
+        arguments["seed"] = flags.seed
+        if flags.trained_agent:
+            # What the networks are is for the saved agent to say.
+            for name in ("policy", "policy_kwargs"):
+                arguments.pop(name, None)
+            path = Path(flags.trained_agent)
+            if self.setup.normalize is not None and self._statistics_beside() is None:
+                print(f"no vecnormalize.pkl next to {path}: observation statistics begin anew")
+            return load_model(self.algorithm, path, env, flags.device, **arguments)
+        space = env.action_space
+        noise = self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
+        if noise is not None:
+            arguments["action_noise"] = noise
+        errors = (*BAD_ARGUMENTS, RuntimeError, MemoryError)
+        with warnings.catch_warnings(), explained(f"{flags.algo} can't be made", *errors):
+            if not {"batch_size", "n_envs", "n_steps"} & {*(flags.hyperparams or {})}:
+                # The sizes of a file are on purpose, a last minibatch that is smaller included.
+                warnings.filterwarnings("ignore", "You have specified a mini-batch size")
+            return self.algorithm(env=env, device=flags.device, **arguments)
+
+    def _statistics_beside(self) -> Path | None:
+        """Observation statistics that a run or an evaluation wrote next to its model."""
+        agent = Path(self.flags.trained_agent)
+        if self.folder is not None or not agent.name or self.setup.normalize is None:
+            return None
+        best = agent.with_name(f"{agent.stem}_vecnormalize.pkl")  # of best_model.zip
+        if best.is_file():
+            return best
+        return min(agent.parent.glob("*/vecnormalize.pkl"), default=None)
+
+    @property
+    def _prints_tables(self) -> bool:
+        """Whether logs go to standard output; where a progress bar shows the same live, not."""
+        return self.flags.verbose > (1 if self.flags.progress else 0)
+
+    # Trained
+
+    def start(self) -> int:
+        """
+        Train a new run in a folder of its own.
+
+        :return: exit status, see :meth:`train`
+        :raises UsageError: something can't be made; nothing has been written then
+        """
+        self.try_out().make()
+        try:
+            folder = RunFolder.create(self.flags, self.hyperparams, shlex.join(sys.orig_argv))
+        except UsageError:
+            self.close()
+            raise
+        with lock(folder.path):
+            return self.train(folder)
+
+    @property
+    def path(self) -> Path:
+        """The folder of a run of a grid, whose number is its seed's."""
+        flags = self.flags
+        return run_path(flags.log_folder, flags.algo, flags.env, flags.seed + 1)
+
+    def standing(self) -> str:
+        """
+        How far a run of a grid is: ``new``, ``done``, or to ``resume``.
+
+        :raises UsageError: its folder holds another run, or is damaged
+        """
+        if not is_run(self.path):
+            return "new"
+        folder = RunFolder(self.path)
+        there = Run(folder.flags(), folder.hyperparams()).identity
+        if others := differences(there, self.identity):
+            words = [f"{name}: {a} there, {b} here" for name, a, b in others[:3]]
+            raise UsageError(
+                f"{self.path} holds another run ({'; '.join(words)}); choose another folder with -f"
+            )
+        if folder.read_result() is not None:
+            return "done"
+        # Without a checkpoint nothing of it is worth keeping, and it restarts in its place.
+        return "resume" if folder.checkpoint.exists() else "new"
+
+    def complete(self, command: str, asked_to_stop: Callable[[], bool] = lambda: False) -> int:
+        """
+        Bring a run of a grid to its end: start it, or continue it from where it was cut.
+
+        :param command: the command line it is part of
+        :param asked_to_stop: when it says so, training ends after the rollout under way
+        :return: exit status, 0 if it is complete, now or already before
+        :raises RunInUse: another process has the run
+        :raises UsageError: it can't be trained, or the folder holds another run
+        """
+        flags, values, path = self.flags, self.hyperparams, self.path
+        import_packages(flags.gym_packages)
+        with explained(f"can't make folder {path}", OSError):
+            path.mkdir(parents=True, exist_ok=True)
+        with lock(path):
+            state = self.standing()
+            if state == "done":
+                return 0
+            made = is_run(path)
+            folder = RunFolder(path) if made else RunFolder.create(flags, values, command, path)
+            quiet = dataclasses.replace(flags, progress=False, verbose=0)
+            run = Run(quiet, values, folder if state == "resume" else None)
+            return run.try_out().make().train(folder, asked_to_stop)
+
+    @classmethod
+    def resume(cls, given: RunFlags) -> int:
+        """
+        Continue a run in its folder.
+
+        :param given: the flags given now; ``trained_agent`` is the run's folder or checkpoint
+        :return: exit status, see :meth:`train`
+        :raises UsageError: the run can't be continued, or a flag contradicts what it is
+        """
+        folder = RunFolder(Path(given.trained_agent))
+        with lock(folder.path):
+            saved, values = folder.flags(), folder.hyperparams()
+            require_named(folder.path, given, saved, "gym_packages")
+            import_packages(given.gym_packages)
+            state = read_checkpoint(folder.checkpoint)
+            done = state["num_timesteps"]
+            changed = {name: getattr(given, name) for name in {*given.given, "progress", "verbose"}}
+            changed |= {name: getattr(saved, name) for name in ("trained_agent", "hyperparams")}
+            run = cls(dataclasses.replace(saved, **changed), folder=folder)
+            if "env" in changed:
+                run.flags.env = str(run.source.env_id)
+            if 0 < given.n_timesteps < done:
+                raise UsageError(
+                    f"-n {given.n_timesteps} is less than the {done} steps that {folder.path} has "
+                    "done"
+                )
+            if given.n_timesteps > 0:
+                values["n_timesteps"] = given.n_timesteps
+            overrides = given.hyperparams or {}
+            refuse_places(folder.path, {n: v for n, v in values.items() if n not in overrides})
+            run.hyperparams = check(saved.algo, algorithm(saved.algo), {**values, **overrides})
+            was = {**saved.values(START), **state["identity"], "n_timesteps": None}
+            now = {**run.flags.values(START), **run.identity, "n_timesteps": None}
+            if Path(run.flags.log_folder).resolve() == folder.path.resolve().parents[1]:
+                now["log_folder"] = was["log_folder"]  # the same folder in other words
+            for name, old, new in differences(was, now):
+                raise UsageError(
+                    f"{name} = {new} contradicts {old}, with which {folder.path} was trained; put "
+                    "it back or leave it out, or start a new run with it, without -i"
+                )
+            if folder.read_result() is not None and done >= run.setup.n_timesteps:
+                print(
+                    f"{folder.path} is finished: {done} of {run.setup.n_timesteps} steps; "
+                    "a larger -n continues it"
+                )
+                return 0
+            return run.try_out().make().train(folder)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What makes a run the run it is: flags of that role, and hyperparameters."""
+        return plain({**self.flags.values(IDENTITY), **self.hyperparams})
+
+    def train(self, folder: RunFolder, asked_to_stop: Callable[[], bool] = lambda: False) -> int:
+        """
+        Train to the end, or to an interrupt, report, and release what was made.
+
+        :param folder: the run's folder, owned by this process
+        :param asked_to_stop: training ends after the rollout under way when this says so
+        :return: exit status: 0, or 128 + the signal's number when interrupted
+        :raises UsageError: training can't continue, or the disk is full or read-only
+        """
+        try:
+            return self._train(folder, asked_to_stop)
+        except PROCESS_DIED as error:
+            if self.flags.vec_env != "subproc":
+                raise
+            raise UsageError(
+                "a process of --vec-env subproc has died, because of an error printed above, by a "
+                f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
+            ) from error
+        except OSError as error:
+            if not is_disk_error(error):
+                raise
+            raise UsageError(
+                f"can't write to {folder.path}: {error.strerror}; what was written before is "
+                f"intact: make room, then continue with: {folder.again(self.flags)}"
+            ) from error
+        finally:
+            self.close()
+
+    def _train(self, folder: RunFolder, asked_to_stop: Callable[[], bool]) -> int:
+        state, flags, verbose = self.begun, self.flags, self.flags.verbose > 0
+        if verbose:
+            print(f"Run folder: {folder.path} (seed {flags.seed})")
+        if self.tracker is not None:
+            (folder.params / ID).write_text(self.tracker.id)
+            self.tracker.config.update({"folder": str(folder.path)}, allow_val_change=True)
+        with explained(f"can't write to {folder.path}", OSError):
+            # Two lines of the csv are no episodes.
+            goes_on = state is not None and cut(folder.monitor, 2 + state["episodes"])
+            find_monitor(self.env).log_to(folder.monitor, append=goes_on)
+            logger = RunLogger(
+                folder.path,
+                stdout=self._prints_tables,
+                tensorboard=folder.events(flags) if flags.tensorboard_log else None,
+                state=None if state is None else state["logger"],
+            )
+        self.model.set_logger(logger)
+
+        def stop(number: int) -> None:
+            if verbose:
+                print(
+                    "\nStopping after this rollout; Ctrl-C again stops immediately.",
+                    file=sys.stderr,
+                )
+
+        began = time.monotonic()
+        epochs = Epochs(
+            self.setup.n_timesteps, bar=bool(flags.progress), cut=self.setup.cuts_episodes
+        )
+        with interrupts(stop) as received, ExitStack() as last:
+            checkpoints = self._checkpoints(
+                folder, epochs, lambda: bool(received) or asked_to_stop()
+            )
+            if state is not None:
+                checkpoints.restore(self.model, state)
+                # In this order, and only now: a result in the folder is always that of its config.
+                folder.result.unlink(missing_ok=True)
+                folder.write_config(flags, self.hyperparams)
+            last.callback(epochs.on_training_end)  # leaves the terminal tidy
+            finished = self._learn(checkpoints)
+            logger.close()
+            result = self._finish(folder, epochs.result(), finished)
+        if verbose:
+            print(summary(folder, flags, result, time.monotonic() - began, finished))
+        return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
+
+    def _checkpoints(
+        self, folder: RunFolder, epochs: Epochs, asked_to_stop: Callable[[], bool]
+    ) -> Checkpoints:
+        """The callback that writes checkpoints, which has all others."""
+        flags = self.flags
+        others: list[BaseCallback] = [epochs]
+        if not isinstance(self.model, Constrained):
+            others.append(LogCosts())
+        if flags.save_freq > 0:
+            every = max(flags.save_freq // self.setup.n_envs, 1)
+            others.append(CheckpointCallback(every, str(folder.path), save_vecnormalize=True))
+        if self.evaluation is not None:
+            self.evaluation.log_path = str(folder.path / "evaluations")
+            self.evaluation.best_model_save_path = str(folder.path)
+            others.append(self.evaluation)
+        return Checkpoints(
+            folder.checkpoint,
+            [*others, *self.callbacks],
+            identity=self.identity,
+            every=flags.checkpoint_every,
+            log_interval=flags.log_interval,
+            asked_to_stop=asked_to_stop,
+        )
+
+    def _learn(self, checkpoints: Checkpoints) -> bool:
+        """Whether training came to its end."""
+        left = self.setup.n_timesteps - (self.model.num_timesteps if self.begun else 0)
+        interval = self.flags.log_interval
+        kwargs: dict[str, Any] = {}
+        if interval != -1:
+            kwargs["log_interval"] = interval if interval > 0 else None
+        try:
+            # The checkpoint comes first: it must see the others as the last rollout left them.
+            self.model.learn(
+                left,
+                callback=[checkpoints, *checkpoints.others],
+                reset_num_timesteps=self.begun is None,
+                **kwargs,
+            )
+        except Interrupted:
+            return False
+        except BAD_NUMBERS as error:
+            if self.flags.verbose > 1:
+                raise
+            raise TrainingStopped(
+                f"training stopped at {self.model.num_timesteps} steps: {one_line(error)} "
+                "(--verbose 2 shows where)"
+            ) from error
+        return True
+
+    def _finish(
+        self, folder: RunFolder, result: Mapping[str, Any], finished: bool
+    ) -> dict[str, Any]:
+        """Save the agent; if training is finished, play it and write the result."""
+        with replacing(folder.model) as file:
+            self.model.save(file)
+        normalizer = self.model.get_vec_normalize_env()
+        if normalizer is not None:
+            normalizer.save(str(folder.normalizer))
+        final = self._play_final() if finished else {}
+        result = {"algo": self.flags.algo, "env": self.flags.env, **result, "final": final}
+        if finished:
+            made = {"command": folder.flags().command(), "curve": folder.curve_hash()}
+            folder.write_result(result | made)
+        return result
+
+    def _play_final(self) -> dict[str, dict[str, Any]]:
+        """
+        Play 100 episodes of the final policy twice: with sampled actions, and with its mean.
+
+        :return: ``returns``, ``costs`` and ``lengths``, a number an episode, of ``stochastic`` and
+            ``greedy`` actions, and ``bounded``, what the limits bound by cost key, where that is
+            something else than the cost. Empty after a training of less than eight episodes: an
+            eighth of its episodes is the most that each policy plays
+        """
+        episodes = min(FINAL_EPISODES, find_monitor(self.env).episode_count // 8)
+        if not episodes:
+            return {}
+        env = self.make_evaluation_envs(episodes)
+        final: dict[str, dict[str, Any]] = {}
+        try:
+            sync_normalization(self.env, env)
+            for name in SPLITS:
+                played = evaluate_policy(
+                    self.model,
+                    env,
+                    episodes,
+                    deterministic=name == "greedy",
+                    seed=evaluation_seed(self.flags.seed, 1),
+                )
+                if not len(played):  # no episode of the greedy policy ends
+                    continue
+                final[name] = {
+                    "returns": rounded(played.returns),
+                    "costs": rounded(played.costs),
+                    "lengths": played.lengths.tolist(),
+                }
+                if len(played.cost_keys) > 1 or played.limit_on == "max":
+                    bounded = zip(played.cost_keys, played.limited.T, strict=True)
+                    final[name]["bounded"] = {key: rounded(costs) for key, costs in bounded}
+        finally:
+            env.close()
+        return final
+
+
+def _wrappers(
+    wrappers: list[tuple[Any, dict[str, Any]]], evaluation: bool
+) -> list[tuple[Any, dict[str, Any]]]:
+    """Evaluation is without what ends episodes early, or changes rewards."""
+    if not evaluation:
+        return wrappers
+    return [
+        (cls, {k: v for k, v in given.items() if k not in getattr(cls, "training_arguments", ())})
+        for cls, given in wrappers
+        if not getattr(cls, "training_only", False)
+    ]
+
+
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """What differs between two runs: name and both values, ``unset`` for those that are absent."""
+
+    def shown(value: Any) -> Any:
+        return "unset" if value in ("", None) else value
+
+    # As data: files of older runs have expressions as text.
+    there, here = (
+        plain({name: as_data(name, value) for name, value in run.items()}) for run in (there, here)
+    )
+    return [
+        (name, shown(there.get(name)), shown(here.get(name)))
+        for name in sorted({*there, *here})
+        if there.get(name) != here.get(name)
+    ]

@@ -94,15 +94,11 @@ def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
     """In words what costs, up to which limit, and how long an episode is."""
     parts = env.engine.constraints
     for part in parts:
-        paragraph = " ".join(inspect.cleandoc(type(part).__doc__ or "").replace("``", "").split())
-        text = paragraph[max(paragraph.find("Cost"), 0) :]
-        words = {*re.findall(r"\w+", text)}
+        text = " ".join((inspect.getdoc(type(part)) or "").replace("``", "").split())
         stated: Any = fields(part)  # type: ignore[arg-type]  # every part is a dataclass
-        changed = {f.name for f in stated if getattr(part, f.name) != f.default}
-        named = words | {"weight", "indicator"} & changed
-        ranges = {name: f"{low:g} to {high:g}" for name, (low, high) in part.ranges.items()}
-        shown = {f.name: ranges.get(f.name, getattr(part, f.name)) for f in stated}
-        values = ", ".join(f"{name} {value}" for name, value in shown.items() if name in named)
+        shown = {field.name: getattr(part, field.name) for field in stated}
+        shown |= {name: f"{low:g} to {high:g}" for name, (low, high) in part.ranges.items()}
+        values = ", ".join(f"{name} {value}" for name, value in shown.items() if value is not None)
         yield f"info['cost_{part.name}']: {text}" + (f" Here: {values}." if values else "")
     how = "1 if any of these costs" if env.scenario.cost == "any" else "their sum"
     if len(parts) > 1:

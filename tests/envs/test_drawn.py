@@ -292,7 +292,7 @@ def test_show_lists_what_is_drawn():
     table = drawn_table(env)
     rows = [[cell.strip() for cell in row.split("|")[1:3]] for row in table.splitlines()]
     assert ["hazards.size", "0.1 to 0.3"] in rows and ["robot.delay", "0 to 25"] in rows
-    assert "Here: size 0.1 to 0.3." in next(costs(env, "Goal_Point_8Hazards-v0"))
+    assert "size 0.1 to 0.3" in next(costs(env, "Goal_Point_8Hazards-v0"))
 
 
 def test_free_objects_lie_still_whatever_their_friction():

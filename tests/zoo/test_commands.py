@@ -512,7 +512,7 @@ def test_show_names_the_joints_of_a_velocity_task(tmp_path, capsys):
     require_rendering()
     assert cli.main(["show", "SafetyHopperVelocity", "-o", str(tmp_path / "hopper.png")]) == 0
     text = capsys.readouterr().out
-    assert "faster than limit (Zhang" in text and "Here: limit 0.7402." in text
+    assert "faster than limit (Zhang" in text and "limit 0.7402" in text
     cells = rows(text)
     # Gymnasium's own documentation of the observation: height, angle of the torso, ...
     assert [row[::3] for row in cells[1:4]] == [
@@ -562,8 +562,8 @@ def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
     cells = rows(text)
     assert ["accelerometer", "0:3", "[-inf, inf]", "m/s²"] in cells
     costs = text.split("\n\n")[1].splitlines()
-    assert costs[0].startswith("info['cost_ghosts']: Cost: Σ max(0, size − distance)")
-    assert costs[0].endswith("Here: size 0.3, solid False.")
+    assert costs[0].startswith("info['cost_ghosts']: Zones that follow the robot")
+    assert "Here: num 8, size 0.3, " in costs[0]
     assert costs[1:] == [
         "Usual cost limit of an episode: 2.", "An episode has 1000 steps of 0.2 s."
     ]  # fmt: skip

@@ -4,12 +4,13 @@ import json
 import shlex
 import shutil
 import tempfile
-from collections.abc import Mapping
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any
 
+import huggingface_hub
 import yaml
+from huggingface_hub import EvalResult, ModelCard, ModelCardData
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
@@ -28,14 +29,16 @@ TAGS = ("reinforcement-learning", "safe-reinforcement-learning", "stable-baselin
 # Flags that name files of this machine
 PATHS = ("log_folder", "tensorboard_log", "conf_file", "trained_agent")
 
-CARD = """
-# {name} on {env}
+CARD = """---
+{{ card_data }}
+---
+# {{ model_name }} on {{ env }}
 
-A **{name}** agent for **{env}**, trained with
-[sb3_guard](https://arxiv.org/abs/2305.13681) for Stable-Baselines3. With {actions} actions:
+A **{{ model_name }}** agent for **{{ env }}**, trained with
+[sb3_guard](https://arxiv.org/abs/2305.13681) for Stable-Baselines3. With {{ actions }} actions:
 
 ```
-{means}
+{{ means }}
 ```
 
 Cost is the undiscounted sum of `info["cost"]` over an episode.
@@ -44,18 +47,18 @@ Cost is the undiscounted sum of `info["cost"]` over an episode.
 
 ```bash
 pip install .   # in a clone of sb3_guard's repository
-sb3-guard hub load --algo {algo} --env {env} -orga {organization} -name {repo} -f logs{packages}
-sb3-guard enjoy --algo {algo} --env {env} -f logs{packages}
+sb3-guard hub load {{ which }} -orga {{ organization }} -name {{ repo }} -f logs{{ packages }}
+sb3-guard enjoy {{ which }} -f logs{{ packages }}
 ```
 
 ## Train it again
 
 ```bash
-{command}
+{{ command }}
 ```
 
 ```yaml
-{hyperparams}```
+{{ hyperparams }}```
 """
 
 
@@ -86,11 +89,9 @@ def push(flags: HubFlags) -> int:
     print(f"Ready to upload: {folder}")
     if flags.to:
         return 0
-    from huggingface_hub import HfApi
-
     repo_id = f"{flags.organization}/{flags.repo_name}"
     with _network(f"the upload of {folder} to {repo_id}"):
-        api = HfApi()
+        api = huggingface_hub.HfApi()
         api.create_repo(repo_id, private=flags.private, exist_ok=True)
         url = api.upload_folder(
             repo_id=repo_id, folder_path=folder, commit_message=flags.commit_message
@@ -132,36 +133,30 @@ def stage(agent: Agent, flags: HubFlags, folder: Path) -> None:
         print(f"There is no policy.onnx: {error}")
     results["is_deterministic"] = not flags.stochastic
     (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
-    page = card(agent, flags, evaluation, results)
-    (folder / "README.md").write_text(page, encoding="utf-8")
+    card(agent, flags, evaluation).save(folder / "README.md")
 
 
-def card(agent: Agent, flags: HubFlags, evaluation: Evaluation, results: Mapping[str, Any]) -> str:
+def card(agent: Agent, flags: HubFlags, evaluation: Evaluation) -> ModelCard:
     """The model card: metadata that the hub reads, and a page that people read."""
-    from huggingface_hub import EvalResult, ModelCardData
-
-    name = type(agent.model).__name__
+    env, results = agent.env_id, summary(evaluation)
+    scores = [
+        EvalResult(
+            task_type="reinforcement-learning", dataset_name=env, dataset_type=env,
+            metric_type=kind, metric_value="{mean:.2f} +/- {std:.2f}".format(**results[key]),
+        )
+        for kind, key in (("mean_reward", "return"), ("mean_cost", "cost"))
+    ]  # fmt: skip
     data = ModelCardData(
         library_name="stable-baselines3",
-        tags=[agent.env_id, *TAGS],
-        model_name=name,
-        eval_results=[
-            EvalResult(
-                task_type="reinforcement-learning",
-                task_name="reinforcement-learning",
-                dataset_name=agent.env_id,
-                dataset_type=agent.env_id,
-                metric_type=kind,
-                metric_name=kind,
-                metric_value=f"{results[key]['mean']:.2f} +/- {results[key]['std']:.2f}",
-            )
-            for kind, key in (("mean_reward", "return"), ("mean_cost", "cost"))
-        ],
+        tags=[env, *TAGS],
+        model_name=type(agent.model).__name__,
+        eval_results=scores,
     )
-    page = CARD.format(
-        name=name,
-        env=agent.env_id,
-        algo=flags.algo,
+    return ModelCard.from_template(
+        data,
+        template_str=CARD,
+        env=env,
+        which=f"--algo {flags.algo} --env {env}",
         organization=flags.organization,
         repo=flags.repo_name,
         packages=packages_flag(agent.run.args().get("gym_packages") or []),
@@ -170,7 +165,6 @@ def card(agent: Agent, flags: HubFlags, evaluation: Evaluation, results: Mapping
         command=command(agent),
         hyperparams=yaml.safe_dump(agent.run.hyperparams()),
     )
-    return f"---\n{data.to_yaml()}\n---\n{page}"
 
 
 def command(agent: Agent) -> str:
@@ -188,11 +182,9 @@ def load(flags: HubFlags) -> int:
     name = model_name(flags.algo, flags.env)
     repo_id = f"{flags.organization}/{flags.repo_name or name}"
     require_writable(Path(flags.folder), "--folder")
-    from huggingface_hub import snapshot_download
-
     print(TRUST)
     with _network(f"the download of {repo_id}"):
-        downloaded = Path(snapshot_download(repo_id))
+        downloaded = Path(huggingface_hub.snapshot_download(repo_id))
     run = install(downloaded, name, flags)
     print(f"Run folder: {run.path}")
     return 0

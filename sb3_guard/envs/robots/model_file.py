@@ -11,7 +11,6 @@ import numpy as np
 
 from sb3_guard.envs.robots import mjcf
 from sb3_guard.envs.robots.measure import lowest
-from sb3_guard.envs.robots.references import drop_references
 from sb3_guard.envs.types import FLOOR, ROBOT, Array
 from sb3_guard.spelling import did_you_mean
 
@@ -204,7 +203,13 @@ def settle(
         height = min((float(before.geom_xpos[geom.id, 2]) for geom in found), default=0.0)
         floors = tuple(_attributes(geom) for geom in found)
         on_floor = tuple(_on_floor(spec, root, {values["name"] for values in floors}))
-        left_out += _take_out(spec, label, root, on_floor)
+        alone = _alone(spec, root, whole)
+        kept = _elements(alone) | {
+            f"pair {v['geomname1']} {v['geomname2']}" if kind == "pair" else f"sensor {v['name']}"
+            for kind, v in on_floor
+        }
+        left_out += _left_out(spec, root, kept)
+        spec = alone
     model = spec.compile()
     data = _carried(whole, before, model)
     file = ModelFile(label, spec, root, {}, left_out, floors, on_floor)
@@ -421,43 +426,36 @@ def _attributes(element: Any) -> dict[str, Any]:
     }
 
 
-def _take_out(
-    spec: mujoco.MjSpec, label: str, root: str, on_floor: Collection[tuple[str, Mapping[str, Any]]]
-) -> tuple[str, ...]:
-    """Leave nothing but the robot in a file: floor, lights and others belong to the arena.
+def _alone(spec: mujoco.MjSpec, root: str, whole: mujoco.MjModel) -> mujoco.MjSpec:
+    """The robot without its world: floor, lights and others belong to the arena."""
+    alone = mujoco.MjSpec()
+    mjcf.copy_options(spec.option, alone.option)
+    copied = spec.copy()
+    for light in copied.lights:
+        copied.delete(light)
+    # MuJoCo drops what refers to bodies, geoms, sites or tendons that stay behind
+    body = alone.worldbody.add_frame().attach_body(copied.body(root), "", "")
+    if spec.body(root).frame is not None:  # which stays behind, too
+        body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        body.pos, body.quat = whole.body(root).pos, whole.body(root).quat
+    body.pos[:2] = 0.0  # the layout says where it is
+    return alone.copy()  # without the warning of names that have no prefix
 
-    :param on_floor: what the arena's floor takes over
-    :return: what was left out, in words
-    """
 
-    def names() -> set[str]:
-        kinds: dict[str, Any] = {
-            "actuator": spec.actuators, "sensor": spec.sensors, "equality": spec.equalities,
-            "tendon": spec.tendons,
-        }  # fmt: skip
-        pairs = {f"pair {pair.geomname1} {pair.geomname2}" for pair in spec.pairs}
-        return pairs | {f"{kind} {element.name}" for kind, of in kinds.items() for element in of}
+def _left_out(spec: mujoco.MjSpec, root: str, kept: Collection[str]) -> tuple[str, ...]:
+    """What of a file is not in the robot, in words."""
+    world = spec.worldbody
+    others = [f"body {body.name}" for body in world.bodies if body.name != root]
+    for kind, things in (("geom", world.geoms), ("site", world.sites), ("camera", world.cameras)):
+        others += [f"{kind} {thing.name}".strip() for thing in things]
+    return (*others, *sorted(_elements(spec) - set(kept)))
 
-    kept = {
-        f"pair {v['geomname1']} {v['geomname2']}" if kind == "pair" else f"sensor {v['name']}"
-        for kind, v in on_floor
-    }
-    before, world, left_out = names() - kept, spec.worldbody, []
-    drop_references(spec)
-    for body in world.bodies:
-        if body.name != root:
-            left_out.append(f"body {body.name}")
-            spec.delete(body)
-    for kind, elements in (("geom", world.geoms), ("site", world.sites), ("camera", world.cameras)):
-        for element in elements:
-            left_out.append(f"{kind} {element.name}".strip())
-            spec.delete(element)
-    for light in spec.lights:
-        spec.delete(light)
-    spec.body(root).pos[:2] = 0.0  # the layout says where it is
-    try:
-        spec.compile()
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{label} needs more than body {root!r}: {reason}") from None
-    return (*left_out, *sorted(before - names()))
+
+def _elements(spec: mujoco.MjSpec) -> set[str]:
+    """What refers to bodies, in words."""
+    kinds = {
+        "actuator": spec.actuators, "sensor": spec.sensors, "equality": spec.equalities,
+        "tendon": spec.tendons,
+    }  # fmt: skip
+    pairs = {f"pair {pair.geomname1} {pair.geomname2}" for pair in spec.pairs}
+    return pairs | {f"{kind} {element.name}" for kind, of in kinds.items() for element in of}

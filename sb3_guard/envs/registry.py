@@ -17,6 +17,7 @@ from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.check_part import diverges
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
+from sb3_guard.envs.robots import guard as guard_robots
 from sb3_guard.envs.robots import gym_mujoco, safety_gymnasium
 from sb3_guard.envs.robots.from_file import robot_class
 from sb3_guard.envs.robots.robot import MJCFRobot
@@ -35,35 +36,16 @@ def guard(parts: Mapping[str, type[P]]) -> dict[str, type[P]]:
     return {name: part for name, part in parts.items() if part.family == "guard"}
 
 
-ROBOTS: dict[str, type[Robot]] = _parts(
-    "robots",
-    "Point",
-    "Car",
-    "Doggo",
-    "Swimmer",
-    "Ant",
-    "Walker",
-    "Humanoid",
-    "Hopper",
-    "Arm3",
-    "Arm6",
-    "Drone",
-)
-ROBOTS |= {
-    robot.__name__: robot
-    for robot in (
-        gym_mujoco.AntV4,
-        gym_mujoco.HalfCheetahV4,
-        gym_mujoco.HopperV4,
-        gym_mujoco.HumanoidV4,
-        gym_mujoco.SwimmerV4,
-        gym_mujoco.Walker2dV4,
-        safety_gymnasium.SafetyPoint,
-        safety_gymnasium.SafetyCar,
-        safety_gymnasium.SafetyAnt,
-        safety_gymnasium.SafetyDoggo,
-    )
-}
+_ROBOTS: tuple[type[Robot], ...] = (
+    guard_robots.Point, guard_robots.Car, guard_robots.Doggo, guard_robots.Swimmer,
+    guard_robots.Ant, guard_robots.Walker, guard_robots.Humanoid, guard_robots.Hopper,
+    guard_robots.Arm3, guard_robots.Arm6, guard_robots.Drone,
+    gym_mujoco.AntV4, gym_mujoco.HalfCheetahV4, gym_mujoco.HopperV4, gym_mujoco.HumanoidV4,
+    gym_mujoco.SwimmerV4, gym_mujoco.Walker2dV4,
+    safety_gymnasium.SafetyPoint, safety_gymnasium.SafetyCar, safety_gymnasium.SafetyAnt,
+    safety_gymnasium.SafetyDoggo,
+)  # fmt: skip
+ROBOTS = {robot.__name__: robot for robot in _ROBOTS}
 TASKS: dict[str, type[Task]] = _parts(
     "tasks",
     "Goal",

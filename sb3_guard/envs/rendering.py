@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -28,7 +27,6 @@ from sb3_guard.envs.types import Array
 
 if TYPE_CHECKING:
     from sb3_guard.envs.engine import Engine
-    from sb3_guard.envs.part import Robot
 
 CAMERAS = ("fixed", "track", "top")
 ELEVATION = {"fixed": 58.0, "track": 55.0, "top": 90.0}  # degrees
@@ -321,25 +319,3 @@ class Renderer:
                 thread.join(timeout=5.0)
         else:
             self._screen.close()
-
-
-def show_robot(robot: Robot) -> None:
-    """Open a robot in MuJoCo's viewer, or write ``<robot>.png`` where there is no display."""
-    from sb3_guard.envs.engine import Engine
-    from sb3_guard.envs.tasks.goal import Goal
-
-    engine = Engine(robot, Goal())
-    engine.reset(np.zeros(1, dtype=np.int32))
-    if _has_display():
-        from mujoco import viewer
-
-        viewer.launch(engine.model, engine.batch.get_data(0))
-        return
-    renderer = Renderer(engine, camera="track")
-    path = Path(f"{type(robot).__name__.lower()}.png")
-    frame = renderer.frame(0)
-    from matplotlib import image
-
-    image.imsave(path, frame)
-    renderer.close()
-    print(f"no display: wrote {path}")

@@ -24,7 +24,6 @@ ATTRIBUTES: dict[str, tuple[str, str]] = {
     "complete": ("False", "True: the file's world is kept: its floor, options and names are used, "
         "and the robot begins where the file puts it"),
     "keyframe": ("start, home or the only one", "the keyframe in which it starts"),
-    "scaled": ("True", "False: actions are the controls themselves"),
     "center": ("the outermost body", "the body or site whose place is the robot's position: of an "
         "arm, its end effector"),
     "reach": ("infinite; of an arm, measured", "how far an arm reaches from its base, m; goals are "
@@ -35,13 +34,9 @@ ATTRIBUTES: dict[str, tuple[str, str]] = {
     "workspace": ('"planar"; of an arm "spatial"', '"spatial" for robots that leave the plane: '
         "tasks and constraints are then in the air"),
     "lidar_bodies": ("the body of center", "bodies that carry lidar and compass"),
-    "eye": ("on that body or the outermost, ahead", "the body that carries the observed camera, "
-        "where on it (m) and which way it looks"),
     "timestep": ("the file's", "of one physics step, s"),
-    "frame_skip": ("10", "physics steps in a control step"),
     "integrator": ("the file's", '"Euler", "RK4", "implicit" or "implicitfast"'),
-    "floor": ("True", "False: it slides at a fixed height and never meets the floor, which saves "
-        "time"),
+    "frame_skip": ("10", "physics steps in a control step"),
 }  # fmt: skip
 #: What they may be, see :func:`~sb3_guard.fields.fit`.
 RULES: dict[str, tuple[Any, ...]] = {

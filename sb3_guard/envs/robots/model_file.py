@@ -433,13 +433,17 @@ def _alone(spec: mujoco.MjSpec, root: str, whole: mujoco.MjModel) -> mujoco.MjSp
     copied = spec.copy()
     for light in copied.lights:
         copied.delete(light)
-    # MuJoCo drops what refers to bodies, geoms, sites or tendons that stay behind
+    # MuJoCo drops what refers to bodies, geoms, sites or tendons that stay behind, and warns of
+    # names without a prefix, which only matter where several robots meet
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
     body = alone.worldbody.add_frame().attach_body(copied.body(root), "", "")
+    mujoco.set_mju_user_warning(handler)
     if spec.body(root).frame is not None:  # which stays behind, too
         body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         body.pos, body.quat = whole.body(root).pos, whole.body(root).quat
     body.pos[:2] = 0.0  # the layout says where it is
-    return alone.copy()  # without the warning of names that have no prefix
+    return alone.copy()  # which does not repeat the warning when it compiles
 
 
 def _left_out(spec: mujoco.MjSpec, root: str, kept: Collection[str]) -> tuple[str, ...]:

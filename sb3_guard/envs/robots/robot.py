@@ -434,10 +434,3 @@ class MJCFRobot(Robot):
         if name == "joint_vel" or (name == "joint_turn" and self._balling):
             return joints  # a ball's rotation is as it is
         return joints | {"first_pose": self._start["qpos"][self._where[name]].tolist()}
-
-    @classmethod
-    def show(cls) -> None:
-        """Open the robot in MuJoCo's viewer, or write a picture where there is no display."""
-        from sb3_guard.envs.rendering import show_robot
-
-        show_robot(cls())

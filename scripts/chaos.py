@@ -51,7 +51,7 @@ def search(args: argparse.Namespace, folder: Path) -> list[str]:
             server = stack.enter_context(running())
             storage = server.url
         study = campaign(storage, folder, *numbers, server=server, say=print)
-        wrong = faults(study, args.trials, args.workers)
+        wrong = faults(study)
         again = len(study.get_trials(deepcopy=False, states=(TrialState.FAIL,)))
         done = len(study.get_trials(deepcopy=False, states=DONE))
     print(f"{done} of {args.trials} trials; workers were killed in {again}")

@@ -334,8 +334,9 @@ def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
     )  # fmt: skip
 
 
-def test_a_run_that_another_process_has_is_awaited(tmp_path, here, capsys):
+def test_a_run_that_another_process_has_is_awaited(tmp_path, here, monkeypatch, capsys):
     """Two grids in one folder both come to their end."""
+    monkeypatch.setattr(grid, "ASK_AGAIN", 0.0)
     run = tmp_path / "cpo" / "CostPoint-v0_1"
     run.mkdir(parents=True)
     with lock(run):

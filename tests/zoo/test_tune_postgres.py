@@ -68,18 +68,19 @@ def states(server: Server) -> Counter[str]:
 @pytest.mark.slow
 def test_no_trial_is_lost_whatever_is_killed(server, tmp_path):
     study = campaign(server.url, tmp_path, n_trials=12, n_workers=3, kills=10, server=server)
-    assert faults(study, 12, n_workers=3) == []
+    assert faults(study) == []
 
 
 def test_the_trial_of_a_silent_worker_is_done_again(server, tmp_path, monkeypatch):
-    """The last worker waits for the silence, once, if it is not over before."""
+    """By whoever begins a trial after the silence."""
     monkeypatch.setattr(studies, "GRACE", 2)
 
     def lose_another() -> None:
-        """A trial whose heart has stopped."""
+        """A trial whose heart stops."""
         storage, _ = studies.open_storage(server.url, tmp_path)
         lost = optuna.load_study(study_name="trpo_lag_CostPoint-v0", storage=storage).ask()
         storage.record_heartbeat(lost.number + 1)  # the number in its table
+        time.sleep(3.0)
 
     interrupt_at(monkeypatch, 70, lose_another)
     assert tune.main([*TOY, "--storage", server.url, "-f", str(tmp_path)]) == 0

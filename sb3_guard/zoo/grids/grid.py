@@ -145,6 +145,7 @@ def try_out(runs: Sequence[GridRun]) -> None:
 
 # In a worker
 
+ASK_AGAIN = 1.0  # seconds until another process is asked for its run again
 _one_at_a_time = threading.Lock()  # random generators and thread counts belong to the process
 
 
@@ -168,6 +169,7 @@ def carry_out(run: GridRun, command: str, stop: Path) -> tuple[str, str]:
             error_file.unlink(missing_ok=True)
             status = run.complete(command, stop.exists)
         except RunInUse as error:
+            time.sleep(ASK_AGAIN)
             return "in use", one_line(error)
         except Exception as error:
             # The grid's summary says it too, so a record that can't be written is no failure.

@@ -20,15 +20,14 @@ import numpy as np
 import optuna
 from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
-from optuna.storages import RDBStorage
 from optuna.study import MaxTrialsCallback, StudyDirection
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import FrozenTrial
 
 from sb3_guard.zoo.cli.usage import UsageError, interrupts, interrupts_held, run
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import folder_name, is_disk_error, require_writable
 from sb3_guard.zoo.run.hyperparams import check
-from sb3_guard.zoo.run.run import Run
+from sb3_guard.zoo.run.run import Run, differences
 from sb3_guard.zoo.tuning import studies
 from sb3_guard.zoo.tuning.flags import TuneFlags
 from sb3_guard.zoo.tuning.report import FINISHED, Report, short
@@ -72,7 +71,7 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         algo=run.flags.algo,
         env=run.flags.env,
         hyperparams=values,
-        space=search.description(),
+        space=search.space,
         n_timesteps=n_timesteps,
         seeds=flags.seeds,
         n_evaluations=n_evaluations,
@@ -120,16 +119,21 @@ def open_study(
         while not study.trials and time.monotonic() < end:
             time.sleep(0.1)
     saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
-    if saved is not None:
-        settings.refuse_others(saved, name)
-    elif begun or study.directions != directions:
+    if saved is None and (begun or study.directions != directions):
         raise UsageError(
             f"{shown} has a study {name!r} that is not one of sb3_guard's; "
             "choose another --study-name"
         )
-    else:
-        # First of all: a worker may die after any of these lines, and the next one continues.
-        study.set_user_attr(SETTINGS, asdict(settings))
+    # First of all: a worker may die after any of these lines, and the next one continues.
+    if saved is None:
+        saved = asdict(settings)
+        study.set_user_attr(SETTINGS, saved)
+    for then, now in ((saved["hyperparams"], settings.hyperparams), (saved, asdict(settings))):
+        for part, old, value in differences(then, now):
+            raise UsageError(
+                f"study {name!r} was begun with {part} {old}, not {value}: "
+                "continue it as it was begun, or begin another with --study-name"
+            )
     if not begun:
         # So that the best is not worse than the starting point, as far as the space has it.
         first, outside = search.first()
@@ -145,70 +149,6 @@ def open_study(
     seed = flags.seed if not begun and flags.seed >= 0 else None
     study.sampler = SAMPLERS[flags.sampler](seed, flags.n_startup_trials)
     return study
-
-
-class Work:
-    """
-    One process's work on a study.
-
-    :param study: which may be shared with other processes
-    :param storage: of the study
-    :param objective: of its trials
-    :param report: rewritten after each of them
-    """
-
-    def __init__(self, study: optuna.Study, storage: Storage, objective: Objective, report: Report):
-        self.study, self.storage = study, storage
-        self.objective, self.report = objective, report
-        self.flags = objective.flags
-
-    def _after(self, study: optuna.Study, trial: FrozenTrial) -> None:
-        trials = study.get_trials(deepcopy=False)
-        self.report.write(study)
-        if self.flags.verbose:
-            print(self.report.line(trials, trial), flush=True)
-        failures = self.objective.failures
-        if failures >= MOST_FAILURES:
-            raise UsageError(
-                f"{failures} trials in a row failed, the last one: {trial.user_attrs['error']}"
-            )
-        if self.objective.stopped():
-            study.stop()
-
-    def _optimize(self, n_trials: int | None = None) -> None:
-        enough = [] if n_trials else [MaxTrialsCallback(self.flags.n_trials, states=FINISHED)]
-        with suppress(Stopped):
-            # A model refers to itself, and Python seldom looks for that.
-            self.study.optimize(
-                self.objective, n_trials, callbacks=[self._after, *enough], gc_after_trial=True
-            )
-
-    def _count(self, *states: TrialState) -> int:
-        return len(self.study.get_trials(deepcopy=False, states=states))
-
-    def do(self) -> None:
-        """
-        Work until the study has all its trials, or until stopped.
-
-        :raises UsageError: trial after trial fails
-        """
-        repeat_lost_trials(self.study, self.storage)
-        if self._count(*FINISHED) < self.flags.n_trials:
-            self._optimize()
-
-    def finish(self) -> None:
-        """Do the trials again whose workers died meanwhile; on a database, their silence tells."""
-        wait = isinstance(self.storage, RDBStorage) and self._count(TrialState.RUNNING)
-        if wait and self.flags.verbose:
-            print(f"Waiting up to {studies.GRACE} s in case a worker is gone", flush=True)
-        end = time.monotonic() + studies.GRACE + 1.0 if wait else 0.0
-        while time.monotonic() < end and not self.objective.stopped():
-            time.sleep(0.5)
-            if not self._count(TrialState.RUNNING):
-                break
-        repeat_lost_trials(self.study, self.storage)
-        while self._count(TrialState.WAITING) and not self.objective.stopped():
-            self._optimize(n_trials=1)
 
 
 def tune(flags: TuneFlags, main: bool = True) -> int:
@@ -241,9 +181,9 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     name = flags.study_name or f"{settings.algo}_{settings.env}"
     storage, shown = open_storage(flags.storage, folder / "study.journal")
     study = open_study(flags, settings, search, name, storage, shown)
+    folder.mkdir(parents=True, exist_ok=True)
     objective = Objective(flags, training, settings, search)
     report = Report(folder, asdict(settings), flags.gym_packages)
-    work = Work(study, storage, objective, report)
     loud = main and flags.verbose > 0
     if loud:
         print(_header(flags, settings, study, folder, shown), flush=True)
@@ -253,13 +193,27 @@ def _tune(flags: TuneFlags, main: bool) -> int:
         if loud:
             print("\nStopping; Ctrl-C again stops immediately.", file=sys.stderr)
 
+    def after(study: optuna.Study, trial: FrozenTrial) -> None:
+        report.write(study)
+        if flags.verbose:
+            print(report.line(trial), flush=True)
+        if objective.failures >= MOST_FAILURES:
+            raise UsageError(
+                f"{MOST_FAILURES} trials in a row failed, the last one: {trial.user_attrs['error']}"
+            )
+        if objective.stopped():
+            study.stop()
+
     with interrupts(stop) as received:
+        repeat_lost_trials(study, storage)
         with _other_workers(flags, flags.n_jobs - 1 if main else 0) as others:
-            work.do()
+            if len(study.get_trials(deepcopy=False, states=FINISHED)) < flags.n_trials:
+                enough = MaxTrialsCallback(flags.n_trials, states=FINISHED)
+                with suppress(Stopped):
+                    # A model refers to itself, and Python seldom looks for that.
+                    study.optimize(objective, callbacks=[after, enough], gc_after_trial=True)
             while not objective.stopped() and any(process.is_alive() for process in others):
                 time.sleep(0.2)
-        if main:
-            work.finish()
     if main:
         report.write(study)
         report.plot(study)
@@ -302,19 +256,12 @@ def _header(
     elif settings.cost_limit is None:
         goal = f"the highest return ({settings.algo} has no cost limit; --cost-limit sets one)"
     else:
-        keys = settings.cost_keys if len(settings.cost_keys) > 1 else [""]
-        limits = zip(settings.cost_limit, keys, strict=True)
-        bounds = ", ".join(f"{short(limit)} {key}".rstrip() for limit, key in limits)
-        goal = f"the highest return with an episode cost of at most {bounds}"
-    seeds = f" × {len(settings.seeds)} seeds" if len(settings.seeds) > 1 else ""
-    pruner = "none" if settings.pareto else flags.pruner
-    return "\n".join(
-        [
-            f"Study {study.study_name}: {finished} of {flags.n_trials} trials are finished",
-            f"  searching    {goal}",
-            f"  each trial   {settings.n_timesteps:,} steps{seeds}, sampler {flags.sampler}, "
-            f"pruner {pruner}",
-            f"  folder       {folder}",
-            f"  watch with   optuna-dashboard {shown}",
-        ]
-    )
+        limits = zip(settings.cost_limit, settings.cost_keys, strict=True)
+        bounds = ", ".join(f"{key} of at most {short(limit)}" for limit, key in limits)
+        goal = f"the highest return with an episode {bounds}"
+    seeds = " ".join(map(str, settings.seeds))
+    return f"""Study {study.study_name}: {finished} of {flags.n_trials} trials are finished
+  searching    {goal}
+  each trial   {settings.n_timesteps:,} steps, --seeds {seeds}
+  folder       {folder}
+  watch with   optuna-dashboard {shown}"""

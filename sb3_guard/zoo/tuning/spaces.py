@@ -8,8 +8,7 @@ A space maps names of hyperparameters to a range or to a list of options, as in 
     policy_kwargs.net_arch: [{pi: [64, 64], vf: [64, 64]}, {pi: [256, 256], vf: [256, 256]}]
 
 Whole bounds draw whole numbers; a name with a dot lies in a mapping. An algorithm states its own
-space in the class attribute ``search_space``, to which those of its bases are added; RL-Zoo's
-samplers serve for RL-Zoo's algorithms, and :func:`rl_zoo_sampler` makes one of a space for RL-Zoo.
+space in the class attribute ``search_space``, to which those of its bases are added.
 """
 
 import json
@@ -18,25 +17,27 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import optuna
-from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
+from optuna.distributions import FloatDistribution, IntDistribution
 from optuna.samplers import BaseSampler, GPSampler, NSGAIISampler, RandomSampler, TPESampler
 
-from sb3_guard.zoo.cli.names import as_data, with_classes
+from sb3_guard.zoo.cli.names import as_data
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
 from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.hyperparams import NOISE_KEYS, RUN_KEYS, parameters
+from sb3_guard.zoo.run.hyperparams import annotations, parameters
 
-Space = Mapping[str, Any]
+# RL-Zoo's algorithms are searched in the space of their constrained relative, without its costs.
+RELATIVES = {
+    "ppo": "ppo_lag", "sac": "sac_lag", "td3": "td3_lag", "ddpg": "td3_lag", "tqc": "tqc_lag",
+    "crossq": "sac_lag",
+}  # fmt: skip
 
-#: of RL-Zoo's algorithms for which RL-Zoo has none
-SPACES: dict[str, dict[str, Any]] = {
-    "crossq": {
-        "gamma": [0.97, 0.98, 0.99, 0.995, 0.999, 0.9999],
-        "learning_rate": {"low": 1e-5, "high": 2e-3, "log": True},
-        "batch_size": [64, 128, 256, 512],
-        "policy_delay": {"low": 1, "high": 4},
-        "policy_kwargs.net_arch": [{"pi": [256, 256], "qf": [n, n]} for n in (256, 512, 1024)],
-    },
+SAMPLERS: dict[str, Callable[[int | None, int], BaseSampler]] = {
+    "tpe": lambda seed, startup: TPESampler(seed=seed, n_startup_trials=startup),
+    "gp": lambda seed, startup: GPSampler(
+        seed=seed, n_startup_trials=startup, warn_independent_sampling=False
+    ),
+    "nsgaii": lambda seed, startup: NSGAIISampler(seed=seed, population_size=max(startup, 2)),
+    "random": lambda seed, startup: RandomSampler(seed=seed),
 }
 
 
@@ -49,9 +50,12 @@ def space_of(algo: str) -> dict[str, Any]:
     :param algo: key of the algorithm
     :raises UsageError: there is no such algorithm, or one of the entries is wrong
     """
-    space = dict(SPACES.get(algo, {}))
-    for cls in reversed(algorithm(algo).__mro__):
+    space: dict[str, Any] = {}
+    for cls in reversed(algorithm(RELATIVES.get(algo, algo)).__mro__):
         space |= vars(cls).get("search_space", {})
+    if algo in RELATIVES:
+        names = annotations(algorithm(algo))
+        space = {name: entry for name, entry in space.items() if name.partition(".")[0] in names}
     return {n: _checked(n, entry, algo) for n, entry in space.items() if entry is not None}
 
 
@@ -79,8 +83,10 @@ def _checked(name: str, entry: Any, where: str) -> Any:
     with explained(f"search space: {name}: {entry} in {where}", fix=fix):
         if isinstance(entry, list) and len(entry) > 1:
             return entry
-        bounds = {**entry, **{key: _bound(entry[key]) for key in ("low", "high")}}
-        return {"log": False, **bounds} if _distribution(bounds) else None
+        bounds: dict[str, Any] = {key: _bound(entry[key]) for key in ("low", "high")}
+        bounds = {"log": False, **entry, **bounds}
+        (IntDistribution if _is_whole(bounds) else FloatDistribution)(**bounds)
+        return bounds
 
 
 def _bound(value: Any) -> int | float:
@@ -90,10 +96,9 @@ def _bound(value: Any) -> int | float:
     return number
 
 
-def _distribution(entry: Mapping[str, Any]) -> BaseDistribution:
-    """What Optuna draws from; it refuses bounds that are none."""
-    whole = isinstance(entry["low"], int) and isinstance(entry["high"], int)
-    return (IntDistribution if whole else FloatDistribution)(**entry)
+def _is_whole(entry: Mapping[str, Any]) -> bool:
+    """Whether a range draws whole numbers."""
+    return isinstance(entry["low"], int) and isinstance(entry["high"], int)
 
 
 def _label(option: Any) -> Any:
@@ -105,42 +110,30 @@ def _draw(trial: optuna.Trial, name: str, entry: Any) -> Any:
     if isinstance(entry, list):
         labels = [_label(option) for option in entry]
         return entry[labels.index(trial.suggest_categorical(name, labels))]
-    whole = isinstance(_distribution(entry), IntDistribution)
-    return trial.suggest_int(name, **entry) if whole else trial.suggest_float(name, **entry)
+    suggest = trial.suggest_int if _is_whole(entry) else trial.suggest_float
+    return suggest(name, **entry)
 
 
 def _contains(entry: Any, value: Any) -> bool:
     if isinstance(entry, list):
         return value in entry
-    whole = isinstance(_distribution(entry), IntDistribution)
-    number = type(value) is int or (type(value) is float and not whole)
+    number = type(value) is int or (type(value) is float and not _is_whole(entry))
     return number and entry["low"] <= value <= entry["high"]
 
 
 def set_dotted(values: Mapping[str, Any], name: str, value: Any) -> dict[str, Any]:
     """A copy of hyperparameters with one changed, which may lie in a mapping: ``a.b``."""
     outer, dot, inner = name.partition(".")
-    if not dot:
-        return {**values, outer: value}
-    return {**values, outer: set_dotted(values.get(outer) or {}, inner, value)}
+    if dot:
+        value = set_dotted(values.get(outer) or {}, inner, value)
+    return {**values, outer: value}
 
 
 def get_dotted(values: Mapping[str, Any], name: str) -> Any:
     """One of the hyperparameters, which may lie in a mapping; None if there is none."""
     outer, dot, inner = name.partition(".")
     value = values.get(outer)
-    if not dot:
-        return value
-    return get_dotted(value, inner) if isinstance(value, Mapping) else None
-
-
-def _named(value: Any) -> Any:
-    """Data that :func:`~sb3_guard.zoo.cli.names.with_classes` makes these objects of."""
-    if isinstance(value, Mapping):
-        return {name: _named(item) for name, item in value.items()}
-    if isinstance(value, type):
-        return f"{value.__module__}.{value.__qualname__}"
-    return value
+    return get_dotted(value or {}, inner) if dot else value
 
 
 class Search:
@@ -150,7 +143,7 @@ class Search:
     :param algo: key of the algorithm
     :param base: hyperparameters of the trials where the space says nothing
     :param space: what to search; None: that of the algorithm
-    :param fixed: names that are not searched, since the user has fixed them
+    :param fixed: hyperparameters that are not searched, since the user has fixed them
     :raises UsageError: there is no space for the algorithm, or nothing is left of it
     """
 
@@ -158,32 +151,22 @@ class Search:
         self,
         algo: str,
         base: Mapping[str, Any],
-        space: Space | None = None,
+        space: Mapping[str, Any] | None = None,
         fixed: Mapping[str, Any] | None = None,
     ):
-        from rl_zoo3.hyperparams_opt import HYPERPARAMS_SAMPLER
-
         self.algo = algo
         self.base = {name: as_data(name, value) for name, value in base.items()}
-        self._fixed = dict(fixed or {})
         space = space_of(algo) if space is None else space
-        self._rl_zoo = None if space else HYPERPARAMS_SAMPLER.get(algo)
-        if not space and self._rl_zoo is None:
+        if not space:
             raise UsageError(
                 f"there is no search space for {algo}; give one with --search-space FILE.yml, or "
                 "as the attribute search_space of its class"
             )
-        self.space = {
-            name: entry
-            for name, entry in space.items()
-            if name not in self._fixed and name.partition(".")[0] not in self._fixed
-        }
-        if not self.space and self._rl_zoo is None:
+        names = {name for name in space if not {name, name.partition(".")[0]} & {*(fixed or ())}}
+        #: entries by name, as data
+        self.space = {name: entry for name, entry in space.items() if name in names}
+        if not self.space:
             raise UsageError("nothing is left to search: -params fixes the whole space")
-
-    def description(self) -> Any:
-        """The space as plain data, or whose it is."""
-        return "rl_zoo3" if self._rl_zoo is not None else self.space
 
     def corners(self) -> list[dict[str, Any]]:
         """The base with each option or bound in turn, to be checked."""
@@ -195,30 +178,9 @@ class Search:
 
     def draw(self, trial: optuna.Trial) -> dict[str, Any]:
         """All hyperparameters of a trial, plain data."""
-        if self._rl_zoo is not None:
-            return self._draw_rl_zoo(trial)
         values = self.base
         for name, entry in self.space.items():
             values = set_dotted(values, name, _draw(trial, name, entry))
-        return dict(sorted(values.items()))
-
-    def _draw_rl_zoo(self, trial: optuna.Trial) -> dict[str, Any]:
-        """RL-Zoo's samplers give objects; a file holds data."""
-        assert self._rl_zoo is not None
-        extra = {"using_her_replay_buffer": False, "her_kwargs": {}}
-        drawn = self._rl_zoo(trial, 1, self.base.get("n_envs", 1), extra)
-        # Made of two parameters, which are data; none may be drawn where the base has some.
-        drawn.pop("action_noise", None)
-        drawn |= {name: trial.params[name] for name in NOISE_KEYS if name in trial.params}
-        values = dict(self.base)
-        for name, value in drawn.items():
-            if name in self._fixed:
-                continue
-            if name == "policy_kwargs":
-                value = {**(values.get(name) or {}), **_named(value)}
-            values[name] = value
-        if values.get("noise_type") is None:
-            values.pop("noise_std", None)
         return dict(sorted(values.items()))
 
     def first(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -238,34 +200,3 @@ class Search:
             elif value is not None:
                 outside[name] = value
         return places, outside
-
-
-def rl_zoo_sampler(algo: str, base: Mapping[str, Any]) -> Callable[..., dict[str, Any]]:
-    """
-    The space of an algorithm as one of RL-Zoo's samplers, which return arguments of the model.
-
-    RL-Zoo replaces ``policy_kwargs`` as a whole, so what is not drawn of it comes from ``base``;
-    how many environments there are is not for its samplers to say.
-
-    :param base: hyperparameters of the trials where the space says nothing
-    """
-    search = Search(algo, base, fixed={name: base.get(name) for name in RUN_KEYS})
-    names = {name.partition(".")[0] for name in search.space}
-
-    def sample(
-        trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        values = search.draw(trial)
-        return {name: with_classes(name, values[name]) for name in names}
-
-    return sample
-
-
-SAMPLERS: dict[str, Callable[[int | None, int], BaseSampler]] = {
-    "tpe": lambda seed, startup: TPESampler(seed=seed, n_startup_trials=startup),
-    "gp": lambda seed, startup: GPSampler(
-        seed=seed, n_startup_trials=startup, warn_independent_sampling=False
-    ),
-    "nsgaii": lambda seed, startup: NSGAIISampler(seed=seed, population_size=max(startup, 2)),
-    "random": lambda seed, startup: RandomSampler(seed=seed),
-}

@@ -1,7 +1,7 @@
 """Optuna's storages for studies that many processes share, and the trials whose worker is gone.
 
 A worker on PostgreSQL gives signs of life, and Optuna queues the trial of a silent one again. A
-journal file is for one machine: there, whether a worker is gone is asked of the operating system.
+journal file is for one machine: there, whoever starts asks the operating system which are gone.
 """
 
 import os
@@ -64,27 +64,17 @@ def open_storage(address: str | None, journal: Path) -> tuple[Storage, str]:
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = JournalFileOpenLock(str(path))
-        if path.exists():
-            _check_journal(path, lock)
+        lock.acquire()
+        try:
+            with path.open("ab+") as file:
+                file.seek(0)
+                content = file.read()
+                if content and not content.startswith(_START):
+                    raise ValueError("it is not an Optuna journal")
+                file.truncate(content.rfind(b"\n") + 1)  # a last line that a full disk has cut
+        finally:
+            lock.release()
         return JournalStorage(JournalFileBackend(str(path), lock)), str(path)
-
-
-def _check_journal(path: Path, lock: JournalFileOpenLock) -> None:
-    """
-    Refuse a file of another kind, and drop a last line that a full disk cut.
-
-    :raises ValueError: it is not a journal
-    """
-    head = path.read_bytes()[: len(_START)]
-    if head != _START[: len(head)]:
-        raise ValueError("it is not an Optuna journal")
-    lock.acquire()
-    try:
-        content = path.read_bytes()
-        if not content.endswith(b"\n"):  # what is appended to such a line can't be read
-            os.truncate(path, content.rfind(b"\n") + 1)
-    finally:
-        lock.release()
 
 
 def _open_database(address: str) -> tuple[Storage, str]:
@@ -152,7 +142,7 @@ def repeat(study: optuna.Study, trial: FrozenTrial, most: int | None = MOST_REPE
 def repeat_lost_trials(study: optuna.Study, storage: Storage) -> None:
     """Queue the trials again whose worker is gone."""
     fail_stale_trials(study)
-    for trial in study.get_trials():
+    for trial in study.get_trials(states=(TrialState.RUNNING, TrialState.FAIL)):
         if _is_lost(trial, storage):
             # Another worker may do the same at the same moment.
             with suppress(ValueError, UpdateFinishedTrialError):
@@ -161,18 +151,12 @@ def repeat_lost_trials(study: optuna.Study, storage: Storage) -> None:
                 repeat(study, trial)
 
 
-def _is_old(moment: datetime | None) -> bool:
-    return moment is not None and datetime.now() - moment > timedelta(seconds=GRACE)
-
-
 def _is_lost(trial: FrozenTrial, storage: Storage) -> bool:
-    if trial.state == TrialState.FAIL:  # whoever noticed it was killed before it was queued
-        return _is_old(trial.datetime_complete)
-    if trial.state != TrialState.RUNNING:
-        return False
-    if WORKER not in trial.user_attrs:  # killed before its first sign of life
-        return _is_old(trial.datetime_start)
-    host, _, process = trial.user_attrs[WORKER].rpartition("-")
+    host, _, process = trial.user_attrs.get(WORKER, "").rpartition("-")
+    if trial.state == TrialState.FAIL or not host:
+        # Killed between two writes: before it said who it is, or before it queued what it failed.
+        moment = trial.datetime_complete or trial.datetime_start
+        return moment is not None and datetime.now() - moment > timedelta(seconds=GRACE)
     local = isinstance(storage, JournalStorage) and host == socket.gethostname()
     return local and not _is_alive(int(process))
 

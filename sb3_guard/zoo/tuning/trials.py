@@ -9,7 +9,7 @@ import os
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,8 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.hyperparams import check
 from sb3_guard.zoo.run.make_envs import PROCESS_DIED
-from sb3_guard.zoo.run.run import Run, differences
+from sb3_guard.zoo.run.run import Run
 from sb3_guard.zoo.tuning.flags import TuneFlags
-from sb3_guard.zoo.tuning.report import short
 from sb3_guard.zoo.tuning.spaces import Search
 from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
 
@@ -33,7 +32,7 @@ from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
 FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError)
 FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
 INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
-GIVEN = "given"  # its hyperparameters are those of the file
+GIVEN = "given"  # attribute of the trial whose hyperparameters are those that train would use
 
 
 @dataclass(frozen=True)
@@ -68,28 +67,9 @@ class Settings:
 
     def outcome(self, mean: Sequence[float]) -> dict[str, float]:
         """Return, costs by key, and by how much they exceed their limits in all."""
-        costs, violation = list(mean[1:]), 0.0
-        if self.cost_limit is not None:
-            violation = float(np.maximum(np.subtract(costs, self.cost_limit), 0.0).sum())
-        named = dict(zip(self.cost_keys, costs, strict=True))
-        return {"return": mean[0], **named, "violation": violation}
-
-    def refuse_others(self, saved: Mapping[str, Any], study: str) -> None:
-        """
-        Compare with those that a study was begun with.
-
-        :raises UsageError: they are not the same
-        """
-
-        def flat(settings: Mapping[str, Any]) -> dict[str, Any]:
-            values = {f"hyperparams {n}": value for n, value in settings["hyperparams"].items()}
-            return {**settings, "hyperparams": None, **values}
-
-        for name, old, value in differences(flat(saved), flat(asdict(self))):
-            raise UsageError(
-                f"study {study!r} was begun with {name} {old}, not {value}: "
-                "continue it as it was begun, or begin another with --study-name"
-            )
+        over = np.subtract(mean[1:], np.inf if self.cost_limit is None else self.cost_limit)
+        costs = dict(zip(self.cost_keys, mean[1:], strict=True))
+        return {"return": mean[0], **costs, "violation": float(np.maximum(over, 0.0).sum())}
 
 
 class Stopped(Exception):
@@ -216,8 +196,8 @@ class Objective:
         trial.set_user_attr("hyperparams", values)
         settings, finished = self.settings, list[list[list[float]]]()
         last = settings.n_evaluations * len(settings.seeds)
-        # The best is to be compared with the file's hyperparameters: they are never pruned.
-        given = trial.user_attrs.get(GIVEN, False)
+        # The best is to be compared with the first trial's hyperparameters: it is never pruned.
+        prunes = not (settings.pareto or trial.user_attrs.get(GIVEN, False))
         mean: list[float] = []
 
         def after(history: list[list[float]]) -> bool:
@@ -225,16 +205,14 @@ class Objective:
             mean[:] = np.mean([rows[-1] for rows in [*finished, history]], axis=0).tolist()
             outcome = settings.outcome(mean)
             trial.set_user_attr("result", outcome)
-            step = settings.n_evaluations * len(finished) + len(history)
-            if self.flags.verbose and step < last:
-                costs = ", ".join(map(short, mean[1:]))
-                print(f"Trial {trial.number}: return {short(mean[0])}, cost {costs} after {step} "
-                      f"of {last} evaluations", flush=True)  # fmt: skip
             if settings.pareto:
                 return True
-            violation = outcome["violation"]
+            step, violation = (
+                len(finished) * settings.n_evaluations + len(history),
+                outcome["violation"],
+            )
             trial.report(INFEASIBLE - violation if violation else mean[0], step)
-            return step == last or given or not trial.should_prune()
+            return step == last or not (prunes and trial.should_prune())
 
         for seed in settings.seeds:
             # A trial that is done again has kept the seeds that were done.

@@ -1,12 +1,15 @@
 """Write the leaderboard, docs/leaderboard.md: ``python scripts/leaderboard.py``.
 
 Made are the tables of the page, and ``rows.csv`` in ``sb3_guard/zoo/results`` for ``sb3-guard
-reproduce``, from the packed logs of the grand table (``scripts/grand_table.py``) and from those
-that were sent in, ``docs/data/sent_*.tar.xz`` (``scripts/check_runs.py``).
+reproduce``, from the packed logs of the grand table. ``--train FOLDER`` trains the grand table, the
+grids ``docs/data/grand_table*.yml`` in the order of ``GRIDS``, and continues where it was stopped;
+``--pack FOLDER`` packs the logs of the runs that are finished there into ``docs/data``.
 """
 
 import argparse
 import re
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,9 +17,7 @@ from typing import Any
 
 import pandas as pd
 import yaml
-from archives import DATA, DOCS, archives, unpacked
-from check_runs import MILLION, SEEDS, limit_of
-from grand_table import GRIDS
+from archives import DATA, DOCS, archives, pack, unpacked
 from results import percent
 
 from sb3_guard.reproduce import final_hash, measures
@@ -32,8 +33,27 @@ from sb3_guard.zoo.run.make_envs import full_id
 PAGE = DOCS / "leaderboard.md"
 ROWS = DOCS.parent / "sb3_guard" / "zoo" / "results" / "rows.csv"
 BLOCK = re.compile(r"(<!-- (glance|leaderboard|untrained) -->\n).*?(<!-- end -->)", re.DOTALL)
+# Grid and folder, whose name is that of its archive; several grids may share one.
+GRIDS = (
+    ("grand_table", "grand_table"),
+    ("grand_table_guard", "grand_table_guard"),
+    ("grand_table_guard_seeds", "grand_table_guard"),
+    ("grand_table_10m", "grand_table_10m"),
+    ("grand_table_off_policy", "grand_table"),
+    ("grand_table_2m", "grand_table_2m"),
+    ("grand_table_tasks", "grand_table"),
+    ("grand_table_algorithms", "grand_table"),
+)
+FOLDERS = (*dict.fromkeys(folder for _, folder in GRIDS),)
 PLANNED = GRIDS[:5]  # a row of these that is missing is shown, with the command that fills it
 MARKS = {"certified": " ✓", "violating": " ✗"}
+MILLION = 1_000_000
+SEEDS = 3  # from which on a certified row has a place
+
+
+def limit_of(env_id: str) -> float:
+    """The cost limit that the rows of an environment are judged by."""
+    return 25.0 if env_id.startswith("Safety") else 2.0
 
 
 def planned() -> pd.DataFrame:
@@ -61,13 +81,6 @@ def training(suite: str, algo: str, budget: int, seeds: Iterable[int]) -> str:
     )
 
 
-def packed() -> list[str]:
-    """Names of the packed logs that the page is made from."""
-    names = [*dict.fromkeys(name for _, name in GRIDS)]
-    names += sorted(path.name.removesuffix(".tar.xz") for path in DATA.glob("sent_*.tar.xz"))
-    return [name for name in names if archives(name)]
-
-
 def read() -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     What the packed logs say.
@@ -78,7 +91,8 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     pages, runs = [], []
     with ExitStack() as stack:
-        grids = [stack.enter_context(unpacked(name)).runs.assign(grid=name) for name in packed()]
+        names = [name for name in FOLDERS if archives(name)]
+        grids = [stack.enter_context(unpacked(name)).runs.assign(grid=name) for name in names]
         if not grids:
             return pd.DataFrame(), pd.DataFrame()
         all_ = with_safety(pd.concat(grids, ignore_index=True))
@@ -91,10 +105,6 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
                 kept |= {"final": final_hash(result), "seconds": round(result["seconds"])}
                 runs.append({"row": run["row"], **kept, **measures(result)})
         all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)
-        # A seed that was sent in joins the row that lacks it.
-        kind = ["suite", "algo", "budget", "config"]
-        firsts = all_.groupby(kind)["grid"].transform("first")
-        all_["grid"] = all_["grid"].where(all_.duplicated([*kind, "seed"]), firsts)
         for (_, budget), group in all_.groupby(["grid", "budget"], sort=False):
             own = select(group)
             extra = own.groupby(["suite", "algo"]).agg(
@@ -121,8 +131,7 @@ def leaderboard(rows: pd.DataFrame) -> str:
         here = rows.query("suite == @suite and budget == @budget") if len(rows) else rows
         plan = wanted.query("suite == @suite and budget == @budget").set_index("algo")["seeds"]
         lines = [*_ranked(here, plan)] if len(here) else []
-        trained = here.loc[here["row"].str.startswith("grand_table"), "algo"] if len(here) else []
-        for algo in plan.index.difference(trained, sort=False):
+        for algo in plan.index.difference(here["algo"] if len(here) else [], sort=False):
             command = training(suite, algo, budget, plan[algo])
             lines.append(_line("–", label_of(algo), f"`{command}`", grey=True))
         if suite in untrained.index:
@@ -150,8 +159,7 @@ def _ranked(rows: pd.DataFrame, plan: "pd.Series[Any]") -> Iterator[dict[str, st
     for place, row in enumerate(order.to_dict("records"), 1):
         other = greedy.loc[row["row"]]
         digits = 0 if abs(row["return"]) >= 100 else 1
-        of_table = row["row"].startswith("grand_table")
-        seeds = plan.get(row["algo"], []) if of_table else []
+        seeds = plan.get(row["algo"], [])
         missing = [seed for seed in seeds if seed not in row["there"]]
         commands = [f"sb3-guard reproduce {row['row']}"]
         if missing:
@@ -249,8 +257,32 @@ def page(rows: pd.DataFrame) -> str:
     return BLOCK.sub(lambda m: f"{m[1]}\n{made[m[2]]()}\n\n{m[3]}", PAGE.read_text())
 
 
+def train(grid: str, folder: Path, jobs: int) -> None:
+    """
+    Carry out what is not done of a grid.
+
+    :raises SystemExit: it was interrupted, or can't be carried out
+    """
+    flags = ["--grid", str(DATA / f"{grid}.yml"), "-f", str(folder), "--jobs", str(jobs)]
+    status = subprocess.run([sys.executable, "-m", "sb3_guard.benchmark", *flags]).returncode
+    if status not in (0, 1):  # 1: some runs have failed
+        raise SystemExit(status)
+
+
 def main() -> None:
-    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args()
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--train", type=Path, metavar="FOLDER", help="train the grand table there")
+    parser.add_argument("--jobs", type=int, default=2, help="runs at once (default: 2)")
+    parser.add_argument("--pack", type=Path, metavar="FOLDER", help="pack what is finished there")
+    args = parser.parse_args()
+    if args.train:
+        for grid, name in GRIDS:
+            train(grid, args.train / name, args.jobs)
+        return
+    for name in FOLDERS if args.pack else ():
+        if any((args.pack / name).rglob("result.json")):
+            pack(args.pack / name, name, by_environment=True)
+            print(DATA / name)
     rows, runs = read()
     PAGE.write_text(page(rows))
     runs.to_csv(ROWS, index=False)

@@ -1,6 +1,6 @@
 """Ship the best certified agents of the grand table: ``python scripts/pretrain.py logs/grand``.
 
-The runs below the folder are those that ``scripts/grand_table.py`` writes. A run is
+The runs below the folder are those that ``scripts/leaderboard.py --train`` writes. A run is
 certified if the 95 % intervals of the mean cost of its final episodes, with sampled actions and
 with the most likely ones, end at or below the limit; of an environment's certified runs that with
 the highest return is taken. With less than a tenth of the best run's return, of whatever cost, it

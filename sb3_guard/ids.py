@@ -20,6 +20,10 @@ class UnknownId(ValueError):
     """An id that names no environment."""
 
 
+class UnknownPart(ValueError):
+    """The name of a robot, task or constraint that is not registered in this process."""
+
+
 def with_version(name: str, others: Iterable[str] = ()) -> str:
     """An id in full: without a version, the latest that is registered with Gymnasium, else v0.
 

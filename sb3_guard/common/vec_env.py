@@ -6,8 +6,11 @@ For an environment of sb3_guard, :func:`make_vec_env` makes a
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -18,6 +21,7 @@ from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.common.sources import Source, find
 from sb3_guard.fields import fit
+from sb3_guard.ids import UnknownPart
 from sb3_guard.spelling import did_you_mean
 
 if TYPE_CHECKING:
@@ -100,7 +104,11 @@ def make_vec_env(
             env = env if wrapper_class is None else wrapper_class(env)
             return CheckedEnv(env, keys, raises=vec_env != "subproc")
 
-        venv = VEC_ENVS[vec_env]([make_one] * int(n_envs))
+        venv = (
+            _subprocesses(make_one, n_envs)
+            if vec_env == "subproc"
+            else DummyVecEnv([make_one] * int(n_envs))
+        )
     else:
         raise ValueError(
             f"unknown vec_env {vec_env!r}: {did_you_mean(vec_env, ['native', *VEC_ENVS])}"
@@ -108,3 +116,34 @@ def make_vec_env(
     if seed is not None:
         venv.seed(seed)
     return CostMonitor(venv, monitor_path, **(monitor_kwargs or {}))
+
+
+def _subprocesses(make: Callable[[], gymnasium.Env], n_envs: int) -> VecEnv:
+    """
+    A process each.
+
+    :raises ValueError: an environment can't be made there, with what the process says of it
+    """
+    with TemporaryDirectory() as folder:
+
+        def make_or_tell() -> gymnasium.Env:
+            try:
+                return make()
+            except Exception as error:
+                text = f"{type(error).__name__}: {error}"
+                if isinstance(error, UnknownPart):
+                    text += (
+                        "; a process imports the main module anew, without what is under if "
+                        "__name__ == '__main__': register parts above that, or in a module"
+                    )
+                with suppress(OSError):  # another one has told already
+                    Path(folder, str(os.getpid())).write_text(text)
+                raise SystemExit(1) from error
+
+        try:
+            return VEC_ENVS["subproc"]([make_or_tell] * int(n_envs))
+        except (EOFError, ConnectionError):
+            said = max((path.read_text() for path in Path(folder).iterdir()), key=len, default="")
+            if not said:
+                raise
+            raise ValueError(f"a process of vec_env='subproc' says {said}") from None

@@ -21,6 +21,7 @@ from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import Layout
 from sb3_guard.envs.observation import Lidar
 from sb3_guard.envs.registry import CONSTRAINTS, KEYWORDS, OPTIONS, ROBOTS, TASKS
+from sb3_guard.ids import UnknownPart
 from sb3_guard.spelling import did_you_mean
 
 Params = Mapping[str, Any]
@@ -91,7 +92,7 @@ class Scenario:
                     f"into {kind}_params"
                 )
             if name not in known:
-                raise ValueError(f"unknown {kind} {name!r}: {did_you_mean(name, known)}")
+                raise UnknownPart(f"unknown {kind} {name!r}: {did_you_mean(name, known)}")
         if not isinstance(self.constraints, Mapping):
             raise ValueError(
                 f"constraints = {self.constraints!r} must be a mapping of names to parameters, "

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from cost_envs import CostPoint
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from worlds import own_parts
 
-from sb3_guard import CostMonitor, Scenario, make_vec_env
+from sb3_guard import CostMonitor, Scenario, make_vec_env, train
 from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.common.sources import find
+from sb3_guard.envs import registry
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.make_envs import full_id
 from sb3_guard.zoo.run.run import Run
@@ -153,6 +155,25 @@ def test_bad_requests_are_refused_in_one_line(env_id, kwargs, message):
     with pytest.raises(ValueError, match=message) as caught:
         make_vec_env(env_id, **kwargs)
     assert "\n" not in str(caught.value)
+
+
+def test_parts_that_other_processes_do_not_have_are_named_in_a_line(capfd):
+    with own_parts():
+        registry.ROBOTS["Mine"] = registry.ROBOTS["Point"]
+        words = "unknown robot 'Mine' .* what is under if __name__ == '__main__': register parts"
+        with pytest.raises(ValueError, match=words) as caught:
+            make_vec_env("Goal_Mine_2Hazards", 2, vec_env="subproc")
+    assert "\n" not in str(caught.value) and capfd.readouterr()[1] == ""
+
+
+def test_processes_import_what_the_command_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    lines = "from sb3_guard.envs.registry import ROBOTS", "ROBOTS['Mine'] = ROBOTS['Point']"
+    (tmp_path / "mine.py").write_text("\n".join(lines))
+    words = "--env Goal_Mine_2Hazards --gym-packages mine --vec-env subproc -n 20 --eval-freq -1"
+    params = ["-params", "n_envs:2", "n_steps:10", "cost_limit:2"]
+    with own_parts():
+        assert train.main([*words.split(), *params, "-f", "logs"]) == 0
 
 
 def test_single_rows_cannot_be_reached_and_the_error_says_what_to_do():

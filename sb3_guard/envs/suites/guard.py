@@ -9,7 +9,7 @@ from itertools import product
 
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.suites.suite import Fields, Suite
-from sb3_guard.ids import IMPORT_FIRST
+from sb3_guard.ids import IMPORT_FIRST, UnknownPart
 from sb3_guard.spelling import did_you_mean, nearest
 
 LADDER = (1, 2, 4, 8, 16)  # numbers of a constraint's objects, by growing difficulty
@@ -37,7 +37,7 @@ def parse(name: str) -> Fields | None:
     known = {"robot": list(ROBOTS), "task": list(TASKS), "constraint": list(CONSTRAINTS)}
     wrong = [kind for kind, names in known.items() if match[kind] not in names]
     if wrong:
-        raise ValueError(_unknown(match, wrong, known))
+        raise UnknownPart(_unknown(match, wrong, known))
     num = {"num": int(match["num"])}
     if "num" not in CONSTRAINTS[match["constraint"]].__dataclass_fields__:  # type: ignore
         if match["num"] != "1":

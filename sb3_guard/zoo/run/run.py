@@ -284,8 +284,11 @@ class Run:
         vec_env = vec_env or flags.vec_env
         packages, single = flags.gym_packages, _wrappers(setup.env_wrapper, evaluation)
 
-        def wrap(env: gym.Env) -> gym.Env:
+        def make(**arguments: Any) -> gym.Env:
             import_packages(packages)  # which a process of its own has not imported
+            return source.make(**arguments)
+
+        def wrap(env: gym.Env) -> gym.Env:
             for cls, arguments in single:
                 env = cls(env, **arguments)
             return ResumableEnv(env)
@@ -296,7 +299,7 @@ class Run:
             # Processes see no interrupt, so that a rollout under way can be finished.
             with explained(f"can't make {source.env_id}{drawn}", *errors), interrupts_held():
                 env = make_vec_env(
-                    source,
+                    source._replace(make=make),
                     n_envs,
                     seed,
                     vec_env=vec_env,

@@ -64,16 +64,10 @@ TRAIN = [
     ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost key 'heat'"]),
     # hyperparameters
     (["-params", "n_step:10"], ["no hyperparameter 'n_step'", "did you mean 'n_steps'?"]),
-    (["-params", "n_steps:ten"], ["n_steps: 'ten'", "an integer"]),
-    (["-params", "n_steps:-5"], ["n_steps: -5", "at least 1"]),
     (["-params", "n_envs:0"], ["n_envs: 0", "at least 1"]),
     (["-params", "n_envs"], ["'n_envs' is not of the form key:value"]),
     (["-params", "gamma:1.5"], ["gamma", "1.5"]),
-    (["-params", "gamma:nan"], ["gamma: 'nan'", "a number"]),
-    (["-params", "target_kl:0"], ["target_kl"]),
-    (["-params", "learning_rate:-1"], ["learning_rate"]),
     (["-params", "cost_limit:[1.0,2.0]"], ["cost_limit", "cost"]),
-    (["-params", "cost_limit:nan"], ["cost_limit: 'nan'"]),
     (["--algo", "cup", "-params", "gamma:1"], ["gamma=1.0: CUP weighs costs", "such as 0.99"]),
     (["--algo", "cup", "-params", "cost_limit:[1.0,2.0]"], ["one for each of the 1 cost keys"]),
     (["--algo", "focops", "-params", "lambda_init:2", "lambda_max:1"],
@@ -81,40 +75,25 @@ TRAIN = [
     (["--algo", "sac_lag", "--env", "CartPole-v1", "-params", "missing_cost:zero", "cost_limit:1"],
      ["continuous actions (Box)", "PPOLag"]),
     (["-params", "policy:MlpPolcy"], ["no policy 'MlpPolcy'", "did you mean 'MlpPolicy'?"]),
-    (["-params", "policy:Foo"], ["no policy 'Foo'", "allowed: ", "MlpPolicy", "dotted name"]),
-    (["-params", "policy:no.such.Policy"], ["no.such.Policy' is not of", "--gym-packages no.such"]),
     (["-params", "selection_limit:[1,2]"],
      ["selection_limit=[1.0, 2.0]", "one number, or one for each of the 1 cost keys", "cost"]),
-    (["-params", "selection_limit:[]"], ["selection_limit=[]", "one number"]),
     ([*LIMITED, "--env-kwargs", "cost_keys:('cost','heat')", "-params", "cost_keys:['cost','heat']",
       "selection_limit:[1]"], ["selection_limit=[1.0]", "heat"]),
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
-    (["-params", "seed:3"], ["use the flag --seed"]),
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
     (["--gym-packages", "../x"], ["--gym-packages '../x' is not the name of a module"]),
-    (["--gym-packages", "robots.py"], ["'robots.py' is not the name of a module, such as my_rob"]),
     (["--gym-packages", ".x"], ["--gym-packages: can't import '.x'"]),
-    (["--gym-packages", ""], ["--gym-packages '' is not the name"]),
     (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown argument --sede", "--seed"]),
     (["cpo"], ["unknown argument cpo"]),
-    (["-params", "frame_stack:0"], ["frame_stack: 0", "at least 1"]),
-    (["-n", "0"], ["-n", "at least 1"]),
     (["-n", "1.5"], ["'1.5' is not a whole number"]),
-    (["-n", "many"], ["'many' is not a whole number"]),
-    (["--seed", "one"], ["--seed", "'one'"]),
     (["--seed", "4294967296"], ["--seed: '4294967296'", "2**32"]),
-    (["--eval-episodes", "0"], ["--eval-episodes", "at least 1"]),
     (["--n-eval-envs", "-2"], ["--n-eval-envs", "at least 1"]),
-    (["--checkpoint-every", "nan"], ["--checkpoint-every: 'nan'"]),
-    (["--log-interval", "0"], ["--log-interval: '0'"]),
     (["--device", "abacus"], ["abacus"]),
     (["-i", "absent"], ["no run folder absent"]),
     ([*LIMITED, "-i", "absent.zip"], ["can't load absent.zip", "No such file"]),
     ([*LIMITED, "-tb", "/dev/null"], ["--tensorboard-log", "'/dev/null'", "choose another"]),
-    ([*LIMITED, "-tb", "/proc/foo/bar"],
-     ["--tensorboard-log", "'/proc/foo/bar'", "choose another"]),
 ]  # fmt: skip
 
 
@@ -129,11 +108,9 @@ ENJOY = [
     ([], ["there is no run of cpo on Goal_Point_8Hazards-v0 in 'logs'", "sb3-guard train"]),
     (["--exp-id", "7"], ["there is no run folder", "_7"]),
     (["-f", "nowhere"], ["'nowhere'"]),
-    (["--n-episodes", "0"], ["--n-episodes", "at least 1"]),
     (["--n-episodes", "1", "-n", "5"], ["not allowed with"]),
     (["--seed", "-1"], ["--seed: '-1'"]),
     (["--load-bets"], ["unknown argument --load-bets", "--load-best"]),
-    ([".."], ["unknown argument ..; did you mean --folder ..?"]),
 ]
 
 
@@ -476,34 +453,9 @@ def test_a_run_whose_files_were_edited(run, capsys):
     path.write_text(yaml.safe_dump(values))
 
 
-def test_a_terminal_that_is_not_utf_8(tmp_path):
-    """What it can't show becomes "?"; errors end after some 500 characters."""
-    code = "from sb3_guard.zoo.cli.usage import run, UsageError\n"
-    code += "def long(): print('±ρ'); raise UsageError('é' * 900)\nraise SystemExit(run(long))"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        env={**os.environ, "PYTHONIOENCODING": "ascii"},
-    )
-    assert (done.returncode, done.stdout) == (2, b"??\n")
-    assert len(done.stderr) < 520
-
-
-OUTPUT = (
-    "--algo ppo --env CostPoint-v0 -n 64 --eval-freq -1 --device cpu "
-    "--gym-packages registered_envs -params n_steps:32 batch_size:32 n_envs:1 -f"
-).split()
-
-
-@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
-def test_output_that_nobody_reads(tmp_path, vec_env):
-    """As with ``| head -3``, which is no process of environments that died."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    done = subprocess.run(
-        [sys.executable, "-m", "sb3_guard.train", *OUTPUT, str(tmp_path), "--vec-env", vec_env],
-        stdout=writer, stderr=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": str(SUPPORT), "PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
-    os.close(writer)
-    assert done.returncode == 141 and b"subproc" not in done.stderr
+def test_a_terminal_that_is_not_utf_8():
+    """What it can't show becomes "?"."""
+    code = "from sb3_guard.zoo.cli.usage import run\nrun(lambda: print('±ρ') or 0)"
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment)
+    assert (done.returncode, done.stdout) == (0, b"??\n")

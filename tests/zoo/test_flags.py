@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import pytest
 
-from sb3_guard.zoo.cli.flags import HOST, IDENTITY, Command, command, flag
+from sb3_guard.zoo.cli.flags import HOST, IDENTITY, Command, flag
 from sb3_guard.zoo.cli.usage import UsageError, positive
 from sb3_guard.zoo.run.flags import RunFlags
 
@@ -54,11 +54,8 @@ def test_typed_attributes_and_what_was_given():
     ("arguments", "message"),
     [
         (["--lenght=3"], "unknown argument --lenght; did you mean --length"),
-        (["-lenght"], "unknown argument -lenght; did you mean --length"),
         (["big", "--zzz"], "unknown argument --zzz; see --help"),
-        (["big", "small"], "unknown argument small; see --help"),
         (["-n", "0"], "-n/--length: '0' is not allowed"),
-        (["-n", "2.5"], "'2.5' is not a whole number"),
         (["medium"], "invalid choice: 'medium'"),
         (["-params", "a"], "-params: 'a' is not of the form key:value"),
         (["--seed", "1", "--seeds", "1"], "not allowed with argument --seed"),
@@ -85,7 +82,6 @@ def test_a_files_values_are_checked_the_same_way():
         ({"seed": 1}, "x.yml: unknown entry 'seed'"),
         ({"length": 0}, "x.yml: length: 0 is not allowed"),
         ({"length": [3]}, "length: .*must be an integer"),
-        ({"length": True}, "length: True is not allowed"),
         ({"seeds": []}, "seeds: .*one value or a list"),
         ({"seeds": [1, 2.5]}, "seeds: .*not allowed"),
         ({"dry_run": "yes"}, "dry_run: 'yes' is not allowed; it must be true or false"),
@@ -105,13 +101,6 @@ def test_roles_and_help():
     text = Toy.parser().format_help()
     assert "secret" not in text and "factor, which may be 100 %" in text
     assert text.index("Play with flags.\n") < text.index("what there is:") < text.index("a bar")
-
-
-def test_main(capsys):
-    main = command(Toy, lambda toy: toy.length)
-    assert main(["-n", "7"]) == 7
-    assert main(["-n", "x"]) == 2
-    assert capsys.readouterr().err.startswith("error: argument -n/--length: 'x'")
 
 
 def test_every_flag_of_rl_zoo_is_there():

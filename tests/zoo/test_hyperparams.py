@@ -125,23 +125,16 @@ def test_arguments_are_the_leafs_and_the_bases():
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("n_steps", 1e3, 1000),
         ("n_steps", "1e3", 1000),
         ("n_timesteps", 6e6, 6_000_000),
         ("learning_rate", "1e-3", 0.001),
         ("learning_rate", 1, 1.0),
-        ("learning_rate", "lin_0.01", "lin_0.01"),
         ("batch_size", None, None),
-        ("batch_size", 64, 64),
         ("cost_limit", 25, 25.0),
         ("cost_limit", [1, 2.5], [1.0, 2.5]),
-        ("cost_keys", ["a", "b"], ["a", "b"]),
-        ("missing_cost", "zero", "zero"),
         ("normalize_advantage", False, False),
         ("policy_kwargs", "dict(log_std_init=-1)", {"log_std_init": -1}),
         ("policy_kwargs", "dict(activation_fn=nn.ReLU)", {"activation_fn": "nn.ReLU"}),
-        ("normalize", True, True),
-        ("selection_limit", 3, 3.0),
     ],
 )
 def test_values_in_their_proper_type(name, value, expected):
@@ -155,22 +148,14 @@ def test_values_in_their_proper_type(name, value, expected):
         ("n_steps", "many", "an integer"),
         ("n_steps", 2.5, "an integer"),
         ("n_steps", True, "an integer"),
-        ("n_steps", None, "an integer"),
-        ("n_steps", [1], "an integer"),
         ("n_steps", 0, "at least 1"),
-        ("n_envs", -3, "at least 1"),
-        ("n_timesteps", 0, "at least 1"),
-        ("gamma", "high", "a number"),
         ("gamma", float("nan"), "a number"),
         ("learning_rate", "fast", "a number or a schedule such as lin_0.001"),
         ("batch_size", 1.5, "an integer or null"),
-        ("batch_size", 0, "at least 1"),
         ("normalize_advantage", 1, "true or false"),
-        ("normalize_advantage", "yes", "true or false"),
         ("missing_cost", "ignore", "'error' or 'zero'"),
         ("cost_limit", "low", "a number or a schedule such as lin_50_25 or a list"),
         ("cost_keys", "cost", "a list of texts"),
-        ("policy", 3, "text or the dotted name of a class"),
         ("policy_kwargs", 3, "a mapping or null"),
     ],
 )
@@ -198,13 +183,6 @@ def test_how_often_to_train_in_episodes(value):
     for bad in ([1], ["episode", 1], [1, 2], "episode"):
         with pytest.raises(UsageError, match="an integer or a list of an integer and text"):
             check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": bad})
-
-
-def test_a_name_that_is_a_number(tmp_path):
-    (tmp_path / "conf.yml").write_text("default: {1: 2, n_steps: 3}")
-    values = read_hyperparams("cpo", "X-v0", str(tmp_path / "conf.yml"))
-    with pytest.raises(UsageError, match="cpo has no hyperparameter 1; "):
-        check("cpo", CPO, values)
 
 
 def test_names_that_are_flags():
@@ -261,10 +239,8 @@ def test_expressions_are_data_and_classes_of_torch(text, value):
         ("policy_kwargs", "dict(activation_fn=nn.Rellu)", "can't be evaluated.*Rellu"),
         ("policy_kwargs", "dict(a=open('x', 'w'))", "can't be evaluated.*open.* is not allowed"),
         ("policy_kwargs", "dict(a=th.hub.load)", "th.hub.load is not a class of torch"),
-        ("policy_kwargs", "dict(a=nn.Module.__subclasses__())", "is not allowed"),
         ("policy_kwargs", "dict([('a', exit())])", r"dict\(.* is not allowed; .*literals"),
         ("monitor_kwargs", "dict(a=[__import__('os')])", "__import__.* is not allowed"),
-        ("normalize", "dict(**{'a': 1})", "can't be evaluated"),
         ("normalize", "{'a': exit()}", r"exit\(\) is not allowed"),
         ("learning_rate", "lin_fast", "not a schedule"),
         ("policy", "no.such.Policy", "add --gym-packages no.such"),
@@ -280,13 +256,10 @@ def test_text_that_names_nothing(name, value, message):
     ("text", "value"),
     [
         ("1e-3", 0.001),
-        ("[1, 2]", [1, 2]),
         ("None", None),
-        ("{'num': 4}", {"num": 4}),
         ("{limit:0.4}", {"limit": 0.4}),
         ("dict(num=4, more=dict(a=[1]))", {"num": 4, "more": {"a": [1]}}),
         ("MlpPolicy", "MlpPolicy"),
-        ("lin_0.001", "lin_0.001"),
         ("'quoted'", "quoted"),
         ("dict(activation_fn=nn.ReLU)", "dict(activation_fn=nn.ReLU)"),
         ("", ""),

@@ -28,7 +28,6 @@ is a switch, ``bool | None`` has a ``--no-…``, ``list[int]`` takes several, ``
 import argparse
 import dataclasses
 import inspect
-import os
 import re
 import sys
 import types
@@ -130,8 +129,6 @@ class Command:
             word = unknown[0].split("=")[0]
             flags = (field.name for field, _ in cls._flags() if not field.metadata["positional"])
             near = nearest(word, map(_long, flags))
-            if os.path.isdir(word) and "folder" in cls.__dataclass_fields__:
-                near = f"--folder {word}"
             remedy = f"did you mean {near}?" if near else "see --help"
             raise UsageError(f"unknown argument {word}; {remedy}")
         parsed, given = vars(namespace), {}
@@ -294,12 +291,12 @@ def _typed(hint: Any, kind: Callable[[Any], Any] | None, value: Any) -> Any:
     if _is(hint, dict):
         return dict(value) if isinstance(value, Mapping) else dict(map(key_value, items))
     if _is(hint, list):
-        (item,) = typing.get_args(_bare(hint))
         if not items:
             raise TypeError
-        return [_typed(item, kind, value) for value in items]
+        made = typed(items, _bare(hint))
+        return [*map(kind, made)] if kind else made
     made = typed(value, _bare(hint))
-    return kind(value) if kind else made
+    return kind(made) if kind else made
 
 
 def _words(hint: Any) -> str:

@@ -20,8 +20,6 @@ import yaml
 from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.zoo.cli.values import parse_value
 
-LONGEST = 500  # characters of an error that are printed
-
 
 class UsageError(Exception):
     """Something the user can put right; the message names the value, what is allowed, the fix."""
@@ -133,27 +131,15 @@ def run(command: Callable[[], int]) -> int:
         status = command()
         sys.stdout.flush()
         return status
-    except (BrokenPipeError, UsageError, ImportError) as error:
-        # Python does not say which pipe is broken: ours, or one of an environment.
-        if isinstance(error.__cause__ or error, BrokenPipeError) and _nobody_reads():
-            return 141
-        if isinstance(error, BrokenPipeError):
-            raise
-        text = one_line(error)  # also of an absent package, or no backend for MuJoCo
-        print(f"error: {text if len(text) <= LONGEST else text[:LONGEST] + ' …'}", file=sys.stderr)
+    except (UsageError, ImportError) as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)  # also of an absent package
         return getattr(error, "status", 2)
+    except BrokenPipeError as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return 141
     except KeyboardInterrupt:
         return 130
-
-
-def _nobody_reads() -> bool:
-    """Whether the reader of standard output is gone, which another line tells; if so, stop it."""
-    try:
-        print(flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
-        return True
-    return False
 
 
 @contextmanager

@@ -1,9 +1,8 @@
 """Write the reference pages from the code: ``python scripts/make_docs.py``.
 
-Robots, tasks and constraints have a page each: the docstring, the place in the paper's taxonomy,
-the parameters with defaults and limits, and tables of actions, joints and observations. Further
-pages list all tasks and all constraints, the parameters that belong to no part, the files in
-``examples/``, the flags of the commands and the default hyperparameters.
+Robots, tasks and constraints have a page a kind: pictures, docstrings, the parameters with defaults
+and limits, what is added to the observation. Further pages list the parameters that belong to no
+part, the files in ``examples/``, the flags of the commands and the default hyperparameters.
 """
 
 from __future__ import annotations
@@ -16,29 +15,26 @@ import inspect
 import re
 from collections.abc import Iterable
 from pathlib import Path
-
-import mujoco
-import numpy as np
+from typing import Any
 
 from sb3_guard.cli import COMMANDS, module_of
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import Layout
-from sb3_guard.envs.movers import Movers
 from sb3_guard.envs.observation import Lidar
 from sb3_guard.envs.parameters import Parameters
-from sb3_guard.envs.part import Part, Robot
+from sb3_guard.envs.part import Part
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.envs.robots.from_file import ATTRIBUTES
-from sb3_guard.list import KINDS, summary, yes
-from sb3_guard.show import action_table, observation_table
+from sb3_guard.list import KINDS, summary
 from sb3_guard.zoo.cli.flags import Command
 from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.run.hyperparams import hyperparams_folder, read_file
 
 ROOT = Path(__file__).parents[1]
 # Robots that tell the sizes of an observation apart: in the plane, in space, with several lidars.
+BLOCK = re.compile(r"(<!-- robots -->\n).*?(<!-- end -->)", re.DOTALL)
 SIZED = ("Point", "Drone", "Arm3", "Arm6")
 GROUPS: dict[str, dict[str, type[Part]]] = {
     "robot": guard(ROBOTS),
@@ -85,10 +81,21 @@ OF_NO_PART: dict[str, tuple[type[Parameters], str]] = {
 }
 
 
+def key_of(field: Any) -> tuple[str, str, str]:
+    """Name, default and meaning of a parameter."""
+    return field.name, str(field.default), field.metadata.get("doc", "")
+
+
 def parameters(part: type[Parameters]) -> str:
     """A row per parameter: name, default, what it is and what is allowed."""
+    return parameter_table(dataclasses.fields(part))  # type: ignore[arg-type]
+
+
+def parameter_table(fields: Iterable[Any]) -> str:
+    """A row per parameter: name, default, what it is and what is allowed."""
     rows = []
-    for field in dataclasses.fields(part):  # type: ignore[arg-type]
+    for field in fields:
+        meaning = field.metadata.get("doc", "")
         limits = []
         for key, sign in (("above", "> "), ("low", "≥ "), ("high", "≤ ")):
             if field.metadata.get(key) is not None:
@@ -96,8 +103,7 @@ def parameters(part: type[Parameters]) -> str:
         if field.metadata.get("choices"):
             limits.append(", ".join(map(str, field.metadata["choices"])))
         if field.metadata.get("drawn"):
-            limits.append("may be [drawn](../customizing.md#domain-randomisation)")
-        meaning = field.metadata.get("doc", "")
+            limits.append("may be [drawn](customizing.md#domain-randomisation)")
         rows.append([f"`{field.name}`", f"`{field.default}`", meaning, "; ".join(limits)])
     return table(["parameter", "default", "what it is", "allowed"], rows)
 
@@ -106,7 +112,7 @@ def parameters_of_environments() -> str:
     """The page of the parameters that belong to no part, and of those that can be drawn."""
     parts = [
         "# Parameters",
-        "Robots, tasks and constraints have their parameters on their own pages. "
+        "[Robots](robots.md), [tasks](tasks.md) and [constraints](constraints.md) list their own. "
         "[Customizing](customizing.md) shows how to set them.",
     ]
     for name, (kind, about) in OF_NO_PART.items():
@@ -126,58 +132,6 @@ def parameters_of_environments() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def joints(robot: type[Robot]) -> str:
-    """A row per joint of a robot's file, with the gear of its actuator, and its touch sensors."""
-    model = mujoco.MjModel.from_xml_path(str(robot.path()))
-    gears = {
-        model.actuator(i).trnid[0]: f"{model.actuator(i).gear[0]:g}"
-        for i in range(model.nu)
-        if model.actuator(i).trntype[0] == mujoco.mjtTrn.mjTRN_JOINT
-    }
-    rows = []
-    for i in range(model.njnt):
-        joint = model.joint(i)
-        kind = mujoco.mjtJoint(joint.type[0]).name.removeprefix("mjJNT_").lower()
-        axis = " ".join(f"{x:g}" for x in np.round(joint.axis, 3)) if kind in "hinge slide" else ""
-        low, high = np.rad2deg(joint.range) if kind == "hinge" else joint.range
-        span = f"{low:.0f}° … {high:.0f}°" if kind == "hinge" else f"{low:g} … {high:g} m"
-        rest = [f"{getattr(joint, what)[0]:g}" for what in ("stiffness", "damping", "armature")]
-        span = span if joint.limited[0] else ""
-        rows.append([joint.name or "(free)", kind, axis, span, gears.get(i, ""), *rest])
-    header = ["joint", "kind", "axis", "range", "gear", "stiffness", "damping", "armature"]
-    touch = [
-        f"`{model.sensor(i).name}` {100 * model.site(model.sensor(i).objid[0]).size[0]:g} cm"
-        for i in range(model.nsensor)
-        if model.sensor(i).type[0] == mujoco.mjtSensor.mjSENS_TOUCH
-    ]
-    felt = f"\n\nRadii of the touch sensors: {', '.join(touch)}." if touch else ""
-    return "Joints, in SI units:\n\n" + table(header, rows) + felt
-
-
-def taxonomy(part: type[Part]) -> str:
-    """The paper's columns for this part, in one line."""
-    names = ("interactive", "contact", "targets", "trespassable", "movable", "workspace", "spaces")
-    values = []
-    for name in names:
-        value = getattr(part, name, None)
-        if value is None or callable(value) or (name == "spaces" and hasattr(part, "workspace")):
-            continue
-        if isinstance(value, bool):
-            value = yes(part, name)
-        values.append(f"{name}: {', '.join(value) if isinstance(value, tuple) else value}")
-    return " · ".join(values)
-
-
-def speeds(part: type[Movers]) -> str:
-    """What the default speed is by the second, which depends on the robot's time step."""
-    robots: dict[float, list[str]] = {}
-    for name, robot in guard(ROBOTS).items():
-        second = part().speed / (robot.frame_skip * robot.timestep)
-        robots.setdefault(second, []).append(name)
-    each = "; ".join(f"{', '.join(robots[v])} {v:.3g}" for v in sorted(robots, reverse=True))
-    return f"In m/s, a `speed` of {part().speed:g} m per control step is, with {each}."
-
-
 def perceived(kind: str, name: str) -> str:
     """What a task or a constraint adds to the observation of some robots."""
     rows: dict[str, list[str]] = {}
@@ -192,16 +146,37 @@ def perceived(kind: str, name: str) -> str:
 
 
 def overview(kind: str, names: Iterable[str]) -> str:
-    """The page that lists all tasks or all constraints."""
+    """The page of all tasks or all constraints."""
     listed = KINDS[f"{kind}s"]()
     for name in names:
-        listed = re.sub(
-            rf"^\| {name} +\|", f"| [{name}]({kind}s/{name.lower()}.md) |", listed, flags=re.M
-        )
-    tree = "\n".join(f"{kind}s/{name.lower()}" for name in names)
-    toctree = f"```{{toctree}}\n:hidden:\n\n{tree}\n```"
-    parts = [f"# {kind.title()}s", ABOUT[kind], listed, thumbnails(kind), toctree]
-    return "\n\n".join(parts) + "\n"
+        listed = re.sub(rf"^\| {name} +\|", f"| [{name}](#{name.lower()}) |", listed, flags=re.M)
+    return "\n\n".join([f"# {kind.title()}s", ABOUT[kind], listed, sections(kind)]) + "\n"
+
+
+def sections(kind: str) -> str:
+    """A section per part of a kind, after the parameters that at least three have alike."""
+    fields: dict[Any, list[Any]] = {}
+    for part in GROUPS[kind].values():
+        for field in dataclasses.fields(part):  # type: ignore[arg-type]
+            fields.setdefault(key_of(field), []).append(field)
+    common = {key: alike[0] for key, alike in fields.items() if len(alike) >= 3}
+    texts = [f"Parameters that several {kind}s have:", parameter_table(common.values())]
+    for name, part in GROUPS[kind].items():
+        own = [f for f in dataclasses.fields(part) if key_of(f) not in common]  # type: ignore[arg-type]
+        about = inspect.cleandoc(part.__doc__ or "").replace("``", "`")
+        texts += [f"## {name}", pictures(kind, name), about]
+        if own:
+            texts += [f"Set with `{part.name or name.lower()}={{...}}`:", parameter_table(own)]
+        if kind != "robot":
+            texts += ["Added to the observation, with the size for some robots:"]
+            texts.append(perceived(kind, name))
+    return "\n\n".join(texts)
+
+
+def robots() -> str:
+    """The page of the robots, whose sections are made."""
+    text = (ROOT / "docs" / "robots.md").read_text()
+    return BLOCK.sub(lambda m: f"{m[1]}\n{sections('robot')}\n\n{m[2]}", text)
 
 
 def thumbnails(kind: str) -> str:
@@ -209,7 +184,7 @@ def thumbnails(kind: str) -> str:
     cells: list[tuple[str, str]] = []
     for name, part in GROUPS[kind].items():
         about = re.sub(r" \([A-Z][^()]*\d{4}[^()]*\)", "", summary(part)).replace("``", "`")
-        caption = f"[**{name}**]({kind}s/{name.lower()}.md)<br>{about}"
+        caption = f"[**{name}**]({kind}s.md#{name.lower()})<br>{about}"
         stem = f"{kind}_{name.lower()}"
         cells.append((f"![{name}](images/{stem}.webp)", caption))
     rows: list[list[str]] = []
@@ -244,33 +219,10 @@ def gallery() -> str:
 def pictures(kind: str, name: str) -> str:
     """The pictures of a part: as it is by default, and the others that the gallery has of it."""
     stem = f"{kind}_{name.lower()}"
-    lines = [f"![{name}](../images/{stem}.png)"]
+    lines = [f"![{name}](images/{stem}.png)"]
     for file in sorted((ROOT / "docs" / "images").glob(f"{stem}_*.png")):
-        lines.append(f"![{name}, {file.stem.rpartition('_')[2]}](../images/{file.name})")
+        lines.append(f"![{name}, {file.stem.rpartition('_')[2]}](images/{file.name})")
     return "\n".join(lines)
-
-
-def page(kind: str, name: str, part: type[Part]) -> str:
-    """The page of one part."""
-    text = inspect.cleandoc(part.__doc__ or "").replace("``", "`")
-    parts = [
-        f"# {name}",
-        pictures(kind, name),
-        text,
-        taxonomy(part),
-        f"Parameters, set with `{part.name or name.lower()}={{...}}`:",
-        parameters(part),
-    ]
-    if issubclass(part, Movers):
-        parts.append(speeds(part))
-    if kind == "robot":
-        env = GuardVectorEnv(1, f"Goal_{name}_8Hazards")
-        parts += [action_table(env), joints(GROUPS["robot"][name])]  # type: ignore[arg-type]
-        parts += [f"In `Goal_{name}_8Hazards`:", observation_table(env)]
-    else:
-        parts += ["What it adds to the observation, with its size for some robots:"]
-        parts += [perceived(kind, name)]
-    return "\n\n".join(parts) + "\n"
 
 
 def examples() -> str:
@@ -371,15 +323,10 @@ def _plain(value: object) -> str:
 
 def pages() -> dict[str, str]:
     """Every page by its path below docs/."""
-    singles = {
-        f"{kind}s/{name.lower()}.md": page(kind, name, part)
-        for kind, parts in GROUPS.items()
-        for name, part in parts.items()
-    }
     overviews = {f"{kind}s.md": overview(kind, GROUPS[kind]) for kind in ABOUT}
-    others = (gallery, examples, command_line, hyperparameter_tables)
+    others = (robots, gallery, examples, command_line, hyperparameter_tables)
     rest = {f"{page.__name__}.md": page() for page in others}
-    return {**singles, **overviews, **rest, "parameters.md": parameters_of_environments()}
+    return {**overviews, **rest, "parameters.md": parameters_of_environments()}
 
 
 def main() -> None:

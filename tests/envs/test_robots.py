@@ -113,7 +113,7 @@ def test_sizes_mass_and_time_step(robot: str) -> None:
 def test_doc_table_matches() -> None:
     text = (Path(__file__).parents[2] / "docs" / "robots.md").read_text()
     rows = re.findall(
-        r"^\| \[(\w+)\]\(robots/\w+\.md\) \| (\d+) \| (\d+) \| ([\d.]+) kg \| ([\d.]+) s",
+        r"^\| \[(\w+)\]\(#\w+\) \| (\d+) \| (\d+) \| ([\d.]+) kg \| ([\d.]+) s",
         text,
         re.M,
     )

@@ -119,10 +119,25 @@ def test_no_packed_run_is_lost(scripts, tmp_path):
         archives.pack(tmp_path / "logs", "grid")
 
 
-def test_the_page_is_made_of_its_logs(scripts, monkeypatch):
-    board, *_ = scripts
+@pytest.mark.parametrize(
+    "folders", [("grand_table_10m",), pytest.param(None, marks=pytest.mark.slow)]
+)
+def test_the_page_is_made_of_its_logs(scripts, monkeypatch, folders):
+    """Of those of one grid, its table; of all, the whole page, which takes a minute."""
+    board, _ = scripts
     for module in scripts:
         monkeypatch.setattr(module, "DATA", ROOT / "docs" / "data")
+    if folders:
+        monkeypatch.setattr(board, "FOLDERS", folders)
     rows, runs = board.read()
-    assert board.page(rows) == board.PAGE.read_text(), "run `python scripts/leaderboard.py`"
-    assert runs.to_csv(index=False) == board.ROWS.read_text(), "its rows are of other logs"
+    page, written = board.PAGE.read_text(), board.ROWS.read_text()
+    if folders is None:
+        assert board.page(rows) == page, "run `python scripts/leaderboard.py`"
+        assert runs.to_csv(index=False) == written, "its rows are of other logs"
+    else:
+        table, heading = board.leaderboard(rows), "SafetyPointGoal1-v0, 10e6 steps"
+        assert len(rows_of(table, heading)) > 3 and rows_of(table, heading) == rows_of(
+            page, heading
+        )
+        lines = [line for line in written.splitlines() if line.startswith("grand_table_10m/")]
+        assert runs.to_csv(index=False).splitlines()[1:] == lines

@@ -524,6 +524,9 @@ def test_a_killed_workers_trial_is_done_at_the_next_start(tmp_path, folder, monk
     arguments = [*TOY, *SMALL, "-f", str(tmp_path), "--pruner", "none", *command]
     worker = fresh(work, arguments, tmp_path / "0.txt")
     wait_for(lambda: "RUNNING" in states_or_none(folder) or not worker.is_alive(), 300)
+    # It trains, and writes nothing: the lock of a journal that is being written holds for 30 s.
+    wait_for(lambda: "hyperparams" in study_in(folder).trials[0].user_attrs)
+    time.sleep(1.0)
     worker.kill()
     worker.join()
     assert states(folder) == {"RUNNING": 1}, (tmp_path / "0.txt").read_text()

@@ -116,13 +116,9 @@ def database_error(error: BaseException | None) -> str | None:
     :param error: an exception; Optuna may raise another while it handles the database's
     :return: None: no database has to do with it
     """
-    while error is not None and not isinstance(error, DATABASE_ERRORS):
+    while error is not None and not isinstance(error, SQLAlchemyError):
         error = error.__cause__ or error.__context__
-    while isinstance(error, StorageInternalError) and error.__cause__ is not None:
-        error = error.__cause__
-    if error is None:
-        return None
-    return " ".join(str(getattr(error, "orig", None) or error).split())
+    return None if error is None else " ".join(str(getattr(error, "orig", None) or error).split())
 
 
 def repeat(study: optuna.Study, trial: FrozenTrial, most: int | None = MOST_REPEATS) -> None:

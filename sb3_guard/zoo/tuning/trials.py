@@ -207,10 +207,8 @@ class Objective:
             trial.set_user_attr("result", outcome)
             if settings.pareto:
                 return True
-            step, violation = (
-                len(finished) * settings.n_evaluations + len(history),
-                outcome["violation"],
-            )
+            step = settings.n_evaluations * len(finished) + len(history)
+            violation = outcome["violation"]
             trial.report(INFEASIBLE - violation if violation else mean[0], step)
             return step == last or not (prunes and trial.should_prune())
 

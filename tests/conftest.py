@@ -1,5 +1,6 @@
 """What every test has in common: an empty working folder, one thread for torch, a clean /tmp."""
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,12 @@ def _working_folder(
 ) -> None:
     """Whoever runs the tests may have runs in ``logs/``: a test neither reads nor adds to them."""
     monkeypatch.chdir(tmp_path_factory.mktemp("cwd"))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _interrupts_are_seen() -> None:
+    """A shell that starts the tests in the background has them ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -121,26 +121,20 @@ def test_a_floor_in_the_file_gives_way_to_the_arenas_or_is_kept(cart):
     assert [engine.model.geom(i).name for i in range(1)] == ["ground"]
 
 
-def test_options_of_the_file_hold_unless_the_class_states_them(cart):
-    options = '<option timestep="0.004" gravity="0 0 -1.62" integrator="RK4" density="1.2"/>'
-    option = cart(options=options).build().model.opt
-    assert (option.timestep, option.gravity[2], option.density) == (0.004, -1.62, 1.2)
-    assert option.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    stated = cart(options=options, timestep=0.001, integrator="Euler").build().model.opt
-    assert (stated.timestep, stated.integrator) == (0.001, mujoco.mjtIntegrator.mjINT_EULER)
-
-
 @pytest.mark.parametrize(
-    ("joint", "attributes", "words"),
+    ("joint", "bits", "timestep", "words"),
     [
-        ('type="slide" axis="0 0 1"', {"floor": False}, "falls through the floor"),
-        ('type="hinge" axis="1 0 0" stiffness="1e7" ref="1"', {"timestep": 0.05}, "explodes"),
-        ('type="slide" axis="0 0 1"', {}, None),
+        ('type="slide" axis="0 0 1"', 0, 0.002, "falls through the floor"),
+        ('type="hinge" axis="1 0 0" stiffness="1e7" ref="1"', 1, 0.05, "explodes"),
+        ('type="slide" axis="0 0 1"', 1, 0.002, None),
     ],
 )
-def test_show_warns_of_robots_that_fall_or_explode(cart, joint, attributes, words):
-    change = lambda text: text.replace("<freejoint/>", f"<joint {joint}/>")  # noqa: E731
-    env = GuardVectorEnv(1, cart(change, **attributes))
+def test_show_warns_of_robots_that_fall_or_explode(cart, joint, bits, timestep, words):
+    def change(text):
+        text = text.replace("<geom ", f'<geom contype="{bits}" conaffinity="{bits}" ')
+        return text.replace("<freejoint/>", f"<joint {joint}/>")
+
+    env = GuardVectorEnv(1, cart(change, timestep=timestep))
     env.begin([0])
     found = unsteady(env.engine)
     assert found is None if words is None else words in found

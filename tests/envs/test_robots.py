@@ -237,38 +237,6 @@ def test_survives_random_actions(robot: str) -> None:
     assert deepest(engine) > -0.1
 
 
-@pytest.mark.slow  # test_engine.py has a shorter case of every robot
-@pytest.mark.parametrize("robot", FACTS)
-def test_row_of_a_batch_is_a_lone_simulation(robot: str) -> None:
-    num = 5
-    scenario = Scenario.parse(f"Goal_{robot}_8Hazards")
-    actions = np.random.default_rng(0).uniform(-1, 1, (200, num, FACTS[robot].actions))
-
-    def episode(engine: Engine, rows: list[int]) -> list[tuple[np.ndarray, ...]]:
-        for i, row in enumerate(rows):
-            engine.seed(i, np.random.default_rng(row))
-        engine.reset(np.arange(len(rows)))
-        out = []
-        for t in range(200):
-            o = engine.step(actions[t, rows])
-            out.append((o.obs.copy(), o.reward.copy(), o.cost.copy()))
-            ended = [i for i, row in enumerate(rows) if t % (40 + 7 * row) == 39]
-            if ended:
-                engine.reset(np.array(ended))
-        return out
-
-    together = episode(scenario.build(num, num_threads=1), list(range(num)))
-    threaded = episode(scenario.build(num, num_threads=2), list(range(num)))
-    for a, b in zip(together, threaded, strict=True):
-        for x, y in zip(a, b, strict=True):
-            np.testing.assert_array_equal(x, y)
-    for row in range(num):
-        alone = episode(scenario.build(1), [row])
-        for a, b in zip(together, alone, strict=True):
-            for x, y in zip(a, b, strict=True):
-                np.testing.assert_array_equal(x[row], y[0])
-
-
 class Gait(NamedTuple):
     """Control-step t applies offset + amplitude · sin(2π (t / period + phase))."""
 

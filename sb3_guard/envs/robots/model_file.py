@@ -251,10 +251,9 @@ def _hold(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     targets = np.where(direct & (model.actuator_ctrllimited != 0), limited, lengths)
     data.ctrl[:] = np.where(direct, targets, 0.0)
     for i in np.flatnonzero(_targets(model) & (model.actuator_actnum == 1)).tolist():
-        low, high = (
-            model.actuator_actrange[i] if model.actuator_actlimited[i] else (-np.inf, np.inf)
-        )
-        data.act[model.actuator_actadr[i]] = np.clip(targets[i], low, high)
+        low, high = model.actuator_actrange[i]
+        held = np.clip(targets[i], low, high) if model.actuator_actlimited[i] else targets[i]
+        data.act[model.actuator_actadr[i]] = held
 
 
 def _carried(old: mujoco.MjModel, before: mujoco.MjData, model: mujoco.MjModel) -> mujoco.MjData:
@@ -265,11 +264,8 @@ def _carried(old: mujoco.MjModel, before: mujoco.MjData, model: mujoco.MjModel) 
             getattr(data, name)[:] = getattr(before, name)
         return data
     for i in range(model.njnt):
-        name = model.joint(i).name
-        data.joint(name).qpos, data.joint(name).qvel = (
-            before.joint(name).qpos,
-            before.joint(name).qvel,
-        )
+        joint, former = data.joint(i), before.joint(model.joint(i).name)
+        joint.qpos, joint.qvel = former.qpos, former.qvel
     for i in range(model.nu):
         name, count = model.actuator(i).name, int(model.actuator_actnum[i])
         data.ctrl[i] = before.actuator(name).ctrl[0]

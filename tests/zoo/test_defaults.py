@@ -78,8 +78,16 @@ def weights(model: Any) -> dict[str, np.ndarray]:
     return arrays
 
 
-@pytest.mark.parametrize("env_id", ENVS)
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize(
+    ("algo", "env_id"),
+    [
+        pytest.param(
+            algo, env_id, marks=() if algo == "cpo" or env_id == ENVS[0] else pytest.mark.slow
+        )
+        for algo in ALGORITHMS
+        for env_id in ENVS
+    ],
+)
 def test_command_function_and_class_train_the_same_agent(
     algo: str, env_id: str, tmp_path: Path
 ) -> None:

@@ -118,24 +118,19 @@ def plot(flags: Flags) -> int:
 
 def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
     """Draw figures; 1 if one that was asked for by name could not be drawn."""
-    status, absent = 0, dict[str, None]()
-    wanted = FIGURES if "all" in kinds else kinds
-    for name, drawing in ((kind, drawing) for kind in wanted for drawing in draw(kind, data)):
-        if drawing.missing and name not in kinds:
-            absent[name] = None
-        elif drawing.missing:
-            lost = "" if drawing.figure else " is not drawn;"
-            print(f"{drawing.name}:{lost} missing: {drawing.missing}", file=sys.stderr)
-        if drawing.figure is None:
-            status |= name in kinds
-            continue
-        for form in dict.fromkeys(flags.format):
-            path = Path(flags.output) / f"{drawing.name}.{form}"
-            figures.save(drawing.figure, path)
-            print(f"wrote {path}")
-    if absent:
-        names = f"{', '.join(absent)}; each tells with --figure what it needs"
-        print(f"not drawn, or not whole: {names}", file=sys.stderr)
+    status = 0
+    for kind in FIGURES if "all" in kinds else kinds:
+        for drawing in draw(kind, data):
+            if drawing.missing and kind in kinds:
+                lost = "" if drawing.figure else " is not drawn;"
+                print(f"{drawing.name}:{lost} missing: {drawing.missing}", file=sys.stderr)
+            if drawing.figure is None:
+                status |= kind in kinds
+                continue
+            for form in dict.fromkeys(flags.format):
+                path = Path(flags.output) / f"{drawing.name}.{form}"
+                figures.save(drawing.figure, path)
+                print(f"wrote {path}")
     return status
 
 

@@ -194,14 +194,6 @@ def test_the_distribution_of_few_costs_is_whole(tmp_path):
     assert drawing.figure.axes[0].get_xlim() == (0, 4)
 
 
-def test_the_distribution_says_how_far_it_goes(tmp_path):
-    fake_run(tmp_path, "cpo", final=final([1.0] * 99 + [300.0], [1.0] * 100))
-    (drawing,) = draw("cdf", Data(with_safety(read_results([tmp_path]).runs)))
-    stochastic, greedy = drawing.figure.axes
-    assert stochastic.get_xlim()[1] < 300
-    assert [text.get_text() for text in stochastic.texts] == ["→ up to 300"] and not greedy.texts
-
-
 def test_agents_with_other_limits_are_told_from_those_without(tmp_path):
     """Limits on several costs say nothing of their sum."""
     costs = {key: {"mean": 2.5, "limit": 4.0} for key in ("heat", "wear")}

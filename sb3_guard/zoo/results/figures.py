@@ -71,7 +71,7 @@ class Drawing(NamedTuple):
 def fit_costs(axis: Axes, values: Iterable[Any], limit: float = np.nan, way: str = "y") -> None:
     """
     Begin a cost axis at 0, or below it at the lowest value, and end it where one outlier does not
-    squash all others.
+    squash all others; a panel whose y axis ends earlier says how far the costs go.
 
     :param values: all lines and points that are drawn, arrays or numbers; bands may be cut
     :param limit: the cost limit, which is always shown; nan without one
@@ -79,22 +79,16 @@ def fit_costs(axis: Axes, values: Iterable[Any], limit: float = np.nan, way: str
     """
     finite = np.concatenate([np.ravel(np.asarray(part, float)) for part in (*values, limit)])
     finite = finite[np.isfinite(finite)]
-    set_limits, end = getattr(axis, f"set_{way}lim"), getattr(axis, f"get_{way}lim")()[1]
-    start = 1.1 * finite.min(initial=0)
-    set_limits(start, end)
-    if not len(finite) or not finite.max() > 0:
-        return
-    highest, enough = finite.max(), np.fmax(5 * np.quantile(finite, 0.75), limit)
-    set_limits(start, min(end, 1.5 * highest))
-    if 0 < enough < highest:
-        set_limits(start, min(1.5 * finite[finite <= enough].max(), 1.05 * enough))
-        if way == "y":
-            say_highest(axis, f"↑ up to {highest:.3g}", 0.98, "top")
-
-
-def say_highest(axis: Axes, text: str, y: float, anchor: str) -> None:
-    """Write at the right of a panel how far the costs go that its axis does not show."""
-    axis.annotate(text, (0.99, y), xycoords="axes fraction", ha="right", va=anchor)
+    end = getattr(axis, f"get_{way}lim")()[1]
+    if len(finite) and (highest := finite.max()) > 0:
+        enough = np.fmax(5 * np.quantile(finite, 0.75), limit)
+        end = min(end, 1.5 * highest)
+        if 0 < enough < highest:
+            end = min(1.5 * finite[finite <= enough].max(), 1.05 * enough)
+            if way == "y":
+                text = f"↑ up to {highest:.3g}"
+                axis.text(0.99, 0.98, text, transform=axis.transAxes, ha="right", va="top")
+    getattr(axis, f"set_{way}lim")(1.1 * finite.min(initial=0), end)
 
 
 def cost_name(column: str) -> str:
@@ -228,13 +222,10 @@ def pareto(data: Data, suite: str) -> Figure | None:
     return figure
 
 
-def _split_axes(data: Data, suite: str, height: float) -> tuple[Figure | None, dict[str, Axes]]:
-    """A figure with a panel for each split that tells most of a suite's agents, if any does."""
+def _split_axes(data: Data, suite: str, height: float) -> tuple[Figure, dict[str, Axes]]:
+    """A figure with a panel for each split that tells most of a suite's agents."""
     splits = data.final_splits(suite)
-    if not splits:
-        return None, {}
-    size = WIDTH * (0.6 if len(splits) == 1 else 1), height
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=(WIDTH * (0.6 if len(splits) < 2 else 1), height), layout="constrained")
     panels = figure.subplots(1, len(splits), sharex=True, sharey=True, squeeze=False)[0]
     for split, axis in zip(splits, panels, strict=True):
         axis.set(title=f"{suite}, {SPLITS[split]}", xlabel="episode cost")
@@ -243,47 +234,42 @@ def _split_axes(data: Data, suite: str, height: float) -> tuple[Figure | None, d
 
 def cdf(data: Data, suite: str) -> Figure | None:
     """Share of episodes that cost at most x, of the final policies, a figure per environment."""
+    if not data.final_splits(suite):
+        return None
     figure, panels = _split_axes(data, suite, height=3.4)
-    shown = [0.0]  # of all panels, which share their axis
-    highest = {}
+    shown = [0.0]  # of all panels, which share their axis: all but the highest 2 % of the costs
     for split, axis in panels.items():
-        highest[split] = 0.0
         for algo in data.algos(suite):
             costs = data.costs_of(suite, algo, split)
             if len(costs):
-                share = np.arange(1, len(costs) + 1) / len(costs)
                 # From a share of 0 on, and on to the end of the axis.
-                x, y = [-1e9, *costs, 1e9], [0.0, *share, 1.0]
+                x, y = [-1e9, *costs, 1e9], [*np.linspace(0, 1, len(costs) + 1), 1.0]
                 axis.step(x, y, where="post", linewidth=1.5, **data.looks[algo].line)
                 shown += costs[: len(costs) - len(costs) // 50].tolist()
-                highest[split] = max(highest[split], costs[-1])
         shown.append(1.05 * draw_limit(axis.axvline, data, suite, "M_c"))
         axis.set(ylim=(-0.02, 1.02), ylabel="share of episodes")
         axis.label_outer()
-    for split, axis in panels.items():
-        axis.set_xlim(np.nanmin(shown), np.nanmax(shown) or 1.0)
-        if highest[split] > axis.get_xlim()[1]:
-            say_highest(axis, f"→ up to {highest[split]:.3g}", 0.03, "bottom")
+    axis.set_xlim(np.nanmin(shown), np.nanmax(shown) or 1.0)
     return figure
 
 
 def tiers(data: Data, suite: str) -> Figure | None:
     """Mean costs with 95 % intervals and the limit: certified or not, a figure per environment."""
+    if not data.final_splits(suite):
+        return None
     algos = data.algos(suite)[::-1]
     figure, panels = _split_axes(data, suite, height=1.4 + 0.28 * len(algos))
     limited = {*data.runs.loc[data.runs["suite"] == suite].dropna(subset=["limits"])["algo"]}
     totals = data.splits[(data.splits["suite"] == suite) & (data.splits["key"] == "")]
     for split, axis in panels.items():
-        rows = totals[totals["split"] == split]
-        for row in rows.to_dict("records"):
+        for row in totals[totals["split"] == split].to_dict("records"):
             name = row["tier"] or ("other limits" if row["algo"] in limited else "no limit")
             y, (color, marker) = algos.index(row["algo"]), TIER_STYLES[name]
             axis.plot([row["low"], row["high"]], [y, y], color=color, linewidth=4, alpha=0.5)
             axis.scatter(row["cost"], y, s=36, color=color, marker=marker, label=name, zorder=3)
         axis.set_yticks(range(len(algos)), [data.looks[algo].label for algo in algos])
         draw_limit(axis.axvline, data, suite, "M_c")
-    for axis in panels.values():  # once all are drawn: they share their axis
-        axis.set_xlim(left=min(0.0, axis.get_xlim()[0]))
+    axis.set_xlim(left=min(0.0, axis.get_xlim()[0]))
     return figure
 
 

@@ -29,7 +29,6 @@ _SUITE = re.compile(
 )
 # Runs that agree in these are the same run, made again.
 _SAME = ["suite", "world", "wrappers", "algo", "limits", "seed", "steps", "started_from", "config"]
-VERDICTS = ("exceeded", "undecided", "kept")  # the worst one first
 
 
 class Results(NamedTuple):
@@ -100,11 +99,11 @@ def read_run(path: Path) -> dict[str, Any]:
         ``M_c`` (means over the episodes of the final epoch; NaN if none ended), ``rho_c``
         (cumulative cost ÷ steps),
         ``cost_limit`` (of the total cost; NaN: there is none), ``limits`` (of all costs, "1 2";
-        missing: unconstrained), ``verdict`` on them (of several the worst), ``seconds`` of
-        training, ``epoch`` (steps of a rollout), ``world`` (``env_kwargs``), ``wrappers``,
+        missing: unconstrained), ``seconds`` of training, ``epoch`` (steps of a rollout), ``world``
+        (``env_kwargs``), ``wrappers``,
         ``started_from`` (the model that training started from) and ``config`` (the same for the
         same hyperparameters). If the limits are on other costs than the total, there are
-        ``M_c/<key>``, ``cost_limit/<key>`` and ``verdict/<key>`` of each
+        ``M_c/<key>`` and ``cost_limit/<key>`` of each
     :raises UsageError: the run is not finished, or damaged
     """
     folder = RunFolder(path)
@@ -116,7 +115,6 @@ def read_run(path: Path) -> dict[str, Any]:
     parts = _SUITE.fullmatch(env)
     limit = result.get("cost_limit")
     limits = limit if isinstance(limit, list) else [] if limit is None else [limit]
-    verdicts = [cost["verdict"] for cost in result["costs"].values() if cost.get("verdict")]
     by_key = _by_key(result)
     total = len(limits) == 1 and not by_key and "limit_on" not in result
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
@@ -135,7 +133,6 @@ def read_run(path: Path) -> dict[str, Any]:
         **{name: _number(result.get(key)) for name, key in numbers.items()},
         "cost_limit": _number(limits[0] if total else None),
         "limits": _limits(limits) if limits else None,
-        "verdict": min(verdicts, key=VERDICTS.index, default=None),
         **by_key,
         "epoch": math.nan if None in rollout else math.prod(rollout),
         "world": _text(config.get("env_kwargs") or {}),
@@ -161,7 +158,6 @@ def _by_key(result: Mapping[str, Any]) -> dict[str, Any]:
     for key, cost in costs.items():
         columns[f"M_c/{key}"] = _number(cost["mean"])
         columns[f"cost_limit/{key}"] = _number(cost["limit"])
-        columns[f"verdict/{key}"] = cost.get("verdict")
     return columns
 
 

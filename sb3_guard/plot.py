@@ -11,6 +11,7 @@ from typing import ClassVar
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import UsageError, positive
+from sb3_guard.zoo.grids.presets import PRESETS
 from sb3_guard.zoo.results import figures, tables
 from sb3_guard.zoo.results import runs as reading
 from sb3_guard.zoo.results.figure_data import Data
@@ -120,16 +121,17 @@ def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
     """Draw figures; 1 if one that was asked for by name could not be drawn."""
     status = 0
     for kind in FIGURES if "all" in kinds else kinds:
-        for drawing in draw(kind, data):
-            if drawing.missing and kind in kinds:
-                lost = "" if drawing.figure else " is not drawn;"
-                print(f"{drawing.name}:{lost} missing: {drawing.missing}", file=sys.stderr)
-            if drawing.figure is None:
-                status |= kind in kinds
-                continue
+        drawn = draw(kind, data)
+        if kind in kinds and not drawn:
+            lists = f"; sb3-guard benchmark --preset {kind} --dry-run lists them" * (
+                kind in PRESETS
+            )
+            print(f"{kind} is not drawn: there are no runs for it{lists}", file=sys.stderr)
+            status = 1
+        for name, figure in drawn.items():
             for form in dict.fromkeys(flags.format):
-                path = Path(flags.output) / f"{drawing.name}.{form}"
-                figures.save(drawing.figure, path)
+                path = Path(flags.output) / f"{name}.{form}"
+                figures.save(figure, path)
                 print(f"wrote {path}")
     return status
 

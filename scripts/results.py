@@ -299,15 +299,14 @@ def draw_healthy(algo: str) -> Figure:
             axes[1].axhline(limit, color=INK, linestyle=(0, (1, 2)), label=f"limit, {limit:g}")
         for axis in axes[1:3]:
             axis.set_ylim(bottom=0)
-        finish(figure, "")
+        finish(figure)
     return figure
 
 
 def draw_curves(runs: pd.DataFrame, name: str) -> None:
     """Save the curves of runs of a suite as an image."""
-    (drawing,) = draw("curves", Data(runs))
-    assert drawing.figure is not None, drawing.missing
-    save(drawing.figure, DOCS / "images" / f"{name}.png")
+    (figure,) = draw("curves", Data(runs)).values()
+    save(figure, DOCS / "images" / f"{name}.png")
     print(name)
 
 
@@ -348,10 +347,9 @@ def main() -> None:
                 # Drawn is what the tables have: the last ten epochs, not the last one.
                 means = {"J_r": runs["return_last"], "M_c": runs["cost_last"]}
                 drawings = draw(kind, Data(runs.assign(**means)))
-            for drawing in drawings:
-                file = f"{name}_{drawing.name}.png"
-                if drawing.figure is not None and (file, name, kind) in images:
-                    save(drawing.figure, DOCS / "images" / file)
+            for drawn, figure in drawings.items():
+                if (file := f"{name}_{drawn}.png", name, kind) in images:
+                    save(figure, DOCS / "images" / file)
 
 
 if __name__ == "__main__":

@@ -150,8 +150,8 @@ def test_a_limit_on_the_worst_step_says_nothing_of_the_sum(tmp_path):
 
 
 def test_the_distribution_of_costs_is_drawn(runs):
-    (drawing,) = draw("cdf", Data(runs))
-    greedy = drawing.figure.axes[1]
+    (drawing,) = draw("cdf", Data(runs)).values()
+    greedy = drawing.axes[1]
     assert "final greedy" in greedy.get_title()
     line = {line.get_label(): line for line in greedy.lines}["CPO"]
     x, y = line.get_data()
@@ -160,8 +160,8 @@ def test_the_distribution_of_costs_is_drawn(runs):
 
 
 def test_tiers_are_drawn(runs):
-    (drawing,) = draw("tiers", Data(runs))
-    stochastic, greedy = drawing.figure.axes
+    (drawing,) = draw("tiers", Data(runs)).values()
+    stochastic, greedy = drawing.axes
     assert [label.get_text() for label in stochastic.get_yticklabels()] == ["CPO", "TRPO"]
     (cpo,) = (line for line in greedy.lines if [*line.get_ydata()] == [0, 0])
     assert [*cpo.get_xdata()] == [4, 9] and cpo.get_color() == TIER_STYLES["undecided"][0]
@@ -175,8 +175,8 @@ def test_no_panel_hides_what_another_shows(tmp_path, kind, dear, cheap):
     limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
     costs = {dear: [50.0, 60.0, 70.0], cheap: [1.0, 1.0, 2.0]}
     fake_run(tmp_path, "cpo", **limit, final=final(costs["stochastic"], costs["greedy"]))
-    (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs)))
-    for axis in drawing.figure.axes:
+    (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs))).values()
+    for axis in drawing.axes:
         assert axis.get_xlim()[0] <= 0 and 70 <= axis.get_xlim()[1] < 150
 
 
@@ -184,14 +184,14 @@ def test_no_panel_hides_what_another_shows(tmp_path, kind, dear, cheap):
 def test_the_limit_is_in_sight(tmp_path, kind):
     limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
     fake_run(tmp_path, "cpo", **limit, final=final([1.0, 2.0], [1.0, 2.0]))
-    (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs)))
-    assert all(axis.get_xlim()[1] > 25 for axis in drawing.figure.axes)
+    (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs))).values()
+    assert all(axis.get_xlim()[1] > 25 for axis in drawing.axes)
 
 
 def test_the_distribution_of_few_costs_is_whole(tmp_path):
     fake_run(tmp_path, "cpo", final=final([4.0], [1.0]))
-    (drawing,) = draw("cdf", Data(with_safety(read_results([tmp_path]).runs)))
-    assert drawing.figure.axes[0].get_xlim() == (0, 4)
+    (drawing,) = draw("cdf", Data(with_safety(read_results([tmp_path]).runs))).values()
+    assert drawing.axes[0].get_xlim() == (0, 4)
 
 
 def test_agents_with_other_limits_are_told_from_those_without(tmp_path):
@@ -200,8 +200,8 @@ def test_agents_with_other_limits_are_told_from_those_without(tmp_path):
     several = {"cost_limit": [4.0, 4.0], "costs": costs}
     for algo, entries in (("cpo", several), ("trpo", {})):
         fake_run(tmp_path, algo, **entries, final=final([1.0, 2.0], [1.0, 9.0]))
-    (drawing,) = draw("tiers", Data(with_safety(read_results([tmp_path]).runs)))
-    labels = drawing.figure.axes[0].get_legend_handles_labels()[1]
+    (drawing,) = draw("tiers", Data(with_safety(read_results([tmp_path]).runs))).values()
+    labels = drawing.axes[0].get_legend_handles_labels()[1]
     assert sorted(labels) == ["no limit", "other limits"]
 
 

@@ -4,7 +4,6 @@ Colours are readable on white and on black, and in the manner of Okabe and Ito's
 colour-blind readers; line styles and markers tell algorithms apart without them.
 """
 
-from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import cycle
 from typing import Any, NamedTuple
@@ -12,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_guard.zoo.grids.presets import ALGOS
 from sb3_guard.zoo.results.curves import read_curve
-from sb3_guard.zoo.results.runs import REFERENCE, label_of
+from sb3_guard.zoo.results.runs import REFERENCE
 from sb3_guard.zoo.results.splits import FINAL, judge, read_splits
 from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize
 
@@ -160,17 +158,3 @@ class Data:
     def score(self, suite: str, algo: str, name: str) -> float:
         """A score of an algorithm or a family, NaN if there is none."""
         return float(self.scores[name].get((suite, algo), np.nan))
-
-    def missing(self, suites: Iterable[str], algos: Sequence[str]) -> str:
-        """Which algorithms lack runs on which environments, in words."""
-        have = {*zip(self.runs["suite"], self.runs["algo"], strict=True)}
-        groups: dict[tuple[str, ...], list[str]] = {}
-        for suite in suites:
-            absent = tuple(algo for algo in algos if (suite, algo) not in have)
-            if absent:
-                groups.setdefault(absent, []).append(suite)
-        return "; ".join(
-            ("all algorithms" if absent == ALGOS else ", ".join(map(label_of, absent)))
-            + f" on {', '.join(names)}"
-            for absent, names in groups.items()
-        )

@@ -1,15 +1,11 @@
-"""Figures: learning curves, and what to read safety off at a glance; ``paper.py`` has the paper's.
-
-A figure is drawn from the runs there are and says which are missing.
-"""
+"""Learning curves, and figures to read safety off at a glance; ``paper.py`` has the paper's."""
 
 import html
 import io
-import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -55,14 +51,6 @@ TIER_STYLES = {
     "other limits": (INK, "P"),
     "no limit": (INK, "s"),
 }
-
-
-class Drawing(NamedTuple):
-    """A figure with its name, or None where there is nothing to draw, and the runs it lacks."""
-
-    name: str
-    figure: Figure | None
-    missing: str
 
 
 # Elements
@@ -159,8 +147,8 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
                       ha="right", color=look.color)  # fmt: skip
 
 
-def finish(figure: Figure, missing: str) -> None:
-    """Add one legend for all panels, above them, where it covers nothing, and what is missing."""
+def finish(figure: Figure) -> None:
+    """Add one legend for all panels, above them, where it covers nothing."""
     entries: dict[str, Any] = {}
     for axis in figure.axes:
         for handle, name in zip(*axis.get_legend_handles_labels(), strict=True):
@@ -171,11 +159,6 @@ def finish(figure: Figure, missing: str) -> None:
             [*entries.values()], [*entries], loc="outside upper center",
             ncols=-(-len(entries) // rows), handlelength=2.6,
         )  # fmt: skip
-    if missing:
-        width = int(figure.get_figwidth() * 14)
-        text = textwrap.shorten(f"Missing: {missing}", 4 * width, placeholder=" …")
-        text = "\n".join(textwrap.wrap(text, width))
-        figure.supxlabel(text, x=0.01, ha="left", fontsize=7, alpha=0.8)
 
 
 def title_of(data: Data, suite: str) -> str:

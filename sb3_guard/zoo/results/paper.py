@@ -8,10 +8,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_guard.zoo.grids.presets import GHOSTS, HAZARDS, MAIN8, OPTIONS, PRESETS, RADAR4, ROBOTS
+from sb3_guard.zoo.grids.presets import GHOSTS, HAZARDS, MAIN8, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.results import figures
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
-from sb3_guard.zoo.results.figures import STYLE, WIDTH, Drawing, finish
+from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish
 from sb3_guard.zoo.results.runs import REFERENCE
 from sb3_guard.zoo.results.statistics import SCORES
 from sb3_guard.zoo.results.tables import SCORE_HEADINGS
@@ -121,23 +121,17 @@ FIGURES: dict[str, Callable[..., Figure | None]] = {
 }
 
 
-def draw(kind: str, data: Data) -> list[Drawing]:
+def draw(kind: str, data: Data) -> dict[str, Figure]:
     """
-    The figures of one kind, in the house's style.
+    The figures of one kind that have runs, by name, in the house's style.
 
     :param kind: a key of :data:`FIGURES`
     """
-    function, drawings = FIGURES[kind], []
-    # In figures of one environment the user chooses the algorithms: no others are missing.
-    blocks = () if function in PER_SUITE else PRESETS.get(kind, ((data.suites, [REFERENCE]),))
+    function, drawn = FIGURES[kind], {}
     with mpl.rc_context(STYLE):
         for suite in data.suites if function in PER_SUITE else [""]:
             figure = function(data, *([suite] if suite else []))
-            missing = "; ".join(filter(None, (data.missing(*block) for block in blocks)))
-            if suite and figure is None:
-                missing = f"episodes of {suite}"
             if figure is not None:
-                finish(figure, missing)
-            name = re.sub("[/:]", "-", f"{kind}_{suite}" if suite else kind)
-            drawings.append(Drawing(name, figure, missing))
-    return drawings
+                finish(figure)
+                drawn[re.sub("[/:]", "-", f"{kind}_{suite}" if suite else kind)] = figure
+    return drawn

@@ -25,10 +25,9 @@ def report(data: Data, title: str, left_out: Mapping[str, str]) -> str:
     loader = jinja2.PackageLoader("sb3_guard.zoo.results", ".")
     page = jinja2.Environment(loader=loader, autoescape=True).get_template("report.html.jinja")
     figures = [
-        (drawing.name, FIGURES[kind].__doc__, inline_svg(drawing.figure, drawing.name))
+        (name, FIGURES[kind].__doc__, inline_svg(figure, name))
         for kind in FIGURES
-        for drawing in draw(kind, data)
-        if drawing.figure is not None
+        for name, figure in draw(kind, data).items()
     ]
     return page.render(
         title=title,

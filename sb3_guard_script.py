@@ -1,5 +1,7 @@
 """The script ``sb3-guard``: Ctrl-C ends it without a traceback, also while Python still imports."""
 
+import signal
+
 
 def main() -> int:
     """
@@ -7,9 +9,11 @@ def main() -> int:
 
     :return: exit status
     """
-    try:
-        from sb3_guard import cli
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is signal.default_int_handler:  # not ignored, as in the background of a shell
+        # Extension modules turn an exception within their import into an ImportError.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from sb3_guard import cli
 
-        return cli.main()
-    except KeyboardInterrupt:
-        return 130
+    signal.signal(signal.SIGINT, handler)
+    return cli.main()

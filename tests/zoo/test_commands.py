@@ -391,14 +391,21 @@ def test_an_interrupt_while_python_imports(tmp_path, monkeypatch, capsys):
     script = tomllib.loads((root / "pyproject.toml").read_text())["project"]["scripts"]["sb3-guard"]
     module, _, function = script.partition(":")
     (tmp_path / "sb3_guard").mkdir()
-    (tmp_path / "sb3_guard" / "__init__.py").write_text("raise KeyboardInterrupt")
+    (tmp_path / "sb3_guard" / "__init__.py").write_text(
+        "import os, signal\n"
+        "try:\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "except KeyboardInterrupt:\n"
+        "    raise ImportError('initialization failed')  # as an extension module does\n"
+    )
     done = subprocess.run(
         [sys.executable, "-c", f"import sys, {module}; sys.exit({module}.{function}())"],
         env={**os.environ, "PYTHONPATH": f"{tmp_path}:{root}"},
         cwd=tmp_path,
         stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
-    assert (done.returncode, done.stderr) == (130, b"")
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, b"")
 
     def interrupted(name):
         raise KeyboardInterrupt

@@ -129,7 +129,8 @@ def explodes(engine: Engine, alone: bool = True, speed: float = 50.0) -> str | N
             return (
                 f"the robot, {'left alone' if alone else 'given random actions'}, explodes within "
                 f"{step * engine.control_step:.2g} s: reduce its timestep (now "
-                f"{engine.model.opt.timestep:g} s), or the stiffness of its joints and the gears, "
+                f"{engine.model.opt.timestep:g} s), or choose the integrator implicitfast, or "
+                "reduce the stiffness of its joints and the gears, "
                 "gains and control ranges of its actuators (of servos in rad, also where a file "
                 "has degrees), or move apart geoms that overlap"
             )

@@ -7,6 +7,7 @@ import mujoco
 
 def add_servos(spec, kp=40.0, kv=2.0, joints=None):
     """Position servos of hinges and slides, within their ranges or half a turn either way."""
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # they diverge with Euler
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_FREE or joint.name not in (joints or [joint.name]):
             continue

@@ -413,7 +413,6 @@ def test_costs_of_a_baseline(algo, env, parts, capsys, tmp_path):
     [
         (RuntimeError("out of order"), 20),
         (ValueError("of somebody's"), 20),
-        (BrokenPipeError("of a simulator"), 20),
         (EOFError("of a simulator"), 20),
         (KeyError("mine"), -1),
     ],

@@ -50,23 +50,33 @@ def fit(
     :raises ValueError: it is not allowed; the message has the name, the value and what is allowed
     """
     if typing.get_origin(annotation) is typing.Literal:
-        choices, annotation = typing.get_args(annotation), Any
+        choices = typing.get_args(annotation)
+    if choices is not None:
+        if value not in choices:
+            names = ["null" if choice is None else str(choice) for choice in choices]
+            raise ValueError(f"{name} = {value!r}: {did_you_mean(value, names)}")
+        return value
     try:
         made = typed(value, annotation)
     except TypeError:
-        made = math.nan
-    if choices is not None:
-        if made not in choices:
-            names = ["null" if choice is None else str(choice) for choice in choices]
-            raise ValueError(f"{name} = {value!r}: {did_you_mean(value, names)}")
-        return made
+        allowed = in_words(annotation, low, high, ends)
+        raise ValueError(f"{name} = {value!r} must be {allowed}") from None
     for number in _numbers(made):
         above = number >= low if ends[0] == "[" else number > low
         below = number <= high if ends[1] == "]" else number < high
         if not (above and below):
-            allowed = in_words(annotation, low, high, ends)
+            allowed = _bounds(low, high, ends) or "finite"
             raise ValueError(f"{name} = {value!r} must be {allowed}")
     return made
+
+
+def plain(value: Any) -> Any:
+    """A value as a file gives it back: lists for tuples and arrays, dictionaries for mappings."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def _numbers(value: Any) -> Iterator[float]:
@@ -160,9 +170,15 @@ def in_words(
         text = _WORDS[kind][many]
     else:
         text = str(getattr(annotation, "__name__", annotation))
+    bounds = _bounds(low, high, ends)
+    return f"{text}, {bounds}" if bounds else text
+
+
+def _bounds(low: float, high: float, ends: str) -> str:
+    """A range in words; empty: all numbers."""
     bounds = []
     if math.isfinite(low):
         bounds.append(f"{'at least' if ends[0] == '[' else 'greater than'} {low:g}")
     if math.isfinite(high):
         bounds.append(f"{'at most' if ends[1] == ']' else 'less than'} {high:g}")
-    return f"{text}, {' and '.join(bounds)}" if bounds else text
+    return " and ".join(bounds)

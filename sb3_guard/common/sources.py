@@ -34,11 +34,13 @@ class Source(NamedTuple):
     :param make: makes one from its keyword arguments
     :param batch: makes n on one batch of simulations, ``batch(n, **kwargs)``; None where that is
         not possible: environments of others, and ours with wrappers in their registration
+    :param scenario: what ours are; None: those of others
     """
 
     env_id: str | None
     make: Callable[..., gymnasium.Env]
     batch: Callable[..., VecEnv] | None = None
+    scenario: Scenario | None = None
 
 
 def find(
@@ -100,6 +102,7 @@ def _ours(env_id: str | Path | Mapping[str, Any] | Scenario) -> Source:
     envs = _our_envs(env_id)
     try:
         spec: EnvSpec = envs.env_spec(env_id)
+        scenario = envs.as_scenario(spec.kwargs["scenario"])
     except UnknownId:
         near = nearest(str(env_id), [*envs.env_ids(), *gymnasium.registry])
         hint = "" if near is None else f"did you mean {near!r}? "
@@ -115,7 +118,7 @@ def _ours(env_id: str | Path | Mapping[str, Any] | Scenario) -> Source:
         registered = {name: value for name, value in spec.kwargs.items() if name != "scenario"}
         if spec.max_episode_steps is not None:
             registered["max_episode_steps"] = spec.max_episode_steps
-        return GuardVecEnv(spec.kwargs["scenario"], n_envs, spec, **{**registered, **kwargs})
+        return GuardVecEnv(scenario, n_envs, spec, **{**registered, **kwargs})
 
     make = partial(gymnasium.make, spec)
-    return Source(spec.id, make, None if spec.additional_wrappers else batch)
+    return Source(spec.id, make, None if spec.additional_wrappers else batch, scenario)

@@ -15,6 +15,7 @@ import mujoco
 
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.check_part import diverges
+from sb3_guard.envs.constraints import limits
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.robots import guard as guard_robots
@@ -67,14 +68,19 @@ CONSTRAINTS: dict[str, type[Constraint]] = _parts(
     "Gremlins",
     "Speed",
     "Boundary",
-    "JointLimits",
-    "JointSpeed",
-    "JointTorque",
-    "BaseTilt",
-    "BaseHeight",
-    "FloorContact",
-    "SelfCollision",
 )
+CONSTRAINTS |= {
+    limit.__name__: limit
+    for limit in (
+        limits.JointLimits,
+        limits.JointSpeed,
+        limits.JointTorque,
+        limits.BaseTilt,
+        limits.BaseHeight,
+        limits.FloorContact,
+        limits.SelfCollision,
+    )
+}
 
 # What else sets parameters, in the fields of a scenario that these name.
 KEYWORDS = {

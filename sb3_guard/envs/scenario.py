@@ -11,8 +11,6 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sb3_guard.envs import suites
 from sb3_guard.envs.arena import Arena
 from sb3_guard.envs.constraints.obstacles import Obstacles
@@ -21,21 +19,13 @@ from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import Layout
 from sb3_guard.envs.observation import Lidar
 from sb3_guard.envs.registry import CONSTRAINTS, KEYWORDS, OPTIONS, ROBOTS, TASKS
+from sb3_guard.fields import plain
 from sb3_guard.ids import UnknownPart
 from sb3_guard.spelling import did_you_mean
 
 Params = Mapping[str, Any]
 COSTS = ("sum", "any")
 _OWN_NAME = "a constraint under a name of its own states its type, such as {'type': 'hazards'}"
-
-
-def _plain(value: Any) -> Any:
-    """The same as JSON would give back: lists for tuples and arrays, dictionaries for mappings."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 def _filled(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -81,7 +71,7 @@ class Scenario:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            value = _plain(getattr(self, f.name))
+            value = plain(getattr(self, f.name))
             if value is None:
                 value = {} if f.default is MISSING else f.default
             object.__setattr__(self, f.name, value)
@@ -163,7 +153,7 @@ class Scenario:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data from which ``Scenario(**data)`` makes this scenario again."""
-        return {f.name: _plain(getattr(self, f.name)) for f in fields(self)}
+        return {f.name: plain(getattr(self, f.name)) for f in fields(self)}
 
     def override(self, cost: str | None = None, **params: Params | None) -> Scenario:
         """This scenario with parameters of its parts changed or constraints added.
@@ -179,7 +169,8 @@ class Scenario:
         table = self._keywords()
         for key, value in params.items():
             if key not in table and not (isinstance(value, Mapping) and "type" in value):
-                raise ValueError(f"unknown parameter {key!r}: {self._instead(key)}")
+                hint = did_you_mean(key, [*table, *OPTIONS])
+                raise ValueError(f"unknown parameter {key!r}: {hint}; {_OWN_NAME}")
             if value is not None and not isinstance(value, Mapping):
                 such = "{'size': 0.3}"
                 if key == "robot":
@@ -204,31 +195,6 @@ class Scenario:
         constraints = [*sorted(map(str.lower, CONSTRAINTS)), *self.constraints]
         own = {**KEYWORDS, self.task.lower(): "task_params"}
         return own | dict.fromkeys(constraints, "constraints")
-
-    def _instead(self, key: str) -> str:
-        """What to write for a keyword that does not exist."""
-        if key == "indicator":
-            return "write cost='any' for costs of 0 or 1"
-        task = next((name for name in TASKS if name.lower() == key), None)
-        if task is not None:
-            return (
-                f"the task is {self.task}, not {task}: set its parameters with "
-                f"{self.task.lower()}={{...}}, or choose the other task with an id such as "
-                f"'{task}_{self.robot}_8Hazards-v0'"
-            )
-        parameter = {"reward_clip": "reward_limit"}.get(key, key)
-        parts: dict[str, Any] = {
-            "arena": Arena,
-            self.task.lower(): TASKS[self.task],
-            "robot": ROBOTS[self.robot],
-            "layout": Layout,
-            "lidar": Lidar,
-            "observe": Extras,
-        }
-        owners = [name for name, cls in parts.items() if parameter in {f.name for f in fields(cls)}]
-        if owners:
-            return f"write {' or '.join(f'{name}={{{parameter!r}: ...}}' for name in owners)}"
-        return f"{did_you_mean(key, [*self._keywords(), *OPTIONS])}; {_OWN_NAME}"
 
     def _components(self, constraints: Mapping[str, Params]) -> list[str]:
         """What is observed with these constraints: not those that go, and the objects that come."""
@@ -273,8 +239,8 @@ class Scenario:
             if kind not in by_name:
                 hint = did_you_mean(kind, by_name)
                 if named:
-                    raise ValueError(f"unknown constraint {name!r}: {hint}; {_OWN_NAME}")
-                raise ValueError(f"{name}.type = {kind!r}: {hint}")
+                    raise UnknownPart(f"unknown constraint {name!r}: {hint}; {_OWN_NAME}")
+                raise UnknownPart(f"{name}.type = {kind!r}: {hint}")
             if name in by_name and kind != name:
                 raise ValueError(
                     f"constraint {name!r} cannot be of type {kind!r}, since {name!r} is a type "

@@ -44,13 +44,6 @@ def is_disk_error(error: BaseException | None) -> bool:
     return False
 
 
-def plain(value: Any) -> Any:
-    """A value as the files of a run give it back: lists for tuples."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    return [plain(item) for item in value] if isinstance(value, list | tuple) else value
-
-
 def read_data(path: Path) -> dict[str, Any]:
     """
     The plain data of a run's file, RL-Zoo's included.

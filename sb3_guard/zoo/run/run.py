@@ -36,6 +36,7 @@ from sb3_guard.common.monitor import find_monitor
 from sb3_guard.common.sources import Source
 from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.costs import read_costs
+from sb3_guard.fields import plain
 from sb3_guard.zoo.cli.flags import IDENTITY, START
 from sb3_guard.zoo.cli.names import as_data, refuse_places, require_named
 from sb3_guard.zoo.cli.usage import (
@@ -61,7 +62,6 @@ from sb3_guard.zoo.run.folder import (
     is_disk_error,
     is_run,
     lock,
-    plain,
     require_writable,
     run_path,
 )

@@ -4,8 +4,6 @@ sb3-guard train --gym-packages custom_algorithm --algo trpo_price \
     -conf custom_algorithm.py --env Goal_Point_8Hazards -n 1e6
 """
 
-import torch as th
-
 from sb3_guard import make_vec_env, register_algorithm
 from sb3_guard.algorithms import TrustRegion, hyperparameter
 
@@ -20,9 +18,8 @@ class TRPOPrice(TrustRegion):
 
     price: float = hyperparameter(1.0)
 
-    def surrogate(self, batch, ratio):
-        costs = batch.cost_advantages.sum(dim=1)
-        return th.mean(ratio * (batch.advantages - self.price * costs))
+    def advantages(self, batch):
+        return batch.advantages - self.price * batch.cost_advantages.sum(dim=1)
 
 
 register_algorithm("trpo_price", TRPOPrice)

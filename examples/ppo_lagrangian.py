@@ -10,9 +10,9 @@ class PPOLagrangian(Lagrangian, CostRollouts, PPO):
     """PPO on A - Σ λ_i A_Ci, where λ follows J_C - d."""
 
     def train(self):
-        weight = self.cost_weight()  # [m], float32: it has followed this rollout's J_C
+        self.step()  # λ follows J_C
         buffer = self.rollout_buffer
-        buffer.advantages = buffer.advantages - buffer.cost_advantages @ weight
+        buffer.advantages = buffer.advantages - buffer.cost_advantages @ self.weights()
         super().train()  # SB3's own: at weight 0 the run equals SB3's PPO bit for bit
         self.fit_cost_critic()
 

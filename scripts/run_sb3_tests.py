@@ -56,7 +56,7 @@ PACKAGES = (stable_baselines3, sb3_contrib)
 # The classes that ours stand in for, with what they are made with where a test says nothing: as
 # theirs, except that A2C's 5 steps per update are few for a trust-region step.
 REPLACED: dict[type, dict[str, dict[str, Any]]] = {
-    TrustRegion: {"A2C": {"n_steps": 16, "normalize_advantage": False}, "PPO": {}, "TRPO": {}},
+    TrustRegion: {"A2C": {"n_steps": 16}, "PPO": {}, "TRPO": {}},
     FirstOrder: {"PPO": {}},
     PPOLag: {"PPO": {}},
     SACLag: {"SAC": {}},

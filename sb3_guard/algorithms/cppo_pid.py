@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.ppo_lag import PPOLag
 
 
@@ -26,4 +27,6 @@ class CPPOPID(PPOLag):
     search_space: ClassVar[dict[str, Any]] = {
         "derivative_gain": {"low": 0.0, "high": 4.0},
     }
-    defaults: ClassVar[dict[str, Any]] = {"derivative_gain": 0.5, "lambda_smoothing": 0.5}
+
+    derivative_gain: float = hyperparameter(0.5)
+    lambda_smoothing: float = hyperparameter(0.5, high=1.0)

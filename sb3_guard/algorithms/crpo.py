@@ -34,17 +34,14 @@ class CRPO(TrustRegion):
     @property
     def violated(self) -> int | None:
         """Index of the cost that is to be lowered; None while the limits hold."""
-        limits = self.cost_limits
-        cost = self.costs.episode_cost
+        limits, cost = self.costs.limits, self.costs.episode_cost
         excess = cost - limits * (1.0 + self.tolerance)
         # a limit of 0 is no unit: any cost above it exceeds it by as much as it is
         unit = np.where(limits > 0.0, limits, np.where(cost == 0.0, 1.0, np.abs(cost)))
         worst = int(np.argmax(excess / unit))
         return worst if excess[worst] > 0.0 else None
 
-    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
+    def advantages(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         worst = self.violated
         self.logger.record("train/rectifies", float(worst is not None))
-        if worst is None:
-            return (ratio * batch.advantages).mean()
-        return -(ratio * batch.cost_advantages[:, worst]).mean()
+        return batch.advantages if worst is None else -batch.cost_advantages[:, worst]

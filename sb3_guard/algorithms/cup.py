@@ -1,6 +1,6 @@
 """CUP: an update improves the policy as PPO does, then projects it towards the limits."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.distributions import Distribution
@@ -37,18 +37,18 @@ class CUP(Lagrangian, FirstOrder):
         "lambda_lr": {"low": 0.005, "high": 0.2, "log": True},
         "proportional_gain": {"low": 0.0, "high": 1.0},
     }
-    # At the limit the second step takes back what the first has done: with PPO's ten passes there
-    # is much noise in both. Gains are small, since the factor above is four with the defaults.
-    defaults: ClassVar[dict[str, Any]] = {
-        "n_epochs": 5,
-        "lambda_lr": 0.016,
-        "proportional_gain": 0.08,
-        "lambda_units": "relative",
-    }
-
     fuse_adam = True  # it takes twice as many steps as PPO's
 
+    # The second step's gains are small, since the factor above is four with the defaults.
+    lambda_lr: float = hyperparameter(0.016)
+    proportional_gain: float = hyperparameter(0.08)
+    lambda_units: Literal["relative", "cost"] = hyperparameter("relative")
     projection_reach: float = hyperparameter(4.0, ends="()")
+
+    # At the limit the second step takes back what the first has done: with PPO's ten passes there
+    # is much noise in both.
+    def __init__(self, *args: Any, n_epochs: int = 5, **kwargs: Any) -> None:
+        super().__init__(*args, n_epochs=n_epochs, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -66,7 +66,8 @@ class CUP(Lagrangian, FirstOrder):
         return (1.0 - gamma * gae_lambda) / (1.0 - gamma)
 
     def train(self) -> None:
-        self._weight = th.as_tensor(self.cost_weight(self.centre_costs()), device=self.device)
+        self.step()
+        self._weight = th.as_tensor(self.weights(self.centre_costs()), device=self.device)
         super().train()  # PPO's, on the rewards
         if bool(self._weight.any()):
             self._improved = self.snapshot()

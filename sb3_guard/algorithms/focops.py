@@ -1,6 +1,6 @@
 """FOCOPS: the best policy near the old one, known in closed form, is followed by gradient steps."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch as th
 from stable_baselines3.common.distributions import Distribution
@@ -9,7 +9,7 @@ from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.first_order import FirstOrder
-from sb3_guard.algorithms.common.lagrangian import RELATIVE, Lagrangian
+from sb3_guard.algorithms.common.lagrangian import Lagrangian
 
 
 class FOCOPS(Lagrangian, FirstOrder):
@@ -39,14 +39,19 @@ class FOCOPS(Lagrangian, FirstOrder):
         "proportional_gain": {"low": 0.0, "high": 4.0},
         "temperature": {"low": 0.5, "high": 5.0, "log": True},
     }
-    defaults: ClassVar[dict[str, Any]] = {**RELATIVE, "lambda_lr": 0.25}
-    fixed_arguments: ClassVar[frozenset[str]] = frozenset({"clip_range", "clip_range_vf"})
+    fixed_arguments: ClassVar[frozenset[str]] = FirstOrder.fixed_arguments | {
+        "clip_range", "clip_range_vf"
+    }  # fmt: skip
 
+    lambda_lr: float = hyperparameter(0.25)
+    proportional_gain: float = hyperparameter(0.5)
+    lambda_units: Literal["relative", "cost"] = hyperparameter("relative")
     temperature: float = hyperparameter(1.5, ends="()")
     trust_region: float = hyperparameter(0.02, ends="()")
 
     def train(self) -> None:
-        weight = self.cost_weight(self.advantage_unit() * self.centre_costs())
+        self.step()
+        weight = self.weights(self.advantage_unit() * self.centre_costs())
         self._weight = th.as_tensor(weight, device=self.device)
         self._old = self.snapshot()
         super().train()

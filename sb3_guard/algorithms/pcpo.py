@@ -1,17 +1,18 @@
 """PCPO: a TRPO step, then a projection onto the cost limits."""
 
+import sys
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import torch as th
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
-from sb3_guard.algorithms.common.margin import Margin
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.costs import Margin
 from sb3_guard.algorithms.common.natural_gradient import projected_step
-from sb3_guard.algorithms.common.trust_region import Region, Trial
+from sb3_guard.algorithms.common.trust_region import Accept, Region, TrustRegion
 
 
-class PCPO(Margin):
+class PCPO(TrustRegion):
     """Projection-based constrained policy optimisation (Yang et al., 2020, arXiv 2010.03152).
 
     ::
@@ -22,9 +23,12 @@ class PCPO(Margin):
     g and B are the gradients of E[ratio · A] and E[ratio · A_C], c the violations (J_C - d) / T, F
     the Fisher matrix, and L is F or I. The projection knows no trust region: it may ask for more
     than δ. The line search therefore shortens x until KL ≤ δ, and asks for nothing else. The limits
-    are kept with a learnt margin (:class:`~sb3_guard.algorithms.common.margin.Margin`), which the
-    paper does not have.
+    are kept with a learnt :class:`~sb3_guard.algorithms.common.costs.Margin`, which the paper does
+    not have.
 
+    :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the paper
+    :param recovery: count a violation as at most this share of what a step of the region can take
+        away; 1 for the whole violation, as in the paper
     :param projection: ``"kl"`` for L = F, ``"l2"`` for L = I
     :param line_search: whether to shorten steps that leave the trust region; False takes them
         whole, as the paper does
@@ -35,19 +39,32 @@ class PCPO(Margin):
         "projection": ["kl", "l2"],
         "margin_lr": [0.0, 0.05, 0.1, 0.2],
     }
+    signed_limits = True
+
     # Costs far ahead are noisy in a rollout, so they are left to the cost critic. A step always has
     # the reward's part, so the projection may go as far as the limit asks.
-    defaults: ClassVar[dict[str, Any]] = {"cost_gae_lambda": 0.5, "recovery": 1.0}
-
+    cost_gae_lambda: float | None = hyperparameter(0.5, high=1.0, ends="[]")
+    margin_lr: float = hyperparameter(0.1)
+    recovery: float = hyperparameter(1.0, high=1.0, ends="(]")
     projection: Literal["kl", "l2"] = hyperparameter("kl")
     line_search: bool = hyperparameter(True)
 
-    def step(self, region: Region) -> th.Tensor:
-        g, B, c, delta = region.gradient, region.cost_gradients, region.violation, region.delta
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.margin: Margin = None  # type: ignore[assignment]
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.margin = Margin.of(self.margin, len(self.cost_keys))
+
+    def plan(self, region: Region) -> tuple[th.Tensor, Accept]:
+        g, B, delta = region.gradient, region.cost_gradients, region.delta
+        c = self.margin.violation(self.costs)
         v, W = region.solve(g), th.stack([region.solve(b) for b in B])
         x, pull = projected_step(g, B, c, v, W, delta, self.projection == "l2", self.recovery)
         self._record_per_cost("train/projection", pull)
-        return x
+        return x, lambda trial: trial.kl <= (delta if self.line_search else sys.float_info.max)
 
-    def accept(self, trial: Trial) -> bool:
-        return trial.kl <= (self.target_kl if self.line_search else np.finfo(np.float64).max)
+    def fit(self, batch: CostRolloutBufferSamples) -> None:
+        self.margin.follow(self.costs, self.margin_lr)
+        self._record_per_cost("train/cost_margin", self.margin.value)

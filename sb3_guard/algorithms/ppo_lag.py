@@ -1,13 +1,14 @@
 """PPO-Lagrangian: PPO with a multiplier for each cost, which follows the violation."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
 from stable_baselines3 import PPO
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.first_order import FirstOrder, check_ppo, mean_kl
-from sb3_guard.algorithms.common.lagrangian import RELATIVE, Lagrangian
+from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 
 
@@ -34,41 +35,48 @@ class PPOLag(Lagrangian, CostRollouts, PPO):
         "lambda_lr": {"low": 0.02, "high": 1.0, "log": True},
         "proportional_gain": {"low": 0.0, "high": 4.0},
     }
-    defaults: ClassVar[dict[str, Any]] = {**FirstOrder.defaults, **RELATIVE}
     policy_defaults: ClassVar[dict[str, Any]] = CALM
+
+    lambda_lr: float = hyperparameter(0.2)
+    proportional_gain: float = hyperparameter(0.5)
+    lambda_units: Literal["relative", "cost"] = hyperparameter("relative")
+
+    def __init__(
+        self,
+        *args: Any,
+        gae_lambda: float = 0.97,
+        target_kl: float | None = 0.02,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, gae_lambda=gae_lambda, target_kl=target_kl, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
         check_ppo(self)
 
     def train(self) -> None:
-        """SB3's update on weighted advantages, then the cost critic."""
-        self.reweigh()
+        """λ follows J_C, SB3's PPO learns from A - Σ λ_i A_Ci, then the cost critic learns."""
+        self.step()
+        buffer = self.rollout_buffer
+        # Where the reward's advantages are all alike, their unit is 1.
+        spread = float(buffer.advantages.std()) or 1.0
+        weights = self.weights(spread * self.centre_costs())
+        if self.lambda_units == "cost" and self.normalize_advantage:
+            weights *= np.float32(spread)  # as published: λ weighs A_C against the standardised A
+        # PPO standardises the result by minibatch, so a division by 1 + Σ λ would change nothing.
+        buffer.advantages = buffer.advantages - buffer.cost_advantages @ weights
         try:
             if self.target_kl is not None:
                 self._take_passes(self.n_epochs, self.target_kl)
             else:
                 super().train()
         except ValueError:  # torch refuses distributions of parameters that are not finite
-            finite = all(bool(th.isfinite(weights).all()) for weights in self.policy.parameters())
+            finite = all(bool(th.isfinite(weight).all()) for weight in self.policy.parameters())
             self._check_finite("policy_gradient_loss", 0.0 if finite else np.nan)
             raise
         for name in ("policy_gradient_loss", "value_loss"):
             self._check_finite(name, self.logger.name_to_value[f"train/{name}"])
         self.fit_cost_critic()
-
-    def reweigh(self) -> None:
-        """Take the weighted cost advantages off the rollout's advantages.
-
-        PPO standardises the result by minibatch, so a division by 1 + Σ λ would change nothing.
-        """
-        buffer = self.rollout_buffer
-        # Where the reward's advantages are all alike, their unit is 1.
-        spread = float(buffer.advantages.std()) or 1.0
-        weight = self.cost_weight(spread * self.centre_costs())
-        if self.lambda_units == "cost" and self.normalize_advantage:
-            weight *= np.float32(spread)  # as published: λ weighs A_C against the standardised A
-        buffer.advantages = buffer.advantages - buffer.cost_advantages @ weight
 
     def _take_passes(self, n_epochs: int, target_kl: float) -> None:
         """SB3's update, one pass at a time, until the mean KL over the rollout is too large."""

@@ -1,12 +1,13 @@
 """RCPO: natural gradient steps on the penalised advantage, without a line search."""
 
-from typing import Any, ClassVar
+import torch as th
 
-from sb3_guard.algorithms.common.penalized import PenalizedTrustRegion
-from sb3_guard.algorithms.common.trust_region import Trial
+from sb3_guard.algorithms.common.arguments import hyperparameter
+from sb3_guard.algorithms.common.trust_region import Accept, Region
+from sb3_guard.algorithms.trpo_lag import TRPOLag
 
 
-class RCPO(PenalizedTrustRegion):
+class RCPO(TRPOLag):
     """Reward-constrained policy optimisation (Tessler et al., 2019, arXiv 1805.11074).
 
     ::
@@ -19,7 +20,10 @@ class RCPO(PenalizedTrustRegion):
     """
 
     label, family, paper = "RCPO", "Lagrangian", "Tessler et al. 2019"
-    defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.1, "proportional_gain": 0.5}
 
-    def accept(self, trial: Trial) -> bool:
-        return True
+    lambda_lr: float = hyperparameter(0.1)
+    proportional_gain: float = hyperparameter(0.5)
+    derivative_gain: float = hyperparameter(0.0)
+
+    def plan(self, region: Region) -> tuple[th.Tensor, Accept]:
+        return region.natural_step(), lambda trial: True

@@ -4,11 +4,12 @@ from typing import Any, ClassVar, Literal
 
 import torch as th
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.linearised import LinearisedLimits
+from sb3_guard.algorithms.cpo import CPO
 
 
-class SCPO(LinearisedLimits):
+class SCPO(CPO):
     """State-wise constrained policy optimisation (Zhao et al., 2023, arXiv 2306.12594).
 
     ::
@@ -18,9 +19,9 @@ class SCPO(LinearisedLimits):
 
     With ``M_t``, the highest cost before step t (0 at first), the increments
     ``D_t = max(0, c_t - M_t)`` add up to the highest cost of an episode. The step is CPO's on the
-    advantages of D, undiscounted. M belongs to the state: ``VecMaxCost`` from
-    ``sb3_guard.common.vec_budgets`` shows it to policy and critic, as in the paper; an environment
-    that is not wrapped in it trains too, by observations that do not tell what has been reached.
+    advantages of D, undiscounted. M belongs to the state: ``VecMaxCost`` (or ``MaxCost``) from
+    ``sb3_guard.common`` shows it to policy and critic, as in the paper; an environment that is not
+    wrapped in it trains too, by observations that do not tell what has been reached.
 
     Most increments are 0: the cost critic is fitted to all rows whose cost-to-go is positive and as
     many others, drawn again for each update.
@@ -33,8 +34,10 @@ class SCPO(LinearisedLimits):
     limit_on: ClassVar[Literal["sum", "max"]] = "max"
     signed_limits = False  # the highest cost so far begins at 0
     # The increments add up to the highest cost undiscounted alone.
-    fixed_arguments: ClassVar[frozenset[str]] = LinearisedLimits.fixed_arguments | {"cost_gamma"}
-    defaults: ClassVar[dict[str, Any]] = {"cost_gamma": 1.0}
+    fixed_arguments: ClassVar[frozenset[str]] = CPO.fixed_arguments | {"cost_gamma"}
+
+    cost_gamma: float | None = hyperparameter(1.0)
+    cost_gae_lambda: float | None = hyperparameter(None, high=1.0, ends="[]")
 
     def critic_rows(self, targets: th.Tensor) -> slice | th.Tensor:
         positive = (targets > 0.0).any(dim=1)

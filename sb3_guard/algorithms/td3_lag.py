@@ -1,17 +1,16 @@
 """TD3-Lagrangian: TD3 with cost critics and a multiplier that follows the violation."""
 
-from typing import Any, ClassVar
-
 import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.replay import LagrangianReplay
+from sb3_guard.algorithms.common.arguments import hyperparameter
+from sb3_guard.algorithms.common.replay import CostReplay
 from sb3_guard.algorithms.common.replay_buffers import CostReplayBufferSamples
 
 
-class TD3Lag(LagrangianReplay, TD3):
+class TD3Lag(CostReplay, TD3):
     """TD3 on the Lagrangian (Ray et al., 2019, with the learner of arXiv 1802.09477).
 
     ::
@@ -25,7 +24,8 @@ class TD3Lag(LagrangianReplay, TD3):
     """
 
     label, family, paper = "TD3-Lagrangian", "Lagrangian", "Ray et al. 2019"
-    defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 10.0}
+
+    lambda_lr: float = hyperparameter(10.0)
 
     def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
         """TD3's step: critics, and with a delay actor and targets."""
@@ -48,9 +48,13 @@ class TD3Lag(LagrangianReplay, TD3):
         if self._n_updates % self.policy_delay == 0:
             actions = self.actor(batch.observations)
             self.actor.optimizer.zero_grad()
+            weights = self.batch_weights(values[0])
             with self.critics_constant():
-                chosen = self.critic.q1_forward(batch.observations, actions)
-                loss = self.penalized(-chosen, batch, actions, values[0]).mean()
+                loss = -self.critic.q1_forward(batch.observations, actions)
+                if weights.any():
+                    costs = (self.cost_critic(batch.observations, actions) * weights).sum(1, True)
+                    loss = (loss + costs) / (1.0 + float(self.prices.sum()))
+                loss = loss.mean()
                 loss.backward()
             self.actor.optimizer.step()
             logs["actor_loss"] = loss.item()

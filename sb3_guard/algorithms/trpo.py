@@ -1,7 +1,8 @@
 """TRPO: the baseline, which maximises return and ignores cost."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
+from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 
@@ -22,4 +23,5 @@ class TRPO(TrustRegion):
 
     constrained, uses_cost_critic = False, False
     search_space: ClassVar[dict[str, Any]] = {"cost_gae_lambda": None}
-    defaults: ClassVar[dict[str, Any]] = {"missing_cost": "zero"}
+
+    missing_cost: Literal["error", "zero"] = hyperparameter("zero")

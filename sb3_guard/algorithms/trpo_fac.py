@@ -155,12 +155,12 @@ class TRPOFAC(TrustRegion):
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "multiplier", "multiplier.optimizer"], tensors
 
-    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
-        weight = self.cost_weight(batch)
+    def advantages(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        weight = self.weights(batch)
         self._record_per_cost("train/cost_weight", weight.mean(dim=0).cpu().numpy())
-        return (ratio * (batch.advantages - (weight * batch.cost_advantages).sum(dim=1))).mean()
+        return batch.advantages - (weight * batch.cost_advantages).sum(dim=1)
 
-    def cost_weight(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+    def weights(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         """What a unit of each cost's advantage is worth at each step of the rollout, [N, m]."""
         weight = self.multiplier.predict(batch.observations)
         if self.proportional_gain:
@@ -204,7 +204,7 @@ class TRPOFAC(TrustRegion):
         if self.mode == "statewise":
             bound = self.discounted_limits()
         else:
-            bound = self.cost_limits
+            bound = self.costs.limits
             to_come = th.as_tensor(self.costs.episode_cost).to(to_come).expand_as(to_come)
         limit = th.tensor(bound).to(to_come)
         return to_come - limit, limit

@@ -8,7 +8,7 @@ import torch as th
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
+from sb3_guard.algorithms.common.trust_region import Accept, Region, TrustRegion
 
 TINY = 1e-12
 
@@ -64,13 +64,13 @@ class TRPOIPO(TrustRegion):
     def _unit(self) -> np.ndarray:
         """What excesses are measured in, shape (m,): the limit, or J_C where the limit is 0."""
         if self.units == "cost":
-            return np.ones(len(self.cost_limits))
-        limits = self.cost_limits
+            return np.ones(len(self.cost_keys))
+        limits = self.costs.limits
         return np.where(limits > 0.0, limits, np.maximum(self.costs.episode_cost, TINY))
 
     @property
     def _sharpness(self) -> float:
-        return self.t * (len(self.cost_limits) if self.units == "relative" else 1.0)
+        return self.t * (len(self.cost_keys) if self.units == "relative" else 1.0)
 
     def _spread(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         """What one standard deviation of a cost's advantages is in the reward's, shape (m,)."""
@@ -87,10 +87,16 @@ class TRPOIPO(TrustRegion):
         penalty = (scale * barrier(excess, self._sharpness, self.max_multiplier)).sum()
         return (ratio * batch.advantages).mean() + penalty
 
-    def accept(self, trial: Trial) -> bool:
+    def plan(self, region: Region) -> tuple[th.Tensor, Accept]:
+        x, accept = super().plan(region)
         violation = self.costs.violation
-        stays_inside = ~(violation < 0.0) | (violation + trial.cost_change < 0.0)
-        return super().accept(trial) and bool(np.all(stays_inside))
+        inside = violation < 0.0
+        return (
+            x,
+            lambda trial: (
+                accept(trial) and bool(np.all((violation + trial.cost_change)[inside] < 0.0))
+            ),
+        )
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         slack = -self.costs.violation * self.costs.horizon / self._unit()

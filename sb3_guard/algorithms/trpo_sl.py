@@ -57,7 +57,7 @@ class TRPOSL(FilteredTrustRegion):
         super().fit(batch)
         layer = self.policy.action_filter
         assert isinstance(layer, SafetyLayer)
-        self._set_threshold(self.cost_limits / self.costs.horizon)
+        self._set_threshold(self.costs.limits / self.costs.horizon)
         costly = (batch.costs != 0.0).any(dim=1)
         some, none = costly.nonzero().flatten(), (~costly).nonzero().flatten()
         if not len(some):

@@ -68,12 +68,12 @@ class TRPOUSL(FilteredTrustRegion):
         assert isinstance(layer, UnrolledSafetyLayer)
         return layer
 
-    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
-        objective = super().surrogate(batch, ratio)
+    def advantages(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        advantages = super().advantages(batch)
         if self.kappa == 0.0:
-            return objective
+            return advantages
         penalty = self._layer.excess(batch.observations, self._sampled(batch))
-        return objective - self.kappa * (ratio * (penalty - penalty.mean())).mean()
+        return advantages - self.kappa * (penalty - penalty.mean())
 
     def value_rollout(self) -> None:
         """Value the executed actions, those after the last step by the policy that took them."""

@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms.common.limits import limits_at
+from sb3_guard.algorithms.common.costs import limits_at
 from sb3_guard.checked_env import refuse_vector_env
 from sb3_guard.common.evaluation import (
     Evaluation,

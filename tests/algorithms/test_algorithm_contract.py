@@ -14,18 +14,15 @@ import pytest
 import torch as th
 from cost_envs import SB3_POLICY, CostPoint, RandomCostEnv
 from gymnasium import spaces
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
-    SubprocVecEnv,
     VecEnv,
     VecEnvWrapper,
-    VecFrameStack,
     VecNormalize,
 )
 
@@ -33,7 +30,6 @@ from sb3_guard.algorithms import (
     ALGORITHMS,
     CPO,
     P3O,
-    RCPO,
     TRPO,
     TRPOFAC,
     TRPOIPO,
@@ -43,8 +39,6 @@ from sb3_guard.algorithms import (
     TrustRegion,
 )
 from sb3_guard.algorithms.common.actor import kl
-from sb3_guard.algorithms.common.buffers import CostRolloutBuffer
-from sb3_guard.algorithms.common.critics import CostCritic
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.costs import read_costs
 
@@ -131,98 +125,34 @@ def assert_equal(a: Any, b: Any) -> None:
         assert a == b
 
 
-# Spaces
+# Spaces and networks; scripts/run_sb3_tests.py runs SB3's own tests of them
 
 
-MOVES = spaces.Box(-2.0, 2.0, (2,), np.float32)
-OBSERVATIONS: dict[str, spaces.Space] = {
-    "box": BOX,
-    "matrix": spaces.Box(-1.0, 1.0, (2, 2), np.float64),
-    "discrete": spaces.Discrete(4),
-    "multidiscrete": spaces.MultiDiscrete([2, 3]),
-    "multibinary": spaces.MultiBinary(3),
-    "dict": spaces.Dict({"a": BOX, "b": spaces.Discrete(3)}),
-}
-ACTIONS: dict[str, spaces.Space] = {
-    "matrix": spaces.Box(-1.0, 3.0, (2, 2), np.float32),
-    "discrete": spaces.Discrete(3),
-    "multidiscrete": spaces.MultiDiscrete([2, 3]),
-    "multibinary": spaces.MultiBinary(3),
-}
+@pytest.mark.parametrize("cls", EVERY)
+def test_spaces_that_an_algorithm_cannot_train_on_are_named(cls: Any) -> None:
+    one = spaces.Discrete(3, start=-1)
+    for observed, acting in (BOX, one), (spaces.Dict(a=BOX, b=one), BOX):
+        env = make_vec_env(lambda o=observed, a=acting: RandomCostEnv(o, a), 2)
+        name = cls.__name__
+        with pytest.raises(ValueError, match=f"must begin at 0|{name} needs continuous|{name} cor"):
+            small(cls, env, "MlpPolicy" if observed is BOX else "MultiInputPolicy")
+    if cls in FILTERED or cls in OFF_POLICY:
+        env = make_vec_env(lambda: RandomCostEnv(BOX, spaces.Discrete(3)), 2)
+        with pytest.raises(ValueError, match=r"corrects actions of a Box|needs continuous actions"):
+            small(cls, env)
 
 
-@pytest.mark.parametrize(
-    ("cls", "observation_space", "action_space"),
-    each(
-        *((space, MOVES) for space in reversed(OBSERVATIONS.values())),
-        *((BOX, space) for space in ACTIONS.values()),
-        classes=EVERY,
-    ),
-)
-def test_spaces(
-    cls: Any,
-    observation_space: spaces.Space,
-    action_space: spaces.Space,
-    tmp_path: Path,
-) -> None:
-    """Train, save, load, and act as before."""
-    policy = "MultiInputPolicy" if isinstance(observation_space, spaces.Dict) else "MlpPolicy"
-    env = make_vec_env(lambda: RandomCostEnv(observation_space, action_space), 2, seed=0)
-    if cls in FILTERED and not isinstance(action_space, spaces.Box):
-        with pytest.raises(ValueError, match=f"{cls.__name__} corrects actions of a Box, not of"):
-            small(cls, env, policy)
-        return
-    if cls in OFF_POLICY and not isinstance(action_space, spaces.Box):
-        with pytest.raises(ValueError, match=f"{cls.__name__} needs continuous actions"):
-            small(cls, env, policy)
-        return
-    if isinstance(action_space, spaces.Discrete | spaces.MultiDiscrete):
-        one = spaces.Discrete(3, start=-1)
-        shifted = (
-            one
-            if isinstance(action_space, spaces.Discrete)
-            else spaces.MultiDiscrete([2, 2], start=[1, 1])
-        )
-        for observed, acting in (BOX, shifted), (spaces.Dict(a=BOX, b=one), action_space):
-            other = make_vec_env(lambda o=observed, a=acting: RandomCostEnv(o, a), 2)
-            with pytest.raises(ValueError, match="must begin at 0"):
-                small(cls, other, policy if observed is BOX else "MultiInputPolicy")
-    model = small(cls, env, policy).learn(160)
+@pytest.mark.parametrize("cls", some(classes=EVERY))
+def test_dictionaries_are_saved_and_loaded(cls: Any, tmp_path: Path) -> None:
+    space = spaces.Dict({"a": BOX, "b": spaces.Discrete(3)})
+    env = make_vec_env(lambda: RandomCostEnv(space, BOX), 2, seed=0)
+    model = small(cls, env, "MultiInputPolicy").learn(160)
     observation = env.reset()
     action, _ = model.predict(observation, deterministic=True)
     model.save(tmp_path / "model")
     again = cls.load(tmp_path / "model", device="cpu")
     np.testing.assert_array_equal(again.predict(observation, deterministic=True)[0], action)
     assert_equal(parameters(model), parameters(again))
-
-
-@pytest.mark.parametrize(
-    ("cls", "policy", "observation_space", "kwargs"),
-    some(
-        ("MlpPolicy", BOX, {"share_features_extractor": False}),
-        ("CnnPolicy", IMAGE, {}),
-        ("CnnPolicy", IMAGE, {"share_features_extractor": False}),
-        ("MultiInputPolicy", spaces.Dict({"image": IMAGE, "vector": BOX}), {}),
-        ("MlpPolicy", BOX, {"activation_fn": th.nn.ReLU}),
-        ("MlpPolicy", BOX, {"net_arch": {"pi": [8], "vf": []}}),
-        ("MlpPolicy", BOX, {"net_arch": {"pi": [8]}}),
-        ("MlpPolicy", BOX, {"net_arch": []}),
-        ("MlpPolicy", BOX, {"ortho_init": False, "log_std_init": -0.5}),
-        ("MlpPolicy", BOX, {"optimizer_class": th.optim.SGD}),
-    ),
-)
-def test_policies(
-    cls: type[TrustRegion], policy: str, observation_space: spaces.Space, kwargs: dict[str, Any]
-) -> None:
-    env = make_vec_env(lambda: RandomCostEnv(observation_space, BOX), 2, seed=0)
-    model = small(cls, env, policy, n_steps=20, policy_kwargs=kwargs)
-    before = parameters(model)["policy"]
-    model.learn(80)
-    after = parameters(model)["policy"]
-    moved = [name for name in before if not th.equal(before[name], after[name])]
-    assert any("value_net" in name for name in moved)
-    assert any("action_net" in name for name in moved)
-    assert all(th.isfinite(value).all() for value in after.values())
 
 
 @pytest.mark.parametrize(("cls", "critic"), [(CPO, "vf"), (ALGORITHMS["sac_lag"], "qf")])
@@ -295,30 +225,6 @@ def test_batch_norm_and_dropout_act_while_fitting_alone(
         assert th.equal(*values)
 
 
-@pytest.mark.parametrize(("cls", "squash"), some(True, False, classes=TRUST_REGION))
-def test_gsde(cls: type[TrustRegion], squash: bool) -> None:
-    model = small(
-        cls, points(), use_sde=True, sde_sample_freq=7, policy_kwargs={"squash_output": squash}
-    )
-    before = parameters(model)["policy"]["action_net.weight"]
-    model.learn(240)
-    assert model.logger.name_to_value["train/kl"] <= model.target_kl
-    assert not th.equal(before, parameters(model)["policy"]["action_net.weight"])
-
-
-@pytest.mark.parametrize("cls", CLASSES)
-def test_what_a_model_is(cls: type[TrustRegion]) -> None:
-    model = small(cls, points())
-    assert isinstance(model, OnPolicyAlgorithm)
-    assert isinstance(model.rollout_buffer, CostRolloutBuffer)
-    assert hasattr(model, "cost_critic") is cls.uses_cost_critic
-    assert cls.uses_cost_critic is (cls not in (TRPO, *FILTERED))
-    if cls.uses_cost_critic:
-        assert isinstance(model.cost_critic, CostCritic)
-        optimizers = {id(model.policy.optimizer), id(model.cost_critic.optimizer)}
-        assert len(optimizers) == 2
-
-
 # Environments
 
 
@@ -336,7 +242,7 @@ def test_episodes_and_rollouts_of_any_length(
     numbers = [v for v in model.logger.name_to_value.values() if isinstance(v, int | float)]
     assert np.isfinite(numbers).all()
     steps = 4 * n_steps
-    np.testing.assert_array_equal(model.episodes.lengths, steps % episode_length)
+    np.testing.assert_array_equal(model.costs.episodes.lengths, steps % episode_length)
     assert len(model.ep_cost_buffer) == min(100, n_envs * (steps // episode_length))
 
 
@@ -385,51 +291,6 @@ def test_vec_normalize_leaves_costs_raw(cls: type[TrustRegion], tmp_path: Path) 
     del model.train
     model.save(tmp_path / "model")
     cls.load(tmp_path / "model", env=env, device="cpu").learn(80)
-
-
-@pytest.mark.parametrize(("cls", "cost_scale"), each(1.0, 0.0))
-def test_a_limit_of_zero_with_and_without_cost(cls: type[TrustRegion], cost_scale: float) -> None:
-    """c = 0 and no cost gradient, or c > 0 throughout: numbers stay numbers, policies move."""
-    model = small(cls, points(2, cost_scale=cost_scale, hazard=(-1.0, 0.0)))
-    before = parameters(model)["policy"]["action_net.weight"]
-    model.learn(400)
-    after = parameters(model)["policy"]
-    assert not th.equal(before, after["action_net.weight"])
-    assert all(th.isfinite(value).all() for value in after.values())
-    numbers = [v for v in model.logger.name_to_value.values() if isinstance(v, int | float)]
-    assert np.isfinite(numbers).all()
-
-
-@pytest.mark.parametrize("cls", some())
-def test_frame_stacks(cls: type[TrustRegion]) -> None:
-    """With costs of time-outs in the last frames, and a filter that acts on stacked ones."""
-    model = small(cls, VecFrameStack(points(), 3)).learn(160)
-    assert model.observation_space.shape == (12,) and len(model.ep_cost_buffer) == 4
-
-
-@pytest.mark.parametrize(
-    ("cls", "how"),
-    [(CPO, {}), (TRPOSL, {"start_method": "fork"}), (TRPOFAC, {"start_method": "fork"})],
-)
-def test_subprocesses_change_nothing(cls: type[TrustRegion], how: dict[str, Any]) -> None:
-    runs = []
-    for kind, kwargs in ((DummyVecEnv, {}), (SubprocVecEnv, how)):
-        env = kind([lambda: CostPoint(episode_length=30, hazard=(-1.0, 0.0))] * 2, **kwargs)
-        env.seed(0)
-        runs.append(small(cls, env).learn(160))
-        env.close()
-    assert_equal(*(parameters(model) for model in runs))
-    assert runs[0].total_cost == runs[1].total_cost > 0.0
-
-
-def test_an_env_that_is_no_vec_env_and_an_id() -> None:
-    small(CPO, CostPoint(episode_length=30)).learn(40)
-    gym.register("CostPointForTests-v0", CostPoint, max_episode_steps=25)
-    try:
-        model = small(CPO, "CostPointForTests-v0").learn(20)
-    finally:
-        del gym.registry["CostPointForTests-v0"]
-    assert model.costs is not None and model.costs.horizon == 25
 
 
 # Costs in info
@@ -516,8 +377,6 @@ def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -
         ({"batch_size": 0}, "batch_size=0"),
         ({"n_critic_updates": -1}, "n_critic_updates=-1"),
         ({"cg_max_steps": 0}, "cg_max_steps=0"),
-        ({"line_search_max_iter": 0}, "line_search_max_iter=0"),
-        ({"line_search_shrinking_factor": 1.0}, r"line_search_shrinking_factor=1.0.*\(0, 1\)"),
         ({"gamma": 1.1}, r"gamma=1.1.*\[0, 1\]"),
         ({"gae_lambda": -0.1}, "gae_lambda=-0.1"),
         ({"cost_gamma": 2.0}, "cost_gamma=2.0"),
@@ -530,7 +389,6 @@ def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -
         ({"learning_rate": True}, "learning_rate=True"),
         ({"learning_rate": float("inf")}, "learning_rate=inf"),
         ({"missing_cost": "ignore"}, "missing_cost='ignore'"),
-        ({"normalize_advantage": "no"}, "normalize_advantage='no': must be True or False"),
         ({"cost_keys": "cost"}, r"cost_keys='cost'.*sequence"),
         ({"cost_keys": ()}, "cost_keys="),
         ({"cost_keys": ("a", "a")}, "different names"),
@@ -539,7 +397,6 @@ def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -
         ({"cost_limit": float("nan")}, "cost_limit=nan"),
         ({"cost_limit": True}, "cost_limit=True"),
         ({"cost_limit": "low"}, "cost_limit='low'"),
-        ({"rollout_buffer_class": dict}, "rollout_buffer_class=dict"),
     ],
 )
 def test_bad_values_are_named(kwargs: dict[str, Any], message: str) -> None:
@@ -572,13 +429,6 @@ def test_a_limit_set_later_is_the_limit() -> None:
         small(TRPO, points(1), cost_limit=[-0.5])
 
 
-@pytest.mark.parametrize("value", [-1, True, np.inf, "much"])
-def test_a_bad_cost_reduction_is_named(value: Any) -> None:
-    with pytest.raises(ValueError, match=f"cost_reduction={value!r}: must be a number in"):
-        small(CPO, points(1), cost_reduction=value)
-    small(CPO, points(1), cost_reduction=np.float32(0.1))
-
-
 # Saving, loading, resuming
 
 
@@ -595,13 +445,13 @@ def test_save_and_load_keep_everything(cls: type[TrustRegion], tmp_path: Path) -
         "target_kl",
         "num_timesteps",
         "total_cost",
-        "horizon",
         "missing_cost",
         "cost_keys",
     ):
         assert getattr(model, name) == getattr(again, name), name
-    for name in ("cost_limits", "total_costs", "last_costs"):
-        np.testing.assert_array_equal(getattr(model, name), getattr(again, name), err_msg=name)
+    for name in ("limits", "total", "last", "episode_cost", "horizon"):
+        pair = [getattr(each.costs, name) for each in (model, again)]
+        np.testing.assert_array_equal(*pair, err_msg=name)
     np.testing.assert_array_equal(np.array(model.ep_cost_buffer), np.array(again.ep_cost_buffer))
     if cls.uses_cost_critic:
         observation = th.randn(5, 4)
@@ -621,64 +471,12 @@ def test_save_and_load_keep_everything(cls: type[TrustRegion], tmp_path: Path) -
     assert again.num_timesteps == model.num_timesteps + 80
 
 
-@pytest.mark.parametrize("cls", EVERY)
-def test_parameters_travel(cls: Any) -> None:
-    a, b = small(cls, points()).learn(80), small(cls, points(), seed=1)
-    b.set_parameters(parameters(a))
-    assert_equal(parameters(a), parameters(b))
-    assert ("cost_critic" in parameters(a)) is (cls in OFF_POLICY or cls.uses_cost_critic)
-    assert ("multiplier" in parameters(a)) is (issubclass(cls, Lagrangian) or cls is TRPOFAC)
-    assert ("policy.action_filter.optimizer" in parameters(a)) is (cls in FILTERED)
-    # SB3's tools draw, average and compare whole state dictionaries: no booleans, no integers.
-    modules = [value for name, value in parameters(a).items() if "optimizer" not in name]
-    assert all(each.is_floating_point() for module in modules for each in module.values())
-    with pytest.raises(ValueError, match="do not match"):
-        b.set_parameters({"policy": parameters(a)["policy"]})
-
-
 @pytest.mark.parametrize("cls", some(classes=EVERY))
 def test_load_with_another_number_of_envs(cls: type[TrustRegion], tmp_path: Path) -> None:
     small(cls, points(2), n_critic_updates=1).learn(80).save(tmp_path / "model")
     model = cls.load(tmp_path / "model", env=points(3), device="cpu")
     model.learn(120, reset_num_timesteps=False)
-    assert model.episodes.totals.shape == (3, 1) and model.num_timesteps == 200
-
-
-def test_a_replaced_policy_is_the_one_that_learns() -> None:
-    model = small(CPO, points(2))
-    model.policy = type(model.policy)(
-        model.observation_space, model.action_space, model.lr_schedule
-    )
-    before = model.policy.value_net.weight.clone()
-    model.learn(80)
-    assert not th.equal(before, model.policy.value_net.weight)
-
-
-def test_a_copy_learns_on_its_own() -> None:
-    """With ReLU, whose regression goes through autograd and the network itself."""
-    model = small(CPO, points(2), policy_kwargs={"activation_fn": th.nn.ReLU}).learn(80)
-    model.env = None
-    twin = copy.deepcopy(model)
-    before = parameters(twin)
-    twin.set_env(points(2))
-    twin.learn(80)
-    assert_equal(parameters(model), before)
-    for name in ("policy", "cost_critic"):
-        moved = [
-            not th.equal(before[name][key], parameters(twin)[name][key]) for key in before[name]
-        ]
-        assert all(moved), name
-
-
-@pytest.mark.parametrize("cls", some(classes=EVERY))
-def test_set_env_starts_new_episodes(cls: type[TrustRegion]) -> None:
-    model = small(cls, points(2, episode_length=1000), n_critic_updates=1)
-    model._warned = {"no episode"}
-    model.learn(80)
-    assert (model.episodes.lengths == 40).all()
-    model.set_env(points(2))
-    model.learn(80, reset_num_timesteps=False)
-    assert (model.episodes.lengths == 10).all()
+    assert model.costs.episodes.totals.shape == (3, 1) and model.num_timesteps == 200
 
 
 class _Checkpoint(BaseCallback):
@@ -732,20 +530,12 @@ def test_resumed_equals_uninterrupted(
     assert resumed.num_timesteps == whole.num_timesteps == 400
     assert_equal(parameters(whole), parameters(resumed))
     assert whole.total_cost == resumed.total_cost
-    np.testing.assert_array_equal(whole.episodes.totals, resumed.episodes.totals)
-    np.testing.assert_array_equal(whole.episodes.lengths, resumed.episodes.lengths)
+    np.testing.assert_array_equal(whole.costs.episodes.totals, resumed.costs.episodes.totals)
+    np.testing.assert_array_equal(whole.costs.episodes.lengths, resumed.costs.episodes.lengths)
     np.testing.assert_array_equal(np.array(whole.ep_cost_buffer), np.array(resumed.ep_cost_buffer))
     for key, value in whole.logger.name_to_value.items():
         if key.startswith(("train/", "rollout/")):
             assert resumed.logger.name_to_value[key] == value, key
-
-
-@pytest.mark.parametrize("cls", some(classes=EVERY))
-def test_same_seed_same_training(cls: type[TrustRegion]) -> None:
-    runs = [parameters(small(cls, points(), seed=seed).learn(160)) for seed in (3, 3, 4)]
-    assert_equal(runs[0], runs[1])
-    with pytest.raises(AssertionError):
-        assert_equal(runs[0], runs[2])
 
 
 # Logging
@@ -771,44 +561,6 @@ class _Dumps(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("cls", some(classes=EVERY))
-def test_callbacks_see_the_locals_of_sb3(cls: Any) -> None:
-    seen: dict[type, tuple[dict[str, Any], dict[str, Any]]] = {}
-    off = cls in OFF_POLICY
-    theirs: Any = SAC if off else PPO
-    settings = narrow() if off else {"n_steps": 40, "batch_size": 40}
-    for kind in (theirs, cls):
-        model = (
-            theirs("MlpPolicy", points(), **settings) if kind is theirs else small(cls, points())
-        )
-
-        def keep(local: dict[str, Any], glob: dict[str, Any], kind: type = kind) -> bool:
-            seen[kind] = dict(local), dict(glob)
-            return True
-
-        model.learn(160, callback=keep)
-    local = seen[cls][0]
-    assert seen[theirs][0].keys() <= local.keys()
-    assert seen[theirs][1].keys() <= seen[cls][1].keys()
-    assert local["self"] is not None and isinstance(local["env"], VecEnv)
-    for name in ["actions"] if off else ["actions", "clipped_actions"]:
-        assert local[name].shape == (2, 2)
-    assert local["infos"][0]["cost"] >= 0.0
-
-
-def test_a_progress_bar_is_shown(capfd: pytest.CaptureFixture[str]) -> None:
-    small(CPO, points()).learn(80, progress_bar=True)
-    assert "80/80" in "".join(capfd.readouterr())
-
-
-@pytest.mark.parametrize("cls", some())
-def test_the_device_is_chosen_as_sb3_does(cls: type[TrustRegion]) -> None:
-    model = cls("MlpPolicy", points())
-    assert model.device == get_device("auto")
-    parts = [model.policy] + ([model.cost_critic] if cls.uses_cost_critic else [])
-    assert {each.device.type for part in parts for each in part.parameters()} == {model.device.type}
-
-
 @pytest.mark.parametrize("cls", TRUST_REGION)
 def test_a_leaf_is_its_problem_and_its_hooks(cls: type[TrustRegion]) -> None:
     """It names its paper, states its problem in a block, and replaces hooks and set-up alone."""
@@ -816,27 +568,25 @@ def test_a_leaf_is_its_problem_and_its_hooks(cls: type[TrustRegion]) -> None:
     first, _, rest = doc.partition("\n\n")
     assert re.search(r"\bet al\., \d{4}.*\d{4}\.\d{5}\)", first)
     assert rest.startswith("::\n")
-    hooks = {"surrogate", "step", "accept", "correct", "fit", "critic_rows", "value_rollout"}
+    hooks = {"advantages", "surrogate", "plan", "correct", "fit", "critic_rows", "value_rollout"}
     set_up = {"__init__", "_check_hyperparameters", "_setup_model", "_get_torch_save_params"}
     base = {name for layer in cls.__mro__[1:] for name in vars(layer)}
     replaced = {name for name, value in vars(cls).items() if callable(value) and name in base}
-    before = {"train"} if cls is RCPO else set()  # the penalty joins the rewards first
-    assert replaced <= hooks | set_up | before | {"learn"}, "learn is made by Constrained"
+    first = {"train"} if issubclass(cls, Lagrangian) else set()  # the multipliers follow J_C
+    assert replaced <= hooks | set_up | first
 
 
 def test_constructors_say_what_they_take(cls: type[TrustRegion] = CPO) -> None:
     taken = inspect.signature(cls).parameters
     assert list(taken)[:3] == ["policy", "env", "learning_rate"]
     for name, default in {
-        "n_steps": 2048, "cost_limit": 0.0, "cost_keys": ("cost",), "cost_reduction": 0.0,
+        "n_steps": 2048, "cost_limit": 0.0, "cost_keys": ("cost",), "margin_lr": 0.1,
         "seed": None, "gae_lambda": 0.97,
     }.items():  # fmt: skip
         assert taken[name].default == default, name
         assert f":param {name}:" in (cls.__doc__ or ""), name
     assert "ent_coef" not in taken
     assert inspect.signature(TRPO).parameters["missing_cost"].default == "zero"
-    learn = inspect.signature(cls.learn).parameters
-    assert learn["tb_log_name"].default == "CPO" and learn["log_interval"].default == 1
 
 
 @pytest.mark.parametrize(
@@ -932,29 +682,6 @@ def test_until_something_costs_the_reward_alone_is_learnt(cls: Any) -> None:
     th.testing.assert_close(*weights, rtol=0.0, atol=1e-6)
 
 
-@pytest.mark.parametrize("cls", some())
-def test_silent_unless_asked(
-    cls: type[TrustRegion], capfd: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    small(cls, points()).learn(80)
-    captured = capfd.readouterr()
-    assert captured.out == "" and captured.err == ""
-    small(cls, points(), verbose=1, tensorboard_log=str(tmp_path)).learn(80)
-    assert "ep_cost_mean" in capfd.readouterr().out
-    assert [path.name for path in tmp_path.iterdir()] == [f"{cls.__name__}_1"]
-
-
-@pytest.mark.parametrize("cls", some())
-def test_learning_rate_schedules_reach_every_critic(cls: type[TrustRegion]) -> None:
-    model = small(cls, points(), learning_rate=lambda remaining: 0.01 * remaining).learn(160)
-    assert model.logger.name_to_value["train/learning_rate"] == 0.0
-    critics = [model.policy] + ([model.cost_critic] if cls.uses_cost_critic else [])
-    if cls in FILTERED:
-        critics.append(model.policy.action_filter)
-    for critic in critics:
-        assert critic.optimizer.param_groups[0]["lr"] == 0.0
-
-
 @pytest.mark.parametrize("cls", some(classes=EVERY))
 def test_a_callback_may_stop_and_training_go_on(cls: type[TrustRegion]) -> None:
     model = small(cls, points())
@@ -963,4 +690,4 @@ def test_a_callback_may_stop_and_training_go_on(cls: type[TrustRegion]) -> None:
     model.learn(160, reset_num_timesteps=False)
     assert model.num_timesteps == 280
     model.learn(80)
-    assert model.num_timesteps == 80 and (model.episodes.lengths == 10).all()
+    assert model.num_timesteps == 80 and (model.costs.episodes.lengths == 10).all()

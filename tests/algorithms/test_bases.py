@@ -4,7 +4,7 @@ import inspect
 import json
 import random
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from sb3_guard.algorithms import (
     Constrained,
     FirstOrder,
     PPOLag,
+    hyperparameter,
     register_algorithm,
 )
 from sb3_guard.algorithms.common.first_order import mean_kl
@@ -142,7 +143,8 @@ def test_costs_of_an_off_policy_algorithm(tmp_path: Path) -> None:
     assert a == state_of_off_policy(model)
     assert model.costs.horizon == 30 and len(model.ep_cost_buffer) == 6
     assert model.costs.violation[0] == pytest.approx((model.costs.episode_cost[0] - 2.0) / 30)
-    np.testing.assert_allclose(np.array(list(model.ep_cost_buffer)[-2:]).mean(0), model.costs[0])
+    latest = np.array(model.ep_cost_buffer)[-2:].mean(axis=0)
+    np.testing.assert_allclose(latest, model.costs.episode_cost)
     model.save(tmp_path / "model")
     again = CostlySAC.load(tmp_path / "model")
     assert again.total_cost == model.total_cost > 0.0 and again.cost_limit == 2.0
@@ -169,10 +171,13 @@ def test_defaults_are_stated_where_only_they_differ() -> None:
     """The signature shows them, a call overrides them, and so does a class further down."""
 
     class Hasty(PPOLag):
-        defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.7, "n_steps": 32}
+        lambda_lr: float = hyperparameter(0.7)
+
+        def __init__(self, *args: Any, n_steps: int = 32, **kwargs: Any) -> None:
+            super().__init__(*args, n_steps=n_steps, **kwargs)
 
     class Hastier(Hasty):
-        defaults: ClassVar[dict[str, Any]] = {"lambda_lr": 0.9}
+        lambda_lr: float = hyperparameter(0.9)
 
     for cls, rate in ((PPOLag, 0.2), (Hasty, 0.7), (Hastier, 0.9)):
         taken = inspect.signature(cls).parameters

@@ -87,8 +87,9 @@ def solve_bandit(
         **SETTINGS[cls],
         **kwargs,
     }
-    modes = Modes(bandit().contexts)
+    modes, standard = Modes(bandit().contexts), settings.pop("normalize_advantage", True)
     model = cls("MlpPolicy", make_vec_env(bandit, 8, seed=seed), **settings)
+    model.normalize_advantage = standard
     model.policy.log_std.requires_grad_(learn_std)
     model.learn(512 * updates, callback=modes)
     return modes
@@ -137,8 +138,10 @@ def solve_tabular(
         **SETTINGS[cls],
         **kwargs,
     }
-    exact = Exact(world)
-    cls("MlpPolicy", env, **settings).learn(45_000 if cls is TRPOIPO else 30_000, callback=exact)
+    exact, standard = Exact(world), settings.pop("normalize_advantage", True)
+    model = cls("MlpPolicy", env, **settings)
+    model.normalize_advantage = standard
+    model.learn(45_000 if cls is TRPOIPO else 30_000, callback=exact)
     return float(np.mean(exact.values[-6:])), np.mean(exact.costs[-6:], axis=0)
 
 
@@ -390,13 +393,13 @@ def test_several_limits_are_kept(
         target_kl=0.05,
         n_critic_updates=20,
         learning_rate=1e-2,
-        normalize_advantage=False,
         cost_keys=("cost", "cost_1"),
         cost_limit=limits,
         policy_kwargs={"net_arch": [8], "log_std_init": -1.0},
         seed=0,
         **kwargs,
     )
+    model.normalize_advantage = False
     train = model.train
     model.train = lambda: costs.append(model.costs.episode_cost) or train()  # type: ignore
     model.learn(256 * 15)

@@ -1,20 +1,21 @@
 """CPO: its step, its line-search test, its units, and what it does where nothing is at stake."""
 
+import copy
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint, LinearCostBandit
+from cost_envs import CostPoint, LinearCostBandit, told
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard.algorithms import CPO, PCPO, TRPO, TRPOFAC, TRPOIPO, PPOLag, TRPOLag
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.algorithms.common.costs import CostEstimate
-from sb3_guard.algorithms.common.natural_gradient import Case
+from sb3_guard.algorithms.common.natural_gradient import Case, Step
 from sb3_guard.algorithms.common.rollouts import CostRollouts
 from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
 
@@ -24,6 +25,17 @@ KEYS = ("cost", "cost_1")
 def make(env: Any = CostPoint, n_envs: int = 4, **kwargs: Any) -> CPO:
     defaults: dict[str, Any] = {"n_steps": 100, "n_critic_updates": 5, "seed": 0, "device": "cpu"}
     return CPO("MlpPolicy", make_vec_env(env, n_envs, seed=0), **{**defaults, **kwargs})
+
+
+def acceptance(model: CPO, violation: list[float], case: Case, monkeypatch: Any) -> Any:
+    """The line search's test where the solver says so, at violations of limits of 0."""
+    m = len(violation)
+    step = Step(th.zeros(1), case, 0.0, np.zeros(m), np.ones(m, bool))
+    monkeypatch.setattr("sb3_guard.algorithms.cpo.constrained_step", lambda *args: step)
+    model.set_logger(Logger(None, []))
+    told(model, violation)
+    gradients = {"gradient": None, "cost_gradients": th.zeros(m, 1), "solve": lambda b: b}
+    return model.plan(SimpleNamespace(delta=model.target_kl, **gradients))[1]  # type: ignore
 
 
 @pytest.mark.parametrize(
@@ -57,23 +69,10 @@ def test_line_search_test(
     improvement: float,
     cost_change: float,
     accepted: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    model = make(target_kl=0.02)
-    model.costs = CostEstimate(np.ones(1), 1.0, np.array([violation]))
-    model._case = case
-    assert model.accept(Trial(kl, improvement, np.array([cost_change]))) is accepted
-
-
-def test_cost_reduction_asks_for_less_cost() -> None:
-    model = make(cost_reduction=0.1)
-    model._case = Case.LOST
-    for violation, change, accepted in [
-        (0.5, -0.2, True),
-        (0.5, -0.05, False),
-        (0.02, -0.03, True),
-    ]:
-        model.costs = CostEstimate(np.ones(1), 1.0, np.array([violation]))
-        assert model.accept(Trial(0.01, 0.0, np.array([change]))) is accepted
+    accept = acceptance(make(target_kl=0.02), [violation], case, monkeypatch)
+    assert accept(Trial(kl, improvement, np.array([cost_change]))) is accepted
 
 
 @pytest.mark.parametrize(
@@ -91,16 +90,11 @@ def test_cost_reduction_asks_for_less_cost() -> None:
     ],
 )
 def test_line_search_test_of_two_costs(
-    case: Case, cost_change: list[float], accepted: bool
+    case: Case, cost_change: list[float], accepted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = make(lambda: CostPoint(cost_keys=KEYS), cost_keys=KEYS)
-    model.costs = CostEstimate(np.ones(2), 1.0, np.array([0.5, 0.1]))
-    model._case = case
-    assert model.accept(Trial(0.01, 0.0, np.array(cost_change))) is accepted
-    if case is Case.LOST:
-        model.cost_reduction = 0.1
-        assert not model.accept(Trial(0.01, 0.0, np.array([-0.05, 0.0])))
-        assert model.accept(Trial(0.01, 0.0, np.array([-0.15, 0.0])))
+    accept = acceptance(model, [0.5, 0.1], case, monkeypatch)
+    assert accept(Trial(0.01, 0.0, np.array(cost_change))) is accepted
 
 
 class _Contradiction(LinearCostBandit):
@@ -140,15 +134,17 @@ def test_the_step_solves_the_linearised_problem(limit: float) -> None:
     """Within the region, and within the limit wherever the region reaches it."""
     model = make(cost_limit=limit, cg_max_steps=60)
     seen = []
-    step = model.step
+    plan = model.plan
 
-    def spy(region: Any) -> th.Tensor:
-        x = step(region)
+    def spy(region: Any) -> Any:
+        x, accept = plan(region)
         reach = float(region.product(x) @ x) / (2 * region.delta)
-        seen.append((model._case, region.violation + (region.cost_gradients @ x).numpy(), reach))
-        return x
+        case = Case(model.logger.name_to_value["train/cpo_case"])
+        c = model.margin.violation(model.costs)
+        seen.append((case, c + (region.cost_gradients @ x).numpy(), reach))
+        return x, accept
 
-    model.step = spy  # type: ignore[method-assign]
+    model.plan = spy  # type: ignore[method-assign]
     model.learn(2000)
     assert len(seen) == 5
     for case, residual, reach in seen:
@@ -173,7 +169,7 @@ def test_violation_is_in_units_of_the_cost_surrogate() -> None:
     train = model.train
 
     def spy() -> None:
-        estimates.append(model.costs)
+        estimates.append(copy.copy(model.costs))
         train()
 
     model.train = spy  # type: ignore[method-assign]
@@ -186,7 +182,7 @@ def test_violation_is_in_units_of_the_cost_surrogate() -> None:
         assert estimate.episode_cost[0] == pytest.approx(ended.mean(), rel=1e-6)
         assert estimate.violation[0] == pytest.approx((ended.mean() - 0.7) / 40, rel=1e-6)
     assert model.total_cost == pytest.approx(costs.sum(), rel=1e-6)
-    np.testing.assert_allclose(model.episodes.totals[:, 0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(model.costs.episodes.totals[:, 0], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("costs", [(5.0, 45.0), (45.0, 5.0)], ids=str)
@@ -323,13 +319,13 @@ def test_without_cost_it_takes_trpos_steps() -> None:
             th.manual_seed(0)
         else:
             th.manual_seed(0)
-        step = model.step
-        model.step = lambda region, step=step: steps.append(step(region)) or steps[-1]
+        plan = model.plan
+        model.plan = lambda region, plan=plan: steps.append(plan(region)) or steps[-1]
         model.learn(200)
         if cls is CPO:
-            assert model._case is Case.NO_GRADIENT
+            assert model.logger.name_to_value["train/cpo_case"] == Case.NO_GRADIENT
     assert len(steps) == 2
-    th.testing.assert_close(steps[0], steps[1])
+    th.testing.assert_close(steps[0][0], steps[1][0])
 
 
 def test_several_costs_have_their_own_logs_and_limits() -> None:
@@ -349,7 +345,7 @@ def test_several_costs_have_their_own_logs_and_limits() -> None:
     model.dump_logs()
     means = [logged[f"rollout/ep_cost_mean/{key}"] for key in KEYS]
     assert means[1] == pytest.approx(2 * means[0])
-    assert logged["rollout/cost_rate/cost"] == pytest.approx(model.total_costs[0] / 400)
+    assert logged["rollout/cost_rate/cost"] == pytest.approx(model.costs.total[0] / 400)
 
 
 def test_cost_advantages_are_centred_and_not_scaled() -> None:
@@ -375,9 +371,9 @@ def test_the_margin_follows_what_was_missed(limit: float) -> None:
     model = CPO("MlpPolicy", env, n_steps=40, cost_limit=limit, margin_lr=0.5, n_critic_updates=1)
     model.set_logger(Logger(None, []))
     for cost, margin in ((3.0, 0.5), (2.5, 0.75), (9.0, 2.0), (1.0, 1.5), (0.0, 0.5)):
-        episode = np.array([cost])
-        model.costs = CostEstimate(episode, 10.0, (episode - model.cost_limits) / 10.0)
+        told(model, [cost], 10.0)
         model.fit(None)  # type: ignore[arg-type]
         expected = margin if limit else 0.0  # at most the limit
-        assert model.margin == pytest.approx(expected)
-        assert model.violation() * 10.0 == pytest.approx(cost - limit + expected)
+        assert model.margin.value == pytest.approx(expected)
+        violation = model.margin.violation(model.costs)
+        assert violation * 10.0 == pytest.approx(cost - limit + expected)

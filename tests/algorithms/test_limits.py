@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_guard import CostEvalCallback, evaluate_policy, train
 from sb3_guard.algorithms import CPO, TRPOIPO, PPOLag, SACLag
-from sb3_guard.algorithms.common.limits import limits_at
+from sb3_guard.algorithms.common.costs import limits_at
 
 
 def points(n_envs: int = 2) -> Any:

@@ -282,20 +282,15 @@ def test_networks_side_by_side_are_networks() -> None:
         th.testing.assert_close(together[:, k], x)
 
 
-def test_the_actors_loss_by_hand() -> None:
+def test_the_weight_of_a_cost_by_hand() -> None:
     model = SACLag("MlpPolicy", points(), lambda_init=2.0, **settings()).learn(120)
-    model.costs_are_new = False
-    model.multiplier.value[:] = 0.5
-    batch = model.replay_buffer.sample(8)
-    loss, values = th.randn(8, 1), th.arange(8.0).reshape(8, 1)
-    actions = th.rand(8, 2)
+    model.prices = np.array([0.5])
+    batch, values = model.replay_buffer.sample(8), th.arange(8.0).reshape(8, 1)
     model.cost_critic.optimizer.param_groups[0]["lr"] = 0.0
     model.fit_cost_critic(batch, batch.actions)  # which keeps the deviation of this batch
     with th.no_grad():
         spread = values.std(correction=0) / model.cost_critic(*batch[:2]).std(0, correction=0)
-        costs = model.cost_critic(batch.observations, actions)
-        expected = (loss + 0.5 * spread * costs) / 1.5
-    th.testing.assert_close(model.penalized(loss, batch, actions, values), expected)
+    th.testing.assert_close(model.batch_weights(values), 0.5 * spread)
 
 
 @shared
@@ -450,7 +445,7 @@ def test_a_callback_that_stops_loses_no_cost() -> None:
     model = SACLag("MlpPolicy", points(1), **settings())
     for _ in range(2):
         model.learn(100, Stop(), reset_num_timesteps=False)
-    assert model.num_timesteps == 60 and model.episodes.lengths.tolist() == [0]
+    assert model.num_timesteps == 60 and model.costs.episodes.lengths.tolist() == [0]
     assert model.total_cost == pytest.approx(sum(float(cost[0]) for cost in model.ep_cost_buffer))
     assert len(model.ep_cost_buffer) == 2
 

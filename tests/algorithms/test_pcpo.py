@@ -1,13 +1,15 @@
 """PCPO: its projection against an independent optimiser, and its line search."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint
+from cost_envs import CostPoint, told
 from scipy.optimize import minimize
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import Logger
 from step_problems import StepProblem
 
 from sb3_guard.algorithms import PCPO
@@ -212,34 +214,47 @@ def make(**kwargs: Any) -> PCPO:
     return PCPO("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0, device="cpu", **kwargs)
 
 
+def acceptance(model: PCPO) -> Any:
+    """The line search's test, whatever the step."""
+    model.set_logger(Logger(None, []))
+    told(model, [1.0])
+    one = th.ones(1)
+    region: Any = SimpleNamespace(
+        gradient=one, cost_gradients=one[None], delta=model.target_kl, solve=lambda b: b
+    )
+    return model.plan(region)[1]
+
+
 @pytest.mark.parametrize("projection", ["kl", "l2"])
 @pytest.mark.parametrize("limit", [0.0, 3.0, 100.0])
 def test_steps_satisfy_the_linearised_limit(projection: Any, limit: float) -> None:
     model = make(projection=projection, cost_limit=limit, cg_max_steps=60, recovery=1.0)
-    step, residuals = model.step, []
+    plan, residuals = model.plan, []
 
-    def spy(region: Any) -> th.Tensor:
-        x = step(region)
-        residuals.append(float((region.violation + (region.cost_gradients @ x).numpy())[0]))
-        return x
+    def spy(region: Any) -> Any:
+        x, accept = plan(region)
+        c = model.margin.violation(model.costs)
+        residuals.append(float((c + (region.cost_gradients @ x).numpy())[0]))
+        return x, accept
 
-    model.step = spy  # type: ignore[method-assign]
+    model.plan = spy  # type: ignore[method-assign]
     model.learn(2000)
     assert len(residuals) == 5 and max(residuals) <= 1e-4
     assert model.logger.name_to_value["train/kl"] <= model.target_kl
 
 
 def test_line_search_asks_for_nothing_but_kl() -> None:
-    model = make(target_kl=0.02)
+    accept = acceptance(make(target_kl=0.02))
     for kl, accepted in [(0.019, True), (0.021, False), (np.nan, False)]:
-        assert model.accept(Trial(kl, -5.0, np.array([5.0]))) is accepted
+        assert accept(Trial(kl, -5.0, np.array([5.0]))) is accepted
 
 
 def test_without_line_search_the_step_is_taken_whole() -> None:
     model = make(line_search=False)
-    assert model.accept(Trial(9.0, -5.0, np.array([5.0])))
-    assert not model.accept(Trial(np.inf, 0.0, np.zeros(1)))
-    assert not model.accept(Trial(np.nan, 0.0, np.zeros(1)))
+    accept = acceptance(model)
+    assert accept(Trial(9.0, -5.0, np.array([5.0])))
+    assert not accept(Trial(np.inf, 0.0, np.zeros(1)))
+    assert not accept(Trial(np.nan, 0.0, np.zeros(1)))
     fractions, kls = [], []
     record = model._line_search
 

@@ -366,7 +366,7 @@ def test_update_direction_is_that_of_sb3_contrib() -> None:
     ours = _reference(TRPO, cg_max_steps=60, cg_damping=0.1)
     theirs = _reference(sb3_contrib.TRPO, cg_max_steps=60, cg_damping=0.05, batch_size=64)
     region = []
-    ours.step = lambda r: region.append(r) or th.zeros_like(r.gradient)  # type: ignore
+    ours.plan = lambda r: region.append(r) or (th.zeros_like(r.gradient), bool)  # type: ignore
     ours.train()
     x = region[0].solve(region[0].gradient)
 
@@ -426,14 +426,18 @@ def _actor_vector(model: TrustRegion) -> th.Tensor:
 
 class _Reject(TRPO):
     trials = 0
+    line_search_max_iter = 7
 
-    def accept(self, trial: Any) -> bool:
+    def plan(self, region: Any) -> Any:
+        return region.natural_step(), self.reject
+
+    def reject(self, trial: Any) -> bool:
         self.trials += 1
         return False
 
 
 def test_a_rejected_step_leaves_the_policy_as_it_was() -> None:
-    model = _toy(_Reject, line_search_max_iter=7)
+    model = _toy(_Reject)
     before = _actor_vector(model)
     model.learn(200)
     assert th.equal(_actor_vector(model), before)
@@ -445,7 +449,7 @@ def test_a_rejected_step_leaves_the_policy_as_it_was() -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_step_that_is_not_finite_is_not_taken(value: float) -> None:
     model = _toy(TRPO)
-    model.step = lambda region: th.full_like(region.gradient, value)  # type: ignore
+    model.plan = lambda region: (th.full_like(region.gradient, value), bool)  # type: ignore
     before = _actor_vector(model)
     model.learn(200)
     assert th.equal(_actor_vector(model), before)
@@ -454,8 +458,10 @@ def test_a_step_that_is_not_finite_is_not_taken(value: float) -> None:
 @pytest.mark.parametrize("size", [-200.0, 1e30, -3e38])
 def test_a_candidate_that_is_no_distribution_is_rejected(size: float) -> None:
     """exp(log_std) is 0, or the mean is not a number: torch raises at that, training continues."""
-    model = _toy(TRPO, line_search_max_iter=2)
-    model.step = lambda region: th.full_like(region.gradient, size)  # type: ignore
+    model = _toy(TRPO)
+    model.line_search_max_iter = 2
+    plan = model.plan
+    model.plan = lambda region: (th.full_like(region.gradient, size), plan(region)[1])  # type: ignore
     before = _actor_vector(model)
     model.learn(200)
     assert th.equal(_actor_vector(model), before)
@@ -464,8 +470,8 @@ def test_a_candidate_that_is_no_distribution_is_rejected(size: float) -> None:
 
 def test_a_search_that_begins_too_far_off_goes_on() -> None:
     model = _toy(TRPO)
-    step = model.step
-    model.step = lambda region: 1e5 * step(region)  # type: ignore[method-assign]
+    plan = model.plan
+    model.plan = lambda region: (1e5 * plan(region)[0], plan(region)[1])  # type: ignore
     before = _actor_vector(model)
     model.learn(200)
     assert not th.equal(_actor_vector(model), before)
@@ -478,7 +484,7 @@ def test_an_error_during_the_search_leaves_the_old_policy() -> None:
     def accept(trial: Any) -> bool:
         raise RuntimeError("nobody expected this")
 
-    model.accept = accept  # type: ignore[method-assign]
+    model.plan = lambda region: (region.natural_step(), accept)  # type: ignore[method-assign]
     before = _actor_vector(model)
     with pytest.raises(RuntimeError, match="nobody"):
         model.learn(200)
@@ -538,15 +544,15 @@ def test_a_steps_promise_is_logged_beside_what_it_brought() -> None:
 def test_the_step_respects_the_trust_region_and_improves() -> None:
     model = _toy(TRPO, target_kl=0.01)
     kls, gains = [], []
-    accept = model.accept
+    search = model._line_search
 
-    def spy(trial: Any) -> bool:
-        if accept(trial):
-            kls.append(trial.kl)
-            gains.append(trial.improvement)
-        return accept(trial)
+    def spy(*args: Any) -> Any:
+        fraction, trial = search(*args)
+        kls.append(trial.kl)
+        gains.append(trial.improvement)
+        return fraction, trial
 
-    model.accept = spy  # type: ignore[method-assign]
+    model._line_search = spy  # type: ignore[method-assign]
     model.learn(2000)
     assert len(kls) == 10 and 0.002 < np.mean(kls) and max(kls) <= 0.01
     assert min(gains) >= 0.0 and np.mean(gains) > 0.0
@@ -619,7 +625,10 @@ def test_a_callback_that_stops_a_rollout_loses_no_cost():
 
     model.learn(200, callback=Count(50))
     assert model.num_timesteps == 50
-    assert model.episodes.lengths is not None and model.episodes.lengths.tolist() == [25, 25]
+    assert model.costs.episodes.lengths is not None and model.costs.episodes.lengths.tolist() == [
+        25,
+        25,
+    ]
     assert model.total_cost == pytest.approx(sum(seen))
 
 

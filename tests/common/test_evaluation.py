@@ -225,15 +225,15 @@ def test_the_cost_is_that_of_the_one_key_and_of_several_the_total():
 def test_training_goes_on_with_new_episodes_after_an_evaluation_in_its_environment(vectorised):
     env = Fixed(30)
     model = CPO("MlpPolicy", env, n_steps=40, n_critic_updates=1, seed=0).learn(40)
-    assert model.episodes.lengths.tolist() == [10]
+    assert model.costs.episodes.lengths.tolist() == [10]
     evaluate_policy(model, fixed(7), 1)
     model.learn(20, reset_num_timesteps=False)
-    assert model.episodes.lengths.tolist() == [20]  # another one's episodes change nothing
+    assert model.costs.episodes.lengths.tolist() == [20]  # another one's episodes change nothing
     evaluate_policy(model, model.env if vectorised else env, 1)
     model.learn(40, reset_num_timesteps=False)
     assert (model.costs.horizon, model.costs.episode_cost.tolist()) == (30, [4650])
     model.learn(40, reset_num_timesteps=False)
-    assert model.episodes.lengths.tolist() == [20]  # once is enough
+    assert model.costs.episodes.lengths.tolist() == [20]  # once is enough
 
 
 def test_a_policy_of_several_costs_wants_their_names():

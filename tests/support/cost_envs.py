@@ -12,6 +12,12 @@ from scipy.optimize import linprog
 SB3_POLICY = {"log_std_init": 0.0, "ortho_init": True}
 
 
+def told(model: Any, cost: Any, horizon: float = 1.0) -> None:
+    """Let an algorithm believe that episodes of so many steps cost so much."""
+    model.costs.episode_cost = np.asarray(cost, np.float64)
+    model.costs.horizon, model.costs.limits = horizon, model.cost_limits
+
+
 class LinearCostBandit(gym.Env):
     """One continuous decision: a quadratic reward under a linear cost, solved by projection.
 

@@ -115,7 +115,7 @@ def checked(**values):
 
 def test_arguments_are_the_leafs_and_the_bases():
     names = annotations(CPO)
-    assert {"cost_reduction", "target_kl", "n_steps", "policy_kwargs"} <= names.keys()
+    assert {"margin_lr", "target_kl", "n_steps", "policy_kwargs"} <= names.keys()
     assert (
         not {"env", "seed", "device", "verbose", "self", "kwargs", "_init_setup_model"}
         & names.keys()
@@ -132,7 +132,7 @@ def test_arguments_are_the_leafs_and_the_bases():
         ("batch_size", None, None),
         ("cost_limit", 25, 25.0),
         ("cost_limit", [1, 2.5], [1.0, 2.5]),
-        ("normalize_advantage", False, False),
+        ("use_sde", False, False),
         ("policy_kwargs", "dict(log_std_init=-1)", {"log_std_init": -1}),
         ("policy_kwargs", "dict(activation_fn=nn.ReLU)", {"activation_fn": "nn.ReLU"}),
     ],
@@ -152,7 +152,7 @@ def test_values_in_their_proper_type(name, value, expected):
         ("gamma", float("nan"), "a number"),
         ("learning_rate", "fast", "a number or a schedule such as lin_0.001"),
         ("batch_size", 1.5, "an integer or null"),
-        ("normalize_advantage", 1, "true or false"),
+        ("use_sde", 1, "true or false"),
         ("missing_cost", "ignore", "'error' or 'zero'"),
         ("cost_limit", "low", "a number or a schedule such as lin_50_25 or a list"),
         ("cost_keys", "cost", "a list of texts"),
@@ -275,8 +275,6 @@ COLUMNS = "trpo trpo_lag trpo_sl trpo_usl trpo_ipo trpo_fac cpo pcpo".split()
 TABLE = {
     "gamma": [0.99] * 8,
     "gae_lambda": [0.97] * 8,
-    "line_search_max_iter": [100] * 7 + [...],
-    "line_search_shrinking_factor": [0.8] * 7 + [...],
     "target_kl": [0.02] * 8,
     "learning_rate": [0.001] * 8,
     "n_critic_updates": [80] * 8,
@@ -287,7 +285,6 @@ TABLE = {
     "rate": [..., ..., ..., 0.05, ..., ..., ..., ...],
     "warmup": [..., ..., pytest.approx(1 / 3), pytest.approx(1 / 3), ..., ..., ..., ...],
     "t": [..., ..., ..., ..., 0.01, ..., ..., ...],
-    "cost_reduction": [..., ..., ..., ..., ..., ..., 0.0, ...],
 }
 # Where the default is another one: (the paper's, ours).
 ALL = {"n_timesteps": (3e7, 1e6)}

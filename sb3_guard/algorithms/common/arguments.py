@@ -4,9 +4,9 @@ A class states its hyperparameters as attributes, each once: name, type, default
 
     temperature: float = hyperparameter(1.5, ends="()")
 
-What else a constructor takes it spells out, and hands the others on by ``*args, **kwargs``; where
-only the values differ from those of its bases, a class states them in ``defaults``. What
-``inspect.signature``, Shift-Tab in a notebook and the documentation show is the whole list.
+A class that has another default states the attribute anew. What else a constructor takes it spells
+out, and hands the others on by ``*args, **kwargs``. What ``inspect.signature``, Shift-Tab in a
+notebook and the documentation show is the whole list.
 """
 
 import inspect
@@ -14,7 +14,6 @@ import re
 import types
 import typing
 from collections.abc import Iterable, Mapping
-from functools import update_wrapper, wraps
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -108,38 +107,6 @@ def own_arguments(cls: type) -> list[inspect.Parameter]:
     return list(signature.parameters.values())[1:]
 
 
-def defaults_of(cls: type) -> dict[str, Any]:
-    """Default values that a class and its bases state in ``defaults``, the nearest one's first."""
-    stated = (vars(one).get("defaults", {}) for one in reversed(cls.__mro__))
-    return {name: value for each in stated for name, value in each.items()}
-
-
-def taking_defaults(cls: type) -> FunctionType:
-    """
-    The constructor of a class, given what ``defaults`` states unless a call says otherwise.
-
-    It hands arguments on by name: the bases' positions include what the class fills in itself.
-    """
-    construct, defaults = cls.__init__, vars(cls).get("defaults", {})  # type: ignore[misc]
-
-    @wraps(construct)
-    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
-        # The class that was called, or whose constructor a subclass calls.
-        called = next(c for c in type(self).__mro__ if getattr(c, "__init__", None) is __init__)
-        arguments = inspect.signature(called).parameters.values()
-        names = [argument.name for argument in arguments if argument.kind is not _ONLY]
-        if len(args) > len(names):
-            raise TypeError(
-                f"{called.__name__} takes {len(names)} arguments by position, not {len(args)}"
-            )
-        given = dict(zip(names, args, strict=False))
-        for name in given.keys() & kwargs.keys():
-            raise TypeError(f"{called.__name__} got two values for argument {name!r}")
-        construct(self, **{**defaults, **given, **kwargs})
-
-    return __init__  # type: ignore[return-value]
-
-
 def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signature:
     """All arguments of a class: its own, then those of the constructors that it hands on to.
 
@@ -159,15 +126,14 @@ def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signatu
             if each.kind in _HANDS_ON or each.name in fixed | _INTERNAL:
                 continue
             kind = each.kind if positional else _ONLY
-            found.setdefault(each.name, each.replace(kind=kind))
+            nearest = found.setdefault(each.name, each.replace(kind=kind))
+            # What comes after an argument that a class takes by name has no position either.
+            positional &= each.kind is _ONLY or nearest.kind is not _ONLY
         kinds = {each.kind for each in own}
         if own and inspect.Parameter.VAR_KEYWORD not in kinds:
             break
         if own and inspect.Parameter.VAR_POSITIONAL not in kinds:
             positional = False
-    for name, default in defaults_of(cls).items():
-        if name in found:
-            found[name] = found[name].replace(default=default)
     # Without a default it comes first; what follows * need not.
     ordered = sorted(found.values(), key=lambda each: each.kind)
     return inspect.Signature(ordered)
@@ -216,18 +182,3 @@ def check_theirs(algorithm: Any) -> None:
         value = getattr(algorithm, name, None)
         if isinstance(value, int | float):  # else absent, a schedule, or "auto"
             check_number(name, value, ends=ends)
-
-
-def with_defaults(function: FunctionType, **defaults: Any) -> FunctionType:
-    """A copy of a function with other default values."""
-    names = list(inspect.signature(function).parameters)
-    old = function.__defaults__ or ()
-    new = [
-        defaults.get(name, default)
-        for name, default in zip(names[len(names) - len(old) :], old, strict=True)
-    ]
-    code, scope = function.__code__, function.__globals__
-    copy = FunctionType(code, scope, None, tuple(new), function.__closure__)
-    update_wrapper(copy, function)
-    del copy.__wrapped__  # type: ignore[attr-defined]  # whose defaults a signature would show
-    return copy

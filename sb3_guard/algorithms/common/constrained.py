@@ -7,20 +7,16 @@ saved. What is done about them is the business of the classes that stand on it.
 import inspect
 import warnings
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from gymnasium import spaces
 from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-    CallbackList,
-    EvalCallback,
-    EventCallback,
-)
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 from sb3_guard.algorithms.common.arguments import (
@@ -30,37 +26,33 @@ from sb3_guard.algorithms.common.arguments import (
     hyperparameter,
     signature,
     stated,
-    taking_defaults,
-    with_defaults,
 )
-from sb3_guard.algorithms.common.costs import CostEstimate
-from sb3_guard.algorithms.common.limits import CostLimits
+from sb3_guard.algorithms.common.costs import Costs, limits_at
 from sb3_guard.checked_env import checked
-from sb3_guard.checks import check_cost_keys, is_number
-from sb3_guard.costs import EpisodeCosts, read_costs
+from sb3_guard.checks import check_cost_keys, check_per_cost, is_number
+from sb3_guard.costs import read_costs
 
 _LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
 
 
-def _within(callback: BaseCallback) -> Iterator[BaseCallback]:
-    """A callback and those that it calls, however deep."""
-    yield callback
-    below = callback.callbacks if isinstance(callback, CallbackList) else []
-    if isinstance(callback, EventCallback) and callback.callback is not None:
-        below = [callback.callback]
-    for one in below:
-        yield from _within(one)
-
-
-class Constrained(CostLimits, BaseAlgorithm):
+class Constrained(BaseAlgorithm):
     """Cost keys, limits and episode costs in addition to an algorithm of Stable-Baselines3.
 
     Mixed in before the algorithm: ``class SafePPO(CostRollouts, PPO)``. A subclass states its
     hyperparameters as attributes (:func:`~sb3_guard.algorithms.common.arguments.hyperparameter`);
     one that needs a constructor sets its own attributes first and then hands the other arguments
-    on: SB3 builds the model at the end of its own. The signature, the docstring and the name under
-    which ``learn`` logs are composed for every subclass.
+    on: SB3 builds the model at the end of its own. The signature and the docstring are composed for
+    every subclass, and ``learn`` logs under its name.
 
+    :param cost_limit: d, bound on the undiscounted cost of an episode; one number, or one per key.
+        The attribute may be set at any time, and holds from the next update on. Instead of a
+        number, a function of the remaining progress (from 1 to 0), or text such as ``"lin_50_25"``,
+        a line from 50 to 25 over the training
+    :param cost_keys: entries of ``info`` that hold the costs of a step
+    :param limit_start: how many times ``cost_limit`` the limit is when the training begins; it
+        falls to ``cost_limit`` along a line. 1 for ``cost_limit`` from the first step on; a limit
+        of 0 is 0 throughout, and a schedule begins where it says
+    :param limit_fall: share of the training over which it falls
     :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
         absent key means that nothing was charged
     :raises TypeError: an argument is not known; the message names the nearest one
@@ -78,28 +70,22 @@ class Constrained(CostLimits, BaseAlgorithm):
     limit_on: ClassVar[Literal["sum", "max"]] = "sum"
     #: Arguments of SB3's constructors that the class fills in itself.
     fixed_arguments: ClassVar[frozenset[str]] = frozenset()
-    #: Default values of keyword arguments, where they differ from those of the bases.
-    defaults: ClassVar[dict[str, Any]] = {}
+    #: Whether costs and limits may be negative: "at least x" of what is reported as -cost.
+    signed_limits: ClassVar[bool] = False
 
+    cost_limit: float | Schedule | Sequence[float | Schedule] = hyperparameter(0.0)
+    cost_keys: Sequence[str] = hyperparameter(("cost",))
+    limit_start: float = hyperparameter(1.0, low=1.0)
+    limit_fall: float = hyperparameter(0.6, high=1.0, ends="(]")
     missing_cost: Literal["error", "zero"] = hyperparameter("error")
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "label" not in vars(cls):
             cls.label = cls.__name__
-        if {"defaults", "fixed_arguments"} & {*vars(cls)}:
-            cls.__init__ = taking_defaults(cls)  # type: ignore[method-assign]
         composed = signature(cls, cls.fixed_arguments)
         cls.__signature__ = composed  # type: ignore[attr-defined]
         cls.__doc__ = documentation(cls, composed.parameters)
-        if getattr(cls.learn, "__code__", None) is Constrained.learn.__code__:
-            theirs = inspect.signature(super().learn).parameters
-            interval = theirs["log_interval"].default
-            cls.learn = with_defaults(  # type: ignore[method-assign]
-                Constrained.learn,  # type: ignore[arg-type]
-                log_interval=100 if interval is inspect.Parameter.empty else interval,
-                tb_log_name=cls.__name__,
-            )
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         check_names(cls, kwargs)
@@ -120,23 +106,11 @@ class Constrained(CostLimits, BaseAlgorithm):
         for name, one in stated(type(self)).items():
             setattr(self, name, kwargs.pop(name, one.default))
 
-        # Running episodes outlive rollouts, and a run may be saved between two; set by `learn`.
-        none: Any = None
-        self.episodes: EpisodeCosts = none
-        # What the last step cost, 0 before the first one of an episode.
-        self.last_costs: np.ndarray | None = None  # [n_envs, m]
+        #: limits, episodes, J_C, T and violations, see :class:`Costs`
+        self.costs: Costs = None  # type: ignore[assignment]
         # Somebody else has reset the environments, so the next `learn` begins new episodes.
         self.begin_anew = False
-        self.total_costs: np.ndarray = none  # [m]
-        self.ep_cost_buffer: deque[np.ndarray] = none
-        self.horizon: float | None = None  # T when an episode last ended
-        self.cost_seen = False
-        #: J_C, T and the violations, as last estimated; there is an estimate in every update
-        self.costs: CostEstimate = none
-        #: Whether the estimate has not been followed yet by what follows it (a multiplier)
-        self.costs_are_new = False
         self.timing: dict[str, float] = {}
-        self._begin_statistics()
         super().__init__(*args, **kwargs)
         if new and self.env is not None and is_masking_supported(self.env):
             self._warn_once(
@@ -183,7 +157,8 @@ class Constrained(CostLimits, BaseAlgorithm):
                 stated_ones[name].check(name, getattr(self, name), parameter.annotation)
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
         check_theirs(self)
-        self._check_cost_limit()
+        for remaining in (1.0, 0.0):
+            self._limits_at(remaining)
 
     def _setup_model(self) -> None:
         self._check_hyperparameters()
@@ -192,6 +167,8 @@ class Constrained(CostLimits, BaseAlgorithm):
         for space in *parts, self.action_space:
             if np.any(getattr(space, "start", 0)):
                 raise ValueError(f"{space}: must begin at 0, where Stable-Baselines3 counts from")
+        if not isinstance(self.costs, Costs) or len(self.costs.total) != len(self.cost_keys):
+            self.costs = Costs(self.cost_limits, self.limit_on, self._stats_window_size)
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
 
@@ -205,7 +182,43 @@ class Constrained(CostLimits, BaseAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "step_costs", "_warned"]
 
-    # Costs
+    # Limits
+
+    @property
+    def cost_limits(self) -> np.ndarray:
+        """d: what ``cost_limit`` says now, for each cost key, shape (m,).
+
+        :raises ValueError: ``cost_limit`` was set to something that is not a limit
+        """
+        return self._limits_at(self._current_progress_remaining)
+
+    @property
+    def final_cost_limits(self) -> np.ndarray:
+        """The limits at the end of the training, by which an agent is judged, shape (m,)."""
+        return self._limits_at(0.0)
+
+    @property
+    def limits_change(self) -> bool:
+        """Whether a limit is a schedule, or falls from ``limit_start``."""
+        return self.limit_start > 1.0 or any(self._scheduled)
+
+    @property
+    def _scheduled(self) -> list[bool]:
+        """Of each limit that is given, whether it is a schedule; one element, or m."""
+        limits = self.cost_limit if isinstance(self.cost_limit, list | tuple) else [self.cost_limit]
+        return [isinstance(limit, str) or callable(limit) for limit in limits]
+
+    def _limits_at(self, remaining: float) -> np.ndarray:
+        limit = limits_at(self.cost_limit, remaining)
+        check_per_cost("cost_limit", limit, tuple(self.cost_keys))
+        if not self.signed_limits and np.min(limit) < 0.0:
+            raise ValueError(
+                f"cost_limit={limit!r}: must be at least 0; a negative limit (cost -x, "
+                "limit -5: at least 5 of x) is for CPO, PCPO and Lagrangian algorithms"
+            )
+        limits = np.broadcast_to(np.asarray(limit, np.float64), (len(self.cost_keys),))
+        excess = LinearSchedule(self.limit_start - 1.0, 0.0, self.limit_fall)(remaining)
+        return limits + np.where(self._scheduled, 0.0, excess * np.abs(limits))
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         """Called by SB3 before each update: a limit may be another one then."""
@@ -213,77 +226,55 @@ class Constrained(CostLimits, BaseAlgorithm):
         super()._update_current_progress_remaining(
             min(num_timesteps, total_timesteps), total_timesteps
         )
-        if self.costs is not None and self.limits_change:
-            cost, horizon, _ = self.costs
-            self.costs = CostEstimate(cost, horizon, (cost - self.cost_limits) / horizon)
+        if self.limits_change:
+            self.costs.limits = self.cost_limits
+
+    # Episodes
+
+    @property
+    def ep_cost_buffer(self) -> deque[np.ndarray]:
+        """Costs of the latest episodes, each of shape (m,)."""
+        return self.costs.latest
 
     @property
     def total_cost(self) -> float:
         """Cost of the whole training so far, summed over the cost keys."""
-        return 0.0 if self.total_costs is None else float(self.total_costs.sum())
-
-    def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str = "run",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """Train, as SB3's ``learn`` does; logs are named after the class.
-
-        :param total_timesteps: steps to take, over all environments
-        :param callback: called at every step
-        :param log_interval: updates, or off-policy episodes, between two logs
-        :param tb_log_name: name of the run in ``tensorboard_log``
-        :param reset_num_timesteps: whether to count from 0 and begin new episodes
-        :param progress_bar: whether to show one
-        :return: the trained model
-        """
-        return super().learn(  # type: ignore[safe-super]
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar
-        )
+        return float(self.costs.total.sum())
 
     def _setup_learn(
         self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         reset_num_timesteps: bool = True,
-        *args: Any,
-        **kwargs: Any,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        n_costs = len(self.cost_keys)
         checked(self.env, self.cost_keys)
         normalizer = self.get_vec_normalize_env()
         self.learnt_normalized = normalizer is not None and normalizer.norm_obs
-        if self.ep_cost_buffer is None or reset_num_timesteps:
-            self.ep_cost_buffer = deque(maxlen=self._stats_window_size)
-            self.total_costs = np.zeros(n_costs)
         if self.begin_anew:
             self._last_obs, self.begin_anew = None, False
+        if reset_num_timesteps:
+            self.costs.latest.clear()
+            self.costs.total[:] = 0.0
+            self.costs.forget()
         # The environments are reset under the same condition.
         if reset_num_timesteps or self._last_obs is None:
-            self.episodes = EpisodeCosts(self.n_envs, n_costs, self.limit_on)
-            self.last_costs = np.zeros((self.n_envs, n_costs))
-        if reset_num_timesteps:
-            self._begin_statistics()
+            self.costs.begin(self.n_envs)
+        theirs = inspect.signature(super().learn)  # type: ignore[safe-super]
+        if tb_log_name == theirs.parameters["tb_log_name"].default:
+            tb_log_name = type(self).__name__
         steps, callbacks = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, *args, **kwargs
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        if self.constrained and any(type(one) is EvalCallback for one in _within(callbacks)):
+        called = callbacks.callbacks if isinstance(callbacks, CallbackList) else [callbacks]
+        if self.constrained and any(type(each) is EvalCallback for each in called):
             self._warn_once(
                 "EvalCallback",
                 "EvalCallback keeps the model of the highest reward, whatever it costs: "
                 "sb3_guard.CostEvalCallback keeps the best safe one",
             )
         return steps, callbacks
-
-    def _begin_statistics(self) -> None:
-        """Forget the episodes that have ended: the next estimate is about others."""
-        self._ended_costs: list[np.ndarray] = []
-        self._ended_lengths: list[int] = []
-        self._cost_seen_lately = False
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
@@ -293,18 +284,10 @@ class Constrained(CostLimits, BaseAlgorithm):
         assert dones is not None
         # A vectorised environment without anything to say may leave infos out.
         infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
-        zero = self.missing_cost == "zero"
-        costs, seen = read_costs(infos, self.cost_keys, zero, self.episodes.lengths)
-        for episode in self.episodes.step(costs, dones):
-            if infos[episode.row].get("physics_error"):
-                continue  # nobody knows what it would have cost
-            self._ended_costs.append(episode.bounded)
-            self._ended_lengths.append(episode.length)
-            self.ep_cost_buffer.append(episode.total)
-        self._cost_seen_lately |= seen
-        self.step_costs = self.episodes.charges  # [n_envs, m], for the buffer
-        self.total_costs += costs.sum(axis=0)
-        self.last_costs = np.where(dones[:, None], 0.0, costs)
+        zero, steps = self.missing_cost == "zero", self.costs.episodes.lengths
+        costs, seen = read_costs(infos, self.cost_keys, zero, steps)
+        broken = [i for i in np.flatnonzero(dones) if infos[i].get("physics_error")]
+        self.step_costs = self.costs.step(costs, dones, seen, broken)  # [n_envs, m]
 
     def _count_last_step(self, callback: BaseCallback) -> None:
         """Read the infos of a step at which a callback stopped training: SB3 only counts it."""
@@ -313,32 +296,22 @@ class Constrained(CostLimits, BaseAlgorithm):
     def _estimate_costs(self, rate: np.ndarray | None = None) -> bool:
         """Renew ``costs`` from the episodes that ended since the last time.
 
-        :param rate: mean costs of a step, shape (m,), which tell what an episode would cost where
-            none has ended; None keeps the last estimate then
+        :param rate: see :meth:`Costs.estimate`
         :return: whether there is a new estimate
         """
-        self.cost_seen |= self._cost_seen_lately
-        if self._ended_costs:
-            self.horizon = horizon = float(np.mean(self._ended_lengths))
-            episode_cost = np.mean(self._ended_costs, axis=0)
-        elif rate is not None:
-            horizon = self.horizon or self._horizon_before_any_episode()
-            episode_cost = rate * horizon
-        else:
+        self.costs.limits = self.cost_limits
+        if not self.costs.estimate(rate, self._length_before_any_episode):
             return False
-        if self.constrained and not self._cost_seen_lately:
+        if self.constrained and not self.costs.seen_lately:
             self._warn_once(
                 "no cost",
                 f"no info had a cost key of {tuple(self.cost_keys)} during a whole rollout: "
                 "training continues as if nothing cost anything (missing_cost='zero')",
             )
-        violation = (episode_cost - self.cost_limits) / horizon
-        self.costs = CostEstimate(episode_cost, horizon, violation)
-        self.costs_are_new = True
-        self._begin_statistics()
+        self.costs.forget()
         return True
 
-    def _horizon_before_any_episode(self) -> float:
+    def _length_before_any_episode(self) -> float:
         assert self.env is not None
         limits: list[Any] = []
         try:
@@ -354,7 +327,7 @@ class Constrained(CostLimits, BaseAlgorithm):
             pass  # a vectorised environment need not tell: then no limit is known, as below
         if limits and all(is_number(limit) and limit > 0 for limit in limits):
             return float(np.mean(limits))
-        longest = float(self.episodes.lengths.max())
+        longest = float(self.costs.episodes.lengths.max())
         if self.constrained:
             self._warn_once(
                 "no episode",
@@ -392,18 +365,19 @@ class Constrained(CostLimits, BaseAlgorithm):
 
     def _record_violation(self) -> None:
         """Record J_C - d, in units of an episode's cost."""
-        if self.constrained and self.costs is not None:
+        if self.constrained:
             excess = self.costs.violation * self.costs.horizon
             self._record_per_cost("train/constraint_violation", excess)
             if self.limits_change:
-                self._record_per_cost("train/cost_limit", self.cost_limits)
+                self._record_per_cost("train/cost_limit", self.costs.limits)
 
     def dump_logs(self, *args: Any) -> None:
-        if self.constrained or self.cost_seen:
-            if self.ep_cost_buffer:
-                self._record_per_cost("rollout/ep_cost_mean", np.mean(self.ep_cost_buffer, axis=0))
+        costs = self.costs
+        if self.constrained or costs.seen:
+            if costs.latest:
+                self._record_per_cost("rollout/ep_cost_mean", np.mean(costs.latest, axis=0))
             if self.num_timesteps:
-                self._record_per_cost("rollout/cost_rate", self.total_costs / self.num_timesteps)
+                self._record_per_cost("rollout/cost_rate", costs.total / self.num_timesteps)
         if self.constrained:
             self._record_per_cost("rollout/cost_limit", self.cost_limits)
         super().dump_logs(*args)

@@ -123,7 +123,7 @@ class FilteredTrustRegion(TrustRegion):
 
     def correct(self, observations: Any, actions: np.ndarray) -> np.ndarray:
         return self.policy.correct(
-            obs_as_tensor(observations, self.device), actions, self.last_costs
+            obs_as_tensor(observations, self.device), actions, self.costs.last
         )
 
     def _unit(self, actions: np.ndarray) -> th.Tensor:
@@ -142,13 +142,12 @@ class FilteredTrustRegion(TrustRegion):
         """How far the executed actions are from the sampled ones, shape [B]."""
         return (self._executed(batch) - self._sampled(batch)).norm(dim=1)
 
-    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
-        objective = super().surrogate(batch, ratio)
+    def advantages(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         lengths = self._corrections(batch)
         if self.correction_penalty == 0.0 or not lengths.any():
-            return objective
+            return batch.advantages
         penalty = self.correction_penalty * self.advantage_unit()
-        return objective - penalty * (ratio * (lengths - lengths.mean())).mean()
+        return batch.advantages - penalty * (lengths - lengths.mean())
 
     def _cost_size(self) -> np.ndarray:
         """The root mean square of those costs of a step that are not zero, shape (m,)."""

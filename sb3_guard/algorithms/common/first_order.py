@@ -45,9 +45,17 @@ class FirstOrder(CostRollouts, PPO):
         "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},
     }
 
-    # λ = 0.97 and the stop by the KL of the rollout: what robots with episodes of 1,000 steps need.
-    defaults: ClassVar[dict[str, Any]] = {"gae_lambda": 0.97, "target_kl": 0.02}
     policy_defaults: ClassVar[dict[str, Any]] = CALM
+
+    # λ = 0.97 and the stop by the KL of the rollout: what robots with episodes of 1,000 steps need.
+    def __init__(
+        self,
+        *args: Any,
+        gae_lambda: float = 0.97,
+        target_kl: float | None = 0.02,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, gae_lambda=gae_lambda, target_kl=target_kl, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()

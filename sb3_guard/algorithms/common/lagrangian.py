@@ -11,8 +11,6 @@ from torch import nn
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
 
-# Gains that keep positive limits whatever the unit of cost, for policies that learn from rollouts.
-RELATIVE = {"lambda_lr": 0.2, "proportional_gain": 0.5, "lambda_units": "relative"}
 # A limit that nothing keeps raises λ as long as it may; where limits are kept it ends below this.
 HIGHEST = 5.0  # in standard deviations of the advantages
 
@@ -111,15 +109,14 @@ def _average(before: th.Tensor, now: th.Tensor, keep: float) -> th.Tensor:
 class Lagrangian(Constrained):
     """Weights of the costs that follow the violations, for any algorithm that takes them.
 
-    The weights of an update come from :meth:`cost_weight`. The multipliers take their step, or
-    steps, once for each new estimate of J_C (:meth:`costs_to_follow`), before the policy learns (in
-    :meth:`cost_weight`) or after (in :meth:`ascend`, which ``train`` calls at its end).
+    ``train`` calls :meth:`step` at its top, which lets the multipliers follow J_C, and takes the
+    weights of its update from :meth:`weights`.
 
     :param lambda_lr: η, what the multipliers gain per unit of violation and step
     :param lambda_init: multipliers before the first update
     :param lambda_max: bound on the multipliers; None for 5 in relative units, none in those of cost
-    :param lambda_update: whether the multipliers follow a rollout ``"before"`` the policy learns
-        from it or ``"after"``
+    :param lambda_update: whether the policy learns from a rollout with the multipliers that have
+        followed it (``"before"``) or with those before that (``"after"``)
     :param proportional_gain: with ``derivative_gain``, turns the ascent into a PID controller
         (Stooke et al., 2020, arXiv 2007.03964) whose integral gain is ``lambda_lr``
     :param derivative_gain: of the rise of J_C
@@ -144,6 +141,8 @@ class Lagrangian(Constrained):
     derivative_gain: float = hyperparameter(0.0)
     lambda_smoothing: float = hyperparameter(0.0, high=1.0)
     lambda_units: Literal["relative", "cost"] = hyperparameter("cost")
+
+    prices: np.ndarray  # λ of the update under way, shape (m,)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -174,39 +173,29 @@ class Lagrangian(Constrained):
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "multiplier", "multiplier.optimizer"], tensors
 
-    def cost_weight(self, spread: np.ndarray | float = 1.0) -> np.ndarray:
-        """The weight of each cost advantage at this update's λ, float32, shape (m,).
+    def step(self, costs: Iterable[np.ndarray] | None = None, rate: float | None = None) -> None:
+        """Let the multipliers follow J_C; called once, at the top of ``train``.
+
+        :param costs: J_C of each of their steps, shape (m,); None for one step, with the estimate
+        :param rate: η of each step; None for ``lambda_lr``
+        """
+        before = self.multiplier.value.clone()
+        # As with the critics' rate: what the attribute says, not what a file has restored.
+        rate = self.lambda_lr if rate is None else rate
+        update_learning_rate(self.multiplier.optimizer, rate)
+        for cost in [self.costs.episode_cost] if costs is None else costs:
+            self.multiplier.update(cost, self.costs.limits)
+        self.prices = (self.multiplier.value if self.lambda_update == "before" else before).numpy()
+        self._record_per_cost("train/multiplier", self.multiplier.value.numpy())
+
+    def weights(self, spread: np.ndarray | float = 1.0) -> np.ndarray:
+        """What each cost weighs against the reward in this update, float32, shape (m,).
 
         :param spread: what one standard deviation of a cost's advantages is in the reward's, shape
             (m,); multiplies λ if it is relative
         """
-        if self.lambda_update == "before":
-            self.ascend()
-        weight = self.multiplier.value.numpy()
+        weight = self.prices
         if self.lambda_units == "relative":
             weight = weight * spread
             self._record_per_cost("train/cost_weight", weight)
         return weight.astype(np.float32)
-
-    def ascend(self) -> None:
-        """Let the multipliers follow J_C, unless they have followed this estimate already."""
-        if self.costs is None or not self.costs_are_new:
-            return
-        self.costs_are_new = False
-        # As with the critics' rate: what the attribute says, not what a file has restored.
-        update_learning_rate(self.multiplier.optimizer, self.multiplier_rate())
-        for cost in self.costs_to_follow():
-            self.multiplier.update(cost, self.cost_limits)
-        self._record_per_cost("train/multiplier", self.multiplier.value.numpy())
-
-    def multiplier_rate(self) -> float:
-        """η of each step that the multipliers take now."""
-        return self.lambda_lr
-
-    def costs_to_follow(self) -> Iterable[np.ndarray]:
-        """J_C in each step of the multipliers, shape (m,); a rollout is one step."""
-        return [self.costs.episode_cost]
-
-    def train(self, *args: Any, **kwargs: Any) -> None:
-        super().train(*args, **kwargs)  # type: ignore[misc]
-        self.ascend()

@@ -7,7 +7,7 @@ Q_C(s, a) = c + γ_C Q_C(s', a'); the latest episodes tell J_C.
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
@@ -25,9 +25,8 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
-from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.cost_critics import CostQ
-from sb3_guard.algorithms.common.costs import CostEstimate, inverse
+from sb3_guard.algorithms.common.costs import inverse
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.algorithms.common.replay_buffers import (
     CostColumns,
@@ -44,12 +43,28 @@ N_STEP_ARGUMENTS = ("n_steps", "gamma", "cost_gamma")
 WINDOW = 50  # episodes whose mean cost the multipliers follow
 
 
-class CostReplay(Constrained, OffPolicyAlgorithm):
-    """Costs and cost critics for an off-policy algorithm with continuous actions.
+class CostReplay(Lagrangian, OffPolicyAlgorithm):
+    """Costs, cost critics and multipliers for an off-policy algorithm with continuous actions.
 
-    A class that inherits from it says in :meth:`learn_from` what it does with a batch.
+    A class that inherits from it says in :meth:`learn_from` what it does with a batch; there
+    :meth:`batch_weights` are what the costs weigh.
+
+    With ``lambda_units="relative"`` the weight of a cost is λ times the standard deviation of Q
+    over that of Q_C, both of the transitions in the batch: replayed actions vary after the policy
+    has ceased to.
+
+    A single episode is a poor estimate of J_C, so each that ends moves the multipliers by the mean
+    cost of the latest 50: the same way whether one environment or many have brought them. Episodes
+    that end while random actions fill the buffer do not count.
 
     :param cost_gamma: γ_C, discount factor of the costs, below 1; None for ``gamma``
+    :param lambda_lr: η, what the multipliers gain per unit of violation. An episode that ends gives
+        them its share of the steps t so far, η T / t, so that they move as far in a short training
+        as in a long one, and settle
+    :param lambda_starts: when the multipliers begin to move: after that many steps, or below 1
+        after that share of the training. Before it the policy learns its task at ``lambda_init``
+    :param safety_margin: how far below a limit d the multipliers keep J_C, as a share of abs(d):
+        they follow J_C - (d - safety_margin abs(d))
     """
 
     #: What tuning searches, as in a file for ``tune --search-space``; subclasses add theirs.
@@ -59,8 +74,18 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         "batch_size": [128, 256, 512],
         "tau": [0.002, 0.005, 0.01, 0.02],
         "train_freq": [1, 4, 8, 16],
+        "lambda_lr": {"low": 0.2, "high": 30.0, "log": True},
+        "lambda_init": {"low": 0.0, "high": 2.0},
+        "proportional_gain": {"low": 0.0, "high": 2.0},
+        "lambda_starts": {"low": 0.0, "high": 0.3},
+        "safety_margin": {"low": 0.0, "high": 0.3},
     }
 
+    lambda_lr: float = hyperparameter(3.0)
+    proportional_gain: float = hyperparameter(0.5)
+    lambda_units: Literal["relative", "cost"] = hyperparameter("relative")
+    lambda_starts: float = hyperparameter(0.15)
+    safety_margin: float = hyperparameter(0.0, high=1.0)
     cost_gamma: float | None = hyperparameter(None, high=1.0)
 
     replay_buffer: CostReplayBuffer | CostDictReplayBuffer
@@ -81,6 +106,7 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         # only time has ended: no action matters to those. Each of shape (m,)
         self.first_costs: np.ndarray | None = None
         self.unmovable: np.ndarray | None = None
+        self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
         super().__init__(policy, env, *args, **kwargs)
 
     # Construction and saving
@@ -221,7 +247,7 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
     ) -> None:
         super()._update_info_buffer(infos, dones)
         if self.num_timesteps - self.n_envs < self.learning_starts:  # the actions were random
-            self._begin_statistics()
+            self.costs.forget()
         self.replay_buffer.costs[self.replay_buffer.pos] = self.step_costs
         if self.first_costs is None or self.unmovable is None:
             self.first_costs = self.step_costs[0].copy()
@@ -244,9 +270,8 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         raise NotImplementedError
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """SB3's loop around :meth:`learn_from`, after an estimate of J_C where episodes ended."""
-        if self._estimate_costs():
-            self._record_violation()
+        """Multipliers follow the episodes that ended, then SB3's loop around :meth:`learn_from`."""
+        self._follow_episodes()
         self.policy.set_training_mode(True)
         self.cost_critic.online.train(True)
         owners: tuple[Any, ...] = (self.actor, self.critic, self.cost_critic)  # type: ignore[attr-defined]
@@ -291,6 +316,32 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         critic.optimizer.step()
         return loss.item()
 
+    def batch_weights(self, values: th.Tensor) -> th.Tensor:
+        """What each cost weighs against Q on a batch, shape (m,).
+
+        :param values: Q of the batch's own actions, shape [B, 1]
+        """
+        spread = float(values.detach().std(correction=0)) or 1.0
+        weights = self.weights(spread * inverse(self.cost_deviation.astype(np.float64)))
+        return th.as_tensor(weights, device=values.device)
+
+    def _follow_episodes(self) -> None:
+        """J_C is the mean of the latest episodes; each that ended is a step of the multipliers."""
+        means = []
+        for cost in self.costs.ended:
+            self.latest_costs = [*self.latest_costs, cost][-WINDOW:]
+            means.append(np.mean(self.latest_costs, axis=0))
+        if self._estimate_costs():
+            self.costs.episode_cost = means[-1]
+            self._record_violation()
+        share = self.lambda_starts < 1.0
+        starts = self.lambda_starts * (self._total_timesteps if share else 1.0)
+        if self.num_timesteps < starts:
+            means = []
+        margin = self.safety_margin * np.abs(self.costs.limits)
+        rate = self.lambda_lr * (self.costs.horizon or 0.0) / self.num_timesteps
+        self.step([mean + margin for mean in means], rate)
+
     @contextmanager
     def critics_constant(self) -> Iterator[None]:
         """Let the actor's gradient go through the critics without gradients of their weights."""
@@ -303,97 +354,3 @@ class CostReplay(Constrained, OffPolicyAlgorithm):
         finally:
             for weight in weights:
                 weight.requires_grad_(True)
-
-
-class LagrangianReplay(Lagrangian, CostReplay):
-    """Multipliers for an actor that climbs a critic.
-
-    With ``lambda_units="relative"`` the weight of a cost is λ times the standard deviation of Q
-    over that of Q_C, both of the transitions in the batch: replayed actions vary after the policy
-    has ceased to.
-
-    A single episode is a poor estimate of J_C, so each that ends moves the multipliers by the mean
-    cost of the latest 50: the same way whether one environment or many have brought them. Episodes
-    that end while random actions fill the buffer do not count.
-
-    :param lambda_lr: η, what the multipliers gain per unit of violation. An episode that ends gives
-        them its share of the steps t so far, η T / t, so that they move as far in a short training
-        as in a long one, and settle
-    :param lambda_starts: when the multipliers begin to move: after that many steps, or below 1
-        after that share of the training. Before it the policy learns its task at ``lambda_init``
-    :param safety_margin: how far below a limit d the multipliers keep J_C, as a share of abs(d):
-        they follow J_C - (d - safety_margin abs(d))
-    """
-
-    search_space: ClassVar[dict[str, Any]] = {
-        "lambda_lr": {"low": 0.2, "high": 30.0, "log": True},
-        "lambda_init": {"low": 0.0, "high": 2.0},
-        "proportional_gain": {"low": 0.0, "high": 2.0},
-        "lambda_starts": {"low": 0.0, "high": 0.3},
-        "safety_margin": {"low": 0.0, "high": 0.3},
-    }
-    defaults: ClassVar[dict[str, Any]] = {
-        "lambda_lr": 3.0,
-        "proportional_gain": 0.5,
-        "lambda_units": "relative",
-    }
-
-    lambda_starts: float = hyperparameter(0.15)
-    safety_margin: float = hyperparameter(0.0, high=1.0)
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
-        # Since the multipliers' last step: the mean after each episode, and which update that was.
-        self.unfollowed: list[np.ndarray] = []
-        self.followed_at = 0
-        super().__init__(*args, **kwargs)
-
-    def _estimate_costs(self, rate: np.ndarray | None = None) -> bool:
-        for cost in self._ended_costs:
-            self.latest_costs = [*self.latest_costs, cost][-WINDOW:]
-            self.unfollowed.append(np.mean(self.latest_costs, axis=0))
-        if not super()._estimate_costs(rate):
-            return False
-        mean, horizon = self.unfollowed[-1], self.costs.horizon
-        self.costs = CostEstimate(mean, horizon, (mean - self.cost_limits) / horizon)
-        return True
-
-    def ascend(self) -> None:
-        share = self.lambda_starts < 1.0
-        starts = self.lambda_starts * (self._total_timesteps if share else 1.0)
-        if self.num_timesteps < starts:
-            self.unfollowed, self.followed_at = [], self._n_updates
-        elif self._n_updates > self.followed_at:
-            super().ascend()
-
-    def multiplier_rate(self) -> float:
-        return self.lambda_lr * self.costs.horizon / self.num_timesteps
-
-    def costs_to_follow(self) -> list[np.ndarray]:
-        margin = self.safety_margin * np.abs(self.cost_limits)
-        means = [mean + margin for mean in self.unfollowed]
-        self.unfollowed, self.followed_at = [], self._n_updates
-        return means
-
-    def penalized(
-        self,
-        loss: th.Tensor,
-        batch: CostReplayBufferSamples,
-        actions: th.Tensor,
-        values: th.Tensor,
-    ) -> th.Tensor:
-        """(loss + Σ weight_i Q_Ci(s, a)) / (1 + Σ λ_i); the loss itself while no λ is positive.
-
-        :param loss: what SB3's actor descends, by row, shape [B, 1]
-        :param batch: B transitions
-        :param actions: the policy's, which carry the gradient
-        :param values: Q of the batch's own actions, shape [B, 1]
-        :return: shape [B, 1]
-        """
-        spread = float(values.detach().std(correction=0)) or 1.0
-        weight = self.cost_weight(spread * inverse(self.cost_deviation.astype(np.float64)))
-        if not weight.any():
-            return loss
-        weights = th.as_tensor(weight, device=loss.device)
-        penalty = (self.cost_critic(batch.observations, actions) * weights).sum(1, keepdim=True)
-        return (loss + penalty) / (1.0 + float(self.multiplier.value.sum()))

@@ -81,6 +81,10 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         "policy_kwargs.net_arch": [{"pi": [n, n], "vf": [n, n]} for n in (64, 256)],
         "policy_kwargs.log_std_init": {"low": -1.5, "high": 0.0},
     }
+    # SB3's buffers have no room for costs.
+    fixed_arguments: ClassVar[frozenset[str]] = frozenset(
+        {"rollout_buffer_class", "rollout_buffer_kwargs"}
+    )
     #: Whether a critic of the costs is built and trained.
     uses_cost_critic: bool = True
     #: What critics learn: SB3's λ-returns, or discounted rewards- and costs-to-go.
@@ -111,14 +115,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        buffer_class = self.rollout_buffer_class
-        if buffer_class is not None and not issubclass(
-            buffer_class, CostRolloutBuffer | CostDictRolloutBuffer
-        ):
-            raise ValueError(
-                f"rollout_buffer_class={buffer_class.__name__}: must be a subclass of "
-                "CostRolloutBuffer, or of CostDictRolloutBuffer for Dict observations"
-            )
         arch = (self.policy_kwargs or {}).get("net_arch")
         if isinstance(arch, dict) and "cost" in arch and not {"pi", "vf"} <= arch.keys():
             raise ValueError(f"net_arch={arch!r}: must also have the layers of 'pi' and 'vf'")
@@ -139,12 +135,10 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             )
 
     def _choose_buffer(self) -> None:
-        if self.rollout_buffer_class is None:
-            dictionary = isinstance(self.observation_space, spaces.Dict)
-            self.rollout_buffer_class = CostDictRolloutBuffer if dictionary else CostRolloutBuffer
+        dictionary = isinstance(self.observation_space, spaces.Dict)
+        self.rollout_buffer_class = CostDictRolloutBuffer if dictionary else CostRolloutBuffer
         gamma, gae_lambda = self.cost_gamma, self.cost_gae_lambda
         self.rollout_buffer_kwargs = {
-            **self.rollout_buffer_kwargs,
             "returns": self.returns,
             "n_costs": len(self.cost_keys),
             "cost_gamma": self.gamma if gamma is None else gamma,
@@ -188,7 +182,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         n_rollout_steps: int,
     ) -> bool:
         started = time.perf_counter()
-        self._begin_statistics()
+        self.costs.forget()
         self._timeouts = []
         # the layers of a small network take less time than threads that meet
         weights = sum(parameter.numel() for parameter in self.policy.parameters())
@@ -212,13 +206,13 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         """The limits as those of the discounted costs-to-go of the last rollout, shape (m,)."""
         gamma = self.rollout_buffer.cost_gamma
         return discounted_limit(
-            self.cost_limits, self.costs.horizon, gamma, cut=bool(self._timeouts)
+            self.costs.limits, self.costs.horizon, gamma, cut=bool(self._timeouts)
         )
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
     ) -> None:
-        before = self.last_costs
+        before = self.costs.last
         super()._update_info_buffer(infos, dones)
         step = self.rollout_buffer.pos
         self.rollout_buffer.costs[step] = self.step_costs

@@ -1,17 +1,17 @@
-"""What SAC and TQC share: a gradient step, and an entropy coefficient that fits the rewards."""
+"""SAC's gradient step with costs, which SAC- and TQC-Lagrangian share."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_guard.algorithms.common.replay import LagrangianReplay
+from sb3_guard.algorithms.common.replay import CostReplay
 from sb3_guard.algorithms.common.replay_buffers import CostReplayBufferSamples
 
 
-class SoftActorCritic(LagrangianReplay):
+class SoftActorCritic(CostReplay):
     """For the classes that maximise E[Σ r + α H(π)].
 
     A leaf says what its critics are: one estimate a network (SAC), or quantiles (TQC).
@@ -26,8 +26,6 @@ class SoftActorCritic(LagrangianReplay):
         (``"auto_0.1"``), or from the size of the rewards (``"auto_reward"``)
     """
 
-    defaults: ClassVar[dict[str, Any]] = {"ent_coef": "auto_reward"}
-
     ent_coef: str | float
     target_entropy: str | float
     batch_norm_stats: list[th.Tensor]
@@ -39,6 +37,9 @@ class SoftActorCritic(LagrangianReplay):
     log_ent_coef: th.Tensor | None
     ent_coef_optimizer: th.optim.Adam | None
     ent_coef_tensor: th.Tensor
+
+    def __init__(self, *args: Any, ent_coef: str | float = "auto_reward", **kwargs: Any) -> None:
+        super().__init__(*args, ent_coef=ent_coef, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
@@ -78,20 +79,7 @@ class SoftActorCritic(LagrangianReplay):
         if size > 0.0 and self.log_ent_coef is not None:
             self.log_ent_coef.fill_(np.log(size / get_action_dim(self.action_space)))
 
-    def fit_temperature(self, log_prob: th.Tensor) -> tuple[dict[str, float], th.Tensor]:
-        """One step of log α, if it is learnt.
-
-        :param log_prob: of the policy's actions, without gradient, shape [B, 1]
-        :return: what to log, and α before the step
-        """
-        if self.ent_coef_optimizer is None or self.log_ent_coef is None:
-            return {"ent_coef": self.ent_coef_tensor.item()}, self.ent_coef_tensor
-        alpha = th.exp(self.log_ent_coef.detach())
-        loss = -(self.log_ent_coef * (log_prob + float(self.target_entropy))).mean()
-        self.ent_coef_optimizer.zero_grad()
-        loss.backward()
-        self.ent_coef_optimizer.step()
-        return {"ent_coef": alpha.item(), "ent_coef_loss": loss.item()}, alpha
+    # What the critics are
 
     def next_values(self, values: Any) -> th.Tensor:
         """Estimates of the next state's value that the critics learn from, shape [B, K].
@@ -114,12 +102,26 @@ class SoftActorCritic(LagrangianReplay):
 
     def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
         """SB3's order: entropy coefficient, critics, actor, targets."""
+        logs: dict[str, float] = {}
         if self.use_sde:
             self.actor.reset_noise()
         actions, log_prob = self.actor.action_log_prob(batch.observations)
         log_prob = log_prob.reshape(-1, 1)
-        logs, alpha = self.fit_temperature(log_prob.detach())
 
+        # Entropy coefficient α: one step of log α, if it is learnt
+        if self.ent_coef_optimizer is None or self.log_ent_coef is None:
+            alpha = self.ent_coef_tensor
+        else:
+            alpha = th.exp(self.log_ent_coef.detach())
+            entropy = log_prob.detach() + float(self.target_entropy)
+            alpha_loss = -(self.log_ent_coef * entropy).mean()
+            self.ent_coef_optimizer.zero_grad()
+            alpha_loss.backward()
+            self.ent_coef_optimizer.step()
+            logs["ent_coef_loss"] = alpha_loss.item()
+        logs["ent_coef"] = alpha.item()
+
+        # Critics of the reward, Q ← r + γ (1 - done) (Q' - α log π'), and of the costs
         discounts = self.gamma if batch.discounts is None else batch.discounts  # of n-step returns
         with th.no_grad():
             next_actions, next_log_prob = self.actor.action_log_prob(batch.next_observations)
@@ -134,15 +136,23 @@ class SoftActorCritic(LagrangianReplay):
         logs["critic_loss"] = critic_loss.item()
         logs["cost_critic_loss"] = self.fit_cost_critic(batch, next_actions)
 
+        # Actor: down (α log π - Q + Σ w_i Q_Ci) / (1 + Σ λ_i)
         self.actor.optimizer.zero_grad()
+        weights = self.batch_weights(self.expected(values))
         with self.critics_constant():
             chosen = self.estimate(self.critic(batch.observations, actions))
             loss = alpha * log_prob - chosen
-            loss = self.penalized(loss, batch, actions, self.expected(values)).mean()
+            if weights.any():
+                costs = self.cost_critic(batch.observations, actions)
+                loss = (loss + (costs * weights).sum(1, keepdim=True)) / (
+                    1.0 + float(self.prices.sum())
+                )
+            loss = loss.mean()
             loss.backward()
         self.actor.optimizer.step()
         logs["actor_loss"] = loss.item()
 
+        # Targets
         if step % self.target_update_interval == 0:
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
             polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)

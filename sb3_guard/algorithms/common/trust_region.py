@@ -3,10 +3,11 @@
 One update reads like the algorithm box of the papers: find a step within a trust region around the
 old policy, search along it, fit the critics; ``rollouts.py`` has collected the rollout and
 estimated its costs. What an algorithm may replace stands at the end of :class:`TrustRegion`:
-``surrogate``, ``step``, ``accept`` and ``fit``; and ``correct``, which it has from there.
+``advantages`` (or ``surrogate``), ``plan`` and ``fit``; and ``correct``, which it has from there.
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -46,6 +47,9 @@ class Trial(NamedTuple):
     cost_change: np.ndarray
 
 
+Accept = Callable[[Trial], bool]
+
+
 @dataclass(eq=False)
 class Region:
     """The update's local picture: a linear surrogate inside a quadratic trust region.
@@ -53,7 +57,6 @@ class Region:
     :param actor: the policy on the batch
     :param batch: the batch
     :param gradient: of the surrogate at the old policy, shape (P,)
-    :param violation: of the cost limits, in units of the cost surrogates, shape (m,)
     :param delta: bound on the mean KL
     :param damping: added to the Fisher matrix's diagonal
     :param cg_max_steps: conjugate-gradient iterations per solve
@@ -62,7 +65,6 @@ class Region:
     actor: Actor
     batch: CostRolloutBufferSamples
     gradient: th.Tensor
-    violation: np.ndarray
     delta: float
     damping: float
     cg_max_steps: int
@@ -115,12 +117,7 @@ class TrustRegion(CostRollouts):
     :param target_kl: δ, bound on the mean KL(old ‖ new) per update, summed over action dimensions
     :param cg_max_steps: conjugate-gradient iterations per solve
     :param cg_damping: added to the diagonal of the Fisher matrix
-    :param line_search_max_iter: candidates tried along a step
-    :param line_search_shrinking_factor: ratio of successive candidates
     :param n_critic_updates: passes over the rollout per critic and update
-    :param normalize_advantage: whether to standardise the reward advantages; cost advantages are
-        centred but never scaled, since they share the limit's units
-    :param rollout_buffer_class: a subclass of ``CostRolloutBuffer``; None chooses
     """
 
     search_space: ClassVar[dict[str, Any]] = {
@@ -137,7 +134,14 @@ class TrustRegion(CostRollouts):
     policy_defaults: ClassVar[dict[str, Any]] = CALM
     returns: ClassVar[Literal["lambda", "discounted"]] = "discounted"
     # SB3's weights of losses: nothing here mixes those of actor and critic.
-    fixed_arguments: ClassVar[frozenset[str]] = frozenset({"ent_coef", "vf_coef", "max_grad_norm"})
+    fixed_arguments: ClassVar[frozenset[str]] = CostRollouts.fixed_arguments | {
+        "ent_coef", "vf_coef", "max_grad_norm"
+    }  # fmt: skip
+    #: Whether the reward advantages are standardised; cost advantages are centred but never scaled,
+    #: since they share the limit's units.
+    normalize_advantage = True
+    #: Candidates that are tried along a step, each this many times as far as the one before.
+    line_search_max_iter, line_search_shrinking_factor = 100, 0.8
 
     target_kl: float = hyperparameter(0.02, ends="()")
     # Measured on Goal_Point_8Hazards: undamped, a hundred iterations promise 1.5 times the gain,
@@ -145,10 +149,7 @@ class TrustRegion(CostRollouts):
     # solved in fifteen iterations and the step is taken nearly whole.
     cg_max_steps: int = hyperparameter(15)
     cg_damping: float = hyperparameter(0.1)
-    line_search_max_iter: int = hyperparameter(100)
-    line_search_shrinking_factor: float = hyperparameter(0.8, high=1.0, ends="()")
     n_critic_updates: int = hyperparameter(80)
-    normalize_advantage: bool = hyperparameter(True)
 
     def __init__(
         self,
@@ -199,8 +200,7 @@ class TrustRegion(CostRollouts):
         if self.env is not None and self.normalize_advantage and self.n_steps * self.n_envs < 2:
             raise ValueError(
                 f"n_steps={self.n_steps} with {self.n_envs} environment: standardising advantages "
-                "takes at least two steps per update; raise n_steps or pass "
-                "normalize_advantage=False"
+                "takes at least two steps per update; raise n_steps"
             )
 
     def _setup_model(self) -> None:
@@ -232,28 +232,49 @@ class TrustRegion(CostRollouts):
 
     def train(self) -> None:
         """One update from the rollout: the policy's step, what a leaf learns, the critics."""
+        started = time.perf_counter()
         self.policy.set_training_mode(False)  # except while the critics are fitted
         self._update_learning_rate(self.policy.optimizer)
 
-        started = time.perf_counter()
+        # The policy: where to go, and as far on the way as the line search accepts
         batch = self._batch()
-        self._update_actor(batch)
+        actor = actor_of(self.policy, batch.observations, batch.actions)
+        ratio = th.ones_like(batch.advantages).requires_grad_()
+        objective = self.surrogate(batch, ratio)
+        (weights,) = th.autograd.grad(objective, ratio)
+        gradient = actor.score(weights)
+        region = Region(actor, batch, gradient, self.target_kl, self.cg_damping, self.cg_max_steps)
+        x, accept = self.plan(region)
+        fraction, trial = self._line_search(region, x, accept, objective.item())
         self.fit(batch)
+
+        # The critics
         moved = time.perf_counter()
-        self._update_critics(batch)
+        loss = Regression.of_value(self.policy).fit(
+            batch.observations, batch.returns[:, None], self.n_critic_updates, self.batch_size
+        )
+        self._check_finite("value_loss", loss)
+        if self.uses_cost_critic:
+            self.fit_cost_critic(self.n_critic_updates)
         self.timing.update(actor=moved - started, critics=time.perf_counter() - moved)
 
         self._n_updates += 1
+        values, returns = self.rollout_buffer.values, self.rollout_buffer.returns
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        log_std = getattr(self.policy, "log_std", None)
-        if log_std is not None:
+        for name, value in {
+            "policy_objective": objective.item() + trial.improvement,
+            "kl": trial.kl,
+            "line_search_step": fraction,
+            "value_loss": loss,
+            "explained_variance": explained_variance(values.flatten(), returns.flatten()),
+        }.items():
+            self.logger.record(f"train/{name}", value)
+        if (log_std := getattr(self.policy, "log_std", None)) is not None:
             self.logger.record("train/std", th.exp(log_std).mean().item())
-        self.logger.record(
-            "train/explained_variance",
-            explained_variance(
-                self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
-            ),
-        )
+        self._record_violation()
+        if self.constrained and self.uses_cost_critic:
+            self._record_per_cost("train/cost_surrogate", trial.cost_change)
+            self._record_promise(trial)
 
     def _batch(self) -> CostRolloutBufferSamples:
         """The whole rollout, with advantages and critic targets as the updates use them."""
@@ -261,36 +282,12 @@ class TrustRegion(CostRollouts):
         advantages, cost_advantages = batch.advantages, batch.cost_advantages
         if self.normalize_advantage:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        return batch._replace(
+        batch = batch._replace(
             actions=self._taken(batch.actions),
             advantages=advantages,
             cost_advantages=cost_advantages - cost_advantages.mean(dim=0),
         )
-
-    def _update_actor(self, batch: CostRolloutBufferSamples) -> None:
-        actor = actor_of(self.policy, batch.observations, batch.actions)
-        ratio = th.ones_like(batch.advantages).requires_grad_()
-        objective = self.surrogate(batch, ratio)
-        (weights,) = th.autograd.grad(objective, ratio)
-        before = objective.item()
-        region = Region(
-            actor,
-            batch,
-            actor.score(weights),
-            self.violation(),
-            self.target_kl,
-            self.cg_damping,
-            self.cg_max_steps,
-        )
-        fraction, trial = self._line_search(region, self.step(region), before)
-        logger = self.logger
-        logger.record("train/policy_objective", before + trial.improvement)
-        logger.record("train/kl", trial.kl)
-        logger.record("train/line_search_step", fraction)
-        self._record_violation()
-        if self.constrained and self.uses_cost_critic:
-            self._record_per_cost("train/cost_surrogate", trial.cost_change)
-            self._record_promise(trial)
+        return batch._replace(advantages=self.advantages(batch))
 
     def _record_promise(self, trial: Trial) -> None:
         """Record what the last step promised J_C and what it brought; keep this one's promise."""
@@ -302,13 +299,16 @@ class TrustRegion(CostRollouts):
         self.promise = (cost, trial.cost_change * self.costs.horizon)
 
     @th.no_grad()
-    def _line_search(self, region: Region, x: th.Tensor, before: float) -> tuple[float, Trial]:
+    def _line_search(
+        self, region: Region, x: th.Tensor, accept: Accept, before: float
+    ) -> tuple[float, Trial]:
         """Move the actor to the first acceptable point on the way to x.
 
+        :param before: the surrogate of the old policy
         :return: the fraction of x that was taken (0 if none was acceptable) and the trial there
         """
         actor, batch = region.actor, region.batch
-        stay = Trial(0.0, 0.0, np.zeros(len(region.violation)))
+        stay = Trial(0.0, 0.0, np.zeros(len(self.cost_keys)))
         if not bool(th.isfinite(x).all()) or not bool(x.any()):
             return 0.0, stay
         origin = flatten(actor.parameters)
@@ -324,7 +324,7 @@ class TrustRegion(CostRollouts):
                     continue
                 improvement = float(self.surrogate(batch, ratio)) - before
                 trial = Trial(kl, improvement, region.cost_changes(ratio))
-                accepted = self.accept(trial)
+                accepted = accept(trial)
                 if accepted:
                     return fraction, trial
                 fraction *= self.line_search_shrinking_factor
@@ -333,41 +333,35 @@ class TrustRegion(CostRollouts):
                 assign(actor.parameters, origin)
         return 0.0, stay
 
-    def _update_critics(self, batch: CostRolloutBufferSamples) -> None:
-        loss = Regression.of_value(self.policy).fit(
-            batch.observations, batch.returns[:, None], self.n_critic_updates, self.batch_size
-        )
-        self._check_finite("value_loss", loss)
-        self.logger.record("train/value_loss", loss)
-        if self.uses_cost_critic:
-            self.fit_cost_critic(self.n_critic_updates)
-
     # What an algorithm may replace
 
-    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
-        """What is ascended, as a function of the likelihood ratios.
+    def advantages(self, batch: CostRolloutBufferSamples) -> th.Tensor:
+        """How good each action of the rollout is, costs included, shape (N,); called once.
 
         :param batch: the rollout; reward advantages standardised, cost advantages centred
+        """
+        return batch.advantages
+
+    def surrogate(self, batch: CostRolloutBufferSamples, ratio: th.Tensor) -> th.Tensor:
+        """What is ascended, where it is not linear in the likelihood ratios.
+
+        :param batch: the rollout, with :meth:`advantages` as its advantages
         :param ratio: π(a|s) / π_old(a|s), shape (N,); all gradients flow through it
         :return: a scalar
         """
         return (ratio * batch.advantages).mean()
 
-    def step(self, region: Region) -> th.Tensor:
-        """Where to go from the old policy's parameters.
+    def plan(self, region: Region) -> tuple[th.Tensor, Accept]:
+        """Where to go from the old policy's parameters, and what becomes the new policy.
 
-        :param region: gradients, violations and products with F⁻¹
-        :return: the step, shape (P,); zero to stay
+        :param region: gradients and products with F⁻¹
+        :return: the step, shape (P,), zero to stay; and whether a candidate of the line search is
+            accepted
         """
-        return region.natural_step()
-
-    def violation(self) -> np.ndarray:
-        """What the step has to take away from each cost surrogate, (J_C - d) / T, shape (m,)."""
-        return self.costs.violation
-
-    def accept(self, trial: Trial) -> bool:
-        """Whether a candidate of the line search becomes the new policy."""
-        return trial.kl <= self.target_kl and trial.improvement >= 0.0
+        return (
+            region.natural_step(),
+            lambda trial: trial.kl <= self.target_kl and trial.improvement >= 0.0,
+        )
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         """Learn what else the algorithm has to learn, after the policy has moved."""

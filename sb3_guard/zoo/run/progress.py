@@ -17,7 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tqdm import tqdm
 
 import sb3_guard
-from sb3_guard.algorithms.common.limits import limits_at
+from sb3_guard.algorithms.common.costs import limits_at
 from sb3_guard.checks import NumberError
 from sb3_guard.common.evaluation import bounded_name
 from sb3_guard.common.monitor import cost_keys_of, find_monitor

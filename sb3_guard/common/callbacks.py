@@ -58,7 +58,7 @@ def selection_limits(
 
 def _mean(values: np.ndarray) -> Any:
     """Mean over episodes, but for those that a physics error ended; NaN: there are none."""
-    values = values[~np.isnan(values.reshape(len(values), -1)).any(axis=1)]
+    values = values[~np.isnan(values).any(axis=tuple(range(1, values.ndim)))]
     return (values.mean(axis=0) if len(values) else np.full(values.shape[1:], np.nan)).tolist()
 
 

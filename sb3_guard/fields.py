@@ -65,7 +65,7 @@ def fit(
         above = number >= low if ends[0] == "[" else number > low
         below = number <= high if ends[1] == "]" else number < high
         if not (above and below):
-            allowed = _bounds(low, high, ends) or "finite"
+            allowed = _bounds(low, high, ends) if math.isfinite(number) else "finite"
             raise ValueError(f"{name} = {value!r} must be {allowed}")
     return made
 

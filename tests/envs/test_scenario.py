@@ -86,7 +86,7 @@ def test_bad_ids_say_what_is_wrong(name, message):
         ({"observe": {"camera": [8, 8.5]}}, "must be a list of 2 integers or null"),
         (
             {"chase": {"num": 3}},
-            "task is Goal, not Chase: .*goal={...}, .*'Chase_Point_8Hazards-v0'",
+            "unknown parameter 'chase': .*allowed: .*, goal, ",
         ),
         ({"hazards": {"indicator": 1}}, "hazards.indicator = 1 must be true or false"),
         ({"hazards": {"keepout": 3}}, "keepout 3.0 does not fit the placement"),
@@ -524,11 +524,11 @@ def test_bad_registrations_are_refused(tmp_path):
     xml = registry.ROBOTS["Point"].path()
     for attributes, message in (
         ({"timstep": 0.01}, "has no 'timstep': did you mean 'timestep'"),
-        ({"timestep": -1.0}, "timestep = -1.0 must be a number or null, greater than 0"),
-        ({"timestep": float("inf")}, "timestep = inf must be a number or null, greater than 0"),
+        ({"timestep": -1.0}, "timestep = -1.0 must be .*greater than 0"),
+        ({"timestep": float("inf")}, "timestep = inf must be finite"),
         ({"timestep": "fast"}, "timestep = 'fast' must be a number or null, greater than 0"),
         ({"reach": "far"}, "reach = 'far' must be a number"),
-        ({"reach": -1}, "reach = -1 must be a number, greater than 0"),
+        ({"reach": -1}, "reach = -1 must be greater than 0"),
         ({"lidar_bodies": "tip"}, "lidar_bodies = 'tip' must be a list of texts"),
         ({"center": 3}, "center = 3 must be text or null"),
         ({"workspace": "3d"}, "workspace = '3d': allowed: planar, spatial"),

@@ -80,7 +80,7 @@ DAMAGE = {
     "unfinished": lambda run: (run / "result.json").unlink(),
     "is damaged": lambda run: (run / "result.json").write_text('{"return": 1'),
     "can't decode": lambda run: (run / "result.json").write_bytes(b"\xff\xfe\x00"),
-    "list indices": lambda run: (run / "result.json").write_text("[1]"),
+    "result.json is damaged: AttributeError": lambda run: (run / "result.json").write_text("[1]"),
     "KeyError: 'n_timesteps'": lambda run: (run / "result.json").write_text("{}"),
     "must be real number": lambda run: edit(run, cost="x"),
     "could not convert string to float: 'x'": lambda run: edit(run, seconds="x"),

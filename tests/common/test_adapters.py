@@ -129,9 +129,11 @@ def test_five_values_are_refused():
 )
 def test_its_ids_are_accepted(package, env_id):
     assert is_safety_gymnasium(env_id)
-    full, _, batch = source_of(env_id)
-    assert batch is None and full == env_id  # the prefix tells it from ours of that name
-    for name in (env_id, full):
+    source = source_of(env_id)
+    assert (
+        source.batch is None and source.env_id == env_id
+    )  # the prefix tells it from ours of that name
+    for name in (env_id, source.env_id):
         env = make_vec_env(name, 2, seed=0)
         env.reset()
         *_, infos = env.step(np.ones((2, 2)))

@@ -178,7 +178,7 @@ def _bounds(low: float, high: float, ends: str) -> str:
     """A range in words; empty: all numbers."""
     bounds = []
     if math.isfinite(low):
-        bounds.append(f"{'at least' if ends[0] == '[' else 'greater than'} {low:g}")
+        bounds.append(f"{'at least' if ends[0] == '[' else 'greater than'} {low:.12g}")
     if math.isfinite(high):
-        bounds.append(f"{'at most' if ends[1] == ']' else 'less than'} {high:g}")
+        bounds.append(f"{'at most' if ends[1] == ']' else 'less than'} {high:.12g}")
     return " and ".join(bounds)

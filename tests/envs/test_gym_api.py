@@ -159,7 +159,7 @@ def test_bad_actions_and_modes_are_refused():
         gymnasium.make("Goal_Point_8Hazards-v0", camera="tracker")
     with pytest.raises(ValueError, match="num_envs = 0 must be"):
         gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=0)
-    with pytest.raises(ValueError, match="max_episode_steps = 0 must be an integer"):
+    with pytest.raises(ValueError, match="max_episode_steps = 0 must be at least 1"):
         gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=1, max_episode_steps=0)
     with pytest.raises(ValueError, match="2 seeds for 1"):
         gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=1).reset(seed=[1, 2])

@@ -320,7 +320,7 @@ def test_numbers_of_any_kind_are_costs(cost: Any) -> None:
 
 @pytest.mark.parametrize("cost", [np.nan, np.inf, "much", "1.5", b"1", None, [1.0, 2.0]])
 def test_anything_else_is_not(cost: Any) -> None:
-    with pytest.raises(ValueError, match=r"info\['cost'\] of environment 0 is .*finite number"):
+    with pytest.raises(ValueError, match=r"info\['cost'\] of environment 0.* is .*finite number"):
         small(CPO, info_env(cost=cost)).learn(40)
     with pytest.raises(ValueError, match=r"info\['b'\] of environment 1 is .*finite number"):
         read_costs([{"a": 1.0, "b": 2}, {"a": 1.0, "b": cost}], ("a", "b"), False)
@@ -353,7 +353,7 @@ class _WithoutInfos(VecEnvWrapper):
 def test_no_infos_at_all_are_no_costs() -> None:
     env = _WithoutInfos(points(2, episode_length=10**6))
     assert small(TRPO, env).learn(80).num_timesteps == 80
-    with pytest.raises(ValueError, match=r"environment 0 has no cost key 'cost'.*adapters has"):
+    with pytest.raises(ValueError, match=r"environment 0.* has no cost key 'cost'.*adapters has"):
         small(CPO, env).learn(80)
 
 
@@ -604,8 +604,9 @@ def test_the_signature_says_what_can_be_passed_by_position(cls: Any) -> None:
     stated = inspect.signature(cls).parameters.values()
     names = [one.name for one in stated if one.kind is one.POSITIONAL_OR_KEYWORD]
     values = {name: inspect.signature(cls).parameters[name].default for name in names[2:]}
-    values |= {"learning_rate": 1.5e-4, "gamma": 0.91, "n_steps": 1 if "tau" in values else 40}
-    values |= {"batch_size": 16} if values["batch_size"] else {}
+    more = {"learning_rate": 1.5e-4, "gamma": 0.91, "n_steps": 1 if "tau" in values else 40}
+    more |= {"batch_size": 16} if values["batch_size"] else {}
+    values |= {name: value for name, value in more.items() if name in values}
     values.pop("_init_setup_model", None)
     model = cls("MlpPolicy", points(1), *values.values())
     for name in {"learning_rate", "gamma", "n_steps", "batch_size", "n_epochs"} & values.keys():

@@ -89,9 +89,10 @@ def test_every_update_has_the_limit_of_its_time(cls: Any, limit: Any, tmp_path: 
     def spy(*args: Any, **kwargs: Any) -> None:
         expected = 4.0 - 2.0 * model.num_timesteps / 160
         assert model.cost_limits.tolist() == pytest.approx([expected])
-        if model.costs is not None:
-            cost, horizon, violation = model.costs
-            np.testing.assert_allclose(violation, (cost - expected) / horizon)
+        costs = model.costs
+        if costs.episode_cost is not None:
+            violation = (costs.episode_cost - expected) / costs.horizon
+            np.testing.assert_allclose(costs.violation, violation)
         train(*args, **kwargs)
         if "train/cost_limit" in model.logger.name_to_value:
             seen.append((model.num_timesteps, model.logger.name_to_value["train/cost_limit"]))

@@ -408,7 +408,7 @@ def test_costs_do_not_change_trpo() -> None:
         env = make_vec_env(lambda kwargs=kwargs: CostPoint(**kwargs), 2, seed=0)
         model = TRPO("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0).learn(400)
         policies.append(flatten(p.detach() for p in model.policy.parameters()))
-        assert model.cost_seen is ("cost_keys" not in kwargs)
+        assert model.costs.seen is ("cost_keys" not in kwargs)
     assert th.equal(policies[0], policies[1]) and th.equal(policies[0], policies[2])
 
 

@@ -167,7 +167,8 @@ def check_normalizer(normalizer: Any, space: spaces.Space) -> None:
     statistics: Any = getattr(normalizer, "obs_rms", None)
     shapes: dict[Any, Any] = {None: space.shape}
     if isinstance(space, spaces.Dict):
-        shapes = {key: space[key].shape for key in normalizer.norm_obs_keys or () if key in space}
+        keys = [key for key in normalizer.norm_obs_keys or () if key in space.spaces]
+        shapes = {key: space[key].shape for key in keys}
     else:
         statistics = {None: statistics}
     if not isinstance(statistics, dict) or statistics.keys() != shapes.keys():

@@ -354,6 +354,19 @@ UNFIT = {
 }
 
 
+def test_a_normalizer_of_some_entries_of_a_dictionary():
+    suite = {"env_kwargs": {"flatten": False}, "max_episode_steps": 5}
+    env = VecNormalize(make_vec_env("Goal_Point_8Hazards", **suite), norm_obs_keys=["velocimeter"])
+    model = PPO("MultiInputPolicy", env, n_steps=10, batch_size=10)
+    assert len(evaluate_policy(model, env, 1)) == 1
+    env.obs_rms["velocimeter"].var[0] = -1.0
+    with pytest.raises(ValueError, match="their var of 'velocimeter'"):
+        evaluate_policy(model, env, 1)
+    env.obs_rms = {}
+    with pytest.raises(ValueError, match="of other observations"):
+        evaluate_policy(model, env, 1)
+
+
 @pytest.mark.parametrize("name", UNFIT)
 def test_a_normalizer_that_does_not_fit_is_refused(name):
     env = VecNormalize(make_vec_env(CostPoint, 2, env_kwargs={"episode_length": 5}))

@@ -60,6 +60,7 @@ class Physics(Batch):
         super().__init__(model, nsim, nthread, persistent=True)
         self.frame_skip, self.stage = frame_skip, stage
         self._copy: mujoco.MjModel | None = None
+        self._usual = int(model.opt.disableflags)
         self._sleeps = bool(model.opt.enableflags & SLEEP)
         self._late = nsim > 1 and stage != NONE and not (model.nhistory or model.nplugin)
         if self._sleeps:
@@ -81,12 +82,11 @@ class Physics(Batch):
         """
         failed = np.zeros(self.nsim, dtype=bool)
         if self._late:
-            flags = self._disabled
-            self._disabled = flags | SENSOR
+            self._leave_out(SENSOR)
             try:
                 self._steps(failed, before, NONE)
             finally:
-                self._disabled = flags
+                self._leave_out(0)
             _run(self.forward, failed, stage=self.stage)
         else:
             self._steps(failed, before, self.stage)
@@ -96,19 +96,12 @@ class Physics(Batch):
             self._warned[:] = self._warnings
         return failed
 
-    @property
-    def _disabled(self) -> Any:
-        """What the simulations leave out, bits of :class:`mujoco.mjtDisableBit`: an integer, or
-        [N] if they have fields of their own.
-        """
-        return self._flags.copy() if self._copy is None else self._copy.opt.disableflags
-
-    @_disabled.setter
-    def _disabled(self, flags: Any) -> None:
+    def _leave_out(self, bits: int) -> None:
+        """Let the simulations leave out these, bits of :class:`mujoco.mjtDisableBit`, too."""
         if self._copy is None:
-            self._flags[:] = flags
+            self._flags[:] = self._usual | bits
         else:
-            self._copy.opt.disableflags = flags
+            self._copy.opt.disableflags = self._usual | bits
 
     def _steps(self, failed: Array, before: Callable[[], None] | None, stage: int) -> None:
         """The physics steps of a control step, then ``stage`` at the new state."""

@@ -35,7 +35,9 @@ class Obstacles(Placed, Constraint):
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        self._nums, self._sizes = self.current("num")[:, None], self.current("size")[:, None]
+        self._nums = self.current("num")[:, None]
+        # one number is faster than the same number for all rows
+        self._sizes = self.current("size")[:, None] if "size" in self.ranges else self.size
 
     def present(self, footprint: Footprint, row: int) -> Footprint:
         is_mine = footprint.name == self.name

@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 30_163,
-    "sb3_guard/envs": 10_005,
-    "sb3_guard/algorithms": 7_074,
-    "sb3_guard/common": 1_990,
-    "sb3_guard/deployment": 1_131,
-    "harness": 9_963,
-    "tests": 28_316,
+    "sb3_guard": 29_220,
+    "sb3_guard/envs": 9_480,
+    "sb3_guard/algorithms": 6_405,
+    "sb3_guard/common": 2_190,
+    "sb3_guard/deployment": 1_190,
+    "harness": 9_900,
+    "tests": 28_060,
 }
-WORDS = 96_450  # of all tracked markdown but the changelog
+WORDS = 82_000  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -360,9 +360,9 @@ def test_what_is_ahead_is_valued_before_the_policy_moves() -> None:
     """An action that was not taken is one of the policy that took the others."""
     model = make(TRPOUSL, points(2))
     order: list[str] = []
-    ahead, update = model._value_ahead, model._update_actor
+    ahead, update = model._value_ahead, model._line_search
     model._value_ahead = lambda *args: order.append("ahead") or ahead(*args)
-    model._update_actor = lambda *args: order.append("update") or update(*args)
+    model._line_search = lambda *args: order.append("update") or update(*args)
     model.learn(160)
     # Each environment meets a time-out in a rollout, and both have a last observation.
     assert order == ["ahead", "ahead", "ahead", "update"] * 2

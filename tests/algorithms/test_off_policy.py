@@ -656,9 +656,3 @@ def test_a_training_that_learns_nothing_is_told():
             model.learn(steps, reset_num_timesteps=False)  # many parts, of which one learns
         whole = SACLag("MlpPolicy", points(8), cost_limit=1.0, **settings()).learn(60)
     assert model._n_updates == whole._n_updates == 1
-
-
-def test_a_file_of_other_arguments_is_told(tmp_path: Path) -> None:
-    SACLag("MlpPolicy", CostPoint(10), cost_limit=1.0, **settings()).save(tmp_path / "a")
-    with pytest.raises(ValueError, match=r"ent_coef_optimizer.* arguments of the agent"):
-        SACLag.load(tmp_path / "a", ent_coef=0.1)

@@ -286,7 +286,7 @@ class Constrained(BaseAlgorithm):
         infos = [*infos, *({} for _ in range(self.n_envs - len(infos)))]
         zero, steps = self.missing_cost == "zero", self.costs.episodes.lengths
         costs, seen = read_costs(infos, self.cost_keys, zero, steps)
-        broken = [i for i in np.flatnonzero(dones) if infos[i].get("physics_error")]
+        broken = [i for i in np.flatnonzero(dones).tolist() if infos[i].get("physics_error")]
         self.step_costs = self.costs.step(costs, dones, seen, broken)  # [n_envs, m]
 
     def _count_last_step(self, callback: BaseCallback) -> None:

@@ -254,6 +254,32 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
         normalizer.training = training
 
 
+def _limits_on(model: Any, keys: Sequence[str]) -> tuple[float, ...]:
+    """The model's limits on these costs; empty if it has none."""
+    if isinstance(model, Constrained) and model.constrained and keys == tuple(model.cost_keys):
+        return tuple(model.final_cost_limits.tolist())
+    return ()
+
+
+def _warn_of_absent(episodes: str, longest: int) -> None:
+    warnings.warn(
+        f"{episodes} episodes are left out: one had not ended after {longest:,} steps; limit their "
+        "length, with gymnasium.wrappers.TimeLimit(env, 1000) or, in commands, --env-kwargs "
+        "max_episode_steps:1000",
+        stacklevel=3,
+    )
+
+
+def _check_number_of_costs(policy: Any, keys: Sequence[str]) -> None:
+    """Refuse a policy that acts on another number of costs than there are keys."""
+    thresholds = getattr(getattr(policy, "action_filter", None), "threshold", keys)
+    if len(thresholds) != len(keys):
+        raise ValueError(
+            f"cost_keys={tuple(keys)}: the policy acts on {len(thresholds)} costs; pass their "
+            "names as cost_keys=(...), or the model instead of its policy"
+        )
+
+
 def evaluate_policy(
     model: PolicyPredictor,
     env: gym.Env | VecEnv,
@@ -312,18 +338,13 @@ def evaluate_policy(
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
     checked(env, keys)
     check_agent(model, env)
-    masked = "action_masks" in inspect.signature(model.predict).parameters
-    masked = masked and env.has_attr("action_masks")
+    takes_masks = "action_masks" in inspect.signature(model.predict).parameters
+    masked = takes_masks and env.has_attr("action_masks")
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
     if acts_on_cost:
-        thresholds = getattr(getattr(policy, "action_filter", None), "threshold", keys)
-        if len(thresholds) != len(keys):
-            raise ValueError(
-                f"cost_keys={keys}: the policy acts on {len(thresholds)} costs; pass their names "
-                "as cost_keys=(...), or the model instead of its policy"
-            )
+        _check_number_of_costs(policy, keys)
     if isinstance(model, Constrained) and model.env is not None:
         model.begin_anew |= share_environment(model.env, env)
 
@@ -355,19 +376,8 @@ def evaluate_policy(
             if longest is not None:
                 tally.give_up(longest)
     if len(tally.ended) < n_eval_episodes and longest is not None:
-        warnings.warn(
-            f"{n_eval_episodes - len(tally.ended)} of {n_eval_episodes} episodes are left out: one "
-            f"had not ended after {longest:,} steps; limit their length, with "
-            "gymnasium.wrappers.TimeLimit(env, 1000) or, in commands, --env-kwargs "
-            "max_episode_steps:1000",
-            stacklevel=2,
-        )
-    return tally.evaluation(
-        limit_on=getattr(model, "limit_on", "sum"),
-        limits=tuple(model.final_cost_limits.tolist())
-        if isinstance(model, Constrained) and model.constrained and keys == tuple(model.cost_keys)
-        else (),
-    )
+        _warn_of_absent(f"{n_eval_episodes - len(tally.ended)} of {n_eval_episodes}", longest)
+    return tally.evaluation(getattr(model, "limit_on", "sum"), _limits_on(model, keys))
 
 
 def _longest_episode(env: VecEnv) -> int:

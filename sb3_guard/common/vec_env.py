@@ -69,11 +69,8 @@ def make_vec_env(
     :raises gymnasium.error.DependencyNotInstalled: the package that has the environment is absent
     """
     fit("n_envs", n_envs, int, 1, 10**6, "[]")
-    kwargs = dict(env_kwargs or {})
-    if render_mode is not None:
-        kwargs["render_mode"] = render_mode
-    if max_episode_steps is not None:
-        kwargs["max_episode_steps"] = max_episode_steps
+    given = {"render_mode": render_mode, "max_episode_steps": max_episode_steps}
+    kwargs = {**(env_kwargs or {}), **{k: v for k, v in given.items() if v is not None}}
     refuse_vector_env(env_id)
     if isinstance(env_id, gymnasium.Env | VecEnv):
         raise TypeError(

@@ -30,7 +30,8 @@ ALLOWED = {
     "documented in Python": {"_asdict", "_exit", "_replace"},
 }  # fmt: skip
 # MuJoCo's Renderer takes no backend, and MuJoCo chooses one before it is known whether it works.
-PATCHED = {"mujoco.rendering.classic.gl_context.GLContext"}
+# Python calls the second for every warning that it shows: a command has a process of its own.
+PATCHED = {"mujoco.rendering.classic.gl_context.GLContext", "warnings.formatwarning"}
 
 
 def private(name: str) -> bool:

@@ -313,8 +313,7 @@ class Run:
             with explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
                 for cls, arguments in _wrappers(setup.vec_env_wrapper, evaluation):
                     env = cls(env, **arguments)
-                beside = self._statistics_beside()
-                if normalizer is None and beside is not None:
+                if normalizer is None and (beside := self._statistics_beside()) is not None:
                     normalizer = read_normalizer(beside)
                 if normalizer is not None:
                     check_normalizer(normalizer, env.observation_space)
@@ -323,8 +322,7 @@ class Run:
                 elif setup.normalize is not None:
                     env = VecNormalize(env, **setup.normalize)
                 if evaluation and isinstance(env, VecNormalize):
-                    env.training = False
-                    env.norm_reward = False
+                    env.training = env.norm_reward = False
                 if setup.frame_stack is not None:
                     env = VecFrameStack(env, setup.frame_stack)
                 # SB3 would transpose images itself, but evaluation is wrapped like training.

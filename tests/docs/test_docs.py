@@ -147,7 +147,7 @@ def test_the_page_of_logs_has_every_key_that_an_algorithm_records():
     record = r"record(?:_per_cost)?\(\s*\"((?:train|rollout)/\w+)\""
     keys = {key for text in code for key in re.findall(record, text)}
     keys -= {"train/n_updates"}  # SB3's own
-    assert {"train/cost_weight", "train/kl", "train/multiplier_std"} <= keys
+    assert {"train/cost_weight", "train/cost_margin", "train/multiplier_std"} <= keys
     page = (DOCS / "logging.md").read_text()
     assert not {key for key in keys if f"`{key}`" not in page}
 

@@ -435,7 +435,7 @@ def with_motor(text):
             "'Dog' has no 'actuators': allowed: r",
         ),
         (nothing, {"center": "hed"}, "center names no body or site 'hed' of "),
-        (nothing, {"keepout": -1}, "keepout = -1 must be a number, at least 0"),
+        (nothing, {"keepout": -1}, "keepout = -1 must be .*at least 0"),
         (nothing, {"defaults": {"goal": 3}}, "defaults = .* must be a mapping"),
         (
             moved_by_weld,

@@ -238,12 +238,13 @@ def test_crowding_within_reach_speaks_of_it():
         ("Goal_Point_0Hazards", {"goal": {"size": 4.5}},
          r"goal\.size = 4\.5: its goal is reached immediately"),
         ("Goal_Drone_0Hazards", {"goal": {"size": 5}},
-         r"goal\.size = 5: its goal is reached immediately"),
+         r"goal\.size = 5\.0: its goal is reached immediately"),
         ("Goal_Point_2Hazards", {"hazards": {"size": 5}},
-         r"hazards\.size = 5: a cost at the start"),
-        ("Goal_Point_8Ghosts", {"ghosts": {"size": 5}}, r"ghosts\.size = 5: a cost at the start"),
+         r"hazards\.size = 5\.0: a cost at the start"),
+        ("Goal_Point_8Ghosts", {"ghosts": {"size": 5}},
+         r"ghosts\.size = 5\.0: a cost at the start"),
         ("Push_Point_8Hazards", {"push": {"size": 5}},
-         r"push\.size = 5: its goal is reached immediately"),
+         r"push\.size = 5\.0: its goal is reached immediately"),
         (
             "Chase_Arm3_0Hazards",
             {"chase": {"num": 1, "solid": True, "locations": [[0, 1]], "size": 0.6,
@@ -274,11 +275,11 @@ def test_a_boundary_that_no_start_is_within_says_how_to_begin_within():
     [
         (
             {"hazards": {"num": 2, "locations": [[1, 1], [1, 0.5]]}},
-            r"hazards\[0\] = \(1, 1\) and hazards\[1\] = \(1, 0\.5\) are 0\.50 m .* 0\.80 m",
+            r"hazards\[0\] = \(1.0, 1.0\) and hazards\[1\] = \(1\.0, 0\.5\) are 0\.50 .* 0\.80 m",
         ),
         (
             {"goal": {"locations": [[1, 1]]}, "robot": {"locations": [[1, 0]], "margin": 0.3}},
-            r"robot\[0\] = \(1, 0\) and goal\[0\] = \(1, 1\) are 1\.00 m .* 1\.10 m",
+            r"robot\[0\] = \(1\.0, 0\.0\) and goal\[0\] = \(1.0, 1.0\) are 1\.00 m .* 1\.10 m",
         ),
     ],
 )

@@ -26,9 +26,7 @@ def number(value: Any, name: str) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        several = isinstance(value, list | tuple | dict) or getattr(value, "ndim", 0) > 0
-        hint = "; sb3_guard.common.adapters.CostFromInfo takes several" if several else ""
-        raise NumberError(f"{name} is {value!r}: a cost must be a finite number{hint}")
+        raise NumberError(f"{name} is {value!r}: a cost must be a finite number")
     return number
 
 
@@ -123,19 +121,14 @@ def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
     return Estimate(float(np.mean(values)), float(np.std(values)), *ends, diverged)
 
 
-def missing(info: Mapping[str, Any], key: str, whose: str = "info") -> ContractError:
-    """What to raise where a cost is not in ``info``.
-
-    :param whose: what the message calls ``info``
-    """
+def _missing(info: Mapping[str, Any], key: str, whose: str) -> ContractError:
     present = sorted(map(str, info))
     near = nearest(key, present)
     hint = "" if near is None else f" (nearest: {near!r})"
     return ContractError(
         f"{whose} has no cost key {key!r}; its keys are {present}{hint}. Name the right one, as "
         "with cost_keys=(...), or pass missing_cost='zero' if the key appears only when there is a "
-        "cost; sb3_guard.common.adapters has wrappers for a cost that is elsewhere or has to be "
-        "computed"
+        "cost; sb3_guard.common.adapters.CostFromFunction computes a cost"
     )
 
 
@@ -162,7 +155,7 @@ def read_costs(
         for i, info in enumerate(infos):
             for key in keys if not zero_if_missing else ():
                 if key not in info:
-                    raise missing(info, key, f"info of {_row(i, lengths)}") from None
+                    raise _missing(info, key, f"info of {_row(i, lengths)}") from None
         rows = [[info.get(key, 0.0) for key in keys] for info in infos]
         seen = any(key in info for info in infos for key in keys)
     try:

@@ -19,9 +19,9 @@ class SCPO(CPO):
 
     With ``M_t``, the highest cost before step t (0 at first), the increments
     ``D_t = max(0, c_t - M_t)`` add up to the highest cost of an episode. The step is CPO's on the
-    advantages of D, undiscounted. M belongs to the state: ``VecMaxCost`` (or ``MaxCost``) from
-    ``sb3_guard.common`` shows it to policy and critic, as in the paper; an environment that is not
-    wrapped in it trains too, by observations that do not tell what has been reached.
+    advantages of D, undiscounted. M belongs to the state: ``VecMaxCost`` from
+    ``sb3_guard.common.vec_budgets`` shows it to policy and critic, as in the paper; an environment
+    that is not wrapped in it trains too, by observations that do not tell what has been reached.
 
     Most increments are 0: the cost critic is fitted to all rows whose cost-to-go is positive and as
     many others, drawn again for each update.

@@ -1,24 +1,23 @@
 """Anyone's environment: wherever it keeps its cost, here it ends up in ``info["cost"]``.
 
-Three wrappers find the cost: :class:`CostFromStep` in a sixth value of ``step``
-(Safety-Gymnasium), :class:`CostFromInfo` under other keys of ``info``, :class:`CostFromFunction`
-in a function of yours. All are Gymnasium wrappers of single environments and need neither torch nor
-MuJoCo. Wrappers that use the cost are in ``budgets.py``.
+:class:`CostFromStep` finds it in a sixth value of ``step`` (Safety-Gymnasium),
+:class:`CostFromFunction` computes it with a function of yours. A cost that ``info`` has under
+another key needs no wrapper: algorithms take ``cost_keys``. Both are Gymnasium wrappers of single
+environments and need neither torch nor MuJoCo.
 """
 
 import copy
 import operator
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from gymnasium.utils import RecordConstructorArgs
 
-from sb3_guard.costs import missing, number
+from sb3_guard.costs import number
 from sb3_guard.spelling import nearest
 
 #: ``cost(obs, action, next_obs, info)``, see :class:`CostFromFunction`
@@ -86,31 +85,12 @@ def _import_safety_gymnasium(env_id: str) -> Any:
     return safety_gymnasium
 
 
-def _parts(value: Any, name: str) -> dict[str, float] | None:
-    """The costs in a dictionary, list, tuple or array by name or number; None for one number."""
-    if isinstance(value, Mapping):
-        return {str(key): number(each, f"{name}[{key!r}]") for key, each in value.items()}
-    if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
-        return {str(i): number(each, f"{name}[{i}]") for i, each in enumerate(value)}
-    return None
-
-
-def _charged(info: Mapping[str, Any], value: Any, name: str) -> dict[str, Any]:
-    """``info`` with the cost; several costs also one by one, as ``cost_<name or number>``."""
-    parts = _parts(value, name)
-    if parts is None:
-        return {**info, "cost": number(value, name)}
-    named = {f"cost_{part}": cost for part, cost in parts.items()}
-    return {**info, **named, "cost": float(sum(parts.values()))}
-
-
 class CostFromStep(gym.Wrapper, RecordConstructorArgs):
     """Turn a ``step`` of six values, the cost third, into Gymnasium's five.
 
     That is Safety-Gymnasium's interface: ``obs, reward, cost, terminated, truncated, info``. The
     cost becomes ``info["cost"]``; the other entries, such as ``cost_hazards`` and ``cost_sum``,
-    stay, so each of them can be limited by ``cost_keys``. A cost of several parts is split as in
-    :class:`CostFromInfo`.
+    stay, so each of them can be limited by ``cost_keys``.
 
     :param env: an environment with the six values, made without Gymnasium's own wrappers
     """
@@ -127,10 +107,11 @@ class CostFromStep(gym.Wrapper, RecordConstructorArgs):
         if len(values) != 6:
             raise ValueError(
                 f"step returned {len(values)} values, not six (obs, reward, cost, terminated, "
-                "truncated, info): if the cost is in info, use CostFromInfo or no adapter at all"
+                "truncated, info): if the cost is in info, name it in cost_keys, without an adapter"
             )
         obs, reward, cost, terminated, truncated, info = values
-        return obs, reward, bool(terminated), bool(truncated), _charged(info, cost, "the cost")
+        info = {**info, "cost": number(cost, "the cost")}
+        return obs, reward, bool(terminated), bool(truncated), info
 
 
 class CostAsThirdValue(gym.Wrapper, RecordConstructorArgs):
@@ -153,79 +134,29 @@ class CostAsThirdValue(gym.Wrapper, RecordConstructorArgs):
     ) -> tuple[Any, SupportsFloat, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, info = self.env.step(action)
         if "cost" not in info:
-            raise KeyError(f"info has no 'cost': {sorted(info)}; use CostFromInfo first")
+            raise KeyError(f"info has no 'cost': {sorted(info)}; use CostFromFunction first")
         cost = float(info["cost"])
         return obs, reward, cost, terminated, truncated, {**info, "cost_sum": cost}
-
-
-class CostFromInfo(gym.Wrapper, RecordConstructorArgs):
-    """Take the cost from other entries of ``info``, such as ``cost_sum`` or ``constraint_costs``.
-
-    ``info["cost"]`` becomes their sum. An entry may hold one number or several, in a dictionary, a
-    list or an array. Several are also reported one by one: ``{"speed": 1.0, "force": 0.5}`` as
-    ``cost_speed`` and ``cost_force``, ``[1.0, 0.5]`` as ``cost_0`` and ``cost_1``; with
-    ``cost_keys=("cost_speed", "cost_force")`` each has its own limit. With more than one key the
-    key comes first: ``cost_<key>_<name>``.
-
-    :param env: the environment
-    :param keys: entry of ``info`` that holds the cost, or several of them
-    :param missing_cost: ``"error"`` if every ``info`` must have the keys, ``"zero"`` if an absent
-        one means that nothing was charged
-    :raises ValueError: no key is given, or ``missing_cost`` is another word
-    """
-
-    def __init__(
-        self, env: gym.Env, keys: str | Sequence[str] = "cost_sum", missing_cost: str = "error"
-    ) -> None:
-        RecordConstructorArgs.__init__(self, keys=keys, missing_cost=missing_cost)
-        gym.Wrapper.__init__(self, env)
-        self.keys = (keys,) if isinstance(keys, str) else tuple(keys)
-        if not self.keys or not all(isinstance(key, str) for key in self.keys):
-            raise ValueError(f"keys={keys!r}: must be names of info entries, such as 'cost_sum'")
-        if missing_cost not in ("error", "zero"):
-            raise ValueError(f"missing_cost={missing_cost!r}: must be 'error' or 'zero'")
-        self.missing_cost = missing_cost
-
-    def step(self, action: Any) -> Step:
-        """
-        :raises ValueError: a key is missing and may not be, or its value is not a cost
-        """
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        if self.missing_cost == "error":
-            for key in self.keys:
-                if key not in info:
-                    raise missing(info, key)
-        values = {key: info.get(key, 0.0) for key in self.keys}
-        if len(values) == 1:
-            [(key, value)] = values.items()
-            return obs, reward, terminated, truncated, _charged(info, value, f"info[{key!r}]")
-        costs: dict[str, float] = {}
-        total = 0.0
-        for key, value in values.items():
-            parts = _parts(value, f"info[{key!r}]")
-            if parts is None:
-                total += number(value, f"info[{key!r}]")
-                continue
-            total += sum(parts.values())
-            costs.update((f"cost_{key}_{part}", cost) for part, cost in parts.items())
-        return obs, reward, terminated, truncated, {**info, **costs, "cost": total}
 
 
 class CostFromFunction(gym.Wrapper, RecordConstructorArgs):
     """Charge what a function of yours says: any environment becomes a constrained one.
 
+    A wrapper each, with keys of their own, makes several costs that ``cost_keys`` limit one by one.
+
     :param env: the environment
     :param cost: ``cost(obs, action, next_obs, info)``, called after each step with the observation
         before it, the action, the observation after it and the step's ``info``. It returns a
-        number, or several in a dictionary or list, which are reported as in :class:`CostFromInfo`.
-        Its name, ``"package.module:function"``, will do, so that a hyperparameter file can say it;
-        the module must have been imported, because a file may not run code
+        number. Its name, ``"package.module:function"``, will do, so that a hyperparameter file can
+        say it; the module must have been imported, because a file may not run code
+    :param key: entry of ``info`` that becomes the cost
     :raises ValueError: there is no function of that name, or its module is not imported
     """
 
-    def __init__(self, env: gym.Env, cost: CostFunction | str) -> None:
-        RecordConstructorArgs.__init__(self, cost=cost)
+    def __init__(self, env: gym.Env, cost: CostFunction | str, key: str = "cost") -> None:
+        RecordConstructorArgs.__init__(self, cost=cost, key=key)
         gym.Wrapper.__init__(self, env)
+        self.key = key
         if isinstance(cost, str):
             module, _, name = cost.rpartition(":" if ":" in cost else ".")
             if module not in sys.modules:
@@ -252,9 +183,11 @@ class CostFromFunction(gym.Wrapper, RecordConstructorArgs):
 
     def step(self, action: Any) -> Step:
         """
-        :raises ValueError: the function did not return finite numbers
+        :raises ValueError: the function did not return a finite number
         """
         obs, reward, terminated, truncated, info = self.env.step(action)
-        cost = self.cost(self.last_observation, action, obs, info)
+        cost = number(
+            self.cost(self.last_observation, action, obs, info), "what cost(...) returned"
+        )
         self.last_observation = copy.deepcopy(obs)
-        return obs, reward, terminated, truncated, _charged(info, cost, "what cost(...) returned")
+        return obs, reward, terminated, truncated, {**info, self.key: cost}

@@ -1,18 +1,20 @@
-"""The wrappers of ``budgets.py`` for all environments of a ``VecEnv`` at once.
+"""Wrappers of a ``VecEnv`` that make use of the costs which infos report.
 
-Row i is, bit for bit, what the wrapper of one environment makes of environment i, on the native
-batch at nearly its speed. They go inside or outside of ``CostMonitor``, and inside ``VecNormalize``
-and frame stacks.
+:class:`VecRemainingBudget` shows the agent what is left of a budget, :class:`VecEarlyTermination`
+ends episodes that overspend it, :class:`VecMaxCost` shows the highest cost of an episode so far.
+They go inside or outside of ``CostMonitor``, and inside ``VecNormalize`` and frame stacks.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.common.budgets import Highest, Remaining, Spending, _Counting, join, with_numbers
+from sb3_guard.checks import check_number
+from sb3_guard.costs import read_costs
 
 
 def end_rows(venv: VecEnv, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
@@ -51,61 +53,166 @@ def replace_rows(obs: Any, rows: Sequence[int], new: Any) -> Any:
     return replaced
 
 
-class _Observing(_Counting, VecEnvWrapper):
-    def _wrap(self, env: VecEnv, size: int, arguments: dict[str, Any]) -> None:
+class Counted(VecEnvWrapper):
+    """Numbers that a wrapper counts join the observation.
+
+    A flat observation gets them at its end, a dictionary as the entry ``name``; any other becomes a
+    dictionary of ``"observation"`` and ``name``.
+
+    :param env: the environments
+    :param size: how many numbers
+    :raises ValueError: the observation has an entry of that name already
+    """
+
+    name: ClassVar[str]
+    first: ClassVar[float]  # what the numbers are when an episode begins
+
+    def __init__(self, env: VecEnv, size: int) -> None:
         self.numbers = np.full((env.num_envs, size), self.first)
-        VecEnvWrapper.__init__(self, env, with_numbers(env.observation_space, self.name, size))
+        space, more = env.observation_space, spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        joined: spaces.Space
+        if isinstance(space, spaces.Dict):
+            if self.name in space.spaces:
+                raise ValueError(
+                    f"the observation has an entry {self.name!r} already: is the environment "
+                    "wrapped twice?"
+                )
+            joined = spaces.Dict({**space.spaces, self.name: more})
+        elif isinstance(space, spaces.Box) and len(space.shape) == 1:
+            dtype = space.dtype if space.dtype in (np.float32, np.float64) else np.float32
+            low, high = np.append(space.low, more.low), np.append(space.high, more.high)
+            joined = spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype)
+        else:
+            joined = spaces.Dict({"observation": space, self.name: more})
+        super().__init__(env, joined)
+
+    def count(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, Any]:
+        """Count a step in ``numbers``; return its rewards and infos."""
+        raise NotImplementedError
+
+    def _join(self, obs: Any, numbers: np.ndarray) -> Any:
+        """An observation with the numbers, [size], or a batch of both, [N, size]."""
+        space = self.observation_space
+        if isinstance(space, spaces.Box):
+            return np.concatenate([obs, numbers], axis=-1).astype(space.dtype)
+        numbers = numbers.astype(np.float32)
+        if isinstance(self.venv.observation_space, spaces.Dict):
+            return {**obs, self.name: numbers}
+        return {"observation": obs, self.name: numbers}
 
     def reset(self) -> VecEnvObs:
         self.numbers = np.full_like(self.numbers, self.first)
-        return join(self, self.venv, self.venv.reset(), self.name, self.numbers)
+        return self._join(self.venv.reset(), self.numbers)
 
     def step_wait(self) -> VecEnvStepReturn:
+        """
+        :raises ValueError: an info lacks a cost, or it is not a number
+        """
         obs, rewards, dones, infos = self.venv.step_wait()
-        rewards, infos = self._count(rewards, list(infos))
+        rewards, infos = self.count(rewards, list(infos))
         # Rows whose episode ended begin with new numbers.
         for row in np.flatnonzero(dones):
-            last = infos[row]["terminal_observation"]
-            last = join(self, self.venv, last, self.name, self.numbers[row])
+            last = self._join(infos[row]["terminal_observation"], self.numbers[row])
             infos[row] = {**infos[row], "terminal_observation": last}
         self.numbers = np.where(dones[:, None], self.first, self.numbers)
-        return join(self, self.venv, obs, self.name, self.numbers), rewards, dones, infos
+        return self._join(obs, self.numbers), rewards, dones, infos
 
     def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
         """See :func:`end_rows`."""
         new = end_rows(self.venv, rows, infos)
         self.numbers[list(rows)] = self.first
         if not isinstance(new, list):
-            return join(self, self.venv, new, self.name, self.numbers)
-        pairs = enumerate(new)
-        return [
-            None if obs is None else join(self, self.venv, obs, self.name, self.numbers[row])
-            for row, obs in pairs
-        ]
+            return self._join(new, self.numbers)
+        pairs = zip(new, self.numbers, strict=True)
+        return [None if obs is None else self._join(obs, row) for obs, row in pairs]
 
 
-class VecRemainingBudget(Remaining, _Observing):
-    """:class:`~sb3_guard.common.budgets.RemainingBudget` of every row (Sootla et al., 2022).
+class VecRemainingBudget(Counted):
+    """Show the agent what is left of its cost budget, so that it can use it wisely.
+
+    A limit on the episode's cost depends on the past, which a policy of the observation alone does
+    not know. Sauté RL (Sootla et al., ICML 2022) adds the remaining share z of the budget to it:
+    z₀ = 1, z_{t+1} = (z_t - cost_t / budget) / discount, negative when the budget is overspent.
+    A flat observation gets z as its last number, a dictionary an entry ``"budget"`` of shape (1,);
+    any other becomes a dictionary of ``"observation"`` and ``"budget"``.
+
+    With ``unsafe_reward``, the reward of every step that ends with z < 0 is replaced, as in the
+    paper: then any algorithm for rewards alone learns to keep the budget. Evaluate without it to
+    see true returns.
 
     :param env: environments that report their cost
     :param budget: what an episode may cost, above 0
     :param discount: discount factor of the costs, in (0, 1]
     :param unsafe_reward: reward of the steps after the budget is overspent; None leaves rewards
     :param cost_key: entry of ``info`` that is counted
-    :raises ValueError: an argument is out of its range
+    :raises ValueError: an argument is out of its range, or the observation has an entry
+        ``"budget"`` already
     """
 
+    name, first = "budget", 1.0
+    training_arguments = ("unsafe_reward",)
 
-class VecMaxCost(Highest, _Observing):
-    """:class:`~sb3_guard.common.budgets.MaxCost` of every row (Zhao et al., 2023).
+    def __init__(
+        self,
+        env: VecEnv,
+        budget: float,
+        discount: float = 1.0,
+        unsafe_reward: float | None = None,
+        cost_key: str = "cost",
+    ) -> None:
+        check_number("budget", budget, ends="()")
+        self.budget = float(budget)
+        check_number("discount", discount, 0.0, 1.0, "(]")
+        self.discount = float(discount)
+        if unsafe_reward is not None:
+            check_number("unsafe_reward", unsafe_reward, -np.inf, ends="()")
+        self.unsafe_reward = unsafe_reward
+        self.cost_key = cost_key
+        super().__init__(env, 1)
+
+    def count(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, Any]:
+        costs, _ = read_costs(infos, [self.cost_key])  # [N, 1]
+        self.numbers = (self.numbers - costs / self.budget) / self.discount
+        if self.unsafe_reward is not None:
+            rewards = np.where(self.numbers[:, 0] < 0.0, self.unsafe_reward, rewards)
+        return rewards, infos
+
+
+class VecMaxCost(Counted):
+    """Show the agent the highest cost of a step so far, for limits on the worst step.
+
+    State-wise constrained policy optimisation (Zhao et al., 2023, arXiv 2306.12594) bounds
+    ``E[max_t c_t]``. With M_t, the highest cost before step t (0 at first), the increments
+    ``D_t = max(0, c_t - M_t)`` add up to the highest cost of the episode: an algorithm that limits
+    the sum of ``info["<key>_increase"]`` limits the worst step. M joins the observation as the
+    remaining budget does in :class:`VecRemainingBudget`, under the name ``"max_cost"``.
 
     :param env: environments that report their costs
     :param cost_keys: entries of ``info``, each with a maximum of its own
     """
 
+    name, first = "max_cost", 0.0
 
-class VecEarlyTermination(Spending, VecEnvWrapper):
-    """:class:`~sb3_guard.common.budgets.EarlyTermination` of every row (Sun et al., 2021).
+    def __init__(self, env: VecEnv, cost_keys: Sequence[str] = ("cost",)) -> None:
+        self.cost_keys = tuple(cost_keys)
+        super().__init__(env, len(self.cost_keys))
+
+    def count(self, rewards: np.ndarray, infos: list[dict[str, Any]]) -> tuple[np.ndarray, Any]:
+        costs, _ = read_costs(infos, self.cost_keys)
+        increase = np.maximum(costs - self.numbers, 0.0).tolist()
+        self.numbers = np.maximum(self.numbers, costs)
+        names = [f"{key}_increase" for key in self.cost_keys]
+        pairs = zip(infos, increase, strict=True)
+        return rewards, [{**info, **dict(zip(names, row, strict=True))} for info, row in pairs]
+
+
+class VecEarlyTermination(VecEnvWrapper):
+    """End episodes that cost more than their budget, so that overspending gives no reward.
+
+    The early-terminated MDP of Sun et al. (2021): with it an algorithm for rewards alone respects
+    a limit, if rewards are positive. Where they are not, ending early is tempting, and
+    ``final_reward`` must make up for it. The step that overspends is terminal and has
+    ``info["budget_exceeded"]``; using up the budget exactly is allowed.
 
     :param env: environments that report their cost, perhaps in a ``CostMonitor``, which then
         reports the episodes that end here, without ``final_reward``
@@ -115,10 +222,18 @@ class VecEarlyTermination(Spending, VecEnvWrapper):
     :raises ValueError: an argument is out of its range
     """
 
-    training_only = True  # as EarlyTermination
+    #: Commands evaluate without it: no episode would cost more than its budget, whatever the agent.
+    training_only = True
 
-    def _wrap(self, env: VecEnv, arguments: dict[str, Any]) -> None:
-        VecEnvWrapper.__init__(self, env)
+    def __init__(
+        self, env: VecEnv, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
+    ) -> None:
+        check_number("budget", budget)
+        self.budget = float(budget)
+        check_number("final_reward", final_reward, -np.inf, ends="()")
+        self.final_reward = float(final_reward)
+        self.cost_key = cost_key
+        super().__init__(env)
         self.episode_costs = np.zeros(env.num_envs)
 
     def reset(self) -> VecEnvObs:
@@ -126,20 +241,24 @@ class VecEarlyTermination(Spending, VecEnvWrapper):
         return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
+        """
+        :raises ValueError: an info lacks the cost, or it is not a number
+        """
         obs, rewards, dones, infos = self.venv.step_wait()
-        over, rewards, infos = self._count(rewards, list(infos))
+        self.episode_costs = self.episode_costs + read_costs(infos, [self.cost_key])[0][:, 0]
+        over = self.episode_costs > self.budget
         if over.any():
+            rewards, infos = np.where(over, rewards + self.final_reward, rewards), list(infos)
             for row in np.flatnonzero(over).tolist():
-                infos[row]["TimeLimit.truncated"] = False
+                ended = {"budget_exceeded": True, "TimeLimit.truncated": False}
+                infos[row] = {**infos[row], **ended}
             rows = np.flatnonzero(over & ~dones).tolist()
+            for row in rows:
+                last: Any = obs
+                several = isinstance(last, dict)
+                last = {key: value[row] for key, value in last.items()} if several else last[row]
+                infos[row]["terminal_observation"] = last
             if rows:
-                for row in rows:
-                    last = (
-                        {key: value[row] for key, value in obs.items()}
-                        if isinstance(obs, dict)
-                        else obs[row]
-                    )
-                    infos[row]["terminal_observation"] = last
                 obs = replace_rows(obs, rows, end_rows(self.venv, rows, infos))
             dones = dones | over
         self.episode_costs[dones] = 0.0

@@ -12,7 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.common.budgets import Highest, Remaining
+from sb3_guard.common.vec_budgets import Counted, VecMaxCost
 from sb3_guard.deployment.deployed import Deployed
 from sb3_guard.deployment.environment import (
     all_wrappers,
@@ -144,7 +144,7 @@ def _components(name: str, space: spaces.Box, env: VecEnv) -> Iterator[dict[str,
     """What the numbers of one frame are, in their order; of a frame nobody describes, nothing."""
     size = space.shape[0] // frames_of(env)
     ours = ours_of(env)
-    counted = {w.name: w for w in all_wrappers(env) if isinstance(w, Remaining | Highest)}
+    counted = {w.name: w for w in all_wrappers(env) if isinstance(w, Counted)}
     counted = {k: w for k, w in counted.items() if name in (OBSERVATION, k)}
     parts = [part for part in (ours.components if ours else ())]
     if name != OBSERVATION:
@@ -173,7 +173,7 @@ def _components(name: str, space: spaces.Box, env: VecEnv) -> Iterator[dict[str,
 
 def _rule(wrapper: Any) -> dict[str, Any]:
     """What the caller counts, as a wrapper did in training."""
-    if isinstance(wrapper, Highest):
+    if isinstance(wrapper, VecMaxCost):
         rule = f"the highest {', '.join(wrapper.cost_keys)} of a step so far in the episode"
     else:
         rule = (

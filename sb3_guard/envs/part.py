@@ -386,7 +386,7 @@ class Constraint(Part):
     instead: ClassVar[Mapping[str, str]] = {
         "speed": "it moves nothing; ghosts={'speed': 0.5} and gremlins={'rate': 1.0} move",
         "ends": "to end episodes by cost, wrap the environment in "
-        "sb3_guard.common.budgets.EarlyTermination",
+        "sb3_guard.common.vec_budgets.VecEarlyTermination",
     }
 
     def cost(self) -> Array:

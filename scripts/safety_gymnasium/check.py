@@ -95,29 +95,26 @@ def with_cost(env: Any) -> Any:
     return CostFromFunction(env, leans)
 
 
-def with_budget(env: Any) -> Any:
-    from sb3_guard.common.adapters import RemainingBudget
-
-    return RemainingBudget(env, budget=25.0)
-
-
 def train(steps: int, plain: bool) -> None:
     """Train, save, load and evaluate, in one process and in several."""
     import numpy as np
 
     from sb3_guard import CPO, evaluate_policy, make_vec_env
+    from sb3_guard.common.vec_budgets import VecRemainingBudget
 
     print(versions())
     env_id = "CartPole-v1" if plain else "SafetyPointGoal1-v0"
-    for kind, wrapper in (("dummy", None), ("subproc", with_budget)):
+    for kind in ("dummy", "subproc"):
         env = make_vec_env(
             env_id,
             2,
             seed=0,
             vec_env=kind,
-            wrapper_class=with_cost if plain else wrapper,
+            wrapper_class=with_cost if plain else None,
             monitor_kwargs={"cost_keys": ("cost",) if plain else ("cost", "cost_sum")},
         )
+        if kind == "subproc" and not plain:
+            env = VecRemainingBudget(env, budget=25.0)
         model = CPO("MlpPolicy", env, n_steps=1000, cost_limit=25.0, seed=0)
         start = time.perf_counter()
         model.learn(steps)

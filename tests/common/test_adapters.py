@@ -5,7 +5,6 @@ import pickle
 import re
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import cloudpickle
@@ -19,55 +18,40 @@ from gymnasium.error import DependencyNotInstalled, NameNotFound
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from safety_stub import Builder, SafeTimeLimit, install
 from stable_baselines3.common.env_checker import check_env as sb3_check
-from stable_baselines3.common.env_util import make_vec_env as sb3_make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_guard import CPO, TRPO, CostMonitor, evaluate_policy, make_vec_env
+from sb3_guard import CPO, CostMonitor, evaluate_policy, make_vec_env
 from sb3_guard.common.adapters import (
     CostAsThirdValue,
     CostFromFunction,
-    CostFromInfo,
     CostFromStep,
     is_safety_gymnasium,
     make_safety_gymnasium,
 )
-from sb3_guard.common.budgets import EarlyTermination, RemainingBudget
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.make_envs import source_of
 from sb3_guard.zoo.run.resumable import ResumableEnv
 
 SUPPORT = Path(__file__).parents[1] / "support"
 SMALL = {"n_steps": 32, "seed": 0, "policy_kwargs": {"net_arch": [8]}}
-SHAPES = {
-    "flat": spaces.Box(-1.0, 2.0, (3,), np.float32),
-    "double": spaces.Box(-1.0, 2.0, (3,), np.float64),
-    "whole": spaces.Box(0, 9, (3,), np.int64),
-    "image": spaces.Box(0, 255, (36, 36, 3), np.uint8),
-    "number": spaces.Discrete(5),
-    "dictionary": spaces.Dict({"a": spaces.Box(-1.0, 1.0, (2,), np.float32)}),
-}
 
 
 class Scripted(gym.Env):
-    """Reward 1, and infos as written down; observations count the steps where they can."""
+    """Reward 1, and infos as written down; observations count the steps."""
 
-    def __init__(self, infos, space=SHAPES["flat"]):
+    def __init__(self, infos):
         self.infos = list(infos)
-        self.observation_space = space
+        self.observation_space = spaces.Box(-1.0, 2.0, (3,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.steps = 0
         self.buffer = np.zeros(3, np.float32)
 
     def observe(self):
-        if self.observation_space == SHAPES["flat"]:
-            self.buffer[:] = self.steps % 3  # written in place, as simulators do
-            return self.buffer
-        return self.observation_space.sample()
+        self.buffer[:] = self.steps % 3  # written in place, as simulators do
+        return self.buffer
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        if seed is not None:
-            self.observation_space.seed(seed)
         self.steps = 0
         return self.observe(), {}
 
@@ -119,7 +103,7 @@ def test_five_values_become_six_and_back_without_loss():
 def test_five_values_are_refused():
     env = CostFromStep(CostPoint())
     env.reset()
-    with pytest.raises(ValueError, match=r"returned 5 values, not six .* use CostFromInfo"):
+    with pytest.raises(ValueError, match=r"returned 5 values, not six .* cost_keys"):
         env.step(np.zeros(2))
 
 
@@ -193,57 +177,27 @@ def test_who_registered_an_id_decides(monkeypatch):
     make_vec_env("SafetyMine-v0").reset()
 
 
-@pytest.mark.parametrize(
-    ("keys", "info", "expected"),
-    [
-        ("cost_sum", {"cost_sum": 2}, {"cost": 2.0}),
-        ("fee", {"fee": True, "cost": 9.0}, {"cost": 1.0}),
-        ("fee", {"fee": np.array([0.5])}, {"cost": 0.5, "cost_0": 0.5}),
-        ("fees", {"fees": [1.0, 0.5]}, {"cost": 1.5, "cost_0": 1.0, "cost_1": 0.5}),
-        ("fees", {"fees": np.array([1, 2])}, {"cost": 3.0, "cost_0": 1.0, "cost_1": 2.0}),
-        ("fees", {"fees": {"a": 1, "b": np.float32(0.5)}}, {"cost": 1.5, "cost_a": 1.0,
-                                                            "cost_b": 0.5}),
-        (("x", "y"), {"x": 1.0, "y": 2.0}, {"cost": 3.0}),
-        (("x", "y"), {"x": [1.0, 2.0], "y": 4.0}, {"cost": 7.0, "cost_x_0": 1.0,
-                                                   "cost_x_1": 2.0}),
-    ],
-)  # fmt: skip
-def test_costs_are_taken_from_other_entries(keys, info, expected):
-    env = CostFromInfo(Scripted([info]), keys)
-    found = play(env, 1)[0][4]
-    assert {key: found[key] for key in expected} == expected
-    assert all(type(found[key]) is float for key in expected)
-    assert set(found) == {*info, *expected}
-
-
-def test_absent_entries_are_errors_unless_they_mean_zero():
-    infos = [{"cost_sums": 1.0}, {}]
-    with pytest.raises(ValueError, match=r"no cost key 'cost_sum'.*nearest: 'cost_sums'"):
-        play(CostFromInfo(Scripted(infos)), 1)
-    free = CostFromInfo(Scripted(infos), "cost_sums", missing_cost="zero")
-    assert [info["cost"] for *_, info in play(free, 2)] == [1.0, 0.0]
-
-
-@pytest.mark.parametrize("value", [float("nan"), "much", "1.5", None, {"a": None}, [np.inf]])
+@pytest.mark.parametrize("value", [float("nan"), "much", "1.5", None, {"a": 1.0}, [1.0, 2.0]])
 def test_what_is_no_cost_is_refused(value):
     with pytest.raises(ValueError, match="must be a finite number"):
-        play(CostFromInfo(Scripted([{"fee": value}]), "fee"), 1)
+        play(CostFromFunction(Scripted([{}]), lambda *_: value), 1)
 
 
 def moved(obs, action, next_obs, info):
-    return {"before": obs[0], "after": next_obs[0], "action": action[1], "info": info["x"]}
+    return obs[0] + 10 * next_obs[0] + 100 * action[1] + info["x"]
+
+
+def first(obs, action, next_obs, info):
+    return obs[0]
 
 
 @pytest.mark.parametrize("cost", [moved, "test_adapters:moved", "test_adapters.moved"])
 def test_functions_see_the_step_from_before_to_after(cost):
-    env = CostFromFunction(Scripted([{"x": 8.0}] * 2), cost)
-    steps = play(env, 2, (0.0, 0.25))
-    for i, (*_, info) in enumerate(steps):
-        parts = [info[f"cost_{name}"] for name in ("before", "after", "action", "info")]
-        assert parts == [i, i + 1, 0.25, 8.0]
-        assert info["cost"] == sum(parts)
+    env = CostFromFunction(CostFromFunction(Scripted([{"x": 8.0}] * 2), cost), first, "before")
+    for i, (*_, info) in enumerate(play(env, 2, (0.0, 0.25))):
+        assert info == {"x": 8.0, "cost": i + 10 * (i + 1) + 25.0 + 8.0, "before": i}
     env.reset()
-    assert env.step(np.zeros(2))[4]["cost_before"] == 0.0
+    assert env.step(np.zeros(2))[4]["before"] == 0.0
 
 
 @pytest.mark.parametrize(
@@ -262,8 +216,6 @@ def test_every_kind_of_number_is_a_cost(kind):
         evaluation = evaluate_policy(model, played, n_eval_episodes=3)
         np.testing.assert_array_equal(evaluation.costs, [4.0] * 3)
         np.testing.assert_array_equal(evaluation.key_costs, [[4.0]] * 3)
-    for wrapper in (RemainingBudget, EarlyTermination):
-        assert len(play(wrapper(one(), budget=9), 8)) == 8
 
 
 def test_environments_may_report_different_kinds_of_numbers():
@@ -282,7 +234,7 @@ def test_environments_may_report_different_kinds_of_numbers():
 @pytest.mark.parametrize("value", [np.array([1.0, 2.0]), np.array(["1.5"])])
 def test_other_arrays_are_no_costs(value):
     model = CPO("MlpPolicy", Scripted([{"cost": value}] * 8), **SMALL)
-    with pytest.raises(ValueError, match=r"environment 0 .* be a finite number; .*CostFromInfo"):
+    with pytest.raises(ValueError, match=r"environment 0 .* be a finite number"):
         model.learn(32)
 
 
@@ -297,104 +249,13 @@ def test_a_time_limit_is_seen_around_an_environment_without_a_spec(kind):
     env.close()
 
 
-COSTS = [{"cost": cost} for cost in (0.0, 1.0, 0.5, 0.5, 1.0, 0.0)]
-
-
-@pytest.mark.parametrize("discount", [1.0, 0.5])
-def test_what_is_left_of_the_budget_is_observed(discount):
-    env = RemainingBudget(Scripted(COSTS), budget=2.0, discount=discount, unsafe_reward=-3.0)
-    first, _ = env.reset(seed=0)
-    assert first[-1] == 1.0
-    z = 1.0
-    for obs, reward, *_, info in play(env, len(COSTS)):
-        z = (z - info["cost"] / 2.0) / discount
-        assert obs[-1] == pytest.approx(z)
-        assert reward == (-3.0 if z < 0 else 1.0)
-    assert env.reset()[0][-1] == 1.0
-    assert z < 0 if discount == 1.0 else z > 0
-
-
-def test_a_budget_that_is_spent_exactly_is_kept():
-    steps = play(RemainingBudget(Scripted(COSTS), budget=3.0, unsafe_reward=-3.0), len(COSTS))
-    assert steps[-1][0][-1] == pytest.approx(0.0, abs=1e-6)
-    assert [reward for _, reward, *_ in steps] == [1.0] * len(COSTS)
-    assert not any(terminated for _, _, terminated, *_ in play(EarlyTermination(
-        Scripted(COSTS), budget=3.0), len(COSTS)))  # fmt: skip
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_the_budget_joins_every_kind_of_observation(shape):
-    env = RemainingBudget(Scripted(COSTS, SHAPES[shape]), budget=2.0)
-    assert env.observation_space.contains(env.reset(seed=0)[0])
-    for obs, *_ in play(env, 3):
-        assert env.observation_space.contains(obs)
-    flat = len(SHAPES[shape].shape or ()) == 1
-    assert obs[-1] == 0.25 if flat else obs["budget"].tolist() == [0.25]
-    policy = "MlpPolicy" if flat else "MultiInputPolicy"
-    TRPO(policy, env, **SMALL).learn(32)
-
-
-@pytest.mark.parametrize(("budget", "end"), [(0, 2), (1.0, 3), (1.9, 4), (2.5, 5), (9.0, None)])
-def test_overspending_ends_the_episode(budget, end):
-    env = EarlyTermination(Scripted(COSTS), budget, final_reward=-2.0)
-    for _ in range(2):  # the second episode begins again
-        env.reset()
-        for i in range(1, len(COSTS) + 1):
-            _, reward, terminated, truncated, info = env.step(np.zeros(2))
-            assert terminated == (i == end) == ("budget_exceeded" in info)
-            assert reward == (-1.0 if terminated else 1.0)
-            if terminated:
-                break
-        assert truncated == (end is None)
-
-
-def test_ending_episodes_outside_a_monitor_is_warned_about_and_they_are_counted_all_the_same():
-    def wrapped(make, **kwargs):
-        return make(lambda: Scripted(COSTS), 2, **kwargs)
-
-    with pytest.warns(UserWarning, match="wrap the environment before its monitor"):
-        outside = wrapped(
-            sb3_make_vec_env, wrapper_class=EarlyTermination, wrapper_kwargs={"budget": 1.0}
-        )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        inside = wrapped(make_vec_env, wrapper_class=lambda env: EarlyTermination(env, 1.0))
-    model = TRPO("MlpPolicy", inside, **SMALL)
-    for env in (outside, inside):
-        played = evaluate_policy(model, env, 4, max_steps=100)
-        assert played.lengths.tolist() == [3] * 4
-        assert played.returns.tolist() == [3.0] * 4
-        assert played.costs.tolist() == [1.5] * 4
-
-
-def test_other_costs_than_the_total_can_be_counted():
-    infos = [{"cost": 9.0, "fee": 0.5}] * 4
-    assert play(RemainingBudget(Scripted(infos), 1.0, cost_key="fee"), 1)[0][0][-1] == 0.5
-    ends = [step[2] for step in play(EarlyTermination(Scripted(infos), 1.0, cost_key="fee"), 3)]
-    assert ends == [False, False, True]
-    with pytest.raises(ValueError, match=r"no cost key 'fees'.*nearest: 'fee'"):
-        play(EarlyTermination(Scripted(infos), 1.0, cost_key="fees"), 1)
-
-
-class Keyed(CostPoint):
-    def step(self, action):
-        *rest, info = super().step(action)
-        return *rest, {"constraint_costs": {"hazard": info["cost"], "height": 0.0}}
-
-
 def distance(obs, action, next_obs, info):
     return float(np.linalg.norm(next_obs[:2] - obs[:2]))
 
 
 WRAPPED = {
     "step": lambda: CostFromStep(SafeTimeLimit(Builder("x"), 30)),
-    "info": lambda: CostFromInfo(Keyed(30), "constraint_costs"),
     "function": lambda: CostFromFunction(CostPoint(30), distance),
-    "budget": lambda: RemainingBudget(CostPoint(30), 2.0, discount=0.99, unsafe_reward=-1.0),
-    "early": lambda: EarlyTermination(CostPoint(30), 1.5, final_reward=-1.0),
-    "all": lambda: EarlyTermination(
-        RemainingBudget(CostFromInfo(Keyed(30), "constraint_costs"), 2.0), 2.0
-    ),
 }
 
 
@@ -433,34 +294,15 @@ def test_an_episode_goes_on_where_it_was_left(name, travel):
 
 def test_the_spec_says_how_to_wrap_again(monkeypatch):
     monkeypatch.setitem(gym.registry, "Point-v0", EnvSpec("Point-v0", CostPoint))
-    env = EarlyTermination(RemainingBudget(gym.make("Point-v0"), 2.0), 1.5)
-    again = gym.make(env.spec)
-    assert (again.budget, again.env.budget) == (1.5, 2.0)
+    again = gym.make(CostFromFunction(gym.make("Point-v0"), distance, "metres").spec)
+    assert (again.cost, again.key) == (distance, "metres")
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda env: RemainingBudget(env, 0.0), r"budget=0.0: must be a number in \(0, inf\)"),
-        (lambda env: RemainingBudget(env, True), "budget=True"),
-        (
-            lambda env: RemainingBudget(env, 1.0, discount=1.5),
-            r"discount=1.5: must be a number in \(0, 1\]",
-        ),
-        (lambda env: RemainingBudget(env, 1.0, unsafe_reward="low"), "unsafe_reward='low'"),
-        (lambda env: EarlyTermination(env, -1.0), r"budget=-1.0: must be a number in \[0, inf\)"),
-        (lambda env: EarlyTermination(env, float("inf")), "budget=inf"),
-        (lambda env: EarlyTermination(env, 1.0, final_reward=None), "final_reward=None"),
-        (lambda env: CostFromInfo(env, ()), "must be names of info entries"),
-        (lambda env: CostFromInfo(env, missing_cost="no"), "'error' or 'zero'"),
         (lambda env: CostFromFunction(env, "nowhere:cost"), "package.module:function"),
         (lambda env: CostFromFunction(env, 3), "cost=3: must be a function"),
-        (
-            lambda env: RemainingBudget(
-                RemainingBudget(Scripted([], SHAPES["dictionary"]), 1.0), 1.0
-            ),
-            "wrapped twice",
-        ),
     ],
 )
 def test_bad_arguments_are_refused_in_one_line(make, message):
@@ -530,5 +372,5 @@ def test_the_commands_train_and_play_on_six_values_without_mujoco_4(absent, tmp_
 def test_the_pages_examples_run():
     page = Path(__file__).parents[2] / "docs" / "your_environment.md"
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
-    assert len(blocks) == 5
+    assert len(blocks) == 4
     exec(compile("\n".join(blocks), str(page), "exec"), {})

@@ -17,9 +17,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_guard import CPO, CostEvalCallback, evaluate_policy, make_vec_env
 from sb3_guard.common import evaluation
-from sb3_guard.common.budgets import RemainingBudget
 from sb3_guard.common.callbacks import LogCosts
 from sb3_guard.common.monitor import CostMonitor
+from sb3_guard.common.vec_budgets import VecRemainingBudget
 
 SMALL: dict[str, Any] = {"n_steps": 20, "n_critic_updates": 1, "cost_limit": 5.0, "seed": 0}
 
@@ -162,7 +162,6 @@ LOSING = {
     "SB3's": lambda env: MaxAndSkipEnv(env, 4),
     "a user's": Twice,
     "inside others": lambda env: TimeLimit(Twice(TimeLimit(env, 30)), 10),
-    "a budget outside": lambda env: RemainingBudget(Twice(env), 100.0),
     "twice": lambda env: Twice(Twice(env), adds_up=True),
 }
 
@@ -185,6 +184,13 @@ def test_costs_of_repeated_steps_are_not_lost(name, kind):
             watched.step(np.zeros((1, 1)))
         else:
             evaluate_policy(Still(), env if kind == "evaluate" else DummyVecEnv([lambda: env]), 1)
+
+
+def test_budgets_outside_of_repeated_steps_do_not_lose_them():
+    env = VecRemainingBudget(make_vec_env(Late, wrapper_class=Twice), 100.0)
+    env.reset()
+    with pytest.raises(ValueError, match="costs of repeated steps must add up"):
+        env.step(np.zeros((1, 1)))
 
 
 @pytest.mark.parametrize("wrap", [lambda env: Twice(env, adds_up=True), lambda env: env])

@@ -96,7 +96,10 @@ def test_bad_ids_say_what_is_wrong(name, message):
             {"hazards": {"speed": 1}},
             r"'speed': it moves nothing; ghosts={'speed': 0.5} and gremlins",
         ),
-        ({"hazards": {"ends": True}}, "'ends': .* sb3_guard.common.budgets.EarlyTermination"),
+        (
+            {"hazards": {"ends": True}},
+            "'ends': .* sb3_guard.common.vec_budgets.VecEarlyTermination",
+        ),
         ({"gremlins": {"speed": 1}}, "gremlins has no parameter 'speed': set rate, .* rad/s"),
         ({"speed": {"speed": 1}}, "speed has no parameter 'speed': set limit, .* m/s"),
         ({"goal": {"speed": 1}}, "'speed': it moves nothing; .* tasks Chase and Defense"),

@@ -680,23 +680,11 @@ def test_early_termination_is_for_training_alone(tmp_path, normalize):
     assert result["cut"] and "verdict" not in result["costs"]["cost"]
 
 
-def test_the_reward_of_an_overspent_budget_is_for_training_alone(tmp_path):
-    wrapper = "env_wrapper:{'sb3_guard.common.budgets.RemainingBudget': "
-    wrapper += "{'budget': 0.01, 'unsafe_reward': -100.0}}"
-    here = ["--env-kwargs", "hazard:(-1.0, 0.0)"]
-    run = trained(tmp_path, "-n", "480", *here, "-params", wrapper)
-    assert load_results(str(run))["r"].min() <= -100.0
-    result = json.loads((run / "result.json").read_text())
-    assert [*result["final"]] == ["stochastic", "greedy"]
-    for split in result["final"].values():
-        assert min(split["costs"]) > 0.01 and min(split["returns"]) > -100.0
-
-
-@pytest.mark.parametrize("kind", ["budgets.RemainingBudget", "vec_budgets.VecRemainingBudget"])
 @pytest.mark.parametrize("evaluation", [False, True])
-def test_an_overspent_budget_changes_the_rewards_of_the_training_alone(kind, evaluation):
-    wrappers = {f"sb3_guard.common.{kind}": {"budget": 0.01, "unsafe_reward": -100.0}}
-    setup = {"cost_limit": 1.0, f"{'vec_' * kind.startswith('vec')}env_wrapper": wrappers}
+def test_an_overspent_budget_changes_the_rewards_of_the_training_alone(evaluation):
+    arguments = {"budget": 0.01, "unsafe_reward": -100.0}
+    wrapper = {"sb3_guard.common.vec_budgets.VecRemainingBudget": arguments}
+    setup = {"cost_limit": 1.0, "vec_env_wrapper": wrapper}
     here = {"gym_packages": ["registered_envs"], "env_kwargs": {"hazard": (-1.0, 0.0)}}
     run = Run.check(RunFlags(algo="cpo", env="CostPoint-v0", seed=0, hyperparams=setup, **here))
     env = run.make_envs(4, seed=0, evaluation=evaluation)

@@ -219,7 +219,7 @@ def test_only_classes_of_their_kind(name, value):
     ("name", "path", "arguments"),
     [
         ("vec_env_wrapper", "sb3_guard.common.vec_budgets.VecEarlyTermination", {"budgets": 5}),
-        ("env_wrapper", "sb3_guard.common.budgets.EarlyTermination", {"budgets": 5}),
+        ("env_wrapper", "sb3_guard.common.adapters.CostFromFunction", {"costs": 5}),
         ("callback", "stable_baselines3.common.callbacks.EveryNTimesteps", {"n_step": 5}),
     ],
 )

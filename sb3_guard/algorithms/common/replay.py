@@ -16,6 +16,7 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.type_aliases import (
     GymEnv,
     RolloutReturn,
@@ -166,6 +167,13 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         self.replay_buffer_kwargs = {**given, **chosen}
 
     def _setup_model(self) -> None:
+        normalizer, space = self._vec_normalize_env, self.observation_space
+        if normalizer and get_obs_shape(normalizer.observation_space) != get_obs_shape(space):
+            raise ValueError(
+                "the replay buffer keeps what VecNormalize is given, so frames are stacked and "
+                "images transposed within: VecNormalize(VecFrameStack(env, 4)), "
+                "VecNormalize(VecTransposeImage(env))"
+            )
         with warnings.catch_warnings():  # SB3 takes it that no buffer but its own knows n_steps
             warnings.filterwarnings("ignore", "`n_steps=")
             super()._setup_model()

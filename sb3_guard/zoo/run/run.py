@@ -25,6 +25,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
@@ -268,7 +269,8 @@ class Run:
         render_mode: str | None = None,
     ) -> VecEnv:
         """
-        Environments of this run: monitor, ``vec_env_wrapper``, VecNormalize, frame stack.
+        Environments of this run: monitor, ``vec_env_wrapper``, VecNormalize, frame stack; of an
+        algorithm with a replay buffer VecNormalize is the outermost.
 
         :param n_envs: how many
         :param seed: the environments get seed, seed + 1, …
@@ -313,6 +315,9 @@ class Run:
             with explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
                 for cls, arguments in _wrappers(setup.vec_env_wrapper, evaluation):
                     env = cls(env, **arguments)
+                replays = issubclass(self.algorithm, OffPolicyAlgorithm)
+                if replays:  # the buffer keeps what VecNormalize is given, which thus has all of it
+                    env = self._reshaped(env)
                 if normalizer is None and (beside := self._statistics_beside()) is not None:
                     normalizer = read_normalizer(beside)
                 if normalizer is not None:
@@ -323,12 +328,16 @@ class Run:
                     env = VecNormalize(env, **setup.normalize)
                 if evaluation and isinstance(env, VecNormalize):
                     env.training = env.norm_reward = False
-                if setup.frame_stack is not None:
-                    env = VecFrameStack(env, setup.frame_stack)
-                # SB3 would transpose images itself, but evaluation is wrapped like training.
-                env = BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
+                if not replays:
+                    env = self._reshaped(env)
             made.pop_all()
         return env
+
+    def _reshaped(self, env: VecEnv) -> VecEnv:
+        """Frames stacked, and images channels first, in evaluation as in training."""
+        if self.setup.frame_stack is not None:
+            env = VecFrameStack(env, self.setup.frame_stack)
+        return BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
 
     def make_evaluation_envs(self, episodes: int) -> VecEnv:
         """

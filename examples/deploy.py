@@ -10,30 +10,32 @@ import sb3_guard  # the simulation that stands in for the robot
 
 contract = json.load(open("contract.json"))  # sb3-guard export --pretrained writes both files
 policy = onnxruntime.InferenceSession("policy.onnx")
-period, bounds, trained = contract["control_step"], contract["outputs"][0], contract["trained"]
+period, output, trained = contract["control_step"], contract["outputs"][0], contract["trained"]
 inputs = {part["name"]: part["shape"][1:] for part in contract["inputs"]}
 if other := inputs.keys() - {"observation", "last_cost"} | {*contract["wrappers"]}:
     raise SystemExit(f"this loop does not compute {', '.join(other)}, which contract.json names")
+assert None not in output["stop"], "say what stops the robot: sb3-guard export --stop 0:0.0"
+stop = np.array([np.nan if value == "hold" else value for value in output["stop"]], np.float32)
 padding = contract["frame_stack"]["padding"]["observation"] if contract["frame_stack"] else 0
 first = np.full(inputs["observation"], padding, np.float32)  # frames when an episode begins
 robot = sb3_guard.make(trained["env"], **trained.get("env_kwargs", {}))
 (latest, _), rng = robot.reset(seed=0), np.random.default_rng(0)
-observation, frames, missing, stops, cost, costs = latest, first, 0, 0, 0.0, []
+observation, frames, missing, stops, cost, costs, sent = latest, first, 0, 0, 0.0, [], None
 for _ in range(500):
-    began, lost = time.perf_counter(), rng.random() < 0.05  # one message in twenty is lost
+    began, lost = time.perf_counter(), sent is not None and rng.random() < 0.05  # 1 in 20 is lost
     missing, observation = (missing + 1, observation) if lost else (0, latest)
     frames = np.append(frames[len(latest) :], np.float32(observation))
     values = {"observation": frames[None], "last_cost": np.float32([[cost]])}
     action = policy.run(["action"], {name: values[name] for name in inputs})[0][0]
-    late = time.perf_counter() - began > period
+    late = sent is not None and time.perf_counter() - began > period
     if missing > 2 or late or not np.isfinite(np.append(frames, action)).all():
-        action, stops = np.zeros_like(action), stops + 1  # the watchdog stops the robot
-    action = np.clip(action, bounds["low"], bounds["high"])
-    latest, _, terminated, truncated, info = robot.step(action)
+        action, stops = np.where(np.isnan(stop), sent, stop), stops + 1  # "hold" is what was sent
+    sent = np.clip(action, output["low"], output["high"])
+    latest, _, terminated, truncated, info = robot.step(sent)
     costs.append(cost := info["cost"])
     if terminated or truncated:
         (latest, _), frames, cost = robot.reset(), first, 0.0
     time.sleep(max(0.0, began + period - time.perf_counter()))
 np.savetxt("costs.csv", costs)
-per = "limit {limit} per {per}".format(**contract["costs"][0])
-print(f"cost {sum(costs):.2f} in {len(costs)} steps, {per}; stopped {stops} times")
+limit = "limit {limit} per {per}".format(**contract["costs"][0])
+print(f"cost {sum(costs):.2f} in {len(costs)} steps, {limit}; stopped {stops} times")

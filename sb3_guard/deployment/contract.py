@@ -12,6 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.checks import is_number
 from sb3_guard.common.vec_budgets import Counted, VecMaxCost
 from sb3_guard.deployment.deployed import Deployed
 from sb3_guard.deployment.environment import (
@@ -23,8 +24,10 @@ from sb3_guard.deployment.environment import (
     ours_of,
 )
 from sb3_guard.deployment.observations import OBSERVATION, inputs_of
+from sb3_guard.spelling import did_you_mean
 
-FORMAT = 1  # increased when the content changes
+FORMAT = 2  # increased when the content changes
+HOLD = "hold"  # the last value is sent again
 _RANDOM = {
     "noise": "independent standard normal numbers, drawn anew in each step",
     "uniform": "one number from [0, 1), drawn anew in each step",
@@ -33,7 +36,11 @@ _LAST_COST = "cost of the step before, 0 when an episode begins, NaN if it is no
 
 
 def contract(
-    model: BaseAlgorithm, env: VecEnv, deployed: Deployed, trained: Mapping[str, Any]
+    model: BaseAlgorithm,
+    env: VecEnv,
+    deployed: Deployed,
+    trained: Mapping[str, Any],
+    stop: Mapping[str, Any],
 ) -> dict[str, Any]:
     """
     The contract of an exported agent, as plain data without infinities.
@@ -42,6 +49,7 @@ def contract(
     :param env: environments with the wrappers of training
     :param deployed: what is exported
     :param trained: what else there is to say of the training
+    :param stop: what stops the robot, see :func:`stops`
     """
     from sb3_guard import __version__
 
@@ -56,7 +64,10 @@ def contract(
     return {
         "format": FORMAT,
         "inputs": [_input(name, model, env, deployed) for name in deployed.inputs],
-        "outputs": [_output(name, model, env) for name in deployed.outputs],
+        "outputs": [
+            {**_output(name, model, env), "stop": values}
+            for name, values in stops(model, env, stop).items()
+        ],
         "actions": "sampled" if deployed.acting.actor.sampled else "mean",
         "control_step": step,
         "control_rate": None if step is None else round(1.0 / step, 6),
@@ -112,6 +123,47 @@ def _output(name: str, model: BaseAlgorithm, env: VecEnv) -> dict[str, Any]:
     if ranges:
         described["actuators"] = [names[0] for names in ranges]
     return described
+
+
+def stops(model: BaseAlgorithm, env: VecEnv, stated: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """
+    What the loop around the policy sends to stop the robot, by output.
+
+    :param stated: by actuator, in units of its control, or by the action's number (``"0"``) where
+        the environment is not of this package, in units of the action; a number, or ``"hold"``
+    :return: of each number of the output a value, ``"hold"`` (the last value sent), or None: the
+        environment does not tell
+    :raises ValueError: a name or value is not possible
+    """
+    driven, space = drive(env), model.action_space
+    if driven is not None:
+        known = {part.name: HOLD if part.stop is None else part.stop for part in driven.actuators}
+        bounds = [part.control for part in driven.actuators]
+    else:
+        low, high = (space.low, space.high) if isinstance(space, spaces.Box) else (0, space.n - 1)
+        bounds = list(zip(np.ravel(low).tolist(), np.ravel(high).tolist(), strict=True))
+        known = dict.fromkeys(map(str, range(len(bounds))))
+    ranges = dict(zip(known, bounds, strict=True))
+    for name, value in stated.items():
+        if name not in known:
+            raise ValueError(f"stop names no actuator {name!r}: {did_you_mean(name, known)}")
+        low, high = ranges[name]
+        if value != HOLD and not (is_number(value) and low <= value <= high):
+            raise ValueError(
+                f"stop of {name!r} is {value!r}: it must be from {low:g} to {high:g}, or 'hold'"
+            )
+    values = list({**known, **stated}.values())
+    if driven is None:
+        return {"action": values}
+    actions = [
+        value
+        if value == HOLD
+        else float(np.clip((value - offset) / (scale or 1.0), part.low, part.high))
+        for value, offset, scale, part in zip(
+            values, driven.offset, driven.scale, driven.actuators, strict=True
+        )
+    ]
+    return {"action": actions, "control": values}
 
 
 def _dtype(space: spaces.Space) -> str:

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.evaluation import check_agent, lacks_statistics
 from sb3_guard.common.files import replacing
-from sb3_guard.deployment.contract import contract
+from sb3_guard.deployment.contract import contract, stops
 from sb3_guard.deployment.deployed import Deployed
 from sb3_guard.deployment.observations import inputs_of, joined
 from sb3_guard.deployment.policies import Acting
@@ -42,6 +42,7 @@ def export(
     *,
     env: VecEnv | None = None,
     sampled: bool = False,
+    stop: Mapping[str, float | str] | None = None,
     trained: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Write an agent as one ONNX file, with normalisation, safety filter and controls in it.
@@ -61,6 +62,9 @@ def export(
     :param path: of the file, ``.onnx``; it is replaced
     :param env: environments wrapped as in training, ``VecNormalize`` included; None: the model's
     :param sampled: sample actions, with the random numbers as an input; False: the most likely ones
+    :param stop: by actuator the control that stops it, or ``"hold"`` for the last one; in an
+        environment of another package by the number of the action, ``{"0": 0.0}``. Others have that
+        of the keyframe ``stop``, else position servos hold and motors and velocity servos have 0
     :param trained: what the contract shall say of the training, plain data
     :return: the contract
     :raises ValueError: the agent is of a kind that can't be exported, or has no environment, or
@@ -76,6 +80,7 @@ def export(
             "environments wrapped as in training (with VecNormalize.load(file, env), if it had any)"
         )
     check_agent(model, env)
+    stops(model, env, stop or {})
     deployed = Deployed(model, env, sampled)
     file = _converted(deployed)
     share, largest = _parity(deployed, file, model)
@@ -93,7 +98,7 @@ def export(
         "opset": OPSET,
         "operators": operators,
     }
-    described = {"file": about_file, **contract(model, env, deployed, trained or {})}
+    described = {"file": about_file, **contract(model, env, deployed, trained or {}, stop or {})}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as out:
         out.write(content)

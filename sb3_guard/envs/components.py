@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import mujoco
 import numpy as np
 
+from sb3_guard.envs.robots.model_file import holding
 from sb3_guard.envs.robots.robot import MJCFRobot
 
 if TYPE_CHECKING:
@@ -52,12 +53,14 @@ class Actuator(NamedTuple):
     :param low: its least action
     :param high: its greatest
     :param control: which controls these set
+    :param stop: the control that stops it; None: the last one, which a position servo holds
     """
 
     name: str
     low: float
     high: float
     control: tuple[float, float]
+    stop: float | None
 
 
 def joints(model: mujoco.MjModel, which: str, last: int) -> Iterator[tuple[str, str]]:
@@ -95,7 +98,11 @@ def actuators(engine: Engine) -> Iterator[Actuator]:
     limits = np.array(
         robot.controls if isinstance(robot, MJCFRobot) else model.actuator_ctrlrange.T
     )
+    holds, stated = holding(model), robot.stop if isinstance(robot, MJCFRobot) else {}
     for i, (low, high) in enumerate(limits.T.tolist()):
         name = model.actuator(i).name or model.joint(model.actuator_trnid[i, 0]).name
         least, most = (np.broadcast_to(b, model.nu)[i] for b in robot.action_range)
-        yield Actuator(name.removeprefix("robot/"), float(least), float(most), (low, high))
+        name = name.removeprefix("robot/")
+        stop = stated.get(name, None if holds[i] else 0.0)
+        stop = None if stop is None else min(max(stop, low), high)
+        yield Actuator(name, float(least), float(most), (low, high), stop)

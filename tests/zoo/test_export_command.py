@@ -9,7 +9,8 @@ import onnxruntime
 import pytest
 from typed import refused, trained
 
-from sb3_guard import cli, export_agent
+from sb3_guard import cli, enjoy, export_agent
+from sb3_guard.zoo.agents import playback
 from sb3_guard.zoo.agents.playback import find_run
 
 WHICH = ["--env", "CostPoint-v0", "--gym-packages", "registered_envs", "--n-episodes", "5"]
@@ -91,3 +92,33 @@ def test_a_pretrained_agent_says_which_limit_it_keeps_and_which_it_was_trained_a
     assert "warning" not in capsys.readouterr().err
     contract = json.loads((tmp_path / "contract.json").read_text())
     assert contract["costs"][0]["limit"] == 5.0 and contract["trained"]["cost_limit"] == 4
+
+
+ENDLESS = 255 * "a"  # the system allows it, but not the hidden file that is written first
+
+
+@pytest.mark.parametrize(
+    ("flags", "names"),
+    [
+        (["-o", "folder.onnx"], "'folder.onnx' is a folder"),
+        (["-o", "beside/policy.onnx"], "contract.json' is a folder"),
+        (["-o", f"{ENDLESS}.onnx"], "choose another"),
+        (["-o", f"new/{2 * ENDLESS}/policy.onnx"], "choose another"),
+        (["--json", "folder.onnx"], "is a folder"),
+        (["--json", ENDLESS], "choose another"),
+        (["--json", f"new/{2 * ENDLESS}"], "choose another"),
+        (["--json", "/dev/null"], "is a device or pipe"),
+        (["--record", f"{ENDLESS}.mp4"], "choose another"),
+    ],
+)
+def test_a_file_that_can_not_be_written_is_said_before_episodes(
+    flags, names, logs, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.onnx").mkdir()
+    (tmp_path / "beside" / "contract.json").mkdir(parents=True)
+    monkeypatch.setattr(playback.Run, "make_envs", lambda *a, **k: pytest.fail("was played"))
+    command = export_agent.main if "-o" in flags else enjoy.main
+    window = [] if "-o" in flags else ["--no-render"]
+    refused(command, [*WHICH, "-f", str(logs), *flags, *window], capsys, names)
+    assert {path.name for path in tmp_path.iterdir()} == {"folder.onnx", "beside"}

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ _PLAIN = (  # types of attributes that are copied from one element to another
 _DYN = mujoco.mjtDyn
 # controls that are the servo's target itself, not its rate
 _DIRECT = [int(kind) for kind in (_DYN.mjDYN_NONE, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT)]
+STOP = "stop"  # the keyframe whose controls stop the robot where it is deployed
 SERVOS = "docs/robot_files.md adds servos in three lines of MjSpec"
 
 
@@ -48,6 +49,7 @@ class ModelFile:
     :param left_out: what of the file is not in ``spec``, in words
     :param floors: the geoms that it stood on, in whose place is the arena's floor: attributes
     :param on_floor: pairs and sensors that refer to them: kind and attributes
+    :param stop: the controls of the keyframe ``stop``, by actuator; empty: there is none
     """
 
     label: str
@@ -57,6 +59,7 @@ class ModelFile:
     left_out: tuple[str, ...] = ()
     floors: tuple[Mapping[str, Any], ...] = ()
     on_floor: tuple[tuple[str, Mapping[str, Any]], ...] = ()
+    stop: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def base(self) -> list[mujoco.MjsJoint]:
@@ -174,7 +177,8 @@ def settle(
     :param complete: whether the world around the robot is kept
     :param grounded: whether a robot on a free joint is put on the floor, unless a keyframe has it
         higher
-    :param keyframe: in which it begins; None: ``start``, ``home`` or the only one, if there is one
+    :param keyframe: in which it begins; None: ``start``, ``home`` or the only one beside ``stop``,
+        if there is one
     :param as_written: whether the file was written for our worlds: it begins as the file says, even
         out of a joint's range or above the floor, and with controls of 0
     :raises ValueError: there is no such robot in the file, in one line
@@ -190,7 +194,11 @@ def settle(
         mujoco.mj_resetDataKeyframe(whole, before, whole.key(key).id)
     if not as_written:
         _check_ranges(spec, root, whole, before, label, key)
-    left_out = tuple(f"keyframe {frame.name}" for frame in spec.keys if frame.name != key)
+    left_out = tuple(f"keyframe {k.name}" for k in spec.keys if k.name not in (key, STOP))
+    stop = {}
+    if STOP in [frame.name for frame in spec.keys]:
+        names = [actuator.name for actuator in spec.actuators]
+        stop = dict(zip(names, whole.key(STOP).ctrl.tolist(), strict=True))
     for frame in spec.keys:
         spec.delete(frame)
     spec.nkey = 0  # MuJoCo would fill up to it
@@ -227,13 +235,25 @@ def settle(
     if key is None and not as_written:
         _hold(model, data)
     start = {name: getattr(data, name).copy() for name in STATE}
-    return ModelFile(label, spec, root, start, left_out, floors, on_floor)
+    return ModelFile(label, spec, root, start, left_out, floors, on_floor, stop)
 
 
 def servos(model: mujoco.MjModel) -> Array:
     """Whether each actuator is a position servo, whose control is its target, [nu] bool."""
     targets: Array = _targets(model) & np.isin(model.actuator_dyntype, _DIRECT)
     return targets
+
+
+def holding(model: mujoco.MjModel) -> Array:
+    """Whether the robot stays where it is while each actuator keeps its control, [nu] bool.
+
+    These are servos of a position, filtered ones and those with other units of control (the gripper
+    of a Panda) included; motors, velocity servos and those whose control is a rate stop at 0.
+    """
+    affine = model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    pulls = affine & (model.actuator_biasprm[:, 1] != 0)
+    kept: Array = pulls & np.isin(model.actuator_dyntype, _DIRECT)
+    return kept
 
 
 def _targets(model: mujoco.MjModel) -> Array:
@@ -342,7 +362,8 @@ def _keyframe(spec: mujoco.MjSpec, label: str, keyframe: str | None) -> str | No
     if keyframe is not None and keyframe not in names:
         raise ValueError(f"{label} has no keyframe {keyframe!r}: {did_you_mean(keyframe, names)}")
     usual = [name for name in ("start", "home") if name in names]
-    only = names if len(names) == 1 else []
+    only = [name for name in names if name != STOP]
+    only = only if len(only) == 1 else []
     return keyframe or next(iter([*usual, *only]), None)
 
 

@@ -159,7 +159,7 @@ class MJCFRobot(Robot):
         super().build(world)
         file = self.model_file()
         self._base, self._posing = [joint.name for joint in file.base], file.posing
-        self._label, self._start = file.label, file.start
+        self._label, self._start, self.stop = file.label, file.start, file.stop
         self._own = {sensor.name for sensor in file.spec.sensors if sensor.name}
         self._own |= {values["name"] for kind, values in file.on_floor if kind == "sensor"}
         bodies = [body.name for body in file.spec.bodies[1:] if body.name]

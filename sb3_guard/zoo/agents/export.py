@@ -9,10 +9,11 @@ from typing import Any
 
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.deployment import onnx_file
+from sb3_guard.deployment.contract import stops
 from sb3_guard.zoo.agents.flags import AgentFlags, ExportFlags
 from sb3_guard.zoo.agents.playback import BATCH, Agent, means, open_agent, summary
 from sb3_guard.zoo.cli.usage import UsageError, explained
-from sb3_guard.zoo.run.folder import require_writable
+from sb3_guard.zoo.run.folder import require_file
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
 
 
@@ -21,16 +22,18 @@ def export(flags: ExportFlags) -> int:
     path = Path(flags.output)
     if path.suffix != ".onnx":
         raise UsageError(f"--output {flags.output!r} must end in .onnx")
-    require_writable(path.parent, "--output")
+    for written in (path, path.with_name(onnx_file.CONTRACT)):
+        require_file(written, "--output")
     agent = open_agent(flags, None, min(flags.n_episodes or BATCH, BATCH))
     with closing(agent.env):
         with explained(f"can't export {agent.path}", ValueError, ImportError):
             onnx_file.check(agent.model, flags.stochastic, path)
+            stops(agent.model, agent.env, flags.stop or {})
         how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
         episodes = flags.n_episodes or max(agent.env.num_envs, 5)
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
             evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
-        contract = write(agent, flags, path, summary(evaluation))
+        contract = write(agent, flags, path, summary(evaluation), flags.stop)
     print(f"{path}: {', '.join(contract['file']['operators'])}")
     print(f"{path.with_name(onnx_file.CONTRACT)} describes input and output")
     print(means(evaluation))
@@ -44,7 +47,11 @@ def export(flags: ExportFlags) -> int:
 
 
 def write(
-    agent: Agent, flags: AgentFlags, path: Path, measured: Mapping[str, Any]
+    agent: Agent,
+    flags: AgentFlags,
+    path: Path,
+    measured: Mapping[str, Any],
+    stop: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """
     Export an agent.
@@ -53,6 +60,7 @@ def write(
     :param flags: how it acts
     :param path: of the ONNX file
     :param measured: return and cost of episodes, see :func:`summary`
+    :param stop: what stops the robot, see :func:`sb3_guard.export`
     :return: the contract
     :raises UsageError: the agent can't be exported
     """
@@ -72,5 +80,10 @@ def write(
     }
     with explained(f"can't export {agent.path}", ValueError, ImportError):
         return onnx_file.export(
-            agent.model, path, env=agent.env, sampled=flags.stochastic, trained=trained
+            agent.model,
+            path,
+            env=agent.env,
+            sampled=flags.stochastic,
+            stop=stop,
+            trained=trained,
         )

@@ -107,6 +107,8 @@ class ExportFlags(AgentFlags):
     Output:
 
     :param output: the file (default: policy.onnx)
+    :param stop: what stops an actuator, in units of its control, or hold for its last control
+        (default: the robot's keyframe stop, else hold for position servos and 0 for others)
     """
 
     prog: ClassVar[str] = "sb3-guard export"
@@ -115,6 +117,7 @@ class ExportFlags(AgentFlags):
   sb3-guard export --algo cpo --env Goal_Point_8Hazards -f logs --load-best -o robot/policy.onnx
 """
     output: str = flag("-o", default="policy.onnx", metavar="FILE.onnx")
+    stop: dict[str, Any] | None = flag(metavar="ACTUATOR:VALUE")
 
 
 @dataclass

@@ -24,7 +24,7 @@ from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, pack
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_writable
+from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_file
 from sb3_guard.zoo.run.hyperparams import check
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, full_id
 from sb3_guard.zoo.run.run import Run
@@ -185,7 +185,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     """
     for name in ("record", "json"):
         if getattr(flags, name):
-            _require_file(Path(getattr(flags, name)), f"--{name}")
+            require_file(Path(getattr(flags, name)), f"--{name}")
     alone = render_mode is not None or flags.n_timesteps is not None
     agent = open_agent(flags, render_mode, 1 if alone else min(flags.n_episodes or BATCH, BATCH))
     video = None
@@ -233,13 +233,6 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     if video is not None and flags.verbose > 0:
         print(f"Video: {video}")
     return 0
-
-
-def _require_file(path: Path, flag: str) -> None:
-    """Raise if a file can't be written, before anything is played for it."""
-    if path.is_dir():
-        raise UsageError(f"{flag}: {str(path)!r} is a folder; name a file")
-    require_writable(path.parent, flag)
 
 
 def summary(evaluation: Evaluation) -> dict[str, Any]:

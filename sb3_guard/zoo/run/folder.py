@@ -6,19 +6,20 @@ import glob
 import hashlib
 import json
 import math
+import os
 import re
 import shlex
 import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import yaml
 from filelock import SoftFileLock, Timeout
 
-from sb3_guard.common.files import replacing
+from sb3_guard.common.files import replacing, sibling_of
 from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag, read_mapping
 from sb3_guard.zoo.run.flags import RunFlags
 
@@ -104,13 +105,37 @@ def require_writable(folder: Path, flag: str) -> None:
     :param flag: the flag that names it, for the message
     :raises UsageError: no file can be made in it, or in what exists of the path to it
     """
-    what = f"{flag}: can't write to folder {str(folder)!r}"
-    with explained(what, OSError, fix="choose another"):
-        whole = folder.absolute()
-        existing = next(path for path in (whole, *whole.parents) if path.exists())
-        # Permission bits mean little to root and on special file systems: only trying tells.
-        with tempfile.TemporaryFile(dir=existing):
-            pass
+    with explained(f"{flag}: can't write to folder {str(folder)!r}", OSError, fix="choose another"):
+        _require_possible(folder)
+
+
+def require_file(path: Path, flag: str) -> None:
+    """
+    The same of a file that :func:`replacing` is to write.
+
+    :raises UsageError: it can't be made, or something else than a file has its name
+    """
+    with explained(f"{flag}: can't write file {str(path)!r}", OSError, fix="choose another"):
+        if path.exists() and not path.is_file():
+            kind = "folder" if path.is_dir() else "device or pipe"
+            raise UsageError(f"{flag}: {str(path)!r} is a {kind}; name a file")
+    require_writable(path.parent, flag)
+    with explained(f"{flag}: can't write file {str(path)!r}", OSError, fix="choose another"):
+        _require_possible(sibling_of(path))
+
+
+def _require_possible(path: Path) -> None:
+    """
+    :raises OSError: a name on the way to it is too long, or nothing can be made where it begins
+    """
+    whole = path.absolute()
+    existing = next(part for part in (whole, *whole.parents) if os.path.lexists(part))
+    for name in whole.relative_to(existing).parts:
+        with suppress(FileNotFoundError):
+            os.stat(existing / name)
+    # Permission bits mean little to root and on special file systems: only trying tells.
+    with tempfile.TemporaryFile(dir=existing):
+        pass
 
 
 class RunFolder:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import stable_baselines3
@@ -135,7 +135,7 @@ def stops(model: BaseAlgorithm, env: VecEnv, stated: Mapping[str, Any]) -> dict[
         environment does not tell
     :raises ValueError: a name or value is not possible
     """
-    driven, space = drive(env), model.action_space
+    driven, space = drive(env), cast(spaces.Box | spaces.Discrete, model.action_space)
     if driven is not None:
         known = {part.name: HOLD if part.stop is None else part.stop for part in driven.actuators}
         bounds = [part.control for part in driven.actuators]

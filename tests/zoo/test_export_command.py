@@ -94,6 +94,29 @@ def test_a_pretrained_agent_says_which_limit_it_keeps_and_which_it_was_trained_a
     assert contract["costs"][0]["limit"] == 5.0 and contract["trained"]["cost_limit"] == 4
 
 
+def test_each_cost_has_its_verdict_wherever_one_is_shown(tmp_path, capsys):
+    limits = "cost_keys:['cost','heat'] cost_limit:[2,1000] normalize:True".split()
+    kwargs = ["--env-kwargs", "cost_keys:('cost','heat')", "episode_length:20"]
+    trained(tmp_path, "-params", *limits, *kwargs)
+    which = [*WHICH[:4], "-f", str(tmp_path)]
+    path, statistics = tmp_path / "policy.onnx", tmp_path / "played.json"
+    capsys.readouterr()
+    assert export_agent.main([*which, "-o", str(path)]) == 0
+    exported = capsys.readouterr().out
+    assert enjoy.main([*which, "--no-render", "--verbose", "0", "--json", str(statistics)]) == 0
+    played = capsys.readouterr().out
+    measured = json.loads((tmp_path / "contract.json").read_text())["trained"]["measured"]
+    assert "100 episodes" in exported and "100 episodes" in played and measured["episodes"] == 100
+    assert json.loads(statistics.read_text())["costs"] == measured["costs"]
+    for key, limit in (("cost", 2.0), ("heat", 1000.0)):
+        cost = measured["costs"][key]
+        assert set(cost) == {"mean", "low", "high", "limit", "verdict"}
+        assert cost["limit"] == limit and cost["low"] <= cost["mean"] <= cost["high"]
+        words = rf"  {key} .*\[{cost['low']:.3f}, {cost['high']:.3f}\] .*limit {limit:g}: "
+        for out in (exported, played):
+            assert re.search(words + cost["verdict"], out), out
+
+
 ENDLESS = 255 * "a"  # the system allows it, but not the hidden file that is written first
 
 

@@ -11,7 +11,7 @@ from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.deployment import onnx_file
 from sb3_guard.deployment.contract import stops
 from sb3_guard.zoo.agents.flags import AgentFlags, ExportFlags
-from sb3_guard.zoo.agents.playback import BATCH, Agent, means, open_agent, summary
+from sb3_guard.zoo.agents.playback import BATCH, EPISODES, Agent, means, open_agent, summary
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.folder import require_file
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
@@ -30,7 +30,7 @@ def export(flags: ExportFlags) -> int:
             onnx_file.check(agent.model, flags.stochastic, path)
             stops(agent.model, agent.env, flags.stop or {})
         how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
-        episodes = flags.n_episodes or max(agent.env.num_envs, 5)
+        episodes = flags.n_episodes or EPISODES
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
             evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
         contract = write(agent, flags, path, summary(evaluation), flags.stop)

@@ -28,8 +28,7 @@ class AgentFlags(Command):
 
     What is played:
 
-    :param n_episodes: number of episodes (default: 30; 5 in a window or in an environment of
-        another package, 1 to record, 10 for the hub)
+    :param n_episodes: number of episodes (default: 100; 5 in a window, 1 to record)
     :param stochastic: sample actions instead of taking the most likely ones
     :param seed: random seed of the episodes (default: 0)
     :param env_kwargs: arguments of the environment, which replace those of training

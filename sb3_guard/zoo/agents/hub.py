@@ -17,14 +17,13 @@ from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.zoo.agents import export
 from sb3_guard.zoo.agents.film import filming
 from sb3_guard.zoo.agents.flags import HubFlags
-from sb3_guard.zoo.agents.playback import Agent, means, open_agent, summary
+from sb3_guard.zoo.agents.playback import EPISODES, Agent, means, open_agent, summary
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, packages_flag
 from sb3_guard.zoo.run.folder import RunFolder, claim, folder_name, is_run, require_writable
 from sb3_guard.zoo.run.make_envs import full_id
 
 # Said before an agent is downloaded.
 TRUST = "agents are programs: load only from people you trust"
-EPISODES = 10  # that the card tells of
 TAGS = ("reinforcement-learning", "safe-reinforcement-learning", "stable-baselines3", "sb3-guard")
 # Flags that name files of this machine
 PATHS = ("log_folder", "tensorboard_log", "conf_file", "trained_agent")

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
-from sb3_guard.costs import LEAST_EPISODES, Estimate, beside
+from sb3_guard.costs import LEAST_EPISODES, Estimate, beside, verdict
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
@@ -29,7 +29,8 @@ from sb3_guard.zoo.run.hyperparams import check
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, full_id
 from sb3_guard.zoo.run.run import Run
 
-BATCH = 30  # episodes at once: as many as tell whether a limit is kept
+EPISODES = 100  # as many as tell whether a limit is kept, in training's final ones, too
+BATCH = 50  # environments of sb3_guard at once
 VIDEO = {"width": 960, "height": 720}  # pixels, where the user has not said otherwise
 
 
@@ -195,7 +196,8 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         video = Path(flags.record or (own if flags.pretrained else beside))
     episodes = flags.n_episodes
     if episodes is None and flags.n_timesteps is None:
-        episodes = 1 if flags.record is not None else max(agent.env.num_envs, 5)
+        watched = 5 if render_mode == "human" else EPISODES
+        episodes = 1 if flags.record is not None else watched
     result = agent.run.read_result() or {}
     if flags.verbose > 0:
         limit = result.get("trained_at")
@@ -243,7 +245,9 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
         the highest cost of a step, of an agent that limits that, the ``mean``,
         ``std``, the 95 % interval of the mean (``low``, ``high``) and the ``values``, one an
         episode; None where there are too few episodes for it, or where it is not known, of the
-        ``physics_errors`` episodes that one ended
+        ``physics_errors`` episodes that one ended. ``costs`` has mean, interval, ``limit`` and
+        ``verdict`` of each cost with a limit, as in ``result.json``; its key's worst step is meant
+        where that is limited
     """
     out: dict[str, Any] = {"episodes": len(evaluation)}
     for name, values in _columns(evaluation).items():
@@ -253,7 +257,22 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
         finite = {key: None if np.isnan(value) else value for key, value in estimate.items()}
         known = [None if np.isnan(value) else value for value in values.tolist()]
         out[name] = {**finite, "values": known}
+    if evaluation.limits:
+        out["costs"] = {
+            key: _judged(cost, limit)
+            for key, (cost, _), limit in zip(
+                evaluation.cost_keys, evaluation.by_key().values(), evaluation.limits, strict=True
+            )
+        }
     return out
+
+
+def _judged(cost: Estimate, limit: float) -> dict[str, Any]:
+    """A cost and its verdict, in words of ``result.json``."""
+    numbers = {"mean": cost.mean, "low": cost.low, "high": cost.high}
+    judged = {key: None if np.isnan(value) else value for key, value in numbers.items()}
+    words = verdict(cost.low, cost.high, limit, cost.diverged)
+    return {**judged, "limit": limit, **({"verdict": words} if words else {})}
 
 
 def _columns(evaluation: Evaluation) -> dict[str, np.ndarray]:

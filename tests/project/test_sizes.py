@@ -13,13 +13,13 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 29_220,
-    "sb3_guard/envs": 9_480,
-    "sb3_guard/algorithms": 6_405,
-    "sb3_guard/common": 2_190,
+    "sb3_guard": 29_000,
+    "sb3_guard/envs": 9_510,
+    "sb3_guard/algorithms": 6_410,
+    "sb3_guard/common": 1_980,
     "sb3_guard/deployment": 1_190,
-    "harness": 9_900,
-    "tests": 28_060,
+    "harness": 9_915,
+    "tests": 28_160,
 }
 WORDS = 82_000  # of all tracked markdown but the changelog
 

@@ -145,7 +145,7 @@ def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):
     which = ["--pretrained", "--env", POINT, "--no-render", "--env-kwargs", "max_episode_steps:5"]
     file = tmp_path / "played.json"
     for flags, episodes, at_once in (
-        ([], 30, 30),
+        ([], 100, 50),
         (["--n-episodes", "3"], 3, 3),
         (["-n", "10"], 2, 1),
     ):

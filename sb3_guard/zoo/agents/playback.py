@@ -25,7 +25,7 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_file
-from sb3_guard.zoo.run.hyperparams import check
+from sb3_guard.zoo.run.hyperparams import check, without_withdrawn
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, full_id
 from sb3_guard.zoo.run.run import Run
 
@@ -141,6 +141,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     require_named(run.path, flags, filed, "gym_packages")
     hyperparams = {**run.hyperparams(), "callback": None}
     refuse_places(run.path, hyperparams)
+    hyperparams = without_withdrawn(run.path, algorithm(flags.algo), hyperparams)
     hyperparams = check(flags.algo, algorithm(flags.algo), hyperparams)
     named = {"algo": flags.algo, "env": flags.env, "gym_packages": flags.gym_packages}
     played = Run(RunFlags.of(named), hyperparams)

@@ -197,6 +197,16 @@ def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
     return {**hints, **RUN_KEYS, **(NOISE_KEYS if "action_noise" in hints else {})}
 
 
+def without_withdrawn(
+    where: object, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Hyperparameters of a run's file, without those of an older version, which are named."""
+    gone = values.keys() - annotations(algorithm).keys()
+    if gone:
+        print(f"{where}: {', '.join(sorted(gone))} left out: withdrawn", file=sys.stderr)
+    return {name: value for name, value in values.items() if name not in gone}
+
+
 def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) -> dict[str, Any]:
     """
     The same hyperparameters as data, numbers in their proper type, or an error that says what to

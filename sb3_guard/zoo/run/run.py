@@ -66,7 +66,13 @@ from sb3_guard.zoo.run.folder import (
     require_writable,
     run_path,
 )
-from sb3_guard.zoo.run.hyperparams import Setup, build, check, read_hyperparams
+from sb3_guard.zoo.run.hyperparams import (
+    Setup,
+    build,
+    check,
+    read_hyperparams,
+    without_withdrawn,
+)
 from sb3_guard.zoo.run.logger import RunLogger, cut
 from sb3_guard.zoo.run.make_envs import (
     BAD_ARGUMENTS,
@@ -463,7 +469,8 @@ class Run:
         if not is_run(self.path):
             return "new"
         folder = RunFolder(self.path)
-        there = Run(folder.flags(), folder.hyperparams()).identity
+        values = without_withdrawn(self.path, self.algorithm, folder.hyperparams())
+        there = Run(folder.flags(), values).identity
         if others := differences(there, self.identity):
             words = [f"{name}: {a} there, {b} here" for name, a, b in others[:3]]
             raise UsageError(
@@ -509,9 +516,10 @@ class Run:
         """
         folder = RunFolder(Path(given.trained_agent))
         with lock(folder.path):
-            saved, values = folder.flags(), folder.hyperparams()
+            saved = folder.flags()
             require_named(folder.path, given, saved, "gym_packages")
             import_packages(given.gym_packages)
+            values = without_withdrawn(folder.path, algorithm(saved.algo), folder.hyperparams())
             state = read_checkpoint(folder.checkpoint)
             done = state["num_timesteps"]
             changed = {name: getattr(given, name) for name in {*given.given, "progress", "verbose"}}

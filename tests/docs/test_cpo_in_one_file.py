@@ -99,6 +99,7 @@ def test_one_update_is_cpos(share, costly):
         np.testing.assert_allclose(vector(module), expected, **TOLERANCE)
 
 
+@pytest.mark.slow
 def test_it_comes_to_its_limit(monkeypatch, capsys):
     monkeypatch.setattr(paper, "UPDATES", 12)
     monkeypatch.setattr(paper, "STEPS", 1000)

@@ -229,6 +229,7 @@ def test_files_of_the_repository_that_pages_name_exist():
         assert not {name for name in tests if not any((ROOT / "tests").rglob(name))}, page
 
 
+@pytest.mark.slow
 def test_tables_of_results_are_made_of_their_logs():
     for path, text in script("results").pages().items():
         assert path.read_text() == text, "run `python scripts/results.py`"

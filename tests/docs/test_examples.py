@@ -148,7 +148,7 @@ def test_the_loop_around_a_policy_stacks_frames_and_knows_the_last_cost(quick, m
     size = len(observation)
     shapes = {"observation": 3 * size, "last_cost": 1}
     inputs = [{"name": name, "shape": ["batch", n]} for name, n in shapes.items()]
-    outputs = [{"name": "action", "low": [-1.0, -1.0], "high": [1.0, 0.5]}]
+    outputs = [{"name": "action", "low": [-1.0, -1.0], "high": [1.0, 0.5], "stop": [0.0, 0.0]}]
     (quick / "contract.json").write_text(
         json.dumps({**CONTRACT, "inputs": inputs, "outputs": outputs})
     )
@@ -194,6 +194,7 @@ gymnasium.registry["Goal_Point_8Hazards-v0"].max_episode_steps = 10
 """
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(tmp_path):
     require_rendering()
     notebook = nbformat.read(NOTEBOOK, as_version=4)

@@ -92,6 +92,7 @@ sys.exit(train.main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 def test_what_the_recipes_add_works_together(copy):
     (command,) = re.findall(r"```bash\nsb3-guard train (.*?)\n```", TEXT)
     short = "n_envs:2 n_steps:50 n_critic_updates:2 price:2.0 -n 200 --eval-freq -1"

@@ -62,6 +62,7 @@ def test_packages_know_their_commit(wheel, tmp_path):
     subprocess.run([*build, "wheel"], cwd=source, check=True, capture_output=True)
 
 
+@pytest.mark.slow
 def test_a_wheel_installed_elsewhere_trains_and_plays(wheel, tmp_path):
     site = tmp_path / "site"
     wheel.extractall(site)

@@ -9,10 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from sb3_guard.zoo.cli.flags import HOST, IDENTITY, command, flag
 from sb3_guard.zoo.cli.usage import (
     UsageError,
-    factor,
-    positive,
     read_mapping,
-    seed_number,
 )
 from sb3_guard.zoo.run.flags import (
     EvaluationFlags,
@@ -69,12 +66,12 @@ class Flags(EvaluationFlags, TrainingFlags):
     envs: list[str] | None = flag(metavar="ENV", role=IDENTITY)
     preset: str | None = flag(metavar="NAME", role=IDENTITY)
     algos: list[str] | None = flag(metavar="ALGO", role=IDENTITY)
-    seeds: list[int] = flag(default=[0, 1], kind=seed_number, metavar="K", role=IDENTITY)
-    scale: float = flag(default=1.0, kind=factor, metavar="X", role=IDENTITY)
+    seeds: list[int] = flag(default=[0, 1], low=0, high=2**32, metavar="K", role=IDENTITY)
+    scale: float = flag(default=1.0, low=0, ends="()", metavar="X", role=IDENTITY)
     grid: str | None = flag(metavar="FILE", role=HOST)
     log_folder: str = flag("-f", default="logs/benchmark", metavar="DIR", role=HOST)
     dry_run: bool = flag(default=False, role=HOST)
-    jobs: int | None = flag(kind=positive, metavar="N", role=HOST)
+    jobs: int | None = flag(low=1, metavar="N", role=HOST)
     scheduler: str | None = flag(metavar="ADDRESS", role=HOST)
     verbose: Literal[0, 1] = flag(default=1, role=HOST)
 

@@ -1,10 +1,11 @@
 """Values of fields: whether an annotation and a range allow them, and in words what they allow.
 
-Hyperparameters, parameters of environments and flags in files have one rule. Booleans are no
-numbers, and NaN is none; a whole float is an integer; text that is a number counts as one, since
-YAML reads 1e-3 as text.
+Hyperparameters, parameters of environments and flags have one rule. Booleans are no numbers, and
+NaN is none; a whole float is an integer; text that is a number counts as one, since YAML reads 1e-3
+as text. Text of command lines and files is read from its syntax tree and never evaluated.
 """
 
+import ast
 import math
 import types
 import typing
@@ -52,10 +53,11 @@ def fit(
     if typing.get_origin(annotation) is typing.Literal:
         choices = typing.get_args(annotation)
     if choices is not None:
-        if value not in choices:
-            names = ["null" if choice is None else str(choice) for choice in choices]
-            raise ValueError(f"{name} = {value!r}: {did_you_mean(value, names)}")
-        return value
+        for choice in choices:
+            if value == choice or str(value) == str(choice):
+                return choice
+        names = ["null" if choice is None else str(choice) for choice in choices]
+        raise ValueError(f"{name} = {value!r}: {did_you_mean(value, names)}")
     try:
         made = typed(value, annotation)
     except TypeError:
@@ -182,3 +184,62 @@ def _bounds(low: float, high: float, ends: str) -> str:
     if math.isfinite(high):
         bounds.append(f"{'at most' if ends[1] == ']' else 'less than'} {high:.12g}")
     return " and ".join(bounds)
+
+
+def read_expression(text: str) -> Any:
+    """
+    The value of an expression such as ``dict(num=4, activation_fn=nn.ReLU)``.
+
+    :param text: literals, lists, tuples and mappings of them, ``dict(name=value)``; dotted names
+        stay text
+    :raises ValueError: anything else
+    """
+    try:
+        return _read(ast.parse(text.strip(), mode="eval").body)
+    except (SyntaxError, TypeError, MemoryError, RecursionError) as error:
+        raise ValueError(f"{text[:60]!r} is not an expression: {error}") from error
+
+
+def _read(node: ast.expr) -> Any:
+    match node:
+        case ast.Call(func=ast.Name(id="dict"), args=[], keywords=pairs):
+            if all(pair.arg for pair in pairs):  # none is **
+                return {pair.arg: _read(pair.value) for pair in pairs}
+        case ast.Dict(keys=keys, values=values):
+            # A shell takes quotes away, so that {limit:0.4} is what a user typed or what is left.
+            names = [
+                key.id if isinstance(key, ast.Name) else ast.literal_eval(key or node)
+                for key in keys
+            ]
+            return dict(zip(names, map(_read, values), strict=True))
+        case ast.List(elts=items):
+            return [*map(_read, items)]
+        case ast.Tuple(elts=items):
+            return tuple(map(_read, items))
+        case ast.Attribute():
+            return ast.unparse(node)
+        case ast.Constant() | ast.UnaryOp() | ast.BinOp() | ast.Set():
+            return ast.literal_eval(node)
+    raise ValueError(f"{ast.unparse(node)} is not allowed")
+
+
+def parse_value(text: str) -> Any:
+    """
+    The value of ``key:value``: an expression, see :func:`read_expression`, else the text itself.
+
+    So ``cost_limit:25``, ``policy:MlpPolicy``, ``hazards:{num:4}`` and ``learning_rate:lin_1e-3``
+    need no further quotes.
+    """
+    try:
+        return read_expression(text)
+    except ValueError:
+        return text
+
+
+def is_data(value: Any) -> bool:
+    """Whether a YAML file can hold the value."""
+    if isinstance(value, Mapping):
+        return all(isinstance(key, str) and is_data(item) for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return all(map(is_data, value))
+    return value is None or isinstance(value, str | bool | int | float)

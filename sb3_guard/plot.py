@@ -1,6 +1,5 @@
 """Tables and figures of trained runs: ``sb3-guard plot logs``."""
 
-import argparse
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
@@ -10,7 +9,7 @@ from typing import ClassVar
 
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.flags import Command, command, flag
-from sb3_guard.zoo.cli.usage import UsageError, positive
+from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.grids.presets import PRESETS
 from sb3_guard.zoo.results import figures, tables
 from sb3_guard.zoo.results import runs as reading
@@ -29,7 +28,7 @@ def file_of(*formats: str) -> Callable[[str], Path]:
         end = Path(text).suffix
         if end not in formats:
             hint = did_you_mean(end, formats)
-            raise argparse.ArgumentTypeError(f"{text!r}: unknown format {end!r}; {hint}")
+            raise ValueError(f"{text!r}: unknown format {end!r}; {hint}")
         return Path(text)
 
     return read
@@ -74,7 +73,7 @@ figures:
     report: Path | None = flag(kind=file_of(".html"), metavar="FILE.html")
     env: list[str] | None = flag(metavar="ID")
     cost_limit: list[float] | None = flag(metavar="D")
-    steps: int | None = flag(kind=positive, metavar="N")
+    steps: int | None = flag(low=1, metavar="N")
 
 
 def plot(flags: Flags) -> int:

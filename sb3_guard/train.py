@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from sb3_guard.zoo.cli.flags import command, flag
-from sb3_guard.zoo.cli.usage import UsageError, positive, seed_number
+from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.flags import RunFlags
 
 
@@ -34,8 +34,8 @@ class Flags(RunFlags):
   sb3-guard train -i logs/cpo/Goal_Point_8Hazards-v0_1                   continue a killed run
   sb3-guard train -i logs/cpo/Goal_Point_8Hazards-v0_1 -n 2e6            continue it to 2e6 steps
 """
-    seeds: list[int] | None = flag(kind=seed_number, metavar="K", exclusive="seeds")
-    jobs: int | None = flag(kind=positive, metavar="N")
+    seeds: list[int] | None = flag(low=0, high=2**32, metavar="K", exclusive="seeds")
+    jobs: int | None = flag(low=1, metavar="N")
 
 
 def train(flags: Flags) -> int:

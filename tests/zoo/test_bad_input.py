@@ -36,7 +36,6 @@ TRAIN = [
     # environment
     (["--env", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
     (["--env", "scene.yml"], ["'scene.yml' is a file", "sb3_guard.register"]),
-    (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),
     (["--env", "Goal_Point_8Hazzards-v0"], ["'Hazzards'", "'Hazards'"]),
     (["--env", "CartPole-v99"], ["CartPole-v99"]),
     (["--env", "Nonsense"], ["'Nonsense'", "--gym-packages"]),
@@ -49,13 +48,11 @@ TRAIN = [
     (["--env-kwargs", "hazards:{'size': 'big'}"], ["size", "'big'"]),
     (["--env-kwargs", "speed:{limit:0.4}", "hazards:{sise:0.4}"], ["'sise'", "'size'"]),
     (["--env-kwargs", "max_steps:100"], ["'max_steps'", "'max_episode_steps'"]),
-    (["--env-kwargs", "hazards"], ["'hazards' is not of the form key:value"]),
     ([*LIMITED, "--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
     (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError", "hazards"]),
     (["--eval-env-kwargs", "hazards:{'num':200}"], ["LayoutError", "hazards"]),
     ([*LIMITED, "--vec-env", "native"],
      ["'CostPoint-v0' is not an sb3_guard environment", "'dummy' or 'subproc'"]),
-    (["--vec-env", "fast"], ["--vec-env", "'fast'", "native"]),
     (["-params", "env_wrapper:gymnasium.wrappers.FlattenObservation", "--vec-env", "native"],
      ["env_wrapper of a run", "'dummy' or 'subproc'"]),
     # an environment without the cost key
@@ -65,7 +62,6 @@ TRAIN = [
     # hyperparameters
     (["-params", "n_step:10"], ["no hyperparameter 'n_step'", "did you mean 'n_steps'?"]),
     (["-params", "n_envs:0"], ["n_envs: 0", "at least 1"]),
-    (["-params", "n_envs"], ["'n_envs' is not of the form key:value"]),
     (["-params", "gamma:1.5"], ["gamma", "1.5"]),
     (["-params", "cost_limit:[1.0,2.0]"], ["cost_limit", "cost"]),
     (["--algo", "cup", "-params", "gamma:1"], ["gamma=1.0: CUP weighs costs", "such as 0.99"]),
@@ -82,14 +78,9 @@ TRAIN = [
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
     (["--gym-packages", "../x"], ["--gym-packages '../x' is not the name of a module"]),
-    (["--gym-packages", ".x"], ["--gym-packages: can't import '.x'"]),
     (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown argument --sede", "--seed"]),
-    (["cpo"], ["unknown argument cpo"]),
-    (["-n", "1.5"], ["'1.5' is not a whole number"]),
-    (["--seed", "4294967296"], ["--seed: '4294967296'", "2**32"]),
-    (["--n-eval-envs", "-2"], ["--n-eval-envs", "at least 1"]),
     (["--device", "abacus"], ["abacus"]),
     (["-i", "absent"], ["no run folder absent"]),
     ([*LIMITED, "-i", "absent.zip"], ["can't load absent.zip", "No such file"]),
@@ -109,7 +100,6 @@ ENJOY = [
     (["--exp-id", "7"], ["there is no run folder", "_7"]),
     (["-f", "nowhere"], ["'nowhere'"]),
     (["--n-episodes", "1", "-n", "5"], ["not allowed with"]),
-    (["--seed", "-1"], ["--seed: '-1'"]),
     (["--load-bets"], ["unknown argument --load-bets", "--load-best"]),
 ]
 
@@ -311,7 +301,7 @@ def test_agent_of_another_environment(capsys, run, tmp_path):
     ("change", "parts"),
     [
         (lambda args: {"a": 1}, ["unknown entry 'a'"]),
-        (lambda args: {**args, "seed": "one"}, ["seed: 'one' is not allowed"]),
+        (lambda args: {**args, "seed": "one"}, ["seed = 'one' must be"]),
     ],
 )
 def test_damaged_flags(change, parts, capsys, run):

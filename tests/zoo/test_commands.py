@@ -555,7 +555,7 @@ def test_list_shows_what_users_registered(capsys):
 def test_list_says_what_it_takes(capsys):
     assert cli.main(["list", "robot"]) == 2
     error = capsys.readouterr().err
-    assert "invalid choice: 'robot' (choose from" in error and error.count("\n") == 1
+    assert "kind = 'robot': did you mean 'robots'?" in error and error.count("\n") == 1
 
 
 def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):

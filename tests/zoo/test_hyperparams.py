@@ -10,8 +10,8 @@ from torch import nn
 from sb3_guard.algorithms import ALGORITHMS, CPO, SACLag
 from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.envs import env_ids
+from sb3_guard.fields import parse_value
 from sb3_guard.zoo.cli.usage import UsageError
-from sb3_guard.zoo.cli.values import parse_value
 from sb3_guard.zoo.run.algos import baselines
 from sb3_guard.zoo.run.hyperparams import (
     PRESETS,
@@ -261,7 +261,8 @@ def test_text_that_names_nothing(name, value, message):
         ("dict(num=4, more=dict(a=[1]))", {"num": 4, "more": {"a": [1]}}),
         ("MlpPolicy", "MlpPolicy"),
         ("'quoted'", "quoted"),
-        ("dict(activation_fn=nn.ReLU)", "dict(activation_fn=nn.ReLU)"),
+        ("dict(activation_fn=nn.ReLU)", {"activation_fn": "nn.ReLU"}),
+        ("dict(a=[x])", "dict(a=[x])"),
         ("", ""),
     ],
 )

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 from sb3_guard.zoo.cli.flags import Command, flag
-from sb3_guard.zoo.cli.usage import positive, seed_number
 
 
 @dataclass
@@ -46,11 +45,11 @@ class AgentFlags(Command):
     exp_id: int = flag(default=0, metavar="K")
     load_best: bool = flag(default=False, exclusive="model")
     pretrained: bool = flag(default=False, exclusive="model")
-    load_checkpoint: int | None = flag(kind=positive, metavar="STEPS", exclusive="model")
+    load_checkpoint: int | None = flag(low=1, metavar="STEPS", exclusive="model")
     load_last_checkpoint: bool = flag(default=False, exclusive="model")
-    n_episodes: int | None = flag(kind=positive, metavar="N", exclusive="length")
+    n_episodes: int | None = flag(low=1, metavar="N", exclusive="length")
     stochastic: bool = flag(default=False, exclusive="actions")
-    seed: int = flag(default=0, kind=seed_number)
+    seed: int = flag(default=0, low=0, high=2**32)
     env_kwargs: dict[str, Any] | None = flag()
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
     device: str = flag(default="auto")
@@ -85,7 +84,7 @@ class EnjoyFlags(AgentFlags):
   sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards --load-best --n-episodes 20
   sb3-guard enjoy --pretrained --env Goal_Point_8Hazards --record agent.mp4
 """
-    n_timesteps: int | None = flag("-n", kind=positive, metavar="N", exclusive="length")
+    n_timesteps: int | None = flag("-n", low=1, metavar="N", exclusive="length")
     deterministic: bool = flag(default=False, exclusive="actions")
     record: str | None = flag(nargs="?", const="", metavar="FILE.mp4")
     json: str | None = flag(metavar="FILE")

@@ -15,29 +15,31 @@ value in a file, and whether it is part of what a run *is*::
         \"\"\"
 
         algo: str = flag(default="cpo", role=IDENTITY)
-        n_timesteps: int = flag("-n", default=-1, kind=positive, metavar="N")
+        n_timesteps: int = flag("-n", default=-1, low=1, metavar="N")
 
     main = command(Flags, train)  # train(flags: Flags) -> exit status
 
 The long name is the field's (``--n-timesteps``), headings and help are the docstring's; a flag that
-has no line there is not shown. Annotations choose how a value is read: ``bool``
-is a switch, ``bool | None`` has a ``--no-…``, ``list[int]`` takes several, ``dict`` takes
-``key:value``, ``Literal`` one of its values.
+has no line there is not shown. Annotations choose how a value is read, from the command line as
+from a file: ``bool`` is a switch, ``bool | None`` has a ``--no-…``, ``list[int]`` takes several,
+``dict`` takes ``key:value``, ``Literal`` one of its values.
 """
 
 import argparse
 import dataclasses
 import inspect
+import math
 import re
 import sys
 import types
 import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from pathlib import Path
+from typing import Any, ClassVar, Literal, NoReturn, Self
 
-from sb3_guard.fields import in_words, typed
+from sb3_guard.fields import fit, parse_value
 from sb3_guard.spelling import did_you_mean, nearest
-from sb3_guard.zoo.cli.usage import Parser, UsageError, key_value, run
+from sb3_guard.zoo.cli.usage import UsageError, run
 
 # Roles of a flag: it says what a run is, how it is started, or how it is hosted and watched,
 # which may change when the run is resumed.
@@ -48,7 +50,10 @@ def flag(
     *names: str,
     default: Any = None,
     role: str = START,
-    kind: Callable[[Any], Any] | None = None,
+    low: float = -math.inf,
+    high: float = math.inf,
+    ends: str = "[)",
+    kind: Callable[[str], Any] | None = None,
     exclusive: str | None = None,
     positional: bool = False,
     **argparse_options: Any,
@@ -59,19 +64,26 @@ def flag(
     :param names: short names
     :param default: value where the flag is not given; a list or dictionary is copied
     :param role: ``IDENTITY``, ``START`` or ``HOST``
-    :param kind: makes the value of its text or number, and raises ``ArgumentTypeError``
+    :param low: least value of a number; also ``high``, and ``ends`` as for
+        :func:`sb3_guard.fields.fit`
+    :param kind: makes the value of its text, and raises ``ValueError``
     :param exclusive: at most one flag of the same ``exclusive`` can be given
     :param positional: the value is given without the flag's name
     :param argparse_options: for ``add_argument``, e.g. ``metavar``
     """
     meta = {
-        "names": names, "role": role, "kind": kind, "exclusive": exclusive,
-        "positional": positional, "options": argparse_options,
+        "names": names, "role": role, "range": (low, high, ends), "kind": kind,
+        "exclusive": exclusive, "positional": positional, "options": argparse_options,
     }  # fmt: skip
     if isinstance(default, list | dict):
-        copied = default
-        return dataclasses.field(default_factory=lambda: copied.copy(), metadata=meta)
+        return dataclasses.field(default_factory=default.copy, metadata=meta)
     return dataclasses.field(default=default, metadata=meta)
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Raise instead of printing the usage, which would bury the message."""
+        raise UsageError(" ".join(message.split()))
 
 
 @dataclasses.dataclass
@@ -86,9 +98,9 @@ class Command:
         self.given: frozenset[str] = frozenset()
 
     @classmethod
-    def parser(cls) -> Parser:
-        """The flags as a parser; what is not given is absent from its result."""
-        result = Parser(
+    def parser(cls) -> argparse.ArgumentParser:
+        """The flags as a parser of text; what is not given is absent from its result."""
+        result = _Parser(
             prog=cls.prog,
             description=inspect.cleandoc(cls.__doc__ or "").partition("\n\n")[0],
             epilog=cls.examples,
@@ -99,17 +111,26 @@ class Command:
         groups: dict[str, Any] = {}
         said = cls._said()
         for field, hint in cls._flags():
-            meta = field.metadata
+            meta, kind = field.metadata, _kind(hint)
             heading, help_ = said.get(field.name, ("options", argparse.SUPPRESS))
-            group = groups.get(heading)
-            if group is None:
-                group = groups[heading] = result.add_argument_group(heading)
-            if meta["exclusive"]:
-                name = meta["exclusive"]
+            if heading not in groups:
+                groups[heading] = result.add_argument_group(heading)
+            group = groups[heading]
+            if name := meta["exclusive"]:
                 if name not in groups:
                     groups[name] = group.add_mutually_exclusive_group()
                 group = groups[name]
-            options = {"help": help_, **_options(field, hint)}
+            options: dict[str, Any] = {"help": help_}
+            if kind is bool:
+                switch = hint is bool
+                options["action"] = "store_true" if switch else argparse.BooleanOptionalAction
+            elif kind is dict:  # may be repeated; what comes later wins
+                options |= {"nargs": "+", "action": "extend", "metavar": "KEY:VALUE"}
+            elif kind is list:
+                options["nargs"] = "+"
+            elif kind is Literal:
+                options["metavar"] = f"{{{','.join(map(str, typing.get_args(_bare(hint))))}}}"
+            options |= meta["options"]
             if meta["positional"]:
                 group.add_argument(field.name, **{"default": None, **options})
             else:
@@ -127,18 +148,10 @@ class Command:
         namespace, unknown = cls.parser().parse_known_args(argv)
         if unknown:
             word = unknown[0].split("=")[0]
-            flags = (field.name for field, _ in cls._flags() if not field.metadata["positional"])
-            near = nearest(word, map(_long, flags))
+            near = nearest(word, map(_long, cls.names()))
             remedy = f"did you mean {near}?" if near else "see --help"
             raise UsageError(f"unknown argument {word}; {remedy}")
-        parsed, given = vars(namespace), {}
-        for field, hint in cls._flags():
-            # What is absent is not there at all, except values that go without a flag.
-            bare = field.metadata["positional"]
-            if field.name in parsed and not (bare and parsed[field.name] in (None, [])):
-                value = parsed[field.name]
-                given[field.name] = dict(value) if _is(hint, dict) else value
-        return cls.of(given)
+        return cls.of(cls._read(vars(namespace)))
 
     @classmethod
     def of(cls, given: Mapping[str, Any]) -> Self:
@@ -157,23 +170,31 @@ class Command:
         :param but: flags that a file can't give
         :raises UsageError: a name is unknown, or a value not allowed
         """
-        flags = {field.name: (field, hint) for field, hint in cls._flags() if field.name not in but}
+        names = cls.names() - {*but}
+        content = {str(key).replace("-", "_"): value for key, value in data.items()}
+        for name in content.keys() - names:
+            hint = did_you_mean(name, sorted(names))
+            raise UsageError(f"{where}: unknown entry {name!r}; {hint}")
+        return cls.of(cls._read(content, where))
+
+    @classmethod
+    def _read(cls, data: Mapping[str, Any], where: object = None) -> dict[str, Any]:
+        """The values that are given; those of a file that are defaults are not."""
         given = {}
-        for key, value in data.items():
-            name = str(key).replace("-", "_")
-            if name not in flags:
-                raise UsageError(f"{where}: unknown entry {key!r}; {did_you_mean(name, flags)}")
-            field, hint = flags[name]
-            if value is not None and value != _default(field):
+        for field, hint in cls._flags():
+            name, value = field.name, data.get(field.name)
+            if where is not None:
+                label, absent = f"{where}: {name}", value is None or value == _default(field)
+            else:
+                label = name if field.metadata["positional"] else _long(name)
+                absent = value is None or value == []
+            if not absent:
                 try:
-                    value = _typed(hint, field.metadata["kind"], value)
-                except (ValueError, TypeError, argparse.ArgumentTypeError) as error:
-                    raise UsageError(
-                        f"{where}: {key}: {value!r} is not allowed; it must be {_words(hint)}"
-                        + (f" ({error})" if isinstance(error, argparse.ArgumentTypeError) else "")
-                    ) from None
-                given[name] = value
-        return cls.of(given)
+                    given[name] = _value(field, hint, value, label)
+                except ValueError as error:
+                    text = str(error)
+                    raise UsageError(text if label in text else f"{label}: {text}") from None
+        return given
 
     def values(self, *roles: str) -> dict[str, Any]:
         """The flags by name, of these roles only if any are named."""
@@ -183,7 +204,7 @@ class Command:
         """What :meth:`parse` reads as these flags; those that have their default are left out."""
         words = []
         for field, _ in self._flags():
-            value, name = getattr(self, field.name), _names(field)[-1]
+            value, name = getattr(self, field.name), _long(field.name)
             if field.name not in names or value == _default(field):
                 continue
             if isinstance(value, bool):
@@ -261,45 +282,26 @@ def _bare(hint: Any) -> Any:
     return hint
 
 
-def _is(hint: Any, kind: type) -> bool:
-    """Whether an annotation is a list or a dictionary, of whatever it holds."""
-    return (typing.get_origin(_bare(hint)) or _bare(hint)) is kind
+def _kind(hint: Any) -> Any:
+    """The type of an annotation: ``list`` of ``list[int] | None``."""
+    return typing.get_origin(_bare(hint)) or _bare(hint)
 
 
-def _options(field: "dataclasses.Field[Any]", hint: Any) -> dict[str, Any]:
-    """What argparse needs to know of a flag."""
-    meta, bare = field.metadata, _bare(hint)
-    arguments = typing.get_args(bare)
-    options: dict[str, Any] = {}
-    if bare is bool:
-        options["action"] = "store_true" if bare is hint else argparse.BooleanOptionalAction
-    elif _is(hint, dict):
-        # The flag may be repeated; what comes later wins.
-        options |= {"nargs": "+", "action": "extend", "type": key_value, "metavar": "KEY:VALUE"}
-    elif _is(hint, list):
-        options |= {"nargs": "+", "type": meta["kind"] or arguments[0]}
-    elif typing.get_origin(bare) is Literal:
-        options |= {"choices": list(arguments), "type": type(arguments[0])}
-    else:
-        options["type"] = meta["kind"] or bare
-    return options | meta["options"]
-
-
-def _typed(hint: Any, kind: Callable[[Any], Any] | None, value: Any) -> Any:
-    """A value of a file as the flag has it."""
+def _value(field: "dataclasses.Field[Any]", hint: Any, value: Any, label: str) -> Any:
+    """A value of a command line or a file as the flag has it."""
+    kind, made = _kind(hint), field.metadata["kind"]
     items = value if isinstance(value, list) else [value]
-    if _is(hint, dict):
-        return dict(value) if isinstance(value, Mapping) else dict(map(key_value, items))
-    if _is(hint, list):
-        if not items:
-            raise TypeError
-        made = typed(items, _bare(hint))
-        return [*map(kind, made)] if kind else made
-    made = typed(value, _bare(hint))
-    return kind(made) if kind else made
-
-
-def _words(hint: Any) -> str:
-    if _is(hint, dict):
-        return "a mapping or a list of key:value"
-    return "one value or a list of them" if _is(hint, list) else in_words(_bare(hint))
+    if kind is dict and not isinstance(value, Mapping):
+        pairs = [str(item).partition(":") for item in items]
+        for key, colon, _ in pairs:
+            if not (key and colon):
+                raise ValueError(f"{label}: {key!r} is not of the form key:value")
+        return {key: parse_value(text) for key, _, text in pairs}
+    if kind is list and not items:
+        raise ValueError(f"{label} = [] must be one value or a list of them")
+    if made is not None:
+        return [*map(made, items)] if kind is list else made(value)
+    if kind is Path:
+        return Path(value)
+    value = items if kind is list else value
+    return fit(label, value, _bare(hint), *field.metadata["range"])

@@ -6,22 +6,19 @@ file may name classes of :data:`KNOWN` packages only, and of modules that the co
 """
 
 import importlib
-import inspect
 import operator
 import re
 import shlex
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from sb3_guard.spelling import did_you_mean
+from sb3_guard.fields import read_expression
 from sb3_guard.zoo.cli.usage import UsageError, explained
-from sb3_guard.zoo.cli.values import read_expression
 
 if TYPE_CHECKING:
     from sb3_guard.zoo.cli.flags import Command
@@ -33,6 +30,7 @@ PRESETS = {"paper": "the paper"}
 BASES: dict[str, type] = {
     "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
 }  # fmt: skip
+ALLOWED = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
 # Names of arguments that say where to write: filename, save_path, video_folder, log_dir.
 PLACE = re.compile("(path|file|file_?name|folder|dir|directory)$")
 
@@ -65,8 +63,7 @@ def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:
 
     :param value: ``module.Class``, ``{module.Class: {argument: value}}``, or a list of such
     :return: classes and their arguments
-    :raises UsageError: it is not of that form, or a class is not there, not of its kind or without
-        such an argument
+    :raises UsageError: it is not of that form, or a class is not there, or not of its kind
     """
     result = []
     for entry in [] if value is None else value if isinstance(value, list) else [value]:
@@ -78,20 +75,8 @@ def classes(name: str, value: Any) -> list[tuple[Any, dict[str, Any]]]:
                 f"hyperparameter {name}: {entry!r} is not allowed; it must be module.Class, or "
                 "{module.Class: {argument: value}}"
             )
-        cls, arguments = import_class(name, path, BASES[name]), dict(arguments or {})
-        _check_arguments(name, cls, arguments)
-        result.append((cls, arguments))
+        result.append((import_class(name, path, BASES[name]), dict(arguments or {})))
     return result
-
-
-def _check_arguments(name: str, cls: type, arguments: Mapping[str, Any]) -> None:
-    parameters = inspect.signature(cls).parameters
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
-        return
-    known = [parameter for parameter in parameters if parameter not in ("env", "venv")]
-    for argument in arguments.keys() - known:
-        hint = did_you_mean(argument, known)
-        raise UsageError(f"{name}: {cls.__name__} has no argument {argument!r}; {hint}")
 
 
 def torch_class(path: str) -> Any:
@@ -114,12 +99,6 @@ def torch_class(path: str) -> Any:
     return value
 
 
-def _evaluating(name: str, value: Any) -> AbstractContextManager[None]:
-    what = f"hyperparameter {name}: {value!r} can't be evaluated"
-    allowed = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
-    return explained(what, ValueError, fix=allowed)
-
-
 def as_data(name: str, value: Any) -> Any:
     """
     A hyperparameter as data, of text such as ``dict(activation_fn=nn.ReLU)`` too.
@@ -128,8 +107,8 @@ def as_data(name: str, value: Any) -> Any:
     :raises UsageError: it is more than literals and names
     """
     if isinstance(value, str) and value.lstrip().startswith(("dict(", "{")):
-        with _evaluating(name, value):
-            return read_expression(value, str)
+        with explained(f"hyperparameter {name}: {value!r} can't be evaluated", fix=ALLOWED):
+            return read_expression(value)
     return value
 
 
@@ -144,7 +123,7 @@ def with_classes(name: str, value: Any) -> Any:
     if isinstance(value, list | tuple):
         return type(value)(with_classes(name, item) for item in value)
     if isinstance(value, str) and value.startswith(("nn.", "th.", "torch.")):
-        with _evaluating(name, value):
+        with explained(f"hyperparameter {name}: {value!r} can't be evaluated", fix=ALLOWED):
             return torch_class(value)
     return value
 

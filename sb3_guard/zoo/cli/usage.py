@@ -1,8 +1,6 @@
 """What a command says when it can't do what was asked: one line, exit status 2, no traceback."""
 
-import argparse
 import importlib
-import math
 import os
 import shlex
 import signal
@@ -13,12 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import yaml
 
 from sb3_guard.plain_yaml import load_yaml
-from sb3_guard.zoo.cli.values import parse_value
 
 
 class UsageError(Exception):
@@ -100,14 +97,6 @@ def import_packages(names: Sequence[str]) -> None:
 def packages_flag(modules: Sequence[str]) -> str:
     """The flag that names modules, for a command that is printed; empty: there are none."""
     return f" --gym-packages {shlex.join(map(str, modules))}" if modules else ""
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser that raises :class:`UsageError`."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise instead of printing the usage, which would bury the message."""
-        raise UsageError(" ".join(message.split()))
 
 
 def run(command: Callable[[], int]) -> int:
@@ -195,48 +184,3 @@ def interrupts_held() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
         if received:
             signal.raise_signal(signal.SIGINT)
-
-
-def number(
-    allowed: str, fits: Callable[[float], bool], kind: Callable[[float], float] = int
-) -> Callable[[Any], Any]:
-    """
-    What makes a number of a flag's text; ``3e5`` is a whole one, too.
-
-    :param allowed: which numbers, in words
-    :param fits: whether it is one of them; not asked for those that are not whole
-    :param kind: ``int`` or ``float``
-    """
-
-    def read(text: Any) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if kind is int and not value.is_integer():
-            raise argparse.ArgumentTypeError(
-                f"{text!r} is not a whole number, such as 300000 or 3e5"
-            )
-        if not fits(value):
-            raise argparse.ArgumentTypeError(f"{text!r} is not allowed; it must be {allowed}")
-        return kind(value)
-
-    return read
-
-
-steps = number("a whole number", lambda n: True)
-positive = number("at least 1", lambda n: n >= 1)
-count = number("at least 0", lambda n: n >= 0)
-amount = number("at least 0", lambda n: 0 <= n < math.inf, float)
-factor = number("above 0", lambda n: 0 < n < math.inf, float)
-seed_number = number("at least 0 and less than 2**32", lambda n: 0 <= n < 2**32)
-seed_or_random = number("less than 2**32; if negative, it is random", lambda n: n < 2**32)
-interval = number("at least 1, or -2 for never", lambda n: n >= 1 or n in (-1, -2))
-
-
-def key_value(text: Any) -> tuple[str, Any]:
-    """What RL-Zoo's ``n_steps:512`` stands for."""
-    key, colon, value = str(text).partition(":")
-    if not colon or not key:
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form key:value")
-    return key, parse_value(value)

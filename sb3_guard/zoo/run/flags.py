@@ -6,12 +6,7 @@ from typing import Any, Literal, Self
 
 from sb3_guard.zoo.cli.flags import HOST, IDENTITY, Command, flag
 from sb3_guard.zoo.cli.usage import (
-    amount,
     explained,
-    interval,
-    positive,
-    seed_or_random,
-    steps,
 )
 
 # Flags beside those of role IDENTITY that a run is trained again with: hyperparameters are stated
@@ -39,7 +34,7 @@ class TrainingFlags(Command):
         algorithms
     """
 
-    n_timesteps: int = flag("-n", default=-1, kind=positive, metavar="N")
+    n_timesteps: int = flag("-n", default=-1, low=1, metavar="N")
     hyperparams: dict[str, Any] | None = flag("-params")
     conf_file: str | None = flag("-conf", metavar="FILE")
     env_kwargs: dict[str, Any] | None = flag()
@@ -79,19 +74,19 @@ class EvaluationFlags(Command):
         (default: -1)
     """
 
-    eval_freq: int = flag(default=100_000, kind=steps, metavar="N", role=IDENTITY)
-    eval_episodes: int = flag(default=30, kind=positive, metavar="N", role=IDENTITY)
-    n_eval_envs: int | None = flag(kind=positive, metavar="N", role=IDENTITY)
+    eval_freq: int = flag(default=100_000, metavar="N", role=IDENTITY)
+    eval_episodes: int = flag(default=30, low=1, metavar="N", role=IDENTITY)
+    n_eval_envs: int | None = flag(low=1, metavar="N", role=IDENTITY)
     eval_env_kwargs: dict[str, Any] | None = flag(role=IDENTITY)
-    save_freq: int = flag(default=-1, kind=steps, metavar="N", role=IDENTITY)
-    checkpoint_every: float = flag(default=10.0, kind=amount, metavar="S", role=HOST)
+    save_freq: int = flag(default=-1, metavar="N", role=IDENTITY)
+    checkpoint_every: float = flag(default=10.0, low=0, metavar="S", role=HOST)
     tensorboard_log: str = flag("-tb", default="", metavar="DIR", role=HOST)
     track: bool = flag(default=False, role=HOST)
     wandb_project_name: str = flag(default="sb3_guard")
     wandb_entity: str | None = flag()
     wandb_group: str | None = flag()
     wandb_tags: list[str] = flag("-tags", default=[])
-    log_interval: int = flag(default=-1, kind=interval, metavar="N", role=IDENTITY)
+    log_interval: int = flag(default=-1, low=-2, metavar="N", role=IDENTITY)
     num_threads: int = flag(default=-1, metavar="N", role=HOST)
 
 
@@ -122,7 +117,7 @@ class RunFlags(EvaluationFlags, TrainingFlags):
 
     algo: str = flag(default="cpo", role=IDENTITY)
     env: str = flag(default="Goal_Point_8Hazards-v0", role=IDENTITY)
-    seed: int = flag(default=-1, kind=seed_or_random, role=IDENTITY, exclusive="seeds")
+    seed: int = flag(default=-1, high=2**32, role=IDENTITY, exclusive="seeds")
     trained_agent: str = flag("-i", default="", metavar="PATH", role=IDENTITY)
     log_folder: str = flag("-f", default="logs", metavar="DIR")
     uuid: bool = flag("-uuid", default=False)

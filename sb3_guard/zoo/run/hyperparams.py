@@ -29,7 +29,7 @@ from stable_baselines3.common.noise import (
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_guard.algorithms.common.arguments import signature
-from sb3_guard.fields import in_words, typed
+from sb3_guard.fields import in_words, is_data, typed
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.names import (
     PRESETS,
@@ -40,7 +40,6 @@ from sb3_guard.zoo.cli.names import (
     with_classes,
 )
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
-from sb3_guard.zoo.cli.values import is_data
 
 # What a hyperparameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).

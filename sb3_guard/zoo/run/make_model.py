@@ -7,8 +7,8 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard.common.monitor import find_monitor
+from sb3_guard.fields import is_data
 from sb3_guard.zoo.cli.usage import UsageError
-from sb3_guard.zoo.cli.values import is_data
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.hyperparams import annotations

@@ -6,11 +6,6 @@ from typing import ClassVar, Literal
 from sb3_guard.zoo.cli.flags import flag
 from sb3_guard.zoo.cli.usage import (
     UsageError,
-    amount,
-    count,
-    positive,
-    seed_number,
-    seed_or_random,
 )
 from sb3_guard.zoo.run.flags import TrainingFlags
 
@@ -70,24 +65,24 @@ class TuneFlags(TrainingFlags):
 
     algo: str = flag(default="cpo")
     env: str = flag(default="Goal_Point_8Hazards-v0")
-    cost_limit: list[float] | None = flag(kind=amount, metavar="D")
+    cost_limit: list[float] | None = flag(low=0, metavar="D")
     pareto: bool = flag(default=False)
     search_space: str | None = flag(metavar="FILE")
 
-    n_trials: int = flag("--max-total-trials", default=50, kind=positive, metavar="N")
-    seeds: list[int] = flag(default=[0], kind=seed_number, metavar="S")
-    seed: int = flag(default=-1, kind=seed_or_random)
+    n_trials: int = flag("--max-total-trials", default=50, low=1, metavar="N")
+    seeds: list[int] = flag(default=[0], low=0, high=2**32, metavar="S")
+    seed: int = flag(default=-1, high=2**32)
     sampler: Literal["tpe", "gp", "nsgaii", "random"] = flag(default="tpe")
     pruner: Literal["median", "halving", "none"] = flag(default="median")
-    n_startup_trials: int = flag(default=10, kind=count, metavar="N")
-    n_evaluations: int | None = flag(kind=positive, metavar="N")
-    eval_episodes: int = flag(default=5, kind=positive, metavar="N")
+    n_startup_trials: int = flag(default=10, low=0, metavar="N")
+    n_evaluations: int | None = flag(low=1, metavar="N")
+    eval_episodes: int = flag(default=5, low=1, metavar="N")
 
     log_folder: str = flag("-f", default="logs", metavar="DIR")
     study_name: str | None = flag(metavar="NAME")
     storage: str | None = flag(metavar="URL")
-    n_jobs: int = flag(default=1, kind=positive, metavar="N")
-    num_threads: int = flag(default=1, kind=positive, metavar="N")
+    n_jobs: int = flag(default=1, low=1, metavar="N")
+    num_threads: int = flag(default=1, low=1, metavar="N")
     verbose: Literal[0, 1, 2] = flag(default=1)
 
     def check(self) -> None:

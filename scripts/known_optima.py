@@ -149,8 +149,8 @@ def cell(outcomes: Sequence[Outcome], algo: str, name: str) -> str:
     n = len(outcomes)
 
     def mean(values: np.ndarray) -> str:
-        error = f" ± {values.std(ddof=1) / np.sqrt(n):.2f}" if n > 1 else ""
-        return f"{values.mean():.2f}{error}"
+        error = f"{values.std(ddof=1) / np.sqrt(n):.2f}" if n > 1 else "0.00"
+        return f"{values.mean():.2f}" + ("" if error == "0.00" else f" ± {error}")
 
     values = np.array([each.value for each in outcomes])
     costs = np.array([each.cost for each in outcomes])  # [seeds, m]
@@ -160,25 +160,21 @@ def cell(outcomes: Sequence[Outcome], algo: str, name: str) -> str:
 
 
 def tables(results: dict[Run, Outcome]) -> str:
-    """Markdown: for each scale a row per algorithm, a column per problem."""
-    texts = []
-    for scale in sorted({run[2] for run in results}, key=lambda each: (each != 1.0, each)):
-        cells = {
-            (algo, name): [
-                value for run, value in results.items() if run[:3] == (name, algo, scale)
-            ]
-            for algo, name in itertools.product(ALGORITHMS, problems())
-        }
-        names = [name for name in problems() if any(cells[algo, name] for algo in ALGORITHMS)]
-        lines = [] if scale == 1.0 else [f"Costs and limits × {scale:g}:", ""]
-        lines += ["| | " + " | ".join(names) + " |", "|" + "---|" * (len(names) + 1)]
-        for algo in ALGORITHMS:
-            row = {name: cells[algo, name] for name in names}
-            if any(row.values()):
-                shown = (cell(each, algo, name) if each else "" for name, each in row.items())
-                lines.append(f"| `{algo}` | " + " | ".join(shown) + " |")
-        texts.append("\n".join(lines))
-    return "\n\n".join(texts)
+    """Markdown: a row per algorithm, a column per problem, costs × 1."""
+    cells = {
+        (algo, name): [value for run, value in results.items() if run[:3] == (name, algo, 1.0)]
+        for algo, name in itertools.product(ALGORITHMS, problems())
+    }
+    names = [name for name in problems() if any(cells[algo, name] for algo in ALGORITHMS)]
+    lines = ["| | " + " | ".join(names) + " |", "|" + "---|" * (len(names) + 1)]
+    for algo in ALGORITHMS:
+        row = {name: cells[algo, name] for name in names}
+        if any(row.values()):
+            shown = (
+                cell(outcomes, algo, name) if outcomes else "" for name, outcomes in row.items()
+            )
+            lines.append(f"| `{algo}` | " + " | ".join(shown) + " |")
+    return "\n".join(lines)
 
 
 def failing(results: dict[Run, Outcome]) -> str:

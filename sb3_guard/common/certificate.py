@@ -1,0 +1,293 @@
+"""Certificates: an agent's mean episode cost is within its limit, shown by fresh episodes."""
+
+import hashlib
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from scipy import stats
+from stable_baselines3.common.type_aliases import PolicyPredictor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+
+from sb3_guard.checks import check_integer
+from sb3_guard.common.evaluation import bounded_name, evaluate_policy
+from sb3_guard.common.monitor import cost_keys_of
+
+#: The looks at the episodes, as shares of all episodes, and the share of the error that each takes.
+LOOKS = {0.25: 0.1, 0.5: 0.3, 1.0: 0.6}
+LEAST, MOST = 20, 400  # episodes of a certificate
+ERROR = 0.05  # probability that an agent whose mean cost is above the limit is certified
+
+Verdict = Literal["certified", "exceeds", "undecided"]
+
+
+def mean_bounds(values: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
+    """
+    One-sided confidence bounds of a mean, each of which fails with probability ``error``.
+
+    Student's bounds are too low for costs, most of which are small and few large: a sample without
+    the large ones has a small mean and a small deviation, too. Hall's cubic transformation of the
+    t statistic removes the influence of the skewness γ (Hall, 1992, On the removal of skewness by
+    transformation, J. R. Stat. Soc. B 54)::
+
+        W(t) = (3/γ) (cbrt(1 + γ (t/√n - γ/(6n))) - 1),    bound = mean - s W(±t)
+
+    :param values: n independent values along the last axis, shape [..., n]
+    :param error: probability, below 0.5
+    :return: lower and upper bound, each of shape [...]
+    """
+    n = values.shape[-1]
+    mean, deviation = values.mean(axis=-1), values.std(axis=-1, ddof=1)
+    scale = np.where(deviation > 0.0, deviation, 1.0)
+    skewness = (((values - mean[..., None]) / scale[..., None]) ** 3).mean(axis=-1)
+    skewness = np.where(np.abs(skewness) < 1e-6, 1e-6, skewness)
+
+    def bound(t: float) -> np.ndarray:
+        root = np.cbrt(1.0 + skewness * (t / math.sqrt(n) - skewness / (6 * n)))
+        return mean - deviation * 3.0 / skewness * (root - 1.0)
+
+    t = float(stats.t.ppf(1.0 - error, n - 1))
+    return bound(t), bound(-t)
+
+
+@dataclass(frozen=True)
+class CostBound:
+    """
+    What the episodes say of one cost and its limit.
+
+    :param limit: d
+    :param mean: mean episode cost
+    :param lower: lower confidence bound of the agent's true mean
+    :param upper: upper confidence bound of it
+    :param share_above: share of the episodes that cost more than d
+    :param deviation: standard deviation of an episode's cost
+    """
+
+    limit: float
+    mean: float
+    lower: float
+    upper: float
+    share_above: float
+    deviation: float
+
+    @classmethod
+    def of(cls, costs: np.ndarray, limit: float, error: float) -> "CostBound":
+        """The bounds from one cost an episode, shape [E]."""
+        lower, upper = mean_bounds(costs, error)
+        numbers = limit, costs.mean(), lower, upper, np.mean(costs > limit), costs.std(ddof=1)
+        return cls(*map(float, numbers))
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.upper <= self.limit:
+            return "certified"
+        return "exceeds" if self.lower > self.limit else "undecided"
+
+    def __str__(self) -> str:
+        words = {
+            "certified": f"upper bound {self.upper:.4g}",
+            "exceeds": f"lower bound {self.lower:.4g}",
+            "undecided": f"bounds {self.lower:.4g} and {self.upper:.4g}",
+        }[self.verdict]
+        return (
+            f"cost {self.mean:.4g}, {words}, limit {self.limit:g}; "
+            f"{self.share_above:.0%} of the episodes cost more"
+        )
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """
+    Whether an agent's mean episode cost is within its limits, and how that is known.
+
+    A *certified* agent's true mean costs, in this environment and with this kind of actions, are
+    within their limits, with a confidence of at least ``1 - error``, all looks and tries counted.
+    Single episodes may cost more, and events so rare that no episode saw them are not bounded.
+
+    :param costs: the bounds of each cost
+    :param episodes: number of fresh episodes
+    :param mean_return: their mean return
+    :param deterministic: whether the most likely actions were taken, or sampled ones
+    :param seed: of the episodes and of sampled actions
+    :param error: probability of a certificate for an agent that exceeds a limit
+    :param tries: number of agents that shared this error; this is one of them
+    :param env: id of the environment, and its arguments
+    :param agent: SHA-256 of the policy's weights and of the normaliser's statistics
+    :param versions: of the packages
+    """
+
+    costs: dict[str, CostBound]
+    episodes: int
+    mean_return: float
+    deterministic: bool
+    seed: int
+    error: float
+    tries: int
+    env: dict[str, Any]
+    agent: str
+    versions: dict[str, str]
+
+    @property
+    def verdict(self) -> Verdict:
+        """*certified* if every cost is, *exceeds* if any does."""
+        verdicts = {cost.verdict for cost in self.costs.values()}
+        if "exceeds" in verdicts:
+            return "exceeds"
+        return "certified" if verdicts == {"certified"} else "undecided"
+
+    @property
+    def nearest(self) -> CostBound:
+        """The bounds of the cost whose upper bound lies highest above its limit."""
+        return max(self.costs.values(), key=lambda cost: cost.upper - cost.limit)
+
+    @property
+    def to_decide(self) -> int | None:
+        """How many episodes would probably decide, if the mean stays; None if none would."""
+        costs = [cost for cost in self.costs.values() if cost.verdict == "undecided"]
+        if not costs or any(cost.mean == cost.limit for cost in costs):
+            return None
+        t = stats.norm.ppf(1.0 - self.error / self.tries / len(self.costs) * LOOKS[1.0])
+        widths = (t * cost.deviation / abs(cost.mean - cost.limit) for cost in costs)
+        return math.ceil(max(max(widths) ** 2, 1.1 * self.episodes))
+
+    def __str__(self) -> str:
+        actions = "most likely" if self.deterministic else "sampled"
+        tail = (
+            f"return {self.mean_return:.4g}; {self.episodes} fresh episodes, {actions} actions, "
+            f"confidence {1 - self.error:.0%}"
+        )
+        if self.verdict == "undecided" and self.to_decide is not None:
+            tail += f"; about {self.to_decide:,} episodes would decide"
+        names = "" if len(self.costs) == 1 else "{}: "
+        lines = [f"{names.format(name)}{cost.verdict}: {cost}" for name, cost in self.costs.items()]
+        return "\n".join([*lines[:-1], f"{lines[-1]}; {tail}"])
+
+    def to_json(self) -> str:
+        """All fields, with the verdict, as JSON."""
+        return json.dumps({"verdict": self.verdict, **asdict(self)}, indent=2, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Certificate":
+        """The certificate that :meth:`to_json` wrote."""
+        content = json.loads(text)
+        costs = {name: CostBound(**cost) for name, cost in content["costs"].items()}
+        del content["verdict"]
+        return cls(**{**content, "costs": costs})
+
+
+def agent_hash(model: Any, env: VecEnv) -> str:
+    """SHA-256 of the policy's weights and of the statistics that normalise its observations."""
+    digest = hashlib.sha256()
+    policy = getattr(model, "policy", model)
+    weights = policy.state_dict() if isinstance(policy, th.nn.Module) else {}
+    for name, tensor in sorted(weights.items()):
+        digest.update(name.encode() + np.ascontiguousarray(tensor.cpu()).tobytes())
+    normalizer = unwrap_vec_normalize(env)
+    if normalizer is not None and normalizer.norm_obs:
+        moments = normalizer.obs_rms
+        parts = sorted(moments.items()) if isinstance(moments, dict) else [("", moments)]
+        for name, part in parts:
+            digest.update(name.encode() + part.mean.tobytes() + part.var.tobytes())
+    return digest.hexdigest()
+
+
+def _described(env: VecEnv) -> dict[str, Any]:
+    """The id and the arguments of an environment, as far as it says."""
+    try:
+        spec = env.get_attr("spec")[0]
+        return {"id": spec.id, "kwargs": json.loads(json.dumps(spec.kwargs, default=str))}
+    except (AttributeError, IndexError):
+        return {"id": "", "kwargs": {}}
+
+
+def certify(
+    model: PolicyPredictor,
+    env: gym.Env | VecEnv,
+    cost_limit: float | Sequence[float] | None = None,
+    *,
+    n_episodes: int = MOST,
+    deterministic: bool = False,
+    cost_keys: Sequence[str] | None = None,
+    seed: int | None = None,
+    error: float = ERROR,
+    tries: int = 1,
+) -> Certificate:
+    """
+    Play fresh episodes and say whether the agent's mean episode cost is within its limit.
+
+    After a quarter, half and all of the episodes, bounds of the mean
+    (:func:`mean_bounds`) are compared with the limit; the first look that decides is the last. The
+    error is shared among looks, costs and tries (Bonferroni), so that an agent whose true mean is
+    above the limit is certified with probability ``error`` at most. ``scripts/certificates.py``
+    measures that by simulation.
+
+    :param model: anything with ``predict``; its training must not have seen ``seed``
+    :param env: a single or a vectorised environment with costs, normalised as in training
+    :param cost_limit: d, one number or one per cost key; None: the model's own
+    :param n_episodes: most episodes to play, at least 20
+    :param deterministic: take the most likely action instead of sampling
+    :param cost_keys: entries of info that are costs; None: those of the model or the environment
+    :param seed: of the episodes; None draws one
+    :param error: probability of a false certificate
+    :param tries: how many agents share this error, such as candidates of one training
+    :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
+        a cost, or the normalisation of the model's observations is absent
+    """
+    check_integer("n_episodes", n_episodes, LEAST)
+    if not isinstance(env, VecEnv):
+        lone = env
+        env = DummyVecEnv([lambda: lone])
+    keys = tuple(cost_keys_of(model, env) if cost_keys is None else cost_keys)
+    limits = np.asarray(
+        getattr(model, "final_cost_limits", None) if cost_limit is None else cost_limit
+    )
+    if (
+        limits.dtype.kind not in "iuf"
+        or not np.isfinite(limits).all()
+        or limits.shape not in ((), (1,), (len(keys),))
+    ):
+        raise ValueError(
+            f"cost_limit={cost_limit!r}: must be a finite number, or one for each of {keys}"
+        )
+    limits = np.broadcast_to(limits, len(keys))
+    if seed is None:
+        seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1)
+    names = [bounded_name(key, getattr(model, "limit_on", "sum")) for key in keys]
+    costs, returns = np.zeros((0, len(keys))), np.zeros(0)
+    for look, (share, part) in enumerate(LOOKS.items()):
+        played = evaluate_policy(
+            model,
+            env,
+            math.ceil(share * n_episodes) - len(returns),
+            deterministic,
+            seed=seed + look,
+            cost_keys=keys,
+        )
+        costs = np.concatenate([costs, played.limited])
+        returns = np.concatenate([returns, played.returns])
+        error_of_look = error * part / tries / len(keys)
+        bounds = map(CostBound.of, costs.T, limits.tolist(), [error_of_look] * len(keys))
+        certificate = Certificate(
+            costs=dict(zip(names, bounds, strict=True)),
+            episodes=len(returns),
+            mean_return=float(returns.mean()),
+            deterministic=deterministic,
+            seed=seed,
+            error=error,
+            tries=tries,
+            env=_described(env),
+            agent=agent_hash(model, env),
+            versions={
+                name: version(name)
+                for name in ("sb3-guard", "stable-baselines3", "torch", "mujoco")
+            },
+        )
+        if certificate.verdict != "undecided":
+            break
+    return certificate

@@ -1,0 +1,157 @@
+"""A certificate is seldom false, is given to safe agents, and says what it is about."""
+
+import json
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from scipy import stats
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_guard.common.certificate import ERROR, LOOKS, MOST, Certificate, certify, mean_bounds
+
+
+class Lottery(gym.Env):
+    """Episodes of one step, whose cost is drawn from an exponential distribution."""
+
+    observation_space = spaces.Box(-1, 1, (1,), np.float32)
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, mean: float = 1.0, keys: tuple[str, ...] = ("cost",)) -> None:
+        self.mean, self.keys = mean, keys
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        costs = {
+            key: (i + 1) * self.np_random.exponential(self.mean) for i, key in enumerate(self.keys)
+        }
+        return np.zeros(1, np.float32), 2.0, True, False, costs
+
+
+class Idle:
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.zeros((len(observation), 1), np.float32), None
+
+
+def false_certificates(costs: np.ndarray, share: float = 1.0) -> float:
+    """The share of agents, of true mean 1, whose mean is said to be below 0.9999."""
+    safe = np.zeros(len(costs), bool)
+    for part, error in LOOKS.items():
+        _, upper = mean_bounds(costs[:, : round(part * MOST)], ERROR * (error if share else 1.0))
+        safe |= upper <= 0.9999
+    return float(safe.mean())
+
+
+def exponential(rng, shape):
+    return rng.exponential(1.0, shape)
+
+
+def rare(rng, shape):
+    return np.where(rng.random(shape) < 0.1, 10.0, 0.0)
+
+
+@pytest.mark.parametrize("draw", [exponential, rare], ids=["exponential", "90 % zeros"])
+def test_few_certificates_are_false_and_only_if_the_looks_share_the_error(draw):
+    costs = draw(np.random.default_rng(0), (10_000, MOST))
+    noise = 3 * math.sqrt(ERROR * (1 - ERROR) / len(costs))
+    assert false_certificates(costs) <= ERROR + noise
+    assert false_certificates(costs, share=0.0) > ERROR + noise
+
+
+def test_students_bounds_would_be_too_low():
+    costs = rare(np.random.default_rng(0), (10_000, 100))
+    student = costs.mean(axis=1) + stats.t.ppf(0.95, 99) * costs.std(axis=1, ddof=1) / 10
+    assert np.mean(student < 1.0) > 0.06
+    assert np.mean(mean_bounds(costs, 0.05)[1] < 1.0) < 0.05
+
+
+def test_without_skewness_the_bounds_are_students():
+    values = np.array([-1.0, 1.0] * 50)
+    half = stats.t.ppf(0.99, 99) * values.std(ddof=1) / 10
+    np.testing.assert_allclose(mean_bounds(values, 0.01), (-half, half), rtol=2e-3)
+    # One that is turned around has its bounds turned around.
+    values = np.random.default_rng(0).exponential(1.0, 50)
+    np.testing.assert_allclose(
+        mean_bounds(-values, 0.05), np.negative(mean_bounds(values, 0.05))[::-1]
+    )
+    np.testing.assert_allclose(mean_bounds(np.full(30, 7.0), 0.05), (7.0, 7.0))
+
+
+@pytest.mark.parametrize(
+    ("limit", "verdict", "episodes"),
+    [(3.0, "certified", 100), (0.4, "exceeds", 100), (1.02, "undecided", MOST)],
+)
+def test_the_first_look_that_decides_is_the_last(limit, verdict, episodes):
+    certificate = certify(Idle(), Lottery(), limit, seed=1)
+    assert (certificate.verdict, certificate.episodes) == (verdict, episodes)
+    cost = certificate.costs["cost"]
+    assert cost.lower < cost.mean < cost.upper and certificate.mean_return == 2.0
+    assert str(certificate).startswith(f"{verdict}: cost ") and "\n" not in str(certificate)
+    assert (certificate.to_decide is not None) == (verdict == "undecided")
+    text = certificate.to_json()
+    assert json.loads(text)["verdict"] == verdict
+    assert Certificate.from_json(text) == certificate
+
+
+def test_the_episodes_depend_on_the_seed_alone():
+    results = [certify(Idle(), Lottery(), 3.0, seed=seed).costs["cost"].mean for seed in (1, 1, 2)]
+    assert results[0] == results[1] != results[2]
+    several = certify(Idle(), DummyVecEnv([Lottery] * 7), 3.0, seed=1)
+    assert several.episodes == 100 and several.verdict == "certified"
+
+
+def test_tries_and_costs_share_the_error():
+    bounds = [certify(Idle(), Lottery(), 3.0, seed=1, tries=n).nearest.upper for n in (1, 3)]
+    assert bounds[0] < bounds[1]
+    both = certify(
+        Idle(), Lottery(keys=("cost", "other")), (3.0, 6.0), cost_keys=("cost", "other"), seed=1
+    )
+    assert both.verdict == "certified" and [*both.costs] == ["cost", "other"]
+    assert len(str(both).splitlines()) == 2
+    assert both.costs["cost"].limit == 3.0 and both.costs["other"].limit == 6.0
+    assert (
+        certify(
+            Idle(), Lottery(keys=("cost", "other")), (3.0, 0.1), cost_keys=("cost", "other"), seed=1
+        ).verdict
+        == "exceeds"
+    )
+
+
+def test_the_hash_knows_weights_and_normaliser():
+    env = VecNormalize(DummyVecEnv([Lottery]), norm_reward=False)
+    hashes = []
+    for seed in (0, 0, 1):
+        model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=seed)
+        hashes.append(certify(model, env, 3.0, n_episodes=20, seed=1).agent)
+    env.obs_rms.mean += 1.0
+    hashes.append(certify(model, env, 3.0, n_episodes=20, seed=1).agent)
+    assert hashes[0] == hashes[1] and len({*hashes}) == 3
+
+
+@pytest.mark.parametrize("limit", [math.nan, math.inf, None, "1", (1.0, 2.0)])
+def test_a_limit_is_a_finite_number(limit):
+    with pytest.raises(ValueError, match="cost_limit"):
+        certify(Idle(), Lottery(), limit)
+
+
+def test_fewer_than_twenty_episodes_are_refused():
+    with pytest.raises(ValueError, match="n_episodes.*20"):
+        certify(Idle(), Lottery(), 1.0, n_episodes=19)
+
+
+def test_absent_costs_are_refused():
+    with pytest.raises(ValueError, match="cost"):
+        certify(Idle(), Lottery(keys=("price",)), 1.0)
+
+
+def test_an_absent_normaliser_is_refused():
+    env = VecNormalize(DummyVecEnv([Lottery]), norm_reward=False)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8)
+    with pytest.raises(ValueError, match="VecNormalize"):
+        certify(model, DummyVecEnv([Lottery]), 1.0)

@@ -12,6 +12,7 @@ COMMANDS = {
     "benchmark": "train a grid of environments, algorithms and seeds",
     "reproduce": "train a published run again and compare",
     "enjoy": "play a trained agent, print return and cost, record a video",
+    "certify": "say whether a trained agent keeps its limit, by fresh episodes",
     "export": "write a trained agent as one ONNX file",
     "plot": "make tables, figures and a page of trained runs",
     "hub": "upload a trained agent to the Hugging Face hub, or download one",
@@ -21,8 +22,8 @@ COMMANDS = {
 
 
 def module_of(command: str) -> str:
-    """The module of a command; that of ``export`` is not called like it, as a function is."""
-    return f"sb3_guard.{'export_agent' if command == 'export' else command}"
+    """The module of a command; functions of the package are called like two of the commands."""
+    return f"sb3_guard.{command}{'_agent' if command in ('certify', 'export') else ''}"
 
 
 def _usage() -> str:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -15,8 +16,9 @@ from scipy import stats
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
 
+from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.checks import check_integer
-from sb3_guard.common.evaluation import bounded_name, evaluate_policy
+from sb3_guard.common.evaluation import Evaluation, bounded_name, evaluate_policy, lacks_statistics
 from sb3_guard.common.monitor import cost_keys_of
 
 #: The looks at the episodes, as shares of all episodes, and the share of the error that each takes.
@@ -111,7 +113,9 @@ class Certificate:
     Single episodes may cost more, and events so rare that no episode saw them are not bounded.
 
     :param costs: the bounds of each cost
-    :param episodes: number of fresh episodes
+    :param episodes: number of fresh episodes, without those that a physics error ended
+    :param physics_errors: number of these; the costs of such an episode are not known, so that an
+        agent that has any is not certified
     :param mean_return: their mean return
     :param deterministic: whether the most likely actions were taken, or sampled ones
     :param seed: of the episodes and of sampled actions
@@ -124,6 +128,7 @@ class Certificate:
 
     costs: dict[str, CostBound]
     episodes: int
+    physics_errors: int
     mean_return: float
     deterministic: bool
     seed: int
@@ -139,7 +144,8 @@ class Certificate:
         verdicts = {cost.verdict for cost in self.costs.values()}
         if "exceeds" in verdicts:
             return "exceeds"
-        return "certified" if verdicts == {"certified"} else "undecided"
+        safe = verdicts == {"certified"} and self.physics_errors == 0
+        return "certified" if safe else "undecided"
 
     @property
     def nearest(self) -> CostBound:
@@ -150,7 +156,7 @@ class Certificate:
     def to_decide(self) -> int | None:
         """How many episodes would probably decide, if the mean stays; None if none would."""
         costs = [cost for cost in self.costs.values() if cost.verdict == "undecided"]
-        if not costs or any(cost.mean == cost.limit for cost in costs):
+        if not costs or self.physics_errors or any(cost.mean == cost.limit for cost in costs):
             return None
         t = stats.norm.ppf(1.0 - self.error / self.tries / len(self.costs) * LOOKS[1.0])
         widths = (t * cost.deviation / abs(cost.mean - cost.limit) for cost in costs)
@@ -164,9 +170,12 @@ class Certificate:
         )
         if self.verdict == "undecided" and self.to_decide is not None:
             tail += f"; about {self.to_decide:,} episodes would decide"
-        names = "" if len(self.costs) == 1 else "{}: "
-        lines = [f"{names.format(name)}{cost.verdict}: {cost}" for name, cost in self.costs.items()]
-        return "\n".join([*lines[:-1], f"{lines[-1]}; {tail}"])
+        if self.physics_errors:
+            tail += f"; {self.physics_errors} more ended in a physics error"
+        if len(self.costs) == 1:
+            return f"{self.verdict}: {next(iter(self.costs.values()))}; {tail}"
+        lines = [f"  {name}: {cost.verdict}, {cost}" for name, cost in self.costs.items()]
+        return "\n".join([f"{self.verdict}: {tail}", *lines])
 
     def to_json(self) -> str:
         """All fields, with the verdict, as JSON."""
@@ -201,7 +210,8 @@ def _described(env: VecEnv) -> dict[str, Any]:
     """The id and the arguments of an environment, as far as it says."""
     try:
         spec = env.get_attr("spec")[0]
-        return {"id": spec.id, "kwargs": json.loads(json.dumps(spec.kwargs, default=str))}
+        kwargs = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
+        return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs, default=str))}
     except (AttributeError, IndexError):
         return {"id": "", "kwargs": {}}
 
@@ -212,7 +222,7 @@ def certify(
     cost_limit: float | Sequence[float] | None = None,
     *,
     n_episodes: int = MOST,
-    deterministic: bool = False,
+    deterministic: bool = True,
     cost_keys: Sequence[str] | None = None,
     seed: int | None = None,
     error: float = ERROR,
@@ -227,13 +237,14 @@ def certify(
     above the limit is certified with probability ``error`` at most. ``scripts/certificates.py``
     measures that by simulation.
 
-    :param model: anything with ``predict``; its training must not have seen ``seed``
+    :param model: anything with ``predict``: an algorithm of Stable-Baselines3 or a policy
     :param env: a single or a vectorised environment with costs, normalised as in training
     :param cost_limit: d, one number or one per cost key; None: the model's own
     :param n_episodes: most episodes to play, at least 20
     :param deterministic: take the most likely action instead of sampling
     :param cost_keys: entries of info that are costs; None: those of the model or the environment
-    :param seed: of the episodes; None draws one
+    :param seed: the episodes' seeds are drawn from it, and are not those that training or
+        evaluation with the same seed draw; None draws one
     :param error: probability of a false certificate
     :param tries: how many agents share this error, such as candidates of one training
     :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
@@ -244,39 +255,32 @@ def certify(
         lone = env
         env = DummyVecEnv([lambda: lone])
     keys = tuple(cost_keys_of(model, env) if cost_keys is None else cost_keys)
-    limits = np.asarray(
-        getattr(model, "final_cost_limits", None) if cost_limit is None else cost_limit
-    )
-    if (
-        limits.dtype.kind not in "iuf"
-        or not np.isfinite(limits).all()
-        or limits.shape not in ((), (1,), (len(keys),))
-    ):
-        raise ValueError(
-            f"cost_limit={cost_limit!r}: must be a finite number, or one for each of {keys}"
-        )
-    limits = np.broadcast_to(limits, len(keys))
+    limits = _limits(model, cost_limit, keys)
     if seed is None:
-        seed = int(np.random.SeedSequence().generate_state(1)[0] >> 1)
+        seed = int(np.random.SeedSequence().generate_state(1)[0])
     names = [bounded_name(key, getattr(model, "limit_on", "sum")) for key in keys]
     costs, returns = np.zeros((0, len(keys))), np.zeros(0)
     for look, (share, part) in enumerate(LOOKS.items()):
-        played = evaluate_policy(
-            model,
-            env,
-            math.ceil(share * n_episodes) - len(returns),
-            deterministic,
-            seed=seed + look,
-            cost_keys=keys,
+        # Words of the seed's children, which training with the same seed has not drawn.
+        fresh = int(np.random.SeedSequence(seed, spawn_key=(2, look)).generate_state(1)[0] >> 1)
+        played = _play(
+            model, env, math.ceil(share * n_episodes) - len(returns), deterministic, fresh, keys
         )
         costs = np.concatenate([costs, played.limited])
         returns = np.concatenate([returns, played.returns])
+        ended = np.isfinite(costs).all(axis=1)
+        if ended.sum() < 2:
+            raise ValueError("the episodes ended in a physics error, whose costs are not known")
         error_of_look = error * part / tries / len(keys)
-        bounds = map(CostBound.of, costs.T, limits.tolist(), [error_of_look] * len(keys))
+        bounds = (
+            CostBound.of(cost, limit, error_of_look)
+            for cost, limit in zip(costs[ended].T, limits, strict=True)
+        )
         certificate = Certificate(
             costs=dict(zip(names, bounds, strict=True)),
-            episodes=len(returns),
-            mean_return=float(returns.mean()),
+            episodes=int(ended.sum()),
+            physics_errors=int((~ended).sum()),
+            mean_return=float(returns[ended].mean()),
             deterministic=deterministic,
             seed=seed,
             error=error,
@@ -291,3 +295,52 @@ def certify(
         if certificate.verdict != "undecided":
             break
     return certificate
+
+
+def _limits(model: Any, cost_limit: Any, keys: Sequence[str]) -> list[float]:
+    """One limit for each cost."""
+    given: Any = cost_limit
+    if cost_limit is None and isinstance(model, Constrained) and model.constrained:
+        given = model.final_cost_limits
+    limits = np.asarray(given)
+    if (
+        limits.dtype.kind not in "iuf"
+        or not np.isfinite(limits).all()
+        or limits.shape not in ((), (1,), (len(keys),))
+    ):
+        need = "must be a finite number" if len(keys) == 1 else f"one number for each of {keys}"
+        hint = ": the model has no limit of its own" if cost_limit is None else ""
+        raise ValueError(f"cost_limit={cost_limit!r}{hint}, {need}")
+    return [float(limit) for limit in np.broadcast_to(limits, len(keys))]
+
+
+def _play(
+    model: PolicyPredictor,
+    env: VecEnv,
+    episodes: int,
+    deterministic: bool,
+    seed: int,
+    keys: tuple[str, ...],
+) -> Evaluation:
+    """
+    Episodes of an agent, all of them.
+
+    :raises ValueError: one has no end, no step reports a cost, or the observations lack the
+        normalisation that the agent learnt with
+    """
+    if lacks_statistics(model, env):
+        raise ValueError(
+            "the agent learnt from normalised observations, and env has no VecNormalize of theirs"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what they say of these episodes is an error here
+        played = evaluate_policy(model, env, episodes, deterministic, seed=seed, cost_keys=keys)
+    if len(played) < episodes:
+        raise ValueError(
+            f"{episodes - len(played)} of {episodes} episodes did not end; limit their length, "
+            "with gymnasium.wrappers.TimeLimit(env, 1000) or, in commands, --env-kwargs "
+            "max_episode_steps:1000"
+        )
+    if not played.reported:
+        raise ValueError(f"no step reported a cost as {', '.join(keys)} in info: name cost_keys")
+    return played

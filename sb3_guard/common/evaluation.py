@@ -56,6 +56,7 @@ class Evaluation:
     :param limit_on: what of the costs the model's limits bound, their ``"sum"`` or ``"max"``
     :param limits: the model's limits, one for each cost key; empty if it has none
     :param cost_keys: the m entries of info that were read as costs
+    :param reported: whether any step had one of them
     """
 
     returns: np.ndarray
@@ -68,6 +69,7 @@ class Evaluation:
     limit_on: str = "sum"
     limits: tuple[float, ...] = ()
     cost_keys: tuple[str, ...] = ("cost",)
+    reported: bool = True
 
     def __len__(self) -> int:
         return len(self.returns)
@@ -499,4 +501,5 @@ class _Tally:
             limit_on=limit_on,
             limits=limits,
             cost_keys=self.keys,
+            reported=self.reported,
         )

@@ -113,7 +113,11 @@ def test_tries_and_costs_share_the_error():
         Idle(), Lottery(keys=("cost", "other")), (3.0, 6.0), cost_keys=("cost", "other"), seed=1
     )
     assert both.verdict == "certified" and [*both.costs] == ["cost", "other"]
-    assert len(str(both).splitlines()) == 2
+    assert [line.split(":")[0].strip() for line in str(both).splitlines()] == [
+        "certified",
+        "cost",
+        "other",
+    ]
     assert both.costs["cost"].limit == 3.0 and both.costs["other"].limit == 6.0
     assert (
         certify(
@@ -141,13 +145,44 @@ def test_a_limit_is_a_finite_number(limit):
 
 
 def test_fewer_than_twenty_episodes_are_refused():
-    with pytest.raises(ValueError, match="n_episodes.*20"):
+    with pytest.raises(ValueError, match=r"n_episodes.*20"):
         certify(Idle(), Lottery(), 1.0, n_episodes=19)
 
 
 def test_absent_costs_are_refused():
     with pytest.raises(ValueError, match="cost"):
         certify(Idle(), Lottery(keys=("price",)), 1.0)
+
+
+class Breaks(Lottery):
+    """Every third episode ends in a physics error."""
+
+    episodes = 0
+
+    def step(self, action):
+        *step, info = super().step(action)
+        self.episodes += 1
+        return *step, {**info, "physics_error": self.episodes % 3 == 0}
+
+
+def test_an_agent_that_breaks_the_simulation_is_not_certified():
+    certificate = certify(Idle(), Breaks(), 3.0, n_episodes=90, seed=1)
+    assert certificate.verdict == "undecided" and certificate.to_decide is None
+    assert (certificate.episodes, certificate.physics_errors) == (60, 30)
+    assert certificate.costs["cost"].upper < 3.0 and "30 more" in str(certificate)
+    assert certify(Idle(), Breaks(), 0.3, n_episodes=90, seed=1).verdict == "exceeds"
+
+
+class Endless(Lottery):
+    def step(self, action):
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, False, False, info
+
+
+def test_episodes_without_an_end_are_refused(monkeypatch):
+    monkeypatch.setattr("sb3_guard.common.evaluation.LONGEST", 50)
+    with pytest.raises(ValueError, match=r"5 of 5 episodes did not end.*max_episode_steps"):
+        certify(Idle(), Endless(), 1.0, n_episodes=20)
 
 
 def test_an_absent_normaliser_is_refused():

@@ -94,6 +94,35 @@ class EnjoyFlags(AgentFlags):
 
 
 @dataclass
+class CertifyFlags(AgentFlags):
+    """
+    Say whether a trained agent's mean episode cost is within its limit, by fresh episodes.
+
+    After 100, 200 and 400 episodes an upper 95 % confidence bound of the mean is compared with the
+    limit. The status is 0 if the agent is certified, else 1.
+
+    What is played:
+
+    :param n_episodes: most episodes to play, at least 20 (default: 400)
+    :param cost_limit: limit of an episode's cost, or one for each cost (default: the agent's own)
+
+    Output:
+
+    :param json: write the certificate to this JSON file
+    """
+
+    prog: ClassVar[str] = "sb3-guard certify"
+    examples: ClassVar[str] = """examples:
+  sb3-guard certify --pretrained
+  sb3-guard certify --algo cpo --env Goal_Point_8Hazards -f logs --load-best
+  sb3-guard certify --algo ppo --env Goal_Point_8Hazards -f logs --cost-limit 5
+"""
+    n_episodes: int | None = flag(kind=positive, metavar="N")
+    cost_limit: list[float] = flag(default=[], metavar="D")
+    json: str | None = flag(metavar="FILE")
+
+
+@dataclass
 class ExportFlags(AgentFlags):
     """
     Write a trained agent as one ONNX file, which runs without torch and without this package.

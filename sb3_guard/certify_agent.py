@@ -1,0 +1,47 @@
+"""Certify a trained agent: ``sb3-guard certify --algo cpo --env Goal_Point_8Hazards``.
+
+``sb3_guard.certify`` is the function that certifies a model, so that the command's module has
+another name.
+"""
+
+import sys
+from contextlib import closing
+from pathlib import Path
+
+from sb3_guard.zoo.agents.flags import CertifyFlags as Flags
+from sb3_guard.zoo.cli.flags import command
+
+
+def certify_agent(flags: Flags) -> int:
+    """Play an agent's fresh episodes and print what they show; 0 if it is certified, else 1."""
+    from sb3_guard.common.certificate import MOST, certify
+    from sb3_guard.common.files import replacing
+    from sb3_guard.zoo.agents.playback import BATCH, open_agent
+    from sb3_guard.zoo.cli.usage import explained
+    from sb3_guard.zoo.run.folder import require_file
+    from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
+
+    if flags.json:
+        require_file(Path(flags.json), "--json")
+    agent = open_agent(flags, None, BATCH)
+    with closing(agent.env), explained(f"can't certify {agent.path}", ValueError, *BAD_NUMBERS):
+        certificate = certify(
+            agent.model,
+            agent.env,
+            flags.cost_limit or None,
+            n_episodes=flags.n_episodes or MOST,
+            deterministic=not flags.stochastic,
+            seed=flags.seed,
+        )
+    print(f"{agent.path} on {agent.env_id}")
+    print(certificate)
+    if flags.json:
+        with replacing(flags.json) as file:
+            file.write(certificate.to_json().encode())
+    return 0 if certificate.verdict == "certified" else 1
+
+
+main = command(Flags, certify_agent)
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -86,6 +86,11 @@ class CostBound:
         return cls(*map(float, numbers))
 
     @property
+    def excess(self) -> float:
+        """How far the upper bound lies above the limit."""
+        return self.upper - self.limit
+
+    @property
     def verdict(self) -> Verdict:
         if self.upper <= self.limit:
             return "certified"
@@ -150,7 +155,7 @@ class Certificate:
     @property
     def nearest(self) -> CostBound:
         """The bounds of the cost whose upper bound lies highest above its limit."""
-        return max(self.costs.values(), key=lambda cost: cost.upper - cost.limit)
+        return max(self.costs.values(), key=lambda cost: cost.excess)
 
     @property
     def to_decide(self) -> int | None:
@@ -255,7 +260,7 @@ def certify(
         lone = env
         env = DummyVecEnv([lambda: lone])
     keys = tuple(cost_keys_of(model, env) if cost_keys is None else cost_keys)
-    limits = _limits(model, cost_limit, keys)
+    limits = limits_of(model, cost_limit, keys)
     if seed is None:
         seed = int(np.random.SeedSequence().generate_state(1)[0])
     names = [bounded_name(key, getattr(model, "limit_on", "sum")) for key in keys]
@@ -297,8 +302,12 @@ def certify(
     return certificate
 
 
-def _limits(model: Any, cost_limit: Any, keys: Sequence[str]) -> list[float]:
-    """One limit for each cost."""
+def limits_of(model: Any, cost_limit: Any, keys: Sequence[str]) -> list[float]:
+    """
+    One limit for each cost.
+
+    :raises ValueError: they are not finite, too many or too few, or there is none
+    """
     given: Any = cost_limit
     if cost_limit is None and isinstance(model, Constrained) and model.constrained:
         given = model.final_cost_limits

@@ -117,7 +117,7 @@ class CertifyFlags(AgentFlags):
   sb3-guard certify --algo cpo --env Goal_Point_8Hazards -f logs --load-best
   sb3-guard certify --algo ppo --env Goal_Point_8Hazards -f logs --cost-limit 5
 """
-    n_episodes: int | None = flag(kind=positive, metavar="N")
+    n_episodes: int | None = flag(low=1, metavar="N")
     cost_limit: list[float] = flag(default=[], metavar="D")
     json: str | None = flag(metavar="FILE")
 

@@ -1,0 +1,223 @@
+"""A training that ends with a certified agent: candidates, screening, certificate."""
+
+import copy
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_guard.common.certificate import MOST, Certificate, certify, limits_of
+from sb3_guard.common.evaluation import evaluate_policy, sync_normalization
+from sb3_guard.common.files import replacing
+from sb3_guard.common.monitor import cost_keys_of
+
+TRIES = 3  # candidates that may be certified; they share the error
+
+
+@dataclass
+class Screened:
+    """What a few episodes say of a candidate."""
+
+    path: Path
+    mean_return: float
+    excess: (
+        float  # largest (mean + standard error of the mean - limit) of a cost; <= 0: looks right
+    )
+
+    @property
+    def order(self) -> tuple[bool, float]:
+        """Those that look right first, by return; then those that are nearest to it."""
+        right = self.excess <= 0.0
+        return right, self.mean_return if right else -self.excess
+
+
+class DeliveryCallback(BaseCallback):
+    """
+    End a training with an agent that is certified to keep its limit.
+
+    From the middle of the training on its policies are kept as *candidates*, with their observation
+    statistics. After its end each plays a few episodes; of those whose mean cost plus its standard
+    error is within the limit, the one of highest return is certified by fresh episodes
+    (:func:`~sb3_guard.certify`), then the next, up to three, which share the error. The first that
+    is certified is written as ``certified_model.zip``, with ``certified_vecnormalize.pkl`` where
+    observations are normalised, and ``certificate.json``; the model itself keeps its last weights.
+
+    A training that was cut and continues keeps the candidates that it has, and ends alike.
+
+    :param eval_env: environment to play in, wrapped as the training environment is
+    :param folder: where the files are written
+    :param cost_limit: d, one number or one per cost; None: the model's own at the end
+    :param candidates: how many policies are kept, the last one among them
+    :param screening: episodes of each
+    :param n_episodes: most episodes of a certificate
+    :param deterministic: certify the most likely actions, or sampled ones
+    :param seed: the episodes' seeds are drawn from it
+    :param verbose: 1 prints what is delivered, or how far the nearest candidate is away
+    """
+
+    def __init__(
+        self,
+        eval_env: VecEnv,
+        folder: str | os.PathLike[str],
+        cost_limit: float | Sequence[float] | None = None,
+        *,
+        candidates: int = 12,
+        screening: int = 20,
+        n_episodes: int = MOST,
+        deterministic: bool = True,
+        seed: int = 0,
+        verbose: int = 1,
+    ) -> None:
+        super().__init__(verbose)
+        self.eval_env, self.folder = eval_env, Path(folder)
+        self.cost_limit, self.candidates, self.screening = cost_limit, candidates, screening
+        self.n_episodes, self.deterministic, self.seed = n_episodes, deterministic, seed
+        self._kept = -1
+        #: of the agent that was delivered; None: none was
+        self.certificate: Certificate | None = None
+
+    def _init_callback(self) -> None:
+        """
+        :raises ValueError: the limit is not finite, or does not fit the costs
+        """
+        self._limits()
+
+    def _limits(self) -> list[float]:
+        keys = cost_keys_of(self.model, self.eval_env)
+        return limits_of(self.model, self.cost_limit, keys)
+
+    @property
+    def _end(self) -> int:
+        """Steps at which the training ends."""
+        return self.model._total_timesteps
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        part = self._part(self.num_timesteps)
+        if part <= self._kept:
+            return
+        self._kept, file = part, self._candidate(part)
+        steps = self._load(file)["num_timesteps"] if file.exists() else 0
+        if self._part(steps) != part or steps > self.num_timesteps:
+            self._keep(file)
+
+    def _part(self, steps: int) -> int:
+        """Which of equal parts of the training's last half; below 0 before it."""
+        return int(np.floor((2 * steps / self._end - 1) * (self.candidates - 1)))
+
+    def _candidate(self, part: int) -> Path:
+        return self.folder / "candidates" / f"{part:03d}.pt"
+
+    def _keep(self, file: Path) -> None:
+        normalizer = unwrap_vec_normalize(self.training_env)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as written:
+            content = {
+                "num_timesteps": self.num_timesteps,
+                "policy": self.model.policy.state_dict(),
+                "statistics": _statistics(normalizer),
+            }
+            th.save(content, written)
+
+    @staticmethod
+    def _load(file: Path) -> dict[str, Any]:
+        return th.load(file, map_location="cpu", weights_only=True)
+
+    def _on_training_end(self) -> None:
+        if self.num_timesteps < self._end:  # stopped before
+            return
+        self._keep(self._candidate(self.candidates - 1))
+        began = time.process_time()
+        policy = copy.deepcopy(self.model.policy.state_dict())
+        sync_normalization(self.training_env, self.eval_env)
+        try:
+            tried = self._deliver()
+        finally:
+            self.model.policy.load_state_dict(policy)
+        if self.verbose > 0:
+            taken = f"({time.process_time() - began:.0f} s of a processor)"
+            print(f"{tried} {taken}")
+
+    def _deliver(self) -> str:
+        """Certify the best candidate; what to say of it."""
+        limits = self._limits()
+        screened = [
+            self._screen(file, np.array(limits))
+            for file in sorted((self.folder / "candidates").glob("*.pt"))
+        ]
+        screened.sort(key=lambda candidate: candidate.order, reverse=True)
+        refused: list[Certificate] = []
+        for number, candidate in enumerate(screened[:TRIES]):
+            if candidate.excess > 0.0 and number > 0:
+                break  # those that look wrong are not worth a try, but for a verdict
+            steps = self._put(candidate.path)
+            certificate = certify(
+                self.model,
+                self.eval_env,
+                limits,
+                n_episodes=self.n_episodes,
+                deterministic=self.deterministic,
+                seed=self.seed + number,
+                tries=TRIES,
+            )
+            if certificate.verdict == "certified":
+                self._write(certificate)
+                return f"Delivered, the policy of {steps:,} steps: {certificate}"
+            refused.append(certificate)
+        nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
+        return f"Nothing is delivered. The nearest candidate {nearest}"
+
+    def _screen(self, file: Path, limits: np.ndarray) -> Screened:
+        self._put(file)
+        played = evaluate_policy(
+            self.model, self.eval_env, self.screening, self.deterministic, seed=self.seed
+        )
+        costs = played.limited  # [E, m]; NaN after a physics error, which looks right nowhere
+        error = costs.std(axis=0, ddof=1) / np.sqrt(len(costs)) if len(costs) > 1 else np.inf
+        excess = float(np.max(costs.mean(axis=0) + error - limits)) if len(costs) else np.inf
+        mean_return = float(played.returns.mean()) if len(costs) else -np.inf
+        return Screened(file, mean_return, np.inf if np.isnan(excess) else excess)
+
+    def _put(self, file: Path) -> int:
+        """Give the model and the environment the weights and statistics of a candidate."""
+        content = self._load(file)
+        self.model.policy.load_state_dict(content["policy"])
+        normalizer = unwrap_vec_normalize(self.eval_env)
+        if normalizer is not None and content["statistics"]:
+            moments = normalizer.obs_rms
+            parts = moments if isinstance(moments, dict) else {"": moments}
+            for name, (mean, var, count) in content["statistics"].items():
+                parts[name].mean, parts[name].var = mean.numpy(), var.numpy()
+                parts[name].count = count
+        return int(content["num_timesteps"])
+
+    def _write(self, certificate: Certificate) -> None:
+        self.certificate = certificate
+        with replacing(self.folder / "certified_model.zip") as file:
+            self.model.save(file)
+        normalizer = unwrap_vec_normalize(self.eval_env)
+        if normalizer is not None:
+            normalizer.save(str(self.folder / "certified_vecnormalize.pkl"))
+        with replacing(self.folder / "certificate.json") as file:  # last: it vouches for the others
+            file.write(certificate.to_json().encode())
+
+
+def _statistics(normalizer: Any) -> dict[str, tuple[th.Tensor, th.Tensor, float]]:
+    """Mean, variance and count of each part of normalised observations; empty: none are."""
+    if normalizer is None or not normalizer.norm_obs:
+        return {}
+    moments = normalizer.obs_rms
+    parts = moments if isinstance(moments, dict) else {"": moments}
+    return {
+        name: (th.from_numpy(part.mean.copy()), th.from_numpy(part.var.copy()), float(part.count))
+        for name, part in parts.items()
+    }

@@ -1,0 +1,105 @@
+"""A training ends with a certified agent, or says how far the nearest is away."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_guard import CPO, make_vec_env
+from sb3_guard.common.certificate import Certificate, agent_hash, certify
+from sb3_guard.common.delivery import DeliveryCallback
+
+
+class Dose(gym.Env):
+    """One step: the action in [0, 1] is the reward and, times a random number, the cost."""
+
+    observation_space = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.Box(0, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample() * 0 + np.float32(0.5), {}
+
+    def step(self, action):
+        dose = float(action[0])
+        cost = dose * self.np_random.exponential(2.0)
+        return np.full(2, 0.5, np.float32), dose, True, False, {"cost": cost}
+
+
+def envs(normalize=True):
+    env = make_vec_env(Dose, n_envs=10, vec_env="dummy")
+    return VecNormalize(env, norm_reward=False) if normalize else env
+
+
+def trained(folder, limit, steps=600):
+    model = CPO("MlpPolicy", envs(), n_steps=10, cost_limit=1.0, seed=0, device="cpu")
+    model.n_critic_updates = 5
+    eval_env = envs()
+    eval_env.training = False
+    deliver = DeliveryCallback(eval_env, folder, limit, candidates=3, screening=20, verbose=1)
+    model.learn(steps, callback=deliver)
+    return model, deliver
+
+
+def kept(folder):
+    files = sorted((folder / "candidates").glob("*.pt"))
+    return [th.load(file, weights_only=True) for file in files]
+
+
+@pytest.fixture(scope="module")
+def delivered(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, *trained(folder, 1.6)
+
+
+def test_the_first_candidate_that_is_certified_is_delivered(delivered):
+    folder, model, deliver = delivered
+    certificate = Certificate.from_json((folder / "certificate.json").read_text())
+    assert certificate == deliver.certificate and certificate.verdict == "certified"
+    assert certificate.tries == 3 and certificate.costs["cost"].limit == 1.6
+    # The file is the agent of the certificate, and its play is within the limit.
+    env = VecNormalize.load(str(folder / "certified_vecnormalize.pkl"), envs(normalize=False))
+    env.training = False
+    agent = CPO.load(folder / "certified_model.zip", env=env)
+    assert agent_hash(agent, env) == certificate.agent
+    assert certify(agent, env, 1.6, seed=99).verdict == "certified"
+    # The model is as training left it.
+    last, weights = kept(folder)[-1]["policy"], model.policy.state_dict()
+    assert all(th.equal(value, weights[name]) for name, value in last.items())
+
+
+def test_candidates_are_of_the_last_half_in_equal_parts(delivered):
+    assert [candidate["num_timesteps"] for candidate in kept(delivered[0])] == [300, 500, 600]
+
+
+def test_nothing_is_delivered_where_nothing_keeps_the_limit(tmp_path, capsys):
+    _, deliver = trained(tmp_path, 0.01)
+    assert deliver.certificate is None
+    assert [path.name for path in tmp_path.iterdir()] == ["candidates"]
+    assert "Nothing is delivered. The nearest candidate exceeds: " in capsys.readouterr().out
+
+
+def test_a_training_that_continues_keeps_the_candidates_that_it_has(delivered, tmp_path):
+    """Not those of a shorter training, nor those that it has not come to again."""
+    first, second, last = kept(delivered[0])
+    (tmp_path / "candidates").mkdir()
+    for number, candidate, steps in ((0, last, 300), (1, last, 550), (2, first, 200)):
+        there = {**candidate, "num_timesteps": steps}
+        th.save(there, tmp_path / "candidates" / f"{number:03d}.pt")
+    trained(tmp_path, 1.6)
+    after = kept(tmp_path)
+    assert [candidate["num_timesteps"] for candidate in after] == [300, 500, 600]
+
+    def same(one, other):
+        return all(th.equal(value, other["policy"][name]) for name, value in one["policy"].items())
+
+    assert same(after[0], last) and same(after[1], second) and same(after[2], last)
+
+
+@pytest.mark.parametrize("limit", [np.nan, (1.0, 2.0)])
+def test_a_wrong_limit_is_told_before_the_training(limit, tmp_path):
+    with pytest.raises(ValueError, match="cost_limit"):
+        trained(tmp_path, limit)
+    assert not [*tmp_path.iterdir()]

@@ -26,7 +26,7 @@ _WORDS: dict[Any, tuple[str, str]] = {  # one value of a type, and several
     Mapping: ("a mapping", "mappings"),
     types.NoneType: ("null", "null"),
     type: ("the dotted name of a class", "dotted names of classes"),
-    Callable: ("a schedule such as lin_0.001", "schedules such as lin_0.001"),
+    Callable: ("a schedule (lin_…)", "schedules (lin_…)"),
 }
 
 

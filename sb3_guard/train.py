@@ -41,8 +41,6 @@ class Flags(RunFlags):
 def train(flags: Flags) -> int:
     """Start a run, continue one, or start one for each of several seeds."""
     flags.check()
-    if flags.progress is None:
-        flags.progress = sys.stderr.isatty() and flags.verbose > 0
     run = RunFlags.shared(flags)
     run.given = flags.given
     if flags.seeds is None:

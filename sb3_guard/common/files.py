@@ -7,11 +7,6 @@ from io import BufferedRandom
 from pathlib import Path
 
 
-def sibling_of(path: Path) -> Path:
-    """The hidden file that :func:`replacing` writes first, beside the file."""
-    return path.with_name(f".{path.name}.tmp")
-
-
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BufferedRandom]:
     """
@@ -24,7 +19,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BufferedRandom]:
     :return: the open sibling; when the block raises, ``path`` is left as it was
     """
     path = Path(path)
-    sibling = sibling_of(path)
+    sibling = path.with_name(f".{path.name}.tmp")
     try:
         with open(sibling, "w+b") as handle:
             yield handle

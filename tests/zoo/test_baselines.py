@@ -43,7 +43,7 @@ def arguments(algo: str, folder: Path, *more: str) -> list[str]:
 
 @pytest.mark.parametrize(
     "algo",
-    [algo if algo in ("ppo_lstm", "sac") else pytest.param(algo, marks=SLOW) for algo in PARAMS],
+    [algo if algo == "sac" else pytest.param(algo, marks=SLOW) for algo in PARAMS],
 )
 def test_trains_with_costs_logged(algo, tmp_path):
     extra = ["--eval-freq", "60", "--log-interval", "1"]
@@ -90,7 +90,7 @@ def test_costs_of_other_names_are_those_of_the_monitor(tmp_path, capsys):
         ("ppo", []),
         pytest.param("sac", ["use_sde:True"], marks=SLOW),
         pytest.param("td3", [], marks=SLOW),
-        ("sac_lag", ["use_sde:True", *COSTLY]),
+        pytest.param("sac_lag", ["use_sde:True", *COSTLY], marks=SLOW),
         pytest.param("td3_lag", [*NOISY, *COSTLY], marks=SLOW),
         pytest.param("tqc_lag", COSTLY, marks=SLOW),
     ],

@@ -342,19 +342,6 @@ def test_a_run_that_another_process_has_is_awaited(tmp_path, here, monkeypatch, 
     assert asked == ["cpo", "trpo", "cpo", "cpo"]
 
 
-def test_a_full_disk_is_named(tmp_path, here, capsys):
-    arguments = [*GRID, "--algos", "trpo", "cpo", "--seeds", "0", "-f", str(tmp_path)]
-    run = tmp_path / "cpo" / "CostPoint-v0_1"
-    run.mkdir(parents=True)
-    (run / "0.monitor.csv").symlink_to("/dev/full")
-    assert benchmark.main(arguments) == 1
-    err = capsys.readouterr().err
-    assert f"can't write to {run}: No space left on device" in err and "Traceback" not in err
-    (run / "0.monitor.csv").unlink()  # room is made
-    assert benchmark.main(arguments) == 0
-    assert len(results(tmp_path)) == 2
-
-
 def test_asked_to_stop(tmp_path, here, capsys):
     """What runs ends with a checkpoint, what waits does not begin, and all is done later."""
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
@@ -465,6 +452,7 @@ def campaign(tmp_path, what: str, kills: int, *flags: str) -> str:
     return run.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="kills processes")
 def test_a_grid_that_is_killed_is_the_same_grid(tmp_path, here, monkeypatch):
     """A real worker is killed, at a random moment; see ``kills.py``."""

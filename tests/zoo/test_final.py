@@ -72,7 +72,7 @@ def test_a_result_says_how_to_train_it_again(run):
     of = run.flags()
     assert words[:2] == ["sb3-guard", "train"]
     assert {name for name in of.names() if getattr(of, name) != getattr(again, name)} == {
-        "log_folder", "progress", "verbose",
+        "log_folder", "verbose",
     }  # fmt: skip
 
 

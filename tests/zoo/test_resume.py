@@ -183,7 +183,7 @@ def test_finished_run_goes_on_as_a_longer_one(undisturbed, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("owner", "name", "result_is_left"),
-    [(run_module, "RunLogger", True), (RunFolder, "write_config", False)],
+    [(run_module, "RunLogger", True), (run_module, "write_config", False)],
 )
 def test_a_result_is_always_that_of_its_configuration(
     owner, name, result_is_left, tmp_path, monkeypatch

@@ -74,21 +74,9 @@ def test_damaged_config(tmp_path, content):
         run.hyperparams()
 
 
-@pytest.mark.parametrize("command", ["sb3-guard train --env 'Goal", 5, ["a"]])
-def test_a_command_that_is_none(tmp_path, command):
-    """The page of an agent for the hub shows it."""
+def test_results_are_finite(tmp_path):
     run = create(tmp_path)
-    run.write_result(
-        {"n_timesteps": 5, "return": 1.0, "cost": 1.0, "cost_rate": None, "command": command}
-    )
-    with pytest.raises(UsageError, match=r"result\.json is damaged: .*"):
-        run.checked_result()
-
-
-@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan")])
-def test_results_are_finite(tmp_path, value):
-    run = create(tmp_path)
-    run.write_result({"n_timesteps": 5, "return": value, "cost": 1.0, "cost_rate": None})
+    run.write_result({"n_timesteps": 5, "return": float("nan"), "cost": 1.0, "cost_rate": None})
     with pytest.raises(UsageError, match=r"is damaged: return = .* should be a number"):
         run.checked_result()
 
@@ -138,24 +126,6 @@ def test_an_owner_elsewhere_may_be_alive(tmp_path):
     with pytest.raises(RunInUse, match="process 12 on elsewhere; if that is gone, remove"):
         with lock(run.path):
             pass
-
-
-def test_a_full_disk_is_no_owner(tmp_path):
-    """A write that fails, of any size, stands for it."""
-    run = create(tmp_path)
-    die_holding(run.path)
-    script = (
-        "import pathlib, resource\n"
-        "from sb3_guard.zoo.cli.usage import UsageError\n"
-        "from sb3_guard.zoo.run.folder import lock\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (0, -1))\n"
-        "try:\n"
-        f"    with lock(pathlib.Path({str(run.path)!r})): pass\n"
-        "except UsageError as error:\n"
-        "    print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout == f"can't write to {run.path}: File too large\n", done.stderr
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path):

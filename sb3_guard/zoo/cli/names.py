@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from sb3_guard.zoo.cli.flags import Command
 
 KNOWN = {"sb3_guard", "rl_zoo3", "stable_baselines3", "sb3_contrib", "gymnasium", "torch"}
-# Files of what differs from an algorithm's own file, which `-conf NAME` reads; not code.
-PRESETS = {"paper": "the paper"}
+PAPER = "paper"  # what `-conf` takes beside files: the paper's table
 # Hyperparameters that name classes, one or several, perhaps with arguments; and of what kind.
 BASES: dict[str, type] = {
     "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
@@ -140,7 +139,7 @@ def require_named(where: object, given: "Command", filed: "Command", *names: str
     """
     for name in names:
         value = getattr(filed, name)
-        if value and str(value) not in PRESETS and not getattr(given, name):
+        if value and value != PAPER and not getattr(given, name):
             raise UsageError(
                 f"{where} needs {name}, which only the command line may name; look at that, then "
                 f"add {shlex.join(filed.words({name}))}"

@@ -30,7 +30,7 @@ from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, interrupts_held, one_line
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, RunInUse, cost_words
+from sb3_guard.zoo.run.folder import RunFolder, RunInUse
 from sb3_guard.zoo.run.hyperparams import annotations
 from sb3_guard.zoo.run.run import Run
 
@@ -62,7 +62,7 @@ class GridRun(Run):
         line = f"{self.state}: {self}"
         result = (RunFolder(self.path).read_result() or {}) if self.state == "done" else {}
         if result.get("return") is not None:
-            line += f", return {result['return']:.2f}, {cost_words(result)}"
+            line += f", return {result['return']:.2f}, cost {result['cost']:.2f}"
         return f"{line}: {self.error}" if self.error else line
 
 

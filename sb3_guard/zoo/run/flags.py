@@ -111,7 +111,7 @@ class RunFlags(EvaluationFlags, TrainingFlags):
 
     Running:
 
-    :param progress: show a progress bar (default: if stderr is a terminal)
+    :param progress: show a progress bar
     :param verbose: output: 0 nothing, 1 progress, 2 everything (default: 1)
     """
 
@@ -121,7 +121,7 @@ class RunFlags(EvaluationFlags, TrainingFlags):
     trained_agent: str = flag("-i", default="", metavar="PATH", role=IDENTITY)
     log_folder: str = flag("-f", default="logs", metavar="DIR")
     uuid: bool = flag("-uuid", default=False)
-    progress: bool | None = flag("-P", role=HOST)
+    progress: bool = flag("-P", default=False, role=HOST)
     verbose: Literal[0, 1, 2] = flag(default=1, role=HOST)
 
     @classmethod

@@ -6,20 +6,19 @@ import glob
 import hashlib
 import json
 import math
-import os
 import re
 import shlex
 import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
 from filelock import SoftFileLock, Timeout
 
-from sb3_guard.common.files import replacing, sibling_of
+from sb3_guard.common.files import replacing
 from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag, read_mapping
 from sb3_guard.zoo.run.flags import RunFlags
 
@@ -52,16 +51,6 @@ def read_data(path: Path) -> dict[str, Any]:
     :raises UsageError: it can't be read, or is not a mapping
     """
     return read_mapping(path, "the run's file", "names to values")
-
-
-def cost_words(result: Mapping[str, Any]) -> str:
-    """The costs of a run as of its ``result.json``, each with its limit: ``cost 27.31 > 25``."""
-    words = []
-    for key, cost in result["costs"].items():
-        mean, limit = cost["mean"], cost["limit"]
-        if mean is not None and limit is not None:
-            words.append(f"{key} {mean:.2f} {'≤' if mean <= limit else '>'} {limit:g}")
-    return ", ".join(words) or f"cost {result['cost']:.2f}"
 
 
 def folder_name(env_id: str) -> str:
@@ -99,43 +88,27 @@ def is_run(path: Path) -> bool:
 
 def require_writable(folder: Path, flag: str) -> None:
     """
-    Find out whether a folder can be made or written to before work is lost; nothing is left there.
+    Make a folder and find out whether files can be written there, before work is lost.
 
-    :param folder: it need not exist yet
     :param flag: the flag that names it, for the message
-    :raises UsageError: no file can be made in it, or in what exists of the path to it
+    :raises UsageError: they can't
     """
     with explained(f"{flag}: can't write to folder {str(folder)!r}", OSError, fix="choose another"):
-        _require_possible(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        # Permission bits mean little to root and on special file systems: only trying tells.
+        with tempfile.TemporaryFile(dir=folder):
+            pass
 
 
 def require_file(path: Path, flag: str) -> None:
     """
-    The same of a file that :func:`replacing` is to write.
+    The same of a file that is to be written.
 
-    :raises UsageError: it can't be made, or something else than a file has its name
+    :raises UsageError: it can't be made, or a folder has its name
     """
-    with explained(f"{flag}: can't write file {str(path)!r}", OSError, fix="choose another"):
-        if path.exists() and not path.is_file():
-            kind = "folder" if path.is_dir() else "device or pipe"
-            raise UsageError(f"{flag}: {str(path)!r} is a {kind}; name a file")
+    if path.is_dir():
+        raise UsageError(f"{flag}: {str(path)!r} is a folder; name a file")
     require_writable(path.parent, flag)
-    with explained(f"{flag}: can't write file {str(path)!r}", OSError, fix="choose another"):
-        _require_possible(sibling_of(path))
-
-
-def _require_possible(path: Path) -> None:
-    """
-    :raises OSError: a name on the way to it is too long, or nothing can be made where it begins
-    """
-    whole = path.absolute()
-    existing = next(part for part in (whole, *whole.parents) if os.path.lexists(part))
-    for name in whole.relative_to(existing).parts:
-        with suppress(FileNotFoundError):
-            os.stat(existing / name)
-    # Permission bits mean little to root and on special file systems: only trying tells.
-    with tempfile.TemporaryFile(dir=existing):
-        pass
 
 
 class RunFolder:
@@ -198,7 +171,7 @@ class RunFolder:
             params = path / name
             params.mkdir(parents=True, exist_ok=True)
             (params / "command.txt").write_text(command, encoding="utf-8")
-            _write_config(params, flags, hyperparams)
+            write_config(params, flags, hyperparams)
         return cls(path)
 
     def args(self) -> dict[str, Any]:
@@ -224,13 +197,15 @@ class RunFolder:
 
     def again(self, flags: RunFlags) -> str:
         """The command that continues the run, for messages."""
-        return (
-            f"sb3-guard train -i {shlex.quote(str(self.path))}{packages_flag(flags.gym_packages)}"
-        )
+        return self._command("train -i", flags)
 
-    def write_config(self, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:
-        """Replace what :meth:`create` wrote, e.g. to make a finished run longer."""
-        _write_config(self.params, flags, hyperparams)
+    def play(self, flags: RunFlags) -> str:
+        """The command that plays the agent, for messages."""
+        return self._command("enjoy -f", flags)
+
+    def _command(self, words: str, flags: RunFlags) -> str:
+        path = shlex.quote(str(self.path))
+        return f"sb3-guard {words} {path}{packages_flag(flags.gym_packages)}"
 
     def curve_hash(self) -> str:
         """SHA-256 of step, return and cost of all training episodes: runs alike have the same."""
@@ -261,10 +236,9 @@ class RunFolder:
         fix = f"sb3-guard train -i {self.path} writes it again"
         with explained("result.json is damaged", fix=fix):
             result: dict[str, Any] = json.loads(self.result.read_bytes())
-            shlex.split("" + result.get("command", ""))  # as others will: it is text, and whole
-            for key, value in {key: result[key] for key in ("n_timesteps", *MEASURES)}.items():
-                if value is not None and not math.isfinite(value):
-                    raise ValueError(f"{key} = {value!r} should be a number")
+            for key in ("n_timesteps", *MEASURES):
+                if result[key] is not None and not math.isfinite(result[key]):
+                    raise ValueError(f"{key} = {result[key]!r} should be a number")
         if "costs" not in result:  # as older versions wrote it: of several costs only the total
             limit = result.get("cost_limit")
             bounded = None if "limit_on" in result else result["cost"]
@@ -298,8 +272,6 @@ def lock(folder: Path) -> Iterator[None]:
         try:
             held.acquire()
         except Timeout:
-            with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
-                file.write(b"x")  # a dead process's lock on a full disk can't be taken over either
             owner = path.read_text().split("\n")
             if owner != [""]:
                 raise RunInUse(
@@ -314,8 +286,8 @@ def lock(folder: Path) -> Iterator[None]:
         held.release()
 
 
-def _write_config(params: Path, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:
-    # args.yml is what makes a folder a run, so it comes last.
+def write_config(params: Path, flags: RunFlags, hyperparams: Mapping[str, Any]) -> None:
+    """Write down what a run is; ``args.yml``, which makes a folder a run, comes last."""
     for name, content in (("config.yml", dict(hyperparams)), ("args.yml", flags.values())):
         with replacing(params / name) as file:
             file.write(yaml.safe_dump(content).encode())

@@ -8,6 +8,7 @@ it.
 
 import importlib
 import inspect
+import math
 import runpy
 import sys
 from collections.abc import Callable, Mapping
@@ -29,10 +30,10 @@ from stable_baselines3.common.noise import (
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_guard.algorithms.common.arguments import signature
-from sb3_guard.fields import in_words, is_data, typed
+from sb3_guard.fields import fit, is_data
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.names import (
-    PRESETS,
+    PAPER,
     as_data,
     classes,
     import_class,
@@ -56,6 +57,7 @@ RUN_KEYS: dict[str, Any] = {
     "selection_limit": float | list[float] | None,
 }
 N_TIMESTEPS = 1_000_000  # the length of training where neither a file nor a flag says
+COUNTS = ("n_envs", "n_timesteps", "n_steps", "batch_size", "frame_stack")  # at least 1
 # RL-Zoo's two for the exploration noise of off-policy algorithms.
 NOISE_KEYS: dict[str, Any] = {
     "noise_type": Literal["normal", "ornstein-uhlenbeck"] | None,
@@ -81,32 +83,20 @@ def read_file(path: str | Path) -> dict[str, Any]:
     :raises UsageError: it is absent, not readable or not of that form
     """
     name = str(path)
-    form = (
-        "environments, or 'default', to hyperparameters ('default:' and below it lines such as "
-        "'  n_steps: 1000')"
-    )
+    form = "environments, or 'default', to hyperparameters such as {n_steps: 1000}"
     if name.endswith((".yml", ".yaml")):
         content = read_mapping(name, "hyperparameter file", form)
     else:
-        fix = f"give a .yml file, a Python file or module, or {' or '.join(map(repr, PRESETS))}"
+        fix = "give a .yml file, a Python file or module, or 'paper'"
         with explained(f"can't read hyperparameters from {name}", fix=fix):
-            python = name.endswith(".py")
-            module = (
-                _module(Path(name).resolve()) if python else vars(importlib.import_module(name))
-            )
-        content = module.get("hyperparams", {None: None})
+            if name.endswith(".py"):
+                module = _ran(Path(name).resolve(), Path(name).stat().st_mtime_ns)
+            else:
+                module = vars(importlib.import_module(name))
+            content = module["hyperparams"]
     if not isinstance(content, dict) or not all(isinstance(v, dict) for v in content.values()):
         raise UsageError(f"{name} must map {form}")
     return content
-
-
-def _module(path: Path) -> dict[str, Any]:
-    """The names in a Python file, of the module where it is imported: it registers parts once."""
-    for module in [*sys.modules.values()]:
-        file = getattr(module, "__file__", None)
-        if file is not None and Path(file).resolve() == path:
-            return vars(module)
-    return _ran(path, path.stat().st_mtime_ns)
 
 
 @cache
@@ -125,23 +115,6 @@ def shipped_file(algo: str) -> Path:
     return theirs if theirs.is_file() else ours
 
 
-def preset(name: str, algo: str, env_id: str) -> dict[str, Any]:
-    """
-    The hyperparameters in which a preset differs from the shipped file of an algorithm.
-
-    :param name: one of ``PRESETS``; below ``all``, its file has entries like those of a
-        hyperparameter file, and below the key of an algorithm what is different for that one
-    :raises UsageError: the algorithm is not in it
-    """
-    content = read_file(hyperparams_folder() / f"{name}.yml")
-    common = entry(content.pop("all", {}), env_id) or {}
-    if algo not in content:
-        raise UsageError(
-            f"-conf {name}: {algo!r} is not in {PRESETS[name]}; {did_you_mean(algo, content)}"
-        )
-    return {**common, **content[algo]}
-
-
 def read_hyperparams(
     algo: str, env_id: str, conf_file: str | None = None, overrides: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -151,21 +124,27 @@ def read_hyperparams(
     :param algo: key of the algorithm, names the shipped file
     :param env_id: its own entry is taken, with or without a version, else the first pattern that
         fits, else ``default``
-    :param conf_file: file to read instead of the shipped one, or a preset: ``paper`` for the
-        paper's table
+    :param conf_file: file to read instead of the shipped one; ``paper``: the shipped one, with what
+        is different in the paper's table
     :param overrides: what the command line says
     :raises UsageError: the file can't be read, or has no entry that fits
     """
-    changes = preset(conf_file, algo, env_id) if conf_file in PRESETS else {}
-    path = shipped_file(algo) if conf_file is None or conf_file in PRESETS else conf_file
+    changes: dict[str, Any] = {}
+    if conf_file == PAPER:
+        content = read_file(hyperparams_folder() / "paper.yml")
+        changes = entry(content.pop("all"), env_id) or {}
+        if algo not in content:
+            raise UsageError(f"-conf {PAPER} has no {algo!r}; {did_you_mean(algo, content)}")
+        changes |= content[algo]
+        conf_file = None
+    path = conf_file or shipped_file(algo)
     # An algorithm of a user has no shipped file; its own defaults serve.
     absent = conf_file is None and not Path(path).is_file()
-    content: dict[str, Any] = {"default": {}} if absent else read_file(path)
+    content = {"default": {}} if absent else read_file(path)
     values = entry(content, env_id)
     if values is None:
-        raise UsageError(
-            f"{path} has no entry for {env_id!r} and no 'default'; {did_you_mean(env_id, content)}"
-        )
+        hint = did_you_mean(env_id, content)
+        raise UsageError(f"{path} has no entry for {env_id!r} and no 'default'; {hint}")
     if str(path).endswith((".yml", ".yaml")):  # a program says what it likes
         refuse_places(path, values)
     return {**values, **changes, **(overrides or {})}
@@ -220,74 +199,42 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
         if name in FLAGS:
             raise UsageError(f"{name!r} is not a hyperparameter; use the flag {FLAGS[name]}")
         if name not in hints:
-            raise UsageError(
-                f"{algo} has no hyperparameter {name!r}; {did_you_mean(name, sorted(hints))}"
-            )
+            hint = did_you_mean(name, sorted(hints))
+            raise UsageError(f"{algo} has no hyperparameter {name!r}; {hint}")
         if not is_data(value):
             raise UsageError(
                 f"hyperparameter {name}: {value!r} is more than plain data; write classes and "
                 "calls as text, such as policy_kwargs: dict(activation_fn=nn.ReLU)"
             )
-        try:
-            checked[name] = typed(as_data(name, value), hints[name])
-        except TypeError:
-            allowed = in_words(hints[name])
-            if name == "cost_limit":  # its schedules are other ones
-                allowed = allowed.replace("lin_0.001", "lin_50_25")
-            raise UsageError(
-                f"hyperparameter {name}: {value!r} is not allowed; it must be {allowed}"
-            ) from None
+        low = 1 if name in COUNTS else -math.inf
+        with explained("hyperparameter", ValueError):
+            checked[name] = fit(name, as_data(name, value), hints[name], low, ends="[]")
     checked.setdefault("n_envs", 1)
     checked.setdefault("n_timesteps", N_TIMESTEPS)
     aliases = algorithm.policy_aliases
     policy = checked.setdefault("policy", next(iter(aliases)))  # MlpPolicy, or its recurrent twin
     if isinstance(policy, str) and "." not in policy and policy not in aliases:
-        raise UsageError(
-            f"{algo} has no policy {policy!r}; {did_you_mean(policy, aliases)}, "
-            "or the dotted name of a class"
-        )
-    for name in ("n_envs", "n_timesteps", "n_steps", "batch_size", "frame_stack"):
-        value = checked.get(name)
-        if isinstance(value, int) and value < 1:
-            raise UsageError(
-                f"hyperparameter {name}: {value} is not allowed; it must be at least 1"
-            )
+        raise UsageError(f"{algo} has no policy {policy!r}; {did_you_mean(policy, aliases)}")
     return dict(sorted(checked.items()))
 
 
 @dataclass
 class Setup:
-    """
-    Hyperparameters as objects, ready for the constructors.
+    """Hyperparameters as objects, ready for the constructors."""
 
-    :param model: arguments of the algorithm
-    :param n_envs: number of parallel environments
-    :param n_timesteps: length of training, steps of all environments together
-    :param normalize: arguments of VecNormalize; None: not used
-    :param frame_stack: number of stacked observations; None: not used
-    :param env_kwargs: arguments of the environment
-    :param env_wrapper: classes that wrap each single environment, and their arguments
-    :param vec_env_wrapper: those that wrap the vectorised environment
-    :param monitor_kwargs: arguments of the monitor
-    :param callback: names of callbacks; :meth:`callbacks` makes them
-    :param selection_limit: see CostEvalCallback
-    :param noise_type: kind of exploration noise; None: none
-    :param noise_std: its standard deviation, in the units of the actions
-    """
-
-    model: dict[str, Any]
+    model: dict[str, Any]  # arguments of the algorithm
     n_envs: int
     n_timesteps: int
-    normalize: dict[str, Any] | None = None
+    normalize: dict[str, Any] | None = None  # arguments of VecNormalize; None: not used
     frame_stack: int | None = None
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     env_wrapper: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
     vec_env_wrapper: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
     monitor_kwargs: dict[str, Any] = field(default_factory=dict)
-    callback: Any = None
+    callback: Any = None  # names, see callbacks()
     selection_limit: float | list[float] | None = None
     noise_type: str | None = None
-    noise_std: float = 0.0
+    noise_std: float = 0.0  # in the units of the actions
 
     @property
     def cuts_episodes(self) -> bool:
@@ -296,21 +243,13 @@ class Setup:
         return any(getattr(cls, "training_only", False) for cls, _ in wrappers)
 
     def callbacks(self) -> list[BaseCallback]:
-        """
-        The callbacks, made only where somebody trains.
-
-        :raises UsageError: one is not there, not a callback, or refuses its arguments
-        """
+        """The callbacks, made only where somebody trains."""
         callbacks = classes("callback", self.callback)
         with explained("a callback can't be made"):
             return [cls(**kwargs) for cls, kwargs in callbacks]
 
     def action_noise(self, actions: int) -> ActionNoise | None:
-        """
-        Exploration noise, as the hyperparameters ``noise_type`` and ``noise_std`` say.
-
-        :param actions: number of action dimensions
-        """
+        """Exploration noise for this number of action dimensions, if there is any."""
         if self.noise_type is None:
             return None
         mean, std = np.zeros(actions), np.full(actions, self.noise_std)

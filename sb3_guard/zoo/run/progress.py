@@ -1,7 +1,6 @@
-"""What a person watching a run wants to see: how far it is, how well it does, how safely."""
+"""What a run comes to: the episodes of its last epoch, and what it was made with."""
 
 import platform
-import shlex
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,6 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from tqdm import tqdm
 
 import sb3_guard
 from sb3_guard.algorithms.common.costs import limits_at
@@ -22,9 +20,7 @@ from sb3_guard.checks import NumberError
 from sb3_guard.common.evaluation import bounded_name
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
 from sb3_guard.costs import beside, estimate, verdict
-from sb3_guard.zoo.cli.usage import packages_flag
-from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import EPOCH, RunFolder, cost_words
+from sb3_guard.zoo.run.folder import EPOCH
 
 DIVERGED = 10  # episodes in a row that a physics error ended, after which training stops
 PACKAGES = ("mujoco", "gymnasium", "stable_baselines3", "torch", "numpy")
@@ -113,24 +109,21 @@ def merit(
 
 class Epochs(BaseCallback):
     """
-    Collect the episodes of each epoch, and show them on a progress bar.
+    Collect the episodes of each epoch.
 
     The paper's figures of merit are means over the episodes that ended in the final *epoch*, the
     final rollout; :meth:`result` has them. Off-policy algorithms, whose rollouts are too short to
     end many episodes, have epochs of 30,000 steps.
 
     :param total: steps at which training ends
-    :param bar: show a progress bar on stderr
     :param cut: a wrapper ends the episodes early, so that their costs do not say whether the agent
         keeps its limits
     """
 
-    def __init__(self, total: int, bar: bool = False, cut: bool = False):
+    def __init__(self, total: int, cut: bool = False):
         super().__init__()
         self.total = total
-        self.show = bar
         self.cut = cut
-        self.bar = tqdm(disable=True)
         # step at which it ended, return, cost, length, and what the m limits bound: the episodes
         # of the epoch under way
         self._episodes: list[list[float]] = []
@@ -141,17 +134,6 @@ class Epochs(BaseCallback):
         self._provenance = provenance()
         #: steps after each part of the run that was to be shorter than it came to be
         self.learned: list[int] = []
-
-    def _on_training_start(self) -> None:
-        self.bar = tqdm(
-            total=self.total,
-            initial=self.model.num_timesteps,
-            unit=" steps",
-            unit_scale=True,
-            dynamic_ncols=True,
-            disable=not self.show,
-        )
-        self._describe()
 
     def _on_rollout_start(self) -> None:
         if not isinstance(self.model, OffPolicyAlgorithm):
@@ -165,7 +147,6 @@ class Epochs(BaseCallback):
             totals = [episode[name] for name in "rcl"]
             self._episodes.append([self.model.num_timesteps, *totals, *costs])
             self._diverged = self._diverged + 1 if np.isnan(episode["c"]) else 0
-        self.bar.update(self.model.num_timesteps - self.bar.n)
         return True
 
     def _on_rollout_end(self) -> None:
@@ -174,7 +155,6 @@ class Epochs(BaseCallback):
             self._episodes = [episode for episode in self._episodes if episode[0] > begin]
         if self._episodes:
             self.last = np.array(self._episodes)[:, 1:]
-            self._describe()
         if self._diverged >= DIVERGED:
             raise NumberError(
                 f"the last {self._diverged} episodes all ended in a physics error, and nothing can "
@@ -185,19 +165,6 @@ class Epochs(BaseCallback):
         if errors:
             self.logger.record("rollout/physics_errors", errors)
 
-    def _on_training_end(self) -> None:
-        self.bar.close()
-
-    def _describe(self) -> None:
-        if self.show and len(self.last):
-            earned, cost, _, *means = np.nanmean(self.last, axis=0).tolist()
-            rows = zip(self._keys, means, self._limits, strict=True)
-            costs = {key: {"mean": mean, "limit": limit} for key, mean, limit in rows}
-            self.bar.set_postfix_str(
-                f"return {earned:.2f}, {cost_words({'cost': cost, 'costs': costs})}, "
-                f"rate {self._cost_rate():.4f}"
-            )
-
     @property
     def _keys(self) -> tuple[str, ...]:
         return cost_keys_of(self.model, self.training_env)
@@ -206,51 +173,36 @@ class Epochs(BaseCallback):
     def _limits_worst(self) -> bool:
         return getattr(self.model, "limit_on", "sum") == "max"
 
-    def _cost_rate(self) -> float | None:
-        monitor = find_monitor(self.training_env)
-        return monitor.total_cost / monitor.total_steps if monitor.total_steps else None
-
-    @property
-    def _limits(self) -> list[float | None]:
-        model: Any = self.model
-        constrained = getattr(model, "constrained", False)
-        return model.final_cost_limits.tolist() if constrained else [None] * len(self._keys)
-
     def result(self) -> dict[str, Any]:
         """
         J_r, M_c and ρ_c as the paper defines them, and what they were obtained with.
 
-        :return: ``label`` and ``family`` that the algorithm's class states (None: it states none),
-            ``return``, ``cost`` and ``length``, means over the episodes of the last epoch in
-            which any ended (None if none did), their number ``episodes``, ``costs``, for each
-            cost key the ``mean`` of what its limit bounds, the 95 % interval of that mean
-            (``low``, ``high``), the ``limit`` (None: unconstrained) and the ``verdict``, "kept",
-            "exceeded" or "undecided" (without interval and verdict if fewer than five episodes
-            ended), and the number of further episodes that ended in ``physics_errors``, if any did,
-            ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the
-            number of episodes that ended because the physics diverged, ``cost_limit`` (None:
-            unconstrained), ``limit_on`` of an algorithm that limits the worst step, ``cut`` where a
-            wrapper ended the episodes early, which leaves no verdict, ``seconds`` of training, and
+        :return: ``label`` and ``family`` that the algorithm's class states, :func:`merit` of the
+            last epoch in which any episode ended, ``cost_rate``, cumulative cost ÷ steps of the
+            whole run, ``physics_errors``, the number of episodes that one ended, ``cost_limit``
+            (None: unconstrained), ``limit_on`` of an algorithm that limits the worst step, ``cut``
+            where a wrapper ended the episodes early, ``seconds`` of training, and
             :func:`provenance`. ``learned``, absent from a straight run, is the steps at which it
             was made longer, since warm-up and schedules were those of shorter runs until then
         """
-        monitor = find_monitor(self.training_env)
-        episodes = self.last if len(self.last) else np.zeros((0, 3 + len(self._keys)))
-        constrained = getattr(self.model, "constrained", False)
-        limit = limits_at(getattr(self.model, "cost_limit", None), 0.0) if constrained else None
-        algorithm = type(self.model)
+        model: Any = self.model
+        monitor, keys = find_monitor(self.training_env), self._keys
+        episodes = self.last if len(self.last) else np.zeros((0, 3 + len(keys)))
+        constrained = getattr(model, "constrained", False)
+        limits = model.final_cost_limits.tolist() if constrained else [None] * len(keys)
+        rate = monitor.total_cost / monitor.total_steps if monitor.total_steps else None
         return {
-            "label": getattr(algorithm, "label", None),
-            "family": getattr(algorithm, "family", None),
-            **merit(episodes, self._keys, self._limits, self.cut),
-            "cost_rate": self._cost_rate(),
-            "n_timesteps": self.model.num_timesteps,
+            "label": getattr(model, "label", None),
+            "family": getattr(model, "family", None),
+            **merit(episodes, keys, limits, self.cut),
+            "cost_rate": rate,
+            "n_timesteps": model.num_timesteps,
             "physics_errors": monitor.physics_errors,
-            "cost_limit": limit,
+            "cost_limit": limits_at(model.cost_limit, 0.0) if constrained else None,
             **({"limit_on": "max"} if self._limits_worst else {}),
             **({"cut": True} if self.cut else {}),
             # SB3's clock, which a resumed run sets back
-            "seconds": round((time.time_ns() - self.model.start_time) / 1e9, 3),
+            "seconds": round((time.time_ns() - model.start_time) / 1e9, 3),
             **({"learned": self.learned} if self.learned else {}),
             **self._provenance,
         }
@@ -275,58 +227,34 @@ class Epochs(BaseCallback):
             self.learned.append(state["steps"])
 
 
-def rounded(values: np.ndarray) -> list[float | None]:
-    """Numbers of six significant digits, for a file; None: it is not known."""
-    return [None if np.isnan(value) else float(f"{value:.6g}") for value in values]
-
-
-def summary(
-    folder: RunFolder, flags: RunFlags, result: Mapping[str, Any], seconds: float, finished: bool
-) -> str:
+def summary(result: Mapping[str, Any]) -> str:
     """What a run came to, as the paper measures it, on a few lines."""
 
     def number(value: float | None, digits: int) -> str:
         return "– (no episode has ended)" if value is None else f"{value:.{digits}f}"
 
-    def bounded(cost: Mapping[str, Any]) -> str:
-        text = number(cost["mean"], 3)
-        if "low" in cost:
-            text += f"   [{cost['low']:.3f}, {cost['high']:.3f}]"
-        if cost["limit"] is not None:
-            text += f"   limit {cost['limit']:g}"
-        text += f": {cost['verdict']}" if "verdict" in cost else ""
-        return text + beside(cost.get("physics_errors", 0))
-
-    costs, limit_on = result["costs"], result.get("limit_on", "sum")
-    alone = len(costs) == 1 and limit_on == "sum"
+    limit_on = result.get("limit_on", "sum")
     lines = [
-        f"{'Finished' if finished else 'Interrupted'} at {result['n_timesteps']:,} steps, "
-        f"{seconds:.0f} s",
-        f"  run folder         {folder.path}",
         f"  return       J_r   {number(result['return'], 3)}",
-        f"  episode cost M_c   {bounded(*costs.values()) if alone else number(result['cost'], 3)}",
-        *(
-            f"    {bounded_name(key, limit_on):<16} {bounded(cost)}"
-            for key, cost in ({} if alone else costs).items()
-        ),
-        f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}",
+        f"  episode cost M_c   {number(result['cost'], 3)}",
     ]
-    for name, played in result["final"].items():
+    for key, cost in result["costs"].items():
+        interval = f"   [{cost['low']:.3f}, {cost['high']:.3f}]" if "low" in cost else ""
+        limit = "" if cost["limit"] is None else f"   limit {cost['limit']:g}"
+        words = f": {cost['verdict']}" if "verdict" in cost else ""
         lines.append(
-            f"  final, {name:<12}return {np.mean(played['returns']):.3f}, cost "
-            f"{(cost := estimate(np.array(played['costs'], float)))}, {len(played['costs'])} "
-            f"episodes{beside(cost.diverged)}"
+            f"    {bounded_name(key, limit_on):<16} {number(cost['mean'], 3)}{interval}{limit}"
+            f"{words}{beside(cost.get('physics_errors', 0))}"
+        )
+    lines.append(f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}")
+    for name, played in result["final"].items():
+        total = estimate(np.array(played["costs"], float))
+        lines.append(
+            f"  final, {name:<12}return {np.mean(played['returns']):.3f}, cost {total}, "
+            f"{len(played['costs'])} episodes{beside(total.diverged)}"
         )
         for key, values in played.get("bounded", {}).items():
-            cost, limit = estimate(np.array(values, float)), costs[key]["limit"]
-            against = "" if limit is None else f"   {cost.against(limit)}"
-            lines.append(f"    {bounded_name(key, limit_on):<16} {cost}{against}")
-    packages = packages_flag(flags.gym_packages)
-    if not finished:
-        lines.append(f"  continue with      {folder.again(flags)}")
-    elif (exp_id := folder.path.name[len(folder.name) + 1 :]).isdigit():
-        lines.append(
-            f"  see the agent      sb3-guard enjoy --algo {flags.algo} --env {flags.env} "
-            f"-f {shlex.quote(str(folder.path.parent.parent))} --exp-id {exp_id}{packages}"
-        )
+            mean, limit = estimate(np.array(values, float)), result["costs"][key]["limit"]
+            against = "" if limit is None else f"   {mean.against(limit)}"
+            lines.append(f"    {bounded_name(key, limit_on):<16} {mean}{against}")
     return "\n".join(lines)

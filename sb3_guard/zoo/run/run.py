@@ -58,14 +58,7 @@ from sb3_guard.zoo.run.checkpoint import (
     read_normalizer,
 )
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import (
-    RunFolder,
-    is_disk_error,
-    is_run,
-    lock,
-    require_writable,
-    run_path,
-)
+from sb3_guard.zoo.run.folder import RunFolder, is_run, lock, run_path, write_config
 from sb3_guard.zoo.run.hyperparams import (
     Setup,
     build,
@@ -82,13 +75,13 @@ from sb3_guard.zoo.run.make_envs import (
     seed_rows,
     source_of,
 )
-from sb3_guard.zoo.run.progress import Epochs, rounded, summary
+from sb3_guard.zoo.run.progress import Epochs, summary
 from sb3_guard.zoo.run.resumable import ResumableEnv
-from sb3_guard.zoo.run.tracking import ID, track
 
 FINAL_EPISODES = 100  # of each policy, after training
 #: what is played after training: the policy that was trained, and its most likely actions
 SPLITS = ("stochastic", "greedy")
+WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
 
 
 @dataclass
@@ -194,17 +187,14 @@ class Run:
 
     def try_out(self) -> Self:
         """
-        Check what no value shows: the folder of events, and a step of the environment.
+        Check what no value shows: a step of the environment.
 
         :return: the same run
-        :raises UsageError: one is not there, or the environment refuses a value or has no cost
+        :raises UsageError: the environment refuses a value, has no cost, or diverges at rest
         """
-        flags = self.flags
-        if flags.tensorboard_log:
-            require_writable(Path(flags.tensorboard_log), "--tensorboard-log")
         self._try_environment(self.setup.env_kwargs)
-        if flags.eval_freq > 0 and flags.eval_env_kwargs is not None:
-            self._try_environment(flags.eval_env_kwargs)
+        if self.flags.eval_freq > 0 and self.flags.eval_env_kwargs is not None:
+            self._try_environment(self.flags.eval_env_kwargs)
         return self
 
     def _try_environment(self, env_kwargs: Mapping[str, Any]) -> None:
@@ -248,7 +238,7 @@ class Run:
             if flags.eval_freq > 0:
                 self.evaluation = self._make_evaluation()
             if flags.track:
-                self.tracker = track(flags, self.hyperparams, self.folder)
+                self.tracker = self._track()
         except BaseException:
             self.close()
             raise
@@ -262,6 +252,31 @@ class Run:
                 env.close()
         if self.tracker is not None:
             self.tracker.finish()
+
+    def _track(self) -> Any:
+        """
+        The run at Weights & Biases, which sends its TensorBoard events as they are written.
+
+        It comes before they are: events of files that are open already would not be seen.
+        """
+        import wandb
+
+        flags = self.flags
+        file = None if self.folder is None else self.folder.params / WANDB
+        run_id = file.read_text().strip() if file is not None and file.exists() else None
+        fix = "log in with: wandb login, set WANDB_MODE=offline, or leave out --track"
+        with explained("--track: Weights & Biases can't be used", fix=fix):
+            return wandb.init(
+                id=run_id,
+                resume="allow" if run_id else None,
+                name=f"{flags.env}__{flags.algo}__{flags.seed}__{int(time.time())}",
+                project=flags.wandb_project_name,
+                entity=flags.wandb_entity,
+                group=flags.wandb_group,
+                tags=flags.wandb_tags,
+                config={**flags.values(), "hyperparams": self.hyperparams},
+                sync_tensorboard=True,
+            )
 
     def make_envs(
         self,
@@ -368,7 +383,7 @@ class Run:
             seed=evaluation_seed(flags.seed),
             n_eval_episodes=flags.eval_episodes,
             eval_freq=max(flags.eval_freq // self.setup.n_envs, 1),
-            verbose=int(flags.verbose > 0 and self._prints_tables),
+            verbose=int(flags.verbose > 0),
         )
         evaluation.model = self.model
         return evaluation
@@ -430,11 +445,6 @@ class Run:
         if best.is_file():
             return best
         return min(agent.parent.glob("*/vecnormalize.pkl"), default=None)
-
-    @property
-    def _prints_tables(self) -> bool:
-        """Whether logs go to standard output; where a progress bar shows the same live, not."""
-        return self.flags.verbose > (1 if self.flags.progress else 0)
 
     # Trained
 
@@ -566,7 +576,7 @@ class Run:
         :param folder: the run's folder, owned by this process
         :param asked_to_stop: training ends after the rollout under way when this says so
         :return: exit status: 0, or 128 + the signal's number when interrupted
-        :raises UsageError: training can't continue, or the disk is full or read-only
+        :raises UsageError: training can't continue
         """
         try:
             return self._train(folder, asked_to_stop)
@@ -577,13 +587,6 @@ class Run:
                 "a process of --vec-env subproc has died, because of an error printed above, by a "
                 f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
             ) from error
-        except OSError as error:
-            if not is_disk_error(error):
-                raise
-            raise UsageError(
-                f"can't write to {folder.path}: {error.strerror}; what was written before is "
-                f"intact: make room, then continue with: {folder.again(self.flags)}"
-            ) from error
         finally:
             self.close()
 
@@ -592,7 +595,7 @@ class Run:
         if verbose:
             print(f"Run folder: {folder.path} (seed {flags.seed})")
         if self.tracker is not None:
-            (folder.params / ID).write_text(self.tracker.id)
+            (folder.params / WANDB).write_text(self.tracker.id)
             self.tracker.config.update({"folder": str(folder.path)}, allow_val_change=True)
         with explained(f"can't write to {folder.path}", OSError):
             # Two lines of the csv are no episodes.
@@ -600,7 +603,7 @@ class Run:
             find_monitor(self.env).log_to(folder.monitor, append=goes_on)
             logger = RunLogger(
                 folder.path,
-                stdout=self._prints_tables,
+                stdout=verbose,
                 tensorboard=folder.events(flags) if flags.tensorboard_log else None,
                 state=None if state is None else state["logger"],
             )
@@ -614,10 +617,8 @@ class Run:
                 )
 
         began = time.monotonic()
-        epochs = Epochs(
-            self.setup.n_timesteps, bar=bool(flags.progress), cut=self.setup.cuts_episodes
-        )
-        with interrupts(stop) as received, ExitStack() as last:
+        epochs = Epochs(self.setup.n_timesteps, cut=self.setup.cuts_episodes)
+        with interrupts(stop) as received:
             checkpoints = self._checkpoints(
                 folder, epochs, lambda: bool(received) or asked_to_stop()
             )
@@ -625,13 +626,19 @@ class Run:
                 checkpoints.restore(self.model, state)
                 # In this order, and only now: a result in the folder is always that of its config.
                 folder.result.unlink(missing_ok=True)
-                folder.write_config(flags, self.hyperparams)
-            last.callback(epochs.on_training_end)  # leaves the terminal tidy
+                write_config(folder.params, flags, self.hyperparams)
             finished = self._learn(checkpoints)
             logger.close()
             result = self._finish(folder, epochs.result(), finished)
         if verbose:
-            print(summary(folder, flags, result, time.monotonic() - began, finished))
+            words = "Finished" if finished else "Interrupted"
+            seconds = time.monotonic() - began
+            print(f"{words} at {result['n_timesteps']:,} steps, {seconds:.0f} s")
+            print(f"  run folder         {folder.path}\n{summary(result)}")
+            if finished:
+                print(f"  see the agent      {folder.play(flags)}")
+            else:
+                print(f"  continue with      {folder.again(flags)}")
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
 
     def _checkpoints(
@@ -671,16 +678,14 @@ class Run:
                 left,
                 callback=[checkpoints, *checkpoints.others],
                 reset_num_timesteps=self.begun is None,
+                progress_bar=self.flags.progress,
                 **kwargs,
             )
         except Interrupted:
             return False
         except BAD_NUMBERS as error:
-            if self.flags.verbose > 1:
-                raise
             raise TrainingStopped(
-                f"training stopped at {self.model.num_timesteps} steps: {one_line(error)} "
-                "(--verbose 2 shows where)"
+                f"training stopped at {self.model.num_timesteps} steps: {one_line(error)}"
             ) from error
         return True
 
@@ -714,7 +719,11 @@ class Run:
             return {}
         env = self.make_evaluation_envs(episodes)
         final: dict[str, dict[str, Any]] = {}
-        try:
+
+        def rounded(values: np.ndarray) -> list[float | None]:
+            return [None if np.isnan(value) else float(f"{value:.6g}") for value in values]
+
+        with closing(env):
             sync_normalization(self.env, env)
             for name in SPLITS:
                 played = evaluate_policy(
@@ -734,8 +743,6 @@ class Run:
                 if len(played.cost_keys) > 1 or played.limit_on == "max":
                     bounded = zip(played.cost_keys, played.limited.T, strict=True)
                     final[name]["bounded"] = {key: rounded(costs) for key, costs in bounded}
-        finally:
-            env.close()
         return final
 
 

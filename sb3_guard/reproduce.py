@@ -12,14 +12,11 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from sb3_guard.spelling import nearest
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import UsageError, explained
-
-if TYPE_CHECKING:
-    from sb3_guard.zoo.run.folder import RunFolder
 
 # A row for each run of the grand table, written by scripts/leaderboard.py
 ROWS = Path(__file__).parent / "zoo" / "results" / "rows.csv"
@@ -75,58 +72,23 @@ def final_hash(result: Mapping[str, Any]) -> str | None:
     return final and hashlib.sha256(json.dumps(final, sort_keys=True).encode()).hexdigest()
 
 
-def unequal(said: Any, got: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Name and both values of what differs, in nested mappings; of what ``said`` has."""
+def unequal(said: Any, got: Any, name: str = "") -> Iterator[str]:
+    """What differs in nested mappings, of what ``said`` has: name and both values, in a line."""
     if isinstance(said, Mapping) and isinstance(got, Mapping):
         for key, value in said.items():
             yield from unequal(value, got.get(key), f"{name} {key}".strip())
     elif isinstance(said, float | int) and isinstance(got, float | int):
         both_nan = said != said and got != got
         if not (both_nan or math.isclose(said, got, rel_tol=1e-6, abs_tol=1e-9)):
-            yield name, said, got
+            yield f"{MEASURES.get(name, name)}: before {said:.6g}, now {got:.6g}"
     elif said != got:
-        yield name, said, got
-
-
-def shown(value: Any) -> str:
-    """A value in a line."""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def faults(run: "RunFolder") -> list[str]:
-    """
-    What a result says of the training episodes that ``0.monitor.csv`` does not.
-
-    Means, intervals and verdicts are computed again. Of a limit on the highest cost of a step only
-    the sums are: the file has no others.
-
-    :raises UsageError: the run is not finished, or damaged
-    """
-    import numpy as np
-    import pandas as pd
-
-    from sb3_guard.zoo.run.progress import merit
-
-    result = run.checked_result()
-    with explained(f"can't compare {run.result} with {run.monitor}"):
-        table = pd.read_csv(run.monitor, skiprows=1)
-        names = [f"c_{key}" if f"c_{key}" in table else "c" for key in result["costs"]]
-        last = table.tail(max(result["episodes"], 0))[["r", "c", "l", *names]].to_numpy(float)
-        limits = np.broadcast_to(np.array(result["cost_limit"], object), len(names)).tolist()
-        got = merit(last, [*result["costs"]], limits, result.get("cut", False))
-        if "limit_on" in result:
-            del got["costs"]
-        said = {key: result[key] for key in got}
-    return [
-        f"{name} is {shown(a)}, by the episodes {shown(b)}" for name, a, b in unequal(said, got)
-    ]
+        yield f"{name}: before {said}, now {got}"
 
 
 def published(name: str) -> dict[str, Any]:
     """
     What a run was and came to: a row of the package's table, or the result of a folder.
 
-    :param name: of a row, or of a run folder
     :return: ``command``, ``curve``, ``final`` (hashes), ``commit``, ``processor`` and ``seconds``;
         ``said``, all numbers that are to be the same again; and ``seeds``, :func:`measures` of the
         runs of the same command with any seed
@@ -137,34 +99,25 @@ def published(name: str) -> dict[str, Any]:
 
     if is_run(Path(name)):
         run = RunFolder(Path(name))
-        result = run.checked_result()
+        result, command = run.checked_result(), run.flags().command()
         if not result.get("curve"):
             raise UsageError(f"{run.result} has no hash of the episodes: an older version wrote it")
-        with explained(f"can't read {run.monitor}", OSError, KeyError, TypeError, ValueError):
-            rounded = result["curve"] != run.curve_hash()
-        if rounded:
-            print(
-                f"{run.monitor} is not as the run wrote it (packed logs are rounded): the hash in "
-                "result.json is compared."
-            )
-        elif wrong := faults(run):
-            raise UsageError(f"{run.result} is not what its episodes came to: {'; '.join(wrong)}")
         with explained(f"{run.result} is damaged"):
-            seconds = timedelta(seconds=result.get("seconds") or 0).total_seconds()
-            words = run.flags().command()
-            seeds = [measures(result)]
-            for path in sorted(run.path.resolve().parent.glob(f"{run.name}_*")):
-                other = RunFolder(path) if is_run(path) and path != run.path.resolve() else None
-                if other and SEED.sub("", other.flags().command()) == SEED.sub("", words):
-                    seeds += [measures(r) for r in [other.read_result()] if r]
             said = {key: value for key, value in result.items() if key not in MADE}
-            made = {"final": final_hash(result), "seconds": seconds, "command": words}
-            return {**result, **made, "said": said | measures(result), "seeds": seeds}
+            said |= measures(result)
+        others = (RunFolder(path) for path in run.path.parent.glob(f"{run.name}_*") if is_run(path))
+        seeds = [
+            measures(there)
+            for other in others
+            if (there := other.read_result())
+            and SEED.sub("", other.flags().command()) == SEED.sub("", command)
+        ]
+        final = final_hash(result)
+        return {**result, "command": command, "final": final, "said": said, "seeds": seeds}
     with ROWS.open(newline="", encoding="utf-8") as file:
         rows = {row["row"]: row for row in csv.DictReader(file)}
     if name not in rows:
-        close = nearest(name, rows)
-        hint = f"a row is {next(iter(rows))!r}" if close is None else f"did you mean {close!r}?"
+        hint = f"did you mean {nearest(name, rows) or next(iter(rows))!r}?"
         if below := find_runs(Path(name)):
             hint = f"run folders in it: {', '.join(map(str, below))}"
         raise UsageError(f"{name!r} is no run folder and no row of the leaderboard; {hint}")
@@ -184,14 +137,13 @@ def differences(row: Mapping[str, Any], result: Mapping[str, Any]) -> list[str]:
         for kind, (name, new) in hashes.items()
         if row.get(name) and row[name] != new
     ]
-    pairs = [*unequal(row["said"], {**result, **measures(result)})]
-    if pairs and not lines:
+    said = row["said"]
+    if lines:  # then only what is worth knowing
+        said = {name: said[name] for name in MEASURES if name in said}
+    numbers = [f"  {line}" for line in unequal(said, {**result, **measures(result)})]
+    if numbers and not lines:
         lines = ["Not the same: the episodes agree, but not what is said of them."]
-    elif lines:
-        pairs = [pair for pair in pairs if pair[0] in MEASURES]
-    return lines + [
-        f"  {MEASURES.get(name, name)}: before {shown(a)}, now {shown(b)}" for name, a, b in pairs
-    ]
+    return lines + numbers
 
 
 def as_another_seed(
@@ -230,8 +182,6 @@ def reproduce(flags: Flags) -> int:
     from sb3_guard.zoo.run.progress import processor
     from sb3_guard.zoo.run.run import Run
 
-    if not flags.run:
-        raise UsageError("which run? Give a row of the leaderboard, or a run folder")
     row = published(flags.run)
     again = RunFlags.parse(shlex.split(row["command"])[2:])
     again.log_folder, again.verbose = flags.log_folder, 0
@@ -242,18 +192,16 @@ def reproduce(flags: Flags) -> int:
     for name in followed:
         setattr(again, name, getattr(flags, name) or getattr(again, name))
     run = Run.check(again)
-    seconds = row.get("seconds")
-    took = f", which took {timedelta(seconds=round(float(seconds)))}" if seconds else ""
-    steps = f"{run.setup.n_timesteps:,} steps{took}"
-    here, there = processor(), row.get("processor") or "a processor that was not recorded"
     if run.path.resolve() == Path(flags.run).resolve():
         raise UsageError(f"the new run would be in {flags.run} itself: choose another --log-folder")
+    here, there = processor(), row.get("processor") or "a processor that was not recorded"
     if there != here:
         print(
             f"The run before is of {there}, this is {here}: another processor rounds differently, "
             "and the episodes may be others."
         )
-    print(f"{row['command']}\n{steps}, in {run.path} …", flush=True)
+    took = timedelta(seconds=round(float(row.get("seconds") or 0)))
+    print(f"{row['command']}\n{run.setup.n_timesteps:,} steps, which took {took}, in {run.path} …")
     if run.standing() == "done":
         print("This run was trained already; to train it again, remove its folder or change -f.")
     if status := run.complete(row["command"]):
@@ -263,16 +211,15 @@ def reproduce(flags: Flags) -> int:
     lines = differences(row, result)
     if result["return"] is None and row.get("curve") == result["curve"]:
         lines = ["No episode has ended: there is nothing to compare."]
-    kinds = "training and final" if row.get("final") else "training"
     same = not lines
     if there != here and row["curve"] != result["curve"]:
         same, judged = as_another_seed(row["seeds"], measures(result))
         lines += judged
+    kinds = "training and final" if row.get("final") else "training"
     print("\n".join(lines) or f"The same: all {kinds} episodes agree, and all measures.")
     if (row.get("commit") or None) != result["commit"]:
         print(
-            f"The run before is of commit {row.get('commit') or 'unknown'}, the new one of "
-            f"{result['commit'] or 'an installed package'}."
+            f"The run before is of commit {row.get('commit')}, the new one of {result['commit']}."
         )
     return int(not same)
 

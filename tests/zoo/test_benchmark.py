@@ -319,27 +319,16 @@ def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
     )  # fmt: skip
 
 
-def test_a_run_that_another_process_has_is_awaited(tmp_path, here, monkeypatch, capsys):
-    """Two grids in one folder both come to their end."""
-    monkeypatch.setattr(grid, "ASK_AGAIN", 0.0)
+def test_a_run_that_another_process_has_is_left_to_it(tmp_path, here, capsys):
+    """Two grids in one folder share the work; the same command takes what is left."""
     run = tmp_path / "cpo" / "CostPoint-v0_1"
     run.mkdir(parents=True)
-    with lock(run):
-        held = (run / ".lock").read_text()
-    (run / ".lock").write_text(held)
-    asked = []
-
-    def free_at_last(other):
-        asked.append(other.flags.algo)
-        if len(asked) == 4:
-            (run / ".lock").unlink()
-
-    here.before = free_at_last
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
+    with lock(run):
+        assert benchmark.main(arguments) == 1
+    out, err = capsys.readouterr()
+    assert "in use: cpo on" in out and "1 of 2 done" in out and "in use by process" in err
     assert benchmark.main(arguments) == 0
-    out = capsys.readouterr().out
-    assert out.count("in use: cpo on") == 1 and "2 of 2 done" in out
-    assert asked == ["cpo", "trpo", "cpo", "cpo"]
 
 
 def test_asked_to_stop(tmp_path, here, capsys):

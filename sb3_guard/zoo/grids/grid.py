@@ -19,8 +19,8 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -145,7 +145,6 @@ def try_out(runs: Sequence[GridRun]) -> None:
 
 # In a worker
 
-ASK_AGAIN = 1.0  # seconds until another process is asked for its run again
 _one_at_a_time = threading.Lock()  # random generators and thread counts belong to the process
 
 
@@ -163,13 +162,12 @@ def carry_out(run: GridRun, command: str, stop: Path) -> tuple[str, str]:
     with _one_at_a_time:
         if stop.exists():
             return "waiting", ""
-        error_file = run.path / "error.txt"
         gc.collect()  # the run before: a model refers to itself, and Python seldom looks for that
+        error_file = run.path / "error.txt"
         try:
             error_file.unlink(missing_ok=True)
             status = run.complete(command, stop.exists)
         except RunInUse as error:
-            time.sleep(ASK_AGAIN)
             return "in use", one_line(error)
         except Exception as error:
             # The grid's summary says it too, so a record that can't be written is no failure.
@@ -200,9 +198,7 @@ def _begin_worker() -> None:
 
 def cores() -> int:
     """How many this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 @contextmanager
@@ -238,48 +234,6 @@ def cluster(address: str) -> Iterator[Executor]:
         yield client.get_executor(retries=0, pure=False)
 
 
-# Here
-
-
-def execute(
-    runs: Sequence[GridRun], executor: Executor, stop: Path, say: Callable[[str], None]
-) -> int:
-    """
-    Train what is not done yet.
-
-    :param runs: as :func:`expand` returns them; their states follow
-    :param executor: whose workers see the runs' folders
-    :param stop: file that asks the runs to stop
-    :param say: prints a line
-    :return: 0, or 128 + the signal's number when interrupted
-    :raises UsageError: a worker or the scheduler is gone
-    """
-    command = shlex.join(sys.orig_argv)
-
-    def ask_to_stop(number: int) -> None:
-        stop.touch()
-        say("Stopping after the rollouts under way; Ctrl-C again stops immediately.")
-
-    with interrupts(ask_to_stop) as received:
-        with interrupts_held():  # by the processes that this starts
-            todo = [run for run in runs if run.state != "done"]
-            futures = {executor.submit(carry_out, run, command, stop): run for run in todo}
-        for run in todo:
-            run.state = "waiting"
-        while futures:
-            for future in wait(futures, return_when=FIRST_COMPLETED).done:
-                run = futures.pop(future)
-                before = run.state
-                # Errors of runs are caught where they run.
-                with explained("a worker or scheduler is gone", fix="the same command continues"):
-                    run.state, run.error = future.result()
-                if run.state not in ("waiting", before):
-                    say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}")
-                if run.state == "in use":  # until whoever has it is done with it, or dead
-                    futures[executor.submit(carry_out, run, command, stop)] = run
-    return 128 + received[0] if received else 0
-
-
 def run_grid(
     runs: Sequence[GridRun],
     folder: Path,
@@ -291,7 +245,7 @@ def run_grid(
     """
     Carry out what is not done, and say what has become of it.
 
-    :param runs: expanded and tried out
+    :param runs: expanded and tried out; their states follow
     :param folder: where they are
     :param jobs: runs at once on this machine; None: as many as there are cores for this process
     :param scheduler: address of a Dask cluster's scheduler; None: this machine
@@ -305,22 +259,36 @@ def run_grid(
         if verbose:
             print(text, flush=True)
 
-    status, stop_file = 0, folder / stop
+    def ask_to_stop(number: int) -> None:
+        stop_file.touch()
+        say("Stopping after the rollouts under way; Ctrl-C again stops immediately.")
+
     for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
         say(f"{algo} has no {', '.join(names)}: left out there")
-    if todo := sum(run.state != "done" for run in runs):
-        say(f"{folder}: {summary(runs)}")
+    say(f"{folder}: {summary(runs)}")
+    status, stop_file, todo = 0, folder / stop, [run for run in runs if run.state != "done"]
+    if todo:
         with explained(f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"):
             folder.mkdir(parents=True, exist_ok=True)
             stop_file.unlink(missing_ok=True)
-        number = min(jobs or cores(), todo)
-        with cluster(scheduler) if scheduler else processes(number) as executor:
-            status = execute(runs, executor, stop_file, say)
+        command, number = shlex.join(sys.orig_argv), min(jobs or cores(), len(todo))
+        hosts = cluster(scheduler) if scheduler else processes(number)
+        with hosts as executor, interrupts(ask_to_stop) as received:
+            with interrupts_held():  # by the processes that this starts
+                futures = {executor.submit(carry_out, run, command, stop_file): run for run in todo}
+            for future in as_completed(futures):
+                run = futures[future]
+                # Errors of runs are caught where they run.
+                with explained("a worker or scheduler is gone", fix="the same command continues"):
+                    run.state, run.error = future.result()
+                if run.state != "waiting":
+                    say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}")
+        status = 128 + received[0] if received else 0
         stop_file.unlink(missing_ok=True)
-    say(f"{folder}: {summary(runs)}")
-    for run in runs:
-        if run.state == "failed":
-            print(f"failed: {run}: {run.error}\n  {run.path / 'error.txt'}", file=sys.stderr)
+        say(f"{folder}: {summary(runs)}")
+    for run in todo:
+        if run.error:
+            print(f"{run.state}: {run}: {run.error}", file=sys.stderr)
     if all(run.state == "done" for run in runs):
         say(f"See the results with: sb3-guard plot {shlex.quote(str(folder))}")
         return status

@@ -1,10 +1,9 @@
 """Train a grid, environments × algorithms × seeds: ``sb3-guard benchmark --preset main8``."""
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from sb3_guard.zoo.cli.flags import HOST, IDENTITY, command, flag
 from sb3_guard.zoo.cli.usage import (
@@ -16,9 +15,6 @@ from sb3_guard.zoo.run.flags import (
     RunFlags,
     TrainingFlags,
 )
-
-if TYPE_CHECKING:
-    from sb3_guard.zoo.grids.grid import GridRun
 
 # Flags that no grid file states
 HOW = ("grid", "log_folder", "dry_run", "scheduler", "verbose")
@@ -49,8 +45,8 @@ class Flags(EvaluationFlags, TrainingFlags):
 
     :param dry_run: list the runs and train nothing
     :param jobs: number of runs at once, one process with one thread each (default: number of cores)
-    :param scheduler: address of a Dask scheduler, e.g. tcp://node1:8786 (default: run on this
-        machine); needs the extra sb3-guard[cluster]
+    :param scheduler: address of a Dask scheduler, e.g. tcp://node1:8786, whose workers carry out a
+        run each, in place of --jobs (default: this machine); needs the extra sb3-guard[cluster]
     :param verbose: output: 0 errors only, 1 progress (default: 1)
     """
 
@@ -123,16 +119,6 @@ def with_file(flags: Flags) -> Flags:
     return Flags.of(given)
 
 
-def show_plan(runs: Sequence["GridRun"]) -> None:
-    """Print the runs and how far they are."""
-    from sb3_guard.zoo.grids.grid import summary
-
-    for run in runs:
-        without = f", without {', '.join(run.ignored)}" if run.ignored else ""
-        print(f"{run.state:<7} {run.path}  {run.steps:,} steps{without}")
-    print(f"{summary(runs)}; {sum(run.steps for run in runs):,} steps in all")
-
-
 def benchmark(flags: Flags) -> int:
     """
     Carry out the command.
@@ -142,23 +128,20 @@ def benchmark(flags: Flags) -> int:
     flags = with_file(flags)
     folder = Path(flags.log_folder)
     if flags.scheduler is not None:
-        if flags.jobs is not None:
-            raise UsageError(
-                "--jobs is for this machine; on a Dask cluster, each worker carries out one run at "
-                "a time (dask worker ADDRESS --nworkers N --nthreads 1)"
-            )
         # Workers have working folders of their own.
         folder = folder.absolute()
         if flags.tensorboard_log:
             flags.tensorboard_log = str(Path(flags.tensorboard_log).absolute())
     of_a_run = RunFlags.shared(flags, log_folder=str(folder), verbose=flags.verbose)
-    of_a_run.check()
 
-    from sb3_guard.zoo.grids.grid import expand, run_grid, try_out
+    from sb3_guard.zoo.grids.grid import expand, run_grid, summary, try_out
 
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
     if flags.dry_run:
-        show_plan(runs)
+        for run in runs:
+            without = f", without {', '.join(run.ignored)}" if run.ignored else ""
+            print(f"{run.state:<7} {run.path}  {run.steps:,} steps{without}")
+        print(f"{summary(runs)}; {sum(run.steps for run in runs):,} steps in all")
         return 0
     try_out(runs)
     return run_grid(runs, folder, flags.jobs, flags.scheduler, flags.verbose)

@@ -209,20 +209,10 @@ def test_scenarios_from_files(tmp_path):
             Scenario.load(path)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("task: Goal\nrobot: Ant\ntask: Push\n", "line 3 has the key 'task' again, after line 1: "),
-        ("constraints:\n  hazards:\n    num: 2\n    num: 3\n", "line 4 .* 'num' .* line 3: "),
-        ("task: Goal\nconstraints: {hazards: {num: 2, num: 2}}\n", "line 2 .* 'num' .* line 2: "),
-        ("constraints:\n  ghosts:\n  'ghosts': {num: 2}\n", "line 3 has the key 'ghosts' again"),
-        ("robot_params: {heading: 2020-13-45}\n", "month must be in 1..12"),
-    ],
-)
-def test_files_that_would_be_read_otherwise_than_written_are_refused(text, message, tmp_path):
+def test_a_file_with_a_date_that_is_none_is_refused(tmp_path):
     path = tmp_path / "mine.yml"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=f"^cannot read scenario '.*mine.yml': {message}"):
+    path.write_text("robot_params: {heading: 2020-13-45}\n")
+    with pytest.raises(ValueError, match=r"^cannot read scenario '.*mine.yml': month must be"):
         Scenario.load(path)
 
 

@@ -149,7 +149,7 @@ def test_more_environments_than_memory_holds(capsys, empty, monkeypatch):
 
 def test_track_without_wandb(capsys, empty, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
-    refused(train.main, ["--track"], capsys, "--track needs wandb", "pip install wandb")
+    refused(train.main, [*TOY, *SMALL, "--track"], capsys, "--track needs wandb", "pip install")
 
 
 def test_track_without_a_key(capsys, empty, monkeypatch):
@@ -171,7 +171,7 @@ def test_corrupt_yaml(capsys, tmp_path):
     assert not (tmp_path / "logs").exists()
 
 
-@pytest.mark.parametrize("inner", ["[1]", "[[1]]", "{a: 1}", "[[[[a], 1]]]", "text"])
+@pytest.mark.parametrize("inner", ["[1]", "{a: 1}"])
 def test_an_ordered_mapping_that_is_none(inner, capsys, tmp_path):
     path = tmp_path / "ordered.yml"
     path.write_text(f"default: !!python/object/apply:collections.OrderedDict {inner}")
@@ -271,7 +271,7 @@ def test_corrupt_model(capsys, run, tmp_path):
         (["-params", "n_steps:31"], ["n_steps = 31 contradicts 30"]),
         (["-params", "gamma:0.9"], ["gamma = 0.9 contradicts unset, with which"]),
         (["-params", "gama:1"], ["no hyperparameter 'gama'", "'gamma'"]),
-        (["-f", "elsewhere"], ["contradicts"]),
+        (["-conf", "paper"], ["conf_file = paper contradicts"]),
         (["-n", "30"], ["-n 30 is less than the 60 steps"]),
     ],
 )

@@ -96,11 +96,10 @@ def test_presets_are_the_papers():
         assert {suite for suite, _ in preset(name)} == {s for s, a in preset(name) if a == "trpo"}
 
 
-@pytest.mark.parametrize("name", ["q2", "ladder"])
-def test_every_run_of_a_preset_is_valid(name, tmp_path):
+def test_every_run_of_a_preset_is_valid(tmp_path):
     flags = RunFlags(log_folder=str(tmp_path), conf_file="paper")
-    runs = grid.expand(preset(name), [0, 1], flags)
-    assert len({run.path for run in runs}) == len(runs) == 2 * len(preset(name))
+    runs = grid.expand(preset("q2"), [0, 1], flags)
+    assert len({run.path for run in runs}) == len(runs) == 2 * len(preset("q2"))
     assert [run.flags.seed + 1 for run in runs] == [1] * (len(runs) // 2) + [2] * (len(runs) // 2)
     for run in runs:  # the paper's lengths
         long = "_Ant_" in run.flags.env or "_Walker_" in run.flags.env
@@ -167,7 +166,6 @@ REFUSED = [
     (["-params", "gamma:1.5"], ["cpo on Goal_Point_8Hazards-v0", "gamma", "1.5"]),
     (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError"]),
     (["--device", "abacus"], ["abacus"]),
-    (["--scheduler", "x", "--jobs", "2"], ["--nworkers"]),
     (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
     (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
 ]
@@ -184,7 +182,6 @@ def test_refused_before_anything_starts(arguments, parts, capsys, tmp_path, monk
 GRID_FILES = [
     ("envs: [a", "g.yml as YAML"),
     ("just text", "must map flags to values"),
-    ("seeds: 1\nenvs: [Goal_Point_8Hazards]\nseeds: 2", "line 3 has the key 'seeds' again"),
     ("enves: [CostPoint-v0]", "unknown entry 'enves'; did you mean 'envs'?"),
     ("envs: [Goal_Point_8Hazards]\nscale: 0", "g.yml: scale = 0 must be greater than 0"),
     ("envs: [Goal_Point_8Hazards]\nhyperparams: [a]", "not of the form key:value"),
@@ -277,8 +274,8 @@ def test_a_warm_start_is_another_run(tmp_path, here, capsys):
     model = str(runs_of(tmp_path / "first") / "CostPoint-v0.zip")
     assert train.main([*one, "--seed", "0", "-i", model, "-f", str(tmp_path / "grid")]) == 0
     refused(
-        train.main, [*one, "--seeds", "0", "-f", str(tmp_path / "grid")], capsys,
-        "holds another run", f"trained_agent: {model} there, unset here",
+        benchmark.main, [*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path / "grid")],
+        capsys, "holds another run", f"trained_agent: {model} there, unset here",
     )  # fmt: skip
 
 
@@ -392,38 +389,14 @@ def test_a_run_looks_for_the_file_after_each_rollout(tmp_path, here):
     assert grid.carry_out(run, "", stop) == ("waiting", "")
 
 
-# train --seeds
-
-
 @pytest.mark.parametrize(("jobs", "number"), [("5", 2), ("1", 1)])
 def test_no_more_workers_than_runs(jobs, number, tmp_path, here, monkeypatch):
     asked = []
     monkeypatch.setattr(grid, "processes", lambda n: asked.append(n) or nullcontext(here))
-    flags = ["--algo", "cpo", "--env", "CostPoint-v0", *SMALL, "-n", "60", "-f", str(tmp_path)]
-    assert train.main([*flags, "--seeds", "0", "1", "--jobs", jobs]) == 0
+    monkeypatch.setattr(grid.GridRun, "complete", lambda *_: 1)
+    flags = ["--algos", "cpo", "--jobs", jobs, "-f", str(tmp_path)]
+    assert benchmark.main([*GRID, *flags]) == 1
     assert asked == [number]
-
-
-def test_seeds_of_train(tmp_path, here, capsys):
-    one = ["--algo", "cpo", "--env", "CostPoint-v0", *SMALL, "-n", "60", "-f", str(tmp_path)]
-    assert train.main([*one, "--seeds", "0", "4", "--verbose", "0"]) == 0
-    assert capsys.readouterr() == ("", "")
-    assert list(results(tmp_path)) == ["cpo/CostPoint-v0_1", "cpo/CostPoint-v0_5"]
-    assert train.main([*one, "--seeds", "0", "4", "5"]) == 0
-    assert len(here.runs) == 3 and "2 of 3 done, 1 new" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "part"),
-    [
-        (["--seeds", "0", "--seed", "1"], "not allowed with"),
-        (["--seeds", "0", "-i", "x"], "-i is for a single run"),
-        (["--seeds", "0", "--uuid"], "--uuid is for a single run"),
-        (["--jobs", "2"], "--jobs goes with several seeds"),
-    ],
-)
-def test_seeds_of_train_refused(arguments, part, capsys):
-    refused(train.main, arguments, capsys, part)
 
 
 # real processes

@@ -168,8 +168,6 @@ def test_make_model_makes_baselines(algo: str) -> None:
         (("cpo", "Goal_Point_8Hazards", {"costlimit": 1}), "did you mean 'cost_limit'"),
         (("p3o", "Goal_Point_8Hazards", {"cost_limit": -1.0}), "must be at least 0"),
         (("cpo", "Goal_Point_8Hazards", {"cost_limit": "much"}), "a number"),
-        (("cpo", None, {}), "env_id=None is not allowed"),
-        ((None, "Goal_Point_8Hazards", {}), "algo=None is not allowed"),
         (("cpo", "Goal_Point_8Hazards", {"callback": "x"}), "'callback'; give it to model.learn"),
         (("cpo", "Goal_Point_8Hazards", {"n_timesteps": 9}), "give it to model.learn"),
         (("cpo", "Goal_Point_8Hazards", {"selection_limit": 1}), "give it to CostEvalCallback"),

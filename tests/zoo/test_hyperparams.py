@@ -84,7 +84,6 @@ def test_python_file_and_module(tmp_path, monkeypatch):
         ("n_steps: 100\n", "must map environments"),
         ("Goal_Point_8Hazards-v0: {}\n", "no entry for 'Goal_Point_8Hazard'.*did you mean"),
         ("\x00\x01", "as YAML"),
-        ("default:\n  n_steps: 1\n  n_steps: 2\n", "line 3 has the key 'n_steps' again, .* line 2"),
     ],
 )
 def test_files_that_are_not_hyperparameters(tmp_path, content, message):

@@ -100,14 +100,6 @@ def test_killed_and_resumed(variant, tmp_path, monkeypatch):
     assert_same_run(tmp_path / "whole", tmp_path / "cut")
 
 
-def test_the_log_folder_may_be_written_otherwise(tmp_path, capsys):
-    assert train.main([*TOY, *SHORT, *SMALL, "-n", "60", "-f", str(tmp_path)]) == 0
-    again = ["-i", str(runs_of(tmp_path)), "-n", "120", *TOY[:2]]
-    assert train.main([*again, "-f", f"{tmp_path}/../{tmp_path.name}/"]) == 0
-    assert train.main([*again, "-f", str(tmp_path / "other")]) == 2
-    assert "contradicts" in capsys.readouterr().err
-
-
 def test_killed_and_resumed_off_policy(tmp_path, monkeypatch):
     """While random actions fill the buffer, and after."""
     off = ["--algo", "sac_lag", "--save-freq", "-1", "--checkpoint-every", "0", "--eval-freq", "-1"]

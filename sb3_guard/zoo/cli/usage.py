@@ -103,8 +103,8 @@ def run(command: Callable[[], int]) -> int:
     """
     Run a command and turn what the user can put right into one line on stderr.
 
-    :return: the exit status: the command's own, 130 for Ctrl-C, 141 if nobody reads its output any
-        longer (``| head``), that of a :class:`UsageError`, 2 for a package that does not import
+    :return: the exit status: the command's own, 130 for Ctrl-C, that of a :class:`UsageError`, 2
+        for a package that does not import
     """
     # OpenMP's idle threads spin by default: on a machine shared with other work, torch's threads
     # then wait for one another's time slices and training is ten times slower. Read when torch is
@@ -117,16 +117,10 @@ def run(command: Callable[[], int]) -> int:
         f"warning: {' '.join(str(message).split())}\n"
     )
     try:
-        status = command()
-        sys.stdout.flush()
-        return status
+        return command()
     except (UsageError, ImportError) as error:
         print(f"error: {one_line(error)}", file=sys.stderr)  # also of an absent package
         return getattr(error, "status", 2)
-    except BrokenPipeError as error:
-        print(f"error: {one_line(error)}", file=sys.stderr)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
-        return 141
     except KeyboardInterrupt:
         return 130
 

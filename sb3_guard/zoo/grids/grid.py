@@ -240,7 +240,6 @@ def run_grid(
     jobs: int | None = None,
     scheduler: str | None = None,
     verbose: int = 1,
-    stop: str = "stop",
 ) -> int:
     """
     Carry out what is not done, and say what has become of it.
@@ -250,7 +249,6 @@ def run_grid(
     :param jobs: runs at once on this machine; None: as many as there are cores for this process
     :param scheduler: address of a Dask cluster's scheduler; None: this machine
     :param verbose: 0: errors only
-    :param stop: name of the file in the folder that asks the runs to stop
     :return: exit status: 0, 1 if runs are not done, or 128 + the signal's number when interrupted
     :raises UsageError: a worker or the scheduler is gone
     """
@@ -266,7 +264,7 @@ def run_grid(
     for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
         say(f"{algo} has no {', '.join(names)}: left out there")
     say(f"{folder}: {summary(runs)}")
-    status, stop_file, todo = 0, folder / stop, [run for run in runs if run.state != "done"]
+    status, stop_file, todo = 0, folder / "stop", [run for run in runs if run.state != "done"]
     if todo:
         with explained(f"can't write to {str(folder)!r}", OSError, fix="choose another with -f"):
             folder.mkdir(parents=True, exist_ok=True)

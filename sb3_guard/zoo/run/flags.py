@@ -5,9 +5,6 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 from sb3_guard.zoo.cli.flags import HOST, IDENTITY, Command, flag
-from sb3_guard.zoo.cli.usage import (
-    explained,
-)
 
 # Flags beside those of role IDENTITY that a run is trained again with: hyperparameters are stated
 # by its folder, and threads change the order of sums.
@@ -117,7 +114,7 @@ class RunFlags(EvaluationFlags, TrainingFlags):
 
     algo: str = flag(default="cpo", role=IDENTITY)
     env: str = flag(default="Goal_Point_8Hazards-v0", role=IDENTITY)
-    seed: int = flag(default=-1, high=2**32, role=IDENTITY, exclusive="seeds")
+    seed: int = flag(default=-1, high=2**32, role=IDENTITY)
     trained_agent: str = flag("-i", default="", metavar="PATH", role=IDENTITY)
     log_folder: str = flag("-f", default="logs", metavar="DIR")
     uuid: bool = flag("-uuid", default=False)
@@ -139,14 +136,3 @@ class RunFlags(EvaluationFlags, TrainingFlags):
         names = {*self.names(IDENTITY), *AGAIN} - {"algo", "env"}
         words = ["--algo", self.algo, "--env", self.env, *self.words(names)]
         return shlex.join(["sb3-guard", "train", *words])
-
-    def check(self) -> None:
-        """
-        What can be said before anything heavy is imported.
-
-        :raises UsageError: a package is absent that a flag needs
-        """
-        if self.track:
-            fix = "install it with: pip install wandb"
-            with explained("--track needs wandb", ImportError, fix=fix):
-                import wandb  # noqa: F401

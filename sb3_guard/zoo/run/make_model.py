@@ -64,9 +64,6 @@ def make_model(
     :return: the model, not yet trained
     :raises ValueError: a name or value is not allowed; the message says what is
     """
-    for argument, value in (("algo", algo), ("env_id", env_id)):
-        if not isinstance(value, str):
-            raise ValueError(f"{argument}={value!r} is not allowed; it must be a name")
     for argument in ELSEWHERE.keys() & hyperparams:
         raise ValueError(f"make_model takes no {argument!r}; give it to {ELSEWHERE[argument]}")
     try:

@@ -259,7 +259,8 @@ class Run:
 
         It comes before they are: events of files that are open already would not be seen.
         """
-        import wandb
+        with explained("--track needs wandb", ImportError, fix="pip install wandb"):
+            import wandb
 
         flags = self.flags
         file = None if self.folder is None else self.folder.params / WANDB
@@ -547,10 +548,9 @@ class Run:
             overrides = given.hyperparams or {}
             refuse_places(folder.path, {n: v for n, v in values.items() if n not in overrides})
             run.hyperparams = check(saved.algo, algorithm(saved.algo), {**values, **overrides})
-            was = {**saved.values(START), **state["identity"], "n_timesteps": None}
-            now = {**run.flags.values(START), **run.identity, "n_timesteps": None}
-            if Path(run.flags.log_folder).resolve() == folder.path.resolve().parents[1]:
-                now["log_folder"] = was["log_folder"]  # the same folder in other words
+            free = {"n_timesteps": None, "log_folder": None}
+            was = {**saved.values(START), **state["identity"], **free}
+            now = {**run.flags.values(START), **run.identity, **free}
             for name, old, new in differences(was, now):
                 raise UsageError(
                     f"{name} = {new} contradicts {old}, with which {folder.path} was trained; put "

@@ -1,17 +1,15 @@
 """A logger whose table is continued from a checkpoint."""
 
-import csv
 import os
-import sys
 from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.logger import (
     CSVOutputFormat,
-    HumanOutputFormat,
     KVWriter,
     Logger,
     TensorBoardOutputFormat,
+    make_output_format,
 )
 
 
@@ -33,7 +31,7 @@ class RunLogger(Logger):
     :param folder: the run folder
     :param stdout: print each row as a table
     :param tensorboard: folder of the TensorBoard events; None: none
-    :param state: continue from what :meth:`state` said, and cut the file there; None: a new run
+    :param state: continue from what :meth:`state` said; None: a new run
     """
 
     def __init__(
@@ -43,21 +41,17 @@ class RunLogger(Logger):
         tensorboard: str | os.PathLike[str] | None = None,
         state: Mapping[str, Any] | None = None,
     ):
-        self._csv = CSVOutputFormat(os.devnull)  # which empties the file it opens
-        self._csv.close()
-        path = os.path.join(folder, "progress.csv")
-        goes_on = state is not None and cut(path, state["lines"])
-        self._csv.file = open(path, "r+" if goes_on else "w+", encoding="utf-8", newline="\n")
-        self._csv.keys = next(csv.reader(self._csv.file), [])
-        self._csv.file.seek(0, os.SEEK_END)
+        self._csv = CSVOutputFormat(os.path.join(folder, "progress.csv"))
+        self._iterations_before = 0
         formats: list[KVWriter] = [self._csv]
         if stdout:
-            formats.append(HumanOutputFormat(sys.stdout))
+            formats.append(make_output_format("stdout", os.fspath(folder)))
         if tensorboard is not None:
             formats.append(TensorBoardOutputFormat(os.fspath(tensorboard)))
         super().__init__(os.fspath(folder), formats)
-        self._iterations_before = 0
         if state is not None:
+            self._csv.file.write(state["rows"])
+            self._csv.keys = state["keys"]
             # What training logged after the last row is written with the next one.
             self.name_to_value.update(state["values"])
             self.name_to_count.update(state["counts"])
@@ -78,7 +72,8 @@ class RunLogger(Logger):
         """
         self._csv.file.seek(0)
         return {
-            "lines": sum(1 for line in self._csv.file),
+            "rows": self._csv.file.read(),
+            "keys": [*self._csv.keys],
             "values": dict(self.name_to_value),
             "counts": dict(self.name_to_count),
             "excluded": dict(self.name_to_excluded),

@@ -3,11 +3,9 @@
 import os
 import pickle
 import shutil
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -36,8 +34,6 @@ TRAIN = [
     # environment
     (["--env", "Goal_Pint_8Hazards"], ["'Pint'", "'Point'"]),
     (["--env", "scene.yml"], ["'scene.yml' is a file", "sb3_guard.register"]),
-    (["--env", "Goal_Point_8Hazzards-v0"], ["'Hazzards'", "'Hazards'"]),
-    (["--env", "CartPole-v99"], ["CartPole-v99"]),
     (["--env", "Nonsense"], ["'Nonsense'", "--gym-packages"]),
     (["--env", "Goal_Rover_8Hazards"], ["unknown robot 'Rover'", "--gym-packages"]),
     (["--env", "go1.xml"], ["register_robot(NAME, xml='go1.xml')"]),
@@ -45,12 +41,9 @@ TRAIN = [
     (["--gym-packages", "no_such_package"], ["--gym-packages", "'no_such_package'"]),
     (["--env-kwargs", "hazard:{}"], ["'hazard'", "hazards"]),
     (["--env-kwargs", "hazards:{'num': -1}"], ["num", "-1"]),
-    (["--env-kwargs", "hazards:{'size': 'big'}"], ["size", "'big'"]),
-    (["--env-kwargs", "speed:{limit:0.4}", "hazards:{sise:0.4}"], ["'sise'", "'size'"]),
     (["--env-kwargs", "max_steps:100"], ["'max_steps'", "'max_episode_steps'"]),
     ([*LIMITED, "--env-kwargs", "length:3"], ["CostPoint-v0", "'length'"]),
     (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError", "hazards"]),
-    (["--eval-env-kwargs", "hazards:{'num':200}"], ["LayoutError", "hazards"]),
     ([*LIMITED, "--vec-env", "native"],
      ["'CostPoint-v0' is not an sb3_guard environment", "'dummy' or 'subproc'"]),
     (["-params", "env_wrapper:gymnasium.wrappers.FlattenObservation", "--vec-env", "native"],
@@ -58,23 +51,16 @@ TRAIN = [
     # an environment without the cost key
     ([*LIMITED, "--env", "NoCost-v0"],
      ["no cost key 'cost'", "depth", "cost_keys", "missing_cost='zero'"]),
-    ([*LIMITED, "-params", "cost_keys:['heat']"], ["no cost key 'heat'"]),
     # hyperparameters
     (["-params", "n_step:10"], ["no hyperparameter 'n_step'", "did you mean 'n_steps'?"]),
     (["-params", "n_envs:0"], ["n_envs = 0", "at least 1"]),
-    (["-params", "gamma:1.5"], ["gamma", "1.5"]),
     (["-params", "cost_limit:[1.0,2.0]"], ["cost_limit", "cost"]),
     (["--algo", "cup", "-params", "gamma:1"], ["gamma=1.0: CUP weighs costs", "such as 0.99"]),
-    (["--algo", "cup", "-params", "cost_limit:[1.0,2.0]"], ["one for each of the 1 cost keys"]),
-    (["--algo", "focops", "-params", "lambda_init:2", "lambda_max:1"],
-     ["lambda_max=1.0", "lambda_init=2.0"]),
     (["--algo", "sac_lag", "--env", "CartPole-v1", "-params", "missing_cost:zero", "cost_limit:1"],
      ["continuous actions (Box)", "PPOLag"]),
     (["-params", "policy:MlpPolcy"], ["no policy 'MlpPolcy'", "did you mean 'MlpPolicy'?"]),
     (["-params", "selection_limit:[1,2]"],
      ["selection_limit=[1.0, 2.0]", "one number, or one for each of the 1 cost keys", "cost"]),
-    ([*LIMITED, "--env-kwargs", "cost_keys:('cost','heat')", "-params", "cost_keys:['cost','heat']",
-      "selection_limit:[1]"], ["selection_limit=[1.0]", "heat"]),
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
     (["--gym-packages", "../x"], ["--gym-packages '../x' is not the name of a module"]),
@@ -93,8 +79,6 @@ def test_train(arguments, parts, capsys, empty):
 
 
 ENJOY = [
-    (["--algo", "cpp"], ["unknown algorithm 'cpp'"]),
-    (["--env", "Goal_Pint_8Hazards"], ["'Pint'"]),
     ([], ["there is no run of cpo on Goal_Point_8Hazards-v0 in 'logs'", "sb3-guard train"]),
     (["--exp-id", "7"], ["there is no run folder", "_7"]),
     (["-f", "nowhere"], ["'nowhere'"]),
@@ -123,14 +107,13 @@ def test_a_module_that_fails(program, said, capsys, empty, tmp_path, monkeypatch
     refused(train.main, ["--gym-packages", "odd_robot"], capsys, said, "python -c 'import odd_ro")
 
 
-@pytest.mark.parametrize("error", [ValueError, TypeError])
-def test_constructor_of_an_environment(error, capsys, empty, monkeypatch):
+def test_constructor_of_an_environment(capsys, empty, monkeypatch):
     """What a user's environment refuses is one line, however many its message has."""
     whole = CostPoint.__init__
 
     def refuse(self, kind="fine", **kwargs):
         if kind != "fine":
-            raise error(f"{kind}\n  is allowed\n  nowhere")
+            raise TypeError(f"{kind}\n  is allowed\n  nowhere")
         whole(self, **kwargs)
 
     monkeypatch.setattr(CostPoint, "__init__", refuse)
@@ -139,58 +122,15 @@ def test_constructor_of_an_environment(error, capsys, empty, monkeypatch):
         refused(train.main, arguments, capsys, "can't make CostPoint-v0", "odd is allowed nowhere")
 
 
-def test_more_environments_than_memory_holds(capsys, empty, monkeypatch):
-    def refuse(*_: object, **__: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr("sb3_guard.zoo.run.run.make_vec_env", refuse)
-    refused(train.main, [*TOY, *SMALL], capsys, "can't make CostPoint-v0: MemoryError")
-
-
 def test_track_without_wandb(capsys, empty, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     refused(train.main, [*TOY, *SMALL, "--track"], capsys, "--track needs wandb", "pip install")
-
-
-def test_track_without_a_key(capsys, empty, monkeypatch):
-    def init(**_: object) -> None:
-        raise RuntimeError("no API key\nconfigured")
-
-    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
-    refused(
-        train.main, [*TOY, *SMALL, "--track"], capsys,
-        "--track: Weights & Biases can't be used: RuntimeError: no API key configured",
-        "wandb login",
-    )  # fmt: skip
-
-
-def test_corrupt_yaml(capsys, tmp_path):
-    (tmp_path / "bad.yml").write_text("default:\n  n_steps: [1, 2\nx: }")
-    arguments = ["-conf", str(tmp_path / "bad.yml"), "-f", str(tmp_path / "logs")]
-    refused(train.main, arguments, capsys, "bad.yml as YAML", "line")
-    assert not (tmp_path / "logs").exists()
-
-
-@pytest.mark.parametrize("inner", ["[1]", "{a: 1}"])
-def test_an_ordered_mapping_that_is_none(inner, capsys, tmp_path):
-    path = tmp_path / "ordered.yml"
-    path.write_text(f"default: !!python/object/apply:collections.OrderedDict {inner}")
-    refused(train.main, ["-conf", str(path)], capsys, "ordered.yml as YAML")
 
 
 def test_ordered_mappings_as_rl_zoo_writes_them():
     tag = "!!python/object/apply:collections.OrderedDict"
     assert load_yaml(f"{tag}\n- - [a, 1]\n  - [b, {{c: 2}}]") == {"a": 1, "b": {"c": 2}}
     assert load_yaml(f"{tag} []") == {}
-
-
-def test_a_csv_that_was_deleted(run):
-    csv = run / "0.monitor.csv"
-    header = csv.read_text().splitlines()[1]
-    csv.unlink()
-    assert train.main([*GO_ON, str(run), "-n", "120", "--verbose", "0"]) == 0
-    lines = csv.read_text().splitlines()
-    assert lines[1] == header and len(lines) > 3
 
 
 def test_more_than_plain_data(capsys, tmp_path):
@@ -213,22 +153,20 @@ def test_unwritable_log_folder(capsys, tmp_path):
         refused(train.main, [*TOY, *SMALL, "-f", str(tmp_path / "locked")], capsys, "locked")
 
 
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    assert train.main([*TOY, *SMALL, "-f", str(folder)]) == 0
+    return folder
+
+
 @pytest.fixture
-def run(tmp_path):
-    assert train.main([*TOY, *SMALL, "-f", str(tmp_path)]) == 0
-    return tmp_path / "cpo" / "CostPoint-v0_1"
+def run(logs, tmp_path):
+    return shutil.copytree(logs, tmp_path, dirs_exist_ok=True) / "cpo" / "CostPoint-v0_1"
 
 
-def test_a_cost_that_is_not_a_number(capsys, tmp_path):
-    arguments = [*TOY, *SMALL, "--env", "Flickering-v0", "-f", str(tmp_path)]
-    arguments += ["--env-kwargs", "episode_length:40"]
-    refused(train.main, arguments, capsys, "info['cost'] is nan", status=1)
-
-
-@pytest.mark.parametrize("content", [b"", b"no zip at all", None])
-def test_corrupt_checkpoint(content, capsys, run):
-    if content is None:
-        content = run.joinpath("checkpoint.zip").read_bytes()[:-2000]
+def test_corrupt_checkpoint(capsys, run):
+    content = run.joinpath("checkpoint.zip").read_bytes()[:-2000]
     run.joinpath("checkpoint.zip").write_bytes(content)
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     for path in (run, run / "checkpoint.zip"):
@@ -289,13 +227,6 @@ def test_other_algorithms_agent(capsys, run, tmp_path):
     refused(train.main, [*warm, "-f", str(tmp_path / "new")], capsys, "can't load", "as TRPO")
 
 
-def test_agent_of_another_environment(capsys, run, tmp_path):
-    warm = [*SMALL, "--env", "CartPole-v1", "-i", str(run / "CostPoint-v0.zip"), "--algo", "cpo"]
-    warm = [one for one in warm if one not in ("--env-kwargs", "episode_length:20")]
-    arguments = [*warm, "-params", "missing_cost:zero", "-f", str(tmp_path / "new")]
-    refused(train.main, arguments, capsys, "can't load")
-
-
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
@@ -329,8 +260,7 @@ def test_playing_in_a_world_without_room(capsys, tmp_path):
     refused(enjoy.main, play, capsys, "Goal_Point_2Hazards-v0", "LayoutError", "hazards")
 
 
-@pytest.mark.parametrize("where", ["__init__", "reset", "render"])
-def test_no_backend_for_a_window(where, capsys, tmp_path, monkeypatch):
+def test_no_backend_for_a_window(capsys, tmp_path, monkeypatch):
     """Whatever needs OpenGL first says so on one line."""
 
     def fail(self, *args, **kwargs):
@@ -340,7 +270,7 @@ def test_no_backend_for_a_window(where, capsys, tmp_path, monkeypatch):
     assert train.main([*filmed, *SMALL]) == 0
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setitem(Filmed.metadata, "render_modes", ["human"])
-    monkeypatch.setattr(Filmed, where, fail)
+    monkeypatch.setattr(Filmed, "render", fail)
     refused(enjoy.main, filmed, capsys, "RenderingError: no OpenGL backend works here")
 
 
@@ -381,10 +311,8 @@ def test_kept_model_that_is_not_there(capsys, run, tmp_path):
     [("Flickering-v0", ["training stopped at", "is nan: a cost must be a finite number"]),
      ("Wordy-v0", ["fails at its first step: info['cost'] is 'high': a cost must be"])],
 )  # fmt: skip
-@pytest.mark.parametrize("algo", ["ppo", "sac"])
-def test_costs_of_a_baseline(algo, env, parts, capsys, tmp_path):
-    params = "n_steps:64" if algo == "ppo" else "learning_starts:10"
-    arguments = f"--algo {algo} --env {env} -n 64 -params n_envs:1 batch_size:32 {params}".split()
+def test_costs_of_a_baseline(env, parts, capsys, tmp_path):
+    arguments = f"--algo ppo --env {env} -n 64 -params n_envs:1 batch_size:32 n_steps:64".split()
     arguments += ["--gym-packages", "registered_envs", "--eval-freq", "-1", "--device", "cpu"]
     status = 1 if "stopped" in parts[0] else 2
     refused(train.main, [*arguments, "-f", str(tmp_path)], capsys, *parts, status=status)
@@ -394,8 +322,6 @@ def test_costs_of_a_baseline(algo, env, parts, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("error", "after"),
     [
-        (RuntimeError("out of order"), 20),
-        (ValueError("of somebody's"), 20),
         (EOFError("of a simulator"), 20),
         (KeyError("mine"), -1),
     ],
@@ -410,10 +336,9 @@ def test_an_exception_of_the_users_keeps_its_traceback(error, after, tmp_path, m
         train.main([*arguments, "-f", str(tmp_path)])
 
 
-@pytest.mark.parametrize("what", ["reward", "observation"])
-@pytest.mark.parametrize("algo", ["sac", "td3", "ppo", "cpo", "sac_lag"])
+@pytest.mark.parametrize(("algo", "what"), [("sac", "reward"), ("cpo", "observation")])
 def test_what_is_not_a_number_ends_training_in_a_line(algo, what, capsys, tmp_path):
-    params = ["learning_starts:10" if algo in ("sac", "td3", "sac_lag") else "n_steps:64"]
+    params = ["learning_starts:10" if algo == "sac" else "n_steps:64"]
     params += ["cost_limit:2"] if algo in ALGORITHMS else []
     arguments = f"--algo {algo} --env Undefined-v0 -n 64 --env-kwargs what:{what}".split()
     arguments += [*TOY[:2], "--eval-freq", "-1", "-params", "n_envs:1", "batch_size:32", *params]
@@ -421,10 +346,6 @@ def test_what_is_not_a_number_ends_training_in_a_line(algo, what, capsys, tmp_pa
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"error: training stopped at 30 steps: the {what} of environment 0 is ")
     assert not list(tmp_path.rglob("result.json"))
-
-
-def test_a_gpu_that_is_not_there(capsys, tmp_path):
-    refused(train.main, ["--device", "cuda:99", "-f", str(tmp_path)], capsys, "device 'cuda:99'")
 
 
 def test_a_hyperparameter_withdrawn_since_is_left_out(capsys, run, tmp_path):
@@ -455,11 +376,3 @@ def test_a_run_whose_files_were_edited(run, capsys):
     path.write_text(yaml.safe_dump({**values, "n_steps": 31}))
     refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "n_steps = 31 contradicts 30")
     path.write_text(yaml.safe_dump(values))
-
-
-def test_a_terminal_that_is_not_utf_8():
-    """What it can't show becomes "?"."""
-    code = "from sb3_guard.zoo.cli.usage import run\nrun(lambda: print('±ρ') or 0)"
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment)
-    assert (done.returncode, done.stdout) == (0, b"??\n")

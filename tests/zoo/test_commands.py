@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,12 +22,10 @@ from matplotlib import image
 from rl_zoo3.utils import EnvironmentName, get_model_path
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from typed import LENGTH, PLAY, SMALL, TOY, require_rendering, trained
-from worlds import own_parts
+from typed import PLAY, SMALL, TOY, require_rendering, trained
 
 from sb3_guard import CPO, cli, enjoy, make_vec_env, train
-from sb3_guard.envs import Scenario, register, register_constraint
-from sb3_guard.envs.part import Constraint
+from sb3_guard.envs import Scenario, register
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.zoo.agents import playback
 from sb3_guard.zoo.cli import usage
@@ -99,26 +96,6 @@ def test_costs_are_in_the_files(tmp_path):
     assert result["cost_rate"] == pytest.approx(episodes["c"].sum() / 120)
 
 
-def outcome(run):
-    """What a run came to, its duration aside."""
-    return json.loads((run / "result.json").read_text()) | {"seconds": None}
-
-
-def test_same_seed_same_run(tmp_path):
-    one, other = trained(tmp_path), trained(tmp_path)
-    assert outcome(one) == outcome(other)
-    assert outcome(trained(tmp_path, "--seed", "4")) != outcome(one)
-
-
-def test_summary_names_folder_and_figures(tmp_path, capsys):
-    trained(tmp_path)
-    assert capsys.readouterr() == ("", "")  # --verbose 0
-    assert train.main([*TOY, *SMALL, *LENGTH, "-n", "60", "-f", str(tmp_path)]) == 0
-    out = capsys.readouterr().out
-    for text in (str(tmp_path / "cpo" / "CostPoint-v0_2"), "J_r", "M_c", "ρ_c", "ep_cost_mean"):
-        assert text in out
-
-
 def test_no_episode_ends(tmp_path, capsys):
     arguments = [*TOY, *SMALL, "-n", "60", "-f", str(tmp_path), "--eval-freq", "-1"]
     assert train.main([*arguments, "--env-kwargs", "episode_length:1000"]) == 0
@@ -149,10 +126,9 @@ def test_every_limit_has_a_verdict(tmp_path, capsys):
         assert any(words[:1] == [key] and words[-2:] == end for words in shown), key
 
 
-@pytest.mark.parametrize("vec_env", ["native", "dummy"])
-def test_our_environments(tmp_path, vec_env, capsys):
+def test_our_environments(tmp_path, capsys):
     run = trained(
-        tmp_path, "--vec-env", vec_env, "--env-kwargs", "goal:dict(size=0.5)", "--eval-freq", "-1",
+        tmp_path, "--env-kwargs", "goal:dict(size=0.5)", "--eval-freq", "-1",
         env="Goal_Point_3Hazards-v0",
     )  # fmt: skip
     config = yaml.safe_load((run / "Goal_Point_3Hazards-v0" / "config.yml").read_text())
@@ -194,27 +170,6 @@ def test_tensorboard_and_uuid(tmp_path):
     assert len(run.name) > len("CostPoint-v0_1_") + 30
     (events,) = (tmp_path / "tb").rglob("events.*")
     assert events.parent.parent.name == "CostPoint-v0"
-
-
-def test_schedules_and_other_conf_file(tmp_path):
-    conf = tmp_path / "conf.yml"
-    conf.write_text(
-        "default: {n_timesteps: 60, n_envs: 1, n_steps: 60, learning_rate: lin_0.01, cost_limit: 2}"
-    )
-    arguments = [
-        *TOY,
-        "-conf",
-        str(conf),
-        "-f",
-        str(tmp_path),
-        "--verbose",
-        "0",
-        "--eval-freq",
-        "-1",
-    ]
-    assert train.main([*arguments, "--env-kwargs", "episode_length:20"]) == 0
-    log = pd.read_csv(tmp_path / "cpo" / "CostPoint-v0_1" / "progress.csv")
-    assert log["time/total_timesteps"].tolist() == [60]
 
 
 # enjoy
@@ -282,11 +237,6 @@ def test_enjoy_is_seeded_and_deterministic_by_default(logs, capsys):
     assert play("--stochastic") == play("--stochastic")
 
 
-def test_enjoy_uses_the_environment_of_training(logs, capsys):
-    assert enjoy.main([*PLAY, "-f", str(logs), "--env-kwargs", "episode_length:7"]) == 0
-    assert "7 steps" in capsys.readouterr().out
-
-
 def test_an_unfinished_run_is_played_from_its_checkpoint(logs, tmp_path, capsys):
     run = trained(tmp_path, "-params", "normalize:True")
     play = [*TOY, "-f", str(tmp_path), "--no-render", "--n-episodes", "2"]
@@ -317,13 +267,6 @@ def test_enjoy_normalises_as_training_did(tmp_path, capsys):
     path.unlink()
     assert enjoy.main(play) == 2
     assert "can't read the observation statistics" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("evaluation", [True, False])
-def test_only_training_adds_to_the_statistics(evaluation):
-    flags = RunFlags(algo="ppo", env="CartPole-v1", hyperparams={"normalize": True})
-    env = Run.check(flags).make_envs(2, seed=0, evaluation=evaluation)
-    assert (env.training, env.norm_reward) == (not evaluation, not evaluation)
 
 
 def test_record_writes_a_video(logs, tmp_path):
@@ -412,27 +355,6 @@ def test_packages_are_found_in_the_current_folder(tmp_path, monkeypatch):
     assert sys.modules.pop("parts_of_mine")
 
 
-def test_an_arm_trains_plays_and_records(tmp_path):
-    import imageio_ffmpeg
-
-    require_rendering()
-    command = "--algo cpo --env Goal_Arm6_8Hazards -n 120 --seed 0 --verbose 0 -f".split()
-    small = "--env-kwargs max_episode_steps:10 --eval-freq 60 --eval-episodes 2".split()
-    params = ["-params", "n_envs:2", "n_steps:30", "n_critic_updates:3"]
-    assert train.main([*command, str(tmp_path), *small, *params]) == 0
-    run = tmp_path / "cpo" / "Goal_Arm6_8Hazards-v0_1"
-    assert json.loads((run / "result.json").read_text())["episodes"] == 6
-    video, played = tmp_path / "film.mp4", tmp_path / "played.json"
-    play = ["--algo", "cpo", "--env", "Goal_Arm6_8Hazards", "-f", str(tmp_path), "--load-best"]
-    assert enjoy.main([*play, "-n", "10", "--record", str(video), "--json", str(played)]) == 0
-    assert json.loads(played.read_text())["length"]["values"] == [10]
-    frames = imageio_ffmpeg.read_frames(str(video))
-    next(frames)
-    pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
-    assert len(pictures) == 9  # of 10 steps; after the last one the next episode begins
-    assert np.ptp(pictures[0]) > 100 and not np.array_equal(pictures[0], pictures[-1])
-
-
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory):
     """Flags that play an agent of an environment of ours for three steps."""
@@ -493,40 +415,6 @@ def test_a_run_is_of_the_latest_version_where_none_is_given(tmp_path, name, vers
         (tmp_path / "cpo" / f"{name}-v{number}_1" / f"{name}-v{number}").mkdir(parents=True)
         (tmp_path / "cpo" / f"{name}-v{number}_1" / f"{name}-v{number}" / "args.yml").touch()
     assert playback.find_run(tmp_path, "cpo", name).path.name == f"{name}-v{version}_1"
-
-
-def test_show_draws_each_version_into_a_file_of_its_name(tmp_path, monkeypatch):
-    require_rendering()
-    monkeypatch.chdir(tmp_path)
-    for name in ("SafetyHopperVelocity", "SafetyHopperVelocity-v0"):
-        assert cli.main(["show", name]) == 0
-        assert (tmp_path / f"{name}.png").is_file()
-
-
-def test_show_names_the_joints_of_a_velocity_task(tmp_path, capsys):
-    require_rendering()
-    assert cli.main(["show", "SafetyHopperVelocity", "-o", str(tmp_path / "hopper.png")]) == 0
-    text = capsys.readouterr().out
-    assert "faster than limit (Zhang" in text and "limit 0.7402" in text
-    cells = rows(text)
-    # Gymnasium's own documentation of the observation: height, angle of the torso, ...
-    assert [row[::3] for row in cells[1:4]] == [
-        ["qpos rootz", "m"], ["qpos rooty", "rad"], ["qpos thigh_joint", "rad"]
-    ]  # fmt: skip
-    assert cells[6] == ["qvel rootx", "5", "[-inf, inf]", "m/s"]
-    assert cells[-1][:2] == ["2", "foot_joint"]
-
-
-def test_list_shows_what_users_registered(capsys):
-    @dataclass
-    class Quiet(Constraint):
-        def cost(self):
-            return np.zeros(self.sim.num_envs)
-
-    with own_parts():
-        register_constraint("Quiet", Quiet)
-        assert cli.main(["list", "constraints"]) == 0
-    assert ["Quiet", "", "", "planar, spatial"] in [r[:4] for r in rows(capsys.readouterr().out)]
 
 
 def test_list_says_what_it_takes(capsys):
@@ -619,13 +507,6 @@ def test_help_is_quick_and_loads_nothing_heavy():
     *text, heavy, seconds = done.stdout.splitlines()
     assert heavy == "[]" and "--env" in "\n".join(text)
     assert float(seconds) < 5  # of the processor, whatever else runs; usually 0.5
-
-
-def test_threads_wait_without_spinning(monkeypatch):
-    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
-    assert usage.run(lambda: int(os.environ["OMP_WAIT_POLICY"] != "PASSIVE")) == 0
-    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
-    assert usage.run(lambda: int(os.environ["OMP_WAIT_POLICY"] != "ACTIVE")) == 0
 
 
 def test_dispatcher(capsys, tmp_path):

@@ -1,7 +1,6 @@
 """What a finished run says of itself: the final policy's episodes, its command, its curve."""
 
 import hashlib
-import json
 import shlex
 from pathlib import Path
 
@@ -87,11 +86,3 @@ def test_equal_curves_have_equal_hashes(run, tmp_path):
     assert curve == hashlib.sha256(text.encode()).hexdigest()
     assert trained(tmp_path, "-n", "1600").checked_result()["curve"] == curve
     assert trained(tmp_path, "-n", "100", "--seed", "4").checked_result()["curve"] != curve
-
-
-def test_numbers_of_a_list_share_a_line(run):
-    content = {"a": [1.5, 2], "b": {"c": [3]}, "d": ["x, y", "[z]"]}
-    run.write_result(content)
-    lines = run.result.read_text().splitlines()
-    assert json.loads("".join(lines)) == content
-    assert '  "a": [ 1.5, 2 ],' in lines

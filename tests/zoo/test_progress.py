@@ -16,7 +16,7 @@ import sb3_guard
 from sb3_guard import CPO, SCPO, TRPO, CostMonitor, train
 from sb3_guard.zoo.results.runs import read_results
 from sb3_guard.zoo.run import progress
-from sb3_guard.zoo.run.progress import Epochs, commit, provenance
+from sb3_guard.zoo.run.progress import Epochs, commit
 
 RUN = (
     "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:20 --device cpu "
@@ -81,14 +81,6 @@ def test_off_policy_epochs_are_of_the_papers_length(monkeypatch):
     assert epochs.result()["episodes"] == 4
 
 
-def test_commit_is_the_checkouts():
-    root = Path(sb3_guard.__file__).parent.parent
-    if not (root / ".git").exists():
-        pytest.skip("no checkout")
-    head = subprocess.run(["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True)
-    assert commit().removesuffix("-dirty") == head.stdout.strip()
-
-
 def package(folder: Path) -> Path:
     (folder / "sb3_guard").mkdir(parents=True)
     file = folder / "sb3_guard" / "__init__.py"
@@ -117,24 +109,3 @@ def test_commit_of_changed_and_of_installed_code(tmp_path, monkeypatch):
     assert commit() is None
     installed.with_name("COMMIT").write_text("abc\n")
     assert commit() == "abc"
-
-
-def test_no_git_no_commit(monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    assert commit() is None
-    assert set(provenance()) == {"versions", "commit", "platform", "processor"}
-
-
-def test_a_package_that_is_not_installed_has_no_version(monkeypatch):
-    """The algorithms train beside an old MuJoCo, or without one."""
-    version = metadata.version
-
-    def without_mujoco(package: str) -> str:
-        if package == "mujoco":
-            raise metadata.PackageNotFoundError(package)
-        return version(package)
-
-    assert "mujoco" in provenance()["versions"]
-    monkeypatch.setattr(metadata, "version", without_mujoco)
-    versions = provenance()["versions"]
-    assert "mujoco" not in versions and "torch" in versions

@@ -58,7 +58,7 @@ def forked(monkeypatch):
     monkeypatch.setitem(VEC_ENVS, "subproc", partial(SubprocVecEnv, start_method="fork"))
 
 
-# What a checkpoint must hold, all at once; the variants by themselves tell which one is lost.
+# What a checkpoint must hold, all at once
 EVERYTHING = [
     *"-params frame_stack:3 normalize:True use_sde:True learning_rate:lin_0.01".split(),
     "env_wrapper:gymnasium.wrappers.NormalizeObservation",
@@ -66,32 +66,14 @@ EVERYTHING = [
     "cost_limit:['lin_3_1', 2.0]",
     *["--env-kwargs", "cost_keys:('cost', 'heat')"],
 ]
-VARIANTS = {
-    "trpo": ["--algo", "trpo"],
-    "normalised": ["-params", "normalize:True"],
-    "stacked": ["-params", "frame_stack:3", "normalize:True"],
-    "gSDE": ["-params", "use_sde:True"],
-    "schedule": ["-params", "learning_rate:lin_0.01"],
-    "wrapped": ["-params", "env_wrapper:gymnasium.wrappers.NormalizeObservation"],
-    "several costs": [
-        "--env-kwargs",
-        "cost_keys:('cost', 'heat')",
-        "-params",
-        "cost_keys:['cost', 'heat']",
-    ],
-    "rare logs": ["--log-interval", "2"],
-}
 
 
 @pytest.mark.parametrize(
-    "variant",
-    [
-        pytest.param(EVERYTHING, id="everything"),
-        *(pytest.param(v, id=name, marks=pytest.mark.slow) for name, v in VARIANTS.items()),
-    ],
+    "more",
+    [EVERYTHING, pytest.param(["--algo", "trpo", "--log-interval", "2"], marks=pytest.mark.slow)],
 )
-def test_killed_and_resumed(variant, tmp_path, monkeypatch):
-    arguments = [*TOY, *SHORT, *SMALL, "-n", "300", *variant]
+def test_killed_and_resumed(more, tmp_path, monkeypatch):
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "300", *more]
     assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
     # Once within the second rollout, and once more after being resumed.
     crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], 100)
@@ -110,14 +92,14 @@ def test_killed_and_resumed_off_policy(tmp_path, monkeypatch):
         "buffer_size:500",
         "policy_kwargs:{'net_arch':[8]}",
     ]
-    more = ["--seed", "3", "--verbose", "0", "-n", "150", "-params", *small, "cost_limit:0.1"]
+    more = ["--seed", "3", "--verbose", "0", "-n", "110", "-params", *small, "cost_limit:0.1"]
     arguments = [*TOY, *SHORT, *off, *more]
     assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
-    for at in (50, 120):
-        cut = tmp_path / f"cut at {at}"
-        crash(monkeypatch, [*arguments, "-f", str(cut)], at)
-        assert train.main(["-i", str(runs_of(cut)), *TOY[:2]]) == 0
-        assert_same_run(tmp_path / "whole", cut)
+    cut = tmp_path / "cut"
+    crash(monkeypatch, [*arguments, "-f", str(cut)], 50)
+    crash(monkeypatch, ["-i", str(runs_of(cut)), *TOY[:2]], 95)
+    assert train.main(["-i", str(runs_of(cut)), *TOY[:2]]) == 0
+    assert_same_run(tmp_path / "whole", cut)
 
 
 @pytest.mark.parametrize(
@@ -138,10 +120,9 @@ def test_worker_processes(forked, tmp_path, monkeypatch):
     assert_same_run(tmp_path / "whole", tmp_path / "cut")
 
 
-@pytest.mark.parametrize("vec_env", ["native", pytest.param("dummy", marks=pytest.mark.slow)])
-def test_our_own_environments(vec_env, tmp_path, monkeypatch):
-    arguments = ["--env", "Goal_Point_3Hazards", *SMALL, "-n", "180", "--vec-env", vec_env,
-                 "--env-kwargs", "goal:{'size': 0.6}", "--eval-freq", "140",
+def test_our_own_environments(tmp_path, monkeypatch):
+    arguments = ["--env", "Goal_Point_3Hazards", *SMALL, "-n", "180", "--env-kwargs",
+                 "goal:{'size': 0.6}", "max_episode_steps:40", "--eval-freq", "140",
                  "--eval-episodes", "1", "--n-eval-envs", "1"]  # fmt: skip
     assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
     crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], 150)
@@ -233,15 +214,6 @@ def test_a_run_stopped_within_a_rollout_keeps_the_checkpoint_before(tmp_path):
     assert read_checkpoint(run / "checkpoint.zip")["num_timesteps"] == 60
 
 
-def test_a_checkpoint_is_a_model(tmp_path, monkeypatch):
-    from sb3_guard import CPO
-
-    crash(monkeypatch, [*TOY, *SMALL, "-n", "300", "-f", str(tmp_path)], 100)
-    model = CPO.load(runs_of(tmp_path) / "checkpoint.zip")
-    assert model.num_timesteps == 60
-    model.predict(model.observation_space.sample())
-
-
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "sb3_guard.train", *arguments]
 
@@ -259,22 +231,19 @@ def test_kill_minus_nine(tmp_path):
     assert_same_run(tmp_path / "whole", tmp_path / "cut")
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
-)
-def test_asked_to_stop(number, undisturbed, tmp_path, monkeypatch, capsys):
+def test_asked_to_stop(undisturbed, tmp_path, monkeypatch, capsys):
     """A polite stop finishes the rollout, leaves a checkpoint and a model, and is resumed."""
     whole = Epochs._on_step
 
     def step(self):
         if self.num_timesteps == 100:
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGINT)
         return whole(self)
 
     arguments = [*TOY, *SHORT, *SMALL, "-n", "300", "--verbose", "1", "--checkpoint-every", "1000"]
     with monkeypatch.context() as patch:
         patch.setattr(Epochs, "_on_step", step)
-        assert train.main([*arguments, "-f", str(tmp_path)]) == 128 + number
+        assert train.main([*arguments, "-f", str(tmp_path)]) == 128 + signal.SIGINT
     out, err = capsys.readouterr()
     assert "Stopping after this rollout" in err and "Traceback" not in err
     run = runs_of(tmp_path)

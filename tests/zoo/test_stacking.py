@@ -31,8 +31,7 @@ def envs():
         del registry[f"{name}-v0"]
 
 
-@pytest.mark.parametrize("algo", ["sac_lag", "sac"])
-@pytest.mark.parametrize("frames", [None, 2])
+@pytest.mark.parametrize(("algo", "frames"), [("sac_lag", 2), ("sac", None)])
 @pytest.mark.parametrize(
     ("env", "policy", "normalize"),
     [
@@ -73,7 +72,6 @@ def test_a_run_with_normalised_frames_is_resumed_played_and_exported(tmp_path, c
     assert export_agent.main([*which, *there]) == 0
 
 
-@pytest.mark.parametrize("wrong", [True, False])
 @pytest.mark.parametrize(
     ("env", "policy", "shape"),
     [
@@ -81,14 +79,11 @@ def test_a_run_with_normalised_frames_is_resumed_played_and_exported(tmp_path, c
         (IMAGE, "CnnPolicy", VecTransposeImage),
     ],
 )
-def test_frames_and_images_outside_of_the_normaliser_are_refused(env, policy, shape, wrong):
+def test_frames_and_images_outside_of_the_normaliser_are_refused(env, policy, shape):
     def normalized(venv):
         return VecNormalize(venv, norm_obs=False)
 
     venv = make_vec_env(lambda: RandomCostEnv(env, ACTIONS), 1)
-    venv = shape(normalized(venv)) if wrong else normalized(shape(venv))
-    if not wrong:
-        SACLag(policy, venv, cost_limit=1.0, **TINY).learn(6)
-        return
+    SACLag(policy, normalized(shape(venv)), cost_limit=1.0, **TINY)
     with pytest.raises(ValueError, match=r"VecNormalize\(VecFrameStack\(env, 4\)\)"):
-        SACLag(policy, venv, cost_limit=1.0, **TINY)
+        SACLag(policy, shape(normalized(venv)), cost_limit=1.0, **TINY)

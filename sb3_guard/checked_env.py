@@ -1,7 +1,9 @@
 """Environments of others, held to Gymnasium's contract in every step and not in the first alone."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any, NoReturn
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
@@ -80,89 +82,67 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
             return self._space.sample(), 0.0, False, False, {BROKEN: str(error)}
 
     def _checked_step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        values: Any
-        if self._repeats or self._steps == 1:
-            values = self._compared(action)
-        else:
-            values = self.env.step(action)
+        listens = self._repeats or self._steps == 1
+        values: Any = self._step_and_compare(action) if listens else self.env.step(action)
         if not (isinstance(values, tuple) and len(values) == 5 and isinstance(values[4], Mapping)):
             five = "(observation, reward, terminated, truncated, info)"
             self._refuse(f"step returns {_brief(values)}", f"it must return {five}")
         observation, reward, *ends, _ = values
         self._check(observation, self._space)
-        if not isinstance(reward, float | int) and not _is_scalar(reward):
+        if not _is_scalar(reward):
             self._refuse(f"the reward is {_brief(reward)}", "it must be one number")
         for name, end in zip(("terminated", "truncated"), ends, strict=True):
-            if end is not True and end is not False and not _is_flag(end):
+            if end is not True and end is not False and not (_is_scalar(end) and end in (0, 1)):
                 self._refuse(f"{name} is {_brief(end)}", "it must be True or False")
         return values
 
     def _check(self, observation: Any, space: spaces.Space, name: str = "the observation") -> None:
         """Refuse an observation of another shape or kind; values may be out of bounds."""
-        if isinstance(space, spaces.Dict):
-            absent = (
-                [*space] if not isinstance(observation, Mapping) else space.keys() - observation
-            )
-            if absent:
-                have = "" if isinstance(observation, Mapping) else f" but {_brief(observation)}"
-                self._refuse(f"{name} has no {sorted(absent)}{have}", f"it must fit {space}")
-            for key, part in space.spaces.items():
-                self._check(observation[key], part, f"{name}'s {key!r}")
-        elif isinstance(space, spaces.Discrete):
-            if not space.contains(observation):
-                self._refuse(f"{name} is {_brief(observation)}", f"it must fit {space}")
-        elif isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
+        if isinstance(space, spaces.Dict) and isinstance(observation, Mapping):
+            for key in space.spaces:
+                self._check(observation.get(key), space[key], f"{name}'s {key!r}")
+            return
+        if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
             try:
                 values = np.asarray(observation)
             except ValueError:  # rows of several lengths
                 values = np.array(None)
-            if values.shape != space.shape or values.dtype.kind not in "biuf":
-                shown = f"has shape {values.shape}"
-                if values.dtype.kind not in "biuf":
-                    shown = f"is {_brief(observation)}"
-                self._refuse(f"{name} {shown}", f"it must fit {space}")
+            fits = values.shape == space.shape and values.dtype.kind in "biuf"
+        else:
+            fits = space.contains(observation)
+        if not fits:
+            shape = f", of shape {observation.shape}" if hasattr(observation, "shape") else ""
+            self._refuse(f"{name} is {_brief(observation)}{shape}", f"it must fit {space}")
 
-    def _compared(self, action: Any) -> Any:
-        """A step in which all layers are listened to.
+    def _step_and_compare(self, action: Any) -> Any:
+        """A step in which the infos of all layers are listened to.
 
-        :raises ContractError: a wrapper has lost costs
+        :raises ContractError: a wrapper took several steps and told the last one's cost
         """
-        layers: list[gym.Env] = [self.env]
+        layers: list[Any] = [self.env]
         while isinstance(layers[-1], gym.Wrapper):
             layers.append(layers[-1].env)
-        infos: list[list[dict[str, Any]]] = [[] for _ in layers]
-        own = [vars(layer).get("step") for layer in layers]
-        for layer, seen in zip(layers, infos, strict=True):
-            layer.step = _listening(layer.step, seen)  # type: ignore[method-assign, assignment]
-        try:
+        told: list[list[dict[str, Any]]] = [[] for _ in layers]
+        with ExitStack() as stack:
+            for layer, infos in zip(layers, told, strict=True):
+                step = _listening(layer.step, infos)
+                stack.enter_context(patch.object(layer, "step", step))
             values = self.env.step(action)
-        finally:
-            for layer, step in zip(layers, own, strict=True):
-                if step is None:
-                    del layer.step
-                else:
-                    layer.step = step  # type: ignore[method-assign]
-        for wrapper, outer, inner in zip(layers, infos, infos[1:], strict=False):
-            if len(inner) > len(outer) > 0:
-                self._repeats = True
-                self._compare(type(wrapper).__name__, outer, inner)
+        for wrapper, outer, inner in zip(layers, told, told[1:], strict=False):
+            if len(inner) <= len(outer) or not outer:
+                continue
+            self._repeats = True
+            for key in sorted(self._cost_keys & outer[-1].keys() & inner[-1].keys()):
+                costs = [number(info.get(key, 0.0), f"info[{key!r}]") for info in inner]
+                total = sum(number(info.get(key, 0.0), f"info[{key!r}]") for info in outer)
+                if outer[-1][key] == inner[-1][key] and not np.isclose(total, sum(costs)):
+                    self._refuse(
+                        f"info[{key!r}] is {costs[-1]:g}, but {type(wrapper).__name__} took "
+                        f"{len(costs)} steps, which cost {sum(costs):g}",
+                        "costs of repeated steps must add up, as rewards do: see "
+                        "docs/your_environment.md",
+                    )
         return values
-
-    def _compare(
-        self, wrapper: str, outer: list[dict[str, Any]], inner: list[dict[str, Any]]
-    ) -> None:
-        for key in sorted(self._cost_keys & outer[-1].keys() & inner[-1].keys()):
-            told, taken = (
-                [number(info.get(key, 0.0), f"info[{key!r}]") for info in infos]
-                for infos in (outer, inner)
-            )
-            if told[-1] == taken[-1] and not np.isclose(sum(told), sum(taken)):
-                self._refuse(
-                    f"info[{key!r}] is {told[-1]:g}, but {wrapper} took {len(taken)} steps, which "
-                    f"cost {sum(taken):g}",
-                    "costs of repeated steps must add up, as rewards do: see "
-                    "docs/your_environment.md",
-                )
 
     def _refuse(self, fault: str, remedy: str) -> NoReturn:
         place = f"in step {self._steps} of an episode" if self._steps else "at reset"
@@ -182,10 +162,6 @@ def _listening(step: Callable[[Any], Any], infos: list[dict[str, Any]]) -> Calla
 def _is_scalar(value: Any) -> bool:
     """Whether a value is a number, as NumPy's and those of other libraries are."""
     return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"
-
-
-def _is_flag(value: Any) -> bool:
-    return _is_scalar(value) and value in (0, 1)
 
 
 def _brief(value: Any) -> str:

@@ -263,25 +263,6 @@ def _limits_on(model: Any, keys: Sequence[str]) -> tuple[float, ...]:
     return ()
 
 
-def _warn_of_absent(episodes: str, longest: int) -> None:
-    warnings.warn(
-        f"{episodes} episodes are left out: one had not ended after {longest:,} steps; limit their "
-        "length, with gymnasium.wrappers.TimeLimit(env, 1000) or, in commands, --env-kwargs "
-        "max_episode_steps:1000",
-        stacklevel=3,
-    )
-
-
-def _check_number_of_costs(policy: Any, keys: Sequence[str]) -> None:
-    """Refuse a policy that acts on another number of costs than there are keys."""
-    thresholds = getattr(getattr(policy, "action_filter", None), "threshold", keys)
-    if len(thresholds) != len(keys):
-        raise ValueError(
-            f"cost_keys={tuple(keys)}: the policy acts on {len(thresholds)} costs; pass their "
-            "names as cost_keys=(...), or the model instead of its policy"
-        )
-
-
 def evaluate_policy(
     model: PolicyPredictor,
     env: gym.Env | VecEnv,
@@ -329,8 +310,7 @@ def evaluate_policy(
     :param on_step: called after each step, e.g. to render
     :param on_episode: called with return, cost and length of each counted episode as it ends
     :raises ValueError: ``n_eval_episodes`` is below 1, a cost is not finite or missing where it
-        must not be, the policy acts on another number of costs than ``cost_keys`` names, or the
-        model's own environment normalises observations and ``env`` nothing
+        must not be, or the model's own environment normalises observations and ``env`` nothing
     """
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
@@ -345,8 +325,6 @@ def evaluate_policy(
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
-    if acts_on_cost:
-        _check_number_of_costs(policy, keys)
     if isinstance(model, Constrained) and model.env is not None:
         model.begin_anew |= share_environment(model.env, env)
 
@@ -378,7 +356,12 @@ def evaluate_policy(
             if longest is not None:
                 tally.give_up(longest)
     if len(tally.ended) < n_eval_episodes and longest is not None:
-        _warn_of_absent(f"{n_eval_episodes - len(tally.ended)} of {n_eval_episodes}", longest)
+        warnings.warn(
+            f"{n_eval_episodes - len(tally.ended)} of {n_eval_episodes} episodes are left out: one "
+            f"had not ended after {longest:,} steps; limit their length, with gymnasium.wrappers."
+            "TimeLimit(env, 1000) or, in commands, --env-kwargs max_episode_steps:1000",
+            stacklevel=2,
+        )
     return tally.evaluation(getattr(model, "limit_on", "sum"), _limits_on(model, keys))
 
 
@@ -415,7 +398,6 @@ class _Tally:
         self.unfinished: list[np.ndarray] = []
         self.successes: list[bool] = []
         self.reported = False  # whether any step reported a cost
-        self.alike: set[str] = set()  # other entries of infos, until then, that may be costs
 
     def step(
         self,
@@ -428,8 +410,6 @@ class _Tally:
         """Add a step of every environment, and the episodes that it ends."""
         self.returns += rewards
         self.reported |= reported
-        if not self.reported:
-            self.alike |= {key for info in infos for key in info if "cost" in str(key).lower()}
         if len(self.keys) == 1:
             totals = costs
         else:
@@ -479,13 +459,10 @@ class _Tally:
 
     def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
         """What was seen."""
-        expected = self.alike or self.keys != ("cost",)  # most environments have no costs
-        if expected and not self.reported and not limits:
-            there = f" (info has {', '.join(sorted(self.alike))})" if self.alike else ""
+        if self.keys != ("cost",) and not self.reported and not limits:
             warnings.warn(
-                f"no step reported a cost as info[{self.keys[0]!r}]{there}, so costs are 0; name "
-                "them in cost_keys or, for PPO and others without costs, in the monitor's: "
-                "-params \"monitor_kwargs:{'cost_keys': ['name']}\"",
+                f"no step reported a cost as info[{self.keys[0]!r}], so costs are 0: cost_keys, or "
+                "the monitor's, name the entries of info that are costs",
                 stacklevel=3,
             )
         shape = len(self.ended), len(self.keys)

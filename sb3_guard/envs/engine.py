@@ -16,7 +16,6 @@ from numpy.typing import DTypeLike
 
 from sb3_guard.checks import NumberError
 from sb3_guard.envs.arena import Arena
-from sb3_guard.envs.contract import check_moving, per_row
 from sb3_guard.envs.drawn import Drawn
 from sb3_guard.envs.extras import Extras
 from sb3_guard.envs.layout import Footprint, Layout, LayoutError
@@ -24,7 +23,7 @@ from sb3_guard.envs.motion import Motion
 from sb3_guard.envs.observation import Channel, Lidar
 from sb3_guard.envs.observer import Observer
 from sb3_guard.envs.outcome import Outcome
-from sb3_guard.envs.parameters import PartError, misshapen
+from sb3_guard.envs.parameters import PartError
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
 from sb3_guard.envs.physics import Physics
 from sb3_guard.envs.placing import Placing
@@ -115,7 +114,6 @@ class Engine:
         """Give the parts their views, and look at what they move, observe and measure."""
         for part in self.parts:
             part.bind(self)
-            check_moving(part, self.num_envs)
         self.drawn.bind(self.model)
         self._motion = Motion(self.parts)
         self.observer = Observer(self.robot, self.parts, lidar, self.extras.components)
@@ -128,11 +126,7 @@ class Engine:
         self._slow = [part for part in self.parts if part.every != "physics"]
         # a part that cannot end an episode is not asked
         self._enders = [p for p in self.parts if type(p).terminated is not Part.terminated]
-        measure = np.shape(self.task.measure())
-        if measure[:1] != (self.num_envs,):
-            label = f"measure() of {self.task.name}"
-            raise PartError(misshapen(label, measure, (self.num_envs, "M")))
-        self._before = self.array("before", measure[1:])
+        self._before = self.array("before", np.shape(self.task.measure())[1:])
 
     def array(self, name: str, shape: tuple[int, ...] = (), dtype: Any = float) -> Array:
         """The array ``name``, ``[N, *shape]``, zero when first asked for; part of the state."""
@@ -381,6 +375,20 @@ class Engine:
         self.drawn.apply(np.arange(self.num_envs))
         self.batch.restore(state["batch"])
         self._begun = bool((self.steps >= 0).all())
+
+
+def per_row(part: Part, verb: str, value: Any, rows: int, dtype: type = float) -> Array:
+    """What a verb of a part gave, [N], a copy: the part may keep and change its own.
+
+    :raises PartError: it has another shape, in which it would be broadcast
+    """
+    out: Array = np.array(value, dtype=dtype)
+    if out.shape != (rows,):
+        raise PartError(
+            f"{verb} of {part.name} has shape {out.shape}, expected ({rows},): one row for each "
+            "simulation of the batch"
+        )
+    return out
 
 
 def _sized(part: Part) -> str:

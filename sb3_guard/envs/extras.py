@@ -18,9 +18,8 @@ class Extras(Part):
 
     The time limit is not the engine's: :func:`gymnasium.make` puts it around a lone environment,
     which is not told. ``remaining`` therefore states the length of an episode itself, and a lone
-    environment and a row of a batch observe the same. Where it contradicts the limit it is refused:
-    by the vector environment and by ``sb3_guard.make`` when they are made, by a lone one that
-    :func:`gymnasium.make` made in an episode that lasts longer.
+    environment and a row of a batch observe the same. Where it contradicts the limit, the vector
+    environment and ``sb3_guard.make`` refuse it.
     """
 
     name = "observe"
@@ -68,17 +67,6 @@ class Extras(Part):
             raise ValueError(
                 f"observe.remaining = {self.remaining}, but episodes are cut after {steps} steps: "
                 "give remaining and max_episode_steps the same value"
-            )
-
-    def check_clock(self, steps: int) -> None:
-        """
-        :param steps: control steps of an episode that continues
-        :raises ValueError: nothing remains
-        """
-        if self.remaining is not None and steps >= self.remaining:
-            raise ValueError(
-                f"observe.remaining = {self.remaining}, but the episode continues after as many "
-                "steps: give remaining and max_episode_steps the same value"
             )
 
     def build(self, world: World) -> None:

@@ -298,13 +298,11 @@ class GuardEnv(Simulated, gymnasium.Env[Any, Array]):
         """Advance by one control step, of ten physics steps unless the robot says otherwise.
 
         :param action: [action size], clipped to the action space
-        :raises ValueError: the action has the wrong shape or is not finite,
-            or the episode lasts longer than ``observe={"remaining": ...}`` says
+        :raises ValueError: the action has the wrong shape or is not finite
         """
         action = np.asarray(action, dtype=float)
         if action.shape != self.action_space.shape:
             raise ValueError(f"action has shape {action.shape}, expected {self.action_space.shape}")
-        self.engine.extras.check_clock(int(self.engine.steps[0]))
         outcome = self.engine.step(action[None])
         self._so_far += outcome.reward[0], outcome.cost[0]
         if self.render_mode == "human":

@@ -9,7 +9,6 @@ disturbs the fewest others, and those are drawn again. This is quick, but favour
 """
 
 import functools
-import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -122,15 +121,6 @@ class Footprint:
                     f"{self.name}: {where} is out of the robot's reach: {gap:.2f} m from its base "
                     f"at {self.base} even at the lowest height, {low} m; it reaches {self.reach} m"
                 )
-        if self.placements and drawn and math.isfinite(self.reach):
-            gap = math.hypot(self._nearest, low)
-            if gap > self.reach:
-                raise ValueError(
-                    f"{self.name}: placements {list(self.placements)} are out of the robot's "
-                    f"reach: with keepout {self.keepout} m their nearest point is {gap:.2f} m from "
-                    f"its base at {self.base}; it reaches {self.reach} m: move them nearer, or the "
-                    "base with robot={'locations': [[x, y]]}"
-                )
 
     @functools.cached_property
     def _room(self) -> tuple[Array, Array, Array]:
@@ -140,23 +130,6 @@ class Footprint:
         span = np.maximum(boxes[:, 2:] - self.keepout - low, 0.0)
         area = span[:, 0] * span[:, 1] + 1e-12
         return low, span, area / area.sum()
-
-    @property
-    def _nearest(self) -> float:
-        """Distance in the plane of the base from the nearest place to draw a centre in, m."""
-        low, span, _ = self._room
-        away = np.maximum(np.maximum(low - self.base, self.base - (low + span)), 0.0)
-        return float(np.hypot(*away.T).min())
-
-    @property
-    def corners(self) -> Array:
-        """The outermost places that a centre can have when an episode begins, [n, 2] m."""
-        fixed = np.array(self.locations or self.among).reshape(-1, 2)
-        if len(self.locations) == self.num or self.among:
-            return fixed
-        low, span, _ = self._room
-        drawn = [low + span * share for share in ((0, 0), (0, 1), (1, 0), (1, 1))]
-        return np.concatenate([fixed, *drawn])
 
     def draw(self, rng: np.random.Generator, n: int) -> Array:
         """``n`` uniform centres, [2, n] m."""
@@ -315,22 +288,6 @@ def check_covers(footprints: Sequence[Footprint]) -> None:
                 f"{f.label} = {f.keepout!r} lets solid objects begin inside each other: it "
                 f"must be at least {least:g}; leave it out for what covers them, or set "
                 "layout={'overlap': True}"
-            )
-
-
-def check_locations(footprints: Sequence[Footprint]) -> None:
-    """Refuse fixed locations that are closer than their keep-outs and margins allow.
-
-    :raises ValueError: two are; names both, with their distance and the least that is allowed, m
-    """
-    fixed = [(f, i, place) for f in footprints for i, place in enumerate(f.locations)]
-    for (f, i, here), (g, j, there) in itertools.combinations(fixed, 2):
-        gap, least = math.dist(here, there), f.keepout + g.keepout + max(f.margin, g.margin)
-        if gap < least - 1e-9:  # rounding
-            raise ValueError(
-                f"locations {f.name}[{i}] = {here} and {g.name}[{j}] = {there} are {gap:.2f} m "
-                f"apart, but their keepouts and margin sum to {least:.2f} m: move one of them, or "
-                "reduce keepout or margin"
             )
 
 

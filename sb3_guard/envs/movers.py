@@ -8,7 +8,7 @@ import numpy as np
 from sb3_guard.envs import motion
 from sb3_guard.envs.groups import CYLINDER, SPHERE, add_geom
 from sb3_guard.envs.parameters import param
-from sb3_guard.envs.part import HEIGHT, SPACE, Simulation, World
+from sb3_guard.envs.part import HEIGHT, SPACE, Simulation
 from sb3_guard.envs.placed import Placed
 from sb3_guard.envs.types import Array, Generators
 
@@ -18,9 +18,8 @@ class Movers(Placed):
     """Objects that chase the robot or flee from it (Zhao et al. 2024, §4).
 
     Speeds are metres per control step under ``speed_law="unit"`` and, with the paper's equations,
-    ``"proportional"``, fractions of the distance per control step. Speeds that would jump to and
-    fro across what they lead to are refused. A subclass states its :meth:`law` of motion. Their z
-    stays within ``height``.
+    ``"proportional"``, fractions of the distance per control step. A subclass states its
+    :meth:`law` of motion. Their z stays within ``height``.
     """
 
     space: str | None = SPACE
@@ -37,14 +36,6 @@ class Movers(Placed):
     v0: float | None = param(None, "speed home from beyond r0; null: speed", low=0)
     r0: float = param(2.5, "radius around the origin that they do not leave, m", low=0)
     origin: tuple[float, float, float] = param((0.0, 0.0, 0.0), "where home is, (x, y, z) m")
-
-    def build(self, world: World) -> None:
-        super().build(world)
-        if self.solid and not self.planar and self.height[0] < self.size:
-            raise ValueError(
-                f"{self.name}.height = {self.height!r}: solid ones of size {self.size} would stick "
-                f"in the floor; the lowest height must be at least {self.size}"
-            )
 
     @property
     def _gap(self) -> float | Array:
@@ -78,28 +69,7 @@ class Movers(Placed):
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         self.group.centers = self.group.places  # which move, and bodies after them
-        law = self.motion = self.law()
-        fastest = max(abs(law.near), abs(law.far), law.settle, law.home)
-        if not law.unit and fastest > 1.0:
-            raise ValueError(
-                f"{self.name}: under speed_law 'proportional' speeds are shares of the distance "
-                f"and must be at most 1, but the fastest is {fastest:g}: lower speed, or v0, v1, v2"
-            )
-        # A step of up to twice the radius at which a mover stops ends within it. Where that is 0 it
-        # goes to and fro over its aim, and by no more than its size still lies on it.
-        aims = (
-            ("the robot", law.near, 0.0),
-            ("the robot", law.far, law.r1),
-            ("the origin", law.settle, 0.0),
-            ("the origin", law.home, law.r0),
-        )
-        for aim, speed, stop in aims if law.unit else ():
-            most = max(2 * stop, self.span("size").low)
-            if speed > most:
-                raise ValueError(
-                    f"{self.name}: with {speed:g} m per control step towards {aim} they would jump "
-                    f"across it forever: at most {most:g} m; lower speed, or v0, v1, v2"
-                )
+        self.motion = self.law()
 
     def reset(self, ids: Array, rngs: Generators) -> None:
         super().reset(ids, rngs)

@@ -5,7 +5,6 @@ the function and its call in :mod:`sb3_guard.envs.physics` can go.
 """
 
 import ctypes
-from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -17,12 +16,7 @@ from sb3_guard.envs.types import Array
 REST = int(mujoco.mjMINAWAKE)  # physics steps at rest after which a body may fall asleep
 
 
-def put_to_sleep(
-    batch: Batch,
-    models: mujoco.MjModel | Sequence[mujoco.MjModel] | None,
-    state: Array,
-    asleep: Array,
-) -> None:
+def put_to_sleep(batch: Batch, model: mujoco.MjModel | None, state: Array, asleep: Array) -> None:
     """Put to sleep the bodies that were, and restore how long the others have been at rest.
 
     MuJoCo's state does not hold this, and nothing writes it. So all are woken and physics steps
@@ -30,7 +24,7 @@ def put_to_sleep(
     where a force of -0.0 is applied, which changes no result: MuJoCo compares its bytes with 0.
 
     :param batch: the simulations
-    :param models: what they run on; None: the batch's model, with fields of their own
+    :param model: what they run on; None: the batch's model, with fields of their own
     :param state: [N, nstate]
     :param asleep: MuJoCo's ``tree_asleep``, [N, trees]: at least 0 is asleep; else the physics
         steps at rest - 11, where -2 means the same as -1: the next at rest is the last awake
@@ -38,29 +32,25 @@ def put_to_sleep(
     rest = np.where(asleep >= 0, REST, np.minimum(asleep, -2) + REST + 1)
     trees, force = batch.model.body_treeid, batch.bind("xfrc_applied")
     batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
-    tolerances = _swap_tolerances(batch, models, np.full(batch.nsim, np.inf))
+    tolerances = _swap_tolerances(batch, model, np.full(batch.nsim, np.inf))
     try:
         for left in range(REST)[::-1]:
             batch.state[:] = state
             force[(rest <= left)[:, trees] & (trees >= 0)] = -0.0
             batch.step()
     finally:
-        _swap_tolerances(batch, models, tolerances)
+        _swap_tolerances(batch, model, tolerances)
 
 
-def _swap_tolerances(
-    batch: Batch, models: mujoco.MjModel | Sequence[mujoco.MjModel] | None, new: Array
-) -> Array:
+def _swap_tolerances(batch: Batch, model: mujoco.MjModel | None, new: Array) -> Array:
     """Set the speed, m/s, below which bodies are at rest; return what it was, [N] both."""
-    if models is None:
+    if model is None:
         field = batch.expand("opt.sleep_tolerance")
         old: Array = field.copy()
         field[:] = new
         return old
-    several = [models] * batch.nsim if isinstance(models, mujoco.MjModel) else models
-    old = np.array([model.opt.sleep_tolerance for model in several])
-    for model, value in zip(several, new, strict=True):
-        model.opt.sleep_tolerance = value
+    old = np.full(batch.nsim, model.opt.sleep_tolerance)
+    model.opt.sleep_tolerance = new[0]
     return old
 
 

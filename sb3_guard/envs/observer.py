@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import DTypeLike
 
-from sb3_guard.envs.contract import check_observations
 from sb3_guard.envs.geometry import into_frames
 from sb3_guard.envs.observation import Channel, Compass, Lidar, Observations, Scan, Values, compass
 from sb3_guard.envs.part import Part, Robot
@@ -21,8 +20,7 @@ class Observer:
     :param lidar: settings of the pseudo-lidar
     :param components: names of what is observed, in the order of the flat observation; None:
         everything, in alphabetical order
-    :raises ValueError: an unknown component, with the nearest match; two parts observe one name; a
-        part's observations are not what they must be
+    :raises ValueError: an unknown component, with the nearest match; two parts observe one name
     """
 
     def __init__(
@@ -34,12 +32,10 @@ class Observer:
     ) -> None:
         self._robot, self._parts, self._lidar = robot, parts, lidar
         self._level = robot.workspace == "planar"
-        self._rows, self._bodies = robot.frames[0].shape[:2]
-        self._checked = False  # whether points and values have been found to be finite
+        self._bodies = robot.frames[0].shape[1]
         self._seen: list[tuple[str, tuple[int, ...], bool]] = []  # name, shape, planar
         known: dict[str, Channel] = {}
         for part in parts:
-            check_observations(part, self._rows)
             for name, channel in self.channels_of(part).items():
                 if name in known:
                     raise ValueError(
@@ -47,7 +43,6 @@ class Observer:
                         "or the robot's sensor, another name"
                     )
                 known[name] = channel
-        self._names = known.keys()
         for name in components or ():
             if name not in known:
                 hint = did_you_mean(name, sorted(known))
@@ -79,36 +74,12 @@ class Observer:
         """The flat observation of every row, [N, D], a new array.
 
         :param dtype: what the observation, computed in float64, is cast to
-        :raises ValueError: names or sizes are not those of the first observation
         """
-        if not self._checked:
-            for part in self._parts:
-                check_observations(part, self._rows, finite=True)
-            self._checked = True
         found: dict[str, Scan | Compass | Values] = {}
         for part in self._parts:
             found.update(part.observations())
-        if found.keys() != self._names:
-            odd = ", ".join(map(repr, sorted(found.keys() ^ self._names)))
-            raise ValueError(
-                f"observations() must always have the same names; {odd} came or went: for what is "
-                "not seen, give a Scan that is not visible, or zeros"
-            )
-        try:
-            seen = self.look({name: found[name] for name in self.channels})
-        except Exception:
-            for part in self._parts:  # whose fault is it?
-                check_observations(part, self._rows, finite=True)
-            raise
-        obs = np.concatenate([seen[name] for name in self.slices], axis=1, dtype=dtype)
-        if obs.shape[1] != self.size:
-            widths = {name: (c.size, np.shape(seen[name])[1]) for name, c in self.channels.items()}
-            name = next(n for n, (size, width) in widths.items() if size != width)
-            raise ValueError(
-                f"{name!r} of the observation has {widths[name][1]} columns; at first it had "
-                f"{widths[name][0]}"
-            )
-        return obs
+        seen = self.look({name: found[name] for name in self.channels})
+        return np.concatenate([seen[name] for name in self.slices], axis=1, dtype=dtype)
 
     def readings(self, row: int) -> list[tuple[Array, int, tuple[float, float, float]]]:
         """Every lidar of a row: closeness [bodies · bins], bins around, and color."""

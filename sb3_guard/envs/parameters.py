@@ -11,7 +11,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 from sb3_guard.checks import WorldError
 from sb3_guard.fields import fit, in_words
@@ -20,12 +20,6 @@ from sb3_guard.spelling import did_you_mean
 
 class PartError(WorldError, ValueError):
     """A part does not keep its contract; the message names the part, the verb and the fix."""
-
-
-def misshapen(what: str, shape: tuple[Any, ...], expected: tuple[Any, ...]) -> str:
-    """An error message about an array of a part."""
-    words = f"({', '.join(map(str, expected))}{',' * (len(expected) == 1)})"
-    return f"{what} has shape {shape}, expected {words}: one row for each simulation of the batch"
 
 
 class Range(NamedTuple):
@@ -100,8 +94,6 @@ class Parameters:
 
     name: str = ""  # what messages call it, and users the keyword that sets its parameters
     ranges: Mapping[str, Range] = types.MappingProxyType({})  # of what is drawn, by parameter
-    # what to write instead of parameters that it does not have, though others have them
-    instead: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         hints = typing.get_type_hints(type(self))
@@ -156,8 +148,7 @@ class Parameters:
         known = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
         for key in params:
             if key not in known:
-                hint = cls.instead.get(key) or did_you_mean(key, known)
-                raise ValueError(f"{label} has no parameter {key!r}: {hint}")
+                raise ValueError(f"{label} has no parameter {key!r}: {did_you_mean(key, known)}")
         made = cls.__new__(cls)
         if name is not None:
             made.name = name  # before the values are checked: it is in the messages

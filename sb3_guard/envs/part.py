@@ -26,19 +26,20 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any, ClassVar, Protocol, Self
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
 
 import mujoco
 import numpy as np
 
 from sb3_guard.envs.layout import Footprint
 from sb3_guard.envs.motion import Moving
-from sb3_guard.envs.observation import Observations, Scan
+from sb3_guard.envs.observation import Observations
 from sb3_guard.envs.parameters import Parameters, param
 from sb3_guard.envs.physics import FRAME_SKIP, Physics
 from sb3_guard.envs.types import Array, Generators
 
+PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 # parameters of parts that exist on the floor and in the air
 SPACE = param(
     None, "planar or spatial; null: the robot's workspace", choices=(None, "planar", "spatial")
@@ -49,22 +50,81 @@ MASS = param(1.0, "factor on masses and inertias", above=0, drawn="mass")
 FRICTION = param(1.0, "factor on friction with the floor", low=0, drawn="friction")
 
 
-class World(Protocol):
-    """A world under construction, as :meth:`Part.build` sees it."""
+@dataclass
+class World:
+    """The world under construction: floor, light, cameras and what the parts add.
 
-    spec: mujoco.MjSpec
+    :param robot: the robot that it is for
+    :param spec: the world, to which the parts add
+    """
+
     robot: Robot
+    spec: mujoco.MjSpec
+
+    def __post_init__(self) -> None:
+        """Note the floors: planes that are added later are walls."""
+        self._floors = [geom for geom in self.spec.worldbody.geoms if geom.type == PLANE]
 
     def rub(self, body: str) -> int:
-        """State the contacts with the floor of all geoms from ``body`` on, as pairs of geoms whose
-        friction may differ between simulations. Returns how many there can be.
+        """State the contacts with the floor of all geoms from ``body`` on, as pairs of geoms.
+
+        Each pair has what MuJoCo would give the contact itself, so that nothing changes but that
+        its friction is one row of ``pair_friction``. Pairs that a file states stay.
+
+        :return: how many there can be
         """
+        count, stated = 0, [{pair.geomname1, pair.geomname2} for pair in self.spec.pairs]
+        for geom in self.spec.body(body).find_all("geom"):
+            for floor in self._floors:
+                if {geom.name, floor.name} in stated:
+                    count += 1
+                    continue
+                if not (geom.contype & floor.conaffinity or floor.contype & geom.conaffinity):
+                    continue
+                geom.name = geom.name or f"{body}/rubs{count}"
+                floor.name = floor.name or "floor"
+                self._add_pair(geom, floor)
+                count += 1
+        return count
+
+    def _add_pair(self, geom: mujoco.MjsGeom, floor: mujoco.MjsGeom) -> None:
+        """What two geoms with priorities, or without, make of their contact."""
+        most = max(geom.priority, floor.priority)
+        ruling = [g for g in (geom, floor) if g.priority == most]
+        mixed = [g.solmix for g in ruling]
+        slide, spin, roll = np.max([g.friction for g in ruling], axis=0)
+        self.spec.add_pair(
+            geomname1=floor.name,
+            geomname2=geom.name,
+            condim=max(g.condim for g in ruling),
+            friction=[slide, slide, spin, roll, roll],
+            solref=np.average([g.solref for g in ruling], axis=0, weights=mixed),
+            solimp=np.average([g.solimp for g in ruling], axis=0, weights=mixed),
+            margin=geom.margin + floor.margin,  # MuJoCo 4 adds them
+            gap=geom.gap + floor.gap,
+        )
 
     def feel(self, name: str, body: str, force: bool = False, by: str | None = None) -> None:
-        """Add a sensor ``name`` of the contacts of the robot, or of its body ``by`` alone, with
-        ``body``: how many there are, 0 or 1, or their net ``force``, [N, 3] N.
-        :meth:`Simulation.sensor` reads it.
+        """Count contacts between any part of the robot and ``body``; 0 if there are none.
+
+        :param name: name of the sensor
+        :param body: name of a body in the world; the floor's and the walls' is ``"world"``
+        :param force: whether their net force is felt instead, [N, 3] N along the world's axes
+        :param by: the body of the robot that feels them, without those on it; None: the robot
         """
+        found = [mujoco.mjtConDataField.mjCONDATA_FOUND, 0]  # no reduction
+        net = [mujoco.mjtConDataField.mjCONDATA_FORCE, 3]
+        data, reduction = net if force else found
+        self.spec.add_sensor(
+            name=name,
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            # in contact sensors, mjOBJ_XBODY is the body's whole subtree
+            objtype=mujoco.mjtObj.mjOBJ_BODY if by else mujoco.mjtObj.mjOBJ_XBODY,
+            objname=by or self.robot.root,
+            reftype=mujoco.mjtObj.mjOBJ_BODY,
+            refname=body,
+            intprm=[1 << int(data), int(reduction), 1],  # one slot
+        )
 
 
 class Simulation(Protocol):
@@ -106,30 +166,6 @@ class Painter(Protocol):
         """A see-through wall, 20 cm high, on the floor between two places, [2] m."""
 
 
-class Objects(Protocol):
-    """Like objects of a part: see :class:`sb3_guard.envs.groups.Group`."""
-
-    name: str
-    footprint: Footprint
-    centers: Array  # [N, num, 3] m
-
-    @property
-    def movable(self) -> list[str]:
-        """Names of the bodies that can be pushed."""
-
-    def bind(self, sim: Simulation) -> None:
-        """Take live views of the running simulations."""
-
-    def reset(self, ids: Array, rngs: Generators) -> None:
-        """Begin an episode in rows ``ids``."""
-
-    def scan(self) -> Scan:
-        """What lidar sees of them."""
-
-    def draw(self, painter: Painter, row: int) -> None:
-        """Draw one row's objects that are not bodies."""
-
-
 class Part(Parameters):
     """A robot, a task or a constraint: see the module's text for the verbs."""
 
@@ -141,22 +177,11 @@ class Part(Parameters):
     size: float  # m, radius of its objects
     # how to let episodes begin clean, where it spoils every start
     remedy: ClassVar[str] = "make size or num smaller, or keepout or placements larger"
-    groups: tuple[Objects, ...] = ()  # its objects, made by build()
+    groups: tuple[Any, ...] = ()  # its objects, each a Group, made by build()
     every: str = "control"  # before which steps before_step is called: "control" or "physics"
     solid: bool = False  # whether its objects are bodies that the robot bumps into
     color: ClassVar[tuple[float, float, float]] = (0.5, 0.5, 0.5)
     family: ClassVar[str] = "guard"  # of suites; a part of GUARD's has a page of its own
-
-    @classmethod
-    def from_params(cls, params: Mapping[str, Any], name: str | None = None) -> Self:
-        known = {f.name for f in fields(cls)}  # type: ignore[arg-type]
-        if isinstance(params, Mapping) and "space" in params and "space" not in known:
-            if len(cls.spaces) == 1:
-                raise ValueError(
-                    f"{name or cls.name}.space = {params['space']!r} cannot be set: its space is "
-                    f"always {cls.spaces[0]}, whatever the robot's workspace; leave it out"
-                )
-        return super().from_params(params, name)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -348,10 +373,6 @@ class Task(Part):
     ends: bool = False  # whether success ends the episode instead of drawing a new goal
     camera: ClassVar[str] = "fixed"  # of pictures that are not asked to have another one
     invalid_reason: ClassVar[str] = "its goal is reached immediately"  # why it is drawn again
-    instead: ClassVar[Mapping[str, str]] = {
-        "speed": "it moves nothing; targets move in the tasks Chase and Defense",
-        "ends": "it is never completed; episodes of the tasks Goal, Push and Button can end",
-    }
 
     def measure(self) -> Array:
         """The distances that the reward is made of, [N, M] m."""
@@ -383,11 +404,6 @@ class Constraint(Part):
 
     trespassable: bool  # the taxonomy of the paper's constraint table
     movable: str  # "no", "passive" or "active"
-    instead: ClassVar[Mapping[str, str]] = {
-        "speed": "it moves nothing; ghosts={'speed': 0.5} and gremlins={'rate': 1.0} move",
-        "ends": "to end episodes by cost, wrap the environment in "
-        "sb3_guard.common.vec_budgets.VecEarlyTermination",
-    }
 
     def cost(self) -> Array:
         """The cost of this step, [N], at least 0."""

@@ -5,7 +5,7 @@ diverged.
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -32,11 +32,9 @@ class Physics(Batch):
     time, though they are read when the control step ends. Here they are switched off until then,
     with the same results bit for bit. The switch is in a copy of the model that the batch runs on,
     or, once simulations have fields of their own, one of these fields. Every physics step evaluates
-    the sensors where someone gives simulations models of their own; where it could make a
-    difference, because sensors
-    have a history or may fall asleep with what they are on, plugins read sensors or nothing is
-    computed at the new state; and for a lone simulation, where it gains little. A physics callback
-    in C (``mjcb_control``) reads them as of the last control step.
+    the sensors where it could make a difference, because sensors have a history or may fall asleep
+    with what they are on, plugins read sensors or nothing is computed at the new state; and for a
+    lone simulation, where it gains little.
 
     :param model: the model
     :param nsim: number of simulations N
@@ -68,7 +66,7 @@ class Physics(Batch):
             self._asleep = self.bind("tree_asleep")
         if self._late or self._sleeps:
             self._copy = copy.copy(model)
-            super().set_models(self._copy)
+            self.set_models(self._copy)
             self._models = None  # not the caller's: named views write per-simulation fields
         self._warnings = self.warning[:, _BAD, 1]  # live counts since the batch was made
         self._warned = self._warnings.copy()
@@ -133,7 +131,7 @@ class Physics(Batch):
         """Continue from a :meth:`snapshot`, bit for bit."""
         state = snapshot[:, : self.nstate]
         if self._sleeps:
-            put_to_sleep(self, self._copy or self.models, state, snapshot[:, self.nstate :])
+            put_to_sleep(self, self._copy, state, snapshot[:, self.nstate :])
         self.state[:] = state
         self.forward(stage=ACC)
         self.state[:] = state  # without the solver's warm start of the new computation
@@ -148,15 +146,10 @@ class Physics(Batch):
         self._release()
         super().set_const(ids)
 
-    def set_models(self, models: mujoco.MjModel | Sequence[mujoco.MjModel] | None) -> None:
-        super().set_models(models)
-        # not before: the batch reads the copy as long as the call may fail
-        self._copy, self._late = None, False
-
     def _release(self) -> None:
         """Run on the batch's own model again: only its fields can differ between simulations."""
         if self._copy is not None:
-            super().set_models(None)
+            self.set_models(None)
             self._copy = None
             if self._late:
                 self._flags = super().expand("opt.disableflags")

@@ -13,7 +13,6 @@ from sb3_guard.envs.layout import (
     Rectangle,
     arrange,
     check_covers,
-    check_locations,
     redraw,
 )
 from sb3_guard.envs.part import Part
@@ -63,7 +62,6 @@ class Placing:
         self._restarts = (
             Restarts(self._ordered, layout.restarts, array) if layout.restarts else None
         )
-        check_locations(list(self.footprints.values()))
         if not layout.overlap:
             check_covers(list(self.footprints.values()))
 

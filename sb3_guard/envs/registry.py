@@ -4,7 +4,6 @@ Adding one to its table here, or with :func:`register_robot`, :func:`register_ta
 :func:`register_constraint` from outside, is all it takes to use it in ids, scenarios and commands.
 """
 
-import inspect
 import re
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -192,13 +191,6 @@ def _add(table: dict[str, Any], name: str, part: Any, kind: type[Part]) -> None:
     if not isinstance(part, type) or not issubclass(part, kind):
         hint = "; a file is given as xml=..." if kind is Robot else ""
         raise ValueError(f"{name!r} = {part!r} must be a subclass of {kind.__name__}{hint}")
-    fields: Any = getattr(part, "__dataclass_fields__", ())
-    for key, annotation in inspect.get_annotations(part).items():
-        if key not in fields and "ClassVar" not in str(annotation):
-            raise ValueError(
-                f"class {part.__name__} is not a dataclass, so its parameter {key} is not read: "
-                f"write @dataclass in the line above class {part.__name__}"
-            )
     for other, known in table.items():
         if name.lower() == other.lower() and not (name == other and _same(part, known)):
             raise ValueError(f"{other!r} is already taken by another class: use another name")

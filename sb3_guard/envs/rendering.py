@@ -241,28 +241,8 @@ class Renderer:
         if self._explain:
             self._look_at(self._camera, data)
         self._screen.update_scene(data, self._camera)
-        if self._explain:
-            self._reveal(self._screen.scene, data)
         self._paint(self._screen.scene, data, row, shift)
         return self._screen.render()
-
-    def _reveal(self, scene: mujoco.MjvScene, data: mujoco.MjData) -> None:
-        """Make what stands before the robot translucent: the more of it that hides, the more.
-
-        A geom of the robot is hidden by the first thing on the way to its middle. What lies beyond
-        the robot, such as the floor seen between two legs, hides nothing.
-        """
-        eye = (scene.camera[0].pos + scene.camera[1].pos) / 2
-        hit, hidden = np.zeros(1, np.int32), np.zeros(self._engine.model.ngeom)
-        for geom in self._geoms:
-            way = data.geom_xpos[geom] - eye
-            share = mujoco.mj_ray(self._engine.model, data, eye, way, None, True, -1, hit)
-            if 0.0 <= share < 1.0 and hit[0] not in self._geoms:
-                hidden[hit[0]] += 1.0 / len(self._geoms)
-        for geom in scene.geoms[: scene.ngeom]:
-            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and hidden[geom.objid] > 0.0:
-                geom.rgba[3] *= 1.0 - 0.65 * hidden[geom.objid]
-                geom.transparent = True
 
     def _look_at(self, camera: mujoco.MjvCamera, data: mujoco.MjData) -> None:
         """Turn a free camera to the robot, or to the whole arena and the robot near it."""

@@ -77,10 +77,7 @@ class Scenario:
             object.__setattr__(self, f.name, value)
         for kind, name, known in (("robot", self.robot, ROBOTS), ("task", self.task, TASKS)):
             if not isinstance(name, str):
-                raise ValueError(
-                    f"{kind} = {name!r} must be a name, one of {', '.join(known)}; parameters go "
-                    f"into {kind}_params"
-                )
+                raise ValueError(f"{kind} = {name!r} must be a name: {', '.join(known)}")
             if name not in known:
                 raise UnknownPart(f"unknown {kind} {name!r}: {did_you_mean(name, known)}")
         if not isinstance(self.constraints, Mapping):
@@ -102,12 +99,7 @@ class Scenario:
         known = list(cls.__dataclass_fields__)
         for key in data:
             if key not in known:
-                hint = did_you_mean(key, known)
-                if str(key).lower() in map(str.lower, TASKS):
-                    hint = "the task's parameters go into task_params"
-                elif str(key).lower() in map(str.lower, CONSTRAINTS):
-                    hint = f"write constraints: {{{str(key).lower()}: {{...}}}}"
-                raise ValueError(f"{label} has no key {key!r}: {hint}")
+                raise ValueError(f"{label} has no key {key!r}: {did_you_mean(key, known)}")
         return cls(**data)
 
     @classmethod
@@ -172,12 +164,7 @@ class Scenario:
                 hint = did_you_mean(key, [*table, *OPTIONS])
                 raise ValueError(f"unknown parameter {key!r}: {hint}; {_OWN_NAME}")
             if value is not None and not isinstance(value, Mapping):
-                such = "{'size': 0.3}"
-                if key == "robot":
-                    such = "{'heading': 0.0}; the robot itself is chosen by the id"
-                raise ValueError(
-                    f"{key} = {value!r} must be a mapping of parameters, such as {key}={such}"
-                )
+                raise ValueError(f"{key} = {value!r} must be a mapping of parameters to values")
             name = table.get(key, "constraints")
             if name != "constraints":
                 changes[name] = {**changes.get(name, getattr(self, name)), **(value or {})}
@@ -216,23 +203,14 @@ class Scenario:
         taken = (self.task.lower(), *KEYWORDS)
         constraints = []
         for name, params in self.constraints.items():
-            if not name.isidentifier() or not name.isascii():
+            used = name.lower() in taken or (name.lower() in by_name and name not in by_name)
+            if not name.isidentifier() or not name.isascii() or used:
                 raise ValueError(
-                    f"constraint {name!r}: its cost is called 'cost_<name>', so the name must be "
-                    "of letters, digits and underscores, no digit first"
-                )
-            if name.lower() in by_name and name not in by_name:
-                raise ValueError(f"constraint {name!r}: write {name.lower()!r}, in lower case")
-            if name.lower() in taken:
-                raise ValueError(
-                    f"constraint {name!r}: this is what the parameters of another part are called "
-                    f"({', '.join(taken)}); give it another name"
+                    f"constraint {name!r}: a name has letters, digits and underscores; types of "
+                    f"constraints are in lower case, and {', '.join(taken)} mean other parts"
                 )
             if not isinstance(params, Mapping):
-                raise ValueError(
-                    f"constraint {name!r} = {params!r} must be a mapping of parameters, such as "
-                    "{'num': 8}"
-                )
+                raise ValueError(f"constraint {name!r} = {params!r} must be a mapping")
             params = dict(params)
             named = "type" not in params
             kind = str(params.pop("type", name)).lower()
@@ -243,9 +221,7 @@ class Scenario:
                 raise UnknownPart(f"{name}.type = {kind!r}: {hint}")
             if name in by_name and kind != name:
                 raise ValueError(
-                    f"constraint {name!r} cannot be of type {kind!r}, since {name!r} is a type "
-                    f"itself: to have {kind} instead, write {name}=None and {kind}={{...}}; to "
-                    f"have both, {kind}={{...}}"
+                    f"constraint {name!r} cannot be of type {kind!r}: {name!r} is a type itself"
                 )
             constraints.append(by_name[kind].from_params(self._suited(kind, params), name))
         task = self.task.lower()

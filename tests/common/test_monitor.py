@@ -87,17 +87,6 @@ def test_a_name_alone_is_no_sequence_of_costs():
         make(3, cost_keys="heat")
 
 
-@pytest.mark.parametrize("kind", [float, np.float32, lambda cost: np.array([cost])])
-def test_several_costs_of_every_kind(kind):
-    env = make(2, cost_keys=("cost", "heat"))
-    lone = env.unwrapped.envs[0]
-    step = lone.step
-    lone.step = lambda action: (*step(action)[:4], {k: kind(v) for k, v in lone.shared.items()})
-    env.reset()
-    (episode,) = play(env, 2)
-    assert [episode[key] for key in ("c", "c_cost", "c_heat")] == pytest.approx([0.3, 0.3, 0.03])
-
-
 @pytest.mark.parametrize(
     ("info", "keys", "expected"),
     [

@@ -5,7 +5,6 @@ import pickle
 import warnings
 import weakref
 
-import cloudpickle
 import gymnasium
 import numpy as np
 import pytest
@@ -59,27 +58,6 @@ def test_native_equals_one_by_one(vec_env, flatten):
                     assert i["episode"][key] == pytest.approx(j["episode"][key], abs=1e-6)
     native.close()
     other.close()
-
-
-def test_states_of_wrapped_environments_survive_pickling():
-    env = make_vec_env("Goal_Point_8Hazards", 2, seed=0, max_episode_steps=20)
-    env.reset()
-    env.step(np.ones((2, 2)))
-    state = cloudpickle.loads(cloudpickle.dumps(env.unwrapped.state()))
-    other = make_vec_env("Goal_Point_8Hazards", 2, seed=9, num_threads=1, max_episode_steps=20)
-    other.reset()
-    other.unwrapped.restore(state)
-    for _ in range(30):
-        np.testing.assert_array_equal(env.step(np.ones((2, 2)))[0], other.step(np.ones((2, 2)))[0])
-
-
-def test_foreign_environments_go_through_gymnasium():
-    env = make_vec_env("CartPole-v1", 2, seed=0)
-    assert env.reset().shape == (2, 4)
-    *_, infos = env.step(np.zeros(2, dtype=int))
-    assert "cost" not in infos[0]
-    assert find("CartPole-v1").batch is None
-    assert find("Goal_Point_2Hazards").batch is not None
 
 
 @pytest.mark.parametrize(

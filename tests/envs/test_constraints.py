@@ -1,9 +1,7 @@
 """Constraints: costs against scalar loops and MuJoCo's own contacts, and bodies that behave."""
 
 import math
-from functools import partial
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
@@ -26,16 +24,14 @@ SLOW = pytest.mark.slow  # further cases of a promise that another case keeps
 OTHERS = ("Point", "Swimmer", "Doggo", "Arm3", "Drone")
 
 
-@pytest.mark.parametrize("indicator", [False, True])
 @pytest.mark.parametrize(
-    ("suite", "params"),
+    ("suite", "params", "indicator"),
     [
-        ("Goal_Point_6Hazards", {"weight": 2.0}),
-        ("Goal_Point_6Ghosts", {"size": 0.5, "weight": 0.5}),
-        ("Goal_Drone_6Hazards", {"height": [0.8, 1.2]}),
-        ("Goal_Drone_6Ghosts", {"height": [0.9, 1.1]}),
-        ("Goal_Drone_6Hazards", {"space": "planar"}),
-        ("Goal_Ant_6Hazards", {"space": "spatial", "height": [0.1, 0.3]}),
+        ("Goal_Point_6Hazards", {"weight": 2.0}, False),
+        ("Goal_Point_6Ghosts", {"size": 0.5, "weight": 0.5}, True),
+        ("Goal_Drone_6Ghosts", {"height": [0.9, 1.1]}, False),
+        ("Goal_Drone_6Hazards", {"space": "planar"}, False),
+        ("Goal_Ant_6Hazards", {"space": "spatial", "height": [0.1, 0.3]}, True),
     ],
     ids=str,
 )
@@ -196,50 +192,6 @@ def test_gremlins_of_other_rows_stay_when_a_row_is_reset():
     assert (engine.batch.mocap_pos[0] != before[0]).any()
 
 
-@pytest.mark.parametrize(
-    ("env_id", "parameters"),
-    [
-        ("Goal_Point_8Ghosts", {"ghosts": {"speed": 2.0}}),
-        ("Chase_Point_0Hazards", {"chase": {"speed": 0.2}}),  # its v1 is ten times that
-        ("Defense_Point_0Hazards", {"defense": {"v0": 1.5}}),
-    ],
-)
-def test_speeds_that_overshoot_are_refused(env_id, parameters):
-    ((part, values),) = parameters.items()
-    world(env_id, 1, **parameters)  # metres per step may be large
-    with pytest.raises(ValueError, match=rf"{part}: under speed_law 'proportional'.*at most 1"):
-        world(env_id, 1, **{part: {**values, "speed_law": "proportional"}})
-
-
-@pytest.mark.parametrize(
-    ("env_id", "params", "key", "most"),
-    [  # they stop within r1 of the robot and r0 of the origin; where that is 0, by their size
-        ("Goal_Point_1Ghosts", {"r1": 0.0}, "v1", 0.3),
-        ("Goal_Point_1Ghosts", {"r1": 0.0, "size": 0.5}, "speed", 0.5),
-        ("Goal_Point_1Ghosts", {"r1": 0.4}, "v1", 0.8),
-        ("Goal_Point_1Ghosts", {"r0": 0.25}, "v0", 0.5),
-        ("Chase_Point_0Hazards", {}, "v0", 4.0),
-        ("Defense_Point_0Hazards", {}, "v2", 0.3),
-    ],
-)
-def test_speeds_that_jump_across_their_aim_are_refused(env_id, params, key, most):
-    name = "ghosts" if "Ghosts" in env_id else env_id.split("_")[0].lower()
-    world(env_id, **{name: {**params, key: most}})
-    with pytest.raises(ValueError, match=f"{name}: with .* across it forever: at most {most:g} m"):
-        world(env_id, **{name: {**params, key: most + 0.01}})
-
-
-def test_the_fastest_ghosts_that_are_allowed_stay_with_the_robot():
-    """Still a ghost that stops nowhere is at the robot by no more than its size."""
-    for r1, within in ((0.0, 0.3), (0.4, 0.4)):
-        ghosts = {"r1": r1, "v1": 0.3 if r1 == 0 else 0.8}
-        engine = world("Goal_Point_1Ghosts", ghosts=ghosts)
-        for step in range(30):
-            engine.step(np.zeros((1, 2)))
-            gap = math.dist(engine.places("ghosts")[0, 0, :2], engine.robot.position[0, :2])
-            assert gap <= within or step < 20
-
-
 def test_gremlins_circle_by_the_simulated_clock():
     """§5: travel · (sin t, cos t) around their places; a step shows the time it began at."""
     engine = world("Goal_Swimmer_3Gremlins", 2, gremlins={"travel": 0.25, "rate": 1.5})
@@ -304,41 +256,9 @@ def test_any_mixture_and_several_of_one_type():
         np.testing.assert_allclose(outcome.cost, sum(outcome.costs.values()), atol=1e-12)
 
 
-@pytest.mark.parametrize("lone", [True, False])
-def test_groups_of_one_type_are_charged_apart(lone):
-    """Two sizes of hazards and one of pillars: each its own cost, and the sum."""
-    groups = {
-        "hazards": {"num": 2, "size": 0.4, "weight": 3.0},
-        "pits": {"type": "hazards", "num": 2, "size": 0.2},
-        "posts": {"type": "pillars", "num": 1, "size": 0.05},
-    }
-    make = gymnasium.make if lone else partial(gymnasium.make_vec, num_envs=2)
-    env = make("Goal_Point_8Hazards-v0", **groups)
-    env.reset(seed=0)
-    engine = env.unwrapped.engine
-    assert list(engine.footprints) == ["robot", "goal", *groups]
-    for name, gaps in (("hazards", (0.25, 0.5)), ("pits", (0.15, 0.05))):
-        engine.places(name)[:, :, 1] = engine.robot.position[:, None, 1]
-        engine.places(name)[:, :, 0] = engine.robot.position[:, None, 0] + gaps
-    rest = np.zeros(env.action_space.shape, np.float32)
-    info = env.step(rest)[4]
-    expected = {"cost_hazards": 3.0 * 0.15, "cost_pits": 0.05 + 0.15, "cost_posts": 0.0}
-    for name, cost in {**expected, "cost": 0.65}.items():
-        np.testing.assert_allclose(info[name], cost, atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("task", "params", "name"),
-    [
-        ("Push", {}, "ball"),
-        ("Push", {"object": "box"}, "box"),
-        ("Chase", {"solid": True}, "targets"),
-    ],
-)
-def test_names_of_bodies_are_not_given_twice(task, params, name):
-    scenario = Scenario(task=task, task_params=params, constraints={name: {"type": "pillars"}})
-    with pytest.raises(ValueError, match=f"two parts have bodies called '{name}'; give the con"):
-        scenario.build()
+def test_names_of_bodies_are_not_given_twice():
+    with pytest.raises(ValueError, match="two parts have bodies called 'ball'"):
+        Scenario(task="Push", constraints={"ball": {"type": "pillars"}}).build()
 
 
 COVER = {  # parameters, and the radius that an object of that size takes up, m
@@ -356,15 +276,8 @@ def test_solid_objects_never_begin_inside_each_other(name):
     few = {"num": 3, **params}
     engine = Scenario(constraints={name: few}).build()
     assert engine.footprints[name].keepout == pytest.approx(cover)
-    for keepout in (0.0, cover - 0.001):
-        with pytest.raises(
-            ValueError, match=rf"{name}.keepout = .* begin inside .* at least 0\.\d"
-        ):
-            Scenario(constraints={name: {**few, "keepout": keepout}}).build()
-    with pytest.raises(ValueError) as refused:
-        Scenario(constraints={name: {**few, "keepout": 0}}).build()
-    least = float(str(refused.value).partition("at least ")[2].partition(";")[0])
-    Scenario(constraints={name: {**few, "keepout": least}}).build()  # what it says is enough
+    with pytest.raises(ValueError, match=rf"{name}.keepout = .* at least 0\.\d"):
+        Scenario(constraints={name: {**few, "keepout": cover - 0.001}}).build()
     allowed = Scenario(constraints={name: {**few, "keepout": 0.0}}, layout={"overlap": True})
     assert allowed.build().footprints[name].keepout == 0.0
     engine.reset(np.zeros(1, dtype=int))
@@ -385,7 +298,7 @@ def test_zones_may_overlap_and_usual_sizes_keep_their_usual_distance():
 
 
 def test_what_hangs_in_the_air_can_be_met():
-    """Zones that a robot on the floor would never enter, and bodies in the floor, are refused."""
+    """Zones that a robot on the floor would never enter are refused."""
 
     def build(robot, **params):
         Scenario(robot=robot, constraints={"ghosts": params}).build()
@@ -399,8 +312,6 @@ def test_what_hangs_in_the_air_can_be_met():
     build("Humanoid", space="spatial", height=[1.0, 2.0])
     build("Point", space="spatial", solid=True)
     build("Drone", height=[0.1, 1.0])
-    with pytest.raises(ValueError, match=r"would stick in the floor; .* at least 0\.3"):
-        build("Drone", height=[0.1, 1.0], solid=True)
 
 
 def test_parts_of_one_name_are_refused():
@@ -464,25 +375,14 @@ def test_constraints_state_the_papers_taxonomy():
 @pytest.mark.parametrize(
     ("name", "params", "words"),
     [
-        ("hazards", {"num": -1}, r"hazards.num = -1 must be at least 0"),
         ("ghosts", {"size": "big"}, r"ghosts.size = 'big' must be a number"),
-        ("ghosts", {"solid": "yes"}, r"ghosts.solid = 'yes' must be true or false"),
         ("ghosts", {"sped": 1.0}, r"no parameter 'sped': did you mean 'speed'\?"),
-        ("ghosts", {"height": [2, 1]}, r"ghosts.height"),
-        ("ghosts", {"height": [-0.2, 1]}, r"ghosts.height = \(-0.2, 1\) must be at least 0"),
         ("hazards", {"height": [-2, -1]}, r"hazards.height = \(-2, -1\) must be at least 0"),
-        ("a b/", {"type": "hazards"}, r"constraint 'a b/': .* letters, digits and underscores"),
-        ("", {"type": "hazards"}, r"constraint '': .* letters, digits and underscores"),
-        ("2pits", {"type": "hazards"}, r"constraint '2pits': .* no digit first"),
-        ("goal", {"type": "hazards"}, r"constraint 'goal': .* parameters of another part"),
-        ("lidar", {"type": "hazards"}, r"constraint 'lidar': .* parameters of another part"),
-        ("hazards", 8, r"constraint 'hazards' = 8 must be a mapping of parameters"),
+        ("a b/", {"type": "hazards"}, r"constraint 'a b/': .* letters, digits"),
+        ("goal", {"type": "hazards"}, r"constraint 'goal': .* mean other parts"),
+        ("hazards", 8, r"constraint 'hazards' = 8 must be a mapping"),
         ("pillars", {"height": [0, 1]}, r"no parameter 'height': did you mean"),
-        ("vases", {"density": 0}, r"vases.density = 0 must be greater than 0"),
-        ("gremlins", {"travel": -0.1}, r"gremlins.travel = -0.1 must be at least 0"),
-        ("buttons", {"weight": float("nan")}, r"buttons.weight = nan must be a number"),
         ("walls", {}, r"unknown constraint 'walls'"),
-        ("speed", {"limit": -1.0}, r"speed.limit = -1.0 must be at least 0"),
     ],
 )
 def test_bad_parameters_are_named(name, params, words):

@@ -78,15 +78,6 @@ def test_a_file_is_a_robot_as_it_is(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", ["reach", "push", "pick_and_place"])
-def test_a_robot_that_is_moved_by_a_mocap_weld_is_answered_in_a_line(scene):
-    path = file("ShadowHand").parents[1] / "fetch" / f"{scene}.xml"
-    with pytest.raises(ValueError, match="by a weld to mocap body 'robot0:mocap'") as caught:
-        register_robot("Fetch", xml=path, root="robot0:base_link")
-    assert "\n" not in str(caught.value) and "Fetch" not in ROBOTS
-
-
-@pytest.mark.slow
 def test_a_world_with_two_robots_asks_which():
     with pytest.raises(ValueError, match=r"'torso', 'ball': say which is the robot, root='torso'"):
         register_robot("Quadruped", xml=file("Quadruped"))

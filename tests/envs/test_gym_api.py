@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 from suites import CASES
 
 import sb3_guard
-from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_ids, env_spec, make, register
+from sb3_guard.envs import GuardEnv, GuardVectorEnv, env_spec, make, register
 
 INFINITE = {"minimum value is -infinity", "maximum value is infinity"}
 
@@ -79,17 +79,6 @@ def test_the_spec_is_plain_data_and_makes_the_environment_again():
     np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
 
 
-def test_max_episode_steps_is_the_callers_to_set():
-    lone = gymnasium.make("Goal_Point_8Hazards-v0", max_episode_steps=7)
-    batch = gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=2, max_episode_steps=7)
-    assert batch.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
-    lone.reset(seed=0)
-    batch.reset(seed=0)
-    for t in range(7):
-        assert lone.step(lone.action_space.sample())[3] == (t == 6)
-        assert (batch.step(batch.action_space.sample())[3] == (t == 6)).all()
-
-
 def test_the_vector_environment_follows_gymnasiums_own():
     ours = gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=3, max_episode_steps=5)
     theirs = gymnasium.vector.SyncVectorEnv(
@@ -131,14 +120,6 @@ def test_unregistered_ids_work_in_make_and_after_register():
     register("Mine", sb3_guard.Scenario(constraints={"hazards": {"num": 1}}))
     assert gymnasium.make("Mine-v0").unwrapped.scenario.constraints == {"hazards": {"num": 1}}
     del gymnasium.registry["Mine-v0"]
-
-
-def test_every_suite_is_registered_with_both_entry_points():
-    for env_id in env_ids("guard"):
-        spec = gymnasium.spec(env_id)
-        assert spec.entry_point and spec.vector_entry_point
-        assert spec == env_spec(env_id)
-        assert spec.max_episode_steps == 1000
 
 
 @pytest.mark.parametrize("cls", [GuardEnv, GuardVectorEnv])

@@ -68,7 +68,13 @@ def test_physics_steps_evaluate_no_sensors(monkeypatch, randomized):
     assert not np.any(flags & SENSOR)
 
 
-@pytest.mark.parametrize("randomize", ["field", "named view", "constants", "models"])
+@pytest.mark.parametrize(
+    "randomize",
+    [
+        "field",
+        "named view",
+    ],
+)
 def test_users_may_randomize_the_physics(randomize):
     ours, theirs = pair("Goal_Ant_8Hazards")
     ours.advance()
@@ -76,19 +82,11 @@ def test_users_may_randomize_the_physics(randomize):
     for batch in (ours, theirs):
         if randomize == "field":
             batch.expand("opt.gravity")[:, 2] = [-9.81, -5.0, -2.0]
-        elif randomize == "named view":
-            batch.body("robot/robot").mass = [[5.0], [8.0], [12.0]]
-        elif randomize == "constants":
-            batch.set_const()
         else:
-            models = [batch.get_model(i) for i in range(N)]
-            models[1].opt.gravity[2] = -5.0
-            batch.set_models(models)
+            batch.body("robot/robot").mass = [[5.0], [8.0], [12.0]]
     check_alike(ours, theirs)
     assert ours._copy is None
-    assert ours._late == (randomize != "models")  # of models, all sensors in every physics step
-    if randomize != "constants":
-        assert (ours.qpos[0] != ours.qpos[1]).any()
+    assert ours._late and (ours.qpos[0] != ours.qpos[1]).any()
 
 
 def test_sensors_with_a_history_see_every_physics_step():
@@ -159,7 +157,13 @@ PILES = """
 """
 
 
-@pytest.mark.parametrize("randomize", [None, "field", "models"])
+@pytest.mark.parametrize(
+    "randomize",
+    [
+        None,
+        "field",
+    ],
+)
 def test_sleep_is_restored_bit_for_bit(randomize):
     """Every third physics step: asleep alone, asleep in a pile, and soon to be."""
     model = mujoco.MjModel.from_xml_string(PILES)
@@ -169,8 +173,6 @@ def test_sleep_is_restored_bit_for_bit(randomize):
     for batch in batches:
         if randomize == "field":
             batch.expand("opt.gravity")[:, 2] = [-9.81, -9.0, -8.0]
-        elif randomize == "models":
-            batch.set_models([model, batch.get_model(1), model])
         for name in fields:
             batch.bind(name)
         batch.forward()
@@ -204,18 +206,7 @@ def test_sensors_once_in_a_control_step_while_bodies_sleep(suite):
     assert (ours.tree_asleep >= 0).any()
 
 
-def test_models_that_are_refused_leave_the_batch_as_it_was():
-    ours, theirs = pair("Goal_Point_8Hazards")
-    with pytest.raises(ValueError, match="a model per simulation"):
-        ours.set_models([ours.model])
-    assert ours._late
-    check_alike(ours, theirs)
-    for batch in (ours, theirs):
-        batch.expand("opt.gravity")
-    check_alike(ours, theirs)
-
-
-@pytest.mark.parametrize(("nsim", "verb"), [(1, "step"), (N, "step"), (N, "forward")])
+@pytest.mark.parametrize(("nsim", "verb"), [(N, "step"), (N, "forward")])
 def test_simulations_that_mujoco_gives_up_are_told(monkeypatch, nsim, verb):
     engine = Scenario.parse("Goal_Point_8Hazards").build(nsim)
     engine.reset(np.arange(nsim))

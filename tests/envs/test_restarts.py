@@ -121,8 +121,3 @@ def test_without_randomisation_all_episodes_are_the_same():
     first = episode(env)
     for _ in range(3):
         np.testing.assert_equal(episode(env), first)
-
-
-def test_an_environment_without_restarts_keeps_none():
-    state = GuardVectorEnv(2, "Goal_Point_8Hazards-v0", num_threads=1).engine.state()
-    assert not [name for name in state["arrays"] if name.startswith("restarts")]

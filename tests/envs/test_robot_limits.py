@@ -40,7 +40,7 @@ def amount(data, model, name):
     return most
 
 
-@pytest.mark.parametrize("robot", ["Ant", "Doggo", "Arm3"])
+@pytest.mark.parametrize("robot", ["Ant", "Arm3"])
 @pytest.mark.parametrize("name", ["jointlimits", "jointspeed", "jointtorque"])
 def test_a_joint_beyond_the_limit_costs(robot, name):
     if (robot, name) == ("Arm3", "jointlimits"):
@@ -175,11 +175,9 @@ def test_rows_are_lone_environments(name):
 @pytest.mark.parametrize(
     ("robot", "limits", "message"),
     [
-        ("Point", {"jointspeed": {}}, r"no hinges except those .* others: x, y, z"),
-        ("Point", {"jointlimits": {}}, r"no hinges with a range .* joints may name others either"),
+        ("Point", {"jointspeed": {}}, r"no hinges except those .* allowed: x, y, z"),
+        ("Point", {"jointlimits": {}}, r"no hinges with a range .* allowed: none"),
         ("Ant", {"jointspeed": {"joints": ["hop_1"]}}, r"'hop_1': did you mean 'hip_1'"),
-        ("Ant", {"jointspeed": {"limit": -1}}, "jointspeed.limit = -1 must be .*at least 0"),
-        ("Ant", {"jointlimits": {"limit": 2}}, "jointlimits.limit = 2 must be .*at most 1"),
         ("Ant", {"floorcontact": {"bodies": ["foot"]}}, "floorcontact.bodies matches no name 'foo"),
         ("Ant", {"baseheight": {"low": 2, "high": 1}}, r"low = 2 must be less than high = 1, m"),
     ],

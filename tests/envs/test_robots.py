@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 from worlds import own_parts
 
-from sb3_guard.envs import register_robot, robots
+from sb3_guard.envs import register_robot
 from sb3_guard.envs.engine import Engine
-from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.scenario import Scenario
-from sb3_guard.envs.suites.guard import SUITE_ROBOTS
 from sb3_guard.envs.types import FLOOR
 
 
@@ -92,12 +90,6 @@ def deepest(engine: Engine) -> float:
     return min((c.dist for c in engine.batch.get_data(0).contact), default=0.0)
 
 
-def test_tables_name_the_same_robots() -> None:
-    assert set(ROBOTS) >= set(FACTS)
-    assert set(SUITE_ROBOTS) == set(FACTS) - {"Car", "Doggo"}
-    assert set(robots.__all__) == set(FACTS)
-
-
 @pytest.mark.parametrize("robot", FACTS)
 def test_sizes_mass_and_time_step(robot: str) -> None:
     engine = Scenario.parse(f"Goal_{robot}_8Hazards").build()
@@ -139,10 +131,6 @@ def test_doc_table_matches() -> None:
             "magnetometer 30:33, touch_point1 33:34, touch_point4 36:37, velocimeter 37:40",
         ),
         (
-            "Drone",
-            "hazards_lidar 9:69, magnetometer 69:72, touch_p1a 72:73, touch_p4b 79:80",
-        ),
-        (
             "Arm3",
             "accelerometer_link_1 0:3, accelerometer_link_5 12:15, goal_compass 15:24, "
             "gyro_link_1 24:27, hazards_lidar 39:219, jointpos_joint_1 219:221, "
@@ -159,29 +147,6 @@ def test_places_in_the_observation(robot: str, slices: str) -> None:
         assert layout[name] == slice(start, stop), name
 
 
-@pytest.mark.parametrize(
-    "robot, names, low, high",
-    [
-        (
-            "Humanoid",
-            [f"{s}_{j}" for s in ("right", "left") for j in ("hip_z", "hip_y", "knee")],
-            -1,
-            1,
-        ),
-        ("Hopper", ["hip_x", "hip_z", "thigh", "leg", "foot"], [-0.4, -0.4, -1, -1, -1], None),
-        ("Ant", [f"{j}_{i}" for i in (1, 2, 3, 4) for j in ("hip", "ankle")], -1, 1),
-    ],
-)
-def test_actuators(robot: str, names: list[str], low: Any, high: Any) -> None:
-    engine = world(robot)
-    model = engine.model
-    assert [model.actuator(i).name for i in range(model.nu)] == [f"robot/{n}" for n in names]
-    high = -np.asarray(low) if high is None else high
-    for action, bound in ((-1.0, low), (1.0, high)):
-        engine.robot.act(np.full((1, model.nu), action))
-        np.testing.assert_allclose(engine.batch.bind("ctrl")[0], np.broadcast_to(bound, model.nu))
-
-
 @pytest.mark.parametrize("robot", FACTS)
 def test_starts_on_the_floor_within_its_limits(robot: str) -> None:
     engine = world(robot)
@@ -195,14 +160,6 @@ def test_starts_on_the_floor_within_its_limits(robot: str) -> None:
         if model.jnt_limited[j]:
             low, high = model.jnt_range[j]
             assert low <= data.qpos[model.jnt_qposadr[j]] <= high, model.joint(j).name
-
-
-def test_ant_starts_with_its_ankles_mid_range() -> None:
-    engine = world("Ant")
-    model, data = engine.model, engine.batch.get_data(0)
-    for i in range(1, 5):
-        joint = model.joint(f"robot/ankle_{i}")
-        assert data.qpos[joint.qposadr[0]] == pytest.approx(joint.range.mean(), abs=1e-4)
 
 
 @pytest.mark.parametrize("robot", FACTS)
@@ -226,8 +183,8 @@ def test_survives_random_actions(robot: str) -> None:
         engine.seed(row, np.random.default_rng(row))
     engine.reset(np.arange(num))
     rng = np.random.default_rng(0)
-    for t in range(400):
-        if t < 200:
+    for t in range(200):
+        if t < 100:
             actions = rng.uniform(-1, 1, (num, engine.robot.action_size))
         elif t % 50 == 0:  # held at full strength, into the joints' limits and the floor
             actions = np.sign(rng.normal(size=(num, engine.robot.action_size)))
@@ -330,26 +287,6 @@ def test_car_drives_along_its_nose_and_turns_on_the_spot() -> None:
     ball = look(engine, drive(engine, [1, 1], 20), "ballquat_rear").reshape(3, 3)
     np.testing.assert_allclose(ball @ ball.T, np.eye(3), atol=1e-5)
     assert not np.allclose(ball, np.eye(3), atol=0.1)  # the ball rolls along
-
-
-@pytest.mark.parametrize("robot", ["Walker", "Humanoid"])
-def test_legs_are_mirror_images(robot: str) -> None:
-    engine = world(robot)
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        leg = rng.uniform(-1, 1, engine.robot.action_size // 2)
-        engine.step(np.concatenate([leg, leg])[None])
-    assert abs(engine.robot.position[0, 1]) < 1e-3
-    assert abs(engine.robot.position[0, 0]) > 1e-2
-
-
-@pytest.mark.parametrize("robot", ["Ant", "Doggo"])
-def test_feet_feel_the_weight(robot: str) -> None:
-    engine = world(robot)
-    obs = drive(engine, 0.0, 100)
-    weight = 9.81 * FACTS[robot].mass
-    feet = sum(look(engine, obs, f"touch_ankle_{i}b")[0] for i in range(1, 5))
-    assert feet == pytest.approx(weight, rel=0.02)
 
 
 def test_start_attitude_turns_with_the_heading() -> None:
@@ -475,30 +412,3 @@ def test_drone_hovers_climbs_and_translates() -> None:
     drive(engine, 0.3, 200)
     moved = engine.robot.position[0] - high
     assert moved[0] > 1.0 and abs(moved[1]) < 0.05
-
-
-def test_drone_feels_the_floor_it_stands_on() -> None:
-    engine = world("Drone")
-    obs = drive(engine, -0.2, 150)  # 0.02 N a propeller less than its weight
-    for i in range(1, 5):
-        assert look(engine, obs, f"touch_p{i}a") == 0
-        assert look(engine, obs, f"touch_p{i}b") == pytest.approx(0.02, rel=0.01)
-
-
-def test_drone_turns_over_without_a_singularity() -> None:
-    # the pitch passes ±90°, where three hinges in series would lock
-    engine = world("Drone")
-    drive(engine, 1.0, 50)
-    drive(engine, [-1, 0, 1, 0], 120)
-    up = engine.robot.frames[1][0, 0][2, 2]
-    assert up < -0.5
-    obs = drive(engine, [0, -1, 0, 1], 20)
-    assert np.abs(look(engine, obs, "gyro")).max() < 1.0
-
-
-@pytest.mark.parametrize("robot", ["Swimmer", "Ant", "Humanoid"])
-def test_clearance_is_the_distance_of_the_origin(robot: str) -> None:
-    engine = world(robot, 2)
-    points = np.random.default_rng(0).uniform(-2, 2, (2, 5, 3))
-    expected = np.linalg.norm(points[..., :2] - engine.robot.position[:, None, :2], axis=-1)
-    np.testing.assert_allclose(engine.robot.clearance(points, planar=True), expected, atol=1e-12)

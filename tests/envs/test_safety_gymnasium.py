@@ -135,39 +135,6 @@ def test_ids_and_time_limits():
     assert env.observation_space.shape == (28,) and env.action_space.shape == (2,)
 
 
-@pytest.mark.parametrize(
-    ("name", "near"),
-    [
-        ("SafetyRacecarGoal1-v0", "SafetyCarGoal1-v0"),
-        ("SafetyPointGoal1Vision-v0", "SafetyPointGoal1-v0"),
-        ("SafetyAntFadingEasy1-v0", "SafetyAntGoal1-v0"),
-        ("SafetyCarPush2Gymnasium-v0", "SafetyCarPush2-v0"),
-    ],
-)
-def test_ids_that_are_not_here_say_what_is(name, near):
-    with pytest.raises(ValueError, match=f"{near}.*safety_gymnasium:{name}"):
-        Scenario.parse(name)
-
-
-@pytest.mark.parametrize(
-    ("name", "near"),
-    [
-        ("SafetyAntMultiGoal1-v0", "SafetyAntGoal1-v0"),
-        ("Safety2x4AntVelocity-v0", "SafetyAntVelocity-v0"),
-        ("Safety9|8HumanoidVelocity-v0", "SafetyHumanoidVelocity-v0"),
-    ],
-)
-def test_ids_of_several_agents_say_so(name, near):
-    with pytest.raises(ValueError, match=f"several agents.*{near}"):
-        Scenario.parse(name)
-
-
-@pytest.mark.parametrize("name", ["SafetyHopperVelocity-v2", "SafetyHopperVelocityGymnasium-v1"])
-def test_velocity_ids_that_are_not_here_say_what_is(name):
-    with pytest.raises(ValueError, match=f"'{name}' is not here: use 'SafetyHopperVelocity-v1'"):
-        Scenario.parse(name)
-
-
 SLOW = pytest.mark.slow
 REST = [pytest.param(name, marks=SLOW) for name in ("CarGoal2", "PointButton1", "AntGoal1")]
 

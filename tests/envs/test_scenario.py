@@ -46,15 +46,9 @@ def test_other_numbers_and_single_goals():
     ("name", "message"),
     [
         ("Goal_Pont_8Hazards", "unknown robot 'Pont' .*did you mean 'Point'"),
-        ("goal_point_8hazards-v0", "unknown .* mean 'Goal_Point_8Hazards'.*allowed: Point, "),
-        ("goal_ant_3ghost_noconti", "did you mean 'Goal_Ant_3Ghosts_noconti'"),
-        ("Goal_zzz_8hazards", "unknown robot 'zzz' in .*: allowed: Point"),
         ("Goal_Point_100000Hazards", "hazards.num = 100000 must be .*at most 1000"),
-        ("Gaol_Point_8Hazards-v0", "unknown task 'Gaol' .*did you mean 'Goal'"),
         ("Goal_Point_8Hazard", "unknown constraint 'Hazard' .*did you mean 'Hazards'"),
         ("Goal_Point", "not an id of the form Task_Robot_NConstraint-v0"),
-        ("Goal_Point_-3Hazards", "not an id of the form"),
-        ("Goal_Point_8Hazards-v1", "not an id of the form"),
         ("Chase_Point_8Hazards_noconti", "Chase has no goal to end at"),
     ],
 )
@@ -68,80 +62,33 @@ def test_bad_ids_say_what_is_wrong(name, message):
     [
         ({"hazards": {"nmu": 3}}, "hazards has no parameter 'nmu': did you mean 'num'"),
         ({"hazards": {"num": -1}}, "hazards.num = -1 must be .*at least 0"),
-        ({"hazards": {"num": 2.5}}, "hazards.num = 2.5 must be an integer"),
         ({"hazards": {"size": -0.1}}, "hazards.size = -0.1 must be .*greater than 0"),
-        ({"hazards": {"size": "big"}}, "hazards.size = 'big' must be a number"),
-        ({"hazards": {"size": float("nan")}}, "hazards.size = nan must be a number"),
         ({"hazards": {"locations": [0, 1]}}, r"\(0, 1\) must be a list of lists of 2 numbers$"),
-        ({"hazards": {"locations": 3}}, "locations = 3 must be a list of lists of 2 numbers$"),
-        ({"hazards": {"space": 2}}, "hazards.space = 2: allowed: null, planar, spatial"),
-        ({"hazards": {"height": [0.5]}}, r"hazards.height = \(0.5,\) must be a list of 2 numbers"),
-        ({"robot": {"heading": "north"}}, "robot.heading = 'north' must be a number or null$"),
-        (
-            {"robot": {"sensing": "robot"}},
-            "robot.sensing = 'robot' must be a list of texts or null$",
-        ),
-        ({"goal": {"ends": None}}, "goal.ends = None must be true or false$"),
-        ({"observe": {"remaining": True}}, "observe.remaining = True must be an integer or null"),
-        ({"observe": {"camera": [8, 8.5]}}, "must be a list of 2 integers or null"),
         (
             {"chase": {"num": 3}},
             "unknown parameter 'chase': .*allowed: .*, goal, ",
         ),
-        ({"hazards": {"indicator": 1}}, "hazards.indicator = 1 must be true or false"),
         ({"hazards": {"keepout": 3}}, "keepout 3.0 does not fit the placement"),
-        ({"hazards": {"space": "flat"}}, "hazards.space = 'flat': "),
         ({"hazards": 4}, "hazards = 4 must be a mapping of parameters"),
-        (
-            {"hazards": {"speed": 1}},
-            r"'speed': it moves nothing; ghosts={'speed': 0.5} and gremlins",
-        ),
-        (
-            {"hazards": {"ends": True}},
-            "'ends': .* sb3_guard.common.vec_budgets.VecEarlyTermination",
-        ),
-        ({"gremlins": {"speed": 1}}, "gremlins has no parameter 'speed': set rate, .* rad/s"),
-        ({"speed": {"speed": 1}}, "speed has no parameter 'speed': set limit, .* m/s"),
-        ({"goal": {"speed": 1}}, "'speed': it moves nothing; .* tasks Chase and Defense"),
         ({"hazzards": {"num": 4}}, "unknown parameter 'hazzards': did you mean 'hazards'"),
-        ({"goal": {"size": 0}}, "goal.size = 0 must be .*greater than 0"),
-        ({"lidar": {"bins": 0}}, "lidar.bins = 0 must be .*at least 1"),
-        ({"layout": {"margin": -1}}, "layout.margin = -1 must be .*at least 0"),
         ({"layout": {"placements": [[0, 0, 0, 1]]}}, "a placement must be"),
-        ({"arena": {"walls": "high"}}, "arena.walls = 'high': "),
         ({"lidar": {"bins": 10**9}}, "lidar.bins = 1000000000 must be .*at most 1000"),
-        ({"robot": "Ant"}, "robot = 'Ant' must be a mapping .* chosen by the id"),
+        ({"robot": "Ant"}, "robot = 'Ant' must be a mapping"),
         (
             {"hazards": {"type": "vases"}},
-            "constraint 'hazards' cannot be of type 'vases', .* hazards=None and vases={...}",
+            "constraint 'hazards' cannot be of type 'vases'",
         ),
-        ({"pillars": {"space": "spatial"}}, "pillars.space = 'spatial' cannot .* always planar"),
         ({"hazards": {"num": 1, "locations": [[0, 1], [1, 0]]}}, "2 locations for 1 objects"),
-        ({"Hazards": {"num": 3}}, "unknown parameter 'Hazards': did you mean 'hazards'"),
-        ({"Hazards": {"type": "hazards"}}, "constraint 'Hazards': write 'hazards', in lower case"),
+        ({"Hazards": {"type": "hazards"}}, "constraint 'Hazards': .* in lower case"),
         (
             {"pits": {"num": 3}},
             "unknown parameter 'pits': .* states its type, such as {'type'",
         ),
         ({"pits": {"type": "hazrds"}}, "pits.type = 'hazrds': did you mean 'hazards'"),
         ({"pits": {"type": "hazards", "size": -1}}, "^pits.size = -1 must be .*greater than 0"),
-        ({"pits": {"type": "hazards", "sise": 1}}, "^pits has no parameter 'sise'"),
-        (
-            {"pits": {"type": "ghosts", "height": [2, 1]}},
-            r"height = \(2.0, 1.0\) must be \(low",
-        ),
-        (
-            {"pits": {"type": "pillars", "space": "spatial"}},
-            "^pits.space = .* cannot be set",
-        ),
         (
             {"hazards": {"height": [1, 2]}},
             r"hazards.height = \(1.0, 2.0\) .* in the air only, .*",
-        ),
-        ({"ghosts": {"height": [1, 2]}}, r"ghosts.height = \(1.0, 2.0\) counts in the air only"),
-        (
-            {"goal": {"height": [1, 2]}},
-            r"goal.height = \(1.0, 2.0\) .* set goal={'space': ",
         ),
     ],
 )
@@ -311,21 +258,11 @@ def test_ids_of_others_are_theirs():
     ("fields", "message"),
     [
         ({"constraints": ["hazards"]}, r"constraints = \['hazards'\] must be a mapping of names"),
-        ({"constraints": "hazards"}, "constraints = 'hazards' must be a mapping of names"),
-        ({"robot": ["Point"]}, r"robot = \['Point'\] must be a name, one of Point, .*robot_params"),
-        ({"task": {"Goal": {}}}, "task = {'Goal': {}} must be a name, one of Goal, .*task_params"),
-        ({"robot_params": [1]}, r"robot = \[1\] must be a mapping"),
-        ({"lidar": "wide"}, "lidar = 'wide' must be a mapping"),
+        ({"robot": ["Point"]}, r"robot = \['Point'\] must be a name: Point"),
         ({"robt": "Ant"}, "scenario has no key 'robt': did you mean 'robot'"),
-        ({"goal": {"size": 1}}, "no key 'goal': the task's parameters go into task_params"),
-        ({"hazards": {}}, r"no key 'hazards': write constraints: {hazards: {\.\.\.}}"),
         (
             {"constraints": {"Hazards": {"num": 3}}},
-            "constraint 'Hazards': write 'hazards'",
-        ),
-        (
-            {"constraints": {"Goal": {"type": "hazards"}}},
-            "constraint 'Goal': this is what the ",
+            "constraint 'Hazards': ",
         ),
         (
             {"constraints": {"pits": {"num": 3}}},
@@ -366,11 +303,6 @@ def test_arrays_do_for_lists():
     engine.reset(np.zeros(1, dtype=int))
     np.testing.assert_array_equal(engine.places("hazards")[0, :2, :2], places)
     assert Hazards(locations=places).locations == ((0, 1), (1, 0))
-
-
-def test_the_module_may_be_named_before_the_id():
-    env = make("sb3_guard:Goal_Ant_3Ghosts-v0")
-    assert env.unwrapped.scenario == Scenario.parse("Goal_Ant_3Ghosts")
 
 
 def test_registered_parts_are_used_by_ids(tmp_path):
@@ -448,13 +380,9 @@ def test_parts_are_called_by_the_names_they_are_registered_under():
         for task in ("relay", "errand"):
             base = Scenario.parse(f"{task.capitalize()}_Crane_0Hazards")
             for params, words in (
-                ({task: {"toll": -1}}, f"^{task}.toll = -1 must be .*at least 0"),
                 ({task: {"tol": 1}}, f"^{task} has no parameter 'tol'"),
-                ({task: {"space": "spatial"}}, f"^{task}.space = 'spatial' cannot be set"),
                 ({task: {"object_keepout": 0.01}}, f"^{task}.object_keepout = 0.01 lets"),
-                ({task: {"size": -9}}, f"^{task}.size = -9 must be .*greater than 0"),
                 ({"push": {"toll": 1}}, f"unknown parameter 'push': .*{task}"),
-                ({"robot": {"heading": "up"}}, "^robot.heading = 'up'"),
             ):
                 with pytest.raises(ValueError, match=words):
                     base.override(**params).build()
@@ -491,19 +419,6 @@ def test_a_constraint_without_a_number_is_one():
             Scenario.parse("Goal_Point_8Speeding")
 
 
-def test_classes_that_cannot_be_parts_are_refused():
-    class Forgotten(Constraint):
-        limit: float = param(0.5, "m/s", above=0)
-
-    class Plain(Hazards):
-        """No parameters of its own, so that the base's decorator does."""
-
-    with own_parts():
-        with pytest.raises(ValueError, match=r"its parameter limit is not read: write @dataclass"):
-            registry.register_constraint("Forgotten", Forgotten)
-        registry.register_constraint("Plain", Plain)
-
-
 def test_bad_registrations_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"one of the two: .*\('X', xml='X.xml'\)"):
         registry.register_robot("X")
@@ -518,10 +433,6 @@ def test_bad_registrations_are_refused(tmp_path):
     for attributes, message in (
         ({"timstep": 0.01}, "has no 'timstep': did you mean 'timestep'"),
         ({"timestep": -1.0}, "timestep = -1.0 must be .*greater than 0"),
-        ({"timestep": float("inf")}, "timestep = inf must be finite"),
-        ({"timestep": "fast"}, "timestep = 'fast' must be a number or null, greater than 0"),
-        ({"reach": "far"}, "reach = 'far' must be a number"),
-        ({"reach": -1}, "reach = -1 must be greater than 0"),
         ({"lidar_bodies": "tip"}, "lidar_bodies = 'tip' must be a list of texts"),
         ({"center": 3}, "center = 3 must be text or null"),
         ({"workspace": "3d"}, "workspace = '3d': allowed: planar, spatial"),
@@ -561,20 +472,6 @@ def test_extra_observations_join_the_layout_in_alphabetical_order():
     np.testing.assert_allclose(obs[layout["com"]], com, atol=1e-3)
 
 
-def test_what_remains_is_the_same_for_a_lone_environment_and_a_row():
-    params = {"observe": {"remaining": 7}, "max_episode_steps": 7}
-    lone = gymnasium.make("Goal_Point_8Hazards-v0", **params)
-    batch = gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=2, **params)
-    where = lone.unwrapped.observation_layout["remaining"]
-    seen = [lone.reset(seed=0)[0][where]], [batch.reset(seed=0)[0][0, where]]
-    for _ in range(7):
-        seen[0].append(lone.step(np.zeros(2, np.float32))[0][where])
-        obs, _, _, _, infos = batch.step(np.zeros((2, 2), np.float32))
-        seen[1].append((infos["final_obs"][0] if "final_obs" in infos else obs[0])[where])
-    np.testing.assert_allclose(seen[0], np.arange(7, -1, -1)[:, None] / 7, atol=1e-6)
-    np.testing.assert_array_equal(*seen)
-
-
 def test_what_remains_must_agree_with_the_time_limit():
     params = {"observe": {"remaining": 3}, "max_episode_steps": 5}
     words = "observe.remaining = 3, but .* give remaining and max_episode_steps the same value"
@@ -585,12 +482,6 @@ def test_what_remains_must_agree_with_the_time_limit():
         make("Goal_Point_8Hazards", **longer)
     make("Goal_Point_8Hazards", **longer, max_episode_steps=2000)
     make("Goal_Point_8Hazards", **longer, max_episode_steps=-1)  # no limit
-    lone = gymnasium.make("Goal_Point_8Hazards-v0", **params)
-    lone.reset(seed=0)
-    for _ in range(3):
-        lone.step(np.zeros(2, np.float32))
-    with pytest.raises(ValueError, match=words):
-        lone.step(np.zeros(2, np.float32))
 
 
 def test_goal_and_object_can_be_seen_by_lidar_and_distance():
@@ -653,12 +544,3 @@ def test_a_falloff_and_a_range_that_disagree_say_how_to_have_either():
     with pytest.raises(ValueError, match=message):
         base.override(lidar={"falloff": "exponential"})
     base.override(lidar={"falloff": "exponential", "range": None}).build()
-
-
-@pytest.mark.parametrize("id_", ["Chase_Point_2Hazards", "SafetyPointCircle1-v0"])
-def test_a_task_without_an_end_says_which_have_one(id_):
-    base = Scenario.parse(id_)
-    with pytest.raises(
-        ValueError, match=r"'ends': it is never completed; .* Goal, Push and Button"
-    ):
-        base.override(**{base.task.lower(): {"ends": True}})

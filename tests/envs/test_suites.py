@@ -10,8 +10,7 @@ from suites import IDS, SIZES
 import sb3_guard
 from sb3_guard import list as listing
 from sb3_guard import show
-from sb3_guard.envs import GuardVectorEnv, Scenario, env_ids, registry, suites
-from sb3_guard.envs.suites.guard import parse
+from sb3_guard.envs import GuardVectorEnv, Scenario, env_ids, suites
 from sb3_guard.ids import with_version
 
 
@@ -29,14 +28,6 @@ def test_every_id_that_is_printed_is_an_environments_own(capsys):
     printed = [name.strip() for row in rows for name in row]
     named = [with_version(name) for name in printed if name and not {*name} <= {"-"} | {*"id"}]
     assert len(named) == len({*named}) and {*named} == {*env_ids()}
-
-
-def test_there_are_eleven_robots_and_the_parts_of_the_paper():
-    assert set(registry.guard(registry.ROBOTS)) == set(SIZES)
-    assert list(registry.guard(registry.TASKS)) == ["Goal", "Push", "Chase", "Defense", "Button"]
-    kinds = {name: c.spaces for name, c in registry.guard(registry.CONSTRAINTS).items()}
-    # hazards and ghosts exist in both spaces: eight constraints in all
-    assert sum(map(len, kinds.values())) == 8
 
 
 @pytest.fixture
@@ -81,11 +72,6 @@ def test_a_family_of_its_own_is_known_everywhere(mazes, capsys, tmp_path):
         env_ids("maze")
     with pytest.raises(ValueError, match="did you mean 'MazeSmall-v0'"):
         Scenario.parse("aMazeSmal")
-
-
-def test_names_of_the_paper_are_told_what_they_are_called():
-    with pytest.raises(ValueError, match=r"8Hazards with hazards=\{'space': 'spatial'\}"):
-        parse("Goal_Drone_8Hazard3Ds")
 
 
 @pytest.mark.parametrize("env_id", IDS)

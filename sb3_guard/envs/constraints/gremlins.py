@@ -1,9 +1,7 @@
 """Gremlins: boxes that go round in circles whatever the robot does."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -31,10 +29,6 @@ class Gremlins(Obstacles):
     solid = True
     moves = True
     usual_keepout = 0.5
-    instead: ClassVar[Mapping[str, str]] = {
-        **Obstacles.instead,
-        "speed": "set rate, the angular speed on the circle, rad/s",
-    }
 
     num: int = param(8, "number of objects", low=0, high=MOST)
     size: float = param(0.1, "half of an edge, m", above=0)

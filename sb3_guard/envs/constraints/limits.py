@@ -1,6 +1,5 @@
 """Limits of the robot itself: a cost in each step at whose end one of its quantities is beyond."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,6 +10,8 @@ from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Constraint, Robot, Simulation, World
 from sb3_guard.envs.types import Array
 from sb3_guard.spelling import matching
+
+SLIDE, HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
 def prefix(robot: Robot) -> str:
@@ -109,39 +110,27 @@ class JointLimit(RobotLimit):
 
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
-        model, start = sim.model, prefix(sim.robot)
-        bodies = sim.robot.bodies(model)
-        single = [j for j in range(model.njnt) if model.jnt_bodyid[j] in bodies
-                  and model.jnt_type[j] >= 2]  # fmt: skip  # slides 2, hinges 3
-        if self.ranged:
-            single = [joint for joint in single if model.jnt_limited[joint]]
-        names = {model.joint(j).name.removeprefix(start): j for j in single}
-        self._ids = self._chosen(sim, names)
+        model, start, bodies = sim.model, prefix(sim.robot), sim.robot.bodies(sim.model)
+        names = {
+            model.joint(j).name.removeprefix(start): j
+            for j in range(model.njnt)
+            if model.jnt_bodyid[j] in bodies and model.jnt_type[j] in (SLIDE, HINGE)
+            and (model.jnt_limited[j] or not self.ranged)
+        }  # fmt: skip
+        label = f"{self.name}.joints"
+        chosen = {names[name] for p in self.joints for name in matching(label, p, names)}
+        if not self.joints:
+            own = [j for j in names.values() if model.jnt_bodyid[j] != bodies[0]]
+            chosen = {j for j in own if model.jnt_type[j] == HINGE}
+        if not chosen:
+            others = ", ".join(names) or "none"
+            raise ValueError(
+                f"{label}: the robot has no hinges{' with a range' * self.ranged} except those of "
+                f"its outermost body; allowed: {others}"
+            )
+        self._ids = sorted(chosen)
         self._dofs = model.jnt_dofadr[self._ids].tolist()
         self._values = sim.batch.bind(self.quantity)
-
-    def _chosen(self, sim: Simulation, names: dict[str, int]) -> list[int]:
-        """The joints that count.
-
-        :raises ValueError: there are none
-        """
-        model, root = sim.model, sim.model.body(sim.robot.root).id
-        if self.joints:
-            label = f"{self.name}.joints"
-            chosen: Sequence[int] = [
-                names[name] for pattern in self.joints for name in matching(label, pattern, names)
-            ]
-        else:
-            chosen = [j for j in names.values() if model.jnt_bodyid[j] != root]
-            chosen = [j for j in chosen if model.jnt_type[j] == 3]
-        if not chosen:
-            ranged = " with a range" if self.ranged else ""
-            of_base = f": {', '.join(names)}" if names else " either"
-            raise ValueError(
-                f"{self.name}: the robot has no hinges{ranged} except those of its outermost body"
-                f"; joints may name others{of_base}"
-            )
-        return sorted(set(chosen))
 
     def amounts(self) -> Array:
         """What is limited of each joint, [N, J]."""
@@ -256,12 +245,8 @@ class FloorContact(RobotLimit):
         root = world.spec.body(robot.root)
         names = [body.name for body in (root, *root.find_all("body"))]
         names = [name.removeprefix(start) for name in names if name]
-        chosen = [
-            name
-            for pattern in self.bodies or (robot.root.removeprefix(start),)
-            for name in matching(f"{self.name}.bodies", pattern, names)
-        ]
-        self._felt = list(dict.fromkeys(chosen))
+        patterns, label = self.bodies or (robot.root.removeprefix(start),), f"{self.name}.bodies"
+        self._felt = list(dict.fromkeys(n for p in patterns for n in matching(label, p, names)))
         for name in self._felt:
             world.feel(f"{self.name}/{name}", "world", force=True, by=start + name)
 

@@ -1,8 +1,6 @@
 """Speed: a limit to how fast the robot may move."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -23,10 +21,6 @@ class Speed(Constraint):
     trespassable = True
     movable = "no"
     color = (0.9, 0.2, 0.1)
-    instead: ClassVar[Mapping[str, str]] = {
-        **Constraint.instead,
-        "speed": "set limit, the highest speed that is free, m/s",
-    }
 
     limit: float = param(1.0, "highest speed that is free, m/s", low=0)
     axes: str = param(

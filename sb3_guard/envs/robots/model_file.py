@@ -16,7 +16,6 @@ from sb3_guard.spelling import did_you_mean
 
 FREE, BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 HINGE, SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
-ROUNDED = 1e-3  # rad or m by which a keyframe may be out of a joint's range
 SHIFT = 2  # a robot's own contact bits begin after ROBOT and FLOOR
 SUNK = 0.05  # share of a robot's extent by which a keyframe may have it in the floor
 NEAR = 1e-6  # m: geoms whose height is fixed meet the floor if they are as near
@@ -186,14 +185,15 @@ def settle(
     spec, label = mjcf.load(source), mjcf.label_of(source)
     _name_all(spec)
     root = _find_root(spec, label, root)
-    _check_commanded(spec, label, root)
+    if not spec.actuators:
+        raise ValueError(f"{label} has no actuators: {SERVOS}")
     key = _keyframe(spec, label, keyframe)
     whole = spec.compile()
     before = mujoco.MjData(whole)
     if key is not None:
         mujoco.mj_resetDataKeyframe(whole, before, whole.key(key).id)
-    if not as_written:
-        _check_ranges(spec, root, whole, before, label, key)
+    if not as_written and key is None:
+        _into_ranges(spec, root, whole, before)
     left_out = tuple(f"keyframe {k.name}" for k in spec.keys if k.name not in (key, STOP))
     stop = {}
     if STOP in [frame.name for frame in spec.keys]:
@@ -334,23 +334,6 @@ def _find_root(spec: mujoco.MjSpec, label: str, root: str | None) -> str:
     )
 
 
-def _check_commanded(spec: mujoco.MjSpec, label: str, root: str) -> None:
-    """
-    :raises ValueError: nothing acts on the robot, or a mocap body does
-    """
-    names = {body.name for body in spec.body(root).find_all("body")} | {root}
-    mocap = {body.name for body in spec.bodies if body.mocap}
-    for weld in spec.equalities:
-        ends = {weld.name1, weld.name2}
-        if weld.type == mujoco.mjtEq.mjEQ_WELD and ends & mocap and ends & names:
-            raise ValueError(
-                f"{label} moves the robot by a weld to mocap body {(ends & mocap).pop()!r}, which "
-                f"no action commands: take the weld out; {SERVOS}"
-            )
-    if not spec.actuators:
-        raise ValueError(f"{label} has no actuators: {SERVOS}")
-
-
 def _keyframe(spec: mujoco.MjSpec, label: str, keyframe: str | None) -> str | None:
     """The name of the keyframe in which the robot begins.
 
@@ -367,31 +350,17 @@ def _keyframe(spec: mujoco.MjSpec, label: str, keyframe: str | None) -> str | No
     return keyframe or next(iter([*usual, *only]), None)
 
 
-def _check_ranges(
-    spec: mujoco.MjSpec,
-    root: str,
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    label: str,
-    key: str | None,
+def _into_ranges(
+    spec: mujoco.MjSpec, root: str, model: mujoco.MjModel, data: mujoco.MjData
 ) -> None:
-    """Put joints without a keyframe that are out of their ranges into their middles.
-
-    :raises ValueError: a keyframe is out of a joint's range
-    """
+    """Put joints that are out of their ranges into their middles."""
     for joint in spec.body(root).find_all("joint"):
         limited = model.joint(joint.name)
-        if int(joint.type) not in (HINGE, SLIDE) or not model.jnt_limited[limited.id]:
-            continue
-        low, high = limited.range
-        at = data.joint(joint.name).qpos
-        if key is None and not low <= at[0] <= high:
-            at[0] = (low + high) / 2
-        if not low - ROUNDED <= at[0] <= high + ROUNDED:
-            raise ValueError(
-                f"keyframe {key!r} of {label} puts joint {joint.name!r} at {at[0]:g}, out of its "
-                f"range, {low:g} to {high:g}: name another, keyframe=..."
-            )
+        if int(joint.type) in (HINGE, SLIDE) and model.jnt_limited[limited.id]:
+            low, high = limited.range
+            at = data.joint(joint.name).qpos
+            if not low <= at[0] <= high:
+                at[0] = (low + high) / 2
 
 
 def _floors(

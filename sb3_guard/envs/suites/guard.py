@@ -10,7 +10,7 @@ from itertools import product
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.envs.suites.suite import Fields, Suite
 from sb3_guard.ids import IMPORT_FIRST, UnknownPart
-from sb3_guard.spelling import did_you_mean, nearest
+from sb3_guard.spelling import did_you_mean
 
 LADDER = (1, 2, 4, 8, 16)  # numbers of a constraint's objects, by growing difficulty
 SUITE_TASKS = ("Goal", "Push", "Chase", "Defense")
@@ -37,7 +37,11 @@ def parse(name: str) -> Fields | None:
     known = {"robot": list(ROBOTS), "task": list(TASKS), "constraint": list(CONSTRAINTS)}
     wrong = [kind for kind, names in known.items() if match[kind] not in names]
     if wrong:
-        raise UnknownPart(_unknown(match, wrong, known))
+        kind = wrong[0]
+        raise UnknownPart(
+            f"unknown {kind} {match[kind]!r} in {name!r}: "
+            f"{did_you_mean(match[kind], known[kind])}{IMPORT_FIRST}"
+        )
     num = {"num": int(match["num"])}
     if "num" not in CONSTRAINTS[match["constraint"]].__dataclass_fields__:  # type: ignore
         if match["num"] != "1":
@@ -55,26 +59,6 @@ def parse(name: str) -> Fields | None:
         "constraints": {match["constraint"].lower(): num},
         "task_params": {"ends": True} if match["noconti"] else {},
     }
-
-
-def _unknown(match: re.Match[str], wrong: list[str], known: dict[str, list[str]]) -> str:
-    """What to say of a name of which parts are unknown."""
-    kind, name = wrong[0], match.string
-    near = {k: nearest(match[k], names) for k, names in known.items()}
-    hint = did_you_mean(match[kind], known[kind])
-    if len(wrong) > 1 and all(near.values()):
-        meant = "{task}_{robot}_".format(**near) + match["num"] + str(near["constraint"])
-        meant += match["noconti"] or ""
-        hint = f"did you mean {meant!r}? allowed: {', '.join(known[kind])}"
-    hint += IMPORT_FIRST
-    paper = re.fullmatch(r"(\w+?)s?3Ds?", match["constraint"])  # GUARD's Hazard3Ds
-    flat = nearest(f"{paper[1]}s", known["constraint"]) if paper else None
-    if wrong == ["constraint"] and flat is not None:
-        hint = (
-            f"write {match['num']}{flat} with {flat.lower()}={{'space': 'spatial'}}, which is the "
-            "default for robots that move in space"
-        )
-    return f"unknown {kind} {match[kind]!r} in {name!r}: {hint}"
 
 
 SUITE = Suite(

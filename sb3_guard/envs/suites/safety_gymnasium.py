@@ -3,12 +3,11 @@
 The names are its own: ``SafetyPointGoal1-v0``. What a level adds to a task is in :data:`LEVELS`.
 """
 
-import re
 from typing import Any
 
 from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.robots.safety_gymnasium import SafetyRobot
-from sb3_guard.envs.suites.suite import Fields, Suite
+from sb3_guard.envs.suites.suite import Suite
 
 NAMES = ("Point", "Car", "Ant", "Doggo")
 HAZARDS = {"size": 0.2}
@@ -144,35 +143,6 @@ def _scenario(robot: str, level: str) -> dict[str, Any]:
     }
 
 
-_FAMILY = re.compile(
-    r"Safety(?P<robot>[A-Z][a-z]+)(?P<task>[A-Z][A-Za-z]*?)(?P<level>\d)(?P<kind>Vision|Debug|Gymnasium)?(-v0)?"
-)
-
-
-def parse(name: str) -> Fields | None:
-    """Say what there is instead of an id of Safety-Gymnasium that is not here.
-
-    :raises ValueError: the id is one of those
-    """
-    match = _FAMILY.fullmatch(name)
-    if match is None and "MultiGoal" not in name and "FormulaOne" not in name:
-        return None
-    near = "SafetyPointGoal1-v0"
-    if match is not None:
-        robot = match["robot"] if match["robot"] in NAMES else "Car"
-        level = match["task"] + match["level"]
-        near = f"Safety{robot}{level if level in LEVELS else 'Goal1'}-v0"
-    if "Multi" in name:
-        raise ValueError(
-            f"{name!r} has several agents, which Stable-Baselines3 does not train: use {near!r}"
-        )
-    raise ValueError(
-        f"{name!r} is not among the tasks of Safety-Gymnasium that are here, which are Goal, "
-        f"Button, Push and Circle 0 to 2 and Run0 for {', '.join(NAMES)}: use {near!r}, or, with "
-        f"the package safety_gymnasium installed, 'safety_gymnasium:{name}'"
-    )
-
-
 SUITE = Suite(
     about="Safety-Gymnasium's navigation tasks, with the numbers of its release 1.0.0",
     scenarios={
@@ -184,5 +154,4 @@ SUITE = Suite(
         for level in LEVELS
         if level.startswith(("Circle", "Run"))
     },
-    parse=parse,
 )

@@ -4,10 +4,9 @@ Robots, rewards and deaths are those of Gymnasium's v4 environments; a step cost
 was faster than its limit. Facts: Safety-Gymnasium 1.0.0 (Ji et al. 2023).
 """
 
-import re
 from typing import Any
 
-from sb3_guard.envs.suites.suite import Fields, Suite
+from sb3_guard.envs.suites.suite import Suite
 
 # robot: its class, the task's parameters, the axes of its speed, and the limits of v0 and v1, m/s
 TABLE: dict[str, tuple[str, dict[str, float], str, tuple[float, float]]] = {
@@ -40,27 +39,6 @@ def _scenario(name: str, version: int) -> dict[str, Any]:
     }
 
 
-# of several agents, such as Safety2x4AntVelocity-v0, or of the package's own registrations
-_FAMILY = re.compile(
-    rf"Safety(?P<agents>\d+[^A-Z]*)?(?P<robot>{'|'.join(TABLE)})Velocity(Gymnasium)?(?P<v>-v\d+)?"
-)
-
-
-def parse(name: str) -> Fields | None:
-    """Say what there is instead of an id of Safety-Gymnasium that is not here.
-
-    :raises ValueError: the id is one of those
-    """
-    match = _FAMILY.fullmatch(name)
-    if match is None:
-        return None
-    near = f"Safety{match['robot']}Velocity{match['v'] if match['v'] in ('-v0', '-v1') else '-v1'}"
-    why = "is not here"
-    if match["agents"]:
-        why = "has several agents, which Stable-Baselines3 does not train"
-    raise ValueError(f"{name!r} {why}: use {near!r}")
-
-
 SUITE = Suite(
     about="Safety-Gymnasium's velocity tasks: Gymnasium's MuJoCo robots within a speed limit",
     scenarios={
@@ -68,5 +46,4 @@ SUITE = Suite(
         for name in TABLE
         for version in (0, 1)
     },
-    parse=parse,
 )

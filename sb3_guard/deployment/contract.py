@@ -258,10 +258,9 @@ def _costs(model: BaseAlgorithm) -> Iterator[dict[str, Any]]:
 
 def _filter(deployed: Deployed) -> dict[str, Any] | None:
     """The safety filter that is part of the file."""
-    corrected = deployed.acting.corrected
-    if corrected is None:
-        return None
     layer: Any = deployed.acting.layer
+    if layer is None:
+        return None
     described = {"kind": type(layer).__name__, "thresholds": layer.threshold.tolist()}
     steps = getattr(layer, "steps", None)
     return described if steps is None else {**described, "steps": steps, "rate": layer.rate}

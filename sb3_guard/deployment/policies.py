@@ -6,7 +6,6 @@ noise, squashing, clipping and safety filters. The modules here repeat it in ope
 
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from sb3_contrib.tqc.policies import Actor as TQCActor
@@ -17,8 +16,8 @@ from stable_baselines3.sac.policies import Actor as SACActor
 from stable_baselines3.td3.policies import Actor as TD3Actor
 from torch import nn
 
+from sb3_guard.algorithms.common.action_filters import SafetyLayer
 from sb3_guard.algorithms.common.policies import FilteredPolicy
-from sb3_guard.deployment.filters import Filter, filter_of
 
 
 class Actor(nn.Module):
@@ -68,11 +67,6 @@ class Box(nn.Module):
     def scale(self, unit: th.Tensor) -> th.Tensor:
         """Actions of the environment from those in [-1, 1], [B, k]."""
         return self.low + 0.5 * (unit + 1.0) * (self.high - self.low)
-
-    def to_unit(self, actions: th.Tensor) -> th.Tensor:
-        """Actions in [-1, 1] from those of the environment, [B, k]."""
-        half = ((self.high - self.low) / 2.0).clamp(min=float(np.finfo(np.float32).tiny))
-        return (actions - self.low) / half - 1.0
 
 
 class Gaussian(Actor):
@@ -135,30 +129,6 @@ class Deterministic(Actor):
         return self.box.scale(self.policy(observations))
 
 
-class Corrected(nn.Module):
-    """An actor behind the safety filter that its policy carries.
-
-    :param actor: it acts in a Box
-    :param action_filter: of actions in units of the action space
-    """
-
-    def __init__(self, actor: Actor, action_filter: Filter) -> None:
-        super().__init__()
-        self.actor, self.filter = actor, action_filter
-        self.box = Box(actor.policy.action_space)
-
-    def forward(
-        self, observations: PyTorchObs, random: th.Tensor | None, last_cost: th.Tensor | None
-    ) -> th.Tensor:
-        actions = self.actor(observations, random)
-        box: Any = self.box
-        unit = box.to_unit(actions)
-        corrected = self.filter(observations, unit, last_cost)
-        # What is not corrected stays as it is, to the last bit.
-        moved = (corrected - unit).abs().amax(dim=1, keepdim=True) > 1e-6
-        return box.clip(th.where(moved, box.scale(corrected).float(), actions))
-
-
 def _output(policy: Any, observations: PyTorchObs) -> th.Tensor:
     """Means or logits, [B, k]."""
     features = policy.extract_features(observations, policy.pi_features_extractor)
@@ -196,7 +166,7 @@ def actor_of(model: BaseAlgorithm, sampled: bool) -> Actor:
 
 
 class Acting(nn.Module):
-    """An actor with or without a filter, called in the same way.
+    """An actor with or without the safety filter that its policy carries.
 
     :param model: the model
     :param sampled: whether it samples its actions
@@ -208,12 +178,15 @@ class Acting(nn.Module):
         self.actor = actor_of(model, sampled)
         policy = model.policy
         corrects = isinstance(policy, FilteredPolicy) and policy.corrects
-        #: the policy's own filter, if it is switched on
-        layer: Any = policy.action_filter if corrects else None
-        self.layer = layer
-        self.corrected = None if layer is None else Corrected(self.actor, filter_of(layer))
+        #: the policy's filter, if it is switched on
+        self.layer: Any = policy.action_filter if corrects else None
+        if isinstance(self.layer, SafetyLayer) and len(self.layer.threshold) > 1:
+            raise ValueError(
+                f"TRPO-SL with {len(self.layer.threshold)} costs can't be exported: its layer then "
+                "solves a quadratic program; train it with one cost, or use trpo_usl"
+            )
         #: whether what the last step cost is an input
-        self.acts_on_cost = layer is not None and layer.acts_on_cost
+        self.acts_on_cost = corrects and policy.acts_on_cost
 
     def forward(
         self, observations: PyTorchObs, random: th.Tensor | None, last_cost: th.Tensor | None
@@ -223,6 +196,7 @@ class Acting(nn.Module):
         :param last_cost: what the last step cost, [B, 1], NaN where that is not known; None if the
             policy does not act on it
         """
-        if self.corrected is None:
-            return self.actor(observations, random)
-        return self.corrected(observations, random, last_cost)
+        actions = self.actor(observations, random)
+        if self.layer is None:
+            return actions
+        return self.actor.policy.filtered(observations, actions, last_cost)

@@ -20,16 +20,11 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
-from torch import nn
 from worlds import own_parts
 
 import sb3_guard
 from sb3_guard import CPO, PPOLag, SACLag, TD3Lag, TQCLag
-from sb3_guard.algorithms import ALGORITHMS, TRPOSL, TRPOUSL
-from sb3_guard.algorithms.common import action_filters
-from sb3_guard.algorithms.common.action_filters import SafetyLayer, UnrolledSafetyLayer
-from sb3_guard.algorithms.common.policies import FilteredPolicy
-from sb3_guard.deployment import filters
+from sb3_guard.algorithms import ALGORITHMS, TRPOSL
 from sb3_guard.deployment.onnx_file import agreement, check, predicted
 
 #: The operators of a plain multilayer perceptron, as docs/deploying.md lists them.
@@ -162,46 +157,6 @@ def test_the_safety_filter_is_in_the_file(
         )
         np.testing.assert_array_equal(infinite, huge)
         assert (np.abs(filtered - unknown) > 1e-3).any()
-
-
-# The filters in torch's operators
-
-
-def test_the_projection_without_sorting() -> None:
-    rng = np.random.default_rng(0)
-    actions, normals = rng.uniform(-1, 1, (5000, 4)), rng.normal(size=(5000, 4))
-    normals[::7, 1] = 0.0
-    normals[::11] = 0.0
-    limits = rng.uniform(-1.3, 0.5, 5000) * np.abs(normals).sum(axis=1) - 0.01
-    expected = action_filters.clip_along(actions, normals, limits)
-    found = filters.clip_along(*map(th.as_tensor, (actions, normals, limits[:, None]))).numpy()
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
-def policy_of(activation: type[nn.Module], net_arch: list[int]) -> FilteredPolicy:
-    th.manual_seed(0)
-    state, box = spaces.Box(-9, 9, (4,), np.float32), spaces.Box(-1.0, 1.0, (3,), np.float32)
-    kwargs = {"net_arch": net_arch, "activation_fn": activation}
-    return FilteredPolicy(state, box, lambda _: 1e-3, **kwargs)
-
-
-@pytest.mark.parametrize("m", [1, 2])
-@pytest.mark.parametrize("net_arch", [[], [16], [16, 8]])
-@pytest.mark.parametrize("activation", filters.DERIVATIVES)
-def test_the_gradient_of_the_unrolled_steps(activation: Any, net_arch: Any, m: int) -> None:
-    layer = UnrolledSafetyLayer(policy_of(activation, net_arch), m, steps=20)
-    layer.threshold.fill_(0.6)
-    layer.unit.copy_(th.arange(1, m + 1))
-    observations, actions = th.randn(500, 4), np.random.default_rng(0).uniform(-2, 2, (500, 3))
-    actions = actions.astype(np.float32)
-    expected = layer.correct(observations, actions, None)
-    with th.no_grad():
-        found = filters.Descent(layer)(observations, th.as_tensor(actions), None).numpy()
-    box = spaces.Box(-1.0, 1.0, (3,), np.float32)
-    share, _ = agreement(found, expected, box)
-    assert share >= 0.95
-    moved = (np.abs(expected - np.clip(actions, -1, 1)).max(axis=1) > 1e-3).mean()
-    assert 0.1 < moved < 1.0 or not net_arch
 
 
 # Spaces
@@ -414,15 +369,11 @@ def refused_models() -> dict[str, Any]:
     two = {"cost_keys": ("cost", "cost_1"), "cost_limit": (1.0, 1.0), "warmup": 1}
     several = TRPOSL("MlpPolicy", points(2, cost_keys=two["cost_keys"]), **{**ON_POLICY, **two})
     several.policy.action_filter.active.fill_(1.0)
-    gelu = {"policy_kwargs": {"activation_fn": nn.GELU}, "warmup": 1}
-    unknown = TRPOUSL("MlpPolicy", points(2), **{**ON_POLICY, **gelu})
-    unknown.policy.action_filter.active.fill_(1.0)
     alone = CPO("MlpPolicy", points(2), **ON_POLICY)
     alone.env = None
     choices = spaces.MultiDiscrete([2, 3])
     return {
         "TRPO-SL with 2 costs can't be exported": several,
-        "activation_fn=GELU can't be exported": unknown,
         "the agent has no environment": alone,
         "its noise is gSDE's": CPO("MlpPolicy", points(2), use_sde=True, **ON_POLICY),
         "Box and Discrete can be": CPO("MlpPolicy", noisy(box, choices), **ON_POLICY),
@@ -453,11 +404,3 @@ def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ImportError, match=r"needs onnxruntime: pip install 'sb3-guard\[export\]'"):
         sb3_guard.export(CPO("MlpPolicy", points(2), **ON_POLICY), tmp_path / "policy.onnx")
-
-
-def test_a_filter_of_ones_own_is_refused() -> None:
-    class Mine(SafetyLayer):
-        pass
-
-    with pytest.raises(ValueError, match="the safety filter Mine can't be exported"):
-        filters.filter_of(Mine(policy_of(nn.Tanh, [8]), 1))

@@ -2,7 +2,8 @@
 
 A filter sees actions in units of the action space: each runs from -1 to 1. It owns its network,
 the network's optimizer, its thresholds, the units that the network measures costs in, and whether
-it is switched on, so a policy that carries it acts the same wherever it is loaded.
+it is switched on, so a policy that carries it acts the same wherever it is loaded. Filters compute
+in torch's operators, with gradients written out, so that the same code acts and is exported.
 """
 
 from collections.abc import Callable
@@ -18,7 +19,6 @@ from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.critics import Regression, StateNetwork
 from sb3_guard.algorithms.common.natural_gradient import shortest
-from sb3_guard.algorithms.fast.mlp import TanhMlp, softplus_slope
 
 
 class ActionFilter(nn.Module):
@@ -28,7 +28,7 @@ class ActionFilter(nn.Module):
     :param n_costs: number m of constraints
     """
 
-    #: Whether :meth:`correct` makes use of what the last step cost.
+    #: Whether :meth:`forward` makes use of what the last step cost.
     acts_on_cost = False
 
     def __init__(self, network: StateNetwork, n_costs: int) -> None:
@@ -48,48 +48,51 @@ class ActionFilter(nn.Module):
         """The network's."""
         return self.network.optimizer
 
-    def correct(
-        self, observations: PyTorchObs, actions: np.ndarray, costs: np.ndarray | None
-    ) -> np.ndarray:
+    def forward(
+        self, observations: PyTorchObs, actions: th.Tensor, costs: th.Tensor | None
+    ) -> th.Tensor:
         """Actions to execute instead.
 
         :param observations: batch of B observations
         :param actions: in units of the action space, shape [B, k]
-        :param costs: what the last step cost, shape [B, m]; None if not known
+        :param costs: what the last step cost, shape [B, m], NaN where that is not known; None if
+            it is known of none
         :return: actions inside the action space, shape [B, k]
         """
         raise NotImplementedError
 
 
-def clip_along(actions: np.ndarray, normals: np.ndarray, limits: np.ndarray) -> np.ndarray:
+def clip_along(actions: th.Tensor, normals: th.Tensor, limits: th.Tensor) -> th.Tensor:
     """Nearest points of the box [-1, 1]ᵏ in a half-space each: ``normal · x ≤ limit``.
 
     The solution is ``clip(a - μ normal, -1, 1)`` for the least μ ≥ 0 that does it. What has to be
     lowered is piecewise linear in μ with a kink where a coordinate meets the box, so μ follows
-    from its values at the kinks. Where the box has no point in the half-space, the coordinates
-    move as far towards it as they can.
+    from its values at two kinks: the greatest at which the half-space is not yet reached, and the
+    least at which it is. Where the box has no point in the half-space, the coordinates move as far
+    towards it as they can.
 
     :param actions: points a of the box, shape [B, k]
     :param normals: shape [B, k]
-    :param limits: shape [B]
+    :param limits: shape [B, 1]
     :return: shape [B, k]
     """
-    k = normals.shape[1]
-    # Where a coordinate meets its wall, [B, k]; one that does not move meets none.
-    still = np.abs(normals) < 1e-12
-    kinks = (np.sign(normals) + actions) / np.where(still, 1.0, normals)
-    kinks = np.concatenate([np.zeros_like(limits)[:, None], np.where(still, 0.0, kinks)], axis=1)
-    kinks.sort(axis=1)  # [B, 1 + k]
-    points = np.clip(actions[:, None] - kinks[..., None] * normals[:, None], -1.0, 1.0)
-    excess = np.einsum("bik,bk->bi", points, normals) - limits[:, None]  # [B, 1 + k], falling
-    after = np.argmax(excess <= 0.0, axis=1)  # first kink that is far enough
-    after[excess[:, -1] > 0.0] = k
-    rows, before = np.arange(len(after)), np.maximum(after - 1, 0)
-    drop = excess[rows, before] - excess[rows, after]
-    share = np.clip(excess[rows, before] / np.where(drop > 0.0, drop, 1.0), 0.0, 1.0)
-    mu = kinks[rows, before] + share * (kinks[rows, after] - kinks[rows, before])
-    mu = np.where(excess[:, 0] <= 0.0, 0.0, mu)
-    return np.clip(actions - mu[:, None] * normals, -1.0, 1.0)
+    # Where a coordinate meets its wall; one that does not move meets none.
+    still = normals.abs() < 1e-12
+    kinks = (normals.sign() + actions) / th.where(still, 1.0, normals)
+    kinks = th.where(still, 0.0, kinks)
+    kinks = th.cat([th.zeros_like(limits), kinks], dim=1)  # [B, 1 + k]
+    points = actions.unsqueeze(1) - kinks.unsqueeze(2) * normals.unsqueeze(1)  # [B, 1 + k, k]
+    excess = (points.clamp(-1.0, 1.0) * normals.unsqueeze(1)).sum(dim=2) - limits
+    above = excess > 0.0
+    last = kinks.amax(dim=1, keepdim=True)
+    before = th.where(above, kinks, 0.0).amax(dim=1, keepdim=True)
+    after = th.where(above, last, kinks).amin(dim=1, keepdim=True)
+    high = th.where(above, excess, th.inf).amin(dim=1, keepdim=True)
+    low = th.where(above, -th.inf, excess).amax(dim=1, keepdim=True)
+    # Where even the last kink is not far enough, `after` and `before` are equal to it.
+    mu = before + high / (high - low) * (after - before)
+    mu = th.where(excess[:, :1] > 0.0, mu, 0.0)
+    return (actions - mu * normals).clamp(-1.0, 1.0)
 
 
 # Weight of a squared violation against a squared change of the action, both as distances.
@@ -185,28 +188,39 @@ class SafetyLayer(ActionFilter):
             self.network, lambda batch: self.network.extract_features(batch[0]), readout
         )
 
-    @th.no_grad()
-    def correct(
-        self, observations: PyTorchObs, actions: np.ndarray, costs: np.ndarray | None
-    ) -> np.ndarray:
-        slopes, last, drifts = (
-            each.cpu().numpy().astype(np.float64)
-            for each in self._split(self.network(observations))
-        )
-        unit = self.unit.cpu().numpy().astype(np.float64)
+    def forward(
+        self, observations: PyTorchObs, actions: th.Tensor, costs: th.Tensor | None
+    ) -> th.Tensor:
+        unit = self.unit.double()
+        slopes, last, drifts = self._split(self.network(observations).double())
         slopes, last, drifts = unit[:, None] * slopes, unit * last, unit * drifts
-        clipped = np.clip(actions.astype(np.float64), -1.0, 1.0)
-        noise = self.noise.cpu().numpy()
-        limits = self.threshold.cpu().numpy() - (last if costs is None else costs) - drifts
-        excess = np.einsum("bmk,bk->bm", slopes, clipped) - limits
-        certain = ((excess <= 0.0) | (excess > noise)) & (np.abs(slopes).sum(axis=2) > noise)
-        slopes = np.where(certain[..., None], slopes, 0.0)
-        if limits.shape[1] == 1:
-            return clip_along(clipped, slopes[:, 0], limits[:, 0])
-        broken = (certain & (excess > 0.0)).any(axis=1)
-        for i in np.flatnonzero(broken):
-            clipped[i] = nearest_in_box(clipped[i], slopes[i], limits[i])
-        return clipped
+        if costs is not None:
+            # Of an infinite cost there would be no correction.
+            last = th.where(th.isnan(costs), last, costs.double().clamp(max=1e30))
+        limits = self.threshold - last - drifts
+        actions = actions.double().clamp(-1.0, 1.0)
+        excess = (slopes * actions.unsqueeze(1)).sum(dim=2) - limits  # [B, m]
+        certain = (excess <= 0.0) | (excess > self.noise)
+        certain = certain & (slopes.abs().sum(dim=2) > self.noise)
+        slopes = th.where(certain.unsqueeze(2), slopes, 0.0)
+        if len(self.threshold) == 1:
+            return clip_along(actions, slopes[:, 0], limits)
+        broken = (certain & (excess > 0.0)).any(dim=1).nonzero().flatten()
+        for i in broken.tolist():
+            parts = (tensor[i].cpu().numpy() for tensor in (actions, slopes, limits))
+            actions[i] = th.as_tensor(nearest_in_box(*parts)).to(actions)
+        return actions
+
+
+_aten = th.ops.aten
+#: What each activation makes of a gradient g, from its input x, its output h and its layer.
+GRADIENTS: dict[type[nn.Module], Callable[..., th.Tensor]] = {
+    nn.Tanh: lambda g, x, h, layer: _aten.tanh_backward(g, h),
+    nn.ReLU: lambda g, x, h, layer: _aten.threshold_backward(g, h, 0.0),
+    nn.ELU: lambda g, x, h, layer: _aten.elu_backward(g, layer.alpha, 1.0, 1.0, False, x),
+    nn.LeakyReLU: lambda g, x, h, layer: g * th.where(x > 0.0, 1.0, layer.negative_slope),
+    nn.SiLU: lambda g, x, h, layer: g * th.sigmoid(x) * (1.0 + x - h),
+}
 
 
 class UnrolledSafetyLayer(ActionFilter):
@@ -220,6 +234,7 @@ class UnrolledSafetyLayer(ActionFilter):
     :param n_costs: number m of constraints
     :param steps: steps at most
     :param rate: length of a step
+    :raises ValueError: the policy's activation is none whose derivative is known here
     """
 
     def __init__(
@@ -228,6 +243,12 @@ class UnrolledSafetyLayer(ActionFilter):
         self.steps = steps
         self.rate = rate
         self.n_actions = get_action_dim(policy.action_space)
+        if policy.activation_fn not in GRADIENTS:
+            names = ", ".join(kind.__name__ for kind in GRADIENTS)
+            raise ValueError(
+                f"activation_fn={policy.activation_fn.__name__}: the filter's gradient is written "
+                f"out for {names}"
+            )
         super().__init__(StateNetwork(policy, n_costs, self.n_actions), n_costs)
 
     def regression(self) -> Regression:
@@ -257,33 +278,43 @@ class UnrolledSafetyLayer(ActionFilter):
         above = self.values(observations, actions) - self.threshold.to(self.unit)
         return (above.clamp(min=0.0) / self.unit).sum(dim=1)
 
-    def correct(
-        self, observations: PyTorchObs, actions: np.ndarray, costs: np.ndarray | None
-    ) -> np.ndarray:
-        with th.no_grad():
-            features = self.network.extract_features(observations)
-        slope = self._slope(features)
-        a = np.clip(actions, -1.0, 1.0).astype(np.float32)
+    def forward(
+        self, observations: PyTorchObs, actions: th.Tensor, costs: th.Tensor | None
+    ) -> th.Tensor:
+        features = self.network.extract_features(observations)
+        first: Any = self.network.network[0]
+        # The observation's share of the first layer stays the same.
+        state = F.linear(features, first.weight[:, : -self.n_actions], first.bias)
+        weight = first.weight[:, -self.n_actions :]
+        least = (self.threshold / self.unit).float().clamp(min=1e-30)
+        bound = least + th.log(-th.expm1(-least))  # where softplus is the threshold, [m]
+        actions = actions.float().clamp(-1.0, 1.0)
         for _ in range(self.steps):
-            down = slope(a)
-            if not down.any():
+            down = self._slope(state, weight, bound, actions)
+            if not (th.compiler.is_exporting() or bool(down.any())):
                 break
-            length = np.abs(down).max(axis=1, keepdims=True)
-            a = np.clip(a - self.rate * down / (length + 1e-8), -1.0, 1.0)
-        return a
+            length = down.abs().amax(dim=1, keepdim=True)
+            # rate · down / (length + 1e-8), in numbers that no optimiser of graphs takes for zero
+            step = (self.rate * 1e8) * down / (1e8 * length + 1.0)
+            actions = (actions - step).clamp(-1.0, 1.0)
+        return actions
 
-    def _slope(self, features: th.Tensor) -> Callable[[np.ndarray], np.ndarray]:
-        """Gradient of ``Σ max(0, Q_i - threshold_i) / unit_i`` in the actions, each [B, k]."""
-        layers = TanhMlp.layers([*self.network.network])
-        threshold = (self.threshold / self.unit).to(features)
-        if layers is not None and features.device.type == "cpu":
-            return softplus_slope(TanhMlp(layers), features, self.n_actions, threshold.numpy())
+    def _slope(
+        self, state: th.Tensor, weight: th.Tensor, bound: th.Tensor, actions: th.Tensor
+    ) -> th.Tensor:
+        """Gradient of ``Σ max(0, Q_i - threshold_i) / unit_i`` in the actions, shape [B, k].
 
-        def slope(actions: np.ndarray) -> np.ndarray:
-            a = th.as_tensor(actions, device=features.device).requires_grad_()
-            with th.enable_grad():
-                values = F.softplus(self.network.network(th.cat([features, a], dim=1)))
-                excess = (values - threshold).clamp(min=0.0).sum()
-            return th.autograd.grad(excess, a)[0].cpu().numpy()
-
-        return slope
+        :param state: the first layer's outputs for the observations alone, shape [B, n]
+        :param weight: the first layer's weights of the actions, shape [n, k]
+        :param bound: outputs of the network at the thresholds, shape [m]
+        """
+        layers: list[Any] = [*self.network.network]
+        x, passed = th.addmm(state, actions, weight.t()), []
+        for activation, layer in zip(layers[1::2], layers[2::2], strict=True):
+            h = activation(x)
+            passed.append((x, h, activation, layer))
+            x = F.linear(h, layer.weight, layer.bias)
+        gradient = th.where(x > bound, th.sigmoid(x), 0.0)
+        for x, h, activation, layer in reversed(passed):
+            gradient = GRADIENTS[type(activation)](gradient @ layer.weight, x, h, activation)
+        return gradient @ weight

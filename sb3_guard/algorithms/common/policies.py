@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import (
     ActorCriticCnnPolicy,
@@ -29,6 +30,8 @@ class FilteredPolicy(ActorCriticPolicy):
     """
 
     action_filter: ActionFilter
+    low: th.Tensor
+    high: th.Tensor
     _filter: tuple[Callable[..., ActionFilter], dict[str, Any]] | None = None
 
     def __init__(
@@ -38,6 +41,10 @@ class FilteredPolicy(ActorCriticPolicy):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
+        if isinstance(self.action_space, spaces.Box):
+            for name in ("low", "high"):
+                bound = th.as_tensor(getattr(self.action_space, name).flatten()).float()
+                self.register_buffer(name, bound.to(self.device), persistent=False)
         if action_filter is not None:
             self.carry(*action_filter)
 
@@ -79,6 +86,26 @@ class FilteredPolicy(ActorCriticPolicy):
             return self.unscale_action(actions)
         return np.clip(actions, self.action_space.low, self.action_space.high)
 
+    def filtered(
+        self, observations: PyTorchObs, actions: th.Tensor, costs: th.Tensor | None
+    ) -> th.Tensor:
+        """What the filter, switched on or off, makes of actions.
+
+        :param observations: batch of B observations
+        :param actions: actions of the environment, flat, shape [B, k]
+        :param costs: what the last step cost, shape [B, m], NaN where not known; None if of none
+        :return: actions of the environment, flat, shape [B, k]
+        """
+        low, high = self.low, self.high
+        half = ((high - low) / 2.0).clamp(min=th.finfo(th.float32).tiny)
+        unit = (actions - low) / half - 1.0
+        corrected = self.action_filter(observations, unit, costs)
+        # What is not corrected stays as it is, to the last bit.
+        moved = (corrected - unit).abs().amax(dim=1, keepdim=True) > 1e-6
+        scaled = (low + 0.5 * (corrected + 1.0) * (high - low)).to(actions)
+        return th.minimum(th.maximum(th.where(moved, scaled, actions), low), high)
+
+    @th.no_grad()
     def correct(
         self, observations: PyTorchObs, actions: np.ndarray, costs: np.ndarray | None = None
     ) -> np.ndarray:
@@ -91,13 +118,9 @@ class FilteredPolicy(ActorCriticPolicy):
         """
         if not self.corrects:
             return actions
-        unit = self.to_unit(actions)
-        corrected = self.action_filter.correct(observations, unit, costs)
-        # What is not corrected stays as it is, to the last bit.
-        moved = (np.abs(corrected - unit) > 1e-6).any(axis=1)
-        result = actions.copy()
-        result[moved] = self.unscale_action(corrected[moved].reshape(-1, *actions.shape[1:]))
-        return np.clip(result, self.action_space.low, self.action_space.high)  # type: ignore
+        flat = th.as_tensor(actions.reshape(len(actions), -1), device=self.device)
+        last = None if costs is None else th.as_tensor(costs).to(self.device)
+        return self.filtered(observations, flat, last).cpu().numpy().reshape(actions.shape)
 
     def predict(
         self,

@@ -167,36 +167,3 @@ def squared_error(
     for parameter, gradient in zip(network.parameters, gradients, strict=True):
         parameter.grad = gradient
     return total / targets.numel()
-
-
-def softplus_slope(
-    network: TanhMlp, features: th.Tensor, n_actions: int, threshold: np.ndarray
-) -> Callable[[np.ndarray], np.ndarray]:
-    """The gradient of ``Σ max(0, softplus(network) - threshold)`` in the last inputs, each [B, k].
-
-    A rollout asks for it twenty times a step; written out it takes a quarter of autograd's time.
-
-    :param features: the other inputs, shape [B, d]
-    :param n_actions: k
-    """
-    weights = [weight.detach().numpy() for weight in network.parameters[0::2]]
-    biases = [bias.detach().numpy() for bias in network.parameters[1::2]]
-    # The observation's share of the first layer stays the same.
-    weights[0], state = weights[0][:, -n_actions:], weights[0][:, :-n_actions]
-    biases[0] = biases[0] + features.numpy() @ state.T  # [B, hidden]
-    least = np.maximum(threshold, 1e-30)
-    bound = least + np.log(-np.expm1(-least))  # where softplus is the threshold
-
-    def slope(actions: np.ndarray) -> np.ndarray:
-        x, hidden = actions @ weights[0].T + biases[0], []
-        for weight, bias in zip(weights[1:], biases[1:], strict=True):
-            hidden.append(np.tanh(x, out=x))
-            x = x @ weight.T
-            x += bias
-        gradient = (x > bound) / (1.0 + np.exp(-np.maximum(x, bound)))
-        for weight, h in zip(reversed(weights[1:]), reversed(hidden), strict=True):
-            gradient = gradient @ weight
-            gradient *= 1.0 - h * h
-        return gradient @ weights[0]
-
-    return slope

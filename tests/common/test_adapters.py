@@ -29,8 +29,8 @@ from sb3_guard.common.adapters import (
     make_safety_gymnasium,
 )
 from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.run.checkpoint import ResumableEnv
 from sb3_guard.zoo.run.make_envs import source_of
-from sb3_guard.zoo.run.resumable import ResumableEnv
 
 SUPPORT = Path(__file__).parents[1] / "support"
 SMALL = {"n_steps": 32, "seed": 0, "policy_kwargs": {"net_arch": [8]}}

@@ -210,7 +210,6 @@ def test_corrupt_model(capsys, run, tmp_path):
         (["-params", "gamma:0.9"], ["gamma = 0.9 contradicts unset, with which"]),
         (["-params", "gama:1"], ["no hyperparameter 'gama'", "'gamma'"]),
         (["-conf", "paper"], ["conf_file = paper contradicts"]),
-        (["-n", "30"], ["-n 30 is less than the 60 steps"]),
     ],
 )
 def test_flags_that_contradict_the_run(arguments, parts, capsys, run):

@@ -172,11 +172,6 @@ def test_how_often_to_train_in_episodes():
             check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": bad})
 
 
-def test_names_that_are_flags():
-    with pytest.raises(UsageError, match="use the flag --seed"):
-        checked(seed=3)
-
-
 def test_training_takes_a_million_steps_unless_somebody_says_otherwise():
     assert check("cpo", CPO, {})["n_timesteps"] == 1_000_000
     for algo in (*ALGORITHMS, *baselines()):

@@ -31,7 +31,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sb3_guard import make_vec_env, train
 from sb3_guard.common.vec_env import VEC_ENVS
 from sb3_guard.zoo.cli.usage import UsageError
-from sb3_guard.zoo.run import resumable
+from sb3_guard.zoo.run import checkpoint
 from sb3_guard.zoo.run import run as run_module
 from sb3_guard.zoo.run.checkpoint import read_checkpoint
 from sb3_guard.zoo.run.folder import RunFolder
@@ -139,7 +139,7 @@ def test_finished_run_goes_on_as_a_longer_one(undisturbed, tmp_path, capsys):
     run = runs_of(tmp_path)
     capsys.readouterr()
     assert train.main(["-i", str(run), *TOY[:2]]) == 0
-    assert "is finished: 120 of 120 steps" in capsys.readouterr().out
+    assert "is finished: 120 steps" in capsys.readouterr().out
     before = outcome(run)
     for damaged in ('{"n_timest', "[]", json.dumps({**before, "return": "high"})):
         (run / "result.json").write_text(damaged)
@@ -283,4 +283,4 @@ def test_an_expression_in_the_files_of_an_older_run_is_the_mapping_that_it_stand
 def test_a_state_of_another_environment_is_refused_in_a_line():
     envs = [make_vec_env(name, 2) for name in ("Goal_Point_8Hazards", "Goal_Point_4Hazards")]
     with pytest.raises(UsageError, match=r"checkpoint belongs to another environment: the state"):
-        resumable.restore(envs[0], resumable.capture(envs[1]))
+        checkpoint.restore(envs[0], checkpoint.capture(envs[1]))

@@ -139,9 +139,8 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         path, statistics = find_model(run, flags)
     filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
     require_named(run.path, flags, filed, "gym_packages")
-    hyperparams = {**run.hyperparams(), "callback": None}
+    hyperparams = {**without_withdrawn(run, algorithm(flags.algo)), "callback": None}
     refuse_places(run.path, hyperparams)
-    hyperparams = without_withdrawn(run.path, algorithm(flags.algo), hyperparams)
     hyperparams = check(flags.algo, algorithm(flags.algo), hyperparams)
     named = {"algo": flags.algo, "env": flags.env, "gym_packages": flags.gym_packages}
     played = Run(RunFlags.of(named), hyperparams)

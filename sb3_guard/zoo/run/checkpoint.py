@@ -13,20 +13,21 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cloudpickle  # type: ignore[import-untyped]
+import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.logger import RunLogger
 from sb3_guard.zoo.run.make_envs import seed_rows
-from sb3_guard.zoo.run.resumable import capture, restore
 
 MEMBER = "run_state.pkl"
 NORMALIZER = "vecnormalize.pkl"
@@ -38,13 +39,93 @@ GSDE_NOISE = "exploration_mat", "exploration_matrices"
 FORMAT = 10  # increased when the content changes: no other can be continued
 
 
+# What a new environment brings itself and what need not be picklable.
+_OWN = {"env", "venv", "class_attributes", "spec", "_cached_spec", "metadata", "render_mode"}
+
+
+def _attributes(layer: Any) -> dict[str, Any]:
+    return {key: value for key, value in vars(layer).items() if key not in _OWN}
+
+
+class ResumableEnv(gym.Wrapper):
+    """
+    Give a single environment, with all its wrappers, ``state()`` and ``restore(state)``.
+
+    An environment that has the two methods itself is asked; of any other, and of wrappers, the
+    attributes are taken. It is the outermost wrapper, so that a vectorised environment reaches it
+    by ``env_method`` even in another process.
+    """
+
+    def layers(self) -> list[Any]:
+        """The wrappers from the outside in, and the environment itself last."""
+        layers: list[Any] = []
+        env: gym.Env = self.env
+        while isinstance(env, gym.Wrapper):
+            layers.append(env)
+            env = env.env
+        return [*layers, env]
+
+    def state(self) -> bytes | None:
+        """Everything the next step depends on; None if it can't be pickled."""
+        *wrappers, base = self.layers()
+        own = hasattr(base, "state") and hasattr(base, "restore")
+        parts = [_attributes(wrapper) for wrapper in wrappers]
+        parts.append(base.state() if own else _attributes(base))
+        try:
+            return cloudpickle.dumps(parts)
+        except Exception:
+            # What can't be pickled says so in many ways; that it can't is all that matters here.
+            return None
+
+    def restore(self, state: bytes) -> None:
+        """Go on from :meth:`state`; the environment has been reset before."""
+        *wrappers, base = self.layers()
+        *parts, last = pickle.loads(state)
+        for wrapper, attributes in zip(wrappers, parts, strict=True):
+            vars(wrapper).update(attributes)
+        if hasattr(base, "state") and hasattr(base, "restore"):
+            base.restore(last)
+        else:
+            vars(base).update(last)
+
+
+def capture(layer: VecEnv) -> list[Any]:
+    """
+    The state of a vectorised environment: of its wrappers from the outside in, then its own.
+
+    :return: picklable parts; the last one is None if the environment itself can't tell its state
+    """
+    own: Any = layer if hasattr(type(layer), "state") else None
+    if isinstance(layer, VecEnvWrapper):
+        return [_attributes(layer) if own is None else own.state(), *capture(layer.venv)]
+    try:
+        states = layer.env_method("state") if own is None else own.state()
+    except AttributeError:
+        return [None]
+    return [None if own is None and None in states else states]
+
+
+def restore(layer: Any, parts: list[Any]) -> None:
+    """
+    Put an environment that was made the same way, and reset, into a captured state.
+
+    :raises UsageError: it was made in another way, as by another version
+    """
+    part, *rest = parts
+    if hasattr(type(layer), "restore") and part is not None:
+        with explained("the checkpoint belongs to another environment", ValueError):
+            layer.restore(part)
+    elif rest:
+        vars(layer).update(part)
+    else:
+        for index, state in enumerate(part or []):
+            layer.env_method("restore", state, indices=index)
+    if rest:
+        restore(layer.venv, rest)
+
+
 class Interrupted(Exception):
     """Training was asked to stop, and stopped with a checkpoint of where it was."""
-
-
-def random_state() -> tuple[Any, Any, th.Tensor]:
-    """The states of Python's, NumPy's and torch's global generators."""
-    return random.getstate(), np.random.get_state(), th.get_rng_state()  # noqa: NPY002
 
 
 def set_random_state(state: Mapping[str, Any]) -> None:
@@ -152,7 +233,7 @@ class Checkpoints(BaseCallback):
             "format": FORMAT,
             "identity": self.identity,
             "num_timesteps": self.model.num_timesteps,
-            "generators": random_state(),
+            "generators": (random.getstate(), np.random.get_state(), th.get_rng_state()),  # noqa: NPY002
             "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
             "noise": exploration
             and {name: vars(exploration)[name].detach() for name in GSDE_NOISE},

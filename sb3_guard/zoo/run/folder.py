@@ -6,7 +6,6 @@ import glob
 import hashlib
 import json
 import math
-import re
 import shlex
 import tempfile
 import uuid
@@ -219,11 +218,8 @@ class RunFolder:
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Mark the run as complete."""
-        text = json.dumps(result, indent=2)
-        # Numbers of one list go on one line.
-        text = re.sub(r'\[[^][{}"]+\]', lambda numbers: " ".join(numbers[0].split()), text)
         with replacing(self.result) as file:
-            file.write(text.encode())
+            file.write(json.dumps(result, indent=2).encode())
 
     def checked_result(self) -> dict[str, Any]:
         """

@@ -41,6 +41,7 @@ from sb3_guard.zoo.cli.names import (
     with_classes,
 )
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
+from sb3_guard.zoo.run.folder import RunFolder
 
 # What a hyperparameter file may hold besides the algorithm's own arguments, as in RL-Zoo;
 # `selection_limit` is ours (see CostEvalCallback).
@@ -63,9 +64,11 @@ NOISE_KEYS: dict[str, Any] = {
     "noise_type": Literal["normal", "ornstein-uhlenbeck"] | None,
     "noise_std": float,
 }
-# Arguments of an algorithm that are flags of the command.
-FLAGS = {"env": "--env", "seed": "--seed", "device": "--device", "verbose": "--verbose"}
-NOT_HYPERPARAMETERS = {*FLAGS, "self", "tensorboard_log", "_init_setup_model", "policy_base"}
+# Arguments of an algorithm that are flags of the command, or none of a user's
+NOT_HYPERPARAMETERS = {
+    "env", "seed", "device", "verbose", "tensorboard_log", "self", "_init_setup_model",
+    "policy_base",
+}  # fmt: skip
 
 
 def hyperparams_folder() -> Path:
@@ -175,13 +178,11 @@ def annotations(algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
     return {**hints, **RUN_KEYS, **(NOISE_KEYS if "action_noise" in hints else {})}
 
 
-def without_withdrawn(
-    where: object, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Hyperparameters of a run's file, without those of an older version, which are named."""
-    gone = values.keys() - annotations(algorithm).keys()
-    if gone:
-        print(f"{where}: {', '.join(sorted(gone))} left out: withdrawn", file=sys.stderr)
+def without_withdrawn(folder: RunFolder, algorithm: type[BaseAlgorithm]) -> dict[str, Any]:
+    """The hyperparameters of a run, without those of an older version, which are named."""
+    values, names = folder.hyperparams(), annotations(algorithm)
+    if gone := values.keys() - names.keys():
+        print(f"{folder.path}: {', '.join(sorted(gone))} left out: withdrawn", file=sys.stderr)
     return {name: value for name, value in values.items() if name not in gone}
 
 
@@ -196,8 +197,6 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     hints = annotations(algorithm)
     checked = {}
     for name, value in values.items():
-        if name in FLAGS:
-            raise UsageError(f"{name!r} is not a hyperparameter; use the flag {FLAGS[name]}")
         if name not in hints:
             hint = did_you_mean(name, sorted(hints))
             raise UsageError(f"{algo} has no hyperparameter {name!r}; {hint}")

@@ -3,7 +3,7 @@
 import platform
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -76,37 +76,6 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def merit(
-    episodes: np.ndarray, keys: Sequence[str], limits: Sequence[float | None], cut: bool = False
-) -> dict[str, Any]:
-    """
-    What a result says of the episodes of the last epoch, see :meth:`Epochs.result`.
-
-    :param episodes: return, cost, length, and what each of the m limits bounds, [E, 3 + m]; costs
-        are NaN of those that a physics error ended: they are in no mean
-    :param keys: of the m costs
-    :param limits: of the m costs; None: there is none
-    :param cut: a wrapper ended the episodes early, which leaves no verdict
-    :return: ``return``, ``cost``, ``length``, ``costs`` and the number of ``episodes``
-    """
-    known = ~np.isnan(episodes[:, 1])
-    episodes, diverged = episodes[known], int((~known).sum())
-    means = episodes.mean(axis=0).tolist() if len(episodes) else [None] * (3 + len(keys))
-    costs = {}
-    for key, limit, mean, values in zip(keys, limits, means[3:], episodes.T[3:], strict=True):
-        interval = estimate(values)
-        cost: dict[str, Any] = {"mean": mean, "limit": limit}
-        if not np.isnan(interval.low):
-            cost |= {"low": interval.low, "high": interval.high}
-            if limit is not None and not cut:
-                cost["verdict"] = verdict(interval.low, interval.high, limit, diverged)
-        if diverged:
-            cost["physics_errors"] = diverged
-        costs[key] = cost
-    measures = dict(zip(("return", "cost", "length"), means, strict=False))
-    return {**measures, "costs": costs, "episodes": len(episodes)}
-
-
 class Epochs(BaseCallback):
     """
     Collect the episodes of each epoch.
@@ -177,24 +146,42 @@ class Epochs(BaseCallback):
         """
         J_r, M_c and ρ_c as the paper defines them, and what they were obtained with.
 
-        :return: ``label`` and ``family`` that the algorithm's class states, :func:`merit` of the
-            last epoch in which any episode ended, ``cost_rate``, cumulative cost ÷ steps of the
-            whole run, ``physics_errors``, the number of episodes that one ended, ``cost_limit``
-            (None: unconstrained), ``limit_on`` of an algorithm that limits the worst step, ``cut``
-            where a wrapper ended the episodes early, ``seconds`` of training, and
-            :func:`provenance`. ``learned``, absent from a straight run, is the steps at which it
-            was made longer, since warm-up and schedules were those of shorter runs until then
+        :return: ``label`` and ``family`` that the algorithm's class states; of the last epoch in
+            which any episode ended the number of ``episodes``, ``return``, ``cost`` and
+            ``length``, means, and ``costs``, by key the ``mean`` of what its limit bounds, the
+            95 % interval of that mean (``low``, ``high``), the ``limit`` and the ``verdict``, which
+            need five episodes, and the number of further episodes that ended in ``physics_errors``;
+            ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the number
+            of episodes that one ended, ``cost_limit`` (None: unconstrained), ``limit_on`` of an
+            algorithm that limits the worst step, ``cut`` where a wrapper ended the episodes early,
+            ``seconds`` of training, and :func:`provenance`. ``learned``, absent from a straight
+            run, is the steps at which it was made longer, since warm-up and schedules were those of
+            shorter runs until then
         """
         model: Any = self.model
         monitor, keys = find_monitor(self.training_env), self._keys
-        episodes = self.last if len(self.last) else np.zeros((0, 3 + len(keys)))
         constrained = getattr(model, "constrained", False)
         limits = model.final_cost_limits.tolist() if constrained else [None] * len(keys)
+        known = ~np.isnan(self.last[:, 1])  # the cost of those that a physics error ended is not
+        episodes, diverged = self.last[known], int((~known).sum())
+        means = episodes.mean(axis=0).tolist() if len(episodes) else [None] * (3 + len(keys))
+        costs = {}
+        for i, (key, limit) in enumerate(zip(keys, limits, strict=True), 3):
+            cost: dict[str, Any] = {"mean": means[i], "limit": limit}
+            if len(episodes) and not np.isnan((interval := estimate(episodes[:, i])).low):
+                cost |= {"low": interval.low, "high": interval.high}
+                if limit is not None and not self.cut:
+                    cost["verdict"] = verdict(interval.low, interval.high, limit, diverged)
+            if diverged:
+                cost["physics_errors"] = diverged
+            costs[key] = cost
         rate = monitor.total_cost / monitor.total_steps if monitor.total_steps else None
         return {
             "label": getattr(model, "label", None),
             "family": getattr(model, "family", None),
-            **merit(episodes, keys, limits, self.cut),
+            **dict(zip(("return", "cost", "length"), means, strict=False)),
+            "costs": costs,
+            "episodes": len(episodes),
             "cost_rate": rate,
             "n_timesteps": model.num_timesteps,
             "physics_errors": monitor.physics_errors,

@@ -53,6 +53,7 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import (
     Checkpoints,
     Interrupted,
+    ResumableEnv,
     load_model,
     read_checkpoint,
     read_normalizer,
@@ -76,7 +77,6 @@ from sb3_guard.zoo.run.make_envs import (
     source_of,
 )
 from sb3_guard.zoo.run.progress import Epochs, summary
-from sb3_guard.zoo.run.resumable import ResumableEnv
 
 FINAL_EPISODES = 100  # of each policy, after training
 #: what is played after training: the policy that was trained, and its most likely actions
@@ -480,9 +480,8 @@ class Run:
         if not is_run(self.path):
             return "new"
         folder = RunFolder(self.path)
-        values = without_withdrawn(self.path, self.algorithm, folder.hyperparams())
-        there = Run(folder.flags(), values).identity
-        if others := differences(there, self.identity):
+        there = Run(folder.flags(), without_withdrawn(folder, self.algorithm))
+        if others := differences(there.identity, self.identity):
             words = [f"{name}: {a} there, {b} here" for name, a, b in others[:3]]
             raise UsageError(
                 f"{self.path} holds another run ({'; '.join(words)}); choose another folder with -f"
@@ -530,22 +529,15 @@ class Run:
             saved = folder.flags()
             require_named(folder.path, given, saved, "gym_packages")
             import_packages(given.gym_packages)
-            values = without_withdrawn(folder.path, algorithm(saved.algo), folder.hyperparams())
+            values = without_withdrawn(folder, algorithm(saved.algo))
             state = read_checkpoint(folder.checkpoint)
-            done = state["num_timesteps"]
             changed = {name: getattr(given, name) for name in {*given.given, "progress", "verbose"}}
             changed |= {name: getattr(saved, name) for name in ("trained_agent", "hyperparams")}
             run = cls(dataclasses.replace(saved, **changed), folder=folder)
-            if "env" in changed:
-                run.flags.env = str(run.source.env_id)
-            if 0 < given.n_timesteps < done:
-                raise UsageError(
-                    f"-n {given.n_timesteps} is less than the {done} steps that {folder.path} has "
-                    "done"
-                )
+            run.flags.env = str(run.source.env_id)
+            overrides = dict(given.hyperparams or {})
             if given.n_timesteps > 0:
-                values["n_timesteps"] = given.n_timesteps
-            overrides = given.hyperparams or {}
+                overrides["n_timesteps"] = given.n_timesteps
             refuse_places(folder.path, {n: v for n, v in values.items() if n not in overrides})
             run.hyperparams = check(saved.algo, algorithm(saved.algo), {**values, **overrides})
             free = {"n_timesteps": None, "log_folder": None}
@@ -556,11 +548,9 @@ class Run:
                     f"{name} = {new} contradicts {old}, with which {folder.path} was trained; put "
                     "it back or leave it out, or start a new run with it, without -i"
                 )
-            if folder.read_result() is not None and done >= run.setup.n_timesteps:
-                print(
-                    f"{folder.path} is finished: {done} of {run.setup.n_timesteps} steps; "
-                    "a larger -n continues it"
-                )
+            done, total = state["num_timesteps"], run.setup.n_timesteps
+            if 0 < given.n_timesteps < done or (total <= done and folder.read_result() is not None):
+                print(f"{folder.path} is finished: {done} steps; a larger -n continues it")
                 return 0
             return run.try_out().make().train(folder)
 

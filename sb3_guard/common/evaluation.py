@@ -157,8 +157,7 @@ def check_normalizer(normalizer: Any, space: spaces.Space) -> None:
 
     :param normalizer: what ``vecnormalize.pkl`` has
     :param space: of the observations
-    :raises ValueError: it is no VecNormalize, or the means and variances of its observations have
-        another shape or are not numbers
+    :raises ValueError: it is no VecNormalize, or does not make finite numbers of an observation
     """
     if not isinstance(normalizer, VecNormalize):
         raise ValueError(
@@ -166,32 +165,22 @@ def check_normalizer(normalizer: Any, space: spaces.Space) -> None:
         )
     if not normalizer.norm_obs:
         return
-    statistics: Any = getattr(normalizer, "obs_rms", None)
-    shapes: dict[Any, Any] = {None: space.shape}
-    if isinstance(space, spaces.Dict):
-        keys = [key for key in normalizer.norm_obs_keys or () if key in space.spaces]
-        shapes = {key: space[key].shape for key in keys}
-    else:
-        statistics = {None: statistics}
-    if not isinstance(statistics, dict) or statistics.keys() != shapes.keys():
-        raise ValueError(f"observation statistics are those of other observations than {space}")
-    for key, shape in shapes.items():
-        for name in ("mean", "var"):
-            values = getattr(statistics[key], name, None)
-            if not isinstance(values, np.ndarray) or values.dtype.kind != "f":
-                fault = f"is {values!r}, no array of numbers"
-            elif values.shape != shape:
-                fault = f"has shape {values.shape}, and the observations have {shape}"
-            elif not np.isfinite(values).all() or (name == "var" and (values < 0.0).any()):
-                fault = "has numbers that are not finite, or variances below 0"
-            else:
-                continue
-            of = "" if key is None else f" of {key!r}"
-            raise ValueError(f"observation statistics do not fit: their {name}{of} {fault}")
-    for name in ("clip_obs", "epsilon"):
-        value: Any = getattr(normalizer, name, None)
-        if not (is_number(value) and float(value) > 0.0):
-            raise ValueError(f"observation statistics do not fit: {name} is {value!r}, not above 0")
+    several = isinstance(space, spaces.Dict)
+    entries: Any = space.spaces if isinstance(space, spaces.Dict) else {None: space}
+    zeros = {name: np.zeros(entry.shape or ()) for name, entry in entries.items()}
+    try:
+        with np.errstate(all="ignore"):
+            seen: Any = normalizer.normalize_obs(zeros if several else zeros[None])
+    except Exception as error:
+        fault = f"{type(error).__name__}: {error}"
+        raise ValueError(f"observation statistics do not fit {space}: {fault}") from None
+    for name, values in (seen if several else {None: seen}).items():
+        if np.shape(values) != zeros[name].shape or not np.isfinite(values).all():
+            of = "" if name is None else f" of {name!r}"
+            raise ValueError(
+                f"observation statistics do not fit {space}: means and variances{of} have another "
+                "shape, or are not finite"
+            )
 
 
 def share_environment(one: VecEnv, other: VecEnv) -> bool:

@@ -182,21 +182,19 @@ class Engine:
             self.drawn.draw(ids)
             self.placing.forget(ids)  # layouts that are kept may be of another number of objects
         pending = ids
-        refusals: dict[tuple[str, str], int] = {}  # starts not used, by reason and remedy
+        refusals: dict[str, None] = {}  # reasons of starts that are not used
         for _ in range(CLEAN_STARTS):
             self._start(pending)
             faults = self._faults()
             pending = pending[np.logical_or.reduce(list(faults.values()))[pending]]
             if not len(pending):
                 break
-            for reason, rows in faults.items():
-                refusals[reason] = refusals.get(reason, 0) + int(rows[pending].sum())
+            refusals |= dict.fromkeys(why for why, rows in faults.items() if rows[pending].any())
         else:
-            found = [r for r, count in sorted(refusals.items(), key=lambda i: -i[1]) if count]
-            reasons, remedies = (dict.fromkeys(words) for words in zip(*found, strict=True))
             raise LayoutError(
                 f"none of {CLEAN_STARTS} layouts lets an episode begin clean "
-                f"({'; '.join(reasons)}): {'; '.join(remedies)}"
+                f"({'; '.join(refusals)}): make size or num smaller, limits wider, keepout or "
+                "placements larger, or state where the robot begins"
             )
         self._before[ids] = self.task.measure()[ids]
         self._begun = self._begun or bool((self.steps >= 0).all())
@@ -210,17 +208,17 @@ class Engine:
             part.reset(ids, self.rngs)
         self.batch.begin(ids)
 
-    def _faults(self) -> dict[tuple[str, str], Array]:
-        """Why no episode is to begin as everything is now: reason and remedy, and rows [N] bool."""
+    def _faults(self) -> dict[str, Array]:
+        """Why no episode is to begin as everything is now, and rows [N] bool."""
         task, n = self.task, self.num_envs
         invalid = per_row(task, "invalid_start()", task.invalid_start(), n, bool)
-        faults = {(f"{_sized(task)}: {task.invalid_reason}", task.remedy): invalid}
+        faults = {f"{_sized(task)}: {task.invalid_reason}": invalid}
         for c in self.constraints:
             pays = per_row(c, "cost()", c.cost(), n) > 0
-            faults[f"{_sized(c)}: a cost at the start", c.remedy] = pays
+            faults[f"{_sized(c)}: a cost at the start"] = pays
         for p in self._enders:
             ends = per_row(p, "terminated()", p.terminated(), n, bool)
-            faults[f"{_sized(p)}: it ends the episode immediately", p.remedy] = ends
+            faults[f"{_sized(p)}: it ends the episode immediately"] = ends
         return faults
 
     def step(self, actions: Array) -> Outcome:
@@ -323,11 +321,6 @@ class Engine:
         """The dense reward of a step after which the task measures ``now``, [N]."""
         task = self.task
         reward = per_row(task, "reward()", task.reward(self._before, now), self.num_envs)
-        if np.count_nonzero(reward != reward):
-            raise PartError(
-                f"reward() of {task.name} is nan in rows "
-                f"{np.flatnonzero(np.isnan(reward)).tolist()}: it must be a number"
-            )
         limit = task.reward_limit
         return reward if limit is None else np.minimum(np.maximum(reward, -limit), limit)
 

@@ -78,15 +78,11 @@ def action_space(engine: Engine) -> spaces.Box:
 def cameras(model: mujoco.MjModel) -> dict[str, str]:
     """The cameras that can be chosen: the renderer's names, by the names that users give.
 
-    A camera of a robot's file has its name there, and that with the prefix if another has that
-    name, too.
+    A camera of a robot's file has its name there, too, unless that is one of ours.
     """
-    names = [name for i in range(model.ncam) if (name := model.camera(i).name)]
-    chosen = {name: name for name in CAMERAS}
-    for name in sorted(names, key=lambda name: name.startswith(PREFIX)):
-        short = name.removeprefix(PREFIX)
-        chosen[name if short in chosen else short] = name
-    return chosen
+    names = [model.camera(i).name for i in range(model.ncam)]
+    chosen = {name: name for name in (*CAMERAS, *names) if name}
+    return {name.removeprefix(PREFIX): name for name in names if name} | chosen
 
 
 class Simulated:

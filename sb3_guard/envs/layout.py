@@ -255,15 +255,11 @@ def _centres(
 
 def _no_room(f: Footprint) -> LayoutError:
     """What to raise where a part found no room most often."""
-    near = ""
-    if math.isfinite(f.reach):
-        near = f" within the robot's reach, {f.reach} m around its base at {f.base},"
-    what = "1 object" if f.num == 1 else f"{f.num} objects"
-    less = " or ".join(["num"] * (f.num > 1) + ["keepout"] + ["height"] * bool(near))
+    within = f" within {f.reach} m of the robot's base" if math.isfinite(f.reach) else ""
     return LayoutError(
-        f"{f.name} cannot be placed: {what} with keepout {f.keepout} m find no room "
-        f"in {list(f.placements)}{near} in addition to the other parts; reduce {less}, its "
-        f"own or another's{'' if near else ', or widen placements'}"
+        f"{f.name} cannot be placed: {f.num} with keepout {f.keepout} m find no room in "
+        f"{list(f.placements)}{within} in addition to the other parts: reduce num or keepout, its "
+        "own or another's, or widen placements or height"
     )
 
 

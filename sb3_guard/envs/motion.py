@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -170,20 +170,13 @@ class MoverGroup:
         move += np.bincount(moved.ravel(), away.ravel(), move.size).reshape(move.shape)
 
 
-class Mover(Protocol):
-    """What is asked what moves, before every control step: a part."""
-
-    def moving(self) -> tuple[Moving, ...]:
-        """What moves by a law."""
-
-
 class Motion:
     """All that moves by a law, in as few groups as can be.
 
-    :param parts: whose movers they are
+    :param parts: whose movers they are, as ``moving()`` of each says
     """
 
-    def __init__(self, parts: Sequence[Mover]) -> None:
+    def __init__(self, parts: Sequence[Any]) -> None:
         self._parts = parts
         self._moving: list[Moving] = []
         self._groups: list[MoverGroup] = []

@@ -175,8 +175,6 @@ class Part(Parameters):
     planar: bool
     height: tuple[float, float] = (0.5, 1.5)  # m, range of z in space
     size: float  # m, radius of its objects
-    # how to let episodes begin clean, where it spoils every start
-    remedy: ClassVar[str] = "make size or num smaller, or keepout or placements larger"
     groups: tuple[Any, ...] = ()  # its objects, each a Group, made by build()
     every: str = "control"  # before which steps before_step is called: "control" or "physics"
     solid: bool = False  # whether its objects are bodies that the robot bumps into

@@ -126,10 +126,6 @@ class Scenario:
 
         try:
             data = load_yaml(Path(path).read_text(encoding="utf-8"))
-        except UnicodeDecodeError:
-            raise ValueError(
-                f"cannot read scenario {str(path)!r}: it is not text in UTF-8; save it as such"
-            ) from None
         except (OSError, ValueError, yaml.YAMLError) as error:
             detail = " ".join(str(error).split())
             raise ValueError(f"cannot read scenario {str(path)!r}: {detail}") from None

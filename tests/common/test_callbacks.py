@@ -93,13 +93,7 @@ def test_unconstrained_algorithms_are_judged_by_return():
     )
 
 
-@pytest.mark.parametrize(
-    "limit",
-    [
-        [1.0, 2.0],
-        np.nan,
-    ],
-)
+@pytest.mark.parametrize("limit", [[1.0, 2.0], np.nan])
 def test_a_limit_that_does_not_fit_is_refused_before_training(limit):
     model = CPO("MlpPolicy", envs(), n_steps=20)
     with pytest.raises(ValueError, match=r"selection_limit=.*each of the 1 cost keys \('cost',\)"):

@@ -74,7 +74,7 @@ FAULTS = {
     [
         *((name, "evaluation") for name in FAULTS),
         *(("truncated", kind) for kind in ("evaluation of many", "make_vec_env", "algorithm")),
-        ("shape", "subproc"),
+        pytest.param("shape", "subproc", marks=pytest.mark.slow),
         *((name, "algorithm") for name in ("no cost", "four values")),
     ],
 )
@@ -345,10 +345,10 @@ def test_a_normalizer_of_some_entries_of_a_dictionary():
     model = PPO("MultiInputPolicy", env, n_steps=10, batch_size=10)
     assert len(evaluate_policy(model, env, 1)) == 1
     env.obs_rms["velocimeter"].var[0] = -1.0
-    with pytest.raises(ValueError, match="their var of 'velocimeter'"):
+    with pytest.raises(ValueError, match="of 'velocimeter'"):
         evaluate_policy(model, env, 1)
     env.obs_rms = {}
-    with pytest.raises(ValueError, match="of other observations"):
+    with pytest.raises(ValueError, match="observation statistics"):
         evaluate_policy(model, env, 1)
 
 

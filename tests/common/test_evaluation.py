@@ -73,14 +73,7 @@ def test_sums_by_hand():
     assert result.successes.tolist() == [False, False]
 
 
-@pytest.mark.parametrize(
-    "episodes",
-    [
-        1,
-        2,
-        3,
-    ],
-)
+@pytest.mark.parametrize("episodes", [1, 2, 3])
 @pytest.mark.parametrize("rows", [1, 2, 4])
 def test_as_many_episodes_as_asked(episodes, rows):
     assert len(evaluate_policy(Idle(), fixed(*[2] * rows), n_eval_episodes=episodes)) == episodes

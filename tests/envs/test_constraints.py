@@ -182,16 +182,6 @@ def test_vase_costs_equal_the_scalar_loop():
     assert poses[0][0][0, 0] > 0.1  # it was pushed
 
 
-def test_gremlins_of_other_rows_stay_when_a_row_is_reset():
-    engine = world("Goal_Point_0Hazards", 2, gremlins={"num": 3})
-    for _ in range(7):
-        engine.step(np.zeros((2, 2)))
-    before = engine.batch.mocap_pos.copy()
-    engine.reset([0])
-    np.testing.assert_array_equal(engine.batch.mocap_pos[1], before[1])
-    assert (engine.batch.mocap_pos[0] != before[0]).any()
-
-
 def test_gremlins_circle_by_the_simulated_clock():
     """§5: travel · (sin t, cos t) around their places; a step shows the time it began at."""
     engine = world("Goal_Swimmer_3Gremlins", 2, gremlins={"travel": 0.25, "rate": 1.5})

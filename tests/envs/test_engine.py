@@ -25,8 +25,12 @@ def actions_for(env, steps, n, seed=0):
     return rng.uniform(-1.2, 1.2, (steps, n, size)).astype(np.float32)
 
 
-@pytest.mark.parametrize("env_id", CASES)
-def test_row_of_a_batch_is_a_lone_environment_bit_for_bit(env_id, length=40, steps=100):
+# tasks of Safety-Gymnasium, of which bodies sleep in the first
+SAFETY = ["SafetyPointGoal1-v0", "SafetyDoggoCircle1-v0", "SafetyHopperVelocity-v1"]
+
+
+@pytest.mark.parametrize("env_id", [*CASES, *SAFETY])
+def test_row_of_a_batch_is_a_lone_environment_bit_for_bit(env_id, length=25, steps=60):
     n = 3
     batch = gymnasium.make_vec(env_spec(env_id), num_envs=n, max_episode_steps=length)
     lone = [make(env_id, max_episode_steps=length) for _ in range(n)]
@@ -60,10 +64,10 @@ def test_rows_of_a_batch_are_lone_environments_for_whole_episodes():
 @pytest.mark.parametrize("env_id", CASES)
 def test_threads_change_nothing(env_id):
     what = env_spec(env_id).kwargs["scenario"]
-    envs = [GuardVectorEnv(5, what, max_episode_steps=30, num_threads=k) for k in (1, 2)]
+    envs = [GuardVectorEnv(5, what, max_episode_steps=15, num_threads=k) for k in (1, 2)]
     first = [env.reset(seed=0)[0] for env in envs]
     np.testing.assert_array_equal(*first)
-    for action in actions_for(envs[0], 70, 5):
+    for action in actions_for(envs[0], 40, 5):
         steps = [env.step(action) for env in envs]
         for a, b in zip(steps[0][:4], steps[1][:4], strict=True):
             np.testing.assert_array_equal(a, b)
@@ -84,18 +88,18 @@ def test_a_full_episode_is_cut_after_a_thousand_steps_and_repeats_with_its_seed(
     np.testing.assert_array_equal(*runs)
 
 
-@pytest.mark.parametrize("env_id", CASES)
+@pytest.mark.parametrize("env_id", [*CASES, *SAFETY])
 def test_a_restored_state_continues_bit_for_bit_on_other_threads(env_id):
     what = env_spec(env_id).kwargs["scenario"]
-    a = GuardVectorEnv(4, what, max_episode_steps=25, num_threads=1)
-    b = GuardVectorEnv(4, what, max_episode_steps=25, num_threads=2)
+    a = GuardVectorEnv(4, what, max_episode_steps=13, num_threads=1)
+    b = GuardVectorEnv(4, what, max_episode_steps=13, num_threads=2)
     a.reset(seed=3)
     b.reset(seed=99)
-    actions = actions_for(a, 60, 4)
-    for action in actions[:20]:
+    actions = actions_for(a, 40, 4)
+    for action in actions[:10]:
         a.step(action)
     b.restore(a.state())
-    for action in actions[20:]:  # past two automatic resets, so the generators matter
+    for action in actions[10:]:  # past two automatic resets, so the generators matter
         for x, y in zip(a.step(action)[:4], b.step(action)[:4], strict=True):
             np.testing.assert_array_equal(x, y)
 
@@ -253,19 +257,6 @@ def test_rewards_and_costs_equal_scalar_loops():
     assert paid > 10 and reached > 0
 
 
-def test_indicator_costs_are_zero_or_one():
-    dense = GuardVectorEnv(4, "Goal_Point_8Hazards", hazards={"weight": 2.0})
-    binary = GuardVectorEnv(4, "Goal_Point_8Hazards", hazards={"indicator": True})
-    dense.reset(seed=2)
-    binary.reset(seed=2)
-    seen = set()
-    for _ in range(300):
-        a, b = (env.step(np.tile([1.0, 0.05], (4, 1)))[4]["cost"] for env in (dense, binary))
-        np.testing.assert_array_equal(b, (a > 0).astype(float))
-        seen |= set(b.tolist())
-    assert seen == {0.0, 1.0}
-
-
 def test_a_fixed_layout_repeats_within_a_row():
     env = GuardVectorEnv(2, "Goal_Point_8Hazards", layout={"randomize": False})
     env.reset(seed=0)
@@ -319,7 +310,6 @@ def test_what_is_wrong_with_a_users_constraint_is_said(verbs, words):
     ("verb", "value", "words"),
     [
         ("reward", np.zeros((2, 1)), r"reward\(\) of odd has shape \(2, 1\), expected \(2,\)"),
-        ("reward", np.array([0.0, np.nan]), r"reward\(\) of odd is nan in rows \[1\]: .* a number"),
         ("invalid_start", False, r"invalid_start\(\) of odd has shape \(\), expected \(2,\)"),
     ],
 )
@@ -356,7 +346,7 @@ def test_costs_of_a_users_constraint_may_be_whole_or_yes_and_no():
 
 def test_an_impossible_layout_names_the_crowded_part():
     env = GuardVectorEnv(1, "Goal_Point_8Hazards", hazards={"num": 60})
-    with pytest.raises(LayoutError, match="hazards cannot be placed: 60 objects"):
+    with pytest.raises(LayoutError, match="hazards cannot be placed: 60 with"):
         env.reset(seed=0)
 
 

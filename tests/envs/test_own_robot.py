@@ -81,13 +81,7 @@ def test_a_robot_that_would_fall_forever_is_refused(cart):
         cart(change).build()
 
 
-@pytest.mark.parametrize(
-    "step",
-    [
-        0,
-        0.051,
-    ],
-)
+@pytest.mark.parametrize("step", [0, 0.051])
 def test_a_physics_step_that_is_none_is_refused(step, cart):
     with pytest.raises(
         ValueError, match=rf"physics step of {step} s; allowed: above 0, at most 0.05"

@@ -126,14 +126,7 @@ def test_a_scenario_may_state_the_physics():
     assert engine.batch.time[0] == pytest.approx(0.005)
 
 
-@pytest.mark.parametrize(
-    "robot",
-    [
-        "Ant",
-        "Arm3",
-        "Drone",
-    ],
-)
+@pytest.mark.parametrize("robot", ["Ant", "Arm3", "Drone"])
 def test_velocity_is_the_change_of_position(robot):
     engine = world(f"Goal_{robot}_0Hazards", 2, arena={"timestep": 1e-5, "frame_skip": 2})
     rng = np.random.default_rng(0)

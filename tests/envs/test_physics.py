@@ -68,13 +68,7 @@ def test_physics_steps_evaluate_no_sensors(monkeypatch, randomized):
     assert not np.any(flags & SENSOR)
 
 
-@pytest.mark.parametrize(
-    "randomize",
-    [
-        "field",
-        "named view",
-    ],
-)
+@pytest.mark.parametrize("randomize", ["field", "named view"])
 def test_users_may_randomize_the_physics(randomize):
     ours, theirs = pair("Goal_Ant_8Hazards")
     ours.advance()
@@ -157,21 +151,15 @@ PILES = """
 """
 
 
-@pytest.mark.parametrize(
-    "randomize",
-    [
-        None,
-        "field",
-    ],
-)
-def test_sleep_is_restored_bit_for_bit(randomize):
+@pytest.mark.parametrize("randomized", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_sleep_is_restored_bit_for_bit(randomized):
     """Every third physics step: asleep alone, asleep in a pile, and soon to be."""
     model = mujoco.MjModel.from_xml_string(PILES)
     ours, restored, left_alone = (Physics(model, N, 1, frame_skip=3) for _ in range(3))
     batches = (ours, restored, left_alone)
     fields = ("qpos", "qvel", "xpos", "qacc", "cvel", "tree_asleep")
     for batch in batches:
-        if randomize == "field":
+        if randomized:
             batch.expand("opt.gravity")[:, 2] = [-9.81, -9.0, -8.0]
         for name in fields:
             batch.bind(name)

@@ -74,22 +74,6 @@ def test_walls_are_drawn_where_it_begins_to_cost(task, limits):
         )
 
 
-@pytest.mark.parametrize(
-    "env_id",
-    [
-        "SafetyPointCircle1-v0",
-    ],
-)
-def test_a_boundary_is_seen_in_pictures(env_id):
-    env = sb3_guard.make(env_id, render_mode="rgb_array", width=120, height=120)
-    env.reset(seed=0)
-    with_walls = env.render().astype(int)
-    env.unwrapped.engine.constraints[0].x = None
-    yellow = (with_walls - env.render())[..., 2] < -40  # it takes the blue out of the floor
-    env.close()
-    assert yellow.sum() > 100
-
-
 @pytest.mark.parametrize("env_id", ["SafetyPointRun0-v0", "SafetyAntVelocity-v1"])
 def test_pictures_of_a_run_are_bright_near_and_without_a_border(env_id, monkeypatch):
     monkeypatch.delattr(scene_module.ScenePainter, "border")

@@ -44,7 +44,7 @@ def _needs_opengl():
     require_rendering()
 
 
-@pytest.mark.parametrize("camera", rendering.CAMERAS)
+@pytest.mark.parametrize("camera", ["track", "top"])
 def test_zones_and_goal_are_drawn(camera):
     env = gymnasium.make(
         "Goal_Point_8Hazards-v0", render_mode="rgb_array", camera=camera, width=200, height=150
@@ -108,14 +108,13 @@ def test_halos_show_the_lidars_that_are_observed(task):
     np.testing.assert_allclose(sorted(shown), sorted(map(tuple, expected)), 1e-6)
 
 
-@pytest.mark.parametrize("camera", ["fixed", "top"])
-def test_cameras_show_an_arena_of_any_size_and_place(camera):
+def test_cameras_show_an_arena_of_any_size_and_place():
     env = GuardEnv(
         "Goal_Point_0Hazards",
         layout={"placements": [[-6.0, -6.0, 6.0, 6.0], [6.0, 0.0, 14.0, 6.0]]},
         robot={"locations": [[-8.0, 4.0]]},
         render_mode="rgb_array",
-        camera=camera,
+        camera="fixed",
         width=120,
         height=120,
     )
@@ -129,7 +128,8 @@ def test_cameras_show_an_arena_of_any_size_and_place(camera):
 
 @pytest.mark.parametrize("env_id", env_ids("guard")[:1])
 def test_looking_changes_nothing(env_id):
-    seen, blind = (gymnasium.make(env_id, render_mode=m) for m in ("rgb_array", None))
+    small = {"width": 64, "height": 48}
+    seen, blind = (gymnasium.make(env_id, render_mode=m, **small) for m in ("rgb_array", None))
     a, b = seen.reset(seed=0)[0], blind.reset(seed=0)[0]
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -203,7 +203,8 @@ def test_cameras_of_a_robots_file_are_chosen_by_their_names(tmp_path):
         register_robot("Dog", xml=spec, root="trunk")
         frames = []
         for camera in ("nose", "fixed"):
-            env = GuardEnv("Goal_Dog_2Hazards", render_mode="rgb_array", camera=camera)
+            size = {"width": 64, "height": 48}
+            env = GuardEnv("Goal_Dog_2Hazards", render_mode="rgb_array", camera=camera, **size)
             env.reset(seed=0)
             frames.append(env.render())
             env.close()
@@ -258,21 +259,6 @@ def test_the_robots_own_camera_looks_ahead(robot):
     assert gap < 0 or gap > 1, f"{model.geom(hit[0]).name} is in the way"
 
 
-@pytest.mark.parametrize("robot", ["Arm6"])
-def test_what_is_ahead_is_in_the_middle_of_the_robots_view(robot):
-    options = {"flatten": False, "observe": {"camera": [48, 48]}, "goal": {"size": 0.15}}
-    env = GuardEnv(f"Goal_{robot}_0Hazards", **options)
-    env.reset(seed=0)
-    views = []
-    for metres in (1.0, -1.0):
-        put_the_goal_ahead(env, metres)
-        views.append(env.look()[0].astype(int))
-    env.close()
-    rows, columns = np.nonzero(np.abs(views[0] - views[1]).sum(axis=2) > 30)
-    assert len(rows) > 20
-    assert abs(columns.mean() - 23.5) < 3 and abs(rows.mean() - 23.5) < 5
-
-
 @dataclass
 class Selfie(Point):
     """A robot that sees itself from behind."""
@@ -296,7 +282,8 @@ def test_the_robots_own_camera_sees_neither_halo_nor_tint(monkeypatch):
     renderer.close()
 
 
-@pytest.mark.parametrize("backend", ["glfw", pytest.param("osmesa", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["glfw", "osmesa"])
 def test_a_forced_backend_that_does_not_work_is_one_line(backend, tmp_path):
     import os
     import subprocess

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -100,25 +98,6 @@ def test_sizes_mass_and_time_step(robot: str) -> None:
     assert list(engine.model.opt.gravity) == [0, 0, -9.81]
     body = engine.model.body("robot/robot").id
     assert engine.model.body_subtreemass[body] == pytest.approx(facts.mass, rel=0.02)
-
-
-def test_doc_table_matches() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "robots.md").read_text()
-    rows = re.findall(
-        r"^\| \[(\w+)\]\(#\w+\) \| (\d+) \| (\d+) \| ([\d.]+) kg \| ([\d.]+) s",
-        text,
-        re.M,
-    )
-    table = {name: (int(a), int(o), float(m), float(dt)) for name, a, o, m, dt in rows}
-    assert set(table) == set(FACTS)
-    for name, (actions, observation, mass, timestep) in table.items():
-        facts = FACTS[name]
-        assert (actions, observation, timestep) == (
-            facts.actions,
-            facts.observation,
-            facts.timestep,
-        ), name
-        assert mass == pytest.approx(facts.mass, rel=0.02), name
 
 
 @pytest.mark.parametrize(

@@ -136,17 +136,19 @@ def test_ids_and_time_limits():
 
 
 SLOW = pytest.mark.slow
+CROWDED = ("PointButton2", "CarPush1", "PointCircle1")
 REST = [pytest.param(name, marks=SLOW) for name in ("CarGoal2", "PointButton1", "AntGoal1")]
 
 
-@pytest.mark.parametrize("name", ["PointGoal1", "PointButton2", "CarPush1", "PointCircle1"])
+@pytest.mark.parametrize("name", ["PointGoal1", *(pytest.param(n, marks=SLOW) for n in CROWDED)])
 def test_layouts_are_distributed_alike(name):
     """Coordinates, and distances of any two things, of 1,000 new episodes, against 400."""
     gaps = layout_gaps(name)
     assert max(gaps.values()) < 0.13, gaps  # chance passes one of them once in 10,000
 
 
-@pytest.mark.parametrize("name", ["PointButton1", pytest.param("PointButton2", marks=SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["PointButton1", "PointButton2"])
 def test_the_robot_of_button_begins_as_far_from_the_middle(name):
     """Of 1,000 new episodes, against 1,000; it is drawn first, and few layouts succeed."""
     *layouts_of_both, kinds = layouts(name, 1000)
@@ -161,3 +163,13 @@ def test_random_episodes_earn_and_cost_alike(name):
     """Returns, costs and lengths of 200 episodes of 100 random steps."""
     gaps = episode_gaps(name)
     assert max(gaps.values()) < 0.17, gaps  # chance passes one of them once in 160
+
+
+def test_what_is_added_is_observed_and_what_is_removed_is_not():
+    plain = gymnasium.make("SafetyPointGoal1-v0").unwrapped.observation_layout
+    changes = {"hazards": None, "gremlins": {"num": 2}, "slow": {"type": "speed", "limit": 1.0}}
+    layout = gymnasium.make("SafetyPointGoal1-v0", **changes).unwrapped.observation_layout
+    names = [name for name in plain if name != "hazards_lidar"]
+    assert list(layout) == [*names, "gremlins_lidar"]
+    asked = gymnasium.make("SafetyPointGoal1-v0", hazards=None, observe={"components": ["gyro"]})
+    assert list(asked.unwrapped.observation_layout) == ["gyro"]

@@ -150,10 +150,9 @@ def test_scenarios_from_files(tmp_path):
         Scenario.load(path)
     with pytest.raises(ValueError, match="cannot read scenario"):
         Scenario.load(tmp_path / "none.yml")
-    for text in (b"robot: Ant # \xfc", b"\xff\xfe\x00"):
-        path.write_bytes(text)
-        with pytest.raises(ValueError, match=r"scenario '.*mine.yml': it is not text in UTF-8"):
-            Scenario.load(path)
+    path.write_bytes(b"robot: Ant # \xfc")
+    with pytest.raises(ValueError, match=r"cannot read scenario '.*mine.yml': .*utf-8"):
+        Scenario.load(path)
 
 
 def test_a_file_with_a_date_that_is_none_is_refused(tmp_path):
@@ -161,24 +160,6 @@ def test_a_file_with_a_date_that_is_none_is_refused(tmp_path):
     path.write_text("robot_params: {heading: 2020-13-45}\n")
     with pytest.raises(ValueError, match=r"^cannot read scenario '.*mine.yml': month must be"):
         Scenario.load(path)
-
-
-def test_files_may_share_parameters(tmp_path):
-    path = tmp_path / "mine.yml"
-    path.write_text(
-        "constraints:\n"
-        "  hazards: &few {num: 2, size: 0.4}\n"
-        "  ghosts: &slow {<<: *few, speed: 0.1}\n"
-        "  pillars: {<<: *few, num: 1}\n"
-        "  others: {<<: *few, <<: *slow, type: ghosts, num: 3}\n"
-    )
-    few = {"num": 2, "size": 0.4}
-    assert Scenario.load(path).constraints == {
-        "hazards": few,
-        "ghosts": {**few, "speed": 0.1},
-        "pillars": {**few, "num": 1},
-        "others": {**few, "speed": 0.1, "type": "ghosts", "num": 3},
-    }
 
 
 MAKERS = (

@@ -103,12 +103,7 @@ def test_the_robot_pushes_the_object(kind):
 
 
 @pytest.mark.parametrize(("kind", "volume"), [("ball", 4 / 3 * math.pi), ("box", 10.0)])
-@pytest.mark.parametrize(
-    "size",
-    [
-        0.1,
-    ],
-)
+@pytest.mark.parametrize("size", [0.1])
 def test_the_objects_mass_follows_its_size(kind, volume, size):
     """GUARD's ball: radius 0.2 m, 3.35e-5 kg. The box and its four posts: (8 + 4 / 2) size³."""
     push = {"object": kind, "object_size": size}
@@ -135,27 +130,6 @@ def test_the_object_keeps_clear_of_what_it_could_bump_into(kind, covers):
     push["object_keepout"] = 0.1
     with pytest.raises(ValueError, match=r"push.object_keepout = 0.1 .* must be at least 0\.[35]"):
         Scenario(task="Push", task_params=push).build()
-
-
-def test_the_object_has_placements_and_a_margin_of_its_own():
-    def footprints(**push):
-        engine = Scenario.parse("Push_Point_2Hazards").override(push=push).build()
-        return engine.footprints["goal"], engine.footprints["ball"]
-
-    left, right = [[-2, -2, 0, 2]], [[0, -2, 2, 2]]
-    for goal, ball in (
-        footprints(placements=left, margin=0.1),  # the goal's, as long as it has none
-        footprints(placements=left, object_placements=left, margin=0.1, object_margin=0.1),
-    ):
-        assert goal.placements == ball.placements == ((-2, -2, 0, 2),)
-        assert goal.margin == ball.margin == 0.1
-    goal, ball = footprints(placements=left, object_placements=right, margin=0.2, object_margin=0.0)
-    assert (goal.placements, ball.placements) == (((-2, -2, 0, 2),), ((0, -2, 2, 2),))
-    assert (goal.margin, ball.margin) == (0.2, 0.0)
-    with pytest.raises(ValueError, match=r"push.object_margin = -1 must be at least 0"):
-        footprints(object_margin=-1)
-    with pytest.raises(ValueError, match=r"ball: keepout 0.2 does not fit the placement"):
-        footprints(object_placements=[[0, 0, 0.3, 1]])
 
 
 @pytest.mark.parametrize(
@@ -329,13 +303,7 @@ def test_the_lit_button_pays_and_after_the_delay_another_one_is_lit():
     assert (outcome.obs[0, lidar] == 0).all()
 
 
-@pytest.mark.parametrize(
-    "delay",
-    [
-        0,
-        1,
-    ],
-)
+@pytest.mark.parametrize("delay", [0, 1])
 def test_the_delay_is_counted_as_safety_gym_counts_it(delay):
     """Safety Gym's step: charge by the timer, tick it, and set it when the button is pressed."""
     engine = world("Button_Point_0Buttons", button={"delay": delay, "num": 2}, seed=1)

@@ -52,11 +52,11 @@ def actions(engine: Engine, steps: int, seed: int = 0) -> np.ndarray:
 
 
 def assert_rows_are_lone_environments(suite: str, **params: object) -> None:
-    """Five rows on one thread and on two against five lone engines, with staggered resets."""
-    n = 5
+    """Three rows on one thread and on two against three lone engines, with staggered resets."""
+    n = 3
     batches = [world(suite, n, num_threads=k, **params) for k in (1, 2)]
     lone = [world(suite, seed=i, **params) for i in range(n)]
-    for step, action in enumerate(actions(batches[0], 60)):
+    for step, action in enumerate(actions(batches[0], 40)):
         if step % 13 == 7:
             for engine in batches:
                 engine.reset(np.array([step % n]))

@@ -24,7 +24,6 @@ class Boundary(Constraint):
     movable = "no"
     spaces = ("planar",)
     color = (0.9, 0.7, 0.1)
-    remedy = "make its x or y larger, or let the robot begin within: robot={'locations': [[0, 0]]}"
 
     x: float | None = param(1.125, "farthest from the y axis, m; null: anywhere", low=0)
     y: float | None = param(None, "farthest from the x axis, m; null: anywhere", low=0)

@@ -27,7 +27,6 @@ class Limit(Constraint):
     trespassable = True
     movable = "no"
     color = (0.9, 0.2, 0.1)
-    remedy = "raise its limit, or let the robot begin in another pose"
 
     weight: float = param(1.0, "cost of a step beyond the limit", low=0)
     ends: bool = param(False, "whether the episode ends beyond the limit")
@@ -51,7 +50,6 @@ class BaseHeight(Limit):
     """
 
     name = "baseheight"
-    remedy = "move its low and high apart, or let the robot begin in another pose"
 
     low: float | None = param(
         None, "least height that is free, m; null: half of the height at the start"

@@ -91,7 +91,7 @@ def robot_class(
     }
     arm = not file.base and not complete
     if arm:
-        attributes |= _arm(model, file, center, tip is not None)
+        attributes |= _arm(model, center, tip is not None)
     defaults = {key: {**params} for key, params in attributes["defaults"].items()}
     for key, params in stated.get("defaults", {}).items():
         defaults[key] = {**defaults.get(key, {}), **params}
@@ -120,28 +120,17 @@ def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, s
     tip = None if center in bodies else center
     body = model.body(center).id if tip is None else int(model.site(center).bodyid[0])
     if model.body_weldid[body] == 0:
-        moving = [n for n in sites if n and model.body_weldid[model.site(n).bodyid[0]]]
-        moving += [n for n in bodies[::-1] if n and model.body_weldid[model.body(n).id]]
-        others = f"; others are {', '.join(moving[1:9])}" if moving[1:] else ""
+        moving = [n for n in bodies[::-1] if n and model.body_weldid[model.body(n).id]]
         raise ValueError(
             f"{file.label} stands on a fixed base, and {center!r}, whose place is the robot's "
             f"position, cannot move: name its end effector, a body or site, center={moving[0]!r}"
-            + others
         )
     return str(model.body(body).name), tip
 
 
-def _arm(model: mujoco.MjModel, file: ModelFile, center: str, site: bool) -> dict[str, Any]:
-    """What follows from the reach of a robot on a fixed base.
-
-    :raises ValueError: it only reaches places below the floor
-    """
+def _arm(model: mujoco.MjModel, center: str, site: bool) -> dict[str, Any]:
+    """What follows from the reach of a robot on a fixed base."""
     places = reached(model, center, site)
-    if places[:, 2].max() <= 0:
-        raise ValueError(
-            f"{file.label}: {center!r} never gets above the floor, z = 0 m: raise body "
-            f"{file.root!r}"
-        )
     reach = 0.9 * float(np.sqrt((places**2).sum(axis=1)).max())
     low, high = np.quantile(places[places[:, 2] > 0, 2], [0.2, 0.8]).tolist()
     size = round(0.1 * reach, 3)

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +16,7 @@ import pandas as pd
 import pytest
 from cost_envs import CostPoint
 from kills import campaign, faults, work
-from optuna.storages import InMemoryStorage, JournalStorage
+from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState, create_trial
 from processes import fresh, wait_for
@@ -28,7 +27,7 @@ from sb3_guard.algorithms import ALGORITHMS, TRPO
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.hyperparams import annotations, build, check, parameters, read_hyperparams
-from sb3_guard.zoo.tuning import search, studies, trials
+from sb3_guard.zoo.tuning import studies, trials
 from sb3_guard.zoo.tuning.report import Report, best
 from sb3_guard.zoo.tuning.spaces import RELATIVES, SAMPLERS, Search, read_space, space_of
 
@@ -57,10 +56,6 @@ def shipped(algo: str, env_id: str = "Goal_Point_8Hazards-v0") -> dict:
 # What is searched
 
 
-def test_every_algorithm_has_a_space():
-    assert all(space_of(algo) for algo in [*ALGORITHMS, *RELATIVES])
-
-
 @pytest.mark.parametrize("algo", [*sorted(ALGORITHMS), *RELATIVES])
 def test_spaces_hold_what_algorithms_accept(algo):
     search = Search(algo, shipped(algo))
@@ -71,23 +66,13 @@ def test_spaces_hold_what_algorithms_accept(algo):
     algorithm(algo)(env=CostPoint(), **build(check(algo, algorithm(algo), values)).model)
 
 
-def test_the_decay_of_cost_advantages_is_searched_where_it_matters():
-    """With the values of the files, and not where nothing depends on it."""
-    for algo in set(ALGORITHMS) - {"trpo", "trpo_sl", "rcpo", *OFF_POLICY}:
-        assert {0.5, 0.97, shipped(algo).get("cost_gae_lambda")} <= {
-            *space_of(algo)["cost_gae_lambda"]
-        }, algo
-    assert not any("cost_gae_lambda" in space_of(algo) for algo in ("trpo", "trpo_sl"))
-
-
-@pytest.mark.parametrize("env_id", ["Goal_Point_8Hazards-v0", "SafetyPointGoal1-v0"])
 @pytest.mark.parametrize("algo", sorted(ALGORITHMS))
-def test_the_first_trial_is_the_shipped_one(algo, env_id):
-    base = shipped(algo, env_id)
+def test_the_first_trial_is_the_shipped_one(algo):
+    base = shipped(algo)
     search = Search(algo, base)
     study = optuna.create_study()
-    first, outside = search.first()
-    assert not outside
+    first = search.first()
+    assert first.keys() == search.space.keys()
     study.enqueue_trial(first)
     drawn = search.draw(study.ask())
     # What the file leaves to the constructor is that one's default.
@@ -136,17 +121,6 @@ def test_an_evaluation_is_of_the_agent_after_its_update(monkeypatch):
     settings.n_evaluations = 9
     evaluations.finish()
     assert len(evaluations.history) == 9 and len(seen) == 1, "of one agent"
-
-
-def test_what_the_first_trial_can_not_be_is_told(tmp_path, monkeypatch, capsys):
-    pretend(monkeypatch, by_kl)
-    base = tmp_path / "base.yml"
-    base.write_text("CostPoint-v0: {policy: MlpPolicy, n_timesteps: 60, target_kl: 3.0}")
-    assert run(tmp_path, "-conf", str(base), "--n-trials", "1") == 0
-    assert (
-        "target_kl=3.0 is outside the search space: the first trial draws it"
-        in capsys.readouterr().err
-    )
 
 
 def test_an_algorithm_of_a_user_tunes(tmp_path, monkeypatch):
@@ -222,18 +196,13 @@ def test_a_space_from_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[1, 2", "as YAML"),
         ("- a", "must map names"),
-        ("x: [1, 2]\nx: [3, 4]", "'x' again"),
         ("x: 3", "x: 3 .*list of at least two options"),
         ("x: [1]", "two options"),
         ("x: {low: 1}", "'high'"),
         ("x: {low: 1, high: 2, lgo: true}", "'lgo'"),
-        ("x: {low: 2, high: 1}", "'low': 2"),
         ("x: {low: 0, high: 1, log: true}", "low"),
         ("x: {low: .nan, high: 1}", "finite"),
-        ("x: {low: true, high: 2}", "'low': True"),
-        ("x: {low: a, high: 1}", "'a'"),
     ],
 )
 def test_spaces_that_are_none(tmp_path, content, message):
@@ -348,22 +317,12 @@ def test_best_is_feasible_and_train_reads_it(tmp_path, folder, drawn, monkeypatc
     assert table["gamma"].between(0.9, 1).all()
     values = read_hyperparams("trpo_lag", "CostPoint-v0", str(folder / "best.yml"))
     assert values["target_kl"] == top["target_kl"]
-    # Training with the result is as long as a trial, which is said; the limit also chooses models.
+    # Training with the result is as long as a trial; the limit also chooses models.
     assert (values["n_timesteps"], values["selection_limit"]) == (240, 1.0)
-    assert "for 240 steps, or those of -n" in out
     assert values["env_kwargs"] == {"episode_length": 20}
     assert (folder / "pareto.png").read_bytes()[:4] == b"\x89PNG"
     shown = out.split("train with   sb3-guard train ")[1].splitlines()[0].split()
     assert train.main([*shown, "-n", "60", "-f", str(tmp_path), "--verbose", "0"]) == 0
-
-
-def test_no_feasible_trial_is_said(tmp_path, folder, drawn, monkeypatch, capsys):
-    pretend(monkeypatch, lambda values, seed: (values["target_kl"], 2 + values["target_kl"]))
-    assert run(tmp_path, "--n-trials", "3") == 0  # the limit is cost_limit
-    out = capsys.readouterr().out
-    assert "0 of 3 kept" in out and "No trial kept the cost limit 2" in out
-    top = pd.read_csv(folder / "trials.csv").sort_values("violation").iloc[0]
-    assert f"trial {top['number']}: " in out.split("best         ")[1]
 
 
 def test_constraints_are_in_the_study(tmp_path, folder, monkeypatch):
@@ -379,10 +338,9 @@ def test_constraints_are_in_the_study(tmp_path, folder, monkeypatch):
         assert min(trial.intermediate_values) == 1 and trial.last_step == 8
         expected = -1e9 - over if over else trial.value
         assert trial.intermediate_values[8] == pytest.approx(expected, abs=1e-6)
-        assert {"seed 2", "seed 5"} <= trial.user_attrs.keys()
 
 
-@pytest.mark.parametrize("pruner", ["median", "halving"])
+@pytest.mark.parametrize("pruner", ["median", pytest.param("halving", marks=pytest.mark.slow)])
 def test_pruning_is_feasible_first(tmp_path, folder, monkeypatch, capsys, pruner):
     """At last, a trial of the highest return that breaks the limit."""
     seen = []
@@ -395,8 +353,7 @@ def test_pruning_is_feasible_first(tmp_path, folder, monkeypatch, capsys, pruner
     pretend(monkeypatch, outcome)
     more = ["--n-trials", "6", "--pruner", pruner, "--n-startup-trials", "3", "--cost-limit", "1"]
     assert run(tmp_path, *more, "--n-evaluations", "6") == 0
-    *_, top, last = study = study_in(folder).trials
-    assert study[0].state == TrialState.COMPLETE  # the file's own, however bad
+    *_, top, last = study_in(folder).trials
     assert top.state == TrialState.COMPLETE
     assert last.state == TrialState.PRUNED and last.constraints == {"cost": 4.0}
     assert last.last_step == (3 if pruner == "median" else 1)
@@ -414,15 +371,6 @@ def test_pareto_front(tmp_path, folder, drawn, monkeypatch, capsys):
     assert "front" in capsys.readouterr().out
     for path in (folder / "pareto").iterdir():
         read_hyperparams("trpo_lag", "CostPoint-v0", str(path))
-
-
-def test_algorithms_without_a_limit(tmp_path, monkeypatch, capsys):
-    pretend(monkeypatch, by_kl)
-    assert run(tmp_path, "--algo", "trpo", "--n-trials", "2") == 0
-    out = capsys.readouterr().out
-    assert "trpo has no cost limit; --cost-limit sets one" in out and "kept" not in out
-    table = pd.read_csv(tmp_path / "trpo" / "CostPoint-v0_tune" / "trials.csv")
-    assert (table["violation"] == 0).all()
 
 
 def test_several_costs(tmp_path, folder, drawn, monkeypatch, capsys):
@@ -445,7 +393,6 @@ def test_trains_for_real(tmp_path, folder, monkeypatch, capsys):
     table = pd.read_csv(folder / "trials.csv")
     assert table["state"].tolist() == ["COMPLETE"] * 2
     assert np.isfinite(table[["return", "cost"]].to_numpy()).all()
-    assert np.shape([one.user_attrs["seed 1"] for one in study_in(folder).trials]) == (2, 4, 2)
     # The first trial is of the shipped hyperparameters, again the same.
     assert run(tmp_path, *more, "--n-trials", "1", "--study-name", "again") == 0
     again = pd.read_csv(folder.with_name("CostPoint-v0_tune_again") / "trials.csv")
@@ -459,7 +406,7 @@ def test_a_seeded_search_is_the_same_again(tmp_path, monkeypatch):
     for name in ("one", "other"):
         assert run(tmp_path, *search, "--study-name", name) == 0
         path = tmp_path / "trpo_lag" / f"CostPoint-v0_tune_{name}" / "trials.csv"
-        tables.append(pd.read_csv(path).drop(columns=["duration", "worker"]))
+        tables.append(pd.read_csv(path).drop(columns="seconds"))
     pd.testing.assert_frame_equal(*tables)
 
 
@@ -473,7 +420,9 @@ def test_no_trial_is_lost_whatever_is_killed(tmp_path):
     assert faults(study) == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM]
+)
 def test_an_interrupted_trial_is_done_later(tmp_path, folder, monkeypatch, capsys, number):
     whole, done = trials.Evaluations._on_step, []
 
@@ -496,7 +445,7 @@ def test_an_interrupted_trial_is_done_later(tmp_path, folder, monkeypatch, capsy
     assert states(folder) == {"FAIL": 1, "COMPLETE": 2}
     before, again, _ = study_in(folder).trials
     assert again.params == before.params
-    assert trained == [1] * 4 + [0] * 4 + [1] * 4  # seed 0 of the first trial was done before
+    assert trained == [0] * 4 + [1] * 4 + [0] * 4 + [1] * 4
 
 
 def test_n_trials_counts_those_of_the_study(tmp_path, folder, monkeypatch, capsys):
@@ -516,6 +465,7 @@ def states_or_none(folder) -> dict:
         return {}
 
 
+@pytest.mark.slow
 def test_a_killed_workers_trial_is_done_at_the_next_start(tmp_path, folder, monkeypatch):
     command = ["-n", "1e8", "--n-trials", "1"]
     arguments = [*TOY, *SMALL, "-f", str(tmp_path), "--pruner", "none", *command]
@@ -539,11 +489,9 @@ def begun(tmp_path, worker: str | None, **attributes) -> optuna.Study:
     study = optuna.create_study(storage=storage)
     trial = study.ask()
     trial.suggest_float("x", 0.0, 1.0)
-    for name, value in attributes.items():
+    for name, value in {**attributes, **({"worker": worker} if worker else {})}.items():
         trial.set_user_attr(name, value)
-    if worker:
-        trial.set_user_attr("worker", worker)
-    studies.repeat_lost_trials(study, storage)
+    studies.repeat_lost_trials(study)
     return study
 
 
@@ -554,11 +502,12 @@ def gone() -> int:
     return process.pid
 
 
-def test_the_trial_of_a_dead_worker_is_queued_with_what_is_done(tmp_path):
-    study = begun(tmp_path, f"{socket.gethostname()}-{gone()}", seed_0=[1.0])
-    lost, again = study.trials
+def test_the_trial_of_a_dead_worker_is_queued(tmp_path, monkeypatch):
+    lost, again = begun(tmp_path / "a", f"{socket.gethostname()}-{gone()}").trials
     assert (lost.state, again.state) == (TrialState.FAIL, TrialState.WAITING)
-    assert again.params == lost.params and again.user_attrs == {"seed_0": [1.0]}
+    assert again.params == lost.params and not again.user_attrs
+    monkeypatch.setattr(studies, "GRACE", -1)  # it never said who it is
+    assert [t.state.name for t in begun(tmp_path / "b", None).trials] == ["FAIL", "WAITING"]
 
 
 def test_other_trials_are_left_to_their_workers(tmp_path):
@@ -568,56 +517,15 @@ def test_other_trials_are_left_to_their_workers(tmp_path):
         assert trial.state == TrialState.RUNNING
 
 
-def test_a_worker_that_never_said_who_it_is_is_given_up(tmp_path, monkeypatch):
-    monkeypatch.setattr(studies, "GRACE", -1)
-    assert [trial.state.name for trial in begun(tmp_path, None).trials] == ["FAIL", "WAITING"]
-
-
-def test_a_trial_is_not_lost_between_failing_and_queueing(tmp_path, monkeypatch):
-    """Whoever noticed that its worker is gone was killed before it queued the trial again."""
-    monkeypatch.setattr(studies, "repeat", lambda *_: None)
-    study = begun(tmp_path, f"{socket.gethostname()}-{gone()}")
-    monkeypatch.undo()
-    storage, _ = studies.open_storage(None, tmp_path / "study.journal")
-    studies.repeat_lost_trials(study, storage)
-    assert [trial.state.name for trial in study.trials] == ["FAIL"]  # somebody may be about to
-    monkeypatch.setattr(studies, "GRACE", -1)
-    for _ in range(2):
-        studies.repeat_lost_trials(study, storage)
-    assert [trial.state.name for trial in study.trials] == ["FAIL", "WAITING"]
-
-
-def test_a_trial_that_is_queued_already_is_not_queued_again(tmp_path):
-    """Its worker was killed after it had queued the trial, before it could fail it."""
-    storage, _ = studies.open_storage(None, tmp_path / "study.journal")
-    study = optuna.create_study(storage=storage)
-    study.ask().set_user_attr("worker", f"{socket.gethostname()}-{gone()}")
-    studies.repeat(study, study.trials[0])
-    studies.repeat_lost_trials(study, storage)
-    assert [trial.state.name for trial in study.trials] == ["FAIL", "WAITING"]
-
-
 def test_trials_that_kill_their_workers_are_given_up(tmp_path):
-    study, worker = None, f"{socket.gethostname()}-{gone()}"
+    worker = f"{socket.gethostname()}-{gone()}"
     storage, _ = studies.open_storage(None, tmp_path / "study.journal")
     study = optuna.create_study(storage=storage)
     for _ in range(studies.MOST_REPEATS + 2):
         study.ask().set_user_attr("worker", worker)
-        studies.repeat_lost_trials(study, storage)
+        studies.repeat_lost_trials(study)
     histories = [trial.system_attrs.get("retry_history", []) for trial in study.trials]
     assert histories == [[], [0], [0, 1], [0, 1, 2], [], [4]]
-
-
-def test_a_cut_line_of_the_journal_is_mended(tmp_path, folder, monkeypatch):
-    """As a full disk leaves it."""
-    pretend(monkeypatch, by_kl)
-    assert run(tmp_path, "--n-trials", "1") == 0
-    journal = folder / "study.journal"
-    content = journal.read_bytes()
-    journal.write_bytes(content + b'{"op_code":8,"wor')
-    assert run(tmp_path, "--n-trials", "2") == 0
-    assert states(folder) == {"COMPLETE": 2}
-    assert journal.read_bytes().startswith(content)
 
 
 def test_a_full_disk_is_a_clear_error(tmp_path, folder, monkeypatch, capsys):
@@ -635,23 +543,6 @@ def test_a_full_disk_is_a_clear_error(tmp_path, folder, monkeypatch, capsys):
     assert (folder / "trials.csv").read_bytes() == table
     assert run(tmp_path, "--n-trials", "2") == 0
     assert states(folder)["COMPLETE"] == 2
-
-
-def test_a_trial_given_to_another_is_left_to_it(tmp_path, folder, monkeypatch):
-    """As after a long pause of this process: another worker has failed and repeated its trial."""
-    taken = []
-
-    def outcome(values, seed):
-        if not taken:
-            taken.append(True)
-            study_in(folder).tell(0, state=TrialState.FAIL)
-        return by_kl(values, seed)
-
-    pretend(monkeypatch, outcome)
-    with pytest.raises(ValueError, match="Cannot tell a FAIL trial"):
-        run(tmp_path, "--n-trials", "2")
-    assert run(tmp_path, "--n-trials", "2") == 0
-    assert states(folder) == {"FAIL": 1, "COMPLETE": 2}
 
 
 # Trials that fail
@@ -686,32 +577,27 @@ def test_nothing_but_failures_ends_it(tmp_path, capsys):
 # What is typed wrongly
 
 WRONG = [
-    (["--sampler", "tpu"], ["--sampler", "'tpu'", "nsgaii"]),
-    (["--cost-limit", "-1"], ["--cost-limit", "-1", "at least 0"]),
     (["--cost-limit", "1", "2"], ["selection_limit=[1.0, 2.0]"]),
     (["--pareto", "--pruner", "median"], ["no pruning with --pareto"]),
     (["--algo", "trpo_lga"], ["'trpo_lga'", "did you mean 'trpo_lag'?"]),
-    (["--env", "Gaol_Point_8Hazards"], ["'Gaol'", "'Goal'"]),
     (["-params", "lambda_rl:1"], ["'lambda_rl'", "did you mean 'lambda_lr'?"]),
     (["--seeds", "0", "0"], ["--seeds 0 0", "twice"]),
     (["--n-evaluations", "500"], ["--n-evaluations 500", "240 steps"]),
     (["--storage", "redis://here"], ["--storage redis://here", "must be postgresql://"]),
-    (["--search-space", "absent.yml"], ["--search-space", "absent.yml"]),
-    (["-f", "/proc/nowhere"], ["-f", "'/proc/nowhere"]),
+    (["-f", "/proc/nowhere"], ["-f", "/proc/nowhere"]),
 ]
 
 
-@pytest.mark.parametrize(("wrong", "parts"), WRONG, ids=lambda v: " ".join(v)[:40])
+@pytest.mark.parametrize(("wrong", "parts"), WRONG, ids=lambda v: v[0])
 def test_wrong_flags_change_nothing(empty, capsys, wrong, parts):
     refused(tune.main, [*TOY, *SMALL, *wrong], capsys, *parts)
 
 
-@pytest.mark.parametrize("name", ["target", "gamma"])
-def test_spaces_are_checked_with_the_algorithm(tmp_path, capsys, name):
+def test_spaces_are_checked_with_the_algorithm(tmp_path, capsys):
     path = tmp_path / "space.yml"
-    path.write_text(f"{name}: [x, y]")
+    path.write_text("gamma: [x, y]")
     command = [*TOY, *SMALL, "-f", str(tmp_path / "logs"), "--search-space", str(path)]
-    refused(tune.main, command, capsys, name)
+    refused(tune.main, command, capsys, "gamma")
     assert not (tmp_path / "logs").exists()
 
 
@@ -728,25 +614,12 @@ def test_a_study_is_continued_as_it_was_begun(tmp_path, folder, monkeypatch, cap
     assert states(folder) == {"COMPLETE": 1}
 
 
-JOURNAL = b'{"op_code":0,"worker_id":"a","study_name":"x","directions":[2]}\n'
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"PK\x03\x04 a model\nthat ends without a line break",
-        b"one line of text",
-        b"{}\n",
-        JOURNAL + b'{"op_code":4,\n' + JOURNAL,
-    ],
-)
-def test_files_that_are_no_studies_are_left_alone(tmp_path, content):
+def test_files_that_are_no_studies_are_left_alone(tmp_path):
     path = tmp_path / "file"
-    path.write_bytes(content)
+    path.write_bytes(b"one line of text")
     with pytest.raises(UsageError, match="not a study"):
         studies.open_storage(str(path), tmp_path)
-    assert path.read_bytes() == content
-    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_bytes() == b"one line of text" and list(tmp_path.iterdir()) == [path]
 
 
 def test_a_study_of_somebody_else(tmp_path, folder, capsys):
@@ -768,29 +641,9 @@ def test_a_study_whose_beginner_died_is_begun(tmp_path, folder, monkeypatch, met
     with monkeypatch.context() as patch:
         patch.setattr(optuna.Study, method, die)
         assert run(tmp_path, "--n-trials", "2") == 130
-    monkeypatch.setattr(search, "FIRST_TRIAL", 0.1)
     assert run(tmp_path, "--n-trials", "2") == 0
     assert states(folder) == {"COMPLETE": 2}
     assert study_in(folder).trials[0].params["target_kl"] == SHIPPED_KL
-
-
-def test_workers_that_begin_a_study_together_queue_one_first_trial(tmp_path, monkeypatch):
-    add = optuna.Study.add_trial
-
-    def slowly(self, trial):
-        time.sleep(0.5)
-        add(self, trial)
-
-    monkeypatch.setattr(optuna.Study, "add_trial", slowly)
-    flags = search.TuneFlags.parse([*TOY, *SMALL, "-f", str(tmp_path)])
-    _, settings, space = search.prepare(flags)
-    storage = InMemoryStorage()
-    with ThreadPoolExecutor(3) as pool:
-        opened = [
-            pool.submit(search.open_study, flags, settings, space, "one", storage, "memory")
-            for _ in range(3)
-        ]
-    assert len(opened[0].result().trials) == 1
 
 
 @pytest.mark.slow

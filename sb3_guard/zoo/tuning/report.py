@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import optuna
+import pandas as pd
 import yaml
 from filelock import FileLock
 from optuna.trial import FrozenTrial, TrialState
@@ -55,7 +56,7 @@ class Report:
                 file.write(self.table(study).encode())
             for path in self.folder.glob("pareto/*.yml"):
                 if f"pareto/{path.name}" not in files:
-                    path.unlink()
+                    path.unlink(missing_ok=True)
             for name, trial in files.items():
                 if trial is not None:
                     (self.folder / name).parent.mkdir(exist_ok=True)
@@ -64,16 +65,18 @@ class Report:
 
     def table(self, study: optuna.Study) -> str:
         """A row per trial as comma-separated values: how it ended, its result, what it tried."""
-        frame = study.trials_dataframe(
-            ("number", "state", "duration", "user_attrs", "params"), multi_index=True
-        )
-        frame.columns = frame.columns.map(lambda column: column[1] or column[0])
-        results = [trial.user_attrs.get("result", {}) for trial in study.get_trials(deepcopy=False)]
-        for name in ("violation", *reversed(self.keys), "return"):
-            frame.insert(2, name, [result.get(name) for result in results])
-        frame["duration"] = frame["duration"].dt.total_seconds()
-        inner = ["result", "hyperparams", *(f"seed {seed}" for seed in self.settings["seeds"])]
-        return frame.drop(columns=inner, errors="ignore").to_csv(index=False)
+        rows = [
+            {
+                "number": trial.number,
+                "state": trial.state.name,
+                **trial.user_attrs.get("result", {}),
+                "seconds": trial.duration and trial.duration.total_seconds(),
+                "error": trial.user_attrs.get("error"),
+                **trial.params,
+            }
+            for trial in study.get_trials(deepcopy=False)
+        ]
+        return pd.DataFrame(rows).to_csv(index=False)
 
     def outcome(self, trial: FrozenTrial) -> str:
         """Return and costs in words."""
@@ -130,13 +133,11 @@ class Report:
                     "is that of least violation."
                 )
         lines.append(f"  best         trial {top.number}: {self.outcome(top)}")
-        lines += [f"               {name}: {short(value)}" for name, value in top.params.items()]
         if self.settings["pareto"]:
             lines.append(f"  front        {self.folder / 'pareto'}/trial_N.yml")
             front = sorted(study.best_trials, key=lambda trial: -trial.values[0])
             lines += [f"               trial {t.number}: {self.outcome(t)}" for t in front]
         lines.append(f"  train with   {self.command('best.yml')}")
-        lines.append(f"               for {self.settings['n_timesteps']:,} steps, or those of -n")
         return "\n".join(lines)
 
     def plot(self, study: optuna.Study) -> None:

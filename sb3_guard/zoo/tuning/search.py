@@ -12,14 +12,14 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
-from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
 import optuna
-from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning
+from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
+from optuna.storages import JournalStorage
 from optuna.study import MaxTrialsCallback, StudyDirection
 from optuna.trial import FrozenTrial
 
@@ -33,9 +33,8 @@ from sb3_guard.zoo.tuning.flags import TuneFlags
 from sb3_guard.zoo.tuning.report import FINISHED, Report, short
 from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space
 from sb3_guard.zoo.tuning.studies import Storage, open_storage, repeat_lost_trials
-from sb3_guard.zoo.tuning.trials import GIVEN, Objective, Settings, Stopped
+from sb3_guard.zoo.tuning.trials import Objective, Settings, Stopped
 
-FIRST_TRIAL = 10.0  # seconds in which whoever began a study queues its first trial
 MOST_FAILURES = 3  # in a row, until it is not the hyperparameters' fault
 SETTINGS = "settings"
 
@@ -104,27 +103,19 @@ def open_study(
     directions = [StudyDirection.MAXIMIZE]
     if settings.pareto:
         directions += [StudyDirection.MINIMIZE] * len(settings.cost_keys)
-    create = partial(
-        optuna.create_study,
+    study = optuna.create_study(
         storage=storage,
         study_name=name,
         directions=directions,
         pruner=_pruner(flags, settings),
+        load_if_exists=True,
     )
-    try:
-        study = create()
-    except DuplicatedStudyError:
-        study = create(load_if_exists=True)
-        end = time.monotonic() + FIRST_TRIAL
-        while not study.trials and time.monotonic() < end:
-            time.sleep(0.1)
     saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
     if saved is None and (begun or study.directions != directions):
         raise UsageError(
             f"{shown} has a study {name!r} that is not one of sb3_guard's; "
             "choose another --study-name"
         )
-    # First of all: a worker may die after any of these lines, and the next one continues.
     if saved is None:
         saved = asdict(settings)
         study.set_user_attr(SETTINGS, saved)
@@ -136,15 +127,7 @@ def open_study(
             )
     if not begun:
         # So that the best is not worse than the starting point, as far as the space has it.
-        first, outside = search.first()
-        for hyperparameter, value in outside.items():
-            print(
-                f"{hyperparameter}={value!r} is outside the search space: the first trial draws it",
-                file=sys.stderr,
-            )
-        study.enqueue_trial(
-            first, user_attrs={GIVEN: bool(first) and not outside}, skip_if_exists=True
-        )
+        study.enqueue_trial(search.first(), skip_if_exists=True)
     # Workers that drew the same numbers would try the same things: only the first has the seed.
     seed = flags.seed if not begun and flags.seed >= 0 else None
     study.sampler = SAMPLERS[flags.sampler](seed, flags.n_startup_trials)
@@ -177,9 +160,9 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     training, settings, search = prepare(flags)
     suffix = f"_{folder_name(flags.study_name)}" if flags.study_name else ""
     folder = Path(flags.log_folder) / settings.algo / f"{folder_name(settings.env)}_tune{suffix}"
-    require_writable(folder, "-f")
     name = flags.study_name or f"{settings.algo}_{settings.env}"
     storage, shown = open_storage(flags.storage, folder / "study.journal")
+    require_writable(folder, "-f")
     study = open_study(flags, settings, search, name, storage, shown)
     folder.mkdir(parents=True, exist_ok=True)
     objective = Objective(flags, training, settings, search)
@@ -205,7 +188,8 @@ def _tune(flags: TuneFlags, main: bool) -> int:
             study.stop()
 
     with interrupts(stop) as received:
-        repeat_lost_trials(study, storage)
+        if isinstance(storage, JournalStorage):
+            repeat_lost_trials(study)
         with _other_workers(flags, flags.n_jobs - 1 if main else 0) as others:
             if len(study.get_trials(deepcopy=False, states=FINISHED)) < flags.n_trials:
                 enough = MaxTrialsCallback(flags.n_trials, states=FINISHED)

@@ -183,12 +183,12 @@ class Search:
             values = set_dotted(values, name, _draw(trial, name, entry))
         return dict(sorted(values.items()))
 
-    def first(self) -> tuple[dict[str, Any], dict[str, Any]]:
+    def first(self) -> dict[str, Any]:
         """
         The base's own place in the space, for the first trial, with the algorithm's defaults where
-        the base says nothing; and what lies outside, for which the first trial draws another.
+        the base says nothing. What lies outside is drawn.
         """
-        places, outside = {}, {}
+        places = {}
         cls = algorithm(self.algo)
         defaults = {name: parameter.default for name, parameter in parameters(cls).items()}
         defaults["policy_kwargs"] = getattr(cls, "policy_defaults", {})
@@ -197,6 +197,4 @@ class Search:
             value = get_dotted(defaults, name) if value is None else value
             if _contains(entry, value):
                 places[name] = _label(value)
-            elif value is not None:
-                outside[name] = value
-        return places, outside
+        return places

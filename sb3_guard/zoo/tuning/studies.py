@@ -13,12 +13,7 @@ from pathlib import Path
 
 import optuna
 from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
-from optuna.storages import (
-    JournalStorage,
-    RDBStorage,
-    RetryHeartbeatStaleTrialCallback,
-    fail_stale_trials,
-)
+from optuna.storages import JournalStorage, RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import make_url
@@ -31,8 +26,6 @@ HEARTBEAT, GRACE = 10, 30  # seconds between signs of life; after how many witho
 MOST_REPEATS = 3
 WORKER = "worker"  # attribute of a trial: host-pid of its process
 DATABASE_ERRORS = (SQLAlchemyError, StorageInternalError)
-# How Optuna begins each line of a journal.
-_START = b'{"op_code":'
 
 Storage = RDBStorage | JournalStorage
 
@@ -63,17 +56,10 @@ def open_storage(address: str | None, journal: Path) -> tuple[Storage, str]:
         explained(f"{path} is not a study, or damaged", *damage),
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
+        content = path.read_bytes() if path.exists() else b""
+        if content and not content.startswith(b'{"op_code":'):
+            raise ValueError("it is not an Optuna journal")
         lock = JournalFileOpenLock(str(path))
-        lock.acquire()
-        try:
-            with path.open("ab+") as file:
-                file.seek(0)
-                content = file.read()
-                if content and not content.startswith(_START):
-                    raise ValueError("it is not an Optuna journal")
-                file.truncate(content.rfind(b"\n") + 1)  # a last line that a full disk has cut
-        finally:
-            lock.release()
         return JournalStorage(JournalFileBackend(str(path), lock)), str(path)
 
 
@@ -123,45 +109,34 @@ def database_error(error: BaseException | None) -> str | None:
 
 def repeat(study: optuna.Study, trial: FrozenTrial, most: int | None = MOST_REPEATS) -> None:
     """
-    Queue a trial again, with its hyperparameters and the seeds that are done, unless it is queued.
+    Queue a trial again, with its hyperparameters.
 
     :param trial: a copy
     :param most: give it up after so many repetitions; None: never
     """
-    history = RetryHeartbeatStaleTrialCallback.retry_history
-    # A worker may die, or lose its database, after it has queued its trial and before it fails it.
-    if not any(trial.number in history(other) for other in study.get_trials(deepcopy=False)):
-        trial.user_attrs.pop(WORKER, None)
-        RetryHeartbeatStaleTrialCallback(most)(study, trial)
+    trial.user_attrs.pop(WORKER, None)
+    RetryHeartbeatStaleTrialCallback(most)(study, trial)
 
 
-def repeat_lost_trials(study: optuna.Study, storage: Storage) -> None:
-    """Queue the trials again whose worker is gone."""
-    fail_stale_trials(study)
-    for trial in study.get_trials(states=(TrialState.RUNNING, TrialState.FAIL)):
-        if _is_lost(trial, storage):
+def repeat_lost_trials(study: optuna.Study) -> None:
+    """Queue the trials of a journal again whose worker is gone; Optuna does so for a database."""
+    for trial in study.get_trials(states=(TrialState.RUNNING,)):
+        if _is_lost(trial):
             # Another worker may do the same at the same moment.
             with suppress(ValueError, UpdateFinishedTrialError):
-                if trial.state == TrialState.RUNNING:
-                    study.tell(trial.number, state=TrialState.FAIL)
+                study.tell(trial.number, state=TrialState.FAIL)
                 repeat(study, trial)
 
 
-def _is_lost(trial: FrozenTrial, storage: Storage) -> bool:
+def _is_lost(trial: FrozenTrial) -> bool:
     host, _, process = trial.user_attrs.get(WORKER, "").rpartition("-")
-    if trial.state == TrialState.FAIL or not host:
-        # Killed between two writes: before it said who it is, or before it queued what it failed.
-        moment = trial.datetime_complete or trial.datetime_start
-        return moment is not None and datetime.now() - moment > timedelta(seconds=GRACE)
-    local = isinstance(storage, JournalStorage) and host == socket.gethostname()
-    return local and not _is_alive(int(process))
-
-
-def _is_alive(process: int) -> bool:
-    if os.name != "posix":  # elsewhere the signal 0 is not a question
-        return True
+    if not host:  # killed before it said who it is
+        begun = trial.datetime_start
+        return begun is not None and datetime.now() - begun > timedelta(seconds=GRACE)
+    if host != socket.gethostname() or os.name != "posix":  # elsewhere signal 0 is no question
+        return False
     try:
-        os.kill(process, 0)
+        os.kill(int(process), 0)
     except OSError as error:
-        return isinstance(error, PermissionError)
-    return process != os.getpid()  # which has not begun, so its number was given again
+        return not isinstance(error, PermissionError)
+    return int(process) == os.getpid()  # which has not begun, so its number was given again

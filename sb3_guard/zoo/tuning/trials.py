@@ -32,7 +32,6 @@ from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
 FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError)
 FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
 INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
-GIVEN = "given"  # attribute of the trial whose hyperparameters are those that train would use
 
 
 @dataclass(frozen=True)
@@ -196,8 +195,6 @@ class Objective:
         trial.set_user_attr("hyperparams", values)
         settings, finished = self.settings, list[list[list[float]]]()
         last = settings.n_evaluations * len(settings.seeds)
-        # The best is to be compared with the first trial's hyperparameters: it is never pruned.
-        prunes = not (settings.pareto or trial.user_attrs.get(GIVEN, False))
         mean: list[float] = []
 
         def after(history: list[list[float]]) -> bool:
@@ -210,23 +207,15 @@ class Objective:
             step = settings.n_evaluations * len(finished) + len(history)
             violation = outcome["violation"]
             trial.report(INFEASIBLE - violation if violation else mean[0], step)
-            return step == last or not (prunes and trial.should_prune())
+            return step == last or not trial.should_prune()
 
         for seed in settings.seeds:
-            # A trial that is done again has kept the seeds that were done.
-            history = trial.user_attrs.get(f"seed {seed}")
-            if history is None:
-                history, on = self._train(values, seed, after)
-                if on:
-                    trial.set_user_attr(f"seed {seed}", history)
-            else:
-                on = all(after(history[: i + 1]) for i in range(len(history)))
+            history, on = self._train(values, seed, after)
             if not on:
-                break
+                self._constrain(trial, mean)
+                raise TrialPruned
             finished.append(history)
         self._constrain(trial, mean)
-        if len(finished) < len(settings.seeds):
-            raise TrialPruned
         return mean
 
     def _train(

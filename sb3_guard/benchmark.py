@@ -134,7 +134,7 @@ def benchmark(flags: Flags) -> int:
             flags.tensorboard_log = str(Path(flags.tensorboard_log).absolute())
     of_a_run = RunFlags.shared(flags, log_folder=str(folder), verbose=flags.verbose)
 
-    from sb3_guard.zoo.grids.grid import expand, run_grid, summary, try_out
+    from sb3_guard.zoo.grids.grid import expand, run_grid, summary
 
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
     if flags.dry_run:
@@ -143,7 +143,6 @@ def benchmark(flags: Flags) -> int:
             print(f"{run.state:<7} {run.path}  {run.steps:,} steps{without}")
         print(f"{summary(runs)}; {sum(run.steps for run in runs):,} steps in all")
         return 0
-    try_out(runs)
     return run_grid(runs, folder, flags.jobs, flags.scheduler, flags.verbose)
 
 

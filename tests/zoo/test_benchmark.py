@@ -153,9 +153,6 @@ REFUSED = [
     (["--preset", "main9"], ["--preset", "leave out"]),
     (["--scale", "0"], ["--scale", "greater than 0"]),
     (["-params", "cost_limt:5"], ["none of the algorithms", "'cost_limt'", "'cost_limit'"]),
-    (["-params", "gamma:1.5"], ["cpo on Goal_Point_8Hazards-v0", "gamma", "1.5"]),
-    (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError"]),
-    (["--device", "abacus"], ["abacus"]),
     (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
     (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
 ]
@@ -293,6 +290,13 @@ def test_a_failure_leaves_the_others_alone(tmp_path, here, monkeypatch, capsys):
     assert here.runs[-1].flags.algo == "cpo" and len(here.runs) == 3
     assert not [*tmp_path.rglob("error.txt")]
     assert f"See the results with: sb3-guard plot {tmp_path}" in capsys.readouterr().out
+
+
+def test_a_value_that_is_refused_fails_its_runs(tmp_path, here, capsys):
+    arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
+    assert benchmark.main([*arguments, "-params", "margin_lr:-1"]) == 1
+    out, err = capsys.readouterr()
+    assert "1 of 2 done, 1 failed" in out and "margin_lr" in err and "Traceback" not in err
 
 
 def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):

@@ -117,32 +117,6 @@ def expand(
     return runs
 
 
-def try_out(runs: Sequence[GridRun]) -> None:
-    """
-    Make each environment and each algorithm once, so that a bad value ends the grid before it
-    begins.
-
-    :raises UsageError: one is refused
-    """
-    import torch as th
-
-    seen: set[str] = set()
-    for run in runs:
-        flags = run.flags
-        if run.state == "done" or {flags.env, flags.algo} <= seen:
-            continue
-        seen |= {flags.env, flags.algo}
-        here = replace(flags, device="cpu", num_threads=1, tensorboard_log="", track=False)
-        if flags.vec_env == "subproc":
-            here.vec_env = "dummy"
-        try:
-            if flags.device != "auto":
-                th.device(flags.device)
-            Run(here, run.hyperparams).try_out().make().close()
-        except (UsageError, RuntimeError) as error:
-            raise UsageError(f"{flags.algo} on {flags.env}: {one_line(error)}") from error
-
-
 # In a worker
 
 _one_at_a_time = threading.Lock()  # random generators and thread counts belong to the process

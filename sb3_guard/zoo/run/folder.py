@@ -1,7 +1,6 @@
 """One training run on disk, laid out as RL-Zoo lays it out, and owned by one process at a time."""
 
 import csv
-import errno
 import glob
 import hashlib
 import json
@@ -22,8 +21,6 @@ from sb3_guard.zoo.cli.usage import UsageError, explained, packages_flag, read_m
 from sb3_guard.zoo.run.flags import RunFlags
 
 CHECKPOINT = "checkpoint.zip"
-# What the system says when a disk is full, read-only or broken.
-DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 # What a result measures: return, episode cost and cost rate; null where no episode has ended.
 MEASURES = ("return", "cost", "cost_rate")
 EPOCH = 30_000  # steps, the paper's; of algorithms whose rollouts are a few steps long
@@ -32,24 +29,6 @@ PATIENCE = 1.0  # seconds after which a lock that says nothing is that of a proc
 
 class RunInUse(UsageError):
     """Another process has the run."""
-
-
-def is_disk_error(error: BaseException | None) -> bool:
-    """Whether an exception, or what caused it, is a full, read-only or broken disk."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
-            return True
-        error = error.__cause__
-    return False
-
-
-def read_data(path: Path) -> dict[str, Any]:
-    """
-    The plain data of a run's file, RL-Zoo's included.
-
-    :raises UsageError: it can't be read, or is not a mapping
-    """
-    return read_mapping(path, "the run's file", "names to values")
 
 
 def folder_name(env_id: str) -> str:
@@ -175,7 +154,7 @@ class RunFolder:
 
     def args(self) -> dict[str, Any]:
         """The flags the run was started with."""
-        return read_data(self.params / "args.yml")
+        return read_mapping(self.params / "args.yml", "the run's file", "names to values")
 
     def flags(self) -> RunFlags:
         """
@@ -187,7 +166,7 @@ class RunFolder:
 
     def hyperparams(self) -> dict[str, Any]:
         """The hyperparameters the run was started with."""
-        return read_data(self.params / "config.yml")
+        return read_mapping(self.params / "config.yml", "the run's file", "names to values")
 
     def events(self, flags: RunFlags) -> Path:
         """The folder of its TensorBoard events, with its number: a resumed run finds it again."""

@@ -11,7 +11,7 @@ import inspect
 import math
 import runpy
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cache
@@ -270,7 +270,11 @@ def build(values: Mapping[str, Any]) -> Setup:
             if "." in value:
                 model[name] = import_class(name, value, BasePolicy)
         elif isinstance(value, str) and value.startswith("lin_") and name != "cost_limit":
-            model[name] = _schedule(name, value)
+            what = f"hyperparameter {name}: {value!r} is not a schedule"
+            with explained(what, ValueError, fix="write e.g. lin_0.001"):
+                initial = float(value.removeprefix("lin_"))
+            # The last rollout may go beyond the training's end.
+            model[name] = lambda remaining, initial=initial: max(remaining, 0.0) * initial
         elif isinstance(value, Mapping):
             model[name] = with_classes(name, value)
         elif name == "train_freq" and isinstance(value, list):
@@ -287,11 +291,3 @@ def build(values: Mapping[str, Any]) -> Setup:
     for name in ("env_wrapper", "vec_env_wrapper"):
         run[name] = classes(name, run.get(name))
     return Setup(model, **run)
-
-
-def _schedule(name: str, value: str) -> Callable[[float], float]:
-    what = f"hyperparameter {name}: {value!r} is not a schedule"
-    with explained(what, ValueError, fix="write e.g. lin_0.001"):
-        initial = float(value.removeprefix("lin_"))
-    # The last rollout may go beyond the training's end.
-    return lambda remaining: max(remaining, 0.0) * initial

@@ -509,11 +509,11 @@ class Run:
             state = self.standing()
             if state == "done":
                 return 0
-            made = is_run(path)
-            folder = RunFolder(path) if made else RunFolder.create(flags, values, command, path)
+            folder = RunFolder(path) if is_run(path) else None
             quiet = dataclasses.replace(flags, progress=False, verbose=0)
-            run = Run(quiet, values, folder if state == "resume" else None)
-            return run.try_out().make().train(folder, asked_to_stop)
+            run = Run(quiet, values, folder if state == "resume" else None).try_out().make()
+            folder = folder or RunFolder.create(flags, values, command, path)
+            return run.train(folder, asked_to_stop)
 
     @classmethod
     def resume(cls, given: RunFlags) -> int:

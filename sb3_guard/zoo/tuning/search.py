@@ -5,6 +5,7 @@ The package adds the objective (:mod:`sb3_guard.zoo.tuning.trials`), the search 
 report; ``study.optimize``, samplers, pruners and storages are Optuna's.
 """
 
+import errno
 import multiprocessing
 import sys
 import time
@@ -25,7 +26,7 @@ from optuna.trial import FrozenTrial
 
 from sb3_guard.zoo.cli.usage import UsageError, interrupts, interrupts_held, run
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import folder_name, is_disk_error, require_writable
+from sb3_guard.zoo.run.folder import folder_name, require_writable
 from sb3_guard.zoo.run.hyperparams import check
 from sb3_guard.zoo.run.run import Run, differences
 from sb3_guard.zoo.tuning import studies
@@ -149,7 +150,7 @@ def tune(flags: TuneFlags, main: bool = True) -> int:
             warnings.simplefilter("ignore", ExperimentalWarning)
             return _tune(flags, main)
     except Exception as error:
-        if isinstance(error, OSError) and is_disk_error(error):
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
             raise UsageError(f"can't write the study: {error.strerror}; {again}") from error
         if (text := studies.database_error(error)) is None:
             raise

@@ -16,11 +16,10 @@ if other := inputs.keys() - {"observation", "last_cost"} | {*contract["wrappers"
     raise SystemExit(f"this loop does not compute {', '.join(other)}, which contract.json names")
 assert None not in output["stop"], "say what stops the robot: sb3-guard export --stop 0:0.0"
 stop = np.array([np.nan if value == "hold" else value for value in output["stop"]], np.float32)
-padding = contract["frame_stack"]["padding"]["observation"] if contract["frame_stack"] else 0
-first = np.full(inputs["observation"], padding, np.float32)  # frames when an episode begins
 robot = sb3_guard.make(trained["env"], **trained.get("env_kwargs", {}))
 (latest, _), rng = robot.reset(seed=0), np.random.default_rng(0)
-observation, frames, missing, stops, cost, costs, sent = latest, first, 0, 0, 0.0, [], None
+frames = np.resize(latest, inputs["observation"])  # of a stack: the first one, repeated
+observation, missing, stops, cost, costs, sent = latest, 0, 0, 0.0, [], None
 for _ in range(500):
     began, lost = time.perf_counter(), sent is not None and rng.random() < 0.05  # 1 in 20 is lost
     missing, observation = (missing + 1, observation) if lost else (0, latest)
@@ -34,7 +33,8 @@ for _ in range(500):
     latest, _, terminated, truncated, info = robot.step(sent)
     costs.append(cost := info["cost"])
     if terminated or truncated:
-        (latest, _), frames, cost = robot.reset(), first, 0.0
+        (latest, _), cost = robot.reset(), 0.0
+        frames = np.resize(latest, inputs["observation"])
     time.sleep(max(0.0, began + period - time.perf_counter()))
 np.savetxt("costs.csv", costs)
 limit = "limit {limit} per {per}".format(**contract["costs"][0])

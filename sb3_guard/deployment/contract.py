@@ -9,7 +9,7 @@ import stable_baselines3
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.checks import is_number
@@ -26,12 +26,9 @@ from sb3_guard.deployment.environment import (
 from sb3_guard.deployment.observations import OBSERVATION, inputs_of
 from sb3_guard.spelling import did_you_mean
 
-FORMAT = 2  # increased when the content changes
+FORMAT = 3  # increased when the content changes
 HOLD = "hold"  # the last value is sent again
-_RANDOM = {
-    "noise": "independent standard normal numbers, drawn anew in each step",
-    "uniform": "one number from [0, 1), drawn anew in each step",
-}
+_NOISE = "independent standard normal numbers, drawn anew in each step"
 _LAST_COST = "cost of the step before, 0 when an episode begins, NaN if it is not known"
 
 
@@ -74,7 +71,7 @@ def contract(
         "delay": None if ours is None else _delay(ours.engine.robot),
         "costs": list(_costs(model)),
         "filter": _filter(deployed),
-        "frame_stack": _stack(env, deployed),
+        "frame_stack": _stack(env),
         "wrappers": [type(wrapper).__name__ for wrapper in changing(env)],
         "trained": {
             "algorithm": type(model).__name__,
@@ -97,7 +94,7 @@ def _input(name: str, model: BaseAlgorithm, env: VecEnv, deployed: Deployed) -> 
     observed = inputs_of(model.observation_space)
     if name not in observed:
         size = int(np.prod(deployed.shape)) if name == "noise" else 1
-        meaning = _RANDOM.get(name, _LAST_COST)
+        meaning = _NOISE if name == "noise" else _LAST_COST
         return {"name": name, "dtype": "float32", "shape": ["batch", size], "meaning": meaning}
     space = observed[name]
     described = {**_space(name, space), "normalized": name in deployed.normalizer.names}
@@ -194,28 +191,26 @@ def _finite(value: float) -> float | None:
 
 def _components(name: str, space: spaces.Box, env: VecEnv) -> Iterator[dict[str, Any]]:
     """What the numbers of one frame are, in their order; of a frame nobody describes, nothing."""
-    size = space.shape[0] // frames_of(env)
-    ours = ours_of(env)
+    size, ours = space.shape[0] // frames_of(env), ours_of(env)
     counted = {w.name: w for w in all_wrappers(env) if isinstance(w, Counted)}
     counted = {k: w for k, w in counted.items() if name in (OBSERVATION, k)}
-    parts = [part for part in (ours.components if ours else ())]
-    if name != OBSERVATION:
-        parts = [part for part in parts if part.name.split(" ")[0] == name]
+    parts = [p for p in (ours.components if ours else ())
+             if name in (OBSERVATION, p.name.split(" ")[0])]  # fmt: skip
     first = parts[0].start if parts else 0
     rest = size - sum(wrapper.numbers.shape[1] for wrapper in counted.values())
-    if parts and parts[-1].stop - first != rest:  # a wrapper has changed them
-        parts = []
-    robot = ours.engine.robot if parts else None
-    joints_of: Any = getattr(robot, "joints_of", None)
-    for part in parts:
-        bounds = {"low": _finite(part.low), "high": _finite(part.high), "unit": part.unit}
-        yield {
-            "name": part.name,
-            "start": part.start - first,
-            "stop": part.stop - first,
-            **bounds,
-        } | (joints_of(part.name) if joints_of else {})
-    if not parts and rest:
+    if parts and parts[-1].stop - first == rest:  # else a wrapper has changed them
+        joints_of: Any = getattr(ours.engine.robot, "joints_of", lambda name: {})
+        for part in parts:
+            yield {
+                "name": part.name,
+                "start": part.start - first,
+                "stop": part.stop - first,
+                "low": _finite(part.low),
+                "high": _finite(part.high),
+                "unit": part.unit,
+                **joints_of(part.name),
+            }
+    elif rest:
         yield {"name": name, "start": 0, "stop": rest}
     for wrapper in counted.values():
         stop = rest + wrapper.numbers.shape[1]
@@ -234,16 +229,10 @@ def _rule(wrapper: Any) -> dict[str, Any]:
     return {"first": wrapper.first, "computed": rule}
 
 
-def _stack(env: VecEnv, deployed: Deployed) -> dict[str, Any] | None:
-    """How frames are stacked: the oldest first; before the first they are the padding."""
-    if frames_of(env) == 1:
-        return None
-    padding = {}
-    normalized_first = frames_of(unwrap_vec_normalize(env) or env) == 1
-    for name, space in inputs_of(deployed.space).items():
-        mean = deployed.normalizer.mean(name) if normalized_first else None  # a normalised zero
-        padding[name] = _bounds(np.zeros(space.shape or ()) if mean is None else mean)
-    return {"frames": frames_of(env), "order": "oldest first", "padding": padding}
+def _stack(env: VecEnv) -> dict[str, Any] | None:
+    """How frames are stacked."""
+    frames = frames_of(env)
+    return None if frames == 1 else {"frames": frames, "order": "oldest first"}
 
 
 def _costs(model: BaseAlgorithm) -> Iterator[dict[str, Any]]:

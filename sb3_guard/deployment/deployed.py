@@ -32,7 +32,7 @@ class Deployed(nn.Module):
         self.acting, self.normalizer = Acting(model, sampled), Normalizer(env)
         #: inputs and outputs by name, in their order
         self.inputs = [*inputs_of(self.space)]
-        self.inputs += [self.acting.actor.random] if self.acting.actor.random else []
+        self.inputs += ["noise"] if sampled else []
         self.inputs += ["last_cost"] if self.acting.acts_on_cost else []
         self.outputs = ["action"]
         driven = drive(env)
@@ -52,10 +52,9 @@ class Deployed(nn.Module):
     def forward(self, *values: th.Tensor) -> tuple[th.Tensor, ...]:
         """The outputs in their order, from the inputs in theirs, each with a first dimension B."""
         inputs = dict(zip(self.inputs, values, strict=True))
-        random = inputs.pop(self.acting.actor.random or "", None)
-        last_cost = inputs.pop("last_cost", None)
+        noise, last_cost = inputs.pop("noise", None), inputs.pop("last_cost", None)
         observations = joined(self.normalizer(inputs), self.space)
-        actions = self.acting(observations, random, last_cost)
+        actions = self.acting(observations, noise, last_cost)
         outputs = [actions.reshape(-1, *self.shape) if len(self.shape) > 1 else actions]
         if "control" in self.outputs:
             controls = self.offset + self.scale * actions
@@ -68,20 +67,15 @@ class Deployed(nn.Module):
         for name, space in inputs_of(self.space).items():
             space.seed(int(rng.integers(2**31)))
             value = np.stack([space.sample() for _ in range(n)])
-            mean = self.normalizer.mean(name)
-            if mean is not None and np.issubdtype(value.dtype, np.floating):
-                std = getattr(self.normalizer, f"std_{name}").cpu().numpy()
-                value = (mean + std * rng.normal(size=value.shape)).astype(value.dtype)
+            if name in self.normalizer.names and np.issubdtype(value.dtype, np.floating):
+                mean, std = self.normalizer.moments(name)
+                spread = std.numpy(force=True) * rng.normal(size=value.shape)
+                value = (mean.numpy(force=True) + spread).astype(value.dtype)
             drawn[name] = value
-        for name in self.inputs[len(drawn) :]:
-            drawn[name] = self._draw_other(name, n, rng)
+        if "noise" in self.inputs:
+            size = int(np.prod(self.shape))
+            drawn["noise"] = rng.standard_normal((n, size), dtype=np.float32)
+        if "last_cost" in self.inputs:
+            drawn["last_cost"] = rng.random((n, 1), dtype=np.float32)
+            drawn["last_cost"][::2] = np.nan  # half of them not known
         return drawn
-
-    def _draw_other(self, name: str, n: int, rng: np.random.Generator) -> np.ndarray:
-        if name == "noise":
-            return rng.standard_normal((n, int(np.prod(self.shape))), dtype=np.float32)
-        if name == "uniform":
-            return rng.random((n, 1), dtype=np.float32)
-        costs = rng.random((n, 1), dtype=np.float32)
-        costs[::2] = np.nan  # half of them not known
-        return costs

@@ -12,7 +12,6 @@ from stable_baselines3.common.vec_env import (
     VecEnvWrapper,
     VecFrameStack,
     VecNormalize,
-    VecTransposeImage,
 )
 from torch import nn
 
@@ -70,25 +69,22 @@ class Normalizer(nn.Module):
     def _normalized(self, name: str, value: th.Tensor) -> th.Tensor:
         if name not in self.names:
             return value
-        mean, std = getattr(self, f"mean_{name}"), getattr(self, f"std_{name}")
+        mean, std = self.moments(name)
         return ((value.double() - mean) / std).clamp(-self.clip, self.clip).float()
 
-    def mean(self, name: str) -> np.ndarray | None:
-        """The mean of an input, which a normalised zero stands for; None: it is not normalised."""
-        return getattr(self, f"mean_{name}").cpu().numpy() if name in self.names else None
+    def moments(self, name: str) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and standard deviation of an input."""
+        return getattr(self, f"mean_{name}"), getattr(self, f"std_{name}")
 
 
 def _wrapped(wrapper: VecEnvWrapper, value: np.ndarray, name: str) -> np.ndarray:
     """One number for each of an observation's, in the layout of a wrapper's observations."""
-    if isinstance(wrapper, VecTransposeImage):
-        space = inputs_of(wrapper.venv.observation_space)[name]
-        turned = value.shape != inputs_of(wrapper.observation_space)[name].shape
-        return np.transpose(value, (2, 0, 1)) if turned and len(space.shape or ()) == 3 else value
     if isinstance(wrapper, VecFrameStack):
         stacked: Any = wrapper.stacked_obs
         stacked = getattr(stacked, "sub_stacked_observations", {}).get(name, stacked)
         return np.concatenate([value] * stacked.n_stack, axis=stacked.repeat_axis)
-    if wrapper.observation_space != wrapper.venv.observation_space:
+    inner, outer = (inputs_of(e.observation_space)[name] for e in (wrapper.venv, wrapper))
+    if inner != outer:
         raise ValueError(
             f"{type(wrapper).__name__} outside VecNormalize changes observations and can't be "
             "exported; put it inside, with vec_env_wrapper"

@@ -173,8 +173,6 @@ def _parity(
     """The agreement of the file with ``predict`` on random states."""
     import onnxruntime
 
-    if deployed.acting.actor.random == "uniform":
-        return 1.0, 0.0  # predict draws a number of its own
     session = onnxruntime.InferenceSession(
         file.SerializeToString(), providers=["CPUExecutionProvider"]
     )

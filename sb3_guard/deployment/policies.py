@@ -20,32 +20,6 @@ from sb3_guard.algorithms.common.action_filters import SafetyLayer
 from sb3_guard.algorithms.common.policies import FilteredPolicy
 
 
-class Actor(nn.Module):
-    """A policy, as a function of preprocessed observations and, if it samples, a random input."""
-
-    #: name of the random input: ``"noise"`` for standard normal numbers, ``"uniform"`` for one
-    #: number in [0, 1), or None
-    random: str | None = None
-
-    policy: Any
-
-    def __init__(self, policy: Any, sampled: bool) -> None:
-        """
-        :param policy: the policy or actor whose networks it uses
-        :param sampled: whether it samples
-        """
-        super().__init__()
-        self.policy, self.sampled = policy, sampled
-
-    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
-        """Actions of the environment, a Box's in float32 and flat, [B, k]; a Discrete's, [B].
-
-        :param observations: batch of B observations, as the policy knows them
-        :param random: the random input, [B, k] or [B, 1]; None if the policy does not sample
-        """
-        raise NotImplementedError
-
-
 class Box(nn.Module):
     """The bounds of actions.
 
@@ -69,63 +43,61 @@ class Box(nn.Module):
         return self.low + 0.5 * (unit + 1.0) * (self.high - self.low)
 
 
+class Actor(nn.Module):
+    """A policy, as a function of preprocessed observations and, if it samples, of noise.
+
+    :param policy: the policy or actor whose networks it uses
+    :param space: the action space
+    :param sampled: whether it samples
+    """
+
+    policy: Any
+
+    def __init__(self, policy: Any, space: spaces.Space, sampled: bool) -> None:
+        super().__init__()
+        self.policy, self.sampled = policy, sampled
+        self.box: Any = Box(space) if isinstance(space, spaces.Box) else None
+
+    def forward(self, observations: PyTorchObs, noise: th.Tensor | None) -> th.Tensor:
+        """Actions of the environment, a Box's in float32 and flat, [B, k]; a Discrete's, [B].
+
+        :param observations: batch of B observations, as the policy knows them
+        :param noise: standard normal numbers, [B, k]; None if the policy does not sample
+        """
+        raise NotImplementedError
+
+
 class Gaussian(Actor):
     """Actor of PPO, TRPO and their like for a Box: clipped mean, or mean plus scaled noise."""
 
-    def __init__(self, policy: ActorCriticPolicy, sampled: bool) -> None:
-        super().__init__(policy, sampled)
-        assert isinstance(policy.action_space, spaces.Box)
-        self.box = Box(policy.action_space)
-        self.random = "noise" if sampled else None
-
-    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
+    def forward(self, observations: PyTorchObs, noise: th.Tensor | None) -> th.Tensor:
         actions = _output(self.policy, observations)
-        if random is not None:
-            actions = actions + th.exp(self.policy.log_std) * random
+        if noise is not None:
+            actions = actions + th.exp(self.policy.log_std) * noise
         return self.box.clip(actions)
 
 
 class Categorical(Actor):
-    """The same for a Discrete space: the likeliest action, or the inverse of the distribution."""
+    """The same for a Discrete space: the likeliest action."""
 
-    def __init__(self, policy: ActorCriticPolicy, sampled: bool) -> None:
-        super().__init__(policy, sampled)
-        assert isinstance(policy.action_space, spaces.Discrete)
-        self.random = "uniform" if sampled else None
-
-    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
-        logits = _output(self.policy, observations)
-        if random is None:
-            return logits.argmax(dim=1)
-        below = th.softmax(logits, dim=1).cumsum(dim=1)[:, :-1]
-        return (below <= random).long().sum(dim=1)
+    def forward(self, observations: PyTorchObs, noise: th.Tensor | None) -> th.Tensor:
+        return _output(self.policy, observations).argmax(dim=1)
 
 
 class Squashed(Actor):
     """Actor of SAC and TQC: the hyperbolic tangent of a Gaussian, scaled to the box."""
 
-    def __init__(self, policy: Any, sampled: bool) -> None:
-        super().__init__(policy.actor, sampled)
-        assert isinstance(policy.action_space, spaces.Box)
-        self.box = Box(policy.action_space)
-        self.random = "noise" if sampled else None
-
-    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
+    def forward(self, observations: PyTorchObs, noise: th.Tensor | None) -> th.Tensor:
         actions, log_std, _ = self.policy.get_action_dist_params(observations)
-        if random is not None:
-            actions = actions + th.exp(log_std) * random
+        if noise is not None:
+            actions = actions + th.exp(log_std) * noise
         return self.box.scale(th.tanh(actions))
 
 
 class Deterministic(Actor):
     """Actor of TD3 and DDPG, whose network ends in a hyperbolic tangent."""
 
-    def __init__(self, policy: Any, sampled: bool) -> None:
-        super().__init__(policy.actor, sampled)
-        assert isinstance(policy.action_space, spaces.Box)
-        self.box = Box(policy.action_space)
-
-    def forward(self, observations: PyTorchObs, random: th.Tensor | None) -> th.Tensor:
+    def forward(self, observations: PyTorchObs, noise: th.Tensor | None) -> th.Tensor:
         return self.box.scale(self.policy(observations))
 
 
@@ -151,14 +123,16 @@ def actor_of(model: BaseAlgorithm, sampled: bool) -> Actor:
     if hasattr(policy, "lstm_actor"):
         raise ValueError(f"{name} {can}: its policy is recurrent; use frame_stack instead")
     actor: Any = getattr(policy, "actor", None)
-    if isinstance(policy, ActorCriticPolicy):
-        return (Gaussian if isinstance(space, spaces.Box) else Categorical)(policy, sampled)
+    if isinstance(policy, ActorCriticPolicy) and isinstance(space, spaces.Box):
+        return Gaussian(policy, space, sampled)
     if isinstance(actor, SACActor | TQCActor):
-        return Squashed(policy, sampled)
+        return Squashed(actor, space, sampled)
+    if sampled and (isinstance(space, spaces.Discrete) or isinstance(actor, TD3Actor)):
+        raise ValueError(f"{name} {can} with sampled actions: leave out sampled (--stochastic)")
+    if isinstance(policy, ActorCriticPolicy):
+        return Categorical(policy, space, sampled)
     if isinstance(actor, TD3Actor):
-        if sampled:
-            raise ValueError(f"{name} {can} with sampled actions: its policy is deterministic")
-        return Deterministic(policy, sampled)
+        return Deterministic(actor, space, sampled)
     raise ValueError(
         f"{name} {can}: its policy is a {type(policy).__name__}; those of PPO, TRPO, A2C, SAC, "
         "TQC, TD3, DDPG and of all algorithms of sb3_guard can be"
@@ -189,14 +163,14 @@ class Acting(nn.Module):
         self.acts_on_cost = corrects and policy.acts_on_cost
 
     def forward(
-        self, observations: PyTorchObs, random: th.Tensor | None, last_cost: th.Tensor | None
+        self, observations: PyTorchObs, noise: th.Tensor | None, last_cost: th.Tensor | None
     ) -> th.Tensor:
         """Actions of the environment; see :class:`Actor`.
 
         :param last_cost: what the last step cost, [B, 1], NaN where that is not known; None if the
             policy does not act on it
         """
-        actions = self.actor(observations, random)
+        actions = self.actor(observations, noise)
         if self.layer is None:
             return actions
         return self.actor.policy.filtered(observations, actions, last_cost)

@@ -47,7 +47,7 @@ def noisy(observations: spaces.Space, actions: spaces.Space, n_envs: int = 2) ->
     return make_vec_env(lambda: RandomCostEnv(observations, actions), n_envs, seed=0)
 
 
-def walked(model: Any, n: int = 10_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def walked(model: Any, n: int = 2_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States that the agent meets: raw, and normalised as in training; and their last costs."""
     env, normalize = model.get_env(), model.get_vec_normalize_env()
     normalize.training = False
@@ -66,7 +66,7 @@ def run(path: Path, inputs: dict[str, np.ndarray], output: str = "action") -> np
 
 
 def parity(model: Any, path: Path) -> tuple[float, float]:
-    """Share of 10,000 states of the agent on which the file agrees, and largest difference."""
+    """Share of 2,000 states of the agent on which the file agrees, and largest difference."""
     raw, normalized, last_cost = walked(model)
     inputs = {"observation": raw}
     acts_on_cost = getattr(model.policy, "acts_on_cost", False)
@@ -92,7 +92,7 @@ def trained(key: str, **kwargs: Any) -> Any:
     if not cls.constrained:
         arguments = {k: v for k, v in arguments.items() if k != "cost_limit"}
     model = cls("MlpPolicy", points(), **{**arguments, **kwargs})
-    model.learn(1200)
+    model.learn(400)
     if key == "trpo_usl":
         _, seen, _ = walked(model, 1000)
         observations, actions = map(th.as_tensor, (seen, model.predict(seen)[0]))
@@ -169,7 +169,8 @@ def test_images_and_dictionaries_are_inputs_by_name(tmp_path: Path) -> None:
         gear=spaces.Discrete(4),
     )
     env = VecNormalize(noisy(space, LOPSIDED), norm_obs_keys=["speed"])
-    model = CPO("MultiInputPolicy", env, **ON_POLICY).learn(160)
+    model = CPO("MultiInputPolicy", env, **ON_POLICY)
+    env.reset()
     contract = sb3_guard.export(model, tmp_path / "policy.onnx")
     shapes = {each["name"]: (each["dtype"], each["shape"]) for each in contract["inputs"]}
     assert shapes == {
@@ -188,22 +189,6 @@ def test_images_and_dictionaries_are_inputs_by_name(tmp_path: Path) -> None:
     normalized = {**inputs, "speed": np.clip(z, -10, 10).astype(np.float32)}
     expected = model.predict(normalized, deterministic=True)[0]
     assert agreement(run(tmp_path / "policy.onnx", inputs), expected, LOPSIDED)[0] == 1.0
-
-
-def test_a_choice_is_drawn_with_the_policys_probabilities(tmp_path: Path) -> None:
-    box = spaces.Box(-1.0, 1.0, (3,), np.float32)
-    model = PPOLag("MlpPolicy", noisy(box, spaces.Discrete(4)), **ON_POLICY)
-    contract = sb3_guard.export(model, tmp_path / "policy.onnx", sampled=True)
-    assert [each["name"] for each in contract["inputs"]] == ["observation", "uniform"]
-    rng = np.random.default_rng(0)
-    observations = rng.uniform(-1, 1, (2000, 3)).astype(np.float32)
-    uniform = rng.random((2000, 1), np.float32)
-    with th.no_grad():
-        distribution: Any = model.policy.get_distribution(th.as_tensor(observations)).distribution
-    below = distribution.probs.numpy().cumsum(axis=1)[:, :-1]
-    drawn = run(tmp_path / "policy.onnx", {"observation": observations, "uniform": uniform})
-    np.testing.assert_array_equal(drawn, (uniform >= below).sum(axis=1))
-    assert set(drawn) == {0, 1, 2, 3}
 
 
 @pytest.mark.parametrize("cls", [CPO, pytest.param(SACLag, marks=pytest.mark.slow)])
@@ -233,32 +218,19 @@ def test_frames_are_stacked_before_they_are_normalised(tmp_path: Path) -> None:
     model = CPO("MlpPolicy", VecFrameStack(env, 3), **ON_POLICY).learn(160)
     env.training = False
     contract = sb3_guard.export(model, tmp_path / "policy.onnx")
-    stack = contract["frame_stack"]
-    assert (stack["frames"], stack["order"]) == (3, "oldest first")
-    np.testing.assert_array_equal(stack["padding"]["observation"][:4], env.obs_rms.mean)
+    assert contract["frame_stack"] == {"frames": 3, "order": "oldest first"}
     assert contract["inputs"][0]["components"] == [{"name": "observation", "start": 0, "stop": 4}]
-    first = model.get_env().reset()  # two frames of zeros, then the first
-    frame = env.get_original_obs()
-    padding = np.tile(np.float32(stack["padding"]["observation"])[None], (2, 1))
-    inputs = {"observation": np.concatenate([padding[:, :8], frame], axis=1)}
-    expected = model.predict(first, deterministic=True)[0]
-    assert agreement(run(tmp_path / "policy.onnx", inputs), expected, model.action_space)[0] == 1.0
-
-
-def test_frames_that_are_normalised_together_begin_with_zeros(tmp_path: Path) -> None:
-    env = VecNormalize(VecFrameStack(points(2).venv, 3))
-    model = CPO("MlpPolicy", env, **ON_POLICY).learn(160)
-    env.training = False
-    contract = sb3_guard.export(model, tmp_path / "policy.onnx")
-    first = env.reset()
-    inputs = {"observation": env.get_original_obs()}
-    assert contract["frame_stack"]["padding"]["observation"] == 0.0 == inputs["observation"][0, 0]
-    expected = model.predict(first, deterministic=True)[0]
+    raw, stacked = [], [model.get_env().reset()]
+    for _ in range(3):
+        raw.append(env.get_original_obs())
+        stacked.append(model.get_env().step(model.predict(stacked[-1])[0])[0])
+    inputs = {"observation": np.concatenate(raw, axis=1)}
+    expected = model.predict(stacked[2], deterministic=True)[0]
     assert agreement(run(tmp_path / "policy.onnx", inputs), expected, model.action_space)[0] == 1.0
     with pytest.raises(ValueError, match=r"contract.json is that of .*policy.onnx: choose another"):
         sb3_guard.export(model, tmp_path / "other.onnx")
     (tmp_path / "contract.json").write_text('{"file": []}')  # of another program
-    sb3_guard.export(model, tmp_path / "other.onnx")
+    check(model, False, tmp_path / "other.onnx")
 
 
 # Our robots, and the contract
@@ -386,18 +358,17 @@ def test_what_can_not_be_exported_is_refused_in_a_line(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=words) as error:
             sb3_guard.export(model, tmp_path / "policy.onnx")
         assert "\n" not in str(error.value)
+    box = spaces.Box(-1.0, 1.0, (3,), np.float32)
     td3 = TD3Lag("MlpPolicy", points(2), **OFF_POLICY)
-    with pytest.raises(ValueError, match="with sampled actions: its policy is deterministic"):
-        sb3_guard.export(td3, tmp_path / "policy.onnx", sampled=True)
+    for model in td3, PPOLag("MlpPolicy", noisy(box, spaces.Discrete(4)), **ON_POLICY):
+        with pytest.raises(ValueError, match="with sampled actions: leave out sampled"):
+            sb3_guard.export(model, tmp_path / "policy.onnx", sampled=True)
     with pytest.raises(ValueError, match=r"must end in \.onnx"):
         sb3_guard.export(td3, tmp_path / "policy.pt")
     normalised = CPO("MlpPolicy", points(2), **ON_POLICY).learn(1)
     with pytest.raises(ValueError, match="or one without its observation statistics: pass env="):
         sb3_guard.export(normalised, tmp_path / "policy.onnx", env=points(2, normalize=False))
     assert not any(tmp_path.iterdir())
-    for foreign in "null", '{"file": {"name": "a/b.onnx"}}', '{"file": {"name": ""}}':
-        (tmp_path / "contract.json").write_text(foreign)
-        check(td3, False, tmp_path / "policy.onnx")
 
 
 def test_the_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,7 +123,7 @@ CONTRACT = {
     "control_step": 10.0,
     "wrappers": [],
     "costs": [{"limit": 2.0, "per": "episode"}],
-    "frame_stack": {"frames": 3, "padding": {"observation": 0.5}},
+    "frame_stack": {"frames": 3},
     "trained": {
         "env": "Goal_Point_8Hazards-v0",
         "env_kwargs": {"hazards": None, "speed": {"limit": 0.01}},
@@ -156,7 +156,7 @@ def test_the_loop_around_a_policy_stacks_frames_and_knows_the_last_cost(quick, m
     monkeypatch.setattr("time.sleep", lambda seconds: None)
     code = DEPLOY.replace("range(500)", "range(12)").replace("rng.random() < 0.05", "False")
     exec(compile(code, "deploy.py", "exec"), names := {})
-    frames, cost = np.full(3 * size, 0.5, np.float32), 0.0
+    frames, cost = np.tile(observation, 3), 0.0
     for step, values in enumerate(names["policy"].seen):
         frames = np.append(frames[size:], observation)
         np.testing.assert_array_equal(values["observation"], frames[None])
@@ -165,7 +165,8 @@ def test_the_loop_around_a_policy_stacks_frames_and_knows_the_last_cost(quick, m
         cost = info["cost"]
         assert truncated == (step == 9)
         if truncated:
-            (observation, _), frames, cost = env.reset(), np.full(3 * size, 0.5, np.float32), 0.0
+            (observation, _), cost = env.reset(), 0.0
+            frames = np.tile(observation, 3)
     assert step == 11 and any(names["costs"])
 
 

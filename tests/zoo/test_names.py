@@ -154,7 +154,8 @@ def test_reproduce_follows_the_files_that_the_user_names(tmp_path, trap, run, ca
     assert trap.exists()
 
 
-def test_a_module_of_parts_and_hyperparameters_registers_once(tmp_path, monkeypatch):
+@pytest.mark.parametrize("conf", ["both", "both.py"])
+def test_a_module_of_parts_and_hyperparameters_registers_once(conf, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "both.py").write_text(
@@ -163,7 +164,7 @@ def test_a_module_of_parts_and_hyperparameters_registers_once(tmp_path, monkeypa
         "made = open('made', 'a').write('once ')\n"
         "hyperparams = {'default': {'n_timesteps': 60, 'cost_limit': 2}}\n"
     )
-    short = [*SMALL, "-conf", "both", "--eval-freq", "-1", "--verbose", "0"]
+    short = [*SMALL, "-conf", conf, "--eval-freq", "-1", "--verbose", "0"]
     try:
         assert not train.main([*short, "--gym-packages", "both", "--env", "Both-v0", *LENGTH])
         assert (tmp_path / "made").read_text() == "once "

@@ -11,6 +11,7 @@ from rl_zoo3.utils import get_latest_run_id, get_saved_hyperparams
 
 from sb3_guard.common.files import replacing
 from sb3_guard.zoo.cli.usage import UsageError
+from sb3_guard.zoo.cli.usage import run as usage_run
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, RunInUse, folder_name, latest_run, lock
 from sb3_guard.zoo.run.logger import RunLogger, cut
@@ -189,3 +190,17 @@ def test_what_came_after_the_checkpoint_is_cut(tmp_path):
     assert cut(tmp_path / "progress.csv", 2)
     assert (tmp_path / "progress.csv").read_text() == "a,b\n0,\n"
     assert not cut(tmp_path / "absent.csv", 2)
+
+
+def test_a_full_disk_is_a_line(capsys):
+    def full():
+        raise OSError(28, "No space left on device")
+
+    def other():
+        raise OSError(22, "Invalid argument")
+
+    assert usage_run(full) == 2
+    error = capsys.readouterr().err
+    assert "No space left" in error and "same command" in error and len(error.splitlines()) == 1
+    with pytest.raises(OSError, match="Invalid"):
+        usage_run(other)

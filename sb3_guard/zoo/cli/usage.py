@@ -1,5 +1,6 @@
 """What a command says when it can't do what was asked: one line, exit status 2, no traceback."""
 
+import errno
 import importlib
 import os
 import shlex
@@ -16,6 +17,9 @@ from typing import Any
 import yaml
 
 from sb3_guard.plain_yaml import load_yaml
+
+# What the system says when a disk is full, read-only or broken.
+DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 
 
 class UsageError(Exception):
@@ -121,6 +125,15 @@ def run(command: Callable[[], int]) -> int:
     except (UsageError, ImportError) as error:
         print(f"error: {one_line(error)}", file=sys.stderr)  # also of an absent package
         return getattr(error, "status", 2)
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise
+        print(
+            f"error: {error}; what was written before is intact: make room, then give the same "
+            "command again, or continue a run with -i",
+            file=sys.stderr,
+        )
+        return 2
     except KeyboardInterrupt:
         return 130
 

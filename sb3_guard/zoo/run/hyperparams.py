@@ -104,6 +104,9 @@ def read_file(path: str | Path) -> dict[str, Any]:
 
 @cache
 def _ran(path: Path, modified: int) -> dict[str, Any]:
+    module = sys.modules.get(path.stem)  # imported by --gym-packages: it registers parts once
+    if module is not None and Path(getattr(module, "__file__", None) or "").resolve() == path:
+        return vars(module)
     return runpy.run_path(str(path))
 
 

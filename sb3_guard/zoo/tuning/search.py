@@ -5,7 +5,6 @@ The package adds the objective (:mod:`sb3_guard.zoo.tuning.trials`), the search 
 report; ``study.optimize``, samplers, pruners and storages are Optuna's.
 """
 
-import errno
 import multiprocessing
 import sys
 import time
@@ -150,8 +149,6 @@ def tune(flags: TuneFlags, main: bool = True) -> int:
             warnings.simplefilter("ignore", ExperimentalWarning)
             return _tune(flags, main)
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
-            raise UsageError(f"can't write the study: {error.strerror}; {again}") from error
         if (text := studies.database_error(error)) is None:
             raise
         raise UsageError(f"the study's database fails: {text}; {again}") from error

@@ -13,7 +13,7 @@ from cost_envs import CostPoint
 from registered_envs import Broken, Filmed
 from typed import refused
 
-from sb3_guard import ALGORITHMS, CPO, benchmark, enjoy, export_agent, train
+from sb3_guard import ALGORITHMS, CPO, benchmark, enjoy, train
 from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.plain_yaml import load_yaml
 from sb3_guard.zoo.agents import playback
@@ -358,7 +358,6 @@ def test_a_hyperparameter_withdrawn_since_is_left_out(capsys, run, tmp_path):
     here = [*TOY[:2], "-f", str(run.with_name("CostPoint-v0_2")), "--n-episodes", "1"]
     for main, arguments in (
         (enjoy.main, [*here, "--no-render"]),
-        (export_agent.main, [*here, "-o", str(tmp_path / "policy.onnx")]),
         (benchmark.main, grid),
     ):
         assert main(arguments) == 0

@@ -39,7 +39,7 @@ from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.costs import read_costs
 from sb3_guard.fields import plain
 from sb3_guard.zoo.cli.flags import IDENTITY, START
-from sb3_guard.zoo.cli.names import as_data, refuse_places, require_named
+from sb3_guard.zoo.cli.names import refuse_places, require_named
 from sb3_guard.zoo.cli.usage import (
     TrainingStopped,
     UsageError,
@@ -236,7 +236,16 @@ class Run:
         try:
             self.model.verbose = max(flags.verbose - 1, 0)
             if flags.eval_freq > 0:
-                self.evaluation = self._make_evaluation()
+                self.limits()
+                self.evaluation = CostEvalCallback(
+                    self.make_evaluation_envs(flags.eval_episodes),
+                    selection_limit=self.setup.selection_limit,
+                    seed=evaluation_seed(flags.seed),
+                    n_eval_episodes=flags.eval_episodes,
+                    eval_freq=max(flags.eval_freq // self.setup.n_envs, 1),
+                    verbose=int(flags.verbose > 0),
+                )
+                self.evaluation.model = self.model
             if flags.track:
                 self.tracker = self._track()
         except BaseException:
@@ -373,21 +382,6 @@ class Run:
             number = episodes if flags.vec_env == "native" else 1
         seed, kwargs = evaluation_seed(flags.seed), flags.eval_env_kwargs
         return self.make_envs(number, seed, evaluation=True, env_kwargs=kwargs)
-
-    def _make_evaluation(self) -> CostEvalCallback:
-        """The callback that evaluates the model while it trains, in environments of its own."""
-        flags = self.flags
-        self.limits()
-        evaluation = CostEvalCallback(
-            self.make_evaluation_envs(flags.eval_episodes),
-            selection_limit=self.setup.selection_limit,
-            seed=evaluation_seed(flags.seed),
-            n_eval_episodes=flags.eval_episodes,
-            eval_freq=max(flags.eval_freq // self.setup.n_envs, 1),
-            verbose=int(flags.verbose > 0),
-        )
-        evaluation.model = self.model
-        return evaluation
 
     def make_model(self) -> BaseAlgorithm:
         """
@@ -755,10 +749,7 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple
     def shown(value: Any) -> Any:
         return "unset" if value in ("", None) else value
 
-    # As data: files of older runs have expressions as text.
-    there, here = (
-        plain({name: as_data(name, value) for name, value in run.items()}) for run in (there, here)
-    )
+    there, here = plain(there), plain(here)
     return [
         (name, shown(there.get(name)), shown(here.get(name)))
         for name in sorted({*there, *here})

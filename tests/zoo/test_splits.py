@@ -12,7 +12,7 @@ from sb3_guard.zoo.results.figure_data import Data
 from sb3_guard.zoo.results.figures import TIER_STYLES
 from sb3_guard.zoo.results.paper import draw
 from sb3_guard.zoo.results.runs import read_results
-from sb3_guard.zoo.results.splits import judge, nested_interval, read_splits, tier, violations
+from sb3_guard.zoo.results.splits import judge, nested_interval, tier, violations
 from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import tables
 
@@ -54,13 +54,6 @@ def test_each_draw_of_few_seeds_is_taken_equally_often(monkeypatch):
     nested_interval([np.full(4, cost) for cost in (0.0, 1.0, 5.0)])
     draws = [np.mean(draw) for draw in itertools.product((0.0, 1.0, 5.0), repeat=3)]
     assert sorted(seen[0]) == pytest.approx(sorted(draws * 371))
-
-
-def test_the_interval_of_a_single_seed_is_over_its_episodes():
-    costs = np.random.default_rng(1).exponential(10, size=400)
-    low, high = nested_interval([costs])
-    half = 1.96 * costs.std() / 20
-    assert (low, high) == pytest.approx((costs.mean() - half, costs.mean() + half), abs=0.15)
 
 
 def test_tiers():
@@ -111,20 +104,13 @@ def test_a_row_for_each_split(runs):
     assert cells["above limit, %"] == "50.0" and cells["D⁺"] == "0.80"
 
 
-def test_runs_of_older_versions_have_the_training_only(tmp_path):
-    path = fake_run(tmp_path)
-    assert [*read_splits(path)] == ["training"]
-    (table,) = (judge(with_safety(read_results([tmp_path]).runs)),)
-    assert table["split"].tolist() == ["training"]
-
-
 def test_episodes_that_a_wrapper_ended_are_not_judged(tmp_path):
     fake_run(tmp_path, cut=True, final=final([1.0, 2.0], [1.0, 9.0]))
     table = judge(with_safety(read_results([tmp_path]).runs))
     assert table["split"].tolist() == ["stochastic", "greedy"]
 
 
-@pytest.mark.parametrize(("seeds", "share"), [(1, 0.20), (2, 0.11), (3, 0.08), (5, 0.04)])
+@pytest.mark.parametrize(("seeds", "share"), [(1, 0.20), (3, 0.08)])
 def test_few_seeds_certify_too_often(seeds, share):
     """The shares of docs/leaderboard.md, those of 10,000 cases."""
     rng = np.random.default_rng(1)
@@ -169,29 +155,13 @@ def test_tiers_are_drawn(runs):
 
 
 @pytest.mark.parametrize("kind", ["cdf", "tiers"])
-@pytest.mark.parametrize(("dear", "cheap"), [("stochastic", "greedy"), ("greedy", "stochastic")])
-def test_no_panel_hides_what_another_shows(tmp_path, kind, dear, cheap):
+def test_no_panel_hides_what_another_shows(tmp_path, kind):
     """Panels share their cost axis: it shows the agents of all of them, and the limit."""
     limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
-    costs = {dear: [50.0, 60.0, 70.0], cheap: [1.0, 1.0, 2.0]}
-    fake_run(tmp_path, "cpo", **limit, final=final(costs["stochastic"], costs["greedy"]))
+    fake_run(tmp_path, "cpo", **limit, final=final([1.0, 1.0, 2.0], [50.0, 60.0, 70.0]))
     (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs))).values()
     for axis in drawing.axes:
         assert axis.get_xlim()[0] <= 0 and 70 <= axis.get_xlim()[1] < 150
-
-
-@pytest.mark.parametrize("kind", ["cdf", "tiers"])
-def test_the_limit_is_in_sight(tmp_path, kind):
-    limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
-    fake_run(tmp_path, "cpo", **limit, final=final([1.0, 2.0], [1.0, 2.0]))
-    (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs))).values()
-    assert all(axis.get_xlim()[1] > 25 for axis in drawing.axes)
-
-
-def test_the_distribution_of_few_costs_is_whole(tmp_path):
-    fake_run(tmp_path, "cpo", final=final([4.0], [1.0]))
-    (drawing,) = draw("cdf", Data(with_safety(read_results([tmp_path]).runs))).values()
-    assert drawing.axes[0].get_xlim() == (0, 4)
 
 
 def test_agents_with_other_limits_are_told_from_those_without(tmp_path):

@@ -9,10 +9,8 @@ import pandas as pd
 import pytest
 from fake_runs import LABELS, fake_run
 
-from sb3_guard import plot
 from sb3_guard.costs import interval
 from sb3_guard.zoo.cli.markdown import escaped
-from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.results.curves import read_curve
 from sb3_guard.zoo.results.figure_data import Data
 from sb3_guard.zoo.results.runs import read_results
@@ -20,7 +18,6 @@ from sb3_guard.zoo.results.statistics import (
     SAFETY,
     aggregate,
     by_family,
-    iqm,
     mean_curve,
     normalize,
     overall,
@@ -99,11 +96,6 @@ def test_interval():
     error = 1.96 * values.std() / 20
     normal = values.mean() - error, values.mean() + error
     assert interval([values]) == pytest.approx(normal, abs=0.02)
-
-
-def test_interquartile_mean():
-    assert iqm(np.array([1000.0, 1, 2, 3, 4, 5, 6, -500])) == 3.5
-    assert iqm(np.array([[0.0, 1, 2, 9]]), axis=1).tolist() == [1.5]
 
 
 def test_mean_of_curves_ends_where_the_shortest_does(tmp_path):
@@ -187,14 +179,6 @@ def runs(tmp_path):
     return with_safety(read_results([tmp_path / "logs"]).runs)
 
 
-def test_csv_is_the_table(tmp_path, runs):
-    plot.main([str(tmp_path / "logs"), "--table", str(tmp_path / "a" / "runs.csv")])
-    again = pd.read_csv(tmp_path / "a" / "runs.csv")
-    same = ["algo", "seed", "J_r"]
-    pd.testing.assert_frame_equal(again[same], runs[same], check_dtype=False)
-    assert list(again.columns) == list(runs.columns) and {*SAFETY} < {*runs.columns}
-
-
 def test_markdown_and_latex(tmp_path, runs):
     for name in ("r.md", "r.tex"):
         write_tables(tmp_path / name, Data(runs))
@@ -256,9 +240,3 @@ def test_latex_escapes(cell):
 def test_markdown_shows_cells_as_they_are(text, page):
     assert markdown(pd.DataFrame({"x": [text]})).splitlines()[2].strip("| ") == page
     assert "|" in text or escaped(text) == page
-
-
-def test_a_table_that_can_not_be_written(tmp_path, runs):
-    (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match=r"can't write to"):
-        write_tables(tmp_path / "file" / "r.md", Data(runs))

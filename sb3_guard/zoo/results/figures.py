@@ -2,7 +2,7 @@
 
 import html
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -56,27 +56,16 @@ TIER_STYLES = {
 # Elements
 
 
-def fit_costs(axis: Axes, values: Iterable[Any], limit: float = np.nan, way: str = "y") -> None:
+def fit_costs(axis: Axes, limit: float, way: str = "y") -> None:
     """
-    Begin a cost axis at 0, or below it at the lowest value, and end it where one outlier does not
-    squash all others; a panel whose y axis ends earlier says how far the costs go.
+    Let a cost axis have 0 and the limit, and end at five times the limit if costs go beyond.
 
-    :param values: all lines and points that are drawn, arrays or numbers; bands may be cut
-    :param limit: the cost limit, which is always shown; nan without one
+    :param limit: the cost limit; nan without one
     :param way: which axis, ``x`` or ``y``
     """
-    finite = np.concatenate([np.ravel(np.asarray(part, float)) for part in (*values, limit)])
-    finite = finite[np.isfinite(finite)]
-    end = getattr(axis, f"get_{way}lim")()[1]
-    if len(finite) and (highest := finite.max()) > 0:
-        enough = np.fmax(5 * np.quantile(finite, 0.75), limit)
-        end = min(end, 1.5 * highest)
-        if 0 < enough < highest:
-            end = min(1.5 * finite[finite <= enough].max(), 1.05 * enough)
-            if way == "y":
-                text = f"↑ up to {highest:.3g}"
-                axis.text(0.99, 0.98, text, transform=axis.transAxes, ha="right", va="top")
-    getattr(axis, f"set_{way}lim")(1.1 * finite.min(initial=0), end)
+    lowest, high = getattr(axis.dataLim, f"{way}0"), getattr(axis, f"get_{way}lim")()[1]
+    end = min(high, 5 * limit) if limit > 0 else high
+    getattr(axis, f"set_{way}lim")(1.1 * min(lowest, 0.0), end)
 
 
 def cost_name(column: str) -> str:
@@ -97,7 +86,6 @@ def draw_limit(line: Callable[..., Any], data: Data, suite: str, cost: str) -> f
 
 def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
     """Draw one figure of merit against steps: means of the seeds, shaded ± their deviation."""
-    drawn, limit = list[Any](), np.nan
     for algo in data.algos(suite):
         curves = [curve for curve in data.curves(suite, algo) if metric in curve]
         if not curves:
@@ -105,19 +93,16 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
         table, look = mean_curve(curves, metric), data.looks[algo]
         steps = table.index.to_numpy()
         axis.plot(steps, table["mean"], linewidth=1.5, **look.line)
-        drawn.append(table["mean"])
         if len(curves) > 1:
             low, high = table["mean"] - table["std"], table["mean"] + table["std"]
             axis.fill_between(steps, low, high, color=look.color, alpha=0.15, linewidth=0)
-    if metric.startswith("M_c"):
-        limit = draw_limit(axis.axhline, data, suite, metric)
     axis.set(
         xlabel="steps", ylabel=AXES.get(metric) or cost_name(metric).replace(" cost, ", " cost,\n")
     )
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_xlim(left=0)
-    if metric != "J_r" and drawn:
-        fit_costs(axis, drawn, limit)
+    if metric.startswith("M_c"):
+        fit_costs(axis, draw_limit(axis.axhline, data, suite, metric))
 
 
 def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
@@ -134,17 +119,9 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
         )  # fmt: skip
     axis.set(xlabel=cost_name(cost), ylabel="return", title=title_of(data, suite))
     axis.margins(0.08)
-    fit_costs(axis, [means[cost]], limit, "x")
-    start, end = axis.get_xlim()
-    axis.set_xlim(start - 0.03 * (end - start), end)
-    if not np.isnan(limit) and limit < end:
+    fit_costs(axis, limit, "x")
+    if not np.isnan(limit) and limit < (end := axis.get_xlim()[1]):
         axis.axvspan(limit, end, color=INK, alpha=0.1, linewidth=0, label="above the limit")
-    edge = end - 0.03 * (end - start)
-    for row in means[means[cost] > end].to_dict("records"):
-        look = data.looks[row["algo"]]
-        axis.scatter(edge, row["J_r"], s=80, color=look.color, marker=look.marker, zorder=3)
-        axis.annotate(f"{row[cost]:.3g} →", (edge, row["J_r"]), (0, 8), textcoords="offset points",
-                      ha="right", color=look.color)  # fmt: skip
 
 
 def finish(figure: Figure) -> None:

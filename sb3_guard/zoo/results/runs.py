@@ -248,18 +248,14 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
     :raises UsageError: an environment has several cost limits or ``env_kwargs``, or an algorithm
         on it several lengths or wrappers
     """
+    other = "give the folders of one kind only"
     for column, name, keys, fix in (
         ("limits", "cost limit", ["suite"], "choose one, such as --cost-limit {}"),
-        ("world", "env_kwargs", ["suite"], "give the folders of one kind only"),
+        ("world", "env_kwargs", ["suite"], other),
         ("steps", "length", ["suite", "algo"], "choose one, such as --steps {}"),
-        ("wrappers", "wrappers", ["suite", "algo"], "give the folders of one kind only"),
-        (
-            "started_from",
-            "the model they started from",
-            ["suite", "algo"],
-            "give the folders of one kind only",
-        ),
-        ("config", "hyperparameters", ["suite", "algo"], "give the folders of one kind only"),
+        ("wrappers", "wrappers", ["suite", "algo"], other),
+        ("started_from", "the model they started from", ["suite", "algo"], other),
+        ("config", "hyperparameters", ["suite", "algo"], other),
     ):
         for key, group in runs.groupby(keys):
             values = _values(group[column])

@@ -92,18 +92,10 @@ def test_enjoy(arguments, parts, capsys, empty):
     refused(enjoy.main, ["--no-render", *arguments], capsys, *parts)
 
 
-@pytest.mark.parametrize(
-    ("program", "said"),
-    [
-        ("raise ValueError('actuator m has no ctrlrange')", "actuator m has no ctrlrange"),
-        ("open('dog.xml')", "No such file or directory"),
-        ("robot.register()", "NameError: name 'robot' is not defined"),
-    ],
-)
-def test_a_module_that_fails(program, said, capsys, empty, tmp_path, monkeypatch):
+def test_a_module_that_fails(capsys, empty, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "odd_robot.py").write_text(program)
-    said = f"--gym-packages: can't import 'odd_robot': {said}"
+    (tmp_path / "odd_robot.py").write_text("robot.register()")
+    said = "--gym-packages: can't import 'odd_robot': NameError: name 'robot' is not defined"
     refused(train.main, ["--gym-packages", "odd_robot"], capsys, said, "python -c 'import odd_ro")
 
 
@@ -249,14 +241,6 @@ def test_unwritable_video(capsys, run, tmp_path, monkeypatch):
     play = [*TOY, "-f", str(tmp_path), "--record"]
     refused(enjoy.main, [*play, "/dev/null/foo.mp4"], capsys, "--record", "choose another")
     refused(enjoy.main, [*play, "."], capsys, "'.' is a folder")
-
-
-def test_playing_in_a_world_without_room(capsys, tmp_path):
-    ours = ["--env", "Goal_Point_2Hazards", "-f", str(tmp_path)]
-    small = [one for one in SMALL if one not in ("--env-kwargs", "episode_length:20")]
-    assert train.main([*ours, *small]) == 0
-    play = [*ours, "--env-kwargs", "hazards:{'num':200}", "--no-render"]
-    refused(enjoy.main, play, capsys, "Goal_Point_2Hazards-v0", "LayoutError", "hazards")
 
 
 def test_no_backend_for_a_window(capsys, tmp_path, monkeypatch):

@@ -23,12 +23,9 @@ OFF_POLICY += ["policy_kwargs:{'net_arch':[16]}"]
 NOISY = ["gradient_steps:2", "noise_type:ornstein-uhlenbeck"]
 SLOW = pytest.mark.slow
 PARAMS = {
-    "a2c": ON_POLICY,
     "ppo": [*ON_POLICY, "batch_size:20", "n_epochs:2"],
     "ppo_lstm": [*ON_POLICY, "batch_size:20", "n_epochs:2"],
     "sac": OFF_POLICY,
-    "td3": OFF_POLICY,
-    "ddpg": OFF_POLICY,
     "tqc": OFF_POLICY,
     "crossq": OFF_POLICY,
 }
@@ -88,8 +85,6 @@ def test_costs_of_other_names_are_those_of_the_monitor(tmp_path, capsys):
     ("algo", "more"),
     [
         ("ppo", []),
-        pytest.param("sac", ["use_sde:True"], marks=SLOW),
-        pytest.param("td3", [], marks=SLOW),
         pytest.param("sac_lag", ["use_sde:True", *COSTLY], marks=SLOW),
         pytest.param("td3_lag", [*NOISY, *COSTLY], marks=SLOW),
         pytest.param("tqc_lag", COSTLY, marks=SLOW),

@@ -269,20 +269,6 @@ def test_enjoy_normalises_as_training_did(tmp_path, capsys):
     assert "can't read the observation statistics" in capsys.readouterr().err
 
 
-def test_record_writes_a_video(logs, tmp_path):
-    import imageio_ffmpeg
-
-    video = tmp_path / "made" / "film.mp4"
-    assert enjoy.main([*PLAY, "-f", str(logs), "-n", "12", "--record", str(video)]) == 0
-    assert [path.name for path in video.parent.iterdir()] == ["film.mp4"]
-    frames = imageio_ffmpeg.read_frames(str(video))
-    meta = next(frames)
-    assert meta["size"] == (64, 64 + 16) and meta["fps"] == 10  # below a line of text
-    pictures = [np.frombuffer(frame, np.uint8) for frame in frames]
-    assert len(pictures) == 12
-    assert pictures[0].max() > 200 and abs(int(np.median(pictures[0])) - 60) < 10
-
-
 def test_an_interrupt_while_environments_are_made(tmp_path, monkeypatch):
     """It comes when they are made, and nothing is written."""
     made = []
@@ -371,18 +357,6 @@ def test_our_environment_has_a_window(ours, monkeypatch):
     assert len(frames) >= 3 and {env.render_mode for env in frames} == {"human"}
 
 
-def test_no_backend_no_video(ours, tmp_path, monkeypatch, capsys):
-    import sb3_guard.envs.rendering as rendering
-
-    def nothing() -> str:
-        raise rendering.RenderingError("no OpenGL backend works here, tried egl; install EGL")
-
-    monkeypatch.setattr(rendering, "gl_backend", nothing)
-    assert enjoy.main([*ours, "--record", str(tmp_path / "film.mp4")]) == 2
-    assert "error: can't render: RenderingError: no OpenGL backend" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 # list and show
 
 
@@ -449,19 +423,6 @@ def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):
     red, green, blue = np.moveaxis(frame, -1, 0)
     assert ((red - green > 0.25) & (blue > green)).sum() > 1000  # ghosts
     assert ((green - red > 0.25) & (green > blue)).sum() > 1000  # the goal
-
-
-def test_show_knows_an_observed_camera_and_lets_its_options_be_changed(tmp_path, capsys):
-    require_rendering()
-    scenario, picture = tmp_path / "seen.yml", tmp_path / "seen.png"
-    scenario.write_text("robot: Car\nobserve: {camera: [32, 24]}\n")
-    show = ["show", str(scenario), "-o", str(picture), "--env-kwargs"]
-    assert cli.main([*show, "num_envs:2", "width:40", "height:30"]) == 0
-    cells = rows(capsys.readouterr().out)
-    assert ["camera", "image 24 × 32 × 3", "[0, 255]", "red, green, blue"] in cells
-    assert image.imread(picture).shape[:2] == (30, 40)
-    assert cli.main([*show, "flatten:True"]) == 2
-    assert "observe.camera = (32, 24) needs flatten=False" in capsys.readouterr().err
 
 
 def test_show_knows_what_users_registered(tmp_path, request, capsys):

@@ -4,15 +4,12 @@ import json
 import shlex
 import shutil
 import sys
-from pathlib import Path
 
-import gymnasium
 import pytest
 import yaml
-from cost_envs import CostPoint
-from typed import LENGTH, SMALL, TOY, refused, trained
+from typed import SMALL, TOY, refused, trained
 
-from sb3_guard import CPO, benchmark, enjoy, reproduce, train
+from sb3_guard import benchmark, enjoy, reproduce, train
 from sb3_guard.fields import parse_value
 from sb3_guard.zoo.cli.names import as_data
 from sb3_guard.zoo.cli.usage import UsageError
@@ -154,25 +151,6 @@ def test_reproduce_follows_the_files_that_the_user_names(tmp_path, trap, run, ca
     assert trap.exists()
 
 
-@pytest.mark.parametrize("conf", ["both", "both.py"])
-def test_a_module_of_parts_and_hyperparameters_registers_once(conf, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "both.py").write_text(
-        "import gymnasium\n"
-        "gymnasium.register('Both-v0', 'cost_envs:CostPoint')\n"
-        "made = open('made', 'a').write('once ')\n"
-        "hyperparams = {'default': {'n_timesteps': 60, 'cost_limit': 2}}\n"
-    )
-    short = [*SMALL, "-conf", conf, "--eval-freq", "-1", "--verbose", "0"]
-    try:
-        assert not train.main([*short, "--gym-packages", "both", "--env", "Both-v0", *LENGTH])
-        assert (tmp_path / "made").read_text() == "once "
-    finally:
-        sys.modules.pop("both", None)
-        gymnasium.registry.pop("Both-v0", None)
-
-
 @pytest.mark.parametrize("vec_env", ["dummy", pytest.param("subproc", marks=pytest.mark.slow)])
 def test_a_file_may_name_a_function_of_a_module_that_the_command_line_names(tmp_path, vec_env):
     (tmp_path / "conf.yml").write_text(
@@ -212,27 +190,3 @@ def test_only_classes_of_their_kind(name, value):
     with pytest.raises(UsageError, match=name):
         values = {"n_envs": 1, "n_timesteps": 1, name: as_data(name, value)}
         build(values).callbacks()
-
-
-class Hostile:
-    """Writes a file when it is unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return Path.touch, (self.path,)
-
-
-def test_weights_can_be_loaded_without_the_rest(trap, tmp_path):
-    env = CostPoint(10)
-    model = CPO("MlpPolicy", env, n_steps=20, seed=0)
-    model.gift = Hostile(trap)
-    model.save(tmp_path / "gift.zip")
-    other = CPO("MlpPolicy", env, n_steps=20, seed=1)
-    other.set_parameters(tmp_path / "gift.zip")
-    assert not trap.exists()
-    for name, learnt in model.policy.state_dict().items():
-        assert learnt.equal(other.policy.state_dict()[name])
-    CPO.load(tmp_path / "gift.zip")
-    assert trap.exists()  # so it was hostile

@@ -82,12 +82,6 @@ def test_results_are_finite(tmp_path):
         run.checked_result()
 
 
-def test_log_folder_that_can_not_be(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match=r"can't write to log folder .* choose another with -f"):
-        create(tmp_path / "file")
-
-
 def test_one_owner_at_a_time(tmp_path):
     run = create(tmp_path)
     with lock(run.path):

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from registered_envs import CostPoint  # which registers the environments
 
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.make_envs import evaluation_seed, row_seeds
@@ -38,18 +37,3 @@ def test_first_observations_of_seeds_0_and_1_differ(algo, vec_env):
         training.close()
     rows = np.concatenate(firsts)
     assert len(np.unique(rows, axis=0)) == len(rows) == 16
-
-
-def test_only_a_tried_out_run_takes_a_step(monkeypatch):
-    steps = []
-    step = CostPoint.step
-    monkeypatch.setattr(CostPoint, "step", lambda *args: steps.append(1) or step(*args))
-    flags = RunFlags(
-        algo="cpo", env="CostPoint-v0", seed=0, hyperparams={"cost_limit": 0}, verbose=0
-    )
-    run = Run.check(flags).make()
-    np.testing.assert_array_equal(run.limits(), run.evaluation.limits())
-    assert not steps
-    run.try_out()
-    assert len(steps) == 1
-    run.close()

@@ -143,6 +143,8 @@ def benchmark(flags: Flags) -> int:
             print(f"{run.state:<7} {run.path}  {run.steps:,} steps{without}")
         print(f"{summary(runs)}; {sum(run.steps for run in runs):,} steps in all")
         return 0
+    for run in {run.flags.env: run for run in runs if run.state != "done"}.values():
+        run.try_out()  # of each environment one, so that nothing begins with a wrong name or value
     return run_grid(runs, folder, flags.jobs, flags.scheduler, flags.verbose)
 
 

@@ -140,6 +140,7 @@ REFUSED = [
     (["--preset", "main9"], ["--preset", "leave out"]),
     (["--scale", "0"], ["--scale", "greater than 0"]),
     (["-params", "cost_limt:5"], ["none of the algorithms", "'cost_limt'", "'cost_limit'"]),
+    (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError"]),
     (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
     (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
 ]

@@ -5,9 +5,10 @@ import shlex
 import shutil
 import sys
 
+import gymnasium
 import pytest
 import yaml
-from typed import SMALL, TOY, refused, trained
+from typed import LENGTH, SMALL, TOY, refused, trained
 
 from sb3_guard import benchmark, enjoy, reproduce, train
 from sb3_guard.fields import parse_value
@@ -149,6 +150,25 @@ def test_reproduce_follows_the_files_that_the_user_names(tmp_path, trap, run, ca
     assert not trap.exists() and not (tmp_path / "again").exists()
     reproduce.main([*again, "-conf", "hostile.py"])
     assert trap.exists()
+
+
+@pytest.mark.parametrize("conf", ["both", "both.py"])
+def test_a_module_of_parts_and_hyperparameters_registers_once(conf, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "both.py").write_text(
+        "import gymnasium\n"
+        "gymnasium.register('Both-v0', 'cost_envs:CostPoint')\n"
+        "made = open('made', 'a').write('once ')\n"
+        "hyperparams = {'default': {'n_timesteps': 60, 'cost_limit': 2}}\n"
+    )
+    short = [*SMALL, "-conf", conf, "--eval-freq", "-1", "--verbose", "0"]
+    try:
+        assert not train.main([*short, "--gym-packages", "both", "--env", "Both-v0", *LENGTH])
+        assert (tmp_path / "made").read_text() == "once "
+    finally:
+        sys.modules.pop("both", None)
+        gymnasium.registry.pop("Both-v0", None)
 
 
 @pytest.mark.parametrize("vec_env", ["dummy", pytest.param("subproc", marks=pytest.mark.slow)])

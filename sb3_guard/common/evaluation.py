@@ -192,17 +192,6 @@ def share_environment(one: VecEnv, other: VecEnv) -> bool:
     return not parts[0].isdisjoint(parts[1])
 
 
-@contextmanager
-def _own_random_numbers(seed: int | None) -> Iterator[None]:
-    """Let a stochastic policy draw from ``seed``, and leave torch's generators as they were."""
-    if seed is None:
-        yield
-        return
-    with th.random.fork_rng():
-        th.manual_seed(seed)
-        yield
-
-
 def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
     """Whether an agent learnt from normalised observations, and ``env`` has no means of them."""
     if not getattr(model, "learnt_normalized", False):
@@ -319,8 +308,10 @@ def evaluate_policy(
 
     tally = _Tally(env, n_eval_episodes, keys, on_episode)
     longest = _longest_episode(env) if max_steps is None else None
-    with _constant_normalization(model, env), _own_random_numbers(seed):
+    # sampled actions are drawn from the seed, and torch's generators stay as they were
+    with _constant_normalization(model, env), th.random.fork_rng(enabled=seed is not None):
         if seed is not None:
+            th.manual_seed(seed)
             env.seed(seed)
         observations = env.reset()
         starts = np.ones(env.num_envs, dtype=bool)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
-import mujoco
 import numpy as np
 
 from sb3_guard.envs.robots.model_file import holding
@@ -63,29 +62,20 @@ class Actuator(NamedTuple):
     stop: float | None
 
 
-def joints(model: mujoco.MjModel, which: str, last: int) -> Iterator[tuple[str, str]]:
-    """
-    Names and units of the last numbers of ``qpos`` or ``qvel``.
-
-    :param which: ``"qpos"`` or ``"qvel"``
-    :param last: number of them
-    """
-    found = [
-        (f"{which} {model.joint(i).name.removeprefix('robot/')} {part}".strip(), unit)
-        for i in range(model.njnt)
-        for part, unit in _COORDINATES[which][model.jnt_type[i]]
-    ]
-    yield from found[len(found) - last :]
-
-
 def components(engine: Engine) -> Iterator[Component]:
     """The components of the flat observation in their order; joints one by one."""
+    model = engine.model
     for name, where in engine.observation_layout.items():
         channel = engine.channels[name]
         low, high = channel.low, channel.high
         if name in ("qpos", "qvel"):
-            parts = joints(engine.model, name, where.stop - where.start)
-            for i, (part, unit) in enumerate(parts, where.start):
+            every = [
+                (f"{name} {model.joint(i).name.removeprefix('robot/')} {part}".strip(), unit)
+                for i in range(model.njnt)
+                for part, unit in _COORDINATES[name][model.jnt_type[i]]
+            ]
+            hidden = len(every) - (where.stop - where.start)  # the first ones
+            for i, (part, unit) in enumerate(every[hidden:], where.start):
                 yield Component(part, i, i + 1, low, high, unit)
             continue
         unit = channel.unit or _UNITS.get(name, "")

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from sb3_guard.envs.part import Part, Simulation, World
+from sb3_guard.envs.part import Part, Simulation, World, below
 from sb3_guard.envs.types import Array
 
 # what a factor multiplies: fields of the model
@@ -53,7 +53,7 @@ class Drawn:
         """Find out what factors apply to, once parts are bound; set those that stay the same."""
         self._scaled: list[tuple[str, Array, Array]] = []  # field, its rows, factors
         for part, name, kind in self._factors:
-            bodies = _below(model, part.roots)
+            bodies = below(model, part.roots)
             ends = model.geom_bodyid[[model.pair_geom1, model.pair_geom2]]
             rubs = np.isin(ends, bodies).any(axis=0) & (ends == 0).any(axis=0)
             rows = np.array(bodies) if kind == "mass" else np.flatnonzero(rubs)
@@ -82,12 +82,3 @@ class Drawn:
     def info(self) -> dict[str, Array]:
         """What info says of the running episodes, by name, [N] each: nothing if not asked to."""
         return {name: values.copy() for name, values in self.values.items() if self._told}
-
-
-def _below(model: mujoco.MjModel, roots: Sequence[str]) -> list[int]:
-    """These bodies and all that hang on them, by number."""
-    bodies = {model.body(root).id for root in roots}
-    for child in range(model.nbody):  # parents come before their children
-        if int(model.body_parentid[child]) in bodies:
-            bodies.add(child)
-    return sorted(bodies)

@@ -34,15 +34,18 @@ GRIPS = 33  # factors on friction at which heights are computed: within 0.3 µm 
 class Group:
     """Like objects of a part: discs on the floor, spheres in the air, or solid bodies.
 
+    Each body has a sensor for the robot's touch.
+
     :param part: whose they are; its ``planar`` and ``color`` are theirs, and the ``size`` of those
         that are not solid
     :param world: the world under construction
     :param footprint: how many, what they are called and where they are placed
     :param shape: adds the geoms of a solid object, whose frame is its place; None: not solid
     :param free: half height of solid objects that can be pushed, m; None: they stay
-    :param weld: whether those that can be pushed are pulled along by a mocap body
+    :param weld: whether those that can be pushed are welded, softly, to a mocap body below them
     :param sink: how deep those that can be pushed begin in the floor, m; None: as they rest
     :param grip: the part's parameter that is a factor on their friction with the floor
+    :raises ValueError: another part's bodies have this name
     """
 
     def __init__(
@@ -58,27 +61,103 @@ class Group:
     ) -> None:
         self.part: Part = weakref.proxy(part)  # which has this group
         self.name, self.footprint = footprint.name, footprint
-        self.solid, self._grip = shape is not None, grip
-        number = footprint.num if shape else 0
+        self.solid, self._grip, self._free = shape is not None, grip, free is not None
+        name, self._num = self.name, footprint.num if shape else 0  # of bodies
+        if self._num and world.spec.body(f"{name}/0") is not None:
+            raise ValueError(
+                f"two parts have bodies called {name!r}; give the constraint another name"
+            )
+        # how high bodies are set down, m, at some factors on their friction
         grips = part.span(grip) if grip else Range(1.0, 1.0)
-        self.bodies = Bodies(world, self.name, number, shape or _no_shape, free, weld, sink, grips)
+        self._grips = np.linspace(*grips, 1 if grips.low == grips.high else GRIPS)
+        self._heights = np.full(len(self._grips), 0.0 if free is None else free - (sink or 0.0))
+        if shape and free is not None and sink is None:
+            timestep = world.spec.option.timestep
+            self._heights[:] = [resting_height(shape, free, timestep, g) for g in self._grips]
+        for i in range(self._num):
+            body = world.spec.worldbody.add_body(name=f"{name}/{i}", mocap=not self._free)
+            if self._free:
+                body.add_freejoint()
+            if shape:
+                shape(body)
+            world.feel(f"{name}/{i}", body=f"{name}/{i}")
+        self._welded = weld and self._num > 0
+        self._lift = free if weld and free else 0.0
+        for i in range(self._num if weld else 0):
+            world.spec.worldbody.add_body(name=f"{name}/{i}/mover", mocap=True)
+            world.spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_WELD,
+                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                name1=f"{name}/{i}/mover",
+                name2=f"{name}/{i}",
+                solref=WELD,
+                # anchor, offset, turn, torque
+                data=[0, 0, 0, 0, 0, self._lift, 1, 0, 0, 0, TURN / self._lift, 0],
+            )
 
     @property
     def movable(self) -> list[str]:
         """Names of the bodies that can be pushed."""
-        return self.bodies.movable
+        return [f"{self.name}/{i}" for i in range(self._num)] if self._free else []
 
     def bind(self, sim: Simulation) -> None:
-        """Take live views: ``places``, where they were put, and ``centers``, [N, num, 3] m."""
-        self.bodies.bind(sim)
-        self.places = sim.places(self.name)
-        self.centers = self.bodies.positions if self.solid else self.places
+        """Take live views: ``places``, where they were put, and ``centers``, [N, num, 3] m; of free
+        bodies ``velocities``, m/s.
+        """
+        self.places = self.centers = sim.places(self.name)
+        model, batch, k = sim.model, sim.batch, self._num
+        if k == 0:
+            self._found = np.zeros((sim.num_envs, 0))
+            return
+        body = model.body(f"{self.name}/0")
+        self.centers = batch.bind("xpos")[:, body.id : body.id + k]
+        first = int(model.sensor(f"{self.name}/0").adr[0])
+        self._found = batch.bind("sensordata")[:, first : first + k]
+        if self._free:
+            first = int(body.jntadr[0])
+            q, v = int(model.jnt_qposadr[first]), int(model.jnt_dofadr[first])
+            pose = batch.bind("qpos")[:, q : q + 7 * k].reshape(-1, k, 7)
+            self._set, self._turns = pose[..., :3], pose[..., 3:]
+            self.velocities = batch.bind("qvel")[:, v : v + 6 * k].reshape(-1, k, 6)[..., :3]
+        else:
+            self._set, self._turns = self._mocap(sim, f"{self.name}/0")
+        self._movers = self._set
+        if self._welded:
+            self._movers, self._mover_turns = self._mocap(sim, f"{self.name}/0/mover")
+
+    def _mocap(self, sim: Simulation, name: str) -> tuple[Array, Array]:
+        """Places and quaternions of the mocap bodies from this one on."""
+        first = int(sim.model.body_mocapid[sim.model.body(name).id])
+        rows = slice(first, first + self._num)
+        return sim.batch.bind("mocap_pos")[:, rows], sim.batch.bind("mocap_quat")[:, rows]
+
+    @property
+    def touched(self) -> Array:
+        """Which bodies the robot touches, [N, num] bool; [N, 0] of what is not solid."""
+        return self._found > 0
 
     def reset(self, ids: Array, rngs: Generators) -> None:
-        """Set solid objects down at their places in rows ``ids``."""
-        if self.solid:
-            grips = self.part.current(self._grip)[ids] if self._grip else np.ones(len(ids))
-            self.bodies.put(ids, self.places[ids], rngs, grips)
+        """Set bodies down at their places in rows ``ids``, each with a random heading."""
+        if not self._num:
+            return
+        places = self.places[ids]
+        grips = self.part.current(self._grip)[ids] if self._grip else np.ones(len(ids))
+        self._set[ids] = places
+        self._set[ids, :, 2] += np.interp(grips, self._grips, self._heights)[:, None]
+        for i in ids.tolist():
+            heading = rngs[i].uniform(0, 2 * math.pi, self._num)
+            self._turns[i] = geometry.yaw_quaternion(heading)
+        if self._welded:
+            self._mover_turns[ids] = self._turns[ids]
+            self.move(places, ids)
+
+    def move(self, places: Array, rows: Array | slice = slice(None)) -> None:
+        """Move bodies, those that cannot be pushed or what they are welded to, in these rows.
+
+        :param places: [n, num, 3] m
+        """
+        self._movers[rows] = places
+        self._movers[rows, :, 2] += self._lift
 
     def scan(self, visible: Array | None = None) -> Scan:
         """What lidar sees of them, in all rows or in the ``visible`` ones, [N] bool."""
@@ -91,127 +170,6 @@ class Group:
             for center in self.centers[row]:
                 if center[0] < AWAY[0]:
                     painter.zone(center, size, half_height, self.part.color)
-
-
-def _no_shape(body: mujoco.MjsBody) -> None:
-    """No geoms."""
-
-
-class Bodies:
-    """Solid objects as bodies of the world, each with a sensor for the robot's touch.
-
-    :param world: the world under construction
-    :param name: what the bodies are called, followed by their number
-    :param num: how many
-    :param shape: adds the geoms of one body
-    :param free: half height of bodies that can be pushed, m; None: they stay where they are put
-    :param weld: whether each is welded, softly, to a mocap body below it
-    :param sink: how deep free ones begin in the floor, m; None: as they rest
-    :param grips: range of factors on their friction with the floor
-    :raises ValueError: another part's bodies have this name
-    """
-
-    def __init__(
-        self,
-        world: World,
-        name: str,
-        num: int,
-        shape: Shape,
-        free: float | None,
-        weld: bool,
-        sink: float | None,
-        grips: Range,
-    ) -> None:
-        if num and world.spec.body(f"{name}/0") is not None:
-            raise ValueError(
-                f"two parts have bodies called {name!r}; give the constraint another name"
-            )
-        self.name, self.num, self.free = name, num, free is not None
-        # how high they are set down, m, at some factors on their friction
-        self._grips = np.linspace(*grips, 1 if grips.low == grips.high else GRIPS)
-        self._heights = np.full(len(self._grips), 0.0 if free is None else free - (sink or 0.0))
-        if free is not None and sink is None:
-            timestep = world.spec.option.timestep
-            self._heights[:] = [resting_height(shape, free, timestep, g) for g in self._grips]
-        for i in range(num):
-            body = world.spec.worldbody.add_body(name=f"{name}/{i}", mocap=not self.free)
-            if self.free:
-                body.add_freejoint()
-            shape(body)
-            world.feel(f"{name}/{i}", body=f"{name}/{i}")
-        self._mover = f"{name}/0/mover" if weld and num else ""
-        self._lift = free if weld and free else 0.0
-        for i in range(num if weld else 0):
-            world.spec.worldbody.add_body(name=f"{name}/{i}/mover", mocap=True)
-            world.spec.add_equality(
-                type=mujoco.mjtEq.mjEQ_WELD,
-                objtype=mujoco.mjtObj.mjOBJ_BODY,
-                name1=f"{name}/{i}/mover",
-                name2=f"{name}/{i}",
-                solref=WELD,
-                # anchor, offset, turn, torque
-                data=[0, 0, 0, 0, 0, self._lift, 1, 0, 0, 0, TURN / self._lift, 0],
-            )
-
-    def bind(self, sim: Simulation) -> None:
-        """Take live views: ``positions`` [N, num, 3] m, and ``velocities``, m/s, of free bodies."""
-        model, batch, k = sim.model, sim.batch, self.num
-        if k == 0:
-            self.positions = self.velocities = np.zeros((sim.num_envs, 0, 3))
-            self._places = self._movers = self.positions
-            self._turns, self._found = np.zeros((sim.num_envs, 0, 4)), np.zeros((sim.num_envs, 0))
-            return
-        body = model.body(f"{self.name}/0")
-        self.positions = batch.bind("xpos")[:, body.id : body.id + k]
-        first = int(model.sensor(f"{self.name}/0").adr[0])
-        self._found = batch.bind("sensordata")[:, first : first + k]
-        if self.free:
-            first = int(body.jntadr[0])
-            q, v = int(model.jnt_qposadr[first]), int(model.jnt_dofadr[first])
-            pose = batch.bind("qpos")[:, q : q + 7 * k].reshape(-1, k, 7)
-            self._places, self._turns = pose[..., :3], pose[..., 3:]
-            self.velocities = batch.bind("qvel")[:, v : v + 6 * k].reshape(-1, k, 6)[..., :3]
-        else:
-            first = int(model.body_mocapid[body.id])
-            self._places = batch.bind("mocap_pos")[:, first : first + k]
-            self._turns = batch.bind("mocap_quat")[:, first : first + k]
-        self._movers = self._places
-        if self._mover:
-            first = int(model.body_mocapid[model.body(self._mover).id])
-            self._movers = batch.bind("mocap_pos")[:, first : first + k]
-            self._mover_turns = batch.bind("mocap_quat")[:, first : first + k]
-
-    @property
-    def movable(self) -> list[str]:
-        """Names of the bodies that can be pushed."""
-        return [f"{self.name}/{i}" for i in range(self.num)] if self.free else []
-
-    @property
-    def touched(self) -> Array:
-        """Which bodies the robot touches, [N, num] bool."""
-        return self._found > 0
-
-    def put(self, ids: Array, places: Array, rngs: Generators, grips: Array) -> None:
-        """Set bodies down in rows ``ids`` at [n, num, 3] m, each with a random heading.
-
-        :param grips: factors on their friction, [n]
-        """
-        self._places[ids] = places
-        self._places[ids, :, 2] += np.interp(grips, self._grips, self._heights)[:, None]
-        for i in ids.tolist():
-            heading = rngs[i].uniform(0, 2 * math.pi, self.num)
-            self._turns[i] = geometry.yaw_quaternion(heading)
-        if self._mover:
-            self._mover_turns[ids] = self._turns[ids]
-            self.move(places, ids)
-
-    def move(self, places: Array, rows: Array | slice = slice(None)) -> None:
-        """Move bodies, those that cannot be pushed or what they are welded to, in these rows.
-
-        :param places: [n, num, 3] m
-        """
-        self._movers[rows] = places
-        self._movers[rows, :, 2] += self._lift
 
 
 def resting_height(shape: Shape, half_height: float, timestep: float, grip: float = 1.0) -> float:

@@ -84,4 +84,4 @@ class Movers(Placed):
             z, (low, high) = self.group.places[..., 2], self.height
             np.minimum(np.maximum(z, low), high, out=z)
         if self.solid:
-            self.group.bodies.move(self.group.places)
+            self.group.move(self.group.places)

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -152,6 +152,15 @@ class Simulation(Protocol):
 
     def redraw(self, name: str, row: int) -> bool:
         """Draw footprint ``name`` again in one row, clear of everything's current place."""
+
+
+def below(model: mujoco.MjModel, roots: Sequence[str]) -> list[int]:
+    """These bodies and all that hang on them, by number."""
+    bodies = {model.body(root).id for root in roots}
+    for child in range(model.nbody):  # parents come before their children
+        if int(model.body_parentid[child]) in bodies:
+            bodies.add(child)
+    return sorted(bodies)
 
 
 class Painter(Protocol):
@@ -312,11 +321,7 @@ class Robot(Part):
 
     def bodies(self, model: mujoco.MjModel) -> list[int]:
         """Its bodies in a compiled world: the outermost and all that hangs on it."""
-        below = [model.body(self.root).id]
-        for body in range(below[0] + 1, model.nbody):  # parents come before their children
-            if model.body_parentid[body] in below:
-                below.append(body)
-        return below
+        return below(model, [self.root])
 
     @property
     def base(self) -> tuple[float, float]:

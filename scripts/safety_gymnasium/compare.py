@@ -78,9 +78,7 @@ def moved(t: Trace) -> tuple[np.ndarray, np.ndarray]:
     actions = np.zeros((t.states, engine.robot.action_size))
     actions[:n] = t.actions
     engine.step(actions)
-    others = 7 * sum(
-        group.bodies.num for p in engine.parts for group in p.groups if group.bodies.free
-    )
+    others = 7 * sum(len(group.movable) for p in engine.parts for group in p.groups)
     robot = engine.model.nq - others
     ours = engine.batch.bind("qpos")[:n, :robot]
     return np.abs(ours - t["qpos"][t.after, :robot]).max(axis=1), met

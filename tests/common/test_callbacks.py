@@ -172,16 +172,6 @@ def test_sb3s_own_callback_is_warned_of(algorithm, recwarn):
     assert len(warned) == (algorithm is CPO)
 
 
-def test_history_has_costs(tmp_path):
-    learn(tmp_path)
-    history = np.load(tmp_path / "evaluations.npz")
-    assert history["timesteps"].tolist() == [30, 60, 90, 120]
-    for name in ("results", "costs", "ep_lengths"):
-        assert history[name].shape == (4, 4)
-    assert (history["costs"] >= 0).all()
-    assert not list(tmp_path.glob(".*"))  # nothing half-written
-
-
 def logged_rows(model) -> list[dict]:
     """What a model logs from now on, a dictionary per dump."""
     rows = []
@@ -262,19 +252,6 @@ def test_normaliser_lies_beside_the_best_model(tmp_path):
     assert saved.obs_rms.count > 1
     # Evaluation used training's statistics and did not add to them.
     assert eval_env.obs_rms.count <= env.obs_rms.count
-
-
-def test_callbacks_on_new_best_and_after_eval(tmp_path):
-    class Count(BaseCallback):
-        def _on_step(self):
-            return True
-
-    best, after = Count(), Count()
-    learn(tmp_path, callback_on_new_best=best, callback_after_eval=after)
-    assert after.n_calls == 4
-    assert 1 <= best.n_calls <= 4
-    model, _ = learn(tmp_path, callback_after_eval=StopAtOnce())
-    assert model.num_timesteps == 30
 
 
 def test_state_continues_the_history(tmp_path):

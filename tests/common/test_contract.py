@@ -99,7 +99,6 @@ def test_what_breaks_the_contract_later_than_at_the_first_step_is_a_line(name, k
     ("space", "good", "bad"),
     [
         (spaces.Discrete(3), 2, 3),
-        (spaces.MultiBinary(3), np.ones(3, np.int8), np.ones(4, np.int8)),
         (spaces.Dict({"a": spaces.Discrete(3)}), {"a": 1}, {"b": 1}),
         (spaces.Dict({"a": spaces.Discrete(3)}), {"a": 1}, 1),
         (spaces.Box(0, 255, (2, 2), np.uint8), [[1, 2], [3, 4]], [1, 2]),
@@ -216,15 +215,6 @@ def test_the_best_model_is_chosen_by_the_episodes_that_ended(tmp_path, monkeypat
         model.learn(20, callback=watcher)
     assert watcher.best_score == (True, 5.0)
     np.testing.assert_array_equal(np.load(tmp_path / "evaluations.npz")["results"], [[5, np.nan]])
-
-
-def test_where_no_episode_ends_no_model_is_the_best(monkeypatch):
-    monkeypatch.setattr(evaluation, "LONGEST", 60)
-    model = CPO("MlpPolicy", Late(), **SMALL)
-    watcher = CostEvalCallback(endless(None), eval_freq=20, n_eval_episodes=1, verbose=0)
-    with pytest.warns(UserWarning, match="1 of 1 episodes are left out"):
-        model.learn(20, callback=watcher)
-    assert watcher.best_score == (False, -np.inf)
 
 
 # What is no environment of Stable-Baselines3

@@ -166,25 +166,6 @@ def test_diverged_episodes_are_counted():
     assert env.physics_errors == 1 and env.state()["physics_errors"] == 1
 
 
-def test_an_episode_that_ends_at_its_goal_is_not_called_truncated():
-    env = make_vec_env("Goal_Point_8Hazards_noconti", 2, seed=0)
-    env.reset()
-    engine = env.unwrapped.envs.engine
-    engine.places("goal")[0, 0, :2] = engine.robot.position[0, :2]
-    _, _, dones, infos = env.step(np.zeros((2, 2)))
-    assert dones.tolist() == [True, False]
-    assert [info["TimeLimit.truncated"] for info in infos] == [False, False]
-
-
-def test_a_seed_counts_for_one_reset():
-    env = make_vec_env("Goal_Point_8Hazards", 2, seed=0)
-    first = env.reset()
-    second = env.reset()
-    assert not np.array_equal(first, second)
-    env.seed(0)
-    np.testing.assert_array_equal(env.reset(), first)
-
-
 def test_everything_that_a_registration_says_is_honoured():
     gymnasium.register(
         "Registered-v0",

@@ -147,11 +147,11 @@ def test_sensors_agree_with_the_contacts_of_every_part_of_the_robot(robot):
 def test_vases_stand_still_until_they_are_pushed(robot):
     """Small and large time step: no speed of their own that would cost."""
     engine = world(f"Goal_{robot}_8Vases", 2)
-    vases = engine.constraints[0].group.bodies
-    before = vases.positions.copy()
+    vases = engine.constraints[0].group
+    before = vases.centers.copy()
     for _ in range(50):
         assert engine.step(np.zeros((2, engine.robot.action_size))).cost.sum() == 0
-    np.testing.assert_allclose(vases.positions, before, atol=1e-6)
+    np.testing.assert_allclose(vases.centers, before, atol=1e-6)
     assert np.abs(vases.velocities).max() < 1e-6
 
 
@@ -185,9 +185,9 @@ def test_vase_costs_equal_the_scalar_loop():
 def test_gremlins_circle_by_the_simulated_clock():
     """§5: travel · (sin t, cos t) around their places; a step shows the time it began at."""
     engine = world("Goal_Swimmer_3Gremlins", 2, gremlins={"travel": 0.25, "rate": 1.5})
-    places, bodies = engine.places("gremlins"), engine.constraints[0].group.bodies
+    places, bodies = engine.places("gremlins"), engine.constraints[0].group
     control_step = 10 * engine.model.opt.timestep
-    np.testing.assert_allclose(bodies.positions - places, [[[0, 0.25, 0]] * 3] * 2, atol=1e-12)
+    np.testing.assert_allclose(bodies.centers - places, [[[0, 0.25, 0]] * 3] * 2, atol=1e-12)
     for step in range(30):
         if step == 11:
             engine.reset(np.array([1]))
@@ -195,7 +195,7 @@ def test_gremlins_circle_by_the_simulated_clock():
         for i, k in enumerate((step, step - 11 if step >= 11 else step)):
             t = 1.5 * k * control_step
             circle = [0.25 * math.sin(t), 0.25 * math.cos(t), 0.0]
-            np.testing.assert_allclose(bodies.positions[i] - places[i], [circle] * 3, atol=1e-9)
+            np.testing.assert_allclose(bodies.centers[i] - places[i], [circle] * 3, atol=1e-9)
 
 
 @pytest.mark.parametrize("solid", [False, True])
@@ -328,7 +328,7 @@ def test_wrong_buttons_of_a_button_task_cost():
         x, y = engine.places("button")[0, button, :2]
         put_point(engine, x - 0.19, y, math.pi)
         assert engine.step(np.zeros((1, 2))).cost[0] == expected
-        assert task.group.bodies.touched[0].tolist() == [b == button for b in range(4)]
+        assert task.group.touched[0].tolist() == [b == button for b in range(4)]
 
 
 def test_indicator_counts_any_touch_once():

@@ -12,7 +12,6 @@ from worlds import ROW, actions, assert_rows_are_lone_environments, world
 from sb3_guard import Scenario, make, make_vec_env
 from sb3_guard.envs import GuardVectorEnv
 from sb3_guard.envs.layout import AWAY
-from sb3_guard.show import costs, drawn_table
 
 SPREAD = {"low": 0.5, "high": 2.0}
 DELAY = {"low": 0, "high": 25}
@@ -279,15 +278,6 @@ def test_info_has_what_was_drawn_if_asked():
         if step == 4:  # of the episode that ends
             assert infos["final_info"]["robot.mass"][1] == first["robot.mass"][1]
             assert dones.all()
-
-
-def test_show_lists_what_is_drawn():
-    params = {"hazards": {"size": {"low": 0.1, "high": 0.3}}, "robot": {"delay": DELAY}}
-    env = GuardVectorEnv(1, "Goal_Point_8Hazards", **params)
-    table = drawn_table(env)
-    rows = [[cell.strip() for cell in row.split("|")[1:3]] for row in table.splitlines()]
-    assert ["hazards.size", "0.1 to 0.3"] in rows and ["robot.delay", "0 to 25"] in rows
-    assert "size 0.1 to 0.3" in next(costs(env, "Goal_Point_8Hazards-v0"))
 
 
 def test_free_objects_lie_still_whatever_their_friction():

@@ -269,23 +269,6 @@ def test_a_fixed_layout_repeats_within_a_row():
     assert not np.array_equal(env.engine.places("hazards"), first)
 
 
-def test_fixed_places_and_rectangles_are_used():
-    env = GuardVectorEnv(
-        3,
-        "Goal_Point_8Hazards",
-        hazards={"locations": [[1.5, 1.5]], "placements": [[-2, -2, 2, 0], [-2, 0, 0, 2]]},
-        robot={"locations": [[0, 0]], "heading": 0.0},
-        goal={"placements": [[0, 0, 2, 1.2]], "keepout": 0.1},
-    )
-    env.reset(seed=0)
-    hazards = env.engine.places("hazards")
-    np.testing.assert_array_equal(hazards[:, 0, :2], [[1.5, 1.5]] * 3)
-    assert ((hazards[:, 1:, 1] <= -0.4 + 1e-9) | (hazards[:, 1:, 0] <= -0.4 + 1e-9)).all()
-    np.testing.assert_allclose(env.engine.robot.position[:, :2], 0, atol=1e-12)
-    goal = env.engine.places("goal")[:, 0]
-    assert (goal[:, :2] >= 0.1 - 1e-9).all() and (goal[:, 1] <= 1.1 + 1e-9).all()
-
-
 def part(base, name, **verbs):
     """A part as a user may write it, with these methods."""
     return dataclass(type(name.capitalize(), (base,), {"name": name, **verbs}))()

@@ -360,5 +360,5 @@ def test_what_is_no_robot_is_answered_in_a_line(dog, change, stated, message):
 
 @pytest.mark.parametrize("center", [None, "base"])
 def test_an_arm_without_an_end_effector_is_answered_in_a_line(arm, center):
-    with pytest.raises(ValueError, match=r"'base', .*, cannot move: .* center='lower'"):
+    with pytest.raises(ValueError, match=r"'base', .*, cannot move: .* center='hand'"):
         arm(center=center)

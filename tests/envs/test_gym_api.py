@@ -1,7 +1,6 @@
 """What Gymnasium and Stable-Baselines3 ask of an environment."""
 
 import copy
-import json
 import pickle
 import warnings
 
@@ -67,16 +66,6 @@ def test_pickled_and_copied_environments_continue_bit_for_bit(env_id):
     obs, _ = env.reset()
     for twin in twins:
         np.testing.assert_array_equal(twin.reset()[0], obs)
-
-
-def test_the_spec_is_plain_data_and_makes_the_environment_again():
-    env = gymnasium.make(
-        "Goal_Point_8Hazards-v0", hazards={"num": 3, "locations": [(1.0, 1.0)]}, goal={"size": 0.3}
-    )
-    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.scenario == env.unwrapped.scenario
-    assert json.loads(env.spec.to_json())["max_episode_steps"] == 1000
-    np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
 
 
 def test_the_vector_environment_follows_gymnasiums_own():

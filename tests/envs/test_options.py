@@ -73,7 +73,7 @@ def test_gremlins_move_before_every_physics_step_where_they_are_told_to():
             engine.step(np.zeros((2, 2)))
             phase = 3.0 * (steps * FRAME_SKIP - late) * step
             circle = 0.3 * np.array([np.sin(phase), np.cos(phase)])
-            moved = engine.constraints[0].group.bodies.positions - engine.places("gremlins")
+            moved = engine.constraints[0].group.centers - engine.places("gremlins")
             np.testing.assert_allclose(
                 moved[..., :2], np.broadcast_to(circle, (2, 2, 2)), atol=1e-12
             )

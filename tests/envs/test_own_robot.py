@@ -1,15 +1,12 @@
 """A user's MJCF file needs to know nothing of our worlds."""
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 import pytest
 from worlds import own_parts, world
 
-from sb3_guard.envs import GuardVectorEnv, Scenario, register_constraint
+from sb3_guard.envs import GuardVectorEnv, Scenario
 from sb3_guard.envs.check_part import unsteady
-from sb3_guard.envs.part import Constraint
 from sb3_guard.envs.registry import ROBOTS, robot_of_file
 
 CART = """
@@ -127,28 +124,3 @@ def test_show_warns_of_actuators_that_are_too_strong(cart):
     """At rest such a robot stands still."""
     env = GuardVectorEnv(1, cart(lambda text: text.replace("<actuator>", BLAST)))
     assert "given random actions, explodes within" in str(unsteady(env.engine))
-
-
-def test_a_users_free_body_lies_on_the_floor():
-    @dataclass
-    class Crate(Constraint):
-        """A box to look at."""
-
-        name = "crate"
-
-        def build(self, world):
-            super().build(world)
-            body = world.spec.worldbody.add_body(name="crate", pos=[1.5, 1.5, 0.3])
-            body.add_freejoint()
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.1, 0.1, 0.1])
-
-        def cost(self):
-            return np.zeros(self.sim.num_envs)
-
-    with own_parts():
-        register_constraint("Crate", Crate)
-        engine = Scenario.parse("Goal_Point_1Crate").build()
-    engine.reset(np.zeros(1, dtype=int))
-    for _ in range(60):
-        engine.step(np.zeros((1, 2)))
-    assert engine.batch.get_data(0).body("crate").xpos[2] == pytest.approx(0.1, abs=0.01)

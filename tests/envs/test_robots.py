@@ -8,9 +8,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 import pytest
-from worlds import own_parts
 
-from sb3_guard.envs import register_robot
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.types import FLOOR
@@ -235,20 +233,6 @@ def test_point_thrusts_along_its_nose_and_turns_on_the_spot() -> None:
     drive(engine, [1, 0], 75)
     moved = engine.robot.position[0, :2] - start
     assert np.hypot(*moved) > 1.0 and moved @ nose > 0.999 * np.hypot(*moved)
-
-
-@pytest.mark.parametrize(
-    ("actuator", "site", "what"), [("trun", "eye", "trun"), ("turn", "nowhere", "nowhere")]
-)
-def test_misspelt_names_in_a_robot_file_are_not_dropped(actuator, site, what, tmp_path) -> None:
-    (tmp_path / "dial.xml").write_text(f"""
-    <mujoco><worldbody><body name="robot"><joint name="turn"/><geom size="0.1"/>
-      <site name="eye"/></body></worldbody>
-      <actuator><motor joint="{actuator}" ctrlrange="-1 1"/></actuator>
-      <sensor><gyro name="gyro" site="{site}"/></sensor></mujoco>""")
-    with own_parts():
-        with pytest.raises(ValueError, match=f"dial.xml: .*{what}"):
-            register_robot("Dial", xml=tmp_path / "dial.xml")
 
 
 def test_car_drives_along_its_nose_and_turns_on_the_spot() -> None:

@@ -24,7 +24,6 @@ from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Constraint
 from sb3_guard.envs.tasks import Goal, Push
-from sb3_guard.spelling import did_you_mean
 
 
 def test_ids_name_their_parts():
@@ -276,16 +275,6 @@ def test_yaml_reads_numbers_with_an_exponent_as_text_and_they_are_numbers(tmp_pa
     assert Scenario(constraints={"ghosts": {"num": "1e1"}}).parts()["constraints"][0].num == 10
 
 
-def test_arrays_do_for_lists():
-    places = np.array([[0.0, 1.0], [1.0, 0.0]])
-    scenario = Scenario.parse("Goal_Point_8Hazards").override(hazards={"locations": places})
-    assert scenario.constraints["hazards"]["locations"] == [[0, 1], [1, 0]]
-    engine = scenario.build()
-    engine.reset(np.zeros(1, dtype=int))
-    np.testing.assert_array_equal(engine.places("hazards")[0, :2, :2], places)
-    assert Hazards(locations=places).locations == ((0, 1), (1, 0))
-
-
 def test_registered_parts_are_used_by_ids(tmp_path):
     class Home(Goal):
         """Go home."""
@@ -429,11 +418,6 @@ def test_bad_registrations_are_refused(tmp_path):
     with pytest.raises(ValueError, match="must be a subclass of Task"):
         registry.register_task("Three", 3)
     assert "Sled" not in registry.ROBOTS
-
-
-def test_hints_name_the_nearest_match_whatever_its_case():
-    assert did_you_mean("pOINT", ["Point", "Ant"]).startswith("did you mean 'Point'?")
-    assert did_you_mean("zzz", ["Point", "Ant"]) == "allowed: Point, Ant"
 
 
 def test_extra_observations_join_the_layout_in_alphabetical_order():

@@ -98,7 +98,7 @@ def test_the_robot_pushes_the_object(kind):
     assert "box_compass" in engine.channels
     for _ in range(80):
         engine.step(np.array([[1.0, 0.0]]))
-        felt |= bool(engine.task.group.bodies.touched[0, 0])
+        felt |= bool(engine.task.group.touched[0, 0])
     assert felt and pose[0, 0] > start[0, 0] + 0.3
 
 
@@ -262,7 +262,7 @@ def test_solid_targets_stop_the_robot_and_others_do_not(task):
         touched = 0
         for _ in range(120):
             engine.step(np.array([[1.0, 0.0]]))
-            touched += int(solid and engine.task.group.bodies.touched[0, 0])
+            touched += int(solid and engine.task.group.touched[0, 0])
         ends[solid] = float(engine.robot.position[0, 0])
         assert (touched > 0) == solid
     assert -0.6 < ends[True] < -0.35  # radius 0.3, the Point's nose 0.15
@@ -273,7 +273,7 @@ def test_solid_targets_do_not_hang_in_an_arm_when_an_episode_begins():
     """Low enough for the upper arm to cross: without a look at the contacts one in ten would."""
     engine = world("Chase_Arm6_0Hazards", 8, chase={"solid": True, "height": [1.5, 1.8]})
     for _ in range(10):
-        assert not engine.task.group.bodies.touched.any()
+        assert not engine.task.group.touched.any()
         engine.reset(np.arange(8))
 
 
@@ -291,7 +291,7 @@ def test_the_lit_button_pays_and_after_the_delay_another_one_is_lit():
     assert (engine.observe()[0, engine.observation_layout["button_lidar"]] > 0).any()
     for wrong in set(range(4)) - {lit}:
         outcome = press(engine, wrong)
-        assert task.group.bodies.touched[0, wrong] and not outcome.goal_met[0]
+        assert task.group.touched[0, wrong] and not outcome.goal_met[0]
         assert task.mistakes()[0] == 1
     outcome = press(engine, lit)
     assert outcome.goal_met[0] and 0.9 < outcome.reward[0] < 1.1

@@ -85,4 +85,4 @@ class Gremlins(Obstacles):
         places = self.group.places[rows].copy()  # [n, num, 3]
         places[..., 0] += (self.travel * np.sin(phase))[:, None]
         places[..., 1] += (self.travel * np.cos(phase))[:, None]
-        self.group.bodies.move(places, rows)
+        self.group.move(places, rows)

@@ -52,7 +52,7 @@ class Obstacles(Placed, Constraint):
     def amounts(self) -> Array:
         """What each object costs, [N, num]."""
         if self.solid:
-            return self.weight * self.group.bodies.touched
+            return self.weight * self.group.touched
         depth = self._sizes - self.sim.robot.clearance(self.group.centers, self.planar)
         return self.weight * np.maximum(depth, 0.0)
 

@@ -64,12 +64,12 @@ class Vases(Obstacles):
 
     def _moved(self) -> Array:
         """What the displacement of each vase costs, [N, num]."""
-        moved = geometry.distance(self.group.bodies.positions, self.group.places, planar=True)
+        moved = geometry.distance(self.group.centers, self.group.places, planar=True)
         return self.displacement_weight * np.where(moved > self.displacement_threshold, moved, 0.0)
 
     def _moving(self) -> Array:
         """What the speed of each vase costs, [N, num]."""
-        speed = geometry.norm(self.group.bodies.velocities)
+        speed = geometry.norm(self.group.velocities)
         return self.velocity_weight * np.where(speed >= self.velocity_threshold, speed, 0.0)
 
     def amounts(self) -> Array:

@@ -120,7 +120,8 @@ def _center(model: mujoco.MjModel, file: ModelFile, center: str) -> tuple[str, s
     tip = None if center in bodies else center
     body = model.body(center).id if tip is None else int(model.site(center).bodyid[0])
     if model.body_weldid[body] == 0:
-        moving = [n for n in bodies[::-1] if n and model.body_weldid[model.body(n).id]]
+        moving = [n for n in sites if n and model.body_weldid[model.site(n).bodyid[0]]]
+        moving += [n for n in bodies[::-1] if n and model.body_weldid[model.body(n).id]]
         raise ValueError(
             f"{file.label} stands on a fixed base, and {center!r}, whose place is the robot's "
             f"position, cannot move: name its end effector, a body or site, center={moving[0]!r}"

@@ -45,7 +45,7 @@ def fields(name: str) -> Fields:
     env_id = with_version(name, env_ids())
     for suite in SUITES.values():
         found = suite.scenarios.get(env_id)
-        if found is None:
+        if found is None and suite.parse is not None:
             found = suite.parse(name)
         if found is not None:
             return found

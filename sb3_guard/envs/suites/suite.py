@@ -8,10 +8,6 @@ Fields = Mapping[str, Any]  # keyword arguments of a Scenario
 EPISODE_STEPS = 1000  # control steps of an episode, where an id does not say otherwise
 
 
-def _nothing(name: str) -> Fields | None:
-    return None
-
-
 @dataclass(frozen=True)
 class Suite:
     """A family of named environments.
@@ -27,4 +23,4 @@ class Suite:
     about: str
     scenarios: Mapping[str, Fields]
     steps: Mapping[str, int] = field(default_factory=dict)
-    parse: Callable[[str], Fields | None] = _nothing
+    parse: Callable[[str], Fields | None] | None = None

@@ -99,7 +99,7 @@ class Button(Placed, Task):
         return self.reward_distance * (before[:, 0] - now[:, 0])
 
     def succeeded(self, now: Array) -> Array:
-        pressed: Array = self.group.bodies.touched[self._rows, self.right]
+        pressed: Array = self.group.touched[self._rows, self.right]
         return pressed & (self.wait == 0) if self.locked else pressed
 
     def advance(self, ids: Array) -> Array:
@@ -113,7 +113,7 @@ class Button(Placed, Task):
         return ids[:0]
 
     def mistakes(self) -> Array:
-        touched = self.group.bodies.touched
+        touched = self.group.touched
         wrong = touched.sum(axis=1) - touched[self._rows, self.right]
         return np.where(self.wait == 0, wrong, 0).astype(float)
 

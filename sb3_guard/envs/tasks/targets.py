@@ -40,7 +40,7 @@ class Targets(Movers, Task):
 
     def invalid_start(self) -> Array:
         """Whether a solid target is touched: it hangs in the link of an arm, [N] bool."""
-        return self.group.bodies.touched.sum(axis=1) > 0
+        return self.group.touched.sum(axis=1) > 0
 
     @property
     def flight(self) -> float:

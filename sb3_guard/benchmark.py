@@ -18,8 +18,6 @@ from sb3_guard.zoo.run.flags import (
 
 # Flags that no grid file states
 HOW = ("grid", "log_folder", "dry_run", "scheduler", "verbose")
-# Flags that name files, folders or programs: what a file says of them is not followed.
-FOLLOWED = ("gym_packages", "conf_file", "tensorboard_log")
 
 
 @dataclass
@@ -102,7 +100,7 @@ def with_file(flags: Flags) -> Flags:
     :raises UsageError: the file can't be read, has an unknown entry, or names files or modules that
         the command line does not name
     """
-    from sb3_guard.zoo.cli.names import refuse_places, require_named
+    from sb3_guard.zoo.cli.names import FOLLOWED, refuse_places, require_named
 
     if flags.grid is None:
         return flags
@@ -111,7 +109,7 @@ def with_file(flags: Flags) -> Flags:
     content = read_mapping(path, "grid file", form)
     filed = Flags.read(content, path, HOW)
     given = {name: getattr(filed, name) for name in filed.given}
-    require_named(path, flags, filed, *FOLLOWED)
+    require_named(path, flags, filed, "conf_file", *FOLLOWED)
     refuse_places(path, filed.hyperparams or {})
     for name in flags.given:
         value, old = getattr(flags, name), given.get(name)

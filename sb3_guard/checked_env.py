@@ -1,21 +1,21 @@
 """Environments of others, held to Gymnasium's contract in every step and not in the first alone."""
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
-from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import AtariPreprocessing, MaxAndSkipObservation, RepeatAction
+from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
 from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_guard.checks import ContractError
-from sb3_guard.costs import number
 
 BROKEN = "contract_error"  # entry of info
+REPEATING = (AtariPreprocessing, MaxAndSkipObservation, RepeatAction, MaxAndSkipEnv)
 
 
 class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
@@ -24,10 +24,8 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
     It is the outermost wrapper and passes on what it is asked for or told to set. Stable-Baselines3
     broadcasts an observation of another shape, and takes every text for an end of the episode.
 
-    A wrapper may take several steps for one of the agent and give the last one's info, as
-    Gymnasium's ``MaxAndSkipObservation`` does: the costs of the others are lost. The infos of all
-    layers in the first step of an episode tell; from then on every step of such an environment is
-    compared.
+    A wrapper that takes several steps for one of the agent and gives the last one's info, as
+    Gymnasium's ``MaxAndSkipObservation`` does, loses the costs of the others: it is refused.
 
     :param env: the environment, with its wrappers
     :param cost_keys: entries of info that are costs
@@ -41,10 +39,10 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, cost_keys=tuple(cost_keys), raises=raises)
         gym.Wrapper.__init__(self, env)
         self._raises = raises
-        self._cost_keys = {"cost", *cost_keys}
+        self._cost_keys = {*cost_keys}
         self._space = env.observation_space
         self._steps = 0
-        self._repeats = False  # whether a wrapper has taken several steps for one
+        self._repeats = _repeats(env)
 
     def __getattr__(self, name: str) -> Any:
         if name == "env" or name.startswith("_"):
@@ -64,8 +62,9 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
         """
         self._steps = 0
         values: Any = self.env.reset(**kwargs)
-        if not (isinstance(values, tuple) and len(values) == 2 and isinstance(values[1], Mapping)):
+        if not (isinstance(values, tuple) and len(values) == 2):
             self._refuse(f"reset returns {_brief(values)}", "it must return (observation, info)")
+        self._check_info(values[1])
         self._check(values[0], self._space)
         return values
 
@@ -82,11 +81,14 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
             return self._space.sample(), 0.0, False, False, {BROKEN: str(error)}
 
     def _checked_step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        listens = self._repeats or self._steps == 1
-        values: Any = self._step_and_compare(action) if listens else self.env.step(action)
-        if not (isinstance(values, tuple) and len(values) == 5 and isinstance(values[4], Mapping)):
+        values: Any = self.env.step(action)
+        if not (isinstance(values, tuple) and len(values) == 5):
             five = "(observation, reward, terminated, truncated, info)"
-            self._refuse(f"step returns {_brief(values)}", f"it must return {five}")
+            six = (
+                "; CostFromStep takes six" if isinstance(values, tuple) and len(values) == 6 else ""
+            )
+            self._refuse(f"step returns {_brief(values)}", f"it must return {five}{six}")
+        self._check_info(values[4])
         observation, reward, *ends, _ = values
         self._check(observation, self._space)
         if not _is_scalar(reward):
@@ -94,7 +96,16 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
         for name, end in zip(("terminated", "truncated"), ends, strict=True):
             if end is not True and end is not False and not (_is_scalar(end) and end in (0, 1)):
                 self._refuse(f"{name} is {_brief(end)}", "it must be True or False")
+        if self._repeats and not self._cost_keys.isdisjoint(values[4]):
+            self._refuse(
+                f"{self._repeats} takes several steps and tells the cost of the last one alone",
+                "costs must add up, as rewards do: see docs/your_environment.md",
+            )
         return values
+
+    def _check_info(self, info: Any) -> None:
+        if not isinstance(info, Mapping):
+            self._refuse(f"info is {_brief(info)}", "it must be a dictionary")
 
     def _check(self, observation: Any, space: spaces.Space, name: str = "the observation") -> None:
         """Refuse an observation of another shape or kind; values may be out of bounds."""
@@ -114,54 +125,29 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
             shape = f", of shape {observation.shape}" if hasattr(observation, "shape") else ""
             self._refuse(f"{name} is {_brief(observation)}{shape}", f"it must fit {space}")
 
-    def _step_and_compare(self, action: Any) -> Any:
-        """A step in which the infos of all layers are listened to.
-
-        :raises ContractError: a wrapper took several steps and told the last one's cost
-        """
-        layers: list[Any] = [self.env]
-        while isinstance(layers[-1], gym.Wrapper):
-            layers.append(layers[-1].env)
-        told: list[list[dict[str, Any]]] = [[] for _ in layers]
-        with ExitStack() as stack:
-            for layer, infos in zip(layers, told, strict=True):
-                step = _listening(layer.step, infos)
-                stack.enter_context(patch.object(layer, "step", step))
-            values = self.env.step(action)
-        for wrapper, outer, inner in zip(layers, told, told[1:], strict=False):
-            if len(inner) <= len(outer) or not outer:
-                continue
-            self._repeats = True
-            for key in sorted(self._cost_keys & outer[-1].keys() & inner[-1].keys()):
-                costs = [number(info.get(key, 0.0), f"info[{key!r}]") for info in inner]
-                total = sum(number(info.get(key, 0.0), f"info[{key!r}]") for info in outer)
-                if outer[-1][key] == inner[-1][key] and not np.isclose(total, sum(costs)):
-                    self._refuse(
-                        f"info[{key!r}] is {costs[-1]:g}, but {type(wrapper).__name__} took "
-                        f"{len(costs)} steps, which cost {sum(costs):g}",
-                        "costs of repeated steps must add up, as rewards do: see "
-                        "docs/your_environment.md",
-                    )
-        return values
-
     def _refuse(self, fault: str, remedy: str) -> NoReturn:
         place = f"in step {self._steps} of an episode" if self._steps else "at reset"
         raise ContractError(f"{type(self.unwrapped).__name__}, {place}: {fault}; {remedy}")
 
 
-def _listening(step: Callable[[Any], Any], infos: list[dict[str, Any]]) -> Callable[[Any], Any]:
-    def listening(action: Any) -> Any:
-        values = step(action)
-        info = values[-1] if isinstance(values, tuple) and values else None
-        infos.append(dict(info) if isinstance(info, Mapping) else {})  # it may be written again
-        return values
+def _repeats(env: Any) -> str | None:
+    """
+    The wrapper that takes several steps for one of the agent and tells the last one's costs.
 
-    return listening
+    Of Gymnasium's and Stable-Baselines3's: what others do, and tell outside of them, is theirs.
+    """
+    while isinstance(env, gym.Wrapper):
+        if type(env).__module__.partition(".")[0] not in ("gymnasium", "stable_baselines3"):
+            return None
+        if isinstance(env, REPEATING) and getattr(env, "_skip", getattr(env, "frame_skip", 2)) > 1:
+            return type(env).__name__
+        env = env.env
+    return None
 
 
 def _is_scalar(value: Any) -> bool:
-    """Whether a value is a number, as NumPy's and those of other libraries are."""
-    return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "biuf"
+    """Whether a value is one number, as NumPy's and those of other libraries are."""
+    return np.size(value) == 1 and np.asarray(value).dtype.kind in "biuf"
 
 
 def _brief(value: Any) -> str:

@@ -99,7 +99,7 @@ class Estimate(NamedTuple):
 
 def beside(diverged: int) -> str:
     """What is said beside a cost and its verdict of episodes that a physics error ended."""
-    return f" ({diverged} more ended in a physics error)" if diverged else ""
+    return f" ({diverged} episodes ended in a physics error)" if diverged else ""
 
 
 def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:

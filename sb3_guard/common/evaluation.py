@@ -140,7 +140,7 @@ def check_agent(model: Any, env: VecEnv) -> None:
     """
     policy = getattr(model, "policy", model)
     if isinstance(policy, th.nn.Module):
-        for name, weights in policy.state_dict().items():
+        for name, weights in policy.named_parameters():  # a buffer may hold -inf, as masks do
             if not th.isfinite(weights).all():
                 raise NumberError(
                     f"the agent can't act: its weights {name!r} are not finite; take an earlier "

@@ -73,9 +73,11 @@ def make_vec_env(
     kwargs = {**(env_kwargs or {}), **{k: v for k, v in given.items() if v is not None}}
     refuse_vector_env(env_id)
     if isinstance(env_id, gymnasium.Env | VecEnv):
+        spec = getattr(env_id, "spec", None)
+        name = repr(spec.id) if spec else "MyEnv"
         raise TypeError(
-            f"{type(env_id).__name__} is one environment, made already: give its class, or a "
-            f"function that makes another one, as make_vec_env({type(env_id).__name__}, n_envs=4)"
+            f"this {type(env_id).__name__} is made already: give an id, a class, or a function "
+            f"that makes another one, as make_vec_env({name}, n_envs=4)"
         )
     source = env_id if isinstance(env_id, Source) else find(env_id)
     batched = source.batch is not None and wrapper_class is None

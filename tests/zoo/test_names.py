@@ -12,7 +12,7 @@ from typed import LENGTH, SMALL, TOY, refused, trained
 
 from sb3_guard import benchmark, enjoy, reproduce, train
 from sb3_guard.fields import parse_value
-from sb3_guard.zoo.cli.names import as_data
+from sb3_guard.zoo.cli.names import as_data, refuse_places
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.hyperparams import build
 
@@ -138,6 +138,23 @@ def test_a_file_names_no_place_to_write(name, path, argument, tmp_path, trap, ru
     (tmp_path / "conf.yml").write_text(yaml.safe_dump({"default": hyperparams}))
     refused(train.main, [*TOY, *SMALL, "-n", "60", "-conf", "conf.yml"], capsys, *parts)
     assert not list(tmp_path.rglob("trap*"))
+
+
+def test_a_run_is_continued_with_the_folders_that_the_user_names_again(tmp_path, run, capsys):
+    go_on = ["-i", str(run), *TOY[:2], "-n", "240", "--verbose", "0"]
+    for name, value, words in (
+        ("tensorboard_log", str(tmp_path / "trap"), "--tensorboard-log"),
+        ("track", True, "--track"),
+    ):
+        enter(run, "args.yml", **{name: value})
+        refused(train.main, go_on, capsys, f"{run} needs {name}", f"then add {words}")
+        enter(run, "args.yml", **{name: type(value)()})
+    assert not list(tmp_path.rglob("trap*"))
+
+
+def test_files_that_are_read_are_no_places():
+    mine = {"env_wrapper": {"mine.Wrapper": {"map_file": "m.npz", "dir": "maps"}}}
+    refuse_places("config.yml", mine)
 
 
 def test_reproduce_follows_the_files_that_the_user_names(tmp_path, trap, run, capsys):

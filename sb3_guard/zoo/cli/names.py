@@ -7,7 +7,6 @@ file may name classes of :data:`KNOWN` packages only, and of modules that the co
 
 import importlib
 import operator
-import re
 import shlex
 import sys
 from collections.abc import Iterator, Mapping
@@ -30,8 +29,10 @@ BASES: dict[str, type] = {
     "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
 }  # fmt: skip
 ALLOWED = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
-# Names of arguments that say where to write: filename, save_path, video_folder, log_dir.
-PLACE = re.compile("(path|file|file_?name|folder|dir|directory)$")
+# Arguments of the monitors, recorders and callbacks of KNOWN packages that say where to write
+PLACES = {"filename", "save_path", "log_path", "best_model_save_path", "log_dir", "video_folder"}
+# Flags that name files, folders, modules or a service, which a run's record does not bring back
+FOLLOWED = ("gym_packages", "tensorboard_log", "track")
 
 
 def import_class(name: str, path: str, base: type) -> Any:
@@ -165,6 +166,6 @@ def _places(value: Any) -> Iterator[tuple[str, str]]:
     for item in value if isinstance(value, list | tuple) else [value]:
         if isinstance(item, Mapping):
             for key, inner in item.items():
-                if isinstance(inner, str) and PLACE.search(str(key).lower()):
+                if isinstance(inner, str) and key in PLACES:
                     yield key, inner
                 yield from _places(inner)

@@ -175,7 +175,9 @@ class RunFolder:
 
     def again(self, flags: RunFlags) -> str:
         """The command that continues the run, for messages."""
-        return self._command("train -i", flags)
+        named = {"tensorboard_log", "track"}  # the command line names them again
+        words = map(shlex.quote, flags.words(named))
+        return " ".join([self._command("train -i", flags), *words])
 
     def play(self, flags: RunFlags) -> str:
         """The command that plays the agent, for messages."""

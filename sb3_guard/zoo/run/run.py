@@ -39,7 +39,7 @@ from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.costs import read_costs
 from sb3_guard.fields import plain
 from sb3_guard.zoo.cli.flags import IDENTITY, START
-from sb3_guard.zoo.cli.names import refuse_places, require_named
+from sb3_guard.zoo.cli.names import FOLLOWED, refuse_places, require_named
 from sb3_guard.zoo.cli.usage import (
     TrainingStopped,
     UsageError,
@@ -521,7 +521,7 @@ class Run:
         folder = RunFolder(Path(given.trained_agent))
         with lock(folder.path):
             saved = folder.flags()
-            require_named(folder.path, given, saved, "gym_packages")
+            require_named(folder.path, given, saved, *FOLLOWED)
             import_packages(given.gym_packages)
             values = without_withdrawn(folder, algorithm(saved.algo))
             state = read_checkpoint(folder.checkpoint)

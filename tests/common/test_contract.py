@@ -255,7 +255,7 @@ def test_vector_environments_of_gymnasium_are_refused_with_what_to_do(use, name)
 
 @pytest.mark.parametrize("env", [Late(), TimeLimit(Late(), 5), endless(5)])
 def test_an_environment_that_is_made_already(env):
-    with pytest.raises(TypeError, match="give its class"):
+    with pytest.raises(TypeError, match="is made already"):
         make_vec_env(env, 4)
 
 

@@ -213,6 +213,14 @@ def test_the_runs_own_flags_may_be_repeated(run):
     assert train.main([*arguments, "--env-kwargs", "episode_length:20", "--seed", "1"]) == 0
 
 
+def test_an_agent_of_nan_is_not_trained_on(capsys, run, tmp_path):
+    model = CPO.load(run / "CostPoint-v0.zip", device="cpu")
+    model.policy.action_net.bias.data[0] = float("nan")
+    model.save(tmp_path / "nan.zip")
+    warm = [*TOY, *SMALL, "-i", str(tmp_path / "nan.zip"), "-f", str(tmp_path / "new")]
+    refused(train.main, warm, capsys, "can't train", "'action_net.bias' are not finite")
+
+
 def test_other_algorithms_agent(capsys, run, tmp_path):
     warm = [*TOY, *SMALL, "--algo", "trpo", "-i", str(run / "CostPoint-v0.zip")]
     refused(train.main, [*warm, "-f", str(tmp_path / "new")], capsys, "can't load", "as TRPO")

@@ -23,6 +23,7 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
+from sb3_guard.common.evaluation import check_agent
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
 from sb3_guard.zoo.cli.usage import UsageError, explained
@@ -357,4 +358,7 @@ def load_model(
                 if REPLAY_BUFFER in archive.namelist():
                     with archive.open(REPLAY_BUFFER) as member:
                         model.replay_buffer = pickle.load(member)
-        return model
+    if env is not None:
+        with explained(f"can't train {path} on", ValueError):
+            check_agent(model, env)
+    return model

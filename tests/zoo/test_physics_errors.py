@@ -54,7 +54,7 @@ def test_what_a_broken_episode_costs_is_not_known():
     played = evaluate_policy(model, env, 20, seed=0)
     broken = int(np.isnan(played.costs).sum())
     assert 0 < broken < 20 and len(played) == 20
-    assert f"limit 0.1: undecided ({broken} more ended in a physics error)" in (
+    assert f"limit 0.1: undecided ({broken} episodes ended in a physics error)" in (
         str(played.estimate(played.costs).against(0.1))
     )
     callback = CostEvalCallback(make_vec_env(Breaks, 2), selection_limit=1.0)
@@ -70,7 +70,7 @@ def test_a_run_counts_them_apart(tmp_path, capfd):
     result = json.loads((folder / "result.json").read_text())
     cost = result["costs"]["cost"]
     assert cost["verdict"] == "undecided" and cost["physics_errors"] > 0
-    assert "limit 2: undecided" in out and "more ended in a physics error" in out
+    assert "limit 2: undecided" in out and "episodes ended in a physics error" in out
     assert None in result["final"]["greedy"]["costs"]
     splits = read_splits(folder)
     assert all(0 < split["M_c"].isna().sum() < len(split) for split in splits.values())
@@ -78,7 +78,7 @@ def test_a_run_counts_them_apart(tmp_path, capfd):
     table = tmp_path / "t.md"
     assert plot.main([str(tmp_path), "--table", str(table)]) == 0
     text = table.read_text()
-    assert "more ended in a physics error" in text
+    assert "episodes ended in a physics error" in text
     assert "2: undecided (" in text and "2: certified" not in text
     capfd.readouterr()
     assert enjoy.main(["-f", str(folder), "--n-episodes", "9", "--json", f"{tmp_path}/e.json"]) == 0

@@ -30,12 +30,10 @@ def train(flags: Flags) -> int:
     from sb3_guard.zoo.run.folder import CHECKPOINT
     from sb3_guard.zoo.run.run import Run
 
-    run = RunFlags.shared(flags)
-    run.given = flags.given
-    path = Path(run.trained_agent)
+    path = Path(flags.trained_agent)
     # Any other archive is a model to begin from.
     model = path.suffix == ".zip" and path.name != CHECKPOINT
-    return Run.check(run).start() if model or not run.trained_agent else Run.resume(run)
+    return Run.check(flags).start() if model or not flags.trained_agent else Run.resume(flags)
 
 
 main = command(Flags, train)

@@ -3,12 +3,11 @@
 Or a robot's file, before it is registered: ``sb3-guard show go1.xml``.
 """
 
-import inspect
 import re
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,6 +20,7 @@ from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.registry import ROBOTS, robot_of_file
 from sb3_guard.envs.rendering import RenderingError
 from sb3_guard.envs.robots.robot import MJCFRobot
+from sb3_guard.list import summary
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages
@@ -94,12 +94,7 @@ def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
     """In words what costs, up to which limit, and how long an episode is."""
     parts = env.engine.constraints
     for part in parts:
-        text = " ".join((inspect.getdoc(type(part)) or "").replace("``", "").split())
-        stated: Any = fields(part)  # type: ignore[arg-type]  # every part is a dataclass
-        shown = {field.name: getattr(part, field.name) for field in stated}
-        shown |= {name: f"{low:g} to {high:g}" for name, (low, high) in part.ranges.items()}
-        values = ", ".join(f"{name} {value}" for name, value in shown.items() if value is not None)
-        yield f"info['cost_{part.name}']: {text}" + (f" Here: {values}." if values else "")
+        yield f"info['cost_{part.name}']: {summary(type(part))}"
     how = "1 if any of these costs" if env.scenario.cost == "any" else "their sum"
     if len(parts) > 1:
         yield f"info['cost']: {how}."
@@ -108,16 +103,6 @@ def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
         yield f"Usual cost limit of an episode: {limit:g}."
     steps = env.max_episode_steps
     yield f"An episode has {steps} steps of {env.engine.control_step:g} s."
-
-
-def drawn_table(env: GuardVectorEnv) -> str:
-    """Name and range of what is drawn anew in each episode, and what it is in this one."""
-    drawn = env.engine.drawn
-    rows = [
-        [name, f"{low:g} to {high:g}", f"{drawn.values[name][0]:g}"]
-        for name, (low, high) in drawn.ranges.items()
-    ]
-    return table(["drawn in each episode", "range", "in the picture"], rows)
 
 
 @dataclass
@@ -213,8 +198,6 @@ def show(flags: Flags) -> int:
     print(yaml.safe_dump(data, sort_keys=False))
     print(*costs(env, spec.id), "", sep="\n")
     print(observation_table(env), action_table(env), sep="\n\n")
-    if env.engine.drawn.ranges:
-        print("\n" + drawn_table(env))
     if flags.mjcf:
         with explained(f"can't write {flags.mjcf}", OSError):
             Path(flags.mjcf).write_text(env.engine.spec.to_xml())

@@ -4,10 +4,7 @@
 algorithm: nothing is set but the limit, and the problem's number of steps and environments. Every
 run becomes a line of ``docs/data/known_optima.csv`` as soon as it has ended, is not repeated, and
 goes into the tables of ``docs/notes/known_optima.md``. ``--seeds`` without a number only writes
-that page. Algorithms whose defaults or updates of ``bandit`` have changed since their lines were
-written, by ``known_optima.json``, are refused until ``--drop-stale`` has removed these lines; where
-the runs are the same (an argument is new), enter the new value in that file instead. The script
-does not notice changes of the code.
+that page. After a change of defaults or code, remove the algorithm's lines first.
 
 Return is a share of the constrained optimum and costs are shares of their limits, over the last
 fifth of the training, by the policy that explores; ± is the standard error over seeds.
@@ -16,13 +13,11 @@ fifth of the training, by the policy that explores; ± is the standard error ove
 
 import argparse
 import csv
-import inspect
 import itertools
-import json
 import os
 import sys
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -42,8 +37,6 @@ from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 Run = tuple[str, str, float, int]  # problem, algorithm, scale, seed
 DOCS = Path(__file__).parents[1] / "docs"
 RESULTS, PAGE = DOCS / "data" / "known_optima.csv", DOCS / "notes" / "known_optima.md"
-SETTINGS = RESULTS.with_suffix(".json")  # of each algorithm, the defaults that its lines are of
-NO_EFFECT = ("verbose", "device", "seed", "tensorboard_log", "stats_window_size")
 MARKS = "<!-- known optima: begin -->", "<!-- known optima: end -->"
 #: A limit that is not one of an episode's mean cost, and whose it is.
 STATEWISE = {
@@ -85,39 +78,6 @@ def read() -> dict[Run, Outcome]:
             costs = np.array([float(cost) for cost in row["costs"].split()])
             results[run] = Outcome(float(row["return"]), costs)
     return results
-
-
-def settings() -> str:
-    """JSON, a line per algorithm: the default of every argument, and the updates of a problem."""
-    lines = []
-    for algo, cls in ALGORITHMS.items():
-        arguments = inspect.signature(cls).parameters.values()
-        values = {
-            each.name: repr(each.default)
-            for each in arguments
-            if each.default is not each.empty and each.name not in NO_EFFECT
-        }
-        values["updates of bandit"] = repr(budget(cls, problems()["bandit"]).updates)
-        lines.append(f'"{algo}": ' + json.dumps(values))
-    return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def stale() -> dict[str, list[str]]:
-    """Algorithms with lines of other settings than today's, and which settings differ."""
-    recorded, current = (json.loads(text) for text in (SETTINGS.read_text(), settings()))
-    differing = {}
-    for algo in sorted({run[1] for run in read()}):
-        before, today = recorded.get(algo, {}), current.get(algo, {})
-        names = [name for name in {**before, **today} if before.get(name) != today.get(name)]
-        if names:
-            differing[algo] = names
-    return differing
-
-
-def drop(algos: Collection[str]) -> None:
-    """Remove the lines of algorithms."""
-    lines = RESULTS.read_text().splitlines(keepends=True)
-    RESULTS.write_text("".join(line for line in lines if line.split(",")[1] not in algos))
 
 
 def keep(run: Run, outcome: Outcome, seconds: float) -> None:
@@ -204,7 +164,7 @@ def pages() -> dict[Path, str]:
     results = read()
     failed = f"Single seeds that fail where the mean passes:\n\n{failing(results)}"
     page = f"{before}{MARKS[0]}\n{tables(results)}\n\n{failed}\n{MARKS[1]}{after}"
-    return {PAGE: page, SETTINGS: settings()}
+    return {PAGE: page}
 
 
 def main() -> None:
@@ -214,16 +174,8 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="*", type=int, default=[11, 12, 13, 14, 15])
     parser.add_argument("--scale", nargs="+", type=float, default=[1.0])
     parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--drop-stale", action="store_true", help="remove lines of other defaults")
     arguments = parser.parse_args()
 
-    if others := stale():
-        for algo, names in others.items():
-            print(f"{algo}: changed since its lines were written: {', '.join(names)}")
-        if not arguments.drop_stale:
-            raise SystemExit(f"--drop-stale removes these lines; or edit {SETTINGS.name}")
-        drop(others)
-        SETTINGS.write_text(settings())
     results = read()
     # A seed of everything before the next one: a table that is cut short is even.
     wanted = [

@@ -4,7 +4,6 @@ import functools
 import importlib
 import importlib.util
 import inspect
-import json
 import re
 import sys
 from pathlib import Path
@@ -236,35 +235,3 @@ def test_tables_of_results_are_made_of_their_logs():
         assert path.read_text() == text, "run `python scripts/results.py`"
     for path, text in script("known_optima").pages().items():
         assert path.read_text() == text, "run `python scripts/known_optima.py --seeds`"
-
-
-@pytest.mark.parametrize(
-    ("change", "names"),
-    [
-        (lambda of: of["cpo"].update(cost_gamma="0.9"), {"cost_gamma"}),
-        (lambda of: of["cpo"].pop("limit_fall"), {"limit_fall"}),
-        (lambda of: of["cpo"].update(gone="1"), {"gone"}),
-        (lambda of: of.pop("cpo"), None),
-    ],
-)
-def test_known_optima_of_other_defaults_are_found(tmp_path, monkeypatch, change, names):
-    """They are refused, and removed when asked; other algorithms' stay."""
-    optima = script("known_optima")
-    recorded = json.loads(optima.settings())
-    change(recorded)
-    for name, text in (("SETTINGS", json.dumps(recorded)), ("RESULTS", optima.RESULTS.read_text())):
-        monkeypatch.setattr(optima, name, tmp_path / name)
-        (tmp_path / name).write_text(text)
-    monkeypatch.setattr(optima, "pages", lambda: {})
-    found = optima.stale()
-    assert [*found] == ["cpo"] and (names is None or {*found["cpo"]} == names)
-    before = optima.read()
-    monkeypatch.setattr(sys, "argv", ["known_optima.py", "--seeds"])
-    with pytest.raises(SystemExit, match="--drop-stale"):
-        optima.main()
-    assert optima.read().keys() == before.keys()
-    sys.argv.append("--drop-stale")
-    optima.main()
-    assert {run[1] for run in before} - {run[1] for run in optima.read()} == {"cpo"}
-    optima.keep(("bandit", "cpo", 1.0, 1), optima.Outcome(1.0, [1.0]), 1.0)
-    assert not optima.stale()  # so the next call continues

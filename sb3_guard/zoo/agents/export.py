@@ -2,7 +2,6 @@
 
 import hashlib
 import sys
-from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ from typing import Any
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.deployment import onnx_file
 from sb3_guard.deployment.contract import stops
-from sb3_guard.zoo.agents.flags import AgentFlags, ExportFlags
-from sb3_guard.zoo.agents.playback import BATCH, EPISODES, Agent, means, open_agent, summary
+from sb3_guard.zoo.agents.flags import ExportFlags
+from sb3_guard.zoo.agents.playback import BATCH, EPISODES, means, open_agent, summary
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.folder import require_file
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
@@ -33,7 +32,30 @@ def export(flags: ExportFlags) -> int:
         episodes = flags.n_episodes or EPISODES
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
             evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
-        contract = write(agent, flags, path, summary(evaluation), flags.stop)
+        settings, measured = agent.run.hyperparams(), summary(evaluation)
+        plain = {
+            name: {key: value for key, value in values.items() if key != "values"}
+            if isinstance(values, dict)
+            else values
+            for name, values in measured.items()
+        }
+        trained = {
+            "algo": flags.algo,
+            "env": agent.env_id,
+            "env_kwargs": settings.get("env_kwargs") or {},
+            "cost_limit": settings.get("cost_limit"),
+            "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
+            "measured": plain,
+        }
+        with explained(f"can't export {agent.path}", ValueError, ImportError):
+            contract = onnx_file.export(
+                agent.model,
+                path,
+                env=agent.env,
+                sampled=flags.stochastic,
+                stop=flags.stop,
+                trained=trained,
+            )
     print(f"{path}: {', '.join(contract['file']['operators'])}")
     print(f"{path.with_name(onnx_file.CONTRACT)} describes input and output")
     print(means(evaluation))
@@ -44,46 +66,3 @@ def export(flags: ExportFlags) -> int:
             file=sys.stderr,
         )
     return 0
-
-
-def write(
-    agent: Agent,
-    flags: AgentFlags,
-    path: Path,
-    measured: Mapping[str, Any],
-    stop: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """
-    Export an agent.
-
-    :param agent: the agent and its environment
-    :param flags: how it acts
-    :param path: of the ONNX file
-    :param measured: return and cost of episodes, see :func:`summary`
-    :param stop: what stops the robot, see :func:`sb3_guard.export`
-    :return: the contract
-    :raises UsageError: the agent can't be exported
-    """
-    means = {
-        name: {key: value for key, value in values.items() if key != "values"}
-        for name, values in measured.items()
-        if isinstance(values, dict)
-    }
-    settings = agent.run.hyperparams()
-    trained = {
-        "algo": flags.algo,
-        "env": agent.env_id,
-        "env_kwargs": settings.get("env_kwargs") or {},
-        "cost_limit": settings.get("cost_limit"),
-        "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
-        "measured": {name: n for name, n in measured.items() if isinstance(n, int)} | means,
-    }
-    with explained(f"can't export {agent.path}", ValueError, ImportError):
-        return onnx_file.export(
-            agent.model,
-            path,
-            env=agent.env,
-            sampled=flags.stochastic,
-            stop=stop,
-            trained=trained,
-        )

@@ -14,7 +14,6 @@ from huggingface_hub import EvalResult, ModelCard, ModelCardData
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
-from sb3_guard.zoo.agents import export
 from sb3_guard.zoo.agents.film import filming
 from sb3_guard.zoo.agents.flags import HubFlags
 from sb3_guard.zoo.agents.playback import EPISODES, Agent, means, open_agent, summary
@@ -126,10 +125,6 @@ def stage(agent: Agent, flags: HubFlags, folder: Path) -> None:
         with filming(agent.env, agent.model, folder / "replay.mp4") as env:
             evaluate_policy(agent.model, env, 1, **how)
     results = summary(evaluation)
-    try:
-        export.write(agent, flags, folder / "policy.onnx", results)
-    except UsageError as error:
-        print(f"There is no policy.onnx: {error}")
     results["is_deterministic"] = not flags.stochastic
     (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
     card(agent, flags, evaluation).save(folder / "README.md")

@@ -221,11 +221,6 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     if flags.verbose > 0:
         for cut in evaluation.unfinished:
             print(_episode(*cut), "so far: this episode did not end and is not counted")
-        trained = result.get("return")
-        if not flags.stochastic and trained is not None:
-            best = evaluation.estimate(evaluation.returns).high
-            if best < trained - 0.5 * abs(trained):
-                print(f"With noise, in training, its return was {trained:.2f}: see --stochastic")
     if flags.json:
         played = {name: getattr(flags, name) for name in ("algo", "seed", "stochastic")}
         content = {"model": str(agent.path), "env": agent.env_id, **played, **summary(evaluation)}
@@ -254,9 +249,8 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
         estimate = evaluation.estimate(values)._asdict()
         if diverged := estimate.pop("diverged"):
             out["physics_errors"] = diverged
-        finite = {key: None if np.isnan(value) else value for key, value in estimate.items()}
-        known = [None if np.isnan(value) else value for value in values.tolist()]
-        out[name] = {**finite, "values": known}
+        numbers = {key: _finite(value) for key, value in estimate.items()}
+        out[name] = {**numbers, "values": [_finite(value) for value in values.tolist()]}
     if evaluation.limits:
         out["costs"] = {
             key: _judged(cost, limit)
@@ -269,10 +263,14 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
 
 def _judged(cost: Estimate, limit: float) -> dict[str, Any]:
     """A cost and its verdict, in words of ``result.json``."""
-    numbers = {"mean": cost.mean, "low": cost.low, "high": cost.high}
-    judged = {key: None if np.isnan(value) else value for key, value in numbers.items()}
+    judged = {key: _finite(getattr(cost, key)) for key in ("mean", "low", "high")}
     words = verdict(cost.low, cost.high, limit, cost.diverged)
     return {**judged, "limit": limit, **({"verdict": words} if words else {})}
+
+
+def _finite(value: float) -> float | None:
+    """A number, or None in place of NaN, which JSON lacks."""
+    return None if np.isnan(value) else value
 
 
 def _columns(evaluation: Evaluation) -> dict[str, np.ndarray]:

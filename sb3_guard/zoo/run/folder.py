@@ -82,11 +82,15 @@ def require_file(path: Path, flag: str) -> None:
     """
     The same of a file that is to be written.
 
-    :raises UsageError: it can't be made, or a folder has its name
+    :raises UsageError: it can't be made, or a folder or device has its name
     """
-    if path.is_dir():
-        raise UsageError(f"{flag}: {str(path)!r} is a folder; name a file")
-    require_writable(path.parent, flag)
+    with explained(f"{flag}: can't write {str(path)!r}", OSError, fix="choose another"):
+        if path.exists() and not path.is_file():  # the null device would be replaced
+            raise UsageError(f"{flag}: {str(path)!r} is a folder or device; name a file")
+        require_writable(path.parent, flag)
+        hidden = path.with_name(f".{path.name}.tmp")  # see replacing; a name may be too long
+        hidden.touch()
+        hidden.unlink()
 
 
 class RunFolder:

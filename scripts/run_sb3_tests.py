@@ -56,7 +56,7 @@ PACKAGES = (stable_baselines3, sb3_contrib)
 # The classes that ours stand in for, with what they are made with where a test says nothing: as
 # theirs, except that A2C's 5 steps per update are few for a trust-region step.
 REPLACED: dict[type, dict[str, dict[str, Any]]] = {
-    TrustRegion: {"A2C": {"n_steps": 16}, "PPO": {}, "TRPO": {}},
+    TrustRegion: {"A2C": {"n_steps": 16, "normalize_advantage": False}, "PPO": {}, "TRPO": {}},
     FirstOrder: {"PPO": {}},
     PPOLag: {"PPO": {}},
     SACLag: {"SAC": {}},
@@ -139,6 +139,8 @@ def stand_in(cls: type, name: str, defaults: dict[str, Any]) -> type:
             ours = {**OUR_ARGUMENTS, **start, **OF_CLASS.get(cls.__name__, {}), **small}
             ours = {argument: value for argument, value in ours.items() if argument in taken}
             kwargs = {**ours, **defaults, **kwargs}
+            if "normalize_advantage" in kwargs and "normalize_advantage" not in taken:
+                self.normalize_advantage = kwargs.pop("normalize_advantage")
             if filtered and isinstance(policy, type) and not issubclass(policy, FilteredPolicy):
                 policy = type(f"Filtered{policy.__name__}", (FilteredPolicy, policy), {})
             try:

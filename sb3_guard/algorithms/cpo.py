@@ -5,11 +5,12 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 
+from sb3_guard.algorithms.common.actor import Accept, Region
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.costs import Margin
 from sb3_guard.algorithms.common.natural_gradient import Case, constrained_step
-from sb3_guard.algorithms.common.trust_region import Accept, Region, TrustRegion
+from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 
 class CPO(TrustRegion):

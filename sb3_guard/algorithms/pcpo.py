@@ -5,14 +5,13 @@ from typing import Any, ClassVar, Literal
 
 import torch as th
 
+from sb3_guard.algorithms.common.actor import Accept, Region
 from sb3_guard.algorithms.common.arguments import hyperparameter
-from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.costs import Margin
 from sb3_guard.algorithms.common.natural_gradient import projected_step
-from sb3_guard.algorithms.common.trust_region import Accept, Region, TrustRegion
+from sb3_guard.algorithms.cpo import CPO
 
 
-class PCPO(TrustRegion):
+class PCPO(CPO):
     """Projection-based constrained policy optimisation (Yang et al., 2020, arXiv 2010.03152).
 
     ::
@@ -26,7 +25,6 @@ class PCPO(TrustRegion):
     are kept with a learnt :class:`~sb3_guard.algorithms.common.costs.Margin`, which the paper does
     not have.
 
-    :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the paper
     :param recovery: count a violation as at most this share of what a step of the region can take
         away; 1 for the whole violation, as in the paper
     :param projection: ``"kl"`` for L = F, ``"l2"`` for L = I
@@ -35,27 +33,12 @@ class PCPO(TrustRegion):
     """
 
     label, family, paper = "PCPO", "CPO-based", "Yang et al. 2020"
-    search_space: ClassVar[dict[str, Any]] = {
-        "projection": ["kl", "l2"],
-        "margin_lr": [0.0, 0.05, 0.1, 0.2],
-    }
-    signed_limits = True
+    search_space: ClassVar[dict[str, Any]] = {"projection": ["kl", "l2"]}
 
-    # Costs far ahead are noisy in a rollout, so they are left to the cost critic. A step always has
-    # the reward's part, so the projection may go as far as the limit asks.
-    cost_gae_lambda: float | None = hyperparameter(0.5, high=1.0, ends="[]")
-    margin_lr: float = hyperparameter(0.1)
+    # A step always has the reward's part, so the projection may go as far as the limit asks.
     recovery: float = hyperparameter(1.0, high=1.0, ends="(]")
     projection: Literal["kl", "l2"] = hyperparameter("kl")
     line_search: bool = hyperparameter(True)
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.margin: Margin = None  # type: ignore[assignment]
-        super().__init__(*args, **kwargs)
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self.margin = Margin.of(self.margin, len(self.cost_keys))
 
     def plan(self, region: Region) -> tuple[th.Tensor, Accept]:
         g, B, delta = region.gradient, region.cost_gradients, region.delta
@@ -64,7 +47,3 @@ class PCPO(TrustRegion):
         x, pull = projected_step(g, B, c, v, W, delta, self.projection == "l2", self.recovery)
         self._record_per_cost("train/projection", pull)
         return x, lambda trial: trial.kl <= (delta if self.line_search else sys.float_info.max)
-
-    def fit(self, batch: CostRolloutBufferSamples) -> None:
-        self.margin.follow(self.costs, self.margin_lr)
-        self._record_per_cost("train/cost_margin", self.margin.value)

@@ -2,8 +2,8 @@
 
 import torch as th
 
+from sb3_guard.algorithms.common.actor import Accept, Region
 from sb3_guard.algorithms.common.arguments import hyperparameter
-from sb3_guard.algorithms.common.trust_region import Accept, Region
 from sb3_guard.algorithms.trpo_lag import TRPOLag
 
 

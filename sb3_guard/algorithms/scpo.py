@@ -1,6 +1,6 @@
 """SCPO: CPO's step on the increments of the highest cost so far, a limit on the worst step."""
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch as th
 
@@ -28,9 +28,6 @@ class SCPO(CPO):
     """
 
     label, family, paper = "SCPO", "State-wise", "Zhao et al. 2023"
-    search_space: ClassVar[dict[str, Any]] = {
-        "margin_lr": [0.0, 0.05, 0.1, 0.2],
-    }
     limit_on: ClassVar[Literal["sum", "max"]] = "max"
     signed_limits = False  # the highest cost so far begins at 0
     # The increments add up to the highest cost undiscounted alone.

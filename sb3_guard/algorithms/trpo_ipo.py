@@ -6,9 +6,10 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch as th
 
+from sb3_guard.algorithms.common.actor import Accept, Region
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.trust_region import Accept, Region, TrustRegion
+from sb3_guard.algorithms.common.trust_region import TrustRegion
 
 TINY = 1e-12
 

@@ -55,16 +55,6 @@ def test_gae_agrees_with_sb3_for_every_cost(gae_lambda: float) -> None:
         np.testing.assert_allclose(ours[..., i], buffer.advantages, rtol=1e-4, atol=1e-5)
 
 
-def test_returns_are_lambda_one() -> None:
-    rng = np.random.default_rng(1)
-    rewards, values = rng.normal(size=(2, 30, 2))
-    starts = rng.random((30, 2)) < 0.2
-    last, dones = rng.normal(size=2), np.array([True, False])
-    advantages = gae(rewards, values, starts, last, dones, 0.9, 1.0)
-    returns = discounted_returns(rewards, starts, last, dones, 0.9)
-    np.testing.assert_allclose(returns, advantages + values)
-
-
 def test_buffer_keeps_transitions_together() -> None:
     """Flattening and shuffling move a transition's reward and its costs alike."""
     box = spaces.Box(-np.inf, np.inf, (1,))

@@ -42,12 +42,11 @@ def state_of(model: Any) -> list[Any]:
     return [*(tensor.tolist() for tensor in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
 
 
-@pytest.mark.parametrize("batch_size", [64, 128])
-def test_without_a_price_it_is_sb3s_ppo_bit_for_bit(batch_size: int) -> None:
-    """128 is the whole rollout; episodes are cut by a time limit of 30 steps."""
-    kwargs: dict[str, Any] = {"n_steps": 32, "batch_size": batch_size, "seed": 0, "device": "cpu"}
-    a = state_of(PPO("MlpPolicy", points(), **kwargs).learn(512))
-    model = PPOLagrangian("MlpPolicy", points(), cost_limit=1e6, **kwargs).learn(512)
+def test_without_a_price_it_is_sb3s_ppo_bit_for_bit() -> None:
+    """Episodes are cut by a time limit of 30 steps."""
+    kwargs: dict[str, Any] = {"n_steps": 32, "batch_size": 64, "seed": 0, "device": "cpu"}
+    a = state_of(PPO("MlpPolicy", points(), **kwargs).learn(256))
+    model = PPOLagrangian("MlpPolicy", points(), cost_limit=1e6, **kwargs).learn(256)
     assert a == state_of(model)
     assert model.total_cost > 0.0 and float(model.multiplier.value) == 0.0
     assert model.logger.name_to_value["train/cost_value_loss"] > 0.0
@@ -62,7 +61,7 @@ def test_first_order_with_ppos_loss_is_ppo_bit_for_bit() -> None:
     states = []
     for model in models:
         model.set_random_seed(0)
-        states.append(state_of(model.learn(512)))
+        states.append(state_of(model.learn(256)))
     assert states[0] == states[1]
     theirs, ours = (model.logger.name_to_value for model in models)
     for name in ("value_loss", "approx_kl", "policy_gradient_loss", "explained_variance"):
@@ -104,6 +103,7 @@ def test_undiscounted_rewards_end_with_the_time_limit(gamma: float) -> None:
     assert np.count_nonzero(added) == np.count_nonzero(added[29]) == (2 if gamma < 1.0 else 0)
 
 
+@pytest.mark.slow
 def test_with_a_price_it_keeps_a_positive_limit() -> None:
     """A bandit whose best action costs 1.5; under the limit 0.5 the best return is 0.5."""
     env = make_vec_env(LinearCostBandit, 8, seed=0)
@@ -114,17 +114,7 @@ def test_with_a_price_it_keeps_a_positive_limit() -> None:
     assert float(model.multiplier.value) > 0.1
     action, _ = model.predict(np.ones((1, 1), np.float32), deterministic=True)
     np.testing.assert_allclose(action[0], LinearCostBandit().optimum(0.5), atol=0.15)
-    assert np.mean(model.ep_cost_buffer) == pytest.approx(0.5, abs=0.1)
-
-
-def test_a_saved_model_goes_on_from_its_multiplier_and_critic(tmp_path: Path) -> None:
-    model = PPOLagrangian("MlpPolicy", points(), n_steps=32, cost_limit=0.1, seed=0).learn(256)
-    model.save(tmp_path / "model")
-    again = PPOLagrangian.load(tmp_path / "model", env=points())
-    assert float(again.multiplier.value) == float(model.multiplier.value) > 0.0
-    observation = th.ones(3, 4)
-    assert th.equal(model.cost_critic(observation), again.cost_critic(observation))
-    assert again.cost_rng.random() == model.cost_rng.random()
+    assert np.mean(model.costs.latest) == pytest.approx(0.5, abs=0.1)
 
 
 class CostlySAC(Constrained, SAC):
@@ -141,9 +131,9 @@ def test_costs_of_an_off_policy_algorithm(tmp_path: Path) -> None:
     a = state_of_off_policy(SAC("MlpPolicy", points(2), **kwargs).learn(200))
     model = CostlySAC("MlpPolicy", points(2), cost_limit=2.0, **kwargs).learn(200)
     assert a == state_of_off_policy(model)
-    assert model.costs.horizon == 30 and len(model.ep_cost_buffer) == 6
+    assert model.costs.horizon == 30 and len(model.costs.latest) == 6
     assert model.costs.violation[0] == pytest.approx((model.costs.episode_cost[0] - 2.0) / 30)
-    latest = np.array(model.ep_cost_buffer)[-2:].mean(axis=0)
+    latest = np.array(model.costs.latest)[-2:].mean(axis=0)
     np.testing.assert_allclose(latest, model.costs.episode_cost)
     model.save(tmp_path / "model")
     again = CostlySAC.load(tmp_path / "model")

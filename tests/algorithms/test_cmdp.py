@@ -7,7 +7,6 @@ import pytest
 import torch as th
 from cost_envs import CostPoint, LinearCostBandit, TabularCMDP, TwoCostBandit
 from known_optima import Bandit, Problem, solve
-from scipy.optimize import minimize
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -25,7 +24,6 @@ from sb3_guard.algorithms import (
 )
 
 WORLD = 0
-SEEDS = [0, pytest.param(1, marks=pytest.mark.slow)]
 # A price of the cost is a price in units of reward: as a policy settles, standardised advantages
 # would make those units ever smaller. And an episode costs about one here, so multipliers must
 # move faster than where it costs ten.
@@ -145,25 +143,22 @@ def solve_tabular(
     return float(np.mean(exact.values[-6:])), np.mean(exact.costs[-6:], axis=0)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_trpo_reaches_the_unconstrained_optimum(seed: int) -> None:
+def test_trpo_reaches_the_unconstrained_optimum() -> None:
     best, costs = TabularCMDP(seed=WORLD).optimum()
-    value, cost = solve_tabular(TRPO, 1, seed)
+    value, cost = solve_tabular(TRPO, 1, 0)
     assert value >= 0.98 * best
     # The limit of the next test would be broken by a third.
     assert cost[0] >= 0.95 * costs[0]
 
 
 @pytest.mark.parametrize(
-    ("n_costs", "shares", "seed"),
+    ("cls", "n_costs", "shares", "seed"),
     [
-        pytest.param(1, [0.75], 0, marks=pytest.mark.slow),
-        pytest.param(1, [0.75], 1, marks=pytest.mark.slow),
-        (2, [0.8, 0.85], 0),
-        pytest.param(2, [0.8, 0.85], 1, marks=pytest.mark.slow),
+        pytest.param(cls, *case, marks=() if cls in (CPO, TRPOLag) and i == 0 else pytest.mark.slow)
+        for cls in CONSTRAINED
+        for i, case in enumerate([(2, [0.8, 0.85], 0), (1, [0.75], 0), (2, [0.8, 0.85], 1)])
     ],
 )
-@pytest.mark.parametrize("cls", CONSTRAINED)
 def test_the_constrained_optimum_is_reached(
     cls: type[TrustRegion], n_costs: int, shares: list[float], seed: int
 ) -> None:
@@ -178,14 +173,9 @@ def test_the_constrained_optimum_is_reached(
     assert np.all(cost <= 1.05 * limits)
 
 
-@pytest.mark.parametrize(
-    ("cls", "seed"),
-    [
-        pytest.param(cls, seed, marks=() if (cls, seed) == (CPO, 0) else pytest.mark.slow)
-        for cls in CONSTRAINED
-        for seed in (0, 1)
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("cls", CONSTRAINED)
 def test_the_bandit_ends_at_its_constrained_optimum(cls: type[TrustRegion], seed: int) -> None:
     bandit, limit = LinearCostBandit(), 0.5
     modes = solve_bandit(cls, LinearCostBandit, seed, cost_limit=limit)
@@ -195,9 +185,8 @@ def test_the_bandit_ends_at_its_constrained_optimum(cls: type[TrustRegion], seed
     assert 1 - np.sum((action - bandit.target) ** 2) >= 0.95 * best
 
 
-@pytest.mark.parametrize(
-    "cls", [CPO, *(pytest.param(cls, marks=pytest.mark.slow) for cls in (PCPO, TRPOLag))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("cls", [CPO, PCPO, TRPOLag])
 def test_at_least_so_much_is_a_negative_limit(cls: type[TrustRegion]) -> None:
     """At least 1 of a₁ + a₂, reported as its negative, where the reward alone leads to 0.4."""
 
@@ -227,10 +216,8 @@ def test_two_limits_that_both_bind(cls: type[TrustRegion], seed: int) -> None:
     assert 1 - np.sum((action - TwoCostBandit().target) ** 2) >= 0.95 * 0.42
 
 
-@pytest.mark.parametrize(
-    "t",
-    [pytest.param(1.0, marks=pytest.mark.slow), 10.0, pytest.param(100.0, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("t", [1.0, 10.0, 100.0])
 def test_the_barrier_keeps_its_distance(t: float) -> None:
     """Where ``J + log(d - J_C) / t`` is greatest, and 1/t of return below the optimum.
 
@@ -244,7 +231,8 @@ def test_the_barrier_keeps_its_distance(t: float) -> None:
     assert 0.5 / t <= 2 * s**2 - 0.5 <= 1.01 / t
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_fac_keeps_the_limit_in_every_context(seed: int) -> None:
     """Its own optimum: where the limit holds by itself nothing is given up for it elsewhere.
 
@@ -277,60 +265,7 @@ def test_fac_keeps_the_limit_in_every_context(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_fac_keeps_two_limits_in_every_context(seed: int) -> None:
-    """In the first context both bind, in the second the second alone; each has its own price.
-
-    The policy's spread is held. Learnt, it falls to a tenth within forty updates, and steps within
-    the trust region with it: the policy trails behind its prices, and they overshoot.
-    """
-
-    def make() -> TwoCostBandit:
-        return TwoCostBandit(offset=[0.5, -1.0])
-
-    bandit, limits = make(), np.array([0.5, 0.4])
-    normals = np.array([bandit.normal, [1.0, 0.0]])  # [m, 2]
-    offsets = np.stack([bandit.offset, [0.5, 0.5]], axis=1)  # [contexts, m]
-
-    def loss(action: np.ndarray) -> Any:
-        return np.sum((action - bandit.target) ** 2, axis=-1)
-
-    best = np.array(
-        [
-            minimize(
-                loss,
-                np.zeros(2),
-                constraints={"type": "ineq", "fun": lambda a, room=room: room - normals @ a},
-            ).x
-            for room in limits - offsets
-        ]
-    )
-    # Where the reward's gradient is a sum of the costs' gradients, these are the shares.
-    expected_prices = 2 * (bandit.target - best) @ np.linalg.inv(normals)
-    np.testing.assert_allclose(expected_prices, [[0.6, 0.8], [0.0, 1.4]], atol=1e-3)
-
-    modes = solve_bandit(
-        TRPOFAC,
-        make,
-        seed,
-        updates=160,
-        learn_std=False,
-        cost_keys=("cost", "cost_1"),
-        cost_limit=list(limits),
-        learning_rate=1e-2,
-        lambda_lr=0.015,
-        policy_kwargs={"net_arch": [8], "log_std_init": -1.6},
-    )
-    actions = np.array(modes.actions)[-60:]  # [60, contexts, 2]
-    costs = (actions @ normals.T + offsets).mean(axis=0)
-    assert np.all(costs <= 1.05 * limits)
-    assert np.all(1 - loss(actions).mean(axis=0) >= 0.95 * (1 - loss(best)))
-    prices = np.mean(modes.prices[-60:], axis=0)
-    np.testing.assert_allclose(prices, expected_prices, atol=0.1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0])
 @pytest.mark.parametrize(
     "key",
     [key for key, cls in ALGORITHMS.items() if issubclass(cls, TrustRegion) and key != "trpo"],
@@ -366,8 +301,8 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
     model = train(key)
     most, least = {"trpo_sl": (0.05, 0.1)}.get(key, (1.75, 0.2))
     if key == "trpo_usl":
-        most = 0.9 * np.mean(train("trpo").ep_cost_buffer)
-    assert np.mean(model.ep_cost_buffer) < most
+        most = 0.9 * np.mean(train("trpo").costs.latest)
+    assert np.mean(model.costs.latest) < most
     assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > least
     assert all(th.isfinite(each).all() for each in model.policy.parameters())
 

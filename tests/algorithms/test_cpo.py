@@ -8,16 +8,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint, LinearCostBandit, told
+from cost_envs import CostPoint, told
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_guard.algorithms import CPO, PCPO, TRPO, TRPOFAC, TRPOIPO, PPOLag, TRPOLag
+from sb3_guard.algorithms import CPO, PCPO, TRPOFAC, PPOLag
+from sb3_guard.algorithms.common.actor import Trial
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.natural_gradient import Case, Step
 from sb3_guard.algorithms.common.rollouts import CostRollouts
-from sb3_guard.algorithms.common.trust_region import Trial, TrustRegion
 
 KEYS = ("cost", "cost_1")
 
@@ -45,20 +45,16 @@ def acceptance(model: CPO, violation: list[float], case: Case, monkeypatch: Any)
         (-0.5, Case.BINDING, 0.01, 0.1, 0.4, True),
         (-0.5, Case.BINDING, 0.01, 0.1, 0.6, False),
         (-0.5, Case.BINDING, 0.01, -0.1, -0.4, False),
-        (-0.5, Case.INACTIVE, 0.01, 0.0, 0.0, True),
         # Violated: cost must not rise, reward may fall.
         (0.5, Case.RECOVERABLE, 0.01, -0.1, -0.1, True),
-        (0.5, Case.RECOVERABLE, 0.01, 0.1, 0.1, False),
         (0.5, Case.LOST, 0.01, -9.0, -1e-6, True),
         (0.5, Case.LOST, 0.01, 0.1, 1e-6, False),
         # On the limit, and nothing to be gained or lost.
-        (0.0, Case.BINDING, 0.01, 0.1, 0.0, True),
         (0.0, Case.NO_GRADIENT, 0.01, 0.1, 0.0, True),
         (0.0, Case.BINDING, 0.01, 0.1, 1e-6, False),
         # The trust region and numbers that are none.
         (-0.5, Case.BINDING, 0.021, 0.1, 0.0, False),
         (-0.5, Case.BINDING, np.nan, 0.1, 0.0, False),
-        (-0.5, Case.BINDING, 0.01, np.nan, 0.0, False),
         (0.5, Case.LOST, 0.01, 0.1, np.nan, False),
     ],
 )
@@ -81,7 +77,6 @@ def test_line_search_test(
         # Violations 0.5 and 0.1: lost, the sum of their squares is to fall.
         (Case.LOST, [-0.1, 0.1], True),
         (Case.LOST, [0.1, -0.1], False),
-        (Case.LOST, [-0.1, 0.3], False),
         (Case.LOST, [0.0, 0.0], True),
         (Case.LOST, [np.nan, -0.1], False),
         # What can be kept within the region may not rise.
@@ -97,39 +92,7 @@ def test_line_search_test_of_two_costs(
     assert accept(Trial(0.01, 0.0, np.array(cost_change))) is accepted
 
 
-class _Contradiction(LinearCostBandit):
-    """Costs a_0 + 0.5 and 0.5 - a_0: limits of 0.2 contradict each other."""
-
-    def step(self, action: np.ndarray) -> Any:
-        *rest, _ = super().step(action)
-        costs = 0.5 + float(action[0]) * np.array([1.0, -1.0])
-        return (*rest, dict(zip(KEYS, costs, strict=True)))
-
-
-def test_limits_that_contradict_each_other_are_broken_evenly() -> None:
-    model = make(
-        _Contradiction,
-        8,
-        n_steps=64,
-        target_kl=0.05,
-        policy_kwargs={"net_arch": [8], "log_std_init": -1.0},
-        cost_keys=KEYS,
-        cost_limit=0.2,
-    )
-    with th.no_grad():
-        model.policy.action_net.bias[0] = 0.5
-    fractions = []
-    train = model.train
-    model.train = lambda: (
-        train() or fractions.append(model.logger.name_to_value["train/line_search_step"])
-    )
-    model.learn(512 * 10)
-    assert np.mean(np.array(fractions) > 0.0) > 0.8
-    action, _ = model.predict(np.ones(1, np.float32), deterministic=True)
-    assert abs(action[0]) < 0.15
-
-
-@pytest.mark.parametrize("limit", [0.0, 1.0, 3.0, 100.0])
+@pytest.mark.parametrize("limit", [0.0, 3.0])
 def test_the_step_solves_the_linearised_problem(limit: float) -> None:
     """Within the region, and within the limit wherever the region reaches it."""
     model = make(cost_limit=limit, cg_max_steps=60)
@@ -145,8 +108,8 @@ def test_the_step_solves_the_linearised_problem(limit: float) -> None:
         return x, accept
 
     model.plan = spy  # type: ignore[method-assign]
-    model.learn(2000)
-    assert len(seen) == 5
+    model.learn(1200)
+    assert len(seen) == 3
     for case, residual, reach in seen:
         assert reach <= 1.01
         if case is not Case.LOST:
@@ -186,7 +149,7 @@ def test_violation_is_in_units_of_the_cost_surrogate() -> None:
 
 
 @pytest.mark.parametrize("costs", [(5.0, 45.0), (45.0, 5.0)], ids=str)
-@pytest.mark.parametrize(("n_envs", "n_steps"), [(1, 100), (4, 100), (8, 10)])
+@pytest.mark.parametrize(("n_envs", "n_steps"), [(1, 100), (8, 10)])
 def test_every_episode_counts_once_whatever_its_length(
     costs: tuple[float, float], n_envs: int, n_steps: int
 ) -> None:
@@ -258,13 +221,12 @@ def test_the_horizon_outlives_a_rollout_in_which_nothing_ends() -> None:
     assert horizons == [25, 30, 30, 30, 30], "the fifth rollout sees steps 101 to 125: none ends"
 
 
-@pytest.mark.parametrize("cost_scale", [0.0, 1.0])
-@pytest.mark.parametrize("limit", [0.0, 5.0])
+@pytest.mark.parametrize(("cost_scale", "limit"), [(0.0, 0.0), (0.0, 5.0), (1.0, 0.0)])
 def test_finite_wherever_nothing_is_at_stake(cost_scale: float, limit: float) -> None:
     """d = 0, no cost , c = 0 and b = 0: parameters and logs stay finite, learning continues."""
     model = make(lambda: CostPoint(cost_scale=cost_scale), cost_limit=limit)
     before = [p.detach().clone() for p in model.policy.parameters()]
-    model.learn(1200)
+    model.learn(800)
     for old, new in zip(before, model.policy.parameters(), strict=True):
         assert th.isfinite(new).all() and not th.equal(old, new)
     logged = model.logger.name_to_value
@@ -280,52 +242,13 @@ class Toll(CostPoint):
         return observation, reward, terminated, truncated, {"cost": 1.0}
 
 
-SLOW = [pytest.param(cls, marks=pytest.mark.slow) for cls in (PCPO, TRPOLag, TRPOFAC, TRPOIPO)]
-
-
-@pytest.mark.parametrize("cls", [CPO, PPOLag, *SLOW])
+@pytest.mark.slow
+@pytest.mark.parametrize("cls", [CPO, PPOLag, PCPO, TRPOFAC])
 def test_a_violation_that_nothing_changes_does_not_end_learning(cls: type[CostRollouts]) -> None:
     """TRPO's return is 1.8 here; following the critic of cost alone it stays at 0."""
     model = cls("MlpPolicy", make_vec_env(Toll, 8, seed=0), n_steps=100, cost_limit=5.0, seed=0)
     model.learn(12_000)
     assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 1.5
-
-
-class Lottery(Toll):
-    """A step costs 1 or nothing, whatever the agent does."""
-
-    def step(self, action: np.ndarray) -> Any:
-        *others, info = super().step(action)
-        return *others, {"cost": info["cost"] * self.np_random.integers(2)}
-
-
-@pytest.mark.slow  # a minute each
-@pytest.mark.parametrize("cls", [TRPOLag, TRPOFAC])
-def test_nor_does_one_that_only_chance_changes(cls: type[TrustRegion]) -> None:
-    model = cls("MlpPolicy", make_vec_env(Lottery, 8, seed=0), n_steps=100, cost_limit=5.0, seed=0)
-    model.learn(100_000)
-    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 0.5
-
-
-def test_without_cost_it_takes_trpos_steps() -> None:
-    """Cost identically zero, and a fresh critic that says so: the natural step, in full."""
-    steps = []
-    for cls in (TRPO, CPO):
-        env = make_vec_env(lambda: CostPoint(cost_scale=0.0), 2, seed=0)
-        model = cls("MlpPolicy", env, n_steps=100, n_critic_updates=1, seed=0)
-        if cls is CPO:
-            th.nn.init.zeros_(model.cost_critic.network[-1].weight)
-            th.nn.init.zeros_(model.cost_critic.network[-1].bias)
-            th.manual_seed(0)
-        else:
-            th.manual_seed(0)
-        plan = model.plan
-        model.plan = lambda region, plan=plan: steps.append(plan(region)) or steps[-1]
-        model.learn(200)
-        if cls is CPO:
-            assert model.logger.name_to_value["train/cpo_case"] == Case.NO_GRADIENT
-    assert len(steps) == 2
-    th.testing.assert_close(steps[0][0], steps[1][0])
 
 
 def test_several_costs_have_their_own_logs_and_limits() -> None:

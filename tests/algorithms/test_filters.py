@@ -111,18 +111,6 @@ def test_one_half_space_and_the_box_against_an_optimiser(k: int) -> None:
     assert 100 < corrected < 300 and (walls > 20 or k == 1)
 
 
-def test_away_from_the_walls_it_is_dalals_closed_form() -> None:
-    rng = np.random.default_rng(0)
-    actions, normals = rng.uniform(-0.1, 0.1, (100, 3)), rng.normal(size=(100, 3))
-    limits = rng.uniform(-0.2, 0.2, 100)
-    excess = np.maximum(0.0, np.sum(normals * actions, axis=1) - limits)
-    expected = actions - (excess / np.sum(normals**2, axis=1))[:, None] * normals
-    inside = np.abs(expected).max(axis=1) < 1.0
-    assert inside.sum() > 80
-    found = clip_along(actions, normals, limits)
-    np.testing.assert_allclose(found[inside], expected[inside], atol=1e-12)
-
-
 def test_an_unreachable_half_space_is_approached_as_far_as_the_box_goes() -> None:
     actions = np.array([[0.3, -0.2, 0.5]])
     normals = np.array([[2.0, -1e-6, 0.0]])
@@ -161,16 +149,6 @@ def test_contradictory_half_spaces_are_violated_least() -> None:
         assert unit @ x == pytest.approx(middle, abs=1e-5)
         units, distances = normals / lengths[:, None], limits / lengths
         np.testing.assert_allclose(x, reference(action, units, distances, slack=1e4), atol=1e-2)
-
-
-def test_one_half_space_stated_twice_changes_nothing() -> None:
-    rng = np.random.default_rng(1)
-    for _ in range(100):
-        action, normal = rng.uniform(-1, 1, 4), rng.normal(size=4)
-        limit = rng.uniform(-0.95, 0.5) * np.abs(normal).sum()
-        once = clip_along(action[None], normal[None], np.array([limit]))[0]
-        twice = nearest_in_box(action, np.stack([normal, normal]), np.array([limit, limit]))
-        np.testing.assert_allclose(twice, once, atol=1e-3)
 
 
 @pytest.mark.parametrize("drift", [False, True])
@@ -269,8 +247,9 @@ def test_descent_takes_steps_of_its_rate_in_the_fastest_coordinate() -> None:
     np.testing.assert_allclose(moved, 0.03, rtol=1e-4)
 
 
-@pytest.mark.parametrize("threshold", [0.0, 0.4, 100.0])
-@pytest.mark.parametrize("net_arch", [[], [16], [16, 8]], ids=str)
+@pytest.mark.parametrize(
+    ("net_arch", "threshold"), [([], 0.0), ([16, 8], 0.4), ([16], 100.0)], ids=str
+)
 @pytest.mark.parametrize("activation", action_filters.GRADIENTS, ids=lambda kind: kind.__name__)
 def test_written_out_descent_is_autograds(activation: Any, net_arch: Any, threshold: float) -> None:
     policy = policy_of(2, net_arch=net_arch, activation_fn=activation)
@@ -341,25 +320,9 @@ def test_targets_of_the_cost_critic_by_hand(lam: float, terminate: bool) -> None
     np.testing.assert_allclose(found, [expected] * 2, rtol=1e-5)
 
 
-def test_targets_use_the_action_executed_next() -> None:
-    settings = {"rate": 0.5, "cost_gae_lambda": 0.0, "learning_rate": 1e-9}
-    model = make(TRPOUSL, points(2), threshold=0.0, **settings).learn(240)
-    batch = model._batch()
-    actions = model._executed(batch)
-    assert not th.equal(actions, model._sampled(batch))
-    values = model._layer.values(batch.observations, actions)[:, 0].reshape(2, 40)
-    found = batch.cost_returns[:, 0].reshape(2, 40)
-    costs = batch.costs[:, 0].reshape(2, 40)
-    starts = th.as_tensor(model.rollout_buffer.episode_starts.T[:, 1:])
-    inner = costs[:, :-1] + 0.99 * values[:, 1:]
-    within = starts == 0.0
-    th.testing.assert_close(found[:, :-1][within], inner[within])
-
-
-@pytest.mark.parametrize("cls", CLASSES)
-def test_models_learn_in_units_of_the_largest_costs_so_far(cls: Any) -> None:
+def test_models_learn_in_units_of_the_largest_costs_so_far() -> None:
     """Root mean squares of those that are not zero; a rollout without any changes nothing."""
-    model = make(cls, points(2))
+    model = make(TRPOSL, points(2))
     layer = model.policy.action_filter
     for costs, expected in (
         ([0.0, 0.0], 1.0),
@@ -370,26 +333,6 @@ def test_models_learn_in_units_of_the_largest_costs_so_far(cls: Any) -> None:
         model.rollout_buffer.costs = np.array(costs, np.float32)[:, None, None]
         model._choose_cost_units()
         assert float(layer.unit) == pytest.approx(expected)
-
-
-def test_what_is_ahead_is_valued_before_the_policy_moves() -> None:
-    """An action that was not taken is one of the policy that took the others."""
-    model = make(TRPOUSL, points(2))
-    order: list[str] = []
-    ahead, update = model._value_ahead, model._line_search
-    model._value_ahead = lambda *args: order.append("ahead") or ahead(*args)
-    model._line_search = lambda *args: order.append("update") or update(*args)
-    model.learn(160)
-    # Each environment meets a time-out in a rollout, and both have a last observation.
-    assert order == ["ahead", "ahead", "ahead", "update"] * 2
-
-
-def test_what_is_ahead_is_the_cost_of_the_corrected_action() -> None:
-    model = make(TRPOUSL, points(2))
-    observations, executed = th.randn(6, 4), np.full((6, 2), 0.25, np.float32)
-    model.policy.correct = lambda *_: executed
-    expected = model._layer.values(observations, th.as_tensor(executed)).numpy()
-    np.testing.assert_allclose(model._value_ahead(observations), expected, rtol=1e-5)
 
 
 # The algorithms
@@ -418,10 +361,9 @@ def test_corrected_actions_run_and_sampled_ones_are_learnt_from(cls: Any) -> Non
     assert logged["train/corrected_fraction"] > 0.5 and logged["train/correction_norm"] > 0.01
 
 
-@pytest.mark.parametrize("cls", CLASSES)
-def test_last_costs_reach_the_batch(cls: Any) -> None:
+def test_last_costs_reach_the_batch() -> None:
     """The cost of the step before, zero where an episode starts, across rollouts too."""
-    model = make(cls, points(2, episode_length=33))
+    model = make(TRPOSL, points(2, episode_length=33))
     steps, batches = [], []
 
     def record(local: dict, _: dict) -> bool:
@@ -438,22 +380,10 @@ def test_last_costs_reach_the_batch(cls: Any) -> None:
     assert expected.max() > 0.1
 
 
-@pytest.mark.parametrize("cls", CLASSES)
-@pytest.mark.parametrize(
-    ("warmup", "on_at"),
-    [
-        (1 / 3, 160),
-        (0.5, 240),
-        (0.0, 80),
-        (100, 160),
-        (np.int64(100), 160),
-        (1, 80),
-        (1.0, None),
-    ],
-)
-def test_warmup(cls: Any, warmup: float, on_at: int | None) -> None:
+@pytest.mark.parametrize(("warmup", "on_at"), [(1 / 3, 80), (np.int64(100), 160), (1.0, None)])
+def test_warmup(warmup: float, on_at: int | None) -> None:
     """The first rollout after that share of the first `learn`, or number of steps."""
-    model = make(cls, warmup=warmup)
+    model = make(TRPOUSL, warmup=warmup, n_critic_updates=1)
     active = {}
     train = model.train
 
@@ -462,27 +392,12 @@ def test_warmup(cls: Any, warmup: float, on_at: int | None) -> None:
         active[model.num_timesteps] = model.policy.corrects
 
     model.train = spy
-    model.learn(480)
-    assert list(active) == [80, 160, 240, 320, 400, 480]
+    model.learn(240)
+    assert list(active) == [80, 160, 240]
     first = next((steps for steps, on in active.items() if on), None)
-    assert first == (480 if on_at is None else on_at)
+    assert first == (240 if on_at is None else on_at)
     model.learn(80)
     assert model.policy.corrects and model.num_timesteps == 80, "once on, it stays on"
-
-
-@pytest.mark.parametrize("cls", CLASSES)
-def test_predict_filters_exactly_when_training_does(cls: Any) -> None:
-    model = make(cls, threshold=-1.0, warmup=160)
-    observations = model.env.reset()
-    model.learn(80)
-    plain, _ = ActorCriticPolicy.predict(model.policy, observations, deterministic=True)
-    np.testing.assert_array_equal(model.predict(observations, deterministic=True)[0], plain)
-    model.learn(80, reset_num_timesteps=False)
-    plain, _ = ActorCriticPolicy.predict(model.policy, observations, deterministic=True)
-    corrected, state = model.predict(observations, deterministic=True)
-    assert state is None and np.abs(corrected - plain).max() > 0.01
-    single, _ = model.predict(observations[0], deterministic=True)
-    np.testing.assert_allclose(single, corrected[0], atol=1e-5)
 
 
 @pytest.mark.parametrize("cls", CLASSES)
@@ -549,7 +464,7 @@ def test_boxes_of_any_size(cls: Any) -> None:
     env = make_vec_env(lambda: RandomCostEnv(STATE, box), 2, seed=0)  # refuses others
     model = make(cls, env, threshold=-1.0).learn(240)
     assert model.logger.name_to_value["train/corrected_fraction"] > 0.5
-    unit = model.policy.to_unit(np.array([[-5.0, 0.1], [-2.0, 0.05]]))
+    unit = model.policy.to_unit(th.tensor([[-5.0, 0.1], [-2.0, 0.05]]))
     np.testing.assert_allclose(unit, [[-1, 1], [0, 0]], atol=1e-6)
     action, _ = model.predict(env.reset())
     assert all(box.contains(each) for each in action)
@@ -567,20 +482,6 @@ def test_thresholds_default_to_the_limit() -> None:
     keys = ("cost", "cost_1")
     model = make(TRPOSL, points(2, cost_keys=keys), cost_keys=keys, threshold=[0.1, 0.3]).learn(80)
     np.testing.assert_allclose(model.policy.action_filter.threshold.numpy(), [0.1, 0.3])
-
-
-def test_a_given_threshold_holds_from_the_first_step() -> None:
-    model = make(TRPOSL, warmup=0, threshold=0.5)
-    seen = []
-    correct = model.policy.action_filter.forward
-
-    def spy(*args: Any) -> Any:
-        seen.append(model.policy.action_filter.threshold.item())
-        return correct(*args)
-
-    model.policy.action_filter.forward = spy
-    model.learn(160)
-    assert len(seen) == 80 and set(seen) == {0.5}
 
 
 @pytest.mark.parametrize("cls", CLASSES)
@@ -604,28 +505,6 @@ def test_costs_below_zero_are_named_once_where_they_cant_be_learnt() -> None:
         warnings.simplefilter("error")
         make(TRPOUSL, n_critic_updates=1, cost_limit=1.0).learn(80)
         make(TRPOSL, points(2, cost_scale=-1.0), n_critic_updates=1, cost_limit=1.0).learn(80)
-
-
-def test_the_cost_model_learns_from_executed_actions() -> None:
-    model = make(TRPOSL, threshold=-1.0)
-    fitted: list[Any] = []
-    original = model.policy.action_filter.regression
-
-    def spy() -> Any:
-        regression = original()
-        fit = regression.fit
-        regression.fit = lambda batch, *rest: fitted.append(batch) or fit(batch, *rest)
-        return regression
-
-    model.policy.action_filter.regression = spy
-    model.learn(160)
-    buffer = model.rollout_buffer
-    executed = model.policy.to_unit(buffer.executed_actions)
-    assert np.abs(executed - np.clip(buffer.actions, -1, 1)).max() > 0.1
-    observations, actions, _ = (each.numpy() for each in fitted[-1])
-    for observation, action in zip(observations, actions, strict=True):
-        (row,) = np.flatnonzero((buffer.observations == observation).all(axis=1))
-        np.testing.assert_allclose(action, executed[row], atol=1e-6)
 
 
 def test_without_a_cost_the_cost_model_rests() -> None:
@@ -693,18 +572,6 @@ def test_what_is_below_the_models_error_is_not_corrected(
     assert (np.abs(executed - action).max() > 0.1) == (slope > noise)
 
 
-def test_the_models_error_is_that_of_its_predictions() -> None:
-    model = make(TRPOSL, tolerance=3.0, drift=True).learn(160)
-    layer, batch = model.policy.action_filter, model._batch()
-    with th.no_grad():
-        outputs = layer.network(batch.observations)
-    slopes, drift = layer.unit * outputs[:, :2], layer.unit * outputs[:, 3]
-    actions = th.as_tensor(model.policy.to_unit(batch.executed_actions.numpy()))
-    predicted = batch.previous_costs[:, 0] + (slopes * actions).sum(dim=1) + drift
-    expected = 3.0 * float((predicted - batch.costs[:, 0]).square().mean().sqrt())
-    assert float(layer.noise) == pytest.approx(expected, rel=1e-4) and expected > 0.0
-
-
 class OwnPolicy(ActorCriticPolicy):
     """Somebody's policy."""
 
@@ -724,17 +591,9 @@ def test_policies_of_ones_own(cls: Any) -> None:
     ("cls", "kwargs", "message"),
     [
         (TRPOSL, {"warmup": 1.5}, r"warmup ?= ?1.5.* 1"),
-        (TRPOSL, {"warmup": np.int64(-1)}, r"warmup.*integer.*at least 0"),
-        (TRPOSL, {"warmup": True}, r"warmup.*True.*integer"),
         (TRPOSL, {"warmup": -1}, r"warmup.*-1.*at least 0"),
         (TRPOSL, {"threshold": [0.1, 0.2]}, r"threshold=\[0.1, 0.2\].*one for each of the 1"),
-        (TRPOSL, {"threshold": "low"}, "threshold='low'"),
         (TRPOUSL, {"steps": 0}, r"steps ?= ?0"),
-        (TRPOUSL, {"rate": 0.0}, r"rate ?= ?0.0"),
-        (TRPOUSL, {"tolerance": -0.1}, r"tolerance ?= ?-0.1"),
-        (TRPOUSL, {"kappa": -1.0}, r"kappa ?= ?-1.0"),
-        (TRPOSL, {"tolerance": -1.0}, r"tolerance ?= ?-1.0"),
-        (TRPOUSL, {"correction_penalty": -1.0}, r"correction_penalty ?= ?-1.0"),
     ],
 )
 def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) -> None:
@@ -742,10 +601,9 @@ def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) ->
         make(cls, **kwargs)
 
 
-@pytest.mark.parametrize(
-    ("cls", "seed"),
-    [(TRPOSL, 0), *(pytest.param(cls, 1, marks=pytest.mark.slow) for cls in CLASSES)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("cls", CLASSES)
 def test_it_stops_before_the_wall(cls: type[FilteredTrustRegion], seed: int) -> None:
     """Most of the return; from its first rollout on a fiftieth of what was paid just before.
 

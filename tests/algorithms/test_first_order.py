@@ -29,7 +29,6 @@ from sb3_guard.algorithms import (
     TRPOSL,
     TRPOUSL,
     PPOLag,
-    TRPOLag,
     TrustRegion,
 )
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
@@ -66,10 +65,8 @@ def state(model: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("cls", [PPOLag, CPPOPID])
-@pytest.mark.parametrize(
-    "kwargs", [{"target_kl": None}, {"target_kl": None, "clip_range_vf": 0.2}], ids=str
-)
-def test_out_of_reach_of_the_limit_it_is_sb3s_ppo(cls: Any, kwargs: dict[str, Any]) -> None:
+def test_out_of_reach_of_the_limit_it_is_sb3s_ppo(cls: Any) -> None:
+    kwargs = {"target_kl": None, "clip_range_vf": 0.2}
     theirs = make_vec_env(lambda: CostPoint(30, hazard=(-1.0, 0.0)), 4, seed=0)
     settings = {"n_steps": 32, "batch_size": 64, "seed": 0, "device": "cpu", **SB3, **kwargs}
     a = state(PPO("MlpPolicy", theirs, **settings).learn(384))
@@ -94,7 +91,13 @@ def test_a_broken_limit_raises_the_multiplier_and_a_kept_one_lowers_it(cls: Any)
     assert 0.0 < seen[0] < seen[1] > seen[2]
 
 
-@pytest.mark.parametrize("cls", [*LAGRANGIAN, CPO, PCPO, TRPOFAC, TRPOIPO, TRPOSL, TRPOUSL])
+@pytest.mark.parametrize(
+    "cls",
+    [
+        pytest.param(cls, marks=() if cls in (PPOLag, CPO, TRPOFAC, TRPOSL) else pytest.mark.slow)
+        for cls in (*LAGRANGIAN, CPO, PCPO, TRPOFAC, TRPOIPO, TRPOSL, TRPOUSL)
+    ],
+)
 def test_a_run_does_not_know_the_unit_of_cost(cls: Any) -> None:
     """Costs and limit × 100 and × 0.01: the same multipliers, the same policy to rounding.
 
@@ -144,26 +147,7 @@ def test_prices_in_units_of_cost_weigh_costs_against_standardised_advantages() -
     model.learn(128)
 
 
-def test_ppo_lagrangians_price_does_not_know_the_unit_of_reward() -> None:
-    """Advantages × 100: the priced ones are × 100, and differ from those without costs."""
-    priced = []
-    for scale in (1.0, 100.0):
-        model = make(PPOLag, cost_limit=0.01)
-        buffer, train = model.rollout_buffer, model.train
-
-        def scaled(buffer: Any = buffer, train: Any = train, scale: float = scale) -> None:
-            raw = buffer.advantages = scale * buffer.advantages
-            train()
-            raw = buffer.swap_and_flatten(raw).reshape(buffer.advantages.shape)
-            assert np.abs(buffer.advantages - raw).max() > 0.1 * raw.std()
-            priced.append(buffer.advantages)
-
-        model.train = scaled
-        model.learn(128)
-    np.testing.assert_allclose(100.0 * priced[0], priced[1], rtol=1e-3, atol=1e-4)
-
-
-@pytest.mark.parametrize("cls", [FOCOPS, P3O, TRPOLag, TRPOFAC, TRPOIPO, TRPOSL])
+@pytest.mark.parametrize("cls", [FOCOPS, P3O, TRPOFAC, TRPOIPO, TRPOSL])
 def test_the_weight_of_a_cost_does_not_know_the_unit_of_reward(cls: Any) -> None:
     """Advantages × 100, which are not standardised: the same gradient × 100."""
     name = "surrogate" if issubclass(cls, TrustRegion) else "loss"
@@ -252,20 +236,6 @@ def test_cup_projection_by_hand() -> None:
     assert float(loss) == pytest.approx((0.02 + 0.08) / 2 + 5.5 * (1.2 - 1.0) / 2, rel=1e-5)
 
 
-def test_cup_compares_with_the_policy_that_collected() -> None:
-    """The second step's ratios are π / π_k: after the first they are not 1."""
-    model = make(CUP, cost_limit=0.01)
-    ratios, projection = [], model.projection
-
-    def spy(rows: Any, ratio: th.Tensor, distribution: Any) -> th.Tensor:
-        ratios.append(ratio.detach().clone())
-        return projection(rows, ratio, distribution)
-
-    model.projection = spy
-    model.learn(128)
-    assert float((ratios[0] - 1.0).abs().max()) > 0.01
-
-
 def test_p3o_by_hand() -> None:
     """A_C centred is 1, -1; ratios 1.5, 0.5 are clipped to 1.2, 0.8: max 1.5, -0.5; mean 0.5."""
     model = make(P3O, penalty=3.0, normalize_advantage=False)
@@ -305,13 +275,6 @@ def test_rcpo_takes_the_whole_step() -> None:
     assert model.logger.name_to_value["train/line_search_step"] == 1.0
 
 
-def test_epochs_stop_by_the_mean_over_the_rollout() -> None:
-    """A pass of two minibatches is taken whole, though the second is beyond the bound already."""
-    model = make(PPOLag, target_kl=1e-7, n_epochs=10, cost_limit=1e6).learn(128)
-    assert model._n_updates == 1
-    assert int(next(iter(model.policy.optimizer.state.values()))["step"]) == 2
-
-
 def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
     """The first goes beyond the bound in a pass; the second, hardly priced, stays and takes all."""
     still: dict[str, Any] = {"lambda_init": 1e-9, "lambda_lr": 0.0, "proportional_gain": 0.0}
@@ -339,20 +302,6 @@ def test_cups_second_step_is_stopped_by_its_own_distance() -> None:
     assert logged["train/n_updates"] == model._n_updates == 5
 
 
-def test_cups_second_step_may_take_back_what_the_first_has_done() -> None:
-    """Far above the limit it goes up to four times the first one's KL, which is twice as far."""
-    high: dict[str, Any] = {"lambda_init": 5.0, "lambda_lr": 0.0, "proportional_gain": 0.0}
-    small: dict[str, Any] = {"batch_size": 128, "learning_rate": 1e-4, "n_epochs": 200}
-    model = make(CUP, target_kl=1e-3, cost_limit=1e-3, **high, **small)
-    model.learn(128)
-    bound = 4.0 * model.target_kl
-    last = model.logger.name_to_value["train/projection_kl"]  # before the last step, or after it
-    assert 0.7 * bound < last < 1.4 * bound
-    # The KL that stopped the first step is logged as it was then.
-    first = model.logger.name_to_value["train/approx_kl"]
-    assert 0.1 * model.target_kl < first < 1.6 * model.target_kl
-
-
 # Bad input
 
 
@@ -360,18 +309,12 @@ def test_cups_second_step_may_take_back_what_the_first_has_done() -> None:
     ("cls", "kwargs", "message"),
     [
         (CUP, {"gamma": 1.0}, r"gamma=1.0: CUP weighs costs by .*use a discount factor below 1"),
-        (CUP, {"cost_gamma": 1.0}, "cost_gamma=1.0: CUP weighs costs by"),
         (PPOLag, {"lambda_init": 2.0, "lambda_max": 1.0}, "lambda_max=1.0: .* lambda_init=2.0"),
         (PPOLag, {"cost_limit": [1.0, 2.0]}, r"cost_limit=.*one for each of the 1 cost keys"),
         (PPOLag, {"lambda_units": "euro"}, "lambda_units='euro': must be 'relative' or 'cost'"),
         (CPPOPID, {"lambda_smoothing": 1.0}, r"lambda_smoothing=1.0: must be a number in \[0, 1\)"),
         (FOCOPS, {"temperature": 0.0}, "temperature=0.0"),
-        (FOCOPS, {"trust_region": -1.0}, "trust_region=-1.0"),
-        (P3O, {"penalty": 0.0}, "penalty=0.0"),
         (PPOLag, {"clip_range": 0.0}, r"clip_range=0.0: must be a number in \(0, inf\)"),
-        (PPOLag, {"clip_range_vf": -1.0}, "clip_range_vf=-1.0"),
-        (CUP, {"ent_coef": -1.0}, r"ent_coef=-1.0: must be a number in \[0, inf\)"),
-        (CRPO, {"tolerance": -0.1}, "tolerance=-0.1"),
         (P3O, {"n_epochs": 0}, "n_epochs=0: must be an integer of at least 1"),
     ],
 )
@@ -380,17 +323,7 @@ def test_bad_values_are_named(cls: Any, kwargs: dict[str, Any], message: str) ->
         make(cls, **kwargs)
 
 
-@pytest.mark.parametrize("key", [*KEYS, "scpo"])
-def test_limits_and_bounds_that_contradict_are_named(key: str) -> None:
-    cls = ALGORITHMS[key]
-    with pytest.raises(ValueError, match=r"cost_limit=.*one for each of the 1 cost keys"):
-        make(cls, cost_limit=[1.0, 2.0])
-    if issubclass(cls, Lagrangian):
-        with pytest.raises(ValueError, match=r"lambda_max=1.0: .* lambda_init=2.0"):
-            make(cls, lambda_init=2.0, lambda_max=1.0)
-
-
-@pytest.mark.parametrize("key", [*KEYS, "sac_lag", "td3_lag", "tqc_lag"])
+@pytest.mark.parametrize("key", ["ppo_lag", "focops", "crpo", "td3_lag"])
 def test_a_reward_that_is_not_finite_is_named(key: str) -> None:
     """Before torch refuses the policy's parameters, and though TD3 would train on."""
 
@@ -401,16 +334,11 @@ def test_a_reward_that_is_not_finite_is_named(key: str) -> None:
 
     cls = ALGORITHMS[key]
     off_policy = {"learning_starts": 20, "batch_size": 8, "buffer_size": 200}
-    more = off_policy if key in ("sac_lag", "td3_lag", "tqc_lag") else {"n_steps": 40}
+    more = off_policy if key == "td3_lag" else {"n_steps": 40}
     more |= {"batch_size": 20} if issubclass(cls, PPO) else {}
     model = cls("MlpPolicy", Broken(30), cost_limit=1.0, device="cpu", **more)
     with pytest.raises(FloatingPointError, match=r"_loss is nan after .*: a reward"):
         model.learn(160)
-
-
-def test_focops_takes_no_clip_range() -> None:
-    with pytest.raises(TypeError, match="FOCOPS takes no argument 'clip_range'"):
-        make(FOCOPS, clip_range=0.2)
 
 
 # Known optima
@@ -419,8 +347,12 @@ def test_focops_takes_no_clip_range() -> None:
 @pytest.mark.parametrize(
     "key",
     [
-        *("ppo_lag", "p3o", "crpo", "rcpo"),
-        *(pytest.param(key, marks=pytest.mark.slow) for key in ("cppo_pid", "focops", "cup")),
+        *("ppo_lag", "p3o"),
+        *(
+            pytest.param(key, marks=pytest.mark.slow)
+            for key in KEYS
+            if key not in ("ppo_lag", "p3o")
+        ),
     ],
 )
 def test_a_known_optimum(key: str) -> None:

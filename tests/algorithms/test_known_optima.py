@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from cost_envs import TabularCMDP
-from known_optima import Bandit, Problem, Street, Table, Worlds, problems
+from known_optima import Bandit, Street, Table, Worlds, problems
 from scipy.optimize import minimize, minimize_scalar
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -166,15 +166,3 @@ def test_rows_are_the_environment_that_gymnasium_has() -> None:
         assert dones[0]
         totals.append(infos[0]["episode"]["r"])
     assert np.mean(totals) == pytest.approx(value, rel=0.05)
-
-
-def test_scale_multiplies_costs_alone() -> None:
-    problem: Problem = PROBLEMS["table"]
-    runs = []
-    for scale in (1.0, 100.0):
-        env = problem.make_env(0, scale)
-        env.reset()
-        runs.append([env.step(np.full(env.num_envs, 1))[1::2] for _ in range(5)])
-    for (reward, infos), (other, scaled) in zip(*runs, strict=True):
-        np.testing.assert_array_equal(reward, other)
-        assert scaled[0]["cost"] == pytest.approx(100 * infos[0]["cost"])

@@ -342,7 +342,7 @@ def test_parallel_gradients(sign: float) -> None:
         assert 0.5 * x @ problem.F @ x == pytest.approx(problem.delta, rel=1e-8)
 
 
-@pytest.mark.parametrize("noise", [1e-7, 1e-6, 1e-5, 1e-4])
+@pytest.mark.parametrize("noise", [1e-7, 1e-4])
 @pytest.mark.parametrize("m", [2, 3])
 def test_nearly_parallel_gradients_in_float32(m: int, noise: float) -> None:
     """Reward along a binding cost, but for rounding: within the region, the limits and 0.2 %."""

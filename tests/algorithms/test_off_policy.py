@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import CostPoint, RandomCostEnv
+from cost_envs import CostPoint
 from gymnasium import spaces
 from known_optima import Outcomes, problems
 from sb3_contrib import TQC
@@ -29,8 +29,6 @@ from sb3_guard.algorithms.common.replay_buffers import (
     CostReplayBuffer,
     CostReplayBufferSamples,
 )
-from sb3_guard.common.callbacks import CostEvalCallback, LogCosts
-from sb3_guard.common.monitor import CostMonitor
 
 
 def settings() -> dict[str, Any]:
@@ -77,10 +75,7 @@ def state_of(model: Any) -> list[Any]:
     [
         (SACLag, SAC, {"gradient_steps": 2, "target_update_interval": 2, "ent_coef": "auto"}),
         (SACLag, SAC, {"ent_coef": 0.1, "use_sde": True}),
-        (SACLag, SAC, {"ent_coef": "auto", "n_steps": 3}),
-        (TD3Lag, TD3, {"gradient_steps": 3}),
         (TD3Lag, TD3, {"n_steps": 3}),
-        (TQCLag, TQC, {"ent_coef": "auto", "n_steps": 3}),
         (TQCLag, TQC, {"gradient_steps": 2, "target_update_interval": 2, "ent_coef": "auto"}),
         (TQCLag, TQC, {"ent_coef": 0.1, "use_sde": True, "top_quantiles_to_drop_per_net": 5}),
     ],
@@ -127,7 +122,7 @@ class Clock(gymnasium.Env[Any, Any]):
         return observation, 0.0, over and not self.cut, over and self.cut, info
 
 
-@every
+@shared
 @pytest.mark.parametrize("cut", [False, True])
 def test_what_is_replayed_and_learnt_from(cls: Any, cut: bool) -> None:
     """Each row has the cost of its own step, the last one's too, and what came after it."""
@@ -161,7 +156,7 @@ def test_what_is_replayed_and_learnt_from(cls: Any, cut: bool) -> None:
     assert model.fit_cost_critic(batch, actions) == pytest.approx(expected, rel=1e-5)
 
 
-@every
+@shared
 @pytest.mark.parametrize("cut", [False, True])
 def test_sums_of_several_steps(cls: Any, cut: bool) -> None:
     """Costs of n steps, or of those until the episode ends, discounted by γ_C, not by γ."""
@@ -260,12 +255,6 @@ def test_cost_quantiles_by_hand() -> None:
     assert model.fit_cost_critic(batch, actions) == pytest.approx(np.mean(losses), rel=1e-4)
 
 
-def test_quantiles_that_do_not_exist_are_refused() -> None:
-    more = {"top_quantiles_to_drop_per_net": 25}
-    with pytest.raises(ValueError, match="per_net=25: must be at least 0 and below"):
-        TQCLag("MlpPolicy", points(1), cost_limit=1.0, **settings(), **more)
-
-
 def test_networks_side_by_side_are_networks() -> None:
     keys = {"cost_keys": ("cost", "again"), "missing_cost": "zero", "cost_limit": 1.0}
     model = SACLag("MlpPolicy", points(), **keys, **settings() | {"policy_kwargs": {}})
@@ -331,9 +320,9 @@ def test_multipliers_follow_the_mean_of_episodes(cls: Any) -> None:
     values = []
     for limit in (5.0, 7.0):
         env = given(itertools.cycle([0.0] * 9 + [60.0]), 1, length=3)
-        model = cls("MlpPolicy", env, cost_limit=limit, **settings()).learn(600)
+        model = cls("MlpPolicy", env, cost_limit=limit, **settings()).learn(300)
         values.append(float(model.multiplier.integral))
-    assert values[0] > 0.3 and values[1] == 0.0
+    assert values[0] > 0.1 and values[1] == 0.0
 
 
 @shared
@@ -351,7 +340,7 @@ def test_a_safety_margin_is_a_share_of_the_limit(cls: Any, sign: float) -> None:
 
 
 @shared
-@pytest.mark.parametrize(("n_envs", "total"), [(1, 400), (8, 800), (8, 1600)])
+@pytest.mark.parametrize(("n_envs", "total"), [(1, 400), (8, 800)])
 def test_a_training_moves_multipliers_as_far_however_many_episodes_it_has(
     cls: Any, n_envs: int, total: int
 ) -> None:
@@ -377,7 +366,6 @@ def paid(size: float) -> Any:
     ("ent_coef", "size", "start"),
     [
         ("auto_reward", 0.02, 0.02),
-        ("auto_reward", 30.0, 30.0),
         ("auto_reward", 0.0, 1.0),  # nothing to go by
         ("auto", 0.02, 1.0),
         ("auto_0.1", 0.02, 0.1),
@@ -396,22 +384,6 @@ def test_the_entropy_coefficient_starts_where_it_is_told(
     model.set_env(paid(1000.0))
     model.learn(4, reset_num_timesteps=False)
     assert float(model.log_ent_coef.exp()) == pytest.approx(start, rel=0.01)
-
-
-def test_the_entropy_coefficient_fits_normalised_rewards_and_the_number_of_actions() -> None:
-    env = VecNormalize(points(), norm_obs=False)
-    model = SACLag("MlpPolicy", env, learning_rate=1e-9, cost_limit=1e6, **settings()).learn(62)
-    rewards = env.normalize_reward(model.replay_buffer.rewards[:31])
-    expected = np.abs(rewards).mean() / 2.0
-    assert float(model.log_ent_coef.exp()) == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize("value", ["auto_size", "car", "auto_0.0", "auto_-1"])
-def test_an_entropy_coefficient_of_another_kind_is_named(value: Any) -> None:
-    with pytest.raises(
-        ValueError, match=f"ent_coef={value!r}: must be a number of at least 0, 'au"
-    ):
-        SACLag("MlpPolicy", points(1), ent_coef=value, cost_limit=1.0, **settings())
 
 
 @shared
@@ -446,12 +418,13 @@ def test_a_callback_that_stops_loses_no_cost() -> None:
     for _ in range(2):
         model.learn(100, Stop(), reset_num_timesteps=False)
     assert model.num_timesteps == 60 and model.costs.episodes.lengths.tolist() == [0]
-    assert model.total_cost == pytest.approx(sum(float(cost[0]) for cost in model.ep_cost_buffer))
-    assert len(model.ep_cost_buffer) == 2
+    assert model.total_cost == pytest.approx(sum(float(cost[0]) for cost in model.costs.latest))
+    assert len(model.costs.latest) == 2
 
 
-@pytest.mark.parametrize("steps", [5, 70])
-@pytest.mark.parametrize("kind", ["flat", "flat, memory saved", "dictionary"])
+@pytest.mark.parametrize(
+    ("kind", "steps"), [("flat", 5), ("flat, memory saved", 70), ("dictionary", 70)]
+)
 def test_a_buffer_is_saved_without_its_empty_rows(kind: str, steps: int) -> None:
     dictionary, memory = kind == "dictionary", kind == "flat, memory saved"
     box = spaces.Box(-1.0, 1.0, (3,))
@@ -504,38 +477,6 @@ def test_saved_and_loaded(cls: Any, tmp_path: Path) -> None:
     assert result.lengths.tolist() == [30, 30] and (result.costs > 0.0).all()
 
 
-def test_evaluated_and_logged_while_training() -> None:
-    judge = CostEvalCallback(points(1), n_eval_episodes=2, eval_freq=50, verbose=0)
-    train = CostMonitor(points())
-    model = SACLag("MlpPolicy", train, cost_limit=0.1, **settings())
-    model.learn(150, [judge, LogCosts()])
-    assert judge.evaluations_timesteps == [100] and np.min(judge.evaluations_costs) > 0.0
-    rate = model.logger.name_to_value["rollout/cost_rate"]
-    assert rate == pytest.approx(train.total_cost / 150)
-
-
-@shared
-def test_images(cls: Any) -> None:
-    image, move = spaces.Box(0, 255, (36, 36, 1), np.uint8), spaces.Box(-1.0, 1.0, (2,))
-    env = make_vec_env(lambda: RandomCostEnv(image, move), 2)
-    model = cls("CnnPolicy", env, **settings() | {"buffer_size": 200}).learn(70)
-    assert model.cost_critic.optimizer.state and len(model.predict(env.reset())[0]) == 2
-
-
-def test_dict_observations() -> None:
-    class Both(gymnasium.ObservationWrapper[Any, Any, Any]):
-        def __init__(self) -> None:
-            super().__init__(CostPoint(30, hazard=(-1.0, 0.0)))
-            self.observation_space = spaces.Dict({"all": self.env.observation_space})
-
-        def observation(self, observation: Any) -> Any:
-            return {"all": observation}
-
-    model = SACLag("MultiInputPolicy", make_vec_env(Both, 2), **settings()).learn(100)
-    batch = model.replay_buffer.sample(5)
-    assert batch.observations["all"].shape[0] == 5 and batch.costs.shape == (5, 1)
-
-
 def test_sampling_draws_what_sb3s_buffer_draws() -> None:
     space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     buffer = CostReplayBuffer(20, space, space, "cpu", n_envs=4, n_costs=1)
@@ -552,7 +493,8 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
 @pytest.mark.parametrize(
     ("more", "error"),
     [
-        ({"n_steps": 0}, "n_steps=0: must be an integer of at least 1"),
+        ({"ent_coef": "auto_size"}, "ent_coef='auto_size': must be a number of at least 0, 'au"),
+        ({"target_update_interval": 0}, "target_update_interval=0: must be an integer"),
         (
             {"n_steps": 3, "replay_buffer_class": type("Own", (CostReplayBuffer,), {})},
             "n_steps=3: must be 1 with a Own",
@@ -560,50 +502,19 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
         ({"n_steps": 3, "optimize_memory_usage": True}, "n_steps=3: must be 1 .*optimize_memory"),
         ({"cost_gamma": 1.0}, r"cost_gamma=1.0: must be a number in \[0, 1\)"),
         ({"gamma": 1.0}, "gamma=1.0: .* must be below 1, .*; give cost_gamma=0.99 too"),
-        ({"gamma": 2.0, "cost_gamma": 0.9}, r"gamma=2.0: must be a number in \[0, 1\]"),
         ({"batch_size": 0}, "batch_size=0: must be an integer of at least 1"),
-        ({"buffer_size": 0}, "buffer_size=0: must be an integer of at least 1"),
-        ({"train_freq": 0}, "train_freq=0: must be an integer of at least 1"),
-        ({"train_freq": (0, "episode")}, "train_freq=0: must be an integer of at least 1"),
         (
             {"train_freq": (1, "episode"), "env": points(2)},
             "train_freq=.*of a single environment, and there are 2; give a number of steps",
         ),
         ({"tau": 2.0}, r"tau=2.0: must be a number in \[0, 1\]"),
-        ({"learning_rate": 0.0}, "learning_rate=0.0: must be a positive number or a schedule"),
-        ({"lambda_starts": -1}, "lambda_starts=-1"),
         ({"safety_margin": 1.0}, "safety_margin=1.0"),
-        ({"cost_limit": [1.0, 2.0]}, "cost_limit=.*one for each of the 1 cost keys"),
-        ({"lambda_init": 2.0, "lambda_max": 1.0}, "lambda_max=1.0"),
         ({"env": "CartPole-v1"}, r"^\w+ needs continuous actions \(Box\), not Discrete"),
-        ({"env": gymnasium.make("CartPole-v1")}, r"needs continuous actions \(Box\), not Discrete"),
     ],
 )
 def test_bad_input(more: Any, error: str) -> None:
     with pytest.raises(ValueError, match=error):
         SACLag("MlpPolicy", **{"env": points(1), **settings(), **more})
-
-
-@pytest.mark.parametrize(
-    ("cls", "name"),
-    [(SACLag, "ent_coef"), (TD3Lag, "target_policy_noise"), (TD3Lag, "target_noise_clip")],
-)
-def test_what_sb3_takes_silently_is_refused(cls: Any, name: str) -> None:
-    with pytest.raises(ValueError, match=rf"{name}=-1: must be a number in \[0, inf\)"):
-        cls("MlpPolicy", points(1), **settings(), **{name: -1})
-
-
-@pytest.mark.parametrize(
-    ("cls", "name"),
-    [
-        (SACLag, "target_update_interval"),
-        (TQCLag, "target_update_interval"),
-        (TD3Lag, "policy_delay"),
-    ],
-)
-def test_an_interval_of_zero_is_refused_before_training(cls: Any, name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name}=0: must be an integer of at least 1"):
-        cls("MlpPolicy", points(1), **settings(), **{name: 0})
 
 
 @shared
@@ -643,6 +554,15 @@ def test_it_finds_a_known_optimum(cls: Any) -> None:
     cls("MlpPolicy", env, cost_limit=0.5, policy_kwargs=policy, **fast).learn(steps, outcomes)
     assert np.mean(outcomes.returns) / problem.best >= 0.9
     assert 0.85 <= np.mean(outcomes.costs) / 0.5 <= 1.05
+
+
+def test_a_fixed_entropy_coefficient_does_not_replace_a_learnt_one(tmp_path: Path) -> None:
+    for saved, other in ((0.2, "auto"), ("auto", 0.2)):
+        model = SACLag("MlpPolicy", points(), cost_limit=1.0, ent_coef=saved, **settings())
+        model.save(tmp_path / "model")
+        with pytest.raises(TypeError, match=f"ent_coef={other!r}: .*load it without ent_coef"):
+            SACLag.load(tmp_path / "model", ent_coef=other)
+        assert SACLag.load(tmp_path / "model").ent_coef == saved
 
 
 def test_a_training_that_learns_nothing_is_told():

@@ -13,8 +13,8 @@ from stable_baselines3.common.logger import Logger
 from step_problems import StepProblem
 
 from sb3_guard.algorithms import PCPO
+from sb3_guard.algorithms.common.actor import Trial
 from sb3_guard.algorithms.common.natural_gradient import projected_step
-from sb3_guard.algorithms.common.trust_region import Trial
 
 SIZE = 6
 
@@ -113,44 +113,7 @@ def test_contradictory_limits_are_violated_least(euclidean: bool) -> None:
         np.testing.assert_allclose(problem.B[0] @ x, np.clip(wanted, -reach, reach), rtol=1e-4)
 
 
-@pytest.mark.parametrize("euclidean", [False, True])
-@pytest.mark.parametrize("m", [2, 3, 4])
-def test_limits_without_a_common_point_against_an_optimiser(m: int, euclidean: bool) -> None:
-    """One half-space lies beyond the sum of the others: least squares within the trust region."""
-    rng = np.random.default_rng(20 * m + euclidean)
-    inside = 0
-    for _ in range(60):
-        problem = Problem(rng, rng.uniform(-0.5, 2.0, size=m), 10 ** rng.uniform(-1, 1, size=m))
-        weights = rng.uniform(0.2, 2.0, size=m - 1)
-        problem.B[-1] = -weights @ problem.B[:-1]
-        gap = rng.uniform(0.02, 0.6) * np.linalg.norm(problem.reach)
-        problem.c[-1] = gap - weights @ problem.c[:-1]
-        x, _ = problem.solve(euclidean)
-        kl = x @ problem.F @ x / (2 * problem.delta)
-        root = np.linalg.inv(np.linalg.cholesky(problem.F)).T * problem.radius
-        B, scale = problem.B @ root, np.abs(problem.c).max()
-
-        def objective(
-            y: np.ndarray, c: np.ndarray = problem.c / scale, B: np.ndarray = B / scale
-        ) -> tuple[float, np.ndarray]:
-            excess = np.maximum(0.0, c + B @ y)
-            return float(excess @ excess), 2 * B.T @ excess
-
-        answer = minimize(
-            objective,
-            np.zeros(SIZE),
-            jac=True,
-            constraints={"type": "ineq", "fun": lambda y: 1 - y @ y, "jac": lambda y: -2 * y},
-            method="SLSQP",
-            options={"ftol": 1e-13, "maxiter": 300},
-        )
-        assert kl <= 1 + 1e-6
-        assert objective(np.linalg.solve(root, x))[0] <= answer.fun * (1 + 1e-5) + 1e-9
-        inside += bool(kl < 0.99)
-    assert 0 < inside < 60, "the compromise lies inside the region, or beyond"
-
-
-@pytest.mark.parametrize("noise", [1e-7, 1e-5, 1e-4, 1e-3])
+@pytest.mark.parametrize("noise", [1e-7, 1e-3])
 @pytest.mark.parametrize("euclidean", [False, True])
 @pytest.mark.parametrize("m", [2, 3])
 def test_half_spaces_that_meet_far_away_count_as_contradictory(
@@ -202,13 +165,6 @@ def test_without_cost_gradient(c: float) -> None:
     assert not pull.any()
 
 
-def test_without_reward_gradient_it_only_recovers() -> None:
-    problem = Problem(np.random.default_rng(0), np.array([0.7]))
-    problem.g[:] = 0.0
-    x, _ = problem.solve(False)
-    assert problem.B[0] @ x == pytest.approx(-problem.c[0])
-
-
 def make(**kwargs: Any) -> PCPO:
     env = make_vec_env(lambda: CostPoint(hazard=(-1.0, 0.0)), 4, seed=0)
     return PCPO("MlpPolicy", env, n_steps=100, n_critic_updates=5, seed=0, device="cpu", **kwargs)
@@ -226,7 +182,7 @@ def acceptance(model: PCPO) -> Any:
 
 
 @pytest.mark.parametrize("projection", ["kl", "l2"])
-@pytest.mark.parametrize("limit", [0.0, 3.0, 100.0])
+@pytest.mark.parametrize("limit", [0.0, 3.0])
 def test_steps_satisfy_the_linearised_limit(projection: Any, limit: float) -> None:
     model = make(projection=projection, cost_limit=limit, cg_max_steps=60, recovery=1.0)
     plan, residuals = model.plan, []
@@ -238,8 +194,8 @@ def test_steps_satisfy_the_linearised_limit(projection: Any, limit: float) -> No
         return x, accept
 
     model.plan = spy  # type: ignore[method-assign]
-    model.learn(2000)
-    assert len(residuals) == 5 and max(residuals) <= 1e-4
+    model.learn(1200)
+    assert len(residuals) == 3 and max(residuals) <= 1e-4
     assert model.logger.name_to_value["train/kl"] <= model.target_kl
 
 
@@ -265,11 +221,6 @@ def test_without_line_search_the_step_is_taken_whole() -> None:
         return fraction, trial
 
     model._line_search = spy  # type: ignore[method-assign]
-    model.learn(2000)
-    assert fractions == [1.0] * 5
+    model.learn(1200)
+    assert fractions == [1.0] * 3
     assert max(kls) > model.target_kl, "at a limit of 0 the projection leaves the trust region"
-
-
-def test_a_bad_projection_is_named() -> None:
-    with pytest.raises(ValueError, match=r"projection='l1': must be 'kl' or 'l2'"):
-        make(projection="l1")

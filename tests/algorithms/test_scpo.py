@@ -54,7 +54,7 @@ def test_it_sums_what_the_wrapper_calls_the_increases() -> None:
 
     model.train = spy
     model.learn(3 * 40 * 3, callback=record)
-    assert model.ep_cost_buffer[0][0] > model.costs.episode_cost[0], "sums, as under the others"
+    assert model.costs.latest[0][0] > model.costs.episode_cost[0], "sums, as under the others"
     with pytest.raises(TypeError, match="SCPO takes no argument 'cost_gamma'"):
         make(cost_gamma=0.99)
 

@@ -14,7 +14,7 @@ from sb3_guard.algorithms.common.batches import CHUNK
 from sb3_guard.algorithms.common.critics import Regression
 from sb3_guard.algorithms.fast import threads as fast_threads
 from sb3_guard.algorithms.fast.actor import TanhActor, actor_of
-from sb3_guard.algorithms.fast.threads import accumulate, one_thread
+from sb3_guard.algorithms.fast.threads import accumulate
 
 
 @pytest.fixture(autouse=True)
@@ -24,8 +24,7 @@ def restored():
     th.set_num_threads(before)
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
-@pytest.mark.parametrize("n_slices", [1, 2, 7])
+@pytest.mark.parametrize(("threads", "n_slices"), [(1, 7), (2, 1), (3, 7)])
 def test_every_slice_counts_once(threads: int, n_slices: int) -> None:
     th.set_num_threads(threads)
     seen: list[int] = []
@@ -76,14 +75,6 @@ threading.Thread(target=work).start()
     assert done.stdout.strip() == "10.0", done.stderr
 
 
-def test_one_thread_gives_back_what_there_was() -> None:
-    th.set_num_threads(2)
-    with pytest.raises(KeyError), one_thread() as before:
-        assert (before, th.get_num_threads()) == (2, 1)
-        raise KeyError
-    assert th.get_num_threads() == 2
-
-
 def quantities(threads: int, env: str) -> np.ndarray:
     """What an update takes from a batch of three slices, on so many threads."""
     th.set_num_threads(threads)
@@ -103,7 +94,7 @@ def quantities(threads: int, env: str) -> np.ndarray:
     return th.cat([score / n, fisher, th.tensor([loss]), *moved]).numpy()
 
 
-@pytest.mark.parametrize("env", ["Pendulum-v1", "CartPole-v1"])
+@pytest.mark.parametrize("env", ["Pendulum-v1"])
 def test_threads_change_no_more_than_rounding(env: str) -> None:
     alone, shared, again = (quantities(threads, env) for threads in (1, 2, 2))
     np.testing.assert_array_equal(shared, again)

@@ -1,16 +1,13 @@
-"""The base algorithm: Fisher products, critics, line search and hooks, and TRPO's reference."""
+"""The base algorithm: Fisher products, critics, line search, hooks, and TRPO without costs."""
 
 import copy
 from typing import Any
 
 import numpy as np
 import pytest
-import sb3_contrib
 import torch as th
 from cost_envs import SB3_POLICY, CostPoint
 from gymnasium import spaces
-from sb3_contrib.common.utils import conjugate_gradient_solver
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import kl_divergence
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import (
@@ -32,7 +29,6 @@ from sb3_guard.algorithms.common.batches import CHUNK, chunks
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.vectors import assign, flatten
 from sb3_guard.algorithms.fast.actor import TanhActor, actor_of, distribution_of, tanh_actor
-from sb3_guard.algorithms.fast.mlp import TanhMlp
 
 BOX = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 HEADS: dict[str, spaces.Space] = {
@@ -93,7 +89,7 @@ def _columns(actor: Actor, policy: ActorCriticPolicy) -> th.Tensor:
     return th.cat([th.arange(p.numel()) + starts[id(p)] for p in actor.parameters])
 
 
-@pytest.mark.parametrize("n", [1, 2, 9, 10, 11, 20, 21, 29, 31])
+@pytest.mark.parametrize("n", [1, 10, 11, 21])
 def test_no_row_is_left_alone(n: int) -> None:
     """Batch normalisation does not learn from one."""
     slices = chunks(n, size=10)
@@ -104,7 +100,7 @@ def test_no_row_is_left_alone(n: int) -> None:
     assert covered == list(range(n))
 
 
-@pytest.mark.parametrize("n", [50, CHUNK + 1, 2 * CHUNK])
+@pytest.mark.parametrize("n", [50, CHUNK + 1])
 @pytest.mark.parametrize("head", HEADS)
 def test_both_actors_agree(head: str, n: int) -> None:
     """Written-out passes and autograd, in one slice and in several, are the same numbers."""
@@ -117,18 +113,6 @@ def test_both_actors_agree(head: str, n: int) -> None:
     product = plain.fisher(vector[order])
     th.testing.assert_close(fast.fisher(vector)[order], product, rtol=1e-3, atol=1e-5)
     th.testing.assert_close(fast.old_log_prob, plain.old_log_prob)
-
-
-@pytest.mark.parametrize("head", HEADS)
-def test_score_is_the_gradient_of_the_mean_ratio(head: str) -> None:
-    policy = make_policy(HEADS[head])
-    observations, actions = make_batch(policy, 40)
-    actor = actor_of(policy, observations, actions)
-    advantages = th.randn(40)
-    log_prob = policy.get_distribution(observations).log_prob(actions)
-    objective = (th.exp(log_prob - log_prob.detach()) * advantages).mean()
-    expected = flatten(th.autograd.grad(objective, actor.parameters))
-    th.testing.assert_close(actor.score(advantages / 40), expected, rtol=1e-4, atol=1e-6)
 
 
 def test_kl_is_summed_over_action_dimensions() -> None:
@@ -278,21 +262,6 @@ def test_value_regression_moves_the_value_network_alone() -> None:
     assert moved == {name for name in before if "value_net" in name}
 
 
-def test_one_full_batch_step_is_adam_on_the_mean_squared_error() -> None:
-    """Ten passes over the whole batch are ten steps of Adam on the mean squared error."""
-    policy = make_policy(HEADS["gaussian"])
-    twin = copy.deepcopy(policy)
-    optimizer = th.optim.Adam(twin.parameters(), lr=1e-3, **policy.optimizer_kwargs)
-    observations, targets = th.randn(3000, 5), th.randn(3000, 1)
-    Regression.of_value(policy).fit(observations, targets, 10)
-    for _ in range(10):
-        optimizer.zero_grad()
-        nn.functional.mse_loss(twin.predict_values(observations), targets).backward()
-        optimizer.step()
-    for a, b in zip(policy.parameters(), twin.parameters(), strict=True):
-        th.testing.assert_close(a, b, rtol=1e-3, atol=1e-5)
-
-
 def test_critics_are_fitted_to_discounted_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     fitted: list[tuple[nn.Module, np.ndarray]] = []
 
@@ -310,32 +279,7 @@ def test_critics_are_fitted_to_discounted_returns(monkeypatch: pytest.MonkeyPatc
     assert not np.allclose(buffer.returns.ravel(), buffer.advantages.ravel())
 
 
-def test_mlp_needs_bias_and_float32() -> None:
-    assert TanhMlp.layers([nn.Linear(2, 2), nn.Tanh(), nn.Linear(2, 1)]) is not None
-    assert TanhMlp.layers([nn.Linear(2, 2), nn.Tanh()]) is None
-    assert TanhMlp.layers([nn.Linear(2, 2, bias=False)]) is None
-    assert TanhMlp.layers([nn.Linear(2, 2).double()]) is None
-
-
-# TRPO against sb3-contrib's
-
-
-def _reference(cls: type, **kwargs: Any) -> Any:
-    """A model with its first rollout collected; the global generators are its own until then."""
-    env = make_vec_env(lambda: CostPoint(episode_length=30), 4, seed=3)
-    model = cls(
-        "MlpPolicy",
-        env,
-        n_steps=64,
-        gamma=0.98,
-        gae_lambda=0.9,
-        seed=3,
-        device="cpu",
-        policy_kwargs=SB3_POLICY,
-        **kwargs,
-    )
-    _collect(model, 256)
-    return model
+# TRPO
 
 
 class _Stop(Exception):
@@ -352,53 +296,6 @@ def _collect(model: Any, total: int) -> None:
     with pytest.raises(_Stop):
         model.learn(total)
     model.train = train
-
-
-def test_collection_is_bit_exact_with_sb3_contrib() -> None:
-    ours, theirs = _reference(TRPO), _reference(sb3_contrib.TRPO, batch_size=64)
-    for name in ("observations", "actions", "rewards", "values", "log_probs", "advantages"):
-        a, b = getattr(ours.rollout_buffer, name), getattr(theirs.rollout_buffer, name)
-        np.testing.assert_array_equal(a, b, err_msg=name)
-
-
-def test_update_direction_is_that_of_sb3_contrib() -> None:
-    """Its KL averages over two action dimensions: half the Fisher matrix and half the damping."""
-    ours = _reference(TRPO, cg_max_steps=60, cg_damping=0.1)
-    theirs = _reference(sb3_contrib.TRPO, cg_max_steps=60, cg_damping=0.05, batch_size=64)
-    region = []
-    ours.plan = lambda r: region.append(r) or (th.zeros_like(r.gradient), bool)  # type: ignore
-    ours.train()
-    x = region[0].solve(region[0].gradient)
-
-    batch = next(theirs.rollout_buffer.get(batch_size=None))
-    advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)
-    with th.no_grad():
-        old = copy.copy(theirs.policy.get_distribution(batch.observations))
-    distribution = theirs.policy.get_distribution(batch.observations)
-    ratio = th.exp(distribution.log_prob(batch.actions) - batch.old_log_prob)
-    divergence = kl_divergence(distribution, old).mean()
-    parameters, gradient, slope, _ = theirs._compute_actor_grad(
-        divergence, (advantages * ratio).mean()
-    )
-
-    def product(vector: th.Tensor, retain_graph: bool = True) -> th.Tensor:
-        return theirs.hessian_vector_product(parameters, slope, vector, retain_graph)
-
-    expected = conjugate_gradient_solver(product, gradient, max_iter=60) / 2
-    actor = region[0].actor
-    pieces = dict(zip(_names(ours, actor.parameters), _split(x, actor.parameters), strict=True))
-    found = th.cat([pieces[name] for name in _names(theirs, parameters)])
-    assert nn.functional.cosine_similarity(found, expected, dim=0) > 1 - 1e-4
-    assert found.norm() / expected.norm() == pytest.approx(1.0, rel=1e-2)
-
-
-def _names(model: Any, parameters: list[th.Tensor]) -> list[str]:
-    names = {id(parameter): name for name, parameter in model.policy.named_parameters()}
-    return [names[id(parameter)] for parameter in parameters]
-
-
-def _split(vector: th.Tensor, parameters: list[th.Tensor]) -> tuple[th.Tensor, ...]:
-    return vector.split([parameter.numel() for parameter in parameters])
 
 
 def test_costs_do_not_change_trpo() -> None:
@@ -424,40 +321,9 @@ def _actor_vector(model: TrustRegion) -> th.Tensor:
     return flatten([p.detach().clone() for p in actor_parameters(model.policy)])
 
 
-class _Reject(TRPO):
-    trials = 0
-    line_search_max_iter = 7
-
-    def plan(self, region: Any) -> Any:
-        return region.natural_step(), self.reject
-
-    def reject(self, trial: Any) -> bool:
-        self.trials += 1
-        return False
-
-
-def test_a_rejected_step_leaves_the_policy_as_it_was() -> None:
-    model = _toy(_Reject)
-    before = _actor_vector(model)
-    model.learn(200)
-    assert th.equal(_actor_vector(model), before)
-    assert model.trials == 7
-    assert model.logger.name_to_value["train/line_search_step"] == 0.0
-    assert model.logger.name_to_value["train/kl"] == 0.0
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_step_that_is_not_finite_is_not_taken(value: float) -> None:
-    model = _toy(TRPO)
-    model.plan = lambda region: (th.full_like(region.gradient, value), bool)  # type: ignore
-    before = _actor_vector(model)
-    model.learn(200)
-    assert th.equal(_actor_vector(model), before)
-
-
-@pytest.mark.parametrize("size", [-200.0, 1e30, -3e38])
+@pytest.mark.parametrize("size", [-200.0, 1e30, np.nan])
 def test_a_candidate_that_is_no_distribution_is_rejected(size: float) -> None:
-    """exp(log_std) is 0, or the mean is not a number: torch raises at that, training continues."""
+    """exp(log_std) is 0, or the step or the mean is not finite: training continues."""
     model = _toy(TRPO)
     model.line_search_max_iter = 2
     plan = model.plan
@@ -595,66 +461,3 @@ def test_surrogate_is_ascended_and_fit_comes_after_the_step() -> None:
     a, b = moves
     assert nn.functional.cosine_similarity(a, b, dim=0) < -0.9
     assert model.order[0] == "surrogate" and model.order[-1] == "fit"
-
-
-@pytest.mark.parametrize("cls", [TRPO, CPO])
-def test_timing_is_split(cls: type[TrustRegion]) -> None:
-    model = _toy(cls).learn(200)
-    assert set(model.timing) == {"collect", "actor", "critics"}
-    assert all(seconds > 0.0 for seconds in model.timing.values())
-
-
-class _StopAt(BaseCallback):
-    def __init__(self, step: int) -> None:
-        super().__init__()
-        self.step = step
-
-    def _on_step(self) -> bool:
-        return self.num_timesteps < self.step
-
-
-def test_a_callback_that_stops_a_rollout_loses_no_cost():
-    env = make_vec_env(lambda: CostPoint(episode_length=50), 2)
-    model = TRPO("MlpPolicy", env, n_steps=20, n_critic_updates=1, seed=0)
-    seen: list[float] = []
-
-    class Count(_StopAt):
-        def _on_step(self) -> bool:
-            seen.extend(info["cost"] for info in self.locals["infos"])
-            return super()._on_step()
-
-    model.learn(200, callback=Count(50))
-    assert model.num_timesteps == 50
-    assert model.costs.episodes.lengths is not None and model.costs.episodes.lengths.tolist() == [
-        25,
-        25,
-    ]
-    assert model.total_cost == pytest.approx(sum(seen))
-
-
-def test_numbers_that_are_not_finite_stop_the_training():
-    class Broken(CostPoint):
-        def step(self, action: np.ndarray) -> Any:
-            obs, _, *rest = super().step(action)
-            return obs, np.nan, *rest
-
-    model = TRPO("MlpPolicy", make_vec_env(Broken, 2), n_steps=20, n_critic_updates=2)
-    with pytest.raises(FloatingPointError, match="value_loss is nan after 0 updates: a reward"):
-        model.learn(40)
-    assert all(bool(th.isfinite(p).all()) for p in actor_parameters(model.policy))
-
-
-def test_the_horizon_of_the_last_ended_episode_is_remembered():
-    env = make_vec_env(lambda: CostPoint(episode_length=30), 1)
-    model = CPO("MlpPolicy", env, n_steps=20, n_critic_updates=1, cost_limit=3.0)
-    model.learn(40)  # the episode ends in the second rollout
-    assert model.costs is not None and model.costs.horizon == 30
-    model.learn(10, reset_num_timesteps=False)  # none ends in the third: steps 41 to 60 end one
-    model.learn(20, reset_num_timesteps=False)
-    assert model.costs.horizon == 30
-    rollout = make_vec_env(lambda: CostPoint(episode_length=1000), 1)
-    model.set_env(rollout)
-    model.learn(20, reset_num_timesteps=False)  # nothing ends
-    assert model.costs.horizon == 30
-    mean = model.rollout_buffer.costs.mean()
-    assert model.costs.violation[0] == pytest.approx(mean - 3.0 / 30)

@@ -1,13 +1,16 @@
-"""The actor as a natural gradient sees it: parameters, score, Fisher products, KL.
+"""The actor as a natural gradient sees it: parameters, score, Fisher products, KL, trust region.
 
 Any ``ActorCriticPolicy`` works, through autograd; ``fast/actor.py`` has the same for tanh networks.
 """
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 import torch as th
 from stable_baselines3.common.distributions import Distribution, kl_divergence
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -16,7 +19,8 @@ from stable_baselines3.common.utils import obs_as_tensor
 from torch import nn
 
 from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
-from sb3_guard.algorithms.common.vectors import flatten, unflatten
+from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
+from sb3_guard.algorithms.common.vectors import conjugate_gradient, flatten, unflatten
 
 
 def kl(old: Distribution, new: Distribution) -> th.Tensor:
@@ -197,3 +201,69 @@ class Actor:
             for each, product in zip(total, th.autograd.grad(along, self.parameters), strict=True):
                 each.add_(product)
         return flatten(total) / len(self.old_log_prob)
+
+
+class Trial(NamedTuple):
+    """A candidate of the line search, compared with the old policy.
+
+    :param kl: mean KL(old ‖ candidate)
+    :param improvement: change of the surrogate
+    :param cost_change: changes of mean(ratio · cost advantage), shape (m,)
+    """
+
+    kl: float
+    improvement: float
+    cost_change: np.ndarray
+
+
+Accept = Callable[[Trial], bool]
+
+
+@dataclass(eq=False)
+class Region:
+    """The update's local picture: a linear surrogate inside a quadratic trust region.
+
+    :param actor: the policy on the batch
+    :param batch: the batch
+    :param gradient: of the surrogate at the old policy, shape (P,)
+    :param delta: bound on the mean KL
+    :param damping: added to the Fisher matrix's diagonal
+    :param cg_max_steps: conjugate-gradient iterations per solve
+    """
+
+    actor: Actor
+    batch: CostRolloutBufferSamples
+    gradient: th.Tensor
+    delta: float
+    damping: float
+    cg_max_steps: int
+
+    @cached_property
+    def cost_gradients(self) -> th.Tensor:
+        """Gradients of mean(ratio · cost advantage) at the old policy, shape (m, P)."""
+        weights = self.batch.cost_advantages / len(self.batch.cost_advantages)
+        return th.stack([self.actor.score(column) for column in weights.unbind(dim=1)])
+
+    def cost_changes(self, ratio: th.Tensor) -> np.ndarray:
+        """By how much mean(ratio · cost advantage) differs from the old policy's, shape (m,).
+
+        :param ratio: likelihood ratios of the actor's present policy, shape (N,)
+        """
+        change = ((ratio - 1.0) @ self.batch.cost_advantages) / len(ratio)
+        return change.cpu().numpy().astype(np.float64)
+
+    def product(self, vector: th.Tensor) -> th.Tensor:
+        """F · vector, damped, shape (P,)."""
+        return self.actor.fisher(vector).add_(vector, alpha=self.damping)
+
+    def solve(self, vector: th.Tensor) -> th.Tensor:
+        """F⁻¹ · vector by conjugate gradients, shape (P,)."""
+        return conjugate_gradient(self.product, vector, self.cg_max_steps)
+
+    def natural_step(self) -> th.Tensor:
+        """The unconstrained step: along F⁻¹ gradient, as far as the region goes, shape (P,)."""
+        direction = self.solve(self.gradient)
+        length = float(self.gradient @ direction)
+        if not length > 0.0:
+            return th.zeros_like(direction)
+        return direction * float(np.sqrt(2 * self.delta / length))

@@ -6,7 +6,6 @@ saved. What is done about them is the business of the classes that stand on it.
 
 import inspect
 import warnings
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Self
 
@@ -14,10 +13,9 @@ import numpy as np
 from gymnasium import spaces
 from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
-from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.arguments import (
     check_names,
@@ -27,12 +25,10 @@ from sb3_guard.algorithms.common.arguments import (
     signature,
     stated,
 )
-from sb3_guard.algorithms.common.costs import Costs, limits_at
+from sb3_guard.algorithms.common.costs import Costs, limits_of, time_limit
 from sb3_guard.checked_env import checked
-from sb3_guard.checks import check_cost_keys, check_per_cost, is_number
+from sb3_guard.checks import check_cost_keys
 from sb3_guard.costs import read_costs
-
-_LIBRARIES = {"sb3_guard", "stable_baselines3"}  # whose lines no warning is about
 
 
 class Constrained(BaseAlgorithm):
@@ -122,32 +118,16 @@ class Constrained(BaseAlgorithm):
     # Construction
 
     @classmethod
-    def load(
-        cls,
-        path: Any,
-        env: Any = None,
-        device: Any = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> Self:
-        """SB3's ``load``, which takes an argument that is misspelt without a word.
+    def load(cls, path: Any, *args: Any, **kwargs: Any) -> Self:
+        """SB3's ``load(path, env, device, …)``, which takes an argument misspelt without a word.
 
         :param path: a file that an algorithm of this class has saved
-        :param env: environment to train in; None: to predict only
-        :param device: torch device
-        :param custom_objects: what replaces attributes in the file
-        :param print_system_info: whether to print the versions that the file was written with
-        :param force_reset: whether the next ``learn`` begins new episodes
         :param kwargs: arguments to change, such as ``cost_limit``
         :return: the agent
         :raises TypeError: an argument is not known; the message names the nearest one
         """
-        check_names(cls, kwargs)
-        return super().load(
-            path, env, device, custom_objects, print_system_info, force_reset, **kwargs
-        )
+        check_names(cls, kwargs.keys() - {"custom_objects", "print_system_info", "force_reset"})
+        return super().load(path, *args, **kwargs)
 
     def _check_hyperparameters(self) -> None:
         """Refuse values that could only fail later or silently do harm."""
@@ -158,7 +138,7 @@ class Constrained(BaseAlgorithm):
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
         check_theirs(self)
         for remaining in (1.0, 0.0):
-            self._limits_at(remaining)
+            limits_of(self, remaining)
 
     def _setup_model(self) -> None:
         self._check_hyperparameters()
@@ -190,51 +170,20 @@ class Constrained(BaseAlgorithm):
 
         :raises ValueError: ``cost_limit`` was set to something that is not a limit
         """
-        return self._limits_at(self._current_progress_remaining)
+        return limits_of(self, self._current_progress_remaining)
 
     @property
     def final_cost_limits(self) -> np.ndarray:
         """The limits at the end of the training, by which an agent is judged, shape (m,)."""
-        return self._limits_at(0.0)
-
-    @property
-    def limits_change(self) -> bool:
-        """Whether a limit is a schedule, or falls from ``limit_start``."""
-        return self.limit_start > 1.0 or any(self._scheduled)
-
-    @property
-    def _scheduled(self) -> list[bool]:
-        """Of each limit that is given, whether it is a schedule; one element, or m."""
-        limits = self.cost_limit if isinstance(self.cost_limit, list | tuple) else [self.cost_limit]
-        return [isinstance(limit, str) or callable(limit) for limit in limits]
-
-    def _limits_at(self, remaining: float) -> np.ndarray:
-        limit = limits_at(self.cost_limit, remaining)
-        check_per_cost("cost_limit", limit, tuple(self.cost_keys))
-        if not self.signed_limits and np.min(limit) < 0.0:
-            raise ValueError(
-                f"cost_limit={limit!r}: must be at least 0; a negative limit (cost -x, "
-                "limit -5: at least 5 of x) is for CPO, PCPO and Lagrangian algorithms"
-            )
-        limits = np.broadcast_to(np.asarray(limit, np.float64), (len(self.cost_keys),))
-        excess = LinearSchedule(self.limit_start - 1.0, 0.0, self.limit_fall)(remaining)
-        return limits + np.where(self._scheduled, 0.0, excess * np.abs(limits))
+        return limits_of(self, 0.0)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        """Called by SB3 before each update: a limit may be another one then."""
         # The last rollout may go beyond the training's end, which no schedule knows of.
-        super()._update_current_progress_remaining(
-            min(num_timesteps, total_timesteps), total_timesteps
-        )
-        if self.limits_change:
-            self.costs.limits = self.cost_limits
+        steps = min(num_timesteps, total_timesteps)
+        super()._update_current_progress_remaining(steps, total_timesteps)
+        self.costs.limits = self.cost_limits
 
     # Episodes
-
-    @property
-    def ep_cost_buffer(self) -> deque[np.ndarray]:
-        """Costs of the latest episodes, each of shape (m,)."""
-        return self.costs.latest
 
     @property
     def total_cost(self) -> float:
@@ -264,17 +213,9 @@ class Constrained(BaseAlgorithm):
         theirs = inspect.signature(super().learn)  # type: ignore[safe-super]
         if tb_log_name == theirs.parameters["tb_log_name"].default:
             tb_log_name = type(self).__name__
-        steps, callbacks = super()._setup_learn(
+        return super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        called = callbacks.callbacks if isinstance(callbacks, CallbackList) else [callbacks]
-        if self.constrained and any(type(each) is EvalCallback for each in called):
-            self._warn_once(
-                "EvalCallback",
-                "EvalCallback keeps the model of the highest reward, whatever it costs: "
-                "sb3_guard.CostEvalCallback keeps the best safe one",
-            )
-        return steps, callbacks
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
@@ -312,39 +253,22 @@ class Constrained(BaseAlgorithm):
         return True
 
     def _length_before_any_episode(self) -> float:
-        assert self.env is not None
-        limits: list[Any] = []
-        try:
-            # TimeLimit's number first: around an environment without a spec there is no other.
-            if self.env.has_attr("_max_episode_steps"):
-                limits = self.env.get_attr("_max_episode_steps")
-            elif not isinstance(self.env.unwrapped, SubprocVecEnv):
-                # Not every spec can be sent from process to process, and to ask for what isn't
-                # there would end them.
-                specs = self.env.get_attr("spec")
-                limits = [getattr(spec, "max_episode_steps", None) for spec in specs]
-        except (AttributeError, NotImplementedError):
-            pass  # a vectorised environment need not tell: then no limit is known, as below
-        if limits and all(is_number(limit) and limit > 0 for limit in limits):
-            return float(np.mean(limits))
-        longest = float(self.costs.episodes.lengths.max())
-        if self.constrained:
-            self._warn_once(
-                "no episode",
-                "no episode has ended yet and the environment states no max_episode_steps: until "
-                f"one ends, the cost limit is spread over the longest so far, {longest:g} steps",
-            )
-        return longest
+        length = time_limit(self.env)
+        if length is None:
+            length = float(self.costs.episodes.lengths.max())
+            if self.constrained:
+                self._warn_once(
+                    "no episode",
+                    "no episode has ended yet and the environment states no max_episode_steps: "
+                    "until one ends, the cost limit is spread over the longest so far, "
+                    f"{length:g} steps",
+                )
+        return length
 
     def _warn_once(self, topic: str, message: str) -> None:
         if topic not in self._warned:
             self._warned.add(topic)
-            # The line to show is the user's, however many constructors are between (from Python
-            # 3.12 on, skip_file_prefixes does this).
-            frame, level = inspect.currentframe(), 1
-            while frame and frame.f_globals.get("__name__", "").split(".")[0] in _LIBRARIES:
-                frame, level = frame.f_back, level + 1
-            warnings.warn(message, UserWarning, stacklevel=level)
+            warnings.warn(message, UserWarning, stacklevel=2)
 
     def _check_finite(self, name: str, loss: float) -> None:
         """
@@ -368,8 +292,6 @@ class Constrained(BaseAlgorithm):
         if self.constrained:
             excess = self.costs.violation * self.costs.horizon
             self._record_per_cost("train/constraint_violation", excess)
-            if self.limits_change:
-                self._record_per_cost("train/cost_limit", self.costs.limits)
 
     def dump_logs(self, *args: Any) -> None:
         costs = self.costs

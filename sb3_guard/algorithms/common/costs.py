@@ -3,10 +3,13 @@
 import re
 from collections import deque, namedtuple
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, Literal
 
 import numpy as np
+from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_guard.checks import check_per_cost, is_number
 from sb3_guard.costs import EpisodeCosts
 
 # Agents that were saved while the estimate was one of these are read; their costs begin anew.
@@ -37,6 +40,37 @@ def limits_at(limit: Any, remaining: float) -> Any:
         first, last = map(float, line.groups())
         return last + remaining * (first - last)
     return limit(remaining) if callable(limit) else limit
+
+
+def limits_of(algorithm: Any, remaining: float) -> np.ndarray:
+    """d of each cost at a time of the training, by ``cost_limit`` and ``limit_start``, shape (m,).
+
+    :param remaining: progress to come, from 1 at the beginning to 0 at the end
+    :raises ValueError: ``cost_limit`` is not a limit, or is below 0 where it may not be
+    """
+    given, keys = algorithm.cost_limit, tuple(algorithm.cost_keys)
+    limit = limits_at(given, remaining)
+    check_per_cost("cost_limit", limit, keys)
+    if not algorithm.signed_limits and np.min(limit) < 0.0:
+        raise ValueError(
+            f"cost_limit={limit!r}: must be at least 0; a negative limit (cost -x, "
+            "limit -5: at least 5 of x) is for CPO, PCPO and Lagrangian algorithms"
+        )
+    limits = np.broadcast_to(np.asarray(limit, np.float64), (len(keys),))
+    excess = LinearSchedule(algorithm.limit_start - 1.0, 0.0, algorithm.limit_fall)(remaining)
+    given = given if isinstance(given, list | tuple) else [given]
+    scheduled = [isinstance(each, str) or callable(each) for each in given]
+    return limits + np.where(scheduled, 0.0, excess * np.abs(limits))
+
+
+def time_limit(env: Any) -> float | None:
+    """The mean over environments of the steps of an episode at most; None where not stated."""
+    for name in ("_max_episode_steps", "max_episode_steps"):  # of TimeLimit, and of our batches
+        with suppress(NotImplementedError):  # a vectorised environment need not tell
+            limits = env.get_attr(name) if env.has_attr(name) else []
+            if limits and all(is_number(limit) and limit > 0 for limit in limits):
+                return float(np.mean(limits))
+    return None
 
 
 class Costs:

@@ -70,13 +70,10 @@ class FilteredPolicy(ActorCriticPolicy):
         """Whether there is a filter, switched on."""
         return self._filter is not None and bool(self.action_filter.active)
 
-    def to_unit(self, actions: np.ndarray) -> np.ndarray:
-        """Actions of the environment, flat or not, in units of the action space, shape [B, k]."""
-        space = self.action_space
-        assert isinstance(space, spaces.Box)
-        half = np.maximum((space.high - space.low) / 2.0, np.finfo(np.float32).tiny)
-        unit = (actions.reshape(-1, *space.shape) - space.low) / half - 1.0
-        return unit.reshape(len(actions), -1)
+    def to_unit(self, actions: th.Tensor) -> th.Tensor:
+        """Actions of the environment, flat, in units of the action space, shape [B, k]."""
+        half = ((self.high - self.low) / 2.0).clamp(min=th.finfo(th.float32).tiny)
+        return (actions - self.low) / half - 1.0
 
     def executable(self, actions: np.ndarray) -> np.ndarray:
         """Sampled actions, flat or not, as SB3 hands them to the environment, shape [B, …]."""
@@ -96,9 +93,7 @@ class FilteredPolicy(ActorCriticPolicy):
         :param costs: what the last step cost, shape [B, m], NaN where not known; None if of none
         :return: actions of the environment, flat, shape [B, k]
         """
-        low, high = self.low, self.high
-        half = ((high - low) / 2.0).clamp(min=th.finfo(th.float32).tiny)
-        unit = (actions - low) / half - 1.0
+        low, high, unit = self.low, self.high, self.to_unit(actions)
         corrected = self.action_filter(observations, unit, costs)
         # What is not corrected stays as it is, to the last bit.
         moved = (corrected - unit).abs().amax(dim=1, keepdim=True) > 1e-6

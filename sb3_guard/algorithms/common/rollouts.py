@@ -22,10 +22,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn, VecE
 from sb3_guard.algorithms.common.advantage import discounted_returns
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import rows
-from sb3_guard.algorithms.common.buffers import (
-    CostDictRolloutBuffer,
-    CostRolloutBuffer,
-)
+from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import discounted_limit, inverse, same_at_every_step
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
@@ -113,12 +110,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
 
     # Construction and saving
 
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        arch = (self.policy_kwargs or {}).get("net_arch")
-        if isinstance(arch, dict) and "cost" in arch and not {"pi", "vf"} <= arch.keys():
-            raise ValueError(f"net_arch={arch!r}: must also have the layers of 'pi' and 'vf'")
-
     def _check_reach(self) -> None:
         """Warn of a box that a first policy, a Gaussian around 0, hardly ever acts in."""
         box, policy = self.action_space, self.policy
@@ -205,9 +196,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     def discounted_limits(self) -> np.ndarray:
         """The limits as those of the discounted costs-to-go of the last rollout, shape (m,)."""
         gamma = self.rollout_buffer.cost_gamma
-        return discounted_limit(
-            self.costs.limits, self.costs.horizon, gamma, cut=bool(self._timeouts)
-        )
+        return discounted_limit(self.costs.limits, self.costs.horizon, gamma, bool(self._timeouts))
 
     def _update_info_buffer(
         self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
@@ -300,14 +289,12 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else actions
         )
 
-    def fit_cost_critic(self, n_epochs: int | None = None, batch_size: int | None = None) -> None:
+    def fit_cost_critic(self, n_epochs: int | None = None) -> None:
         """Fit the cost critic to the rollout's cost returns, with the algorithm's learning rate.
 
         It draws from no generator but ``cost_rng``.
 
         :param n_epochs: passes over the rollout; None for the algorithm's own ``n_epochs``
-        :param batch_size: rows per step; None for the algorithm's own ``batch_size``, which may be
-            None for the whole rollout
         :raises FloatingPointError: its loss is not finite
         """
         update_learning_rate(
@@ -322,7 +309,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             rows(batch.observations, learnt),
             targets[learnt],
             getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,
-            getattr(self, "batch_size", None) if batch_size is None else batch_size,
+            getattr(self, "batch_size", None),
             self.cost_rng,
         )
         self._check_finite("cost_value_loss", loss)

@@ -7,10 +7,7 @@ estimated its costs. What an algorithm may replace stands at the end of :class:`
 """
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch as th
@@ -24,80 +21,14 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_guard.algorithms.common.actor import Actor, actor_modules
+from sb3_guard.algorithms.common.actor import Accept, Region, Trial
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.critics import Regression
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
-from sb3_guard.algorithms.common.vectors import assign, conjugate_gradient, flatten
+from sb3_guard.algorithms.common.vectors import assign, flatten
 from sb3_guard.algorithms.fast.actor import actor_of
 from sb3_guard.checks import check_integer, check_learning_rate, check_number
-
-
-class Trial(NamedTuple):
-    """A candidate of the line search, compared with the old policy.
-
-    :param kl: mean KL(old ‖ candidate)
-    :param improvement: change of the surrogate
-    :param cost_change: changes of mean(ratio · cost advantage), shape (m,)
-    """
-
-    kl: float
-    improvement: float
-    cost_change: np.ndarray
-
-
-Accept = Callable[[Trial], bool]
-
-
-@dataclass(eq=False)
-class Region:
-    """The update's local picture: a linear surrogate inside a quadratic trust region.
-
-    :param actor: the policy on the batch
-    :param batch: the batch
-    :param gradient: of the surrogate at the old policy, shape (P,)
-    :param delta: bound on the mean KL
-    :param damping: added to the Fisher matrix's diagonal
-    :param cg_max_steps: conjugate-gradient iterations per solve
-    """
-
-    actor: Actor
-    batch: CostRolloutBufferSamples
-    gradient: th.Tensor
-    delta: float
-    damping: float
-    cg_max_steps: int
-
-    @cached_property
-    def cost_gradients(self) -> th.Tensor:
-        """Gradients of mean(ratio · cost advantage) at the old policy, shape (m, P)."""
-        weights = self.batch.cost_advantages / len(self.batch.cost_advantages)
-        return th.stack([self.actor.score(column) for column in weights.unbind(dim=1)])
-
-    def cost_changes(self, ratio: th.Tensor) -> np.ndarray:
-        """By how much mean(ratio · cost advantage) differs from the old policy's, shape (m,).
-
-        :param ratio: likelihood ratios of the actor's present policy, shape (N,)
-        """
-        change = ((ratio - 1.0) @ self.batch.cost_advantages) / len(ratio)
-        return change.cpu().numpy().astype(np.float64)
-
-    def product(self, vector: th.Tensor) -> th.Tensor:
-        """F · vector, damped, shape (P,)."""
-        return self.actor.fisher(vector).add_(vector, alpha=self.damping)
-
-    def solve(self, vector: th.Tensor) -> th.Tensor:
-        """F⁻¹ · vector by conjugate gradients, shape (P,)."""
-        return conjugate_gradient(self.product, vector, self.cg_max_steps)
-
-    def natural_step(self) -> th.Tensor:
-        """The unconstrained step: along F⁻¹ gradient, as far as the region goes, shape (P,)."""
-        direction = self.solve(self.gradient)
-        length = float(self.gradient @ direction)
-        if not length > 0.0:
-            return th.zeros_like(direction)
-        return direction * float(np.sqrt(2 * self.delta / length))
 
 
 class TrustRegion(CostRollouts):
@@ -201,19 +132,6 @@ class TrustRegion(CostRollouts):
             raise ValueError(
                 f"n_steps={self.n_steps} with {self.n_envs} environment: standardising advantages "
                 "takes at least two steps per update; raise n_steps"
-            )
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        if any(
-            getattr(module, "num_batches_tracked", None) == 0
-            for module in actor_modules(self.policy)
-        ):
-            self._warn_once(
-                "batch normalisation",
-                "the actor has batch normalisation that has seen no data: it will keep the mean 0 "
-                "and variance 1 it starts from, since statistics that move would change the "
-                "policy outside the trust region; VecNormalize normalises observations",
             )
 
     # Collecting

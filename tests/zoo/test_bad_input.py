@@ -63,7 +63,7 @@ TRAIN = [
      ["selection_limit=[1.0, 2.0]", "one number, or one for each of the 1 cost keys", "cost"]),
     (["-params", "policy_kwargs:dict(net_ark=[3])"], ["net_ark"]),
     (["--algo", "ppo", "-params", "n_steps:1e15"], ["ppo can't be made", "allocate", "10000000"]),
-    (["--gym-packages", "../x"], ["--gym-packages '../x' is not the name of a module"]),
+    (["--gym-packages", "../x"], ["--gym-packages: can't import '../x'"]),
     (["-conf", "absent.yml"], ["can't read hyperparameter file absent.yml", "No such file"]),
     # flags
     (["--sede", "3"], ["unknown argument --sede", "--seed"]),
@@ -96,7 +96,7 @@ def test_a_module_that_fails(capsys, empty, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "odd_robot.py").write_text("robot.register()")
     said = "--gym-packages: can't import 'odd_robot': NameError: name 'robot' is not defined"
-    refused(train.main, ["--gym-packages", "odd_robot"], capsys, said, "python -c 'import odd_ro")
+    refused(train.main, ["--gym-packages", "odd_robot"], capsys, said)
 
 
 def test_constructor_of_an_environment(capsys, empty, monkeypatch):

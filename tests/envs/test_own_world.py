@@ -138,8 +138,3 @@ def test_velocity_is_the_change_of_position(robot):
     moved = (engine.robot.position - before) / engine.control_step
     assert np.abs(moved).max() > 0.1
     np.testing.assert_allclose(engine.robot.velocity, moved, atol=0.02 * np.abs(moved).max())
-
-
-def test_a_robot_in_its_own_world_is_not_put_elsewhere(hopper):
-    with pytest.raises(ValueError, match="begins where its file puts it"):
-        hopper.override(robot={"heading": 0.0})

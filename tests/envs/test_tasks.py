@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from worlds import ROW, actions, assert_rows_are_lone_environments, free_body, put_point, world
+from worlds import actions, assert_rows_are_lone_environments, free_body, put_point, world
 
 from sb3_guard.envs import Scenario
 from sb3_guard.envs.registry import TASKS, guard
@@ -334,17 +334,6 @@ def test_button_rewards_equal_the_scalar_loop():
             new = gap(engine.robot.position[i], goal[i], True)
             expected = 2.0 * (old[i] - new) + outcome.goal_met[i]
             assert outcome.reward[i] == pytest.approx(expected, abs=1e-12)
-
-
-def test_every_button_gets_its_turn():
-    engine = world("Button_Point_0Hazards")
-    seen = []
-    for _ in range(200):
-        old = int(engine.task.right[0])
-        engine.task.advance(ROW)
-        assert engine.task.right[0] != old
-        seen.append(int(engine.task.right[0]))
-    assert np.bincount(seen).min() > 25
 
 
 TAXONOMY = {  # interactive, contact, targets, spaces

@@ -147,12 +147,14 @@ def state_of_off_policy(model: Any) -> list[Any]:
     return [*(tensor.tolist() for tensor in tensors), random.getstate(), np.random.get_state()[2]]  # noqa: NPY002
 
 
-def test_policies_begin_calm_unless_told_otherwise() -> None:
+def test_policies_begin_calm_unless_told_otherwise(tmp_path: Path) -> None:
     """Key by key: what a user says of the networks leaves the first σ as it is."""
     for cls in (CPO, PPOLag):
         model = cls("MlpPolicy", points(2), n_steps=32, policy_kwargs={"net_arch": [8]})
         assert model.policy_kwargs == {"log_std_init": -0.5, "ortho_init": False, "net_arch": [8]}
         assert (model.policy.log_std == -0.5).all() and not model.policy.ortho_init
+        model.save(tmp_path / "model")
+        assert cls.load(tmp_path / "model", policy_kwargs={"net_arch": [8]}).policy.net_arch == [8]
         loud = cls("MlpPolicy", points(2), n_steps=32, policy_kwargs={"log_std_init": 0.0})
         assert (loud.policy.log_std == 0.0).all() and not loud.policy.ortho_init
 

@@ -154,7 +154,7 @@ def test_trpo_reaches_the_unconstrained_optimum() -> None:
 @pytest.mark.parametrize(
     ("cls", "n_costs", "shares", "seed"),
     [
-        pytest.param(cls, *case, marks=() if cls in (CPO, TRPOLag) and i == 0 else pytest.mark.slow)
+        pytest.param(cls, *case, marks=() if cls is CPO and i == 0 else pytest.mark.slow)
         for cls in CONSTRAINED
         for i, case in enumerate([(2, [0.8, 0.85], 0), (1, [0.75], 0), (2, [0.8, 0.85], 1)])
     ],

@@ -83,6 +83,7 @@ def test_evaluations_hold_the_worst_step_against_the_limit() -> None:
     assert callback.score(calm)[0] and not callback.score(deep)[0]
 
 
+@pytest.mark.slow
 def test_the_worst_step_keeps_its_limit_where_a_limited_sum_does_not() -> None:
     """Stopping 0.5 beyond the wall costs 10 in all, which CPO spends on going farther."""
     problem = replace(problems()["wall"], updates=20)

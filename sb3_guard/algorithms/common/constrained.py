@@ -64,6 +64,8 @@ class Constrained(BaseAlgorithm):
     constrained: ClassVar[bool] = True
     #: What of an episode's costs the limits bound, see :class:`~sb3_guard.costs.EpisodeCosts`.
     limit_on: ClassVar[Literal["sum", "max"]] = "sum"
+    #: Arguments of the policy where ``policy_kwargs`` does not have them.
+    policy_defaults: ClassVar[dict[str, Any]] = {}
     #: Arguments of SB3's constructors that the class fills in itself.
     fixed_arguments: ClassVar[frozenset[str]] = frozenset()
     #: Whether costs and limits may be negative: "at least x" of what is reported as -cost.
@@ -127,6 +129,8 @@ class Constrained(BaseAlgorithm):
         :raises TypeError: an argument is not known; the message names the nearest one
         """
         check_names(cls, kwargs.keys() - {"custom_objects", "print_system_info", "force_reset"})
+        if "policy_kwargs" in kwargs:  # SB3 compares them with those of the file
+            kwargs["policy_kwargs"] = cls.policy_defaults | (kwargs["policy_kwargs"] or {})
         return super().load(path, *args, **kwargs)
 
     def _check_hyperparameters(self) -> None:

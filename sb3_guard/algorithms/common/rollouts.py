@@ -87,9 +87,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     #: What critics learn: SB3's λ-returns, or discounted rewards- and costs-to-go.
     returns: ClassVar[Literal["lambda", "discounted"]] = "lambda"
 
-    #: Arguments of the policy where ``policy_kwargs`` does not have them.
-    policy_defaults: ClassVar[dict[str, Any]] = {}
-
     cost_gamma: float | None = hyperparameter(None, high=1.0, ends="[]")
     cost_gae_lambda: float | None = hyperparameter(None, high=1.0, ends="[]")
 

@@ -65,9 +65,7 @@ class TrustRegion(CostRollouts):
     policy_defaults: ClassVar[dict[str, Any]] = CALM
     returns: ClassVar[Literal["lambda", "discounted"]] = "discounted"
     # SB3's weights of losses: nothing here mixes those of actor and critic.
-    fixed_arguments: ClassVar[frozenset[str]] = CostRollouts.fixed_arguments | {
-        "ent_coef", "vf_coef", "max_grad_norm"
-    }  # fmt: skip
+    fixed_arguments = CostRollouts.fixed_arguments | {"ent_coef", "vf_coef", "max_grad_norm"}
     #: Whether the reward advantages are standardised; cost advantages are centred but never scaled,
     #: since they share the limit's units.
     normalize_advantage = True

@@ -182,6 +182,14 @@ class Certificate:
         lines = [f"  {name}: {cost.verdict}, {cost}" for name, cost in self.costs.items()]
         return "\n".join([f"{self.verdict}: {tail}", *lines])
 
+    def summary(self) -> dict[str, Any]:
+        """Return, and of each cost its mean, upper bound and limit, as plain data."""
+        costs = {
+            key: {"mean": cost.mean, "upper": cost.upper, "limit": cost.limit}
+            for key, cost in self.costs.items()
+        }
+        return {"return": self.mean_return, "costs": costs, "episodes": self.episodes}
+
     def to_json(self) -> str:
         """All fields, with the verdict, as JSON."""
         return json.dumps({"verdict": self.verdict, **asdict(self)}, indent=2, allow_nan=False)

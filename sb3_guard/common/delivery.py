@@ -52,7 +52,7 @@ class DeliveryCallback(BaseCallback):
     A training that was cut and continues keeps the candidates that it has, and ends alike.
 
     :param eval_env: environment to play in, wrapped as the training environment is
-    :param folder: where the files are written
+    :param folder: where the files are written; the current one unless it is given
     :param cost_limit: d, one number or one per cost; None: the model's own at the end
     :param candidates: how many policies are kept, the last one among them
     :param screening: episodes of each
@@ -65,7 +65,7 @@ class DeliveryCallback(BaseCallback):
     def __init__(
         self,
         eval_env: VecEnv,
-        folder: str | os.PathLike[str],
+        folder: str | os.PathLike[str] = ".",
         cost_limit: float | Sequence[float] | None = None,
         *,
         candidates: int = 12,

@@ -1,6 +1,7 @@
 """A trained agent of a run folder as an ONNX file, with what it was trained at and measured."""
 
 import hashlib
+import json
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -33,6 +34,7 @@ def export(flags: ExportFlags) -> int:
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
             evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
         settings, measured = agent.run.hyperparams(), summary(evaluation)
+        certificate = agent.certificate
         plain = {
             name: {key: value for key, value in values.items() if key != "values"}
             if isinstance(values, dict)
@@ -46,6 +48,7 @@ def export(flags: ExportFlags) -> int:
             "cost_limit": settings.get("cost_limit"),
             "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
             "measured": plain,
+            "certificate": json.loads(certificate.to_json()) if certificate else None,
         }
         with explained(f"can't export {agent.path}", ValueError, ImportError):
             contract = onnx_file.export(

@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_guard.common.certificate import Certificate, agent_hash
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.costs import LEAST_EPISODES, Estimate, beside, verdict
@@ -66,7 +67,8 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     """
     The model that the flags ask for, and where its observation statistics are, if it has any.
 
-    Without a flag: the final model, or the checkpoint of a run that has not come to its end.
+    Without a flag: the certified model, else the final one, or the checkpoint of a run that has not
+    come to its end.
 
     :raises UsageError: the run has no such model
     """
@@ -75,7 +77,10 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     if flags.load_last_checkpoint and kept:
         steps = max(kept)
     model, statistics = run.model, run.normalizer
-    if flags.load_best:
+    certified = run.path / "certified_model.zip"
+    if not (flags.load_best or steps or flags.load_last_checkpoint) and certified.is_file():
+        model, statistics = certified, run.path / "certified_vecnormalize.pkl"
+    elif flags.load_best:
         model, statistics = run.path / "best_model.zip", run.path / "best_model_vecnormalize.pkl"
     elif steps is not None:
         if steps not in kept:
@@ -107,6 +112,16 @@ class Agent:
     env_id: str
     model: BaseAlgorithm
     env: VecEnv
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """What was certified of this very agent when its training ended."""
+        file = self.path.with_name("certificate.json")
+        if self.path.name != "certified_model.zip" or not file.is_file():
+            return None
+        with explained(f"{file} is damaged"):
+            certificate = Certificate.from_json(file.read_text())
+        return certificate if certificate.agent == agent_hash(self.model, self.env) else None
 
 
 def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> Agent:
@@ -203,6 +218,8 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         limit = result.get("trained_at")
         trained_at = "" if limit is None else f", trained at limit {limit:g}"
         print(f"Playing {agent.path} on {agent.env_id}{trained_at}")
+        if agent.certificate is not None:
+            print(agent.certificate)
     stage: AbstractContextManager[VecEnv] = nullcontext(agent.env)
     if video is not None:
         stage = filming(agent.env, agent.model, video)

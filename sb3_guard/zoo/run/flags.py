@@ -53,6 +53,8 @@ class EvaluationFlags(Command):
     :param n_eval_envs: number of environments to evaluate in (default: one per episode if native,
         else 1)
     :param eval_env_kwargs: arguments of the evaluation environment (default: those of training)
+    :param certify: end with the best policy of the last half that is certified to keep its limit,
+        by at most so many fresh episodes each of up to three; 0: with the last policy (default: 0)
 
     Files:
 
@@ -75,6 +77,7 @@ class EvaluationFlags(Command):
     eval_episodes: int = flag(default=30, low=1, metavar="N", role=IDENTITY)
     n_eval_envs: int | None = flag(low=1, metavar="N", role=IDENTITY)
     eval_env_kwargs: dict[str, Any] | None = flag(role=IDENTITY)
+    certify: int = flag(default=0, low=0, metavar="N", role=IDENTITY)
     save_freq: int = flag(default=-1, metavar="N", role=IDENTITY)
     checkpoint_every: float = flag(default=10.0, low=0, metavar="S", role=HOST)
     tensorboard_log: str = flag("-tb", default="", metavar="DIR", role=HOST)

@@ -31,6 +31,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts, selection_limits
+from sb3_guard.common.delivery import DeliveryCallback
 from sb3_guard.common.evaluation import check_normalizer, evaluate_policy, sync_normalization
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
@@ -79,6 +80,7 @@ from sb3_guard.zoo.run.make_envs import (
 from sb3_guard.zoo.run.progress import Epochs, summary
 
 FINAL_EPISODES = 100  # of each policy, after training
+DELIVERY_ENVS = 20  # in which candidates are screened and certified
 #: what is played after training: the policy that was trained, and its most likely actions
 SPLITS = ("stochastic", "greedy")
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
@@ -108,6 +110,7 @@ class Run:
         self.env: VecEnv
         self.callbacks: list[BaseCallback]
         self.evaluation: CostEvalCallback | None = None
+        self.delivery: DeliveryCallback | None = None
         self.tracker: Any = None
         #: what to continue from
         self.begun: dict[str, Any] | None = None
@@ -246,6 +249,13 @@ class Run:
                     verbose=int(flags.verbose > 0),
                 )
                 self.evaluation.model = self.model
+            if flags.certify and self.constrained:
+                self.delivery = DeliveryCallback(
+                    self.make_evaluation_envs(DELIVERY_ENVS),
+                    n_episodes=flags.certify,
+                    seed=evaluation_seed(flags.seed, 2),
+                    verbose=int(flags.verbose > 0),
+                )
             if flags.track:
                 self.tracker = self._track()
         except BaseException:
@@ -255,8 +265,8 @@ class Run:
 
     def close(self) -> None:
         """Release the environments, and let Weights & Biases have what it has not yet."""
-        evaluation = [] if self.evaluation is None else [self.evaluation.eval_env]
-        for env in (self.env, *evaluation):
+        others = [callback.eval_env for callback in (self.evaluation, self.delivery) if callback]
+        for env in (self.env, *others):
             with suppress(*PROCESS_DIED):
                 env.close()
         if self.tracker is not None:
@@ -640,6 +650,9 @@ class Run:
             self.evaluation.log_path = str(folder.path / "evaluations")
             self.evaluation.best_model_save_path = str(folder.path)
             others.append(self.evaluation)
+        if self.delivery is not None:
+            self.delivery.folder = folder.path
+            others.append(self.delivery)
         return Checkpoints(
             folder.checkpoint,
             [*others, *self.callbacks],
@@ -684,6 +697,8 @@ class Run:
             normalizer.save(str(folder.normalizer))
         final = self._play_final() if finished else {}
         result = {"algo": self.flags.algo, "env": self.flags.env, **result, "final": final}
+        if self.delivery is not None and self.delivery.certificate is not None:
+            result["delivered"] = self.delivery.certificate.summary()
         if finished:
             made = {"command": folder.flags().command(), "curve": folder.curve_hash()}
             folder.write_result(result | made)

@@ -1,0 +1,60 @@
+"""A run that ends with a certified agent: trained, cut and continued, played, exported."""
+
+import json
+
+import pytest
+import torch
+from killed import crash, runs_of
+from typed import LENGTH, SMALL, TOY, trained
+
+from sb3_guard import enjoy, export_agent, train
+from sb3_guard.common.certificate import Certificate
+
+CERTIFY = ["--certify", "40", "--eval-freq", "-1", "-n", "240"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("logs"), *CERTIFY, "-params", "cost_limit:400")
+
+
+def test_a_run_delivers_and_says_so(run, capsys, tmp_path):
+    certificate = Certificate.from_json((run / "certificate.json").read_text())
+    assert certificate.verdict == "certified"
+    delivered = json.loads((run / "result.json").read_text())["delivered"]
+    assert delivered == certificate.summary()
+    # What plays the agent takes the certified one, and says what is certified.
+    here = ["-f", str(run), *TOY[:2], "--n-episodes", "2"]
+    assert enjoy.main([*here, "--no-render"]) == 0
+    out = capsys.readouterr().out
+    assert f"Playing {run / 'certified_model.zip'}" in out and str(certificate) in out
+    assert export_agent.main([*here, "-o", str(tmp_path / "policy.onnx")]) == 0
+    trained_at = json.loads((tmp_path / "contract.json").read_text())["trained"]
+    assert trained_at["certificate"] == json.loads((run / "certificate.json").read_text())
+
+
+def test_a_certificate_of_another_agent_is_not_shown(run, capsys):
+    file = run / "certificate.json"
+    before = file.read_text()
+    file.write_text(before.replace(json.loads(before)["agent"], "0" * 64))
+    here = ["-f", str(run), *TOY[:2], "--n-episodes", "2", "--no-render"]
+    assert enjoy.main(here) == 0
+    assert "certified: cost" not in capsys.readouterr().out
+    file.write_text(before)
+
+
+@pytest.mark.parametrize("step", [230, pytest.param(150, marks=pytest.mark.slow)])
+def test_a_run_that_is_killed_delivers_the_same(step, tmp_path, monkeypatch):
+    more = [*CERTIFY, "-params", "normalize:True", "cost_limit:400"]
+    arguments = [*LENGTH, *TOY, *SMALL, *more, "--verbose", "0", "--checkpoint-every", "0"]
+    assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
+    crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], step)
+    assert train.main(["-i", str(runs_of(tmp_path / "cut")), *TOY[:2]]) == 0
+    whole, cut = runs_of(tmp_path / "whole"), runs_of(tmp_path / "cut")
+    assert (whole / "certificate.json").read_text() == (cut / "certificate.json").read_text()
+    parts = [file.name for file in sorted((whole / "candidates").iterdir())]
+    assert len(parts) > 1
+    for name in parts:
+        one, other = (torch.load(run / "candidates" / name) for run in (whole, cut))
+        assert one["num_timesteps"] == other["num_timesteps"]
+        assert all(torch.equal(value, other["policy"][key]) for key, value in one["policy"].items())

@@ -32,6 +32,7 @@ GUIDES = [
     ),
     *sorted((DOCS / "algorithms").glob("*.md")),
 ]
+KINDS = ("cpo", "ppo_lag", "sac_lag", "trpo_usl")  # whose samples run every time
 # The samples as written, but for the length of the training.
 SHORTER = {
     r"(\.learn\(|total_timesteps=)[\d_]+": r"\g<1>40",
@@ -76,7 +77,16 @@ def anchors(document):
     return {heading.strip().replace(" ", "-") for heading in plain}
 
 
-@pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "guide",
+    [
+        pytest.param(
+            g, marks=[pytest.mark.slow] * (g.parent.name == "algorithms" and g.stem not in KINDS)
+        )
+        for g in GUIDES
+    ],
+    ids=lambda path: path.stem,
+)
 def test_the_guides_samples_run_in_order(guide, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for env_id in ("Goal_Point_8Hazards-v0", "SafetyPointGoal1-v0"):

@@ -12,11 +12,10 @@ from PIL import Image
 from stable_baselines3.common.vec_env import VecNormalize
 from typed import require_rendering
 
-from sb3_guard import cli, enjoy, evaluate_policy, load_pretrained, train
+from sb3_guard import cli, enjoy, load_pretrained, train
 from sb3_guard.costs import Estimate
 from sb3_guard.zoo.agents import pretrained
 from sb3_guard.zoo.run.folder import RunFolder
-from sb3_guard.zoo.run.run import Run
 
 POINT = "Goal_Point_8Hazards"
 SHIPPED = pretrained.pretrained()
@@ -35,7 +34,7 @@ def test_a_shipped_agent_is_small_and_acts_as_the_one_that_was_trained(run):
     result = run.checked_result()
     assert result["played"]["stochastic"]["cost"][0] < result.get("cost_limit", np.inf)
 
-    model = load_pretrained(env_id, algo, seed=5, n_envs=20, device="cpu")
+    model = load_pretrained(env_id, algo, device="cpu")
     assert model.num_timesteps == result["n_timesteps"] >= 1e6  # contract.json states it
     env = model.get_env()
     with np.load(RECORDED) as recorded:
@@ -47,10 +46,8 @@ def test_a_shipped_agent_is_small_and_acts_as_the_one_that_was_trained(run):
             got, _ = model.predict(seen, deterministic=actions == "deterministic")
             want = recorded[f"{algo}/{env_id}/{actions}"]
             np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
-    # Random actions get about 0.
-    played = evaluate_policy(model, env, 20, deterministic=True)
-    assert [*played.limits] == [result[key] for key in ("cost_limit",) if key in result]
-    assert played.returns.mean() > 0.5 * result["played"]["deterministic"]["return"][0]
+    if "cost_limit" in result:
+        assert model.final_cost_limits.tolist() == [result["cost_limit"]]
 
 
 def test_shipped_agents_are_small_together_and_what_is_missing_is_said():
@@ -68,8 +65,9 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
     monkeypatch.syspath_prepend(SCRIPTS)
     script = runpy.run_path(str(SCRIPTS / "pretrain.py"))
     toy = (
-        "--env Goal_Point_8Hazards -n 2000 --eval-freq -1 --verbose 0 --device cpu -f "
-        f"{tmp_path / 'grand' / 'grand_table_guard'} -params cost_limit:2 n_envs:2 n_steps:1000 "
+        "--env Goal_Point_8Hazards --env-kwargs max_episode_steps:50 -n 200 --eval-freq -1 "
+        "--verbose 0 --device cpu -f "
+        f"{tmp_path / 'grand' / 'grand_table_guard'} -params cost_limit:2 n_envs:2 n_steps:100 "
         "n_critic_updates:1 normalize:True"
     ).split()
     for algo, sampled, greedy, got in (
@@ -132,26 +130,6 @@ def test_a_shipped_agent_keeps_its_limit(run, noise, tmp_path):
     cost = json.loads(file.read_text())["cost"]
     # The most likely actions may cost nothing.
     assert (cost["mean"] > 0.1 or not noise) and cost["high"] <= limit
-
-
-def test_unseen_episodes_are_played_at_once(tmp_path, monkeypatch, capsys):
-    made = []
-    make_envs = Run.make_envs
-    monkeypatch.setattr(
-        Run,
-        "make_envs",
-        lambda *args, **kwargs: made.append(make_envs(*args, **kwargs)) or made[-1],
-    )
-    which = ["--pretrained", "--env", POINT, "--no-render", "--env-kwargs", "max_episode_steps:5"]
-    file = tmp_path / "played.json"
-    for flags, episodes, at_once in (
-        ([], 100, 50),
-        (["--n-episodes", "3"], 3, 3),
-        (["-n", "10"], 2, 1),
-    ):
-        assert enjoy.main([*which, *flags, "--json", str(file)]) == 0
-        assert json.loads(file.read_text())["episodes"] == episodes
-        assert made[-1].num_envs == at_once
 
 
 def test_a_shipped_agent_is_played(capsys, tmp_path, monkeypatch):

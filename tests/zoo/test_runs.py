@@ -32,7 +32,7 @@ def test_a_row_says_all_about_a_run(tmp_path):
     table = read_results([tmp_path]).runs
     (row,) = table.to_dict("records")
     expected = {
-        "suite": HAZARDS, "task": "Goal", "robot": "Point", "constraint": "8Hazards",
+        "suite": HAZARDS,
         "algo": "cpo", "label": "CPO", "family": "CPO-based", "seed": 3, "steps": 600, "J_r": 20.0,
         "M_c": 5.0, "rho_c": 0.5, "cost_limit": 25.0, "limits": "25", "seconds": 12.5,
         "epoch": 100, "mujoco": "4.0.0", "python": "3.11.4", "commit": "abc", "platform": "Linux",
@@ -46,7 +46,7 @@ def test_an_algorithm_that_states_no_name_has_its_key(tmp_path):
     fake_run(tmp_path, "sac_x", env="CartPole-v1", label=None, family=None)
     (row,) = read_results([tmp_path]).runs.to_dict("records")
     assert (row["suite"], row["label"], row["family"]) == ("CartPole-v1", "SAC-X", "")
-    assert pd.isna(row["robot"]) and math.isnan(row["seconds"]) and pd.isna(row["commit"])
+    assert math.isnan(row["seconds"]) and pd.isna(row["commit"])
 
 
 def test_the_reference_comes_first_then_family_by_family(tmp_path):

@@ -39,15 +39,11 @@ class Film(VecEnvWrapper):
         limited = isinstance(model, Constrained) and model.constrained
         self.limits = model.final_cost_limits.tolist() if limited else [None] * len(self.keys)  # type: ignore[attr-defined]
         self.worst = getattr(model, "limit_on", "sum") == "max"
-        self.reset_totals()
-
-    def reset_totals(self) -> None:
-        """Begin an episode's return and costs at 0."""
         self.total, self.costs = 0.0, np.zeros(len(self.keys))
 
     def reset(self) -> VecEnvObs:
         """Begin an episode; nothing is written."""
-        self.reset_totals()
+        self.total, self.costs = 0.0, np.zeros(len(self.keys))
         return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -57,9 +53,13 @@ class Film(VecEnvWrapper):
         self.total += float(rewards[0])
         self.costs = np.maximum(self.costs, costs) if self.worst else self.costs + costs
         if dones[0]:  # pictures are of the next episode by now
-            self.reset_totals()
+            self.total, self.costs = 0.0, np.zeros(len(self.keys))
         else:
-            for picture in pictures(self.venv):
+            native = self.venv.unwrapped  # of which long control steps have several pictures
+            shots: list[Any] = (
+                native.film() if isinstance(native, GuardVecEnv) else [render(self.venv)]
+            )
+            for picture in shots:
                 self.writer.send(np.ascontiguousarray(below(self.caption(), picture)))
         return obs, rewards, dones, infos
 
@@ -106,8 +106,13 @@ def filming(env: VecEnv, model: BaseAlgorithm, video: Path) -> Iterator[Film]:
     height, width = below("", first).shape[:2]
     video.parent.mkdir(parents=True, exist_ok=True)
     with explained(f"can't write {video}", OSError), replacing(video) as file:
+        if isinstance(env.unwrapped, GuardVecEnv):
+            fps: float = env.unwrapped.envs.film_fps
+        else:
+            metadata = env.get_attr("metadata")[0] if env.has_attr("metadata") else {}
+            fps = float(metadata.get("render_fps", 30))
         writer = imageio_ffmpeg.write_frames(
-            file.name, (width, height), fps=fps(env), macro_block_size=2,
+            file.name, (width, height), fps=fps, macro_block_size=2,
             output_params=["-f", "mp4"],
         )  # fmt: skip
         writer.send(None)
@@ -126,17 +131,3 @@ def render(env: VecEnv) -> np.ndarray | None:
         return None
     with explained("can't render", RuntimeError, ImportError, AttributeError):
         return env.get_images()[0]
-
-
-def pictures(env: VecEnv) -> list[Any]:
-    """The pictures of one step: several where a control step of sb3_guard is long."""
-    native = env.unwrapped
-    return native.film() if isinstance(native, GuardVecEnv) else [render(env)]
-
-
-def fps(env: VecEnv) -> float:
-    """Pictures a second as fast as it happens, one or more a step."""
-    if isinstance(env.unwrapped, GuardVecEnv):
-        return env.unwrapped.envs.film_fps
-    metadata = env.get_attr("metadata")[0] if env.has_attr("metadata") else {}
-    return float(metadata.get("render_fps", 30))

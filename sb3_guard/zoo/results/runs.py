@@ -24,9 +24,7 @@ REFERENCE = "trpo"  # scores are relative to it
 # Columns of the figures of merit, and their key in result.json
 METRICS = dict(zip(("J_r", "M_c", "rho_c"), MEASURES, strict=True))
 VERSIONS = ("sb3_guard", "mujoco", "gymnasium", "stable_baselines3", "torch", "numpy", "python")
-_SUITE = re.compile(
-    r"(?P<task>[A-Za-z][A-Za-z0-9]*)_(?P<robot>[A-Za-z][A-Za-z0-9]*)_(?P<constraint>\d+[A-Za-z]\w*)-v0"
-)
+_SUITE = re.compile(r"[A-Za-z][A-Za-z0-9]*_[A-Za-z][A-Za-z0-9]*_\d+[A-Za-z]\w*-v0")
 # Runs that agree in these are the same run, made again.
 _SAME = ["suite", "world", "wrappers", "algo", "limits", "seed", "steps", "started_from", "config"]
 
@@ -112,7 +110,6 @@ def read_run(path: Path) -> dict[str, Any]:
     if not isinstance(env, str) or not isinstance(algo, str) or not isinstance(seed, int):
         raise UsageError(f"{folder.params / 'args.yml'} is damaged: it has no env, algo or seed")
     read_episodes(path)  # raises if there are none
-    parts = _SUITE.fullmatch(env)
     limit = result.get("cost_limit")
     limits = limit if isinstance(limit, list) else [] if limit is None else [limit]
     by_key = _by_key(result)
@@ -121,10 +118,7 @@ def read_run(path: Path) -> dict[str, Any]:
     versions = result.get("versions") or {}
     numbers = {**METRICS, **{k: k for k in ("episodes", "physics_errors", "seconds")}}
     return {
-        "suite": env.removesuffix("-v0") if parts else env,
-        "task": parts and parts["task"],
-        "robot": parts and parts["robot"],
-        "constraint": parts and parts["constraint"],
+        "suite": env.removesuffix("-v0") if _SUITE.fullmatch(env) else env,
         "algo": algo,
         "label": result.get("label") or algo.upper().replace("_", "-"),
         "family": (result.get("family") or "").replace("unconstrained", ""),

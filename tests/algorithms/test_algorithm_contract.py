@@ -539,19 +539,6 @@ def test_a_leaf_is_its_problem_and_its_hooks(cls: type[TrustRegion]) -> None:
     assert replaced <= hooks | set_up | first
 
 
-def test_constructors_say_what_they_take(cls: type[TrustRegion] = CPO) -> None:
-    taken = inspect.signature(cls).parameters
-    assert list(taken)[:3] == ["policy", "env", "learning_rate"]
-    for name, default in {
-        "n_steps": 2048, "cost_limit": 0.0, "cost_keys": ("cost",), "margin_lr": 0.1,
-        "seed": None, "gae_lambda": 0.97,
-    }.items():  # fmt: skip
-        assert taken[name].default == default, name
-        assert f":param {name}:" in (cls.__doc__ or ""), name
-    assert "ent_coef" not in taken
-    assert inspect.signature(TRPO).parameters["missing_cost"].default == "zero"
-
-
 @pytest.mark.parametrize(("name", "meant"), [("cost_limt", "cost_limit"), ("nsteps", "n_steps")])
 def test_an_unknown_argument_is_answered_with_the_nearest(name: str, meant: str) -> None:
     with pytest.raises(TypeError, match=f"CPO takes no argument '{name}'; did you mean '{meant}'"):
@@ -633,14 +620,3 @@ def test_until_something_costs_the_reward_alone_is_learnt(cls: Any) -> None:
         model = one("MlpPolicy", points(cost_scale=0.0), **settings, **base, **limit).learn(240)
         weights.append(th.cat([value.flatten() for value in model.policy.parameters()]))
     th.testing.assert_close(*weights, rtol=0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize("cls", PAIR)
-def test_a_callback_may_stop_and_training_go_on(cls: type[TrustRegion]) -> None:
-    model = small(cls, points())
-    model.learn(400, callback=lambda local, _: local["self"].num_timesteps < 120)
-    assert model.num_timesteps == 120
-    model.learn(160, reset_num_timesteps=False)
-    assert model.num_timesteps == 280
-    model.learn(80)
-    assert model.num_timesteps == 80 and (model.costs.episodes.lengths == 10).all()

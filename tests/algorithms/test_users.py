@@ -10,7 +10,7 @@ from cost_envs import CostPoint
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_guard import CPO, CRPO, PPOLag, SACLag
+from sb3_guard import CPO, PPOLag, SACLag
 from sb3_guard.algorithms import CostReplay
 from sb3_guard.zoo.run.hyperparams import build
 
@@ -35,13 +35,6 @@ def test_no_function_is_asked_about_a_time_after_the_training(cls: Any) -> None:
     model = cls("MlpPolicy", env, cost_limit=at(5.0), learning_rate=at(1e-3), **small(cls))
     model.learn(100).learn(100, reset_num_timesteps=False)
     assert len(asked) > 3 and min(asked) >= 0.0 and max(asked) <= 1.0
-
-
-@pytest.mark.parametrize("cls", [CRPO, CPO, PPOLag, SACLag])
-def test_a_limit_ends_where_it_says(cls: Any) -> None:
-    env = CostPoint(20, hazard=(-1.0, 0.0))
-    model = cls("MlpPolicy", env, cost_limit="lin_5_0", **small(cls)).learn(100)
-    assert model.cost_limits.tolist() == [0.0]
 
 
 def test_a_rate_of_a_file_ends_at_zero() -> None:

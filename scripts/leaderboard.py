@@ -20,10 +20,11 @@ from archives import DATA, DOCS, archives, pack, unpacked
 
 from sb3_guard.reproduce import final_hash, measures
 from sb3_guard.zoo.cli.markdown import table
-from sb3_guard.zoo.results.runs import label_of, select
+from sb3_guard.zoo.results.runs import select
 from sb3_guard.zoo.results.splits import judge
 from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import number
+from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import RunFolder
 
 PAGE = DOCS / "leaderboard.md"
@@ -115,6 +116,11 @@ def leaderboard(rows: pd.DataFrame) -> pd.DataFrame:
 def _table(lines: list[dict[str, str]]) -> str:
     """Lines of the same headings as a table."""
     return table([*lines[0]], [[*line.values()] for line in lines])
+
+
+def label_of(algo: str) -> str:
+    """The name of an algorithm, run or not, from its class."""
+    return getattr(algorithm(algo), "label", algo.upper().replace("_", "-"))
 
 
 def glance(rows: pd.DataFrame) -> str:

@@ -153,21 +153,9 @@ def test_a_database_that_is_gone_ends_the_worker_with_a_line(server, tmp_path, m
     [
         ("postgresql://me:secret@127.0.0.1:{port}/x", ["database fails", "refused"]),
         ("mysql://me:secret@127.0.0.1/x", ["must be postgresql://", "me:***@127.0.0.1"]),
-        ("postgresql://me:secret@127.0.0.1:port/x", ["must be postgresql://"]),
     ],
 )
 def test_wrong_addresses(tmp_path, capsys, url, parts):
     command = [*TOY, "--storage", url.format(port=free_port()), "-f", str(tmp_path)]
-    assert tune.main(command) == 2
-    out, err = capsys.readouterr()
-    assert "Traceback" not in out + err and "secret" not in out + err
-    assert len(err.splitlines()) == 1
-    for part in parts:
-        assert part in err
+    assert "secret" not in refused(tune.main, command, capsys, *parts)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_database_that_is_not_there(cluster, tmp_path, capsys):
-    url = cluster.url.replace("/postgres", "/nowhere")
-    assert tune.main([*TOY, "--storage", url, "-f", str(tmp_path)]) == 2
-    assert '"nowhere" does not exist' in capsys.readouterr().err

@@ -155,13 +155,6 @@ def _by_key(result: Mapping[str, Any]) -> dict[str, Any]:
     return columns
 
 
-def label_of(algo: str) -> str:
-    """The name of an algorithm, run or not, from its class."""
-    from sb3_guard.zoo.run.algos import algorithm
-
-    return getattr(algorithm(algo), "label", algo.upper().replace("_", "-"))
-
-
 def _number(value: Any) -> float:
     return math.nan if value is None else float(value)
 

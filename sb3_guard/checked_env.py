@@ -139,7 +139,7 @@ def _repeats(env: Any) -> str | None:
     while isinstance(env, gym.Wrapper):
         if type(env).__module__.partition(".")[0] not in ("gymnasium", "stable_baselines3"):
             return None
-        if isinstance(env, REPEATING) and getattr(env, "_skip", getattr(env, "frame_skip", 2)) > 1:
+        if isinstance(env, REPEATING):
             return type(env).__name__
         env = env.env
     return None

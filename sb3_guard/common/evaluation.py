@@ -306,8 +306,8 @@ def evaluate_policy(
     if isinstance(model, Constrained) and model.env is not None:
         model.begin_anew |= share_environment(model.env, env)
 
-    tally = _Tally(env, n_eval_episodes, keys, on_episode)
     longest = _longest_episode(env) if max_steps is None else None
+    tally = _Tally(env, n_eval_episodes, keys, on_episode, longest)
     # sampled actions are drawn from the seed, and torch's generators stay as they were
     with _constant_normalization(model, env), th.random.fork_rng(enabled=seed is not None):
         if seed is not None:
@@ -333,15 +333,6 @@ def evaluate_policy(
                 on_step()
             tally.step(rewards, last_costs, starts, infos, seen)
             last_costs[np.flatnonzero(starts)] = 0.0
-            if longest is not None:
-                tally.give_up(longest)
-    if len(tally.ended) < n_eval_episodes and longest is not None:
-        warnings.warn(
-            f"{n_eval_episodes - len(tally.ended)} of {n_eval_episodes} episodes are left out: one "
-            f"had not ended after {longest:,} steps; limit their length, with gymnasium.wrappers."
-            "TimeLimit(env, 1000) or, in commands, --env-kwargs max_episode_steps:1000",
-            stacklevel=2,
-        )
     return tally.evaluation(getattr(model, "limit_on", "sum"), _limits_on(model, keys))
 
 
@@ -359,6 +350,7 @@ class _Tally:
     Return, costs and steps of the episodes of vectorised environments, under way and ended.
 
     :param left: episodes that each environment has still to play, shape [n]
+    :param longest: steps after which an episode is given up; None: never
     """
 
     def __init__(
@@ -367,10 +359,12 @@ class _Tally:
         n_eval_episodes: int,
         keys: tuple[str, ...],
         on_episode: Callable[[float, float, int], Any] | None,
+        longest: int | None,
     ) -> None:
         n = env.num_envs
-        self.keys, self.on_episode = keys, on_episode
+        self.keys, self.on_episode, self.longest = keys, on_episode, longest
         self.monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
+        self.asked = n_eval_episodes
         self.left = np.array([(n_eval_episodes + i) // n for i in range(n)])
         self.returns = np.zeros(n)
         self.costs = EpisodeCosts(n, len(keys) + 1)  # each of the keys, then all costs
@@ -387,7 +381,7 @@ class _Tally:
         infos: list[dict[str, Any]],
         reported: bool,
     ) -> None:
-        """Add a step of every environment, and the episodes that it ends."""
+        """Add a step of every environment, and the episodes that it ends; give up endless ones."""
         self.returns += rewards
         self.reported |= reported
         if len(self.keys) == 1:
@@ -399,13 +393,11 @@ class _Tally:
             over[i] = self._is_over(infos[i])
         for cost in self.costs.step(np.hstack([costs, totals]), over):
             self._end(cost, infos[cost.row])
-
-    def give_up(self, longest: int) -> None:
-        """Wait no longer for the end of episodes that have so many steps."""
-        rows = (self.left > 0) & (self.costs.lengths >= longest)
-        if rows.any():
-            self.unfinished.append(self._under_way(rows))
-            self.left[rows] = 0
+        if self.longest is not None:
+            rows = (self.left > 0) & (self.costs.lengths >= self.longest)
+            if rows.any():
+                self.unfinished.append(self._under_way(rows))
+                self.left[rows] = 0
 
     def _under_way(self, rows: np.ndarray) -> np.ndarray:
         """Return, cost and steps so far of some rows, shape [K, 3]."""
@@ -443,6 +435,14 @@ class _Tally:
             warnings.warn(
                 f"no step reported a cost as info[{self.keys[0]!r}], so costs are 0: cost_keys, or "
                 "the monitor's, name the entries of info that are costs",
+                stacklevel=3,
+            )
+        absent = self.asked - len(self.ended)
+        if absent and self.longest is not None:
+            warnings.warn(
+                f"{absent} of {self.asked} episodes are left out: one had not ended after "
+                f"{self.longest:,} steps; limit their length, with gymnasium.wrappers.TimeLimit("
+                "env, 1000) or, in commands, --env-kwargs max_episode_steps:1000",
                 stacklevel=3,
             )
         shape = len(self.ended), len(self.keys)

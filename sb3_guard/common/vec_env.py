@@ -71,14 +71,7 @@ def make_vec_env(
     fit("n_envs", n_envs, int, 1, 10**6, "[]")
     given = {"render_mode": render_mode, "max_episode_steps": max_episode_steps}
     kwargs = {**(env_kwargs or {}), **{k: v for k, v in given.items() if v is not None}}
-    refuse_vector_env(env_id)
-    if isinstance(env_id, gymnasium.Env | VecEnv):
-        spec = getattr(env_id, "spec", None)
-        name = repr(spec.id) if spec else "MyEnv"
-        raise TypeError(
-            f"this {type(env_id).__name__} is made already: give an id, a class, or a function "
-            f"that makes another one, as make_vec_env({name}, n_envs=4)"
-        )
+    _refuse_made(env_id)
     source = env_id if isinstance(env_id, Source) else find(env_id)
     batched = source.batch is not None and wrapper_class is None
     vec_env = vec_env or ("native" if batched else "dummy")
@@ -115,6 +108,17 @@ def make_vec_env(
     if seed is not None:
         venv.seed(seed)
     return CostMonitor(venv, monitor_path, **(monitor_kwargs or {}))
+
+
+def _refuse_made(env_id: Any) -> None:
+    refuse_vector_env(env_id)
+    if isinstance(env_id, gymnasium.Env | VecEnv):
+        spec = getattr(env_id, "spec", None)
+        name = repr(spec.id) if spec else "MyEnv"
+        raise TypeError(
+            f"this {type(env_id).__name__} is made already: give an id, a class, or a function "
+            f"that makes another one, as make_vec_env({name}, n_envs=4)"
+        )
 
 
 def _subprocesses(make: Callable[[], gymnasium.Env], n_envs: int) -> VecEnv:

@@ -183,7 +183,6 @@ def cost_of(observation, action, next_observation, info):
     [
         (Twice(Late()), 40.0),
         (CostFromFunction(MaxAndSkipEnv(Late(), 4), cost_of), 20.0),  # it is told outside
-        (MaxAndSkipEnv(Late({4: {}}), 1), 6.0),  # of one step
     ],
 )
 def test_what_tells_its_costs_itself_is_right(env, cost):

@@ -188,17 +188,15 @@ def settle(
     if not spec.actuators:
         raise ValueError(f"{label} has no actuators: {SERVOS}")
     key = _keyframe(spec, label, keyframe)
-    whole = spec.compile()
-    before = mujoco.MjData(whole)
+    before = mujoco.MjData(whole := spec.compile())
     if key is not None:
         mujoco.mj_resetDataKeyframe(whole, before, whole.key(key).id)
-    if not as_written and key is None:
+    elif not as_written:
         _into_ranges(spec, root, whole, before)
     left_out = tuple(f"keyframe {k.name}" for k in spec.keys if k.name not in (key, STOP))
-    stop = {}
-    if STOP in [frame.name for frame in spec.keys]:
-        names = [actuator.name for actuator in spec.actuators]
-        stop = dict(zip(names, whole.key(STOP).ctrl.tolist(), strict=True))
+    names = [actuator.name for actuator in spec.actuators]
+    stops = [whole.key(frame.name).ctrl.tolist() for frame in spec.keys if frame.name == STOP]
+    stop = dict(zip(names, stops[0], strict=True)) if stops else {}
     for frame in spec.keys:
         spec.delete(frame)
     spec.nkey = 0  # MuJoCo would fill up to it

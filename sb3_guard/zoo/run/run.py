@@ -356,8 +356,8 @@ class Run:
             with explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
                 for cls, arguments in _wrappers(setup.vec_env_wrapper, evaluation):
                     env = cls(env, **arguments)
-                replays = issubclass(self.algorithm, OffPolicyAlgorithm)
-                if replays:  # the buffer keeps what VecNormalize is given, which thus has all of it
+                # A replay buffer keeps what VecNormalize is given, which thus has all of it.
+                if replays := issubclass(self.algorithm, OffPolicyAlgorithm):
                     env = self._reshaped(env)
                 if normalizer is None and (beside := self._statistics_beside()) is not None:
                     normalizer = read_normalizer(beside)
@@ -369,10 +369,8 @@ class Run:
                     env = VecNormalize(env, **setup.normalize)
                 if evaluation and isinstance(env, VecNormalize):
                     env.training = env.norm_reward = False
-                if not replays:
-                    env = self._reshaped(env)
             made.pop_all()
-        return env
+        return env if replays else self._reshaped(env)
 
     def _reshaped(self, env: VecEnv) -> VecEnv:
         """Frames stacked, and images channels first, in evaluation as in training."""

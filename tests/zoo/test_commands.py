@@ -50,7 +50,8 @@ def test_track_sends_what_tensorboard_gets_and_goes_on(tmp_path, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=init))
     run = trained(logs, "--track", "-tb", str(tmp_path / "tb"))
-    assert train.main(["-i", str(run), *TOY[:2], "-n", "180", "--verbose", "0"]) == 0
+    again = ["-i", str(run), *TOY[:2], "--track", "-tb", str(tmp_path / "tb"), "--verbose", "0"]
+    assert train.main([*again, "-n", "180"]) == 0
     assert json.loads((run / "result.json").read_text())["n_timesteps"] == 180
     (first, *before), (second, *after) = calls
     assert (before, after) == ([0, False], [1, True])

@@ -198,3 +198,14 @@ def test_a_full_disk_is_a_line(capsys):
     assert "No space left" in error and "same command" in error and len(error.splitlines()) == 1
     with pytest.raises(OSError, match="Invalid"):
         usage_run(other)
+
+
+def test_nobody_reads_the_output():
+    command = [
+        sys.executable,
+        "-c",
+        "from sb3_guard.cli import main; raise SystemExit(main(['list']))",
+    ]
+    listing = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    listing.stdout.close()
+    assert listing.wait() == 141 and listing.stderr.read() == b""

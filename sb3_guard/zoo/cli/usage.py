@@ -118,7 +118,12 @@ def run(command: Callable[[], int]) -> int:
         f"warning: {' '.join(str(message).split())}\n"
     )
     try:
-        return command()
+        status = command()
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:  # `list | head` has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 128 + signal.SIGPIPE
     except (UsageError, ImportError) as error:
         print(f"error: {one_line(error)}", file=sys.stderr)  # also of an absent package
         return getattr(error, "status", 2)

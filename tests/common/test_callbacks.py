@@ -8,7 +8,6 @@ import torch as th
 from cost_envs import CostPoint
 from stable_baselines3.common.callbacks import (
     BaseCallback,
-    EvalCallback,
     StopTrainingOnNoModelImprovement,
     StopTrainingOnRewardThreshold,
 )
@@ -161,15 +160,6 @@ def learn(tmp_path, algorithm=CPO, evaluate=True, env=None, steps=120, **kwargs)
     )
     model.learn(steps, callback=watcher if evaluate else None)
     return model, watcher
-
-
-@pytest.mark.parametrize("algorithm", [CPO, TRPO])
-def test_sb3s_own_callback_is_warned_of(algorithm, recwarn):
-    """It keeps the model of the highest reward: what a constrained algorithm is not for."""
-    model = algorithm("MlpPolicy", envs(), n_steps=20, n_critic_updates=1)
-    model.learn(20, callback=[EvalCallback(envs(1), verbose=0)])
-    warned = [str(one.message) for one in recwarn if "CostEvalCallback" in str(one.message)]
-    assert len(warned) == (algorithm is CPO)
 
 
 def logged_rows(model) -> list[dict]:

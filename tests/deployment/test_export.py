@@ -131,7 +131,7 @@ def test_so_do_those_of_other_algorithms(key: str, tmp_path: Path) -> None:
     ("key", "kwargs", "least"),
     [
         ("trpo_sl", {}, 0.999),
-        ("trpo_usl", {"steps": 1}, 0.999),
+        pytest.param("trpo_usl", {"steps": 1}, 0.999, marks=pytest.mark.slow),
         pytest.param("trpo_sl", {"drift": True}, 0.999, marks=pytest.mark.slow),
         pytest.param("trpo_usl", {"steps": 20}, 0.95, marks=pytest.mark.slow),
     ],

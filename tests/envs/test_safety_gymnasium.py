@@ -95,7 +95,11 @@ def test_gremlins_turn_as_much_when_pushed():
 
 
 @pytest.mark.parametrize(
-    ("name", "lidar"), [("PointGoal2", "vases_lidar"), ("PointPush1", "box_lidar")]
+    ("name", "lidar"),
+    [
+        pytest.param("PointGoal2", "vases_lidar", marks=pytest.mark.slow),
+        ("PointPush1", "box_lidar"),
+    ],
 )
 def test_sleep_changes_no_step(name, lidar):
     """From every state of episodes in which what sleeps is driven at, beside all awake."""

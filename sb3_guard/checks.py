@@ -47,14 +47,6 @@ def check_number(
         )
 
 
-def check_learning_rate(rate: Any) -> None:
-    """
-    :raises ValueError: ``rate`` is neither a positive number nor a schedule
-    """
-    if not callable(rate) and not (is_number(rate) and rate > 0.0):
-        raise ValueError(f"learning_rate={rate!r}: must be a positive number or a schedule")
-
-
 def check_cost_keys(keys: Any) -> tuple[str, ...]:
     """
     :return: the keys

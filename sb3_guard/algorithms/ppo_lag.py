@@ -7,7 +7,7 @@ import torch as th
 from stable_baselines3 import PPO
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
-from sb3_guard.algorithms.common.first_order import FirstOrder, check_ppo, mean_kl
+from sb3_guard.algorithms.common.first_order import FirstOrder, mean_kl
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 
@@ -49,10 +49,6 @@ class PPOLag(Lagrangian, CostRollouts, PPO):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, gae_lambda=gae_lambda, target_kl=target_kl, **kwargs)
-
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_ppo(self)
 
     def train(self) -> None:
         """λ follows J_C, SB3's PPO learns from A - Σ λ_i A_Ci, then the cost critic learns."""

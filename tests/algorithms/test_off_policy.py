@@ -2,7 +2,6 @@
 
 import itertools
 import pickle
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -201,13 +200,13 @@ def test_several_steps_survive_saving(tmp_path: Path) -> None:
     assert changed.replay_buffer.cost_gamma == 0.7
     one = SACLag.load(tmp_path / "model", env=points(), n_steps=1)
     assert type(one.replay_buffer) is CostReplayBuffer
-    with pytest.raises(ValueError, match=r"was saved by .* more than one step, and .* n_steps=1"):
+    with pytest.raises(ValueError, match="is CostNStepReplayBuffer, and the"):
         one.load_replay_buffer(tmp_path / "buffer")
     SAC("MlpPolicy", points(), buffer_size=100).save_replay_buffer(tmp_path / "theirs")
-    with pytest.raises(ValueError, match="the replay buffer has no costs"):
+    with pytest.raises(ValueError, match="replay_buffer is ReplayBuffer"):
         one.load_replay_buffer(tmp_path / "theirs")
     two = TD3Lag("MlpPolicy", points(), cost_keys=("cost", "heat"), n_steps=3, cost_limit=1.0)
-    with pytest.raises(ValueError, match="has 1 costs for each step, and the model 2"):
+    with pytest.raises(ValueError, match="n_costs is 1, and the model's 2"):
         two.load_replay_buffer(tmp_path / "buffer")
     assert type(one.replay_buffer) is CostReplayBuffer
     one.save(tmp_path / "one")
@@ -495,18 +494,10 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
     [
         ({"ent_coef": "auto_size"}, "ent_coef='auto_size': must be a number of at least 0, 'au"),
         ({"target_update_interval": 0}, "target_update_interval=0: must be an integer"),
-        (
-            {"n_steps": 3, "replay_buffer_class": type("Own", (CostReplayBuffer,), {})},
-            "n_steps=3: must be 1 with a Own",
-        ),
         ({"n_steps": 3, "optimize_memory_usage": True}, "n_steps=3: must be 1 .*optimize_memory"),
         ({"cost_gamma": 1.0}, r"cost_gamma=1.0: must be a number in \[0, 1\)"),
         ({"gamma": 1.0}, "gamma=1.0: .* must be below 1, .*; give cost_gamma=0.99 too"),
         ({"batch_size": 0}, "batch_size=0: must be an integer of at least 1"),
-        (
-            {"train_freq": (1, "episode"), "env": points(2)},
-            "train_freq=.*of a single environment, and there are 2; give a number of steps",
-        ),
         ({"tau": 2.0}, r"tau=2.0: must be a number in \[0, 1\]"),
         ({"safety_margin": 1.0}, "safety_margin=1.0"),
         ({"env": "CartPole-v1"}, r"^\w+ needs continuous actions \(Box\), not Discrete"),
@@ -515,24 +506,6 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
 def test_bad_input(more: Any, error: str) -> None:
     with pytest.raises(ValueError, match=error):
         SACLag("MlpPolicy", **{"env": points(1), **settings(), **more})
-
-
-@shared
-@pytest.mark.parametrize("cut", [True, False])
-def test_a_cost_that_nothing_changes_has_no_price(cls: Any, cut: bool) -> None:
-    """Every step costs 1: no action matters, unless one may end the episode before its time."""
-
-    class Toll(Clock):
-        def step(self, action: Any) -> Any:
-            *others, info = super().step(action)
-            return *others, {**info, "cost": 1.0}
-
-    keys = {"cost_keys": ("cost", "ten"), "cost_limit": [0.5, 0.5]}
-    model = cls("MlpPolicy", make_vec_env(lambda: Toll(4, cut), 2), **keys, **settings())
-    model.learn(100)
-    assert (model.multiplier.value > 0.0).all()
-    prices = [model.logger.name_to_value[f"train/cost_weight/{key}"] for key in ("cost", "ten")]
-    assert (prices[0] == 0.0) == cut and prices[1] > 0.0
 
 
 @pytest.mark.slow
@@ -554,25 +527,3 @@ def test_it_finds_a_known_optimum(cls: Any) -> None:
     cls("MlpPolicy", env, cost_limit=0.5, policy_kwargs=policy, **fast).learn(steps, outcomes)
     assert np.mean(outcomes.returns) / problem.best >= 0.9
     assert 0.85 <= np.mean(outcomes.costs) / 0.5 <= 1.05
-
-
-def test_a_fixed_entropy_coefficient_does_not_replace_a_learnt_one(tmp_path: Path) -> None:
-    for saved, other in ((0.2, "auto"), ("auto", 0.2)):
-        model = SACLag("MlpPolicy", points(), cost_limit=1.0, ent_coef=saved, **settings())
-        model.save(tmp_path / "model")
-        with pytest.raises(TypeError, match=f"ent_coef={other!r}: .*load it without ent_coef"):
-            SACLag.load(tmp_path / "model", ent_coef=other)
-        assert SACLag.load(tmp_path / "model").ent_coef == saved
-
-
-def test_a_training_that_learns_nothing_is_told():
-    model = SACLag("MlpPolicy", CostPoint(10), cost_limit=1.0, **settings())
-    with pytest.warns(UserWarning, match="nothing is learnt in 60 steps: .* learning_starts=60"):
-        model.learn(60)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        model = SACLag("MlpPolicy", CostPoint(10), cost_limit=1.0, **settings())
-        for steps in (0, 30, 31):
-            model.learn(steps, reset_num_timesteps=False)  # many parts, of which one learns
-        whole = SACLag("MlpPolicy", points(8), cost_limit=1.0, **settings()).learn(60)
-    assert model._n_updates == whole._n_updates == 1

@@ -24,10 +24,15 @@ from sb3_guard.spelling import did_you_mean
 
 # Arguments that SB3's own base classes take from the algorithms, not from users.
 _INTERNAL = {"supported_action_spaces", "monitor_wrapper", "support_multi_env", "sde_support"}
-# The ends of the ranges, from 0 to infinity, of arguments that SB3 does not check.
-_THEIRS = {
-    "clip_range": "()", "clip_range_vf": "()", "ent_coef": "[)", "target_policy_noise": "[)",
-    "target_noise_clip": "[)",
+# The ranges of arguments that SB3 does not check.
+_INTEGERS = {  # of at least 1
+    "n_steps", "batch_size", "n_epochs", "buffer_size", "policy_delay", "target_update_interval"
+}  # fmt: skip
+_NUMBERS: dict[str, tuple[float, str]] = {  # from 0 to a number, with the ends of the interval
+    "gamma": (1.0, "[]"), "gae_lambda": (1.0, "[]"), "tau": (1.0, "[]"),
+    "clip_range": (np.inf, "()"), "clip_range_vf": (np.inf, "()"), "target_kl": (np.inf, "()"),
+    "ent_coef": (np.inf, "[)"), "target_policy_noise": (np.inf, "[)"),
+    "target_noise_clip": (np.inf, "[)"), "learning_rate": (np.inf, "()"),
 }  # fmt: skip
 _ONLY = inspect.Parameter.KEYWORD_ONLY
 _HANDS_ON = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
@@ -45,10 +50,10 @@ class Hyperparameter(NamedTuple):
         """
         :raises ValueError: ``value`` is not what the annotation and the range allow
         """
-        union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-        kinds = {*(typing.get_args(hint) if union else (hint,))} - {types.NoneType}
-        if value is None and types.NoneType in typing.get_args(hint):
+        kinds = {*(typing.get_args(hint) or (hint,))}
+        if value is None and types.NoneType in kinds:
             return
+        kinds.discard(types.NoneType)
         if typing.get_origin(hint) is typing.Literal:
             check_choice(name, value, *typing.get_args(hint))
         elif kinds == {bool}:
@@ -87,26 +92,6 @@ def stated(cls: type) -> dict[str, Hyperparameter]:
     }
 
 
-def _annotations(cls: type) -> dict[str, Any]:
-    """Those written in this very class, evaluated where that is possible."""
-    try:
-        return inspect.get_annotations(cls, eval_str=True)
-    except (NameError, TypeError):  # what only a type checker can resolve
-        return inspect.get_annotations(cls)
-
-
-def own_arguments(cls: type) -> list[inspect.Parameter]:
-    """What the constructor written in this very class takes, without ``self``."""
-    constructor = cls.__dict__.get("__init__")
-    if not isinstance(constructor, FunctionType):
-        return []
-    try:
-        signature = inspect.signature(constructor, eval_str=True)
-    except (NameError, TypeError):  # annotations that only a type checker can resolve
-        signature = inspect.signature(constructor)
-    return list(signature.parameters.values())[1:]
-
-
 def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signature:
     """All arguments of a class: its own, then those of the constructors that it hands on to.
 
@@ -115,25 +100,27 @@ def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signatu
     """
     found: dict[str, inspect.Parameter] = {}
     positional = True
-    for one in cls.__mro__:
-        for name, value in vars(one).items():
+    for base in cls.__mro__:
+        hints = inspect.get_annotations(base)
+        for name, value in vars(base).items():
             if isinstance(value, Hyperparameter) and name not in fixed:
-                hint = _annotations(one).get(name, inspect.Parameter.empty)
+                hint = hints.get(name, inspect.Parameter.empty)
                 parameter = inspect.Parameter(name, _ONLY, default=value.default, annotation=hint)
                 found.setdefault(name, parameter)
-        own = own_arguments(one)
-        for each in own:
-            if each.kind in _HANDS_ON or each.name in fixed | _INTERNAL:
+        if not isinstance(constructor := vars(base).get("__init__"), FunctionType):
+            continue
+        _, *arguments = inspect.signature(constructor).parameters.values()
+        for argument in arguments:
+            if argument.kind in _HANDS_ON or argument.name in fixed | _INTERNAL:
                 continue
-            kind = each.kind if positional else _ONLY
-            nearest = found.setdefault(each.name, each.replace(kind=kind))
+            kind = argument.kind if positional else _ONLY
+            nearest = found.setdefault(argument.name, argument.replace(kind=kind))
             # What comes after an argument that a class takes by name has no position either.
-            positional &= each.kind is _ONLY or nearest.kind is not _ONLY
-        kinds = {each.kind for each in own}
-        if own and inspect.Parameter.VAR_KEYWORD not in kinds:
+            positional &= argument.kind is _ONLY or nearest.kind is not _ONLY
+        kinds = {argument.kind for argument in arguments}
+        if inspect.Parameter.VAR_KEYWORD not in kinds:
             break
-        if own and inspect.Parameter.VAR_POSITIONAL not in kinds:
-            positional = False
+        positional &= inspect.Parameter.VAR_POSITIONAL in kinds
     # Without a default it comes first; what follows * need not.
     ordered = sorted(found.values(), key=lambda each: each.kind)
     return inspect.Signature(ordered)
@@ -141,22 +128,18 @@ def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signatu
 
 def documentation(cls: type, arguments: Mapping[str, inspect.Parameter]) -> str:
     """The class's docstring with the arguments of its bases, each as the nearest base has it."""
-    own = inspect.cleandoc(cls.__dict__.get("__doc__") or "")
-    known: dict[str, str] = {}
-    for one in cls.__mro__:
-        text = inspect.cleandoc(one.__dict__.get("__doc__") or "")
-        for name, entry in re.findall(r"^:param (\w+): ?((?:.*)(?:\n[ \t]+.*)*)", text, re.M):
-            known.setdefault(name, f":param {name}: {entry}")
-    stated = set(re.findall(r"^:param (\w+):", own, re.M))
-    wanted = [name for name in arguments if name not in stated and not name.startswith("_")]
-    others = [known[name] for name in wanted if name in known]
-    if not others:
-        return own
+    text = inspect.cleandoc(vars(cls).get("__doc__") or cls.__name__)
+    entry = re.compile(r"^:param (\w+):.*(?:\n[ \t]+.*)*", re.M)
+    entries: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        doc = inspect.cleandoc(vars(base).get("__doc__") or "")
+        entries |= {match[1]: match[0] for match in entry.finditer(doc)}
+    stated = [*entry.finditer(text)]
+    wanted = [name for name in arguments if name in entries and not name.startswith("_")]
+    others = [entries[n] for n in wanted if n not in {match[1] for match in stated}]
     # A list of parameters goes on; after other text a new one begins.
-    at = [match.end() for match in re.finditer(r"^:param .*(?:\n[ \t]+.*)*", own, re.M)]
-    if not at:
-        return "\n".join([own or cls.__name__, "", *others])
-    return own[: at[-1]] + "\n" + "\n".join(others) + own[at[-1] :]
+    at = stated[-1].end() if stated else len(text)
+    return "\n".join([text[:at] + ("" if stated else "\n" * bool(others)), *others]) + text[at:]
 
 
 def check_names(cls: type, given: Iterable[str]) -> None:
@@ -178,7 +161,8 @@ def check_theirs(algorithm: Any) -> None:
 
     :raises ValueError: one is out of its range
     """
-    for name, ends in _THEIRS.items():
-        value = getattr(algorithm, name, None)
-        if isinstance(value, int | float):  # else absent, a schedule, or "auto"
-            check_number(name, value, ends=ends)
+    for name, value in vars(algorithm).items():
+        if name in _INTEGERS and value is not None:
+            check_integer(name, value)
+        elif name in _NUMBERS and isinstance(value, int | float):  # else a schedule, or "auto"
+            check_number(name, value, 0.0, *_NUMBERS[name])

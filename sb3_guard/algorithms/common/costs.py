@@ -1,7 +1,7 @@
 """The costs of a training: limits, episodes, and what they say about the violation."""
 
 import re
-from collections import deque, namedtuple
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Literal
@@ -11,9 +11,6 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_guard.checks import check_per_cost, is_number
 from sb3_guard.costs import EpisodeCosts
-
-# Agents that were saved while the estimate was one of these are read; their costs begin anew.
-CostEstimate = namedtuple("CostEstimate", "episode_cost horizon violation")
 
 _NUMBER = r"(-?\d+\.?\d*(?:e[+-]?\d+)?)"
 _LINE = re.compile(f"lin_{_NUMBER}_{_NUMBER}")
@@ -207,15 +204,6 @@ def discounted_limit(limits: np.ndarray, horizon: float, gamma: float, cut: bool
     if gamma == 1.0:
         return limits
     return limits / horizon * (1.0 if cut else 1.0 - gamma**horizon) / (1.0 - gamma)
-
-
-def same_at_every_step(costs: np.ndarray) -> np.ndarray:
-    """Which of m costs are the same, and not 0, at each step of a rollout, shape (m,) bool.
-
-    :param costs: shape (T, n, m)
-    """
-    first = costs[0, 0]
-    return (first != 0.0) & (costs == first).all(axis=(0, 1))
 
 
 def inverse(deviation: np.ndarray) -> np.ndarray:

@@ -20,8 +20,6 @@ from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 from sb3_guard.algorithms.fast.actor import distribution_of
-from sb3_guard.algorithms.fast.optimizers import fuse
-from sb3_guard.checks import check_integer, check_number
 
 #: ``loss(batch, ratio, distribution)``, see :meth:`FirstOrder.loss`
 Loss = Callable[[CostRolloutBufferSamples, th.Tensor, Distribution], th.Tensor]
@@ -57,19 +55,7 @@ class FirstOrder(CostRollouts, PPO):
     ) -> None:
         super().__init__(*args, gae_lambda=gae_lambda, target_kl=target_kl, **kwargs)
 
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        check_ppo(self)
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        if self.fuse_adam:
-            fuse(self.policy.optimizer)
-
     # What an algorithm replaces
-
-    #: Whether Adam takes its steps as one operation: faster, and PPO's up to rounding alone.
-    fuse_adam: ClassVar[bool] = False
 
     def loss(
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution
@@ -181,20 +167,6 @@ class FirstOrder(CostRollouts, PPO):
             change = th.clamp(values - batch.old_values, -clip, clip)
             values = batch.old_values + change
         return F.mse_loss(batch.returns, values)
-
-
-def check_ppo(model: PPO) -> None:
-    """
-    Refuse values of PPO's arguments that SB3 takes silently, or fails at later.
-
-    :raises ValueError: one is out of its range
-    """
-    for name in ("n_steps", "batch_size", "n_epochs"):
-        check_integer(name, getattr(model, name))
-    for name in ("gamma", "gae_lambda"):
-        check_number(name, getattr(model, name), 0.0, 1.0, "[]")
-    if model.target_kl is not None:
-        check_number("target_kl", model.target_kl, ends="()")
 
 
 @th.no_grad()

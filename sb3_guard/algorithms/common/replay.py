@@ -17,12 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_obs_shape
-from stable_baselines3.common.type_aliases import (
-    GymEnv,
-    RolloutReturn,
-    TrainFreq,
-    TrainFrequencyUnit,
-)
+from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
@@ -30,17 +25,12 @@ from sb3_guard.algorithms.common.cost_critics import CostQ
 from sb3_guard.algorithms.common.costs import inverse
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.algorithms.common.replay_buffers import (
-    CostColumns,
     CostDictReplayBuffer,
     CostNStepReplayBuffer,
     CostReplayBuffer,
     CostReplayBufferSamples,
 )
-from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
-# What is chosen where the user names no buffer, and what the last of them alone takes.
-AUTOMATIC = (CostReplayBuffer, CostDictReplayBuffer, CostNStepReplayBuffer)
-N_STEP_ARGUMENTS = ("n_steps", "gamma", "cost_gamma")
 WINDOW = 50  # episodes whose mean cost the multipliers follow
 
 
@@ -82,6 +72,9 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         "safety_margin": {"low": 0.0, "high": 0.3},
     }
 
+    # Ours have room for costs.
+    fixed_arguments: ClassVar[frozenset[str]] = frozenset({"replay_buffer_class"})
+
     lambda_lr: float = hyperparameter(3.0)
     proportional_gain: float = hyperparameter(0.5)
     lambda_units: Literal["relative", "cost"] = hyperparameter("relative")
@@ -103,10 +96,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
                 "there are on-policy algorithms such as PPOLag"
             )
         self.cost_deviation = np.zeros(0, np.float32)  # of Q_C in the last batch, shape (m,)
-        # The costs of the very first step, and which of them every step has had, in episodes that
-        # only time has ended: no action matters to those. Each of shape (m,)
-        self.first_costs: np.ndarray | None = None
-        self.unmovable: np.ndarray | None = None
         self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
         super().__init__(policy, env, *args, **kwargs)
 
@@ -118,53 +107,28 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        for name in ("batch_size", "buffer_size", "policy_delay", "target_update_interval"):
-            check_integer(name, getattr(self, name, 1))  # the last two are TD3's and SAC's
-        self._convert_train_freq()
-        frequency, unit = self.train_freq  # type: ignore[misc]
-        check_integer("train_freq", frequency)
-        if unit is TrainFrequencyUnit.EPISODE and self.n_envs > 1:
-            raise ValueError(
-                f"train_freq=({frequency}, 'episode'): counts episodes of a single environment, "
-                f"and there are {self.n_envs}; give a number of steps, or n_envs=1"
-            )
-        check_number("gamma", self.gamma, 0.0, 1.0, "[]")
-        check_number("tau", self.tau, 0.0, 1.0, "[]")
-        check_learning_rate(self.learning_rate)
         if self.cost_gamma is None and self.gamma == 1.0:
             raise ValueError(
                 f"gamma={self.gamma!r}: cost_gamma, which is gamma unless it is given, must be "
                 "below 1, as undiscounted costs add up without end; give cost_gamma=0.99 too"
             )
-        check_integer("n_steps", self.n_steps)
-        own = None if self.replay_buffer_class in AUTOMATIC else self.replay_buffer_class
-        if own is not None and not issubclass(own, CostColumns):
+        several = isinstance(self.observation_space, spaces.Dict) or self.optimize_memory_usage
+        if self.n_steps > 1 and several:
             raise ValueError(
-                f"replay_buffer_class={own.__name__}: must be a subclass of "
-                "CostReplayBuffer, or of CostDictReplayBuffer for Dict observations"
+                f"n_steps={self.n_steps}: must be 1 for Dict observations and with "
+                "optimize_memory_usage=True"
             )
-        reason = None
-        if isinstance(self.observation_space, spaces.Dict):
-            reason = "for Dict observations"
-        elif self.optimize_memory_usage:
-            reason = "with optimize_memory_usage=True"
-        elif own is not None and not issubclass(own, CostNStepReplayBuffer):
-            reason = f"with a {own.__name__}"
-        if self.n_steps > 1 and reason is not None:
-            raise ValueError(f"n_steps={self.n_steps}: must be 1 {reason}")
 
     def _choose_buffer(self) -> None:
-        # A loaded model names the one that was chosen for it, and may have another n_steps now.
-        if self.replay_buffer_class is None or self.replay_buffer_class in AUTOMATIC:
-            dictionary = isinstance(self.observation_space, spaces.Dict)
-            one_step = CostDictReplayBuffer if dictionary else CostReplayBuffer
-            self.replay_buffer_class = CostNStepReplayBuffer if self.n_steps > 1 else one_step
-        chosen: dict[str, Any] = {"n_costs": len(self.cost_keys)}
-        if issubclass(self.replay_buffer_class, CostNStepReplayBuffer):
-            values = (self.n_steps, self.gamma, self._gamma_of_costs)
-            chosen |= dict(zip(N_STEP_ARGUMENTS, values, strict=True))
-        given = {k: v for k, v in self.replay_buffer_kwargs.items() if k not in N_STEP_ARGUMENTS}
-        self.replay_buffer_kwargs = {**given, **chosen}
+        dictionary = isinstance(self.observation_space, spaces.Dict)
+        one_step = CostDictReplayBuffer if dictionary else CostReplayBuffer
+        self.replay_buffer_class = CostNStepReplayBuffer if self.n_steps > 1 else one_step
+        # A loaded model has the arguments that were chosen for it, and maybe another n_steps now.
+        names = "n_steps", "gamma", "cost_gamma"
+        given = {k: v for k, v in self.replay_buffer_kwargs.items() if k not in names}
+        values = (self.n_steps, self.gamma, self._gamma_of_costs) if self.n_steps > 1 else ()
+        chosen = dict(zip(names, values, strict=False))
+        self.replay_buffer_kwargs = {**given, **chosen, "n_costs": len(self.cost_keys)}
 
     def _setup_model(self) -> None:
         normalizer, space = self._vec_normalize_env, self.observation_space
@@ -190,32 +154,23 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         return [*state_dicts, "cost_critic", "cost_critic.optimizer"], tensors
 
     def load_replay_buffer(self, path: Any, *args: Any, **kwargs: Any) -> None:
-        before, n_costs = self.replay_buffer, len(self.cost_keys)
+        before = self.replay_buffer
         super().load_replay_buffer(path, *args, **kwargs)
-        loaded, wrong = self.replay_buffer, ""
-        several = isinstance(loaded, CostNStepReplayBuffer)
-        if not isinstance(loaded, CostColumns):
-            wrong = "has no costs: the algorithm that saved it knew none"
-        elif (there := loaded.costs.shape[-1]) != n_costs:
-            wrong = f"has {there} costs for each step, and the model {n_costs}"
-        elif several != issubclass(self.replay_buffer_class, CostNStepReplayBuffer):  # type: ignore[arg-type]
-            kind = "more than one step" if several else "n_steps=1"
-            wrong = f"was saved by a model with {kind}, and this one has n_steps={self.n_steps}"
-        elif loaded.n_envs != self.n_envs:
-            wrong = f"is of {loaded.n_envs} environments, and the model has {self.n_envs}"
-        elif (loaded.observation_space, loaded.action_space) != (
-            self.observation_space,
-            self.action_space,
-        ):
-            wrong = (
-                f"has observations {loaded.observation_space} and actions {loaded.action_space}, "
-                f"and the model {self.observation_space} and {self.action_space}"
-            )
-        if wrong:
-            self.replay_buffer = before
-            raise ValueError(f"the replay buffer {wrong}")
-        for name in N_STEP_ARGUMENTS if several else ():
-            setattr(self.replay_buffer, name, self.replay_buffer_kwargs[name])
+        theirs, ours = (
+            {
+                "replay_buffer": type(buffer).__name__,
+                "n_costs": getattr(buffer, "costs", np.zeros(0)).shape[-1],
+                "n_envs": buffer.n_envs,
+                "observation_space": buffer.observation_space,
+                "action_space": buffer.action_space,
+            }
+            for buffer in (self.replay_buffer, before)
+        )
+        for name, value in theirs.items():
+            if value != ours[name]:
+                self.replay_buffer = before
+                raise ValueError(f"{path}: {name} is {value}, and the model's {ours[name]}")
+        vars(self.replay_buffer).update(self.replay_buffer_kwargs)  # n_steps and discounts
 
     # Collecting
 
@@ -230,16 +185,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
             reset_num_timesteps or self._last_obs is None
         ):
             self.replay_buffer.cut()  # new episodes begin
-        assert isinstance(self.train_freq, TrainFreq)
-        per_rollout = self.n_envs * self.train_freq.frequency
-        steps = -(-total_timesteps // per_rollout) * per_rollout  # of whole rollouts
-        counted = self.train_freq.unit is TrainFrequencyUnit.STEP
-        if reset_num_timesteps and counted and 0 < steps <= self.learning_starts:
-            self._warn_once(
-                "learning_starts",
-                f"nothing is learnt in {total_timesteps:,} steps: the first gradient step comes "
-                f"after learning_starts={self.learning_starts:,}",
-            )
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
 
     def collect_rollouts(
@@ -257,14 +202,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         if self.num_timesteps - self.n_envs < self.learning_starts:  # the actions were random
             self.costs.forget()
         self.replay_buffer.costs[self.replay_buffer.pos] = self.step_costs
-        if self.first_costs is None or self.unmovable is None:
-            self.first_costs = self.step_costs[0].copy()
-            self.unmovable = self.first_costs != 0.0
-        assert dones is not None
-        cut = [info.get("TimeLimit.truncated", False) for info in infos]
-        self.unmovable &= (self.step_costs == self.first_costs).all(axis=0) & bool(
-            np.all(cut, where=dones)
-        )
 
     # Learning
 
@@ -316,8 +253,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         predicted = critic.predict(critic.online, batch.observations, batch.actions)
         values = critic.value(predicted.detach())
         self.cost_deviation = values.std(dim=0, correction=0).cpu().numpy()
-        if self.unmovable is not None:
-            self.cost_deviation[self.unmovable] = 0.0  # it is the critic's errors
         loss = critic.loss(predicted, target)
         critic.optimizer.zero_grad()
         loss.backward()

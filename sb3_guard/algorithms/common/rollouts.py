@@ -24,7 +24,7 @@ from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.algorithms.common.costs import discounted_limit, inverse, same_at_every_step
+from sb3_guard.algorithms.common.costs import discounted_limit, inverse
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.fast.threads import one_thread
 
@@ -227,11 +227,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         assert self._last_obs is not None and self._last_episode_starts is not None
         last = self.cost_critic(obs_as_tensor(self._last_obs, self.device)).cpu().numpy()
         buffer.compute_cost_returns_and_advantage(units * last, self._last_episode_starts)
-        # Where every step costs the same, in episodes that only time has ended, no action matters:
-        # what is left are the critic's errors, all that a policy would follow at a high weight.
-        ended = buffer.episode_starts[1:].sum() + self._last_episode_starts.sum()
-        if ended == len(self._timeouts):
-            buffer.cost_advantages[..., same_at_every_step(buffer.costs)] = 0.0
 
     def _choose_cost_units(self) -> np.ndarray:
         """What networks measure costs in, shape (m,), float32, from a rollout just filled.

@@ -64,19 +64,6 @@ class SoftActorCritic(CostReplay):
         super()._setup_model()
         self.ent_coef = start
 
-    def set_parameters(
-        self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto"
-    ) -> None:
-        learnt = self.ent_coef_optimizer is not None
-        if exact_match and isinstance(load_path_or_dict, dict):
-            saved = "ent_coef_optimizer" in load_path_or_dict
-            if saved is not learnt:
-                raise TypeError(  # of a ValueError SB3 thinks that the file is an old one
-                    f"ent_coef={self.ent_coef!r}: the agent was saved with a coefficient that is "
-                    f"{'learnt' if saved else 'fixed'}; load it without ent_coef"
-                )
-        super().set_parameters(load_path_or_dict, exact_match, device)
-
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         if self._n_updates == 0 and self.ent_coef == "auto_reward":
             self._start_at_the_rewards()

@@ -28,7 +28,6 @@ from sb3_guard.algorithms.common.critics import Regression
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 from sb3_guard.algorithms.common.vectors import assign, flatten
 from sb3_guard.algorithms.fast.actor import actor_of
-from sb3_guard.checks import check_integer, check_learning_rate, check_number
 
 
 class TrustRegion(CostRollouts):
@@ -120,12 +119,6 @@ class TrustRegion(CostRollouts):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        check_integer("n_steps", self.n_steps)
-        if self.batch_size is not None:
-            check_integer("batch_size", self.batch_size)
-        for name in ("gamma", "gae_lambda"):
-            check_number(name, getattr(self, name), 0.0, 1.0, "[]")
-        check_learning_rate(self.learning_rate)
         if self.env is not None and self.normalize_advantage and self.n_steps * self.n_envs < 2:
             raise ValueError(
                 f"n_steps={self.n_steps} with {self.n_envs} environment: standardising advantages "

@@ -96,10 +96,25 @@ class Estimate(NamedTuple):
         words = verdict(self.low, self.high, limit, self.diverged)
         return f"limit {limit:g}" + (f": {words}" if words else "") + beside(self.diverged)
 
+    def judged(self, limit: float | None) -> dict[str, Any]:
+        """Mean, limit, interval, verdict and physics errors, those that there are, as data."""
+        judged: dict[str, Any] = {"mean": None if math.isnan(self.mean) else self.mean}
+        judged["limit"] = limit
+        if not math.isnan(self.low):
+            judged |= {"low": self.low, "high": self.high}
+            if limit is not None:
+                judged["verdict"] = verdict(self.low, self.high, limit, self.diverged)
+        return judged | ({"physics_errors": self.diverged} if self.diverged else {})
+
 
 def beside(diverged: int) -> str:
     """What is said beside a cost and its verdict of episodes that a physics error ended."""
     return f" ({diverged} episodes ended in a physics error)" if diverged else ""
+
+
+def bounded_name(key: str, limit_on: str) -> str:
+    """What the limit of a cost bounds, in words: its sum over an episode, or its worst step."""
+    return f"worst step of {key}" if limit_on == "max" else key
 
 
 def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:

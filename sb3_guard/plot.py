@@ -2,7 +2,7 @@
 
 import sys
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -19,19 +19,6 @@ from sb3_guard.zoo.results.report import report
 from sb3_guard.zoo.results.statistics import with_safety
 
 TITLES = "\n".join(f"  {name:<10} {figure.__doc__}" for name, figure in FIGURES.items())
-
-
-def file_of(*formats: str) -> Callable[[str], Path]:
-    """What makes a file's path of a flag's text, which ends in one of the formats."""
-
-    def read(text: str) -> Path:
-        end = Path(text).suffix
-        if end not in formats:
-            hint = did_you_mean(end, formats)
-            raise ValueError(f"{text!r}: unknown format {end!r}; {hint}")
-        return Path(text)
-
-    return read
 
 
 @dataclass
@@ -69,8 +56,8 @@ figures:
     figure: list[str] = flag(default=[], choices=[*FIGURES, "all"], metavar="NAME")
     output: str = flag("-o", default="figures", metavar="DIR")
     format: list[str] = flag(default=["png"], choices=figures.FORMATS)
-    table: list[Path] = flag(default=[], kind=file_of(*tables.FORMATS), metavar="FILE")
-    report: Path | None = flag(kind=file_of(".html"), metavar="FILE.html")
+    table: list[str] = flag(default=[], metavar="FILE")
+    report: str | None = flag(metavar="FILE.html")
     env: list[str] | None = flag(metavar="ID")
     cost_limit: list[float] | None = flag(metavar="D")
     steps: int | None = flag(low=1, metavar="N")
@@ -82,14 +69,19 @@ def plot(flags: Flags) -> int:
 
     :return: exit status, 1 if a figure lacks all its runs
     """
+    files = [*map(Path, flags.table)]
+    for file in files:
+        if file.suffix not in tables.FORMATS:
+            hint = did_you_mean(file.suffix, tables.FORMATS)
+            raise UsageError(f"--table {file}: unknown format {file.suffix!r}; {hint}")
     results = reading.read_results(flags.folders)
     for path, why in results.left_out.items():
         print(f"left out: {path}: {why}", file=sys.stderr)
     if not len(results.runs):
         raise UsageError(f"there is no finished run below {', '.join(flags.folders)}")
     chosen = with_safety(reading.choose(results.runs, flags.env, flags.cost_limit, flags.steps))
-    means = [file for file in flags.table if file.suffix != ".csv"]
-    for file in flags.table:
+    means = [file for file in files if file.suffix != ".csv"]
+    for file in files:
         if file not in means:
             with tables.written(file) as handle:
                 chosen.to_csv(handle, index=False)
@@ -106,7 +98,7 @@ def plot(flags: Flags) -> int:
     if flags.report:
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
         page = report(data, title, results.left_out)
-        with tables.written(flags.report) as handle:
+        with tables.written(Path(flags.report)) as handle:
             handle.write(page.encode())
         print(f"wrote {flags.report}")
     if by_default:

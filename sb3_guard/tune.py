@@ -8,7 +8,6 @@ from sb3_guard.zoo.tuning.flags import TuneFlags as Flags
 
 
 def _tune(flags: Flags) -> int:
-    flags.check()
     # Read when torch is imported, below.
     os.environ.setdefault("OMP_NUM_THREADS", str(flags.num_threads))
 

@@ -18,8 +18,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_nor
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.checks import check_integer
-from sb3_guard.common.evaluation import Evaluation, bounded_name, evaluate_policy, lacks_statistics
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy, lacks_statistics
 from sb3_guard.common.monitor import cost_keys_of
+from sb3_guard.costs import bounded_name
 
 #: The looks at the episodes, as shares of all episodes, and the share of the error that each takes.
 LOOKS = {0.25: 0.1, 0.5: 0.3, 1.0: 0.6}

@@ -28,14 +28,17 @@ from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.checked_env import checked
 from sb3_guard.checks import NumberError, check_cost_keys, is_number
 from sb3_guard.common.monitor import cost_keys_of, total_cost
-from sb3_guard.costs import EpisodeCost, EpisodeCosts, Estimate, beside, estimate, read_costs
+from sb3_guard.costs import (
+    EpisodeCost,
+    EpisodeCosts,
+    Estimate,
+    beside,
+    bounded_name,
+    estimate,
+    read_costs,
+)
 
 LONGEST = 20_000  # steps of an episode that nothing ends, after which it is given up
-
-
-def bounded_name(key: str, limit_on: str) -> str:
-    """What the limit of a cost bounds, in words: its sum over an episode, or its worst step."""
-    return f"worst step of {key}" if limit_on == "max" else key
 
 
 @dataclass(frozen=True)

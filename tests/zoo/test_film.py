@@ -54,7 +54,7 @@ def test_an_agent_without_limits_and_one_that_limits_the_worst_step():
         each.reset()
         costs = [each.step(np.zeros((1, 2)))[3][0]["cost"] for _ in range(3)]
     assert film.caption().endswith(f"    cost {sum(costs):.2f}")
-    assert worst.caption().endswith(f"    worst cost of a step {max(costs):.2f} (limit 0.1)")
+    assert worst.caption().endswith(f"    worst step of cost {max(costs):.2f} (limit 0.1)")
 
 
 def test_a_line_stands_above_the_picture():

@@ -122,17 +122,34 @@ def test_few_seeds_certify_too_often(seeds, share):
     assert abs(np.mean(certified) - share) < 3 * (share / 600) ** 0.5
 
 
-def test_a_limit_on_the_worst_step_says_nothing_of_the_sum(tmp_path):
+def test_a_limit_on_the_worst_step_has_its_tier_and_says_nothing_of_the_sum(tmp_path):
     """SCPO's: no tier by the sum of an episode's costs, and none for TRPO by that limit."""
-    for algo in ("scpo", "trpo"):
-        limit = {"cost_limit": 5.0, "limit_on": "max"} if algo == "scpo" else {}
-        costs = {"cost": {"mean": 0.5, "limit": 5.0, "verdict": "kept"}} if limit else {}
-        fake_run(tmp_path, algo, **limit, costs=costs, final=final([1.0, 2.0], [1.0, 9.0]))
+    played = final([6.0, 9.0], [1.0, 9.0])
+    fake_run(tmp_path, "trpo", final=played)
+    played["stochastic"]["bounded"] = {"cost": [0.25, 0.75]}
+    costs = {"cost": {"mean": 0.5, "limit": 5.0, "verdict": "kept"}}
+    fake_run(tmp_path, "scpo", cost_limit=5.0, limit_on="max", costs=costs, final=played)
     runs = with_safety(read_results([tmp_path]).runs)
-    table = judge(runs)
-    assert {*table["tier"]} == {""} and table["above"].isna().all()
+    table = judge(runs).set_index(["algo", "split", "key"])
+    worst = table.loc["scpo", "stochastic", "worst step of cost"]
+    assert (worst["cost"], worst["low"], worst["high"]) == (0.5, 0.25, 0.75)
+    assert {*table.drop(worst.name)["tier"]} == {""} and worst["tier"] == "certified"
     assert runs["above_limit"].isna().all() and runs["limits"].dropna().tolist() == ["5"]
-    assert {*tables(Data(runs))["Tiers"]["limit"]} == {"–"}
+    shown = tables(Data(runs))
+    assert shown["Results"]["limit"].tolist() == ["–", "5: certified"]
+    (row,) = shown["Tiers"][shown["Tiers"]["cost key"] == "worst step of cost"].to_dict("records")
+    assert (row["limit"], row["cost"]) == ("5: certified", "0.5 [0.2, 0.8]")
+    for kind in ("curves", "pareto"):
+        assert draw(kind, Data(runs))
+
+
+def test_the_share_of_runs_that_delivered(tmp_path):
+    for seed, result in enumerate([{"delivered": {"return": 9.0}}, {}]):
+        fake_run(tmp_path, "cpo", seed=seed, args={"certify": 400}, **result)
+    fake_run(tmp_path, "trpo")
+    runs = with_safety(read_results([tmp_path]).runs)
+    assert tables(Data(runs))["Results"]["delivered"].tolist() == ["–", "50%"]
+    assert "delivered" not in tables(Data(runs[runs["algo"] == "trpo"]))["Results"]
 
 
 def test_the_distribution_of_costs_is_drawn(runs):

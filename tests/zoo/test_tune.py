@@ -28,7 +28,7 @@ from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.hyperparams import annotations, build, check, parameters, read_hyperparams
 from sb3_guard.zoo.tuning import studies, trials
-from sb3_guard.zoo.tuning.report import Report, best
+from sb3_guard.zoo.tuning.report import best
 from sb3_guard.zoo.tuning.spaces import RELATIVES, SAMPLERS, Search, read_space, space_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
@@ -213,19 +213,14 @@ def test_spaces_that_are_none(tmp_path, content, message):
 
 
 @pytest.mark.parametrize("sampler", sorted(SAMPLERS))
-def test_samplers_take_constraints_or_several_directions(sampler):
-    for pareto in (False, True):
-        study = optuna.create_study(
-            directions=["maximize", "minimize"] if pareto else ["maximize"],
-            sampler=SAMPLERS[sampler](0, 4),
-        )
-        for _ in range(6):
-            trial = study.ask()
-            x = trial.suggest_float("x", 0.0, 1.0)
-            if not pareto:
-                trial.set_constraint("cost", 2 * x - 1)
-            study.tell(trial, [x, 2 * x] if pareto else x)
-        assert len(study.trials) == 6
+def test_samplers_take_constraints(sampler):
+    study = optuna.create_study(direction="maximize", sampler=SAMPLERS[sampler](0, 4))
+    for _ in range(6):
+        trial = study.ask()
+        x = trial.suggest_float("x", 0.0, 1.0)
+        trial.set_constraint("cost", 2 * x - 1)
+        study.tell(trial, x)
+    assert len(study.trials) == 6
 
 
 @pytest.mark.parametrize(
@@ -287,23 +282,11 @@ def folder(tmp_path):
     return tmp_path / "trpo_lag" / "CostPoint-v0_tune"
 
 
-@pytest.fixture
-def drawn():
-    """For tests that want the plots."""
-
-
-@pytest.fixture(autouse=True)
-def _plots(request, monkeypatch):
-    """Drawing takes most of the time of a study as small as these."""
-    if "drawn" not in request.fixturenames:
-        monkeypatch.setattr(Report, "plot", lambda self, study: None)
-
-
 def run(tmp_path, *more: str) -> int:
     return tune.main([*TOY, *SMALL, "-f", str(tmp_path), "--pruner", "none", *more])
 
 
-def test_best_is_feasible_and_train_reads_it(tmp_path, folder, drawn, monkeypatch, capsys):
+def test_best_is_feasible_and_train_reads_it(tmp_path, folder, monkeypatch, capsys):
     pretend(monkeypatch, by_kl)
     assert run(tmp_path, "--n-trials", "12", "--cost-limit", "1", "--seed", "0") == 0
     out, err = capsys.readouterr()
@@ -320,7 +303,6 @@ def test_best_is_feasible_and_train_reads_it(tmp_path, folder, drawn, monkeypatc
     # Training with the result is as long as a trial; the limit also chooses models.
     assert (values["n_timesteps"], values["selection_limit"]) == (240, 1.0)
     assert values["env_kwargs"] == {"episode_length": 20}
-    assert (folder / "pareto.png").read_bytes()[:4] == b"\x89PNG"
     shown = out.split("train with   sb3-guard train ")[1].splitlines()[0].split()
     assert train.main([*shown, "-n", "60", "-f", str(tmp_path), "--verbose", "0"]) == 0
 
@@ -360,20 +342,7 @@ def test_pruning_is_feasible_first(tmp_path, folder, monkeypatch, capsys, pruner
     assert f"pruned after {last.last_step} of 6" in capsys.readouterr().out
 
 
-def test_pareto_front(tmp_path, folder, drawn, monkeypatch, capsys):
-    pretend(monkeypatch, by_kl)
-    assert tune.main([*TOY, *SMALL, "-f", str(tmp_path), "--pareto", "--n-trials", "4"]) == 0
-    study = study_in(folder)
-    assert [one.name for one in study.directions] == ["MAXIMIZE", "MINIMIZE"]
-    assert all(not one.constraints for one in study.trials)
-    names = {path.stem for path in (folder / "pareto").iterdir()}
-    assert names == {f"trial_{one.number}" for one in study.best_trials}
-    assert "front" in capsys.readouterr().out
-    for path in (folder / "pareto").iterdir():
-        read_hyperparams("trpo_lag", "CostPoint-v0", str(path))
-
-
-def test_several_costs(tmp_path, folder, drawn, monkeypatch, capsys):
+def test_several_costs(tmp_path, folder, monkeypatch, capsys):
     pretend(monkeypatch, lambda values, seed: (1.0, 0.2, 50 * values["target_kl"]))
     costs = ["--env-kwargs", "cost_keys:('cost','heat')", "-params", "cost_keys:['cost','heat']"]
     assert run(tmp_path, *costs, "--n-trials", "2", "--cost-limit", "1", "0.5") == 0
@@ -382,7 +351,6 @@ def test_several_costs(tmp_path, folder, drawn, monkeypatch, capsys):
         assert one.constraints == pytest.approx({"cost": -0.8, "heat": heat - 0.5})
     out = capsys.readouterr().out
     assert "cost heat" in out and "episode cost of at most 1, heat of at most 0.5\n" in out
-    assert {path.name for path in folder.glob("*.png")} == {"pareto_cost.png", "pareto_heat.png"}
 
 
 def test_trains_for_real(tmp_path, folder, monkeypatch, capsys):
@@ -578,7 +546,6 @@ def test_nothing_but_failures_ends_it(tmp_path, capsys):
 
 WRONG = [
     (["--cost-limit", "1", "2"], ["selection_limit=[1.0, 2.0]"]),
-    (["--pareto", "--pruner", "median"], ["no pruning with --pareto"]),
     (["--algo", "trpo_lga"], ["'trpo_lga'", "did you mean 'trpo_lag'?"]),
     (["-params", "lambda_rl:1"], ["'lambda_rl'", "did you mean 'lambda_lr'?"]),
     (["--seeds", "0", "0"], ["--seeds 0 0", "twice"]),

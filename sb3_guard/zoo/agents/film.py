@@ -20,7 +20,7 @@ from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.common.native import GuardVecEnv
-from sb3_guard.costs import read_costs
+from sb3_guard.costs import EpisodeCosts, bounded_name, read_costs
 from sb3_guard.zoo.cli.usage import UsageError, explained
 
 
@@ -38,22 +38,21 @@ class Film(VecEnvWrapper):
         self.writer, self.keys = writer, cost_keys_of(model, venv)
         limited = isinstance(model, Constrained) and model.constrained
         self.limits = model.final_cost_limits.tolist() if limited else [None] * len(self.keys)  # type: ignore[attr-defined]
-        self.worst = getattr(model, "limit_on", "sum") == "max"
-        self.total, self.costs = 0.0, np.zeros(len(self.keys))
+        self.limit_on = getattr(model, "limit_on", "sum")
+        self.total, self.costs = 0.0, EpisodeCosts(1, len(self.keys))
 
     def reset(self) -> VecEnvObs:
         """Begin an episode; nothing is written."""
-        self.total, self.costs = 0.0, np.zeros(len(self.keys))
+        self.total, self.costs = 0.0, EpisodeCosts(1, len(self.keys))
         return self.venv.reset()
 
     def step_wait(self) -> VecEnvStepReturn:
         """Pass a step on, and write its pictures."""
         obs, rewards, dones, infos = self.venv.step_wait()
-        costs = read_costs(infos, self.keys, zero_if_missing=True)[0][0]
         self.total += float(rewards[0])
-        self.costs = np.maximum(self.costs, costs) if self.worst else self.costs + costs
+        self.costs.step(read_costs(infos, self.keys, zero_if_missing=True)[0], dones)
         if dones[0]:  # pictures are of the next episode by now
-            self.total, self.costs = 0.0, np.zeros(len(self.keys))
+            self.total = 0.0
         else:
             native = self.venv.unwrapped  # of which long control steps have several pictures
             shots: list[Any] = (
@@ -65,9 +64,10 @@ class Film(VecEnvWrapper):
 
     def caption(self) -> str:
         """Return and each cost of the episode so far, beside its limit."""
-        words = [f"return {self.total:z.2f}"]
-        for key, cost, limit in zip(self.keys, self.costs.tolist(), self.limits, strict=True):
-            name = f"worst {key} of a step" if self.worst else key
+        words, costs = [f"return {self.total:z.2f}"], self.costs
+        bounded = costs.highest if self.limit_on == "max" else costs.totals
+        for key, cost, limit in zip(self.keys, bounded[0].tolist(), self.limits, strict=True):
+            name = bounded_name(key, self.limit_on)
             words.append(f"{name} {cost:.2f}" + ("" if limit is None else f" (limit {limit:g})"))
         return "    ".join(words)
 

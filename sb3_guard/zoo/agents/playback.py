@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 from sb3_guard.common.certificate import Certificate, agent_hash
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
-from sb3_guard.costs import LEAST_EPISODES, Estimate, beside, verdict
+from sb3_guard.costs import LEAST_EPISODES, Estimate, beside
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
@@ -257,9 +257,8 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
         the highest cost of a step, of an agent that limits that, the ``mean``,
         ``std``, the 95 % interval of the mean (``low``, ``high``) and the ``values``, one an
         episode; None where there are too few episodes for it, or where it is not known, of the
-        ``physics_errors`` episodes that one ended. ``costs`` has mean, interval, ``limit`` and
-        ``verdict`` of each cost with a limit, as in ``result.json``; its key's worst step is meant
-        where that is limited
+        ``physics_errors`` episodes that one ended. ``costs`` has each cost with a limit, as in
+        ``result.json``; its key's worst step is meant where that is limited
     """
     out: dict[str, Any] = {"episodes": len(evaluation)}
     for name, values in _columns(evaluation).items():
@@ -270,19 +269,12 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
         out[name] = {**numbers, "values": [_finite(value) for value in values.tolist()]}
     if evaluation.limits:
         out["costs"] = {
-            key: _judged(cost, limit)
+            key: cost.judged(limit)
             for key, (cost, _), limit in zip(
                 evaluation.cost_keys, evaluation.by_key().values(), evaluation.limits, strict=True
             )
         }
     return out
-
-
-def _judged(cost: Estimate, limit: float) -> dict[str, Any]:
-    """A cost and its verdict, in words of ``result.json``."""
-    judged = {key: _finite(getattr(cost, key)) for key in ("mean", "low", "high")}
-    words = verdict(cost.low, cost.high, limit, cost.diverged)
-    return {**judged, "limit": limit, **({"verdict": words} if words else {})}
 
 
 def _finite(value: float) -> float | None:

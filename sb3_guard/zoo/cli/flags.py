@@ -34,7 +34,6 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, ClassVar, Literal, NoReturn, Self
 
 from sb3_guard.fields import fit, parse_value
@@ -53,7 +52,6 @@ def flag(
     low: float = -math.inf,
     high: float = math.inf,
     ends: str = "[)",
-    kind: Callable[[str], Any] | None = None,
     exclusive: str | None = None,
     positional: bool = False,
     **argparse_options: Any,
@@ -66,14 +64,13 @@ def flag(
     :param role: ``IDENTITY``, ``START`` or ``HOST``
     :param low: least value of a number; also ``high``, and ``ends`` as for
         :func:`sb3_guard.fields.fit`
-    :param kind: makes the value of its text, and raises ``ValueError``
     :param exclusive: at most one flag of the same ``exclusive`` can be given
     :param positional: the value is given without the flag's name
     :param argparse_options: for ``add_argument``, e.g. ``metavar``
     """
     meta = {
-        "names": names, "role": role, "range": (low, high, ends), "kind": kind,
-        "exclusive": exclusive, "positional": positional, "options": argparse_options,
+        "names": names, "role": role, "range": (low, high, ends), "exclusive": exclusive,
+        "positional": positional, "options": argparse_options,
     }  # fmt: skip
     if isinstance(default, list | dict):
         return dataclasses.field(default_factory=default.copy, metadata=meta)
@@ -289,7 +286,7 @@ def _kind(hint: Any) -> Any:
 
 def _value(field: "dataclasses.Field[Any]", hint: Any, value: Any, label: str) -> Any:
     """A value of a command line or a file as the flag has it."""
-    kind, made = _kind(hint), field.metadata["kind"]
+    kind = _kind(hint)
     items = value if isinstance(value, list) else [value]
     if kind is dict and not isinstance(value, Mapping):
         pairs = [str(item).partition(":") for item in items]
@@ -299,9 +296,5 @@ def _value(field: "dataclasses.Field[Any]", hint: Any, value: Any, label: str) -
         return {key: parse_value(text) for key, _, text in pairs}
     if kind is list and not items:
         raise ValueError(f"{label} = [] must be one value or a list of them")
-    if made is not None:
-        return [*map(made, items)] if kind is list else made(value)
-    if kind is Path:
-        return Path(value)
     value = items if kind is list else value
     return fit(label, value, _bare(hint), *field.metadata["range"])

@@ -1,6 +1,5 @@
 """What a command says when it can't do what was asked: one line, exit status 2, no traceback."""
 
-import errno
 import importlib
 import os
 import shlex
@@ -17,9 +16,6 @@ from typing import Any
 import yaml
 
 from sb3_guard.plain_yaml import load_yaml
-
-# What the system says when a disk is full, read-only or broken.
-DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO}
 
 
 class UsageError(Exception):
@@ -105,7 +101,7 @@ def run(command: Callable[[], int]) -> int:
     Run a command and turn what the user can put right into one line on stderr.
 
     :return: the exit status: the command's own, 130 for Ctrl-C, that of a :class:`UsageError`, 2
-        for a package that does not import
+        for a package that does not import and a file that can't be written
     """
     # OpenMP's idle threads spin by default: on a machine shared with other work, torch's threads
     # then wait for one another's time slices and training is ten times slower. Read when torch is
@@ -124,18 +120,9 @@ def run(command: Callable[[], int]) -> int:
     except BrokenPipeError:  # `list | head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 128 + signal.SIGPIPE
-    except (UsageError, ImportError) as error:
-        print(f"error: {one_line(error)}", file=sys.stderr)  # also of an absent package
+    except (UsageError, ImportError, OSError) as error:  # an absent package, a full disk
+        print(f"error: {one_line(error)}", file=sys.stderr)
         return getattr(error, "status", 2)
-    except OSError as error:
-        if error.errno not in DISK_ERRORS:
-            raise
-        print(
-            f"error: {error}; what was written before is intact: make room, then give the same "
-            "command again, or continue a run with -i",
-            file=sys.stderr,
-        )
-        return 2
     except KeyboardInterrupt:
         return 130
 

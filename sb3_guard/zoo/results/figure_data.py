@@ -153,7 +153,9 @@ class Data:
 
     def panels(self, suite: str) -> list[str]:
         """Columns that have a learning curve."""
-        return ["J_r", *self.costs(suite), "rho_c"]
+        curves = [self._curves[path] for path in self.runs.loc[self.runs["suite"] == suite, "path"]]
+        names = ["J_r", *self.costs(suite), "rho_c"]
+        return [name for name in names if any(name in curve for curve in curves)]
 
     def score(self, suite: str, algo: str, name: str) -> float:
         """A score of an algorithm or a family, NaN if there is none."""

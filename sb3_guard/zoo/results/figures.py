@@ -10,14 +10,13 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.splits import SPLITS
-from sb3_guard.zoo.results.statistics import SCORES, mean_curve, overall
-from sb3_guard.zoo.results.tables import SCORE_HEADINGS, written
+from sb3_guard.zoo.results.statistics import mean_curve
+from sb3_guard.zoo.results.tables import written
 
 FORMATS = ("png", "svg", "pdf")
 WIDTH = 8.0  # inches: at the width of a page, text has the size of the page's
@@ -230,31 +229,6 @@ def tiers(data: Data, suite: str) -> Figure | None:
         axis.set_yticks(range(len(algos)), [data.looks[algo].label for algo in algos])
         draw_limit(axis.axvline, data, suite, "M_c")
     axis.set_xlim(left=min(0.0, axis.get_xlim()[0]))
-    return figure
-
-
-def iqm(data: Data) -> Figure | None:
-    """Interquartile means of the scores over runs and environments, with 95 % intervals."""
-    table = overall(data.runs, data.means).set_index("algo")
-    table = table.dropna(subset=[f"{score}_iqm" for score in SCORES.values()], how="all")
-    if not len(table):
-        return None
-    figure = Figure(figsize=(WIDTH, 1.2 + 0.32 * len(table)), layout="constrained")
-    rows = np.arange(len(table))[::-1]
-    for axis, score in zip(figure.subplots(1, 3, sharey=True), SCORES.values(), strict=True):
-        for y, (algo, row) in zip(rows, table.iterrows(), strict=True):
-            color = data.looks[str(algo)].color
-            low, high, middle = (row[f"{score}_{end}"] for end in ("low", "high", "iqm"))
-            if not np.isnan(low):
-                pale = to_rgba(color, 0.5)
-                axis.barh(y, high - low, 0.6, left=low, color=pale, edgecolor=INK, linewidth=0.5)
-            axis.plot(middle, y, marker="|", markersize=13, markeredgewidth=2, color=color)
-        axis.set_yticks(rows, table["label"])
-        axis.set(xlabel=SCORE_HEADINGS[score])
-        axis.use_sticky_edges = False
-        axis.margins(0.06)
-        axis.axvline(1, color=INK, linewidth=1, linestyle=(0, (1, 2)))
-        axis.grid(axis="y", visible=False)
     return figure
 
 

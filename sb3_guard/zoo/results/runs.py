@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from sb3_guard.costs import bounded_name
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, one_line
 from sb3_guard.zoo.results.curves import read_episodes
@@ -95,7 +96,7 @@ def read_run(path: Path) -> dict[str, Any]:
 
     :return: by column: ``label`` and ``family`` of the algorithm (empty: unconstrained), ``J_r``,
         ``M_c`` (means over the episodes of the final epoch; NaN if none ended), ``rho_c``
-        (cumulative cost ÷ steps),
+        (cumulative cost ÷ steps), ``delivered`` (1 or 0: whether ``--certify`` found an agent),
         ``cost_limit`` (of the total cost; NaN: there is none), ``limits`` (of all costs, "1 2";
         missing: unconstrained), ``seconds`` of training, ``epoch`` (steps of a rollout), ``world``
         (``env_kwargs``), ``wrappers``,
@@ -113,7 +114,7 @@ def read_run(path: Path) -> dict[str, Any]:
     limit = result.get("cost_limit")
     limits = limit if isinstance(limit, list) else [] if limit is None else [limit]
     by_key = _by_key(result)
-    total = len(limits) == 1 and not by_key and "limit_on" not in result
+    total = len(limits) == 1 and not by_key
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
     versions = result.get("versions") or {}
     numbers = {**METRICS, **{k: k for k in ("episodes", "physics_errors", "seconds")}}
@@ -132,6 +133,7 @@ def read_run(path: Path) -> dict[str, Any]:
         "world": _text(config.get("env_kwargs") or {}),
         "wrappers": _text([config.get(f"{kind}env_wrapper") for kind in ("", "vec_")]),
         "started_from": args.get("trained_agent") or "",
+        "delivered": float("delivered" in result) if args.get("certify") else math.nan,
         "config": _digest(config, result.get("learned")),
         **{name: versions.get(name) for name in VERSIONS},
         "commit": result.get("commit"),
@@ -142,16 +144,17 @@ def read_run(path: Path) -> dict[str, Any]:
 
 def _by_key(result: Mapping[str, Any]) -> dict[str, Any]:
     """Columns of the costs that have limits of their own, rather than their total."""
-    costs = result["costs"]
+    costs, limit_on = result["costs"], result.get("limit_on", "sum")
     means = [_number(cost["mean"]) for cost in costs.values()]
     # Both are means of the same episodes, but may be rounded differently.
     total = np.allclose(means, [_number(result["cost"])] * len(means), equal_nan=True)
-    if "limit_on" in result or (total and len(means) == 1):
+    if limit_on == "sum" and total and len(means) == 1:
         return {}
     columns: dict[str, Any] = {}
     for key, cost in costs.items():
-        columns[f"M_c/{key}"] = _number(cost["mean"])
-        columns[f"cost_limit/{key}"] = _number(cost["limit"])
+        name = bounded_name(key, limit_on)
+        columns[f"M_c/{name}"] = _number(cost["mean"])
+        columns[f"cost_limit/{name}"] = _number(cost["limit"])
     return columns
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sb3_guard.costs import verdict
+from sb3_guard.costs import bounded_name, verdict
 from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.statistics import judging_limits, last_epochs
 
@@ -33,17 +33,18 @@ def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataF
     :param path: the run folder
     :param epoch: steps, as for :func:`~sb3_guard.zoo.results.statistics.last_epochs`
     :return: for each of :data:`SPLITS` that the run has, its episodes' ``J_r``, ``M_c`` and, of
-        several costs, ``M_c/<key>``: of training those of the last ten epochs, if no wrapper ended
-        them early. Runs of older versions have no final ones
+        several costs or a limit on the worst step, ``M_c/<name>``: of training those of the last
+        ten epochs, if no wrapper ended them early. Runs of older versions have no final ones
     :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
     """
     result = json.loads((Path(path) / "result.json").read_bytes())
-    splits = {}
+    splits, limit_on = {}, result.get("limit_on", "sum")
     if not result.get("cut"):
         splits["training"] = last_epochs(read_episodes(path), epoch).filter(regex="^(J_r|M_c)")
     for split, episodes in result.get("final", {}).items():
-        keys = {} if "limit_on" in result else episodes.get("bounded", {})
-        costs = {"M_c": episodes["costs"], **{f"M_c/{key}": keys[key] for key in keys}}
+        bounded = episodes.get("bounded", {}).items()
+        keys = {f"M_c/{bounded_name(key, limit_on)}": costs for key, costs in bounded}
+        costs = {"M_c": episodes["costs"], **keys}
         # NaN: a physics error ended it
         splits[split] = pd.DataFrame({"J_r": episodes["returns"], **costs}, dtype=float)
     return splits

@@ -113,7 +113,7 @@ def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
     """
     groups = runs.groupby(["suite", "algo"], sort=False)
     stated = runs.filter(regex="^(label|family|limits|cost_limit)").columns
-    measured = [*METRICS, *runs.filter(regex="^M_c/"), *(name for name in SAFETY if name in runs)]
+    measured = [*METRICS, *runs.filter(regex="^M_c/|^delivered$"), *runs.filter(SAFETY)]
     table = pd.concat(
         [
             groups[list(stated)].first(),

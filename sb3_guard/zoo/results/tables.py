@@ -165,6 +165,11 @@ def _limits(splits: pd.DataFrame) -> Callable[[Any], str]:
     return cell
 
 
+def _delivered(row: Any) -> str:
+    """A cell with the share of runs that ended with a certified agent; a dash: none tried."""
+    return "–" if pd.isna(row["delivered"]) else f"{row['delivered']:.0%}"
+
+
 SAFETY_HEADINGS: Columns = {
     "return, last epochs": _deviation("return_last"),
     "cost, last epochs": _deviation("cost_last"),
@@ -215,6 +220,7 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
                 "seeds": whole("seeds"),
                 "steps": whole("steps"),
                 **means,
+                **({"delivered": _delivered} if data.runs["delivered"].notna().any() else {}),
             },
         ),
         "Safety": spelled(data.means, {**who, **SAFETY_HEADINGS}),

@@ -17,9 +17,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 import sb3_guard
 from sb3_guard.algorithms.common.costs import limits_at
 from sb3_guard.checks import NumberError
-from sb3_guard.common.evaluation import bounded_name
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
-from sb3_guard.costs import beside, estimate, verdict
+from sb3_guard.costs import beside, bounded_name, estimate
 from sb3_guard.zoo.run.folder import EPOCH
 
 DIVERGED = 10  # episodes in a row that a physics error ended, after which training stops
@@ -163,23 +162,20 @@ class Epochs(BaseCallback):
         constrained = getattr(model, "constrained", False)
         limits = model.final_cost_limits.tolist() if constrained else [None] * len(keys)
         known = ~np.isnan(self.last[:, 1])  # the cost of those that a physics error ended is not
-        episodes, diverged = self.last[known], int((~known).sum())
-        means = episodes.mean(axis=0).tolist() if len(episodes) else [None] * (3 + len(keys))
-        costs = {}
-        for i, (key, limit) in enumerate(zip(keys, limits, strict=True), 3):
-            cost: dict[str, Any] = {"mean": means[i], "limit": limit}
-            if len(episodes) and not np.isnan((interval := estimate(episodes[:, i])).low):
-                cost |= {"low": interval.low, "high": interval.high}
-                if limit is not None and not self.cut:
-                    cost["verdict"] = verdict(interval.low, interval.high, limit, diverged)
-            if diverged:
-                cost["physics_errors"] = diverged
-            costs[key] = cost
+        episodes = self.last[known]
+        means = episodes[:, :3].mean(axis=0).tolist() if len(episodes) else [None] * 3
+        bounded = self.last[:, 3:].T if len(self.last) else np.zeros((len(keys), 0))
+        costs = {
+            key: estimate(values).judged(limit)
+            for key, values, limit in zip(keys, bounded, limits, strict=True)
+        }
+        for cost in costs.values() if self.cut else ():
+            cost.pop("verdict", None)
         rate = monitor.total_cost / monitor.total_steps if monitor.total_steps else None
         return {
             "label": getattr(model, "label", None),
             "family": getattr(model, "family", None),
-            **dict(zip(("return", "cost", "length"), means, strict=False)),
+            **dict(zip(("return", "cost", "length"), means, strict=True)),
             "costs": costs,
             "episodes": len(episodes),
             "cost_rate": rate,

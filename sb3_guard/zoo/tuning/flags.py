@@ -4,16 +4,12 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from sb3_guard.zoo.cli.flags import flag
-from sb3_guard.zoo.cli.usage import (
-    UsageError,
-)
 from sb3_guard.zoo.run.flags import TrainingFlags
 
 EXAMPLES = """examples:
   sb3-guard tune --algo trpo_lag --env Goal_Point_8Hazards --n-trials 50 -n 1e6
   sb3-guard tune --algo cpo --env Goal_Point_8Hazards -params cost_limit:5 --n-jobs 2
   sb3-guard tune --algo cpo --env Goal_Point_8Hazards --seeds 0 1 2 --pruner halving
-  sb3-guard tune --algo cpo --env Goal_Point_8Hazards --pareto --study-name trade-off
   sb3-guard tune ... --storage postgresql://me:secret@server/studies
 
 The same command continues a study that was stopped, and joins a study that is running: --n-trials
@@ -32,7 +28,6 @@ class TuneFlags(TrainingFlags):
     :param env: environment id; the version may be left out (default: Goal_Point_8Hazards)
     :param cost_limit: highest episode cost of a feasible trial, one for all costs or one per cost
         (default: selection_limit of the hyperparameters, else their cost_limit, but at least 1)
-    :param pareto: search for the best return at every cost; the limit is only drawn
     :param search_space: YAML file of ranges and lists to search (default: the algorithm's search
         space)
 
@@ -66,7 +61,6 @@ class TuneFlags(TrainingFlags):
     algo: str = flag(default="cpo")
     env: str = flag(default="Goal_Point_8Hazards-v0")
     cost_limit: list[float] | None = flag(low=0, metavar="D")
-    pareto: bool = flag(default=False)
     search_space: str | None = flag(metavar="FILE")
 
     n_trials: int = flag("--max-total-trials", default=50, low=1, metavar="N")
@@ -84,14 +78,3 @@ class TuneFlags(TrainingFlags):
     n_jobs: int = flag(default=1, low=1, metavar="N")
     num_threads: int = flag(default=1, low=1, metavar="N")
     verbose: Literal[0, 1, 2] = flag(default=1)
-
-    def check(self) -> None:
-        """
-        What can be said before anything heavy is imported.
-
-        :raises UsageError: two flags contradict each other
-        """
-        if len(set(self.seeds)) < len(self.seeds):
-            raise UsageError(f"--seeds {' '.join(map(str, self.seeds))}: a seed is given twice")
-        if self.pareto and self.pruner != "none" and "pruner" in self.given:
-            raise UsageError("--pruner: there is no pruning with --pareto; leave it out")

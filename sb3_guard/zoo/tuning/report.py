@@ -1,4 +1,4 @@
-"""What tuning leaves behind: the best as a file that ``train`` reads, a table, and pictures."""
+"""What tuning leaves behind: the best as a file that ``train`` reads, and a table."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -47,21 +47,14 @@ class Report:
         self.keys: list[str] = settings["cost_keys"]
 
     def write(self, study: optuna.Study) -> None:
-        """Write ``trials.csv`` and ``best.yml``, and a file for each trial of the front."""
-        files = {"best.yml": best(study.get_trials(deepcopy=False))}
-        if self.settings["pareto"]:
-            files |= {f"pareto/trial_{trial.number}.yml": trial for trial in study.best_trials}
+        """Write ``trials.csv`` and ``best.yml``."""
+        trial = best(study.get_trials(deepcopy=False))
         with FileLock(self.folder / ".report.lock"):
             with replacing(self.folder / "trials.csv") as file:
                 file.write(self.table(study).encode())
-            for path in self.folder.glob("pareto/*.yml"):
-                if f"pareto/{path.name}" not in files:
-                    path.unlink(missing_ok=True)
-            for name, trial in files.items():
-                if trial is not None:
-                    (self.folder / name).parent.mkdir(exist_ok=True)
-                    with replacing(self.folder / name) as file:
-                        file.write(self.hyperparams(trial, name).encode())
+            if trial is not None:
+                with replacing(self.folder / "best.yml") as file:
+                    file.write(self.hyperparams(trial).encode())
 
     def table(self, study: optuna.Study) -> str:
         """A row per trial as comma-separated values: how it ended, its result, what it tried."""
@@ -88,7 +81,7 @@ class Report:
         verdict = [f"{short(over)} over the limit" if over else "within the limit"] * limited
         return ", ".join([f"return {short(result['return'])}", *costs, *verdict])
 
-    def hyperparams(self, trial: FrozenTrial, name: str) -> str:
+    def hyperparams(self, trial: FrozenTrial) -> str:
         """A trial's hyperparameters as a file for ``train -conf``."""
         settings = self.settings
         seeds = " ".join(map(str, settings["seeds"]))
@@ -96,15 +89,15 @@ class Report:
         return (
             f"# Trial {trial.number} of tuning {settings['algo']} on {settings['env']}:\n"
             f"# {self.outcome(trial)} ({settings['n_timesteps']:,} steps, --seeds {seeds}).\n"
-            f"# Train with: {self.command(name)}\n"
+            f"# Train with: {self.command()}\n"
             + yaml.safe_dump(values, default_flow_style=None, allow_unicode=True)
         )
 
-    def command(self, name: str) -> str:
-        """The command line that trains with one of the files."""
+    def command(self) -> str:
+        """The command line that trains with the best."""
         flags = ["--algo", self.settings["algo"], "--env", self.settings["env"]]
         flags += ["--gym-packages", *self.packages] if self.packages else []
-        return shlex.join(["sb3-guard", "train", *flags, "-conf", str(self.folder / name)])
+        return shlex.join(["sb3-guard", "train", *flags, "-conf", str(self.folder / "best.yml")])
 
     def line(self, trial: FrozenTrial) -> str:
         """A finished trial in one line."""
@@ -133,30 +126,5 @@ class Report:
                     "is that of least violation."
                 )
         lines.append(f"  best         trial {top.number}: {self.outcome(top)}")
-        if self.settings["pareto"]:
-            lines.append(f"  front        {self.folder / 'pareto'}/trial_N.yml")
-            front = sorted(study.best_trials, key=lambda trial: -trial.values[0])
-            lines += [f"               trial {t.number}: {self.outcome(t)}" for t in front]
-        lines.append(f"  train with   {self.command('best.yml')}")
+        lines.append(f"  train with   {self.command()}")
         return "\n".join(lines)
-
-    def plot(self, study: optuna.Study) -> None:
-        """Draw return against each cost, Optuna's picture of the front, in ``pareto.png``."""
-        if best(study.get_trials(deepcopy=False)) is None:
-            return
-        import matplotlib
-
-        matplotlib.use("agg")  # of a file; there may be no display
-        import matplotlib.pyplot as plt
-        from optuna.visualization.matplotlib import plot_pareto_front
-
-        for key in self.keys:
-
-            def place(trial: FrozenTrial, key: str = key) -> list[float]:
-                return [trial.user_attrs["result"][name] for name in (key, "return")]
-
-            names = [f"episode {key}", "return"]
-            plot_pareto_front(study, targets=place, target_names=names)
-            name = "pareto.png" if len(self.keys) == 1 else f"pareto_{key}.png"
-            plt.savefig(self.folder / name, dpi=150)
-            plt.close()

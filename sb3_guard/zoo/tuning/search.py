@@ -20,7 +20,7 @@ import optuna
 from optuna.exceptions import ExperimentalWarning
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.storages import JournalStorage
-from optuna.study import MaxTrialsCallback, StudyDirection
+from optuna.study import MaxTrialsCallback
 from optuna.trial import FrozenTrial
 
 from sb3_guard.zoo.cli.usage import UsageError, interrupts, interrupts_held, run
@@ -46,6 +46,8 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     :return: the flags of a training, and what the study is
     :raises UsageError: something is wrong with the flags
     """
+    if len(set(flags.seeds)) < len(flags.seeds):
+        raise UsageError(f"--seeds {' '.join(map(str, flags.seeds))}: a seed is given twice")
     fixed = dict(flags.hyperparams or {})
     hyperparams = dict(fixed)
     if flags.cost_limit is not None:
@@ -77,13 +79,12 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         eval_episodes=flags.eval_episodes,
         cost_keys=list(run.cost_keys),
         cost_limit=limits if np.isfinite(limits).all() else None,
-        pareto=flags.pareto,
     )
     return run.flags, settings, search
 
 
 def _pruner(flags: TuneFlags, settings: Settings) -> BasePruner:
-    if flags.pruner == "none" or settings.pareto:
+    if flags.pruner == "none":
         return NopPruner()
     if flags.pruner == "halving":
         return SuccessiveHalvingPruner(min_resource=1, reduction_factor=4)
@@ -100,18 +101,15 @@ def open_study(
     :param shown: address of the storage, for the message
     :raises UsageError: it was begun with other settings
     """
-    directions = [StudyDirection.MAXIMIZE]
-    if settings.pareto:
-        directions += [StudyDirection.MINIMIZE] * len(settings.cost_keys)
     study = optuna.create_study(
         storage=storage,
         study_name=name,
-        directions=directions,
+        direction="maximize",
         pruner=_pruner(flags, settings),
         load_if_exists=True,
     )
     saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
-    if saved is None and (begun or study.directions != directions):
+    if saved is None and begun:
         raise UsageError(
             f"{shown} has a study {name!r} that is not one of sb3_guard's; "
             "choose another --study-name"
@@ -198,7 +196,6 @@ def _tune(flags: TuneFlags, main: bool) -> int:
                 time.sleep(0.2)
     if main:
         report.write(study)
-        report.plot(study)
         if loud:
             print(report.summary(study))
             if received:
@@ -233,9 +230,7 @@ def _header(
     flags: TuneFlags, settings: Settings, study: optuna.Study, folder: Path, shown: str
 ) -> str:
     finished = len(study.get_trials(deepcopy=False, states=FINISHED))
-    if settings.pareto:
-        goal = "the trade-off of return and episode cost"
-    elif settings.cost_limit is None:
+    if settings.cost_limit is None:
         goal = f"the highest return ({settings.algo} has no cost limit; --cost-limit sets one)"
     else:
         limits = zip(settings.cost_limit, settings.cost_keys, strict=True)

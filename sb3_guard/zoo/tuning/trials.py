@@ -49,7 +49,6 @@ class Settings:
     :param eval_episodes: episodes per evaluation with each kind of actions
     :param cost_keys: entries of info that are costs
     :param cost_limit: highest feasible episode cost, one per cost key; None: no constraint
-    :param pareto: search the trade-off of return and cost instead
     """
 
     algo: str
@@ -62,7 +61,6 @@ class Settings:
     eval_episodes: int
     cost_keys: list[str]
     cost_limit: list[float] | None
-    pareto: bool
 
     def outcome(self, mean: Sequence[float]) -> dict[str, float]:
         """Return, costs by key, and by how much they exceed their limits in all."""
@@ -134,7 +132,7 @@ class Evaluations(BaseCallback):
 
 class Objective:
     """
-    What Optuna optimises: a trial's hyperparameters to its return, or return and costs.
+    What Optuna optimises: a trial's hyperparameters to its return.
 
     :param flags: of the command
     :param training: of each training but for its seed
@@ -153,11 +151,11 @@ class Objective:
         parent = multiprocessing.parent_process()
         return self.stop or (parent is not None and not parent.is_alive())
 
-    def __call__(self, trial: optuna.Trial) -> float | list[float]:
+    def __call__(self, trial: optuna.Trial) -> float:
         """
         Train an agent for each seed.
 
-        :return: means over the seeds: return, and with ``pareto`` each episode cost
+        :return: mean over the seeds
         :raises optuna.TrialPruned: it compares badly, or its hyperparameters fail
         :raises Stopped: it is to be done again
         """
@@ -178,11 +176,11 @@ class Objective:
                 repeat(trial.study, trial.study.trials[trial.number], most=None)
             raise
         self.failures = 0
-        return mean if self.settings.pareto else mean[0]
+        return mean[0]
 
     def _constrain(self, trial: optuna.Trial, mean: Sequence[float] | None) -> None:
         """Tell the sampler by how much each cost is below its limit; once in a trial."""
-        if self.settings.cost_limit is None or self.settings.pareto:
+        if self.settings.cost_limit is None:
             return
         costs = [FAILED_VIOLATION] * len(self.settings.cost_keys) if mean is None else mean[1:]
         for key, cost, limit in zip(
@@ -202,8 +200,6 @@ class Objective:
             mean[:] = np.mean([rows[-1] for rows in [*finished, history]], axis=0).tolist()
             outcome = settings.outcome(mean)
             trial.set_user_attr("result", outcome)
-            if settings.pareto:
-                return True
             step = settings.n_evaluations * len(finished) + len(history)
             violation = outcome["violation"]
             trial.report(INFEASIBLE - violation if violation else mean[0], step)

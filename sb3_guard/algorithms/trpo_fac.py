@@ -53,17 +53,9 @@ class StateMultiplier(nn.Module):
                 nn.init.constant_(last, init + np.log(-np.expm1(-init)))
         self.optimizer = th.optim.Adam(self.parameters(), lr=rate)
 
-    def forward(self, observations: PyTorchObs) -> th.Tensor:
-        """Multipliers at observations, shape [B, m]."""
-        return F.softplus(self.outputs(observations))
-
-    def outputs(self, observations: PyTorchObs) -> th.Tensor:
-        """The arguments of the softplus, shape [B, m]."""
-        return th.cat([network(observations) for network in self.networks], dim=1)
-
     @th.no_grad()
     def predict(self, observations: PyTorchObs) -> th.Tensor:
-        """:meth:`forward` without gradients, in slices that bound the memory."""
+        """Multipliers at observations, shape [B, m], in slices that bound the memory."""
         each = [network.predict(observations) for network in self.networks]  # type: ignore
         return F.softplus(th.cat(each, dim=1))
 
@@ -74,10 +66,9 @@ class StateMultiplier(nn.Module):
         :param excess: how far each state's cost is above its limit, shape [N, m]
         """
         self.optimizer.zero_grad(set_to_none=True)
-        self.networks.train(True)
         for index in chunks(len(excess)):
             part, above = rows(observations, index), excess[index]
-            moved = self.outputs(part)
+            moved = th.cat([network(part) for network in self.networks], dim=1)
             value = F.softplus(moved)
             above = th.where(value.detach() > self.maximum, -above.abs(), above)
             if self.ascent == "value":
@@ -86,7 +77,6 @@ class StateMultiplier(nn.Module):
                 above = above * ((above > 0.0) | (moved.detach() > LOWEST))
             gain = (moved * above).sum() / len(excess)
             (-gain).backward()
-        self.networks.train(False)
         self.optimizer.step()
 
 

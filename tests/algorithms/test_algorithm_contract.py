@@ -18,7 +18,6 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecEnv,
@@ -38,7 +37,6 @@ from sb3_guard.algorithms import (
     PPOLag,
     TrustRegion,
 )
-from sb3_guard.algorithms.common.actor import kl
 from sb3_guard.algorithms.common.lagrangian import Lagrangian
 from sb3_guard.costs import read_costs
 
@@ -149,49 +147,6 @@ def test_layers_of_the_cost_critic(cls: type[Any], critic: str) -> None:
     assert 17 in widths(model.policy) and 19 not in widths(model.policy)
     model = small(cls, points(), policy_kwargs={"net_arch": arch})
     assert 17 in widths(model.cost_critic)
-
-
-class _Normed(FlattenExtractor):
-    """Layers that behave in another way while a network is fitted."""
-
-    def __init__(self, observation_space: spaces.Space) -> None:
-        super().__init__(observation_space)
-        self.norm = th.nn.BatchNorm1d(self.features_dim)
-        self.dropout = th.nn.Dropout(0.5)
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.dropout(self.norm(super().forward(observations)))
-
-
-@pytest.mark.parametrize("share", [True, False])
-def test_batch_norm_and_dropout_act_while_fitting_alone(share: bool) -> None:
-    """And in the critics alone: the actor changes by its step, of the KL that is logged."""
-    kwargs = {
-        "features_extractor_class": _Normed,
-        "share_features_extractor": share,
-        "log_std_init": -1.0,
-    }
-    model = small(CPO, points(2, hazard=(-1.0, 0.0)), policy_kwargs=kwargs)
-    train = model.train
-
-    def spy() -> None:
-        before = copy.deepcopy(model.policy)
-        observations = th.as_tensor(model.rollout_buffer.observations.reshape(-1, 4))
-        train()
-        assert not any(module.training for module in model.policy.modules())
-        logged = model.logger.name_to_value
-        assert logged["train/line_search_step"] > 0.0
-        pair = [each.get_distribution(observations) for each in (before, model.policy)]
-        assert kl(*pair).mean().item() == pytest.approx(logged["train/kl"], rel=1e-3)
-
-    model.train = spy
-    model.learn(240)
-    batches = model.policy.vf_features_extractor.norm.num_batches_tracked
-    assert batches == (0 if share else 9)
-    assert model.policy.pi_features_extractor.norm.num_batches_tracked == 0
-    assert model.cost_critic.features_extractor.norm.num_batches_tracked == 9
-    values = [model.cost_critic.predict(th.ones(3, 4)) for _ in range(2)]
-    assert th.equal(*values)
 
 
 # Environments

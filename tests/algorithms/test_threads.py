@@ -1,7 +1,5 @@
 """Threads that share an update: the same sums, in the same order, and torch left as it was."""
 
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -12,7 +10,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_guard import TRPO
 from sb3_guard.algorithms.common.batches import CHUNK
 from sb3_guard.algorithms.common.critics import Regression
-from sb3_guard.algorithms.fast import threads as fast_threads
 from sb3_guard.algorithms.fast.actor import TanhActor, actor_of
 from sb3_guard.algorithms.fast.threads import accumulate
 
@@ -57,22 +54,6 @@ def test_an_error_in_any_thread_is_raised_and_threads_restored(broken: int) -> N
     with pytest.raises(FloatingPointError, match=str(broken)):
         accumulate(add, 4, [th.zeros(1)])
     assert th.get_num_threads() == 2
-
-
-def test_training_goes_on_in_a_thread_when_the_main_one_has_ended() -> None:
-    code = f"""
-import runpy, threading, time, torch as th
-# Without the rest of the package, which takes long to import.
-accumulate = runpy.run_path({fast_threads.__file__!r})["accumulate"]
-th.set_num_threads(2)
-def work():
-    threading.main_thread().join()
-    time.sleep(0.2)
-    print(accumulate(lambda i, sums: float(i), 5, [th.zeros(1)])[1])
-threading.Thread(target=work).start()
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    assert done.stdout.strip() == "10.0", done.stderr
 
 
 def quantities(threads: int, env: str) -> np.ndarray:

@@ -25,7 +25,7 @@ from sb3_guard.algorithms.common.actor import (
     kl,
     value_parameters,
 )
-from sb3_guard.algorithms.common.batches import CHUNK, chunks
+from sb3_guard.algorithms.common.batches import CHUNK
 from sb3_guard.algorithms.common.critics import CostCritic, Regression
 from sb3_guard.algorithms.common.vectors import assign, flatten
 from sb3_guard.algorithms.fast.actor import TanhActor, actor_of, distribution_of, tanh_actor
@@ -87,17 +87,6 @@ def _columns(actor: Actor, policy: ActorCriticPolicy) -> th.Tensor:
         starts[id(parameter)] = position
         position += parameter.numel()
     return th.cat([th.arange(p.numel()) + starts[id(p)] for p in actor.parameters])
-
-
-@pytest.mark.parametrize("n", [1, 10, 11, 21])
-def test_no_row_is_left_alone(n: int) -> None:
-    """Batch normalisation does not learn from one."""
-    slices = chunks(n, size=10)
-    sizes = [s.stop - s.start for s in slices]
-    assert min(sizes) > 1 or n == 1
-    assert max(sizes) <= 11
-    covered = [row for s in slices for row in range(s.start, s.stop)]
-    assert covered == list(range(n))
 
 
 @pytest.mark.parametrize("n", [50, CHUNK + 1])
@@ -263,16 +252,16 @@ def test_value_regression_moves_the_value_network_alone() -> None:
 
 
 def test_critics_are_fitted_to_discounted_returns(monkeypatch: pytest.MonkeyPatch) -> None:
-    fitted: list[tuple[nn.Module, np.ndarray]] = []
+    fitted: list[tuple[Any, np.ndarray]] = []
 
     def fit(self: Regression, batch: Any, targets: th.Tensor, *_: Any) -> float:
-        fitted.append((self.module, targets.numpy().copy()))
+        fitted.append((self.optimizer, targets.numpy().copy()))
         return 0.0
 
     monkeypatch.setattr(Regression, "fit", fit)
     model = _toy(CPO).learn(200)
     (policy, values), (critic, costs) = fitted
-    assert policy is model.policy and critic is model.cost_critic
+    assert policy is model.policy.optimizer and critic is model.cost_critic.optimizer
     buffer = model.rollout_buffer
     np.testing.assert_array_equal(values, buffer.returns.reshape(-1, 1))
     np.testing.assert_array_equal(costs, buffer.cost_returns)

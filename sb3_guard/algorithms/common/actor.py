@@ -16,7 +16,6 @@ from stable_baselines3.common.distributions import Distribution, kl_divergence
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import obs_as_tensor
-from torch import nn
 
 from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
@@ -37,27 +36,10 @@ def _reached(output: th.Tensor, policy: ActorCriticPolicy) -> list[th.Tensor]:
 
 def actor_parameters(policy: ActorCriticPolicy) -> list[th.Tensor]:
     """The parameters that the action distribution depends on, found by differentiating it."""
-    policy.set_training_mode(False)  # of one observation there is nothing to normalise by
+    policy.set_training_mode(False)  # batch normalisation refuses one observation
     observation = _zero_observation(policy)
     distribution = policy.get_distribution(observation)
     return _reached(distribution.log_prob(distribution.get_actions(deterministic=True)), policy)
-
-
-def actor_modules(policy: ActorCriticPolicy) -> list[nn.Module]:
-    """The modules that compute the action distribution, found by calling them."""
-    policy.set_training_mode(False)
-    called: list[nn.Module] = []
-    hooks = [
-        module.register_forward_hook(lambda module, *_: called.append(module))
-        for module in policy.modules()
-    ]
-    try:
-        with th.no_grad():
-            policy.get_distribution(_zero_observation(policy))
-    finally:
-        for hook in hooks:
-            hook.remove()
-    return called
 
 
 def value_parameters(policy: ActorCriticPolicy) -> list[th.Tensor]:

@@ -10,14 +10,8 @@ CHUNK = 2048
 
 
 def chunks(n_rows: int, size: int = CHUNK) -> list[slice]:
-    """Consecutive slices that cover ``n_rows`` rows; a last row of its own joins the one before.
-
-    Batch normalisation refuses to learn from one row.
-    """
-    slices = [slice(start, min(start + size, n_rows)) for start in range(0, n_rows, size)]
-    if len(slices) > 1 and n_rows % size == 1:
-        slices[-2:] = [slice(slices[-2].start, n_rows)]
-    return slices
+    """Consecutive slices that cover ``n_rows`` rows."""
+    return [slice(start, min(start + size, n_rows)) for start in range(0, n_rows, size)]
 
 
 def rows(batch: Any, index: slice | th.Tensor) -> Any:

@@ -10,7 +10,6 @@ from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_guard.algorithms.common.advantage import discounted_returns, gae
-from sb3_guard.checks import check_choice
 
 
 class CostRolloutBufferSamples(NamedTuple):
@@ -59,7 +58,6 @@ class _Costs:
         returns: Literal["lambda", "discounted"] = "lambda",
         **kwargs: Any,
     ) -> None:
-        check_choice("returns", returns, "lambda", "discounted")
         self.targets = returns
         self.n_costs = n_costs
         self.cost_gamma = cost_gamma

@@ -1,7 +1,6 @@
 """Networks, separate from the policy, that learn from costs, and the regression that fits them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -14,7 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.actor import actor_modules, value_parameters
+from sb3_guard.algorithms.common.actor import value_parameters
 from sb3_guard.algorithms.common.batches import chunks, n_rows, rows
 from sb3_guard.algorithms.fast.actor import parameterless
 from sb3_guard.algorithms.fast.mlp import TanhMlp, squared_error
@@ -49,7 +48,7 @@ class StateNetwork(nn.Module):
             self.network[:-1].apply(partial(policy.init_weights, gain=np.sqrt(2)))
             self.network[-1].apply(partial(policy.init_weights, gain=1.0))
         self.to(policy.device)
-        self.train(False)  # but while it is fitted
+        self.train(False)
         self.optimizer = policy.optimizer_class(
             self.parameters(),
             lr=policy.optimizer.param_groups[0]["lr"],  # type: ignore[call-arg]
@@ -89,57 +88,54 @@ class CostCritic(StateNetwork):
     """Expected discounted cost-to-go V_c(s), one output per constraint."""
 
 
-@dataclass
 class Regression:
     """Least-squares fit of a network to a batch, full-batch by default.
 
-    A batch is observations, or a tuple of observations and whatever else ``values`` takes. Layers
-    that behave in another way during training, such as batch normalisation, do so here alone, and
-    those of the actor not even here: the policy that a trust region is about is the one that acted.
+    A batch is observations, or a tuple of observations and whatever else ``inputs`` takes. Layers
+    such as batch normalisation stay as they are in evaluation: the policy that a trust region is
+    about is the one that acted.
 
-    :param module: the policy or network that is fitted
-    :param values: maps a batch to predictions, shape [B, m]
+    :param extractor: what the features come from
+    :param layers: the modules of a network, of which a tanh network is passed through in
+        ``fast/mlp.py`` where the extractor has no parameters
+    :param inputs: maps a batch to the input of the layers
     :param parameters: what may move
     :param optimizer: moves them, whatever else it could move
-    :param inputs: maps a batch to the input of a tanh network, where ``values`` is one
-    :param layers: the layers of that network
-    :param readout: maps the network's outputs and the batch to predictions; None: they are equal
-    :param still: submodules of ``module`` that behave as in evaluation all the same
+    :param values: maps a batch to predictions, shape [B, m]; None: by the layers alone
+    :param readout: maps the layers' outputs and the batch to predictions; None: they are equal
     """
 
-    module: nn.Module
-    values: Callable[[Any], th.Tensor]
-    parameters: Sequence[th.Tensor]
-    optimizer: th.optim.Optimizer
-    inputs: Callable[[Any], th.Tensor] | None = None
-    layers: Sequence[nn.Linear] | None = None
-    readout: Callable[[th.Tensor, Any], th.Tensor] | None = None
-    still: Sequence[nn.Module] = ()
-
-    def __post_init__(self) -> None:
-        self.network = None if self.layers is None else TanhMlp(self.layers)
+    def __init__(
+        self,
+        extractor: nn.Module,
+        layers: Sequence[nn.Module],
+        inputs: Callable[[Any], th.Tensor],
+        parameters: Sequence[th.Tensor],
+        optimizer: th.optim.Optimizer,
+        values: Callable[[Any], th.Tensor] | None = None,
+        readout: Callable[[th.Tensor, Any], th.Tensor] | None = None,
+    ) -> None:
+        self.inputs, self.parameters, self.optimizer = inputs, parameters, optimizer
+        self.readout = readout
+        last, chain = readout or (lambda outputs, batch: outputs), nn.Sequential(*layers)
+        self.values = values or (lambda batch: last(chain(inputs(batch)), batch))
+        fast = parameters[0].device.type == "cpu" and parameterless(extractor)
+        self.network = TanhMlp.of(layers) if fast else None
 
     @classmethod
     def of_value(cls, policy: ActorCriticPolicy) -> "Regression":
         """The policy's own critic; what it shares with the actor stays still."""
-        parameters = value_parameters(policy)
-        standard = type(policy).predict_values is ActorCriticPolicy.predict_values
         extractor = policy.vf_features_extractor
-        layers = None
-        if (
-            standard
-            and policy.device.type == "cpu"
-            and type(policy.mlp_extractor) is MlpExtractor
-            and parameterless(extractor)
-        ):
-            layers = TanhMlp.layers([*policy.mlp_extractor.value_net, policy.value_net])
+        standard = type(policy).predict_values is ActorCriticPolicy.predict_values
+        layers: list[nn.Module] = []  # of another kind of critic nothing is known
+        if standard and type(policy.mlp_extractor) is MlpExtractor:
+            layers = [*policy.mlp_extractor.value_net, policy.value_net]
 
         def features(observations: PyTorchObs) -> th.Tensor:
             return super(ActorCriticPolicy, policy).extract_features(observations, extractor)
 
-        values = policy.predict_values
-        still = actor_modules(policy)
-        return cls(policy, values, parameters, policy.optimizer, features, layers, None, still)
+        moving = value_parameters(policy)
+        return cls(extractor, layers, features, moving, policy.optimizer, policy.predict_values)
 
     @classmethod
     def of_network(
@@ -154,21 +150,13 @@ class Regression:
             observations
         :param readout: see :class:`Regression`
         """
-        first = inputs or network.extract_features
-        last = readout or (lambda outputs, batch: outputs)
-        layers = None
-        if next(network.parameters()).device.type == "cpu" and parameterless(
-            network.features_extractor
-        ):
-            layers = TanhMlp.layers([*network.network])
         return cls(
-            network,
-            lambda batch: last(network.network(first(batch)), batch),
+            network.features_extractor,
+            [*network.network],
+            inputs or network.extract_features,
             list(network.parameters()),
             network.optimizer,
-            first,
-            layers,
-            readout,
+            readout=readout,
         )
 
     def fit(
@@ -190,13 +178,9 @@ class Regression:
         """
         n, inputs = len(targets), None
         if self.network is not None:
-            assert self.inputs is not None
             with th.no_grad():
                 inputs = self.inputs(batch)
         self.optimizer.zero_grad(set_to_none=True)
-        self.module.train(True)
-        for module in self.still:
-            module.training = False
         loss = 0.0
         for _ in range(n_epochs):
             if batch_size is None or batch_size >= n:
@@ -211,7 +195,6 @@ class Regression:
                 error = self._gradients(rows(batch, index), targets[index], part)
                 loss += error * len(index) / n
                 self.optimizer.step()
-        self.module.train(False)
         return loss
 
     def _gradients(self, batch: Any, targets: th.Tensor, inputs: th.Tensor | None) -> float:

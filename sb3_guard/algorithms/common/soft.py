@@ -1,5 +1,6 @@
 """SAC's gradient step with costs, which SAC- and TQC-Lagrangian share."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -43,15 +44,7 @@ class SoftActorCritic(CostReplay):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        text = str(self.ent_coef)
-        if text in ("auto", "auto_reward"):
-            return
-        try:
-            start = float(text.removeprefix("auto_"))
-        except ValueError:
-            start = np.nan
-        least = np.nextafter(0.0, 1.0) if text.startswith("auto_") else 0.0
-        if not least <= start < np.inf:
+        if not re.fullmatch(r"auto|auto_reward|(auto_)?\d*\.?\d+(e[+-]?\d+)?", str(self.ent_coef)):
             raise ValueError(
                 f"ent_coef={self.ent_coef!r}: must be a number of at least 0, 'auto' (learnt, from "
                 "1), 'auto_0.1' (learnt, from 0.1) or 'auto_reward' (from the size of the rewards)"

@@ -125,18 +125,6 @@ class TrustRegion(CostRollouts):
                 "takes at least two steps per update; raise n_steps"
             )
 
-    # Collecting
-
-    def _update_info_buffer(
-        self, infos: list[dict[str, Any]], dones: np.ndarray | None = None
-    ) -> None:
-        super()._update_info_buffer(infos, dones)
-        if self.gamma == 1.0:
-            # Undiscounted, a return is a finite sum, as an episode's cost is: SB3, which comes to
-            # it after this, is not to add the value of what might follow a time-out.
-            for info in infos:
-                info["TimeLimit.truncated"] = False
-
     # Updating
 
     def train(self) -> None:

@@ -39,8 +39,8 @@ def parameterless(extractor: nn.Module) -> bool:
     )
 
 
-def tanh_actor(policy: ActorCriticPolicy) -> list[nn.Linear] | None:
-    """The layers of a policy whose actor is exactly a tanh network, else None."""
+def tanh_actor(policy: ActorCriticPolicy) -> TanhMlp | None:
+    """The network of a policy whose actor is exactly a tanh network, else None."""
     standard = all(
         getattr(type(policy), name) is getattr(ActorCriticPolicy, name)
         for name in ("get_distribution", "extract_features", "_get_action_dist_from_latent")
@@ -62,15 +62,14 @@ def tanh_actor(policy: ActorCriticPolicy) -> list[nn.Linear] | None:
         policy.log_std.requires_grad and policy.log_std.dtype is th.float32
     ):
         return None
-    return TanhMlp.layers([*policy.mlp_extractor.policy_net, policy.action_net])
+    return TanhMlp.of([*policy.mlp_extractor.policy_net, policy.action_net])
 
 
 def distribution_of(policy: ActorCriticPolicy) -> Callable[[PyTorchObs], Distribution]:
     """``policy.get_distribution``, in the fastest way that is exact for this policy."""
-    layers = tanh_actor(policy)
-    if layers is None or policy.device.type != "cpu":
+    network, head = tanh_actor(policy), policy.action_dist
+    if network is None or policy.device.type != "cpu":
         return policy.get_distribution
-    network, head = TanhMlp(layers), policy.action_dist
     gaussian = isinstance(head, DiagGaussianDistribution)
 
     def distribution(observations: PyTorchObs) -> Distribution:
@@ -87,11 +86,10 @@ class TanhActor(Actor):
     """:class:`Actor` of a tanh network: the same numbers from cached activations."""
 
     def _parameters(self) -> list[th.Tensor]:
-        layers = tanh_actor(self.policy)
-        assert layers is not None
-        self.network = TanhMlp(layers)
+        policy, network = self.policy, tanh_actor(self.policy)
+        assert network is not None
+        self.network = network
         with th.no_grad():
-            policy = self.policy
             features = [
                 super(ActorCriticPolicy, policy).extract_features(
                     rows(self.observations, index), policy.pi_features_extractor

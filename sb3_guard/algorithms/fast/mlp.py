@@ -46,24 +46,23 @@ class TanhMlp:
         for layer in layers:
             self.parameters += [layer.weight, layer.bias]
 
-    @staticmethod
-    def layers(modules: Sequence[nn.Module]) -> list[nn.Linear] | None:
-        """The linear layers of a chain of modules, or None if it is no tanh network.
+    @classmethod
+    def of(cls, modules: Sequence[nn.Module]) -> "TanhMlp | None":
+        """A view of a chain of modules, or None if it is no tanh network.
 
         Exact types are asked for: a subclass may compute something else.
         """
-        linear, activations = modules[0::2], modules[1::2]
-        plain = len(modules) % 2 == 1 and all(type(module) is nn.Tanh for module in activations)
-        found = [
+        linear = [
             module
-            for module in linear
+            for module in modules[0::2]
             if type(module) is nn.Linear
             and module.bias is not None
             and module.weight.dtype is th.float32
             and module.weight.requires_grad
             and module.bias.requires_grad
         ]
-        return found if plain and len(found) == len(linear) else None
+        plain = all(type(module) is nn.Tanh for module in modules[1::2])
+        return cls(linear) if plain and len(modules) == 2 * len(linear) - 1 else None
 
     def _pairs(self, tensors: Sequence[th.Tensor]) -> list[tuple[th.Tensor, th.Tensor]]:
         return list(zip(tensors[0::2], tensors[1::2], strict=True))

@@ -8,7 +8,6 @@ and they meet once when all are done. Small operations, as in a rollout, stay on
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
 
 import torch as th
 
@@ -49,15 +48,10 @@ def accumulate(
         if not others:
             return part(first)
         with ThreadPoolExecutor(len(others)) as pool:
-            jobs: list[Callable[[], tuple[list[th.Tensor], float]]] = []
-            for numbers in others:
-                try:
-                    jobs.append(pool.submit(part, numbers).result)
-                except RuntimeError:  # no thread can be started, as when the main one has ended
-                    jobs.append(partial(part, numbers))
+            jobs = [pool.submit(part, numbers) for numbers in others]
             sums, number = part(first)
             for job in jobs:
-                more, another = job()
+                more, another = job.result()
                 number += another
                 for total, each in zip(sums, more, strict=True):
                     total.add_(each)

@@ -56,7 +56,6 @@ class TRPOSL(FilteredTrustRegion):
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
         layer = self.policy.action_filter
-        assert isinstance(layer, SafetyLayer)
         self._set_threshold(self.costs.limits / self.costs.horizon)
         costly = (batch.costs != 0.0).any(dim=1)
         some, none = costly.nonzero().flatten(), (~costly).nonzero().flatten()

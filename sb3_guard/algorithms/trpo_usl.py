@@ -26,9 +26,8 @@ class TRPOUSL(FilteredTrustRegion):
     λ = ``cost_gae_lambda``, and unit_i the largest root mean square yet of a rollout's costs of a
     step that are not zero. It can't learn costs below zero. With λ = 0 the target is
     ``c + γ Q(s', a')``, a' the action executed next, as in GUARD; fitted once per update, such a
-    critic needs hundreds of updates to forget where it started. ``kappa`` adds the paper's exact
-    penalty: the policy then ascends ``E[ratio · (A - κ h(s, a))]``, whose gradient is that of the
-    expected penalty of the sampled actions.
+    critic needs hundreds of updates to forget where it started. The paper's exact penalty is left
+    out, as in GUARD.
 
     :param learning_rate: of the critic and the cost Q-critic
     :param threshold: highest discounted cost to come that is not corrected; one number or one per
@@ -38,7 +37,6 @@ class TRPOUSL(FilteredTrustRegion):
         softplus never is zero
     :param steps: K
     :param rate: η, in units of the action space, which runs from -1 to 1
-    :param kappa: weight of the exact penalty; 0 for none, as in GUARD
     """
 
     label, family, paper = "TRPO-USL", "hierarchical", "Zhang et al. 2022"
@@ -52,7 +50,6 @@ class TRPOUSL(FilteredTrustRegion):
     tolerance: float = hyperparameter(0.05)
     steps: int = hyperparameter(20)
     rate: float = hyperparameter(0.05, ends="()")
-    kappa: float = hyperparameter(0.0)
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -62,26 +59,13 @@ class TRPOUSL(FilteredTrustRegion):
         )
         self._set_threshold(np.full(len(self.cost_keys), self.tolerance))
 
-    @property
-    def _layer(self) -> UnrolledSafetyLayer:
-        layer = self.policy.action_filter
-        assert isinstance(layer, UnrolledSafetyLayer)
-        return layer
-
-    def advantages(self, batch: CostRolloutBufferSamples) -> th.Tensor:
-        advantages = super().advantages(batch)
-        if self.kappa == 0.0:
-            return advantages
-        penalty = self._layer.excess(batch.observations, self._sampled(batch))
-        return advantages - self.kappa * (penalty - penalty.mean())
-
     def value_rollout(self) -> None:
         """Value the executed actions, those after the last step by the policy that took them."""
         super().value_rollout()
         buffer = self.rollout_buffer
         observations = buffer.observations_by_time(self.device)
         executed = self._unit(buffer.executed_actions.reshape(-1, buffer.action_dim))
-        values = self._layer.values(observations, executed)
+        values = self.policy.action_filter.values(observations, executed)
         buffer.cost_values = values.cpu().numpy().reshape(buffer.costs.shape)
         for step, i, observation in self._timeouts if buffer.cost_gamma < 1.0 else ():
             terminal, _ = self.policy.obs_to_tensor(observation)
@@ -93,7 +77,7 @@ class TRPOUSL(FilteredTrustRegion):
 
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
-        unit = self._layer.unit
+        unit = self.policy.action_filter.unit
         if bool((batch.costs < 0.0).any()):
             self._warn_once(
                 "costs below zero",
@@ -101,7 +85,7 @@ class TRPOUSL(FilteredTrustRegion):
                 "constant to the cost of every step, and its sum over an episode to cost_limit, "
                 "or use TRPOSL",
             )
-        loss = self._layer.regression().fit(
+        loss = self.policy.action_filter.regression().fit(
             (batch.observations, self._executed(batch)),
             batch.cost_returns / unit,
             self.n_critic_updates,
@@ -118,4 +102,4 @@ class TRPOUSL(FilteredTrustRegion):
         sampled = self.policy.get_distribution(observations).get_actions()
         actions = self.policy.executable(sampled.cpu().numpy())
         executed = self._unit(self.policy.correct(observations, actions))
-        return self._layer.values(observations, executed).cpu().numpy()
+        return self.policy.action_filter.values(observations, executed).cpu().numpy()

@@ -302,12 +302,12 @@ def test_targets_of_the_cost_critic_by_hand(lam: float, terminate: bool) -> None
     model = make(TRPOUSL, env, n_steps=7, gamma=0.9, cost_gae_lambda=lam, warmup=10**9)
     # A critic that says half a unit everywhere.
     with th.no_grad():
-        last = model._layer.network.network[-1]
+        last = model.policy.action_filter.network.network[-1]
         last.weight.zero_()
         last.bias.fill_(float(np.log(np.expm1(0.5))))
     model.learn(14)
     unit = float(np.sqrt(np.mean(np.square([1, 2, 4, 1, 2, 4, 1]))))
-    assert float(model._layer.unit) == pytest.approx(unit)
+    assert float(model.policy.action_filter.unit) == pytest.approx(unit)
     ahead = 0.9 * 0.5 * unit
     end = 0.0 if terminate else ahead
     if lam == 0.0:
@@ -532,23 +532,12 @@ def test_as_many_steps_without_cost_are_drawn_as_with() -> None:
         assert len(costs) == 2 * total and int((costs != 0).sum()) == total
 
 
-def test_the_exact_penalty_lowers_the_expected_excess() -> None:
-    """The gradient is that of the expected penalty of sampled actions."""
-    model = make(TRPOUSL, points(2), kappa=2.0, threshold=0.1, correction_penalty=0.0).learn(80)
-    batch, raw = model._batch(), model.rollout_buffer.whole()
-    reward = (raw.advantages - raw.advantages.mean()) / raw.advantages.std()
-    values = model._layer.values(batch.observations, model._sampled(batch))
-    penalty = (values - 0.1).clamp(min=0.0)[:, 0] / model._layer.unit
-    assert penalty.std() > 0.0
-    th.testing.assert_close(batch.advantages, reward - 2.0 * (penalty - penalty.mean()))
-
-
 def test_the_policy_pays_for_corrections() -> None:
     """By κ times their length, centred, row by row."""
     model = make(TRPOUSL, points(2), threshold=0.0, warmup=0, correction_penalty=3.0).learn(80)
     batch, raw = model._batch(), model.rollout_buffer.whole()
     reward = (raw.advantages - raw.advantages.mean()) / raw.advantages.std()
-    lengths = (model._executed(batch) - model._sampled(batch)).norm(dim=1)
+    lengths = model._corrections(batch)
     assert lengths.std() > 0.0
     th.testing.assert_close(batch.advantages, reward - 3.0 * (lengths - lengths.mean()))
 

@@ -269,15 +269,6 @@ class UnrolledSafetyLayer(ActionFilter):
         """
         return self.unit * F.softplus(self.network.predict(observations, actions))
 
-    def excess(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-        """What the layer descends, ``Σ max(0, Q_i - threshold_i) / unit_i``, shape [B].
-
-        :param observations: batch of B observations
-        :param actions: in units of the action space, shape [B, k]
-        """
-        above = self.values(observations, actions) - self.threshold.to(self.unit)
-        return (above.clamp(min=0.0) / self.unit).sum(dim=1)
-
     def forward(
         self, observations: PyTorchObs, actions: th.Tensor, costs: th.Tensor | None
     ) -> th.Tensor:

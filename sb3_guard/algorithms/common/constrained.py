@@ -245,7 +245,9 @@ class Constrained(BaseAlgorithm):
         :return: whether there is a new estimate
         """
         self.costs.limits = self.cost_limits
-        if not self.costs.estimate(rate, self._length_before_any_episode):
+        # Until an episode has ended, the longest so far stands for its length.
+        longest = float(self.costs.episodes.lengths.max())
+        if not self.costs.estimate(rate, lambda: time_limit(self.env) or longest):
             return False
         if self.constrained and not self.costs.seen_lately:
             self._warn_once(
@@ -255,19 +257,6 @@ class Constrained(BaseAlgorithm):
             )
         self.costs.forget()
         return True
-
-    def _length_before_any_episode(self) -> float:
-        length = time_limit(self.env)
-        if length is None:
-            length = float(self.costs.episodes.lengths.max())
-            if self.constrained:
-                self._warn_once(
-                    "no episode",
-                    "no episode has ended yet and the environment states no max_episode_steps: "
-                    "until one ends, the cost limit is spread over the longest so far, "
-                    f"{length:g} steps",
-                )
-        return length
 
     def _warn_once(self, topic: str, message: str) -> None:
         if topic not in self._warned:

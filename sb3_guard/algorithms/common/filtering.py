@@ -61,18 +61,13 @@ class FilteredTrustRegion(TrustRegion):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        name = type(self).__name__
         if self.env is not None and not isinstance(self.action_space, spaces.Box):
-            raise ValueError(
-                f"{name} corrects actions of a Box, not of {self.action_space}; "
-                "for other actions use trpo_lag, cpo or pcpo"
-            )
+            raise ValueError(f"{type(self).__name__} corrects actions of a Box only")
         if not issubclass(self.policy_class, FilteredPolicy):
-            own = self.policy_class.__name__
+            name = self.policy_class.__name__
             raise ValueError(
-                f"policy={own}: {name} needs a policy that carries an action filter; define "
-                f"class Filtered{own}(FilteredPolicy, {own}), with FilteredPolicy from "
-                "sb3_guard.algorithms.common.policies"
+                f"policy={name}: must carry an action filter; define class Filtered{name}"
+                f"(FilteredPolicy, {name}), with FilteredPolicy from {FilteredPolicy.__module__}"
             )
         if isinstance(self.warmup, int | np.integer):
             check_integer("warmup", self.warmup, 0)
@@ -100,12 +95,8 @@ class FilteredTrustRegion(TrustRegion):
     ) -> tuple[int, BaseCallback]:
         prepared = super()._setup_learn(total_timesteps, *args, **kwargs)
         if self.filter_from is None:
-            steps = self.warmup
-            self.filter_from = (
-                int(steps)
-                if isinstance(steps, int | np.integer)
-                else math.ceil(steps * total_timesteps)
-            )
+            share = not isinstance(self.warmup, int | np.integer)
+            self.filter_from = math.ceil(self.warmup * (total_timesteps if share else 1))
         self._switch_on()
         return prepared
 
@@ -135,13 +126,10 @@ class FilteredTrustRegion(TrustRegion):
         """The executed actions of a batch in units of the action space, shape [B, k]."""
         return self._unit(batch.executed_actions.cpu().numpy())
 
-    def _sampled(self, batch: CostRolloutBufferSamples) -> th.Tensor:
-        """The sampled actions, clipped to the box, shape [B, k]."""
-        return self._unit(self.policy.executable(batch.actions.cpu().numpy()))
-
     def _corrections(self, batch: CostRolloutBufferSamples) -> th.Tensor:
-        """How far the executed actions are from the sampled ones, shape [B]."""
-        return (self._executed(batch) - self._sampled(batch)).norm(dim=1)
+        """How far the executed actions are from the sampled ones, clipped to the box, shape [B]."""
+        sampled = self._unit(self.policy.executable(batch.actions.cpu().numpy()))
+        return (self._executed(batch) - sampled).norm(dim=1)
 
     def advantages(self, batch: CostRolloutBufferSamples) -> th.Tensor:
         lengths = self._corrections(batch)
@@ -150,18 +138,15 @@ class FilteredTrustRegion(TrustRegion):
         penalty = self.correction_penalty * self.advantage_unit()
         return batch.advantages - penalty * (lengths - lengths.mean())
 
-    def _cost_size(self) -> np.ndarray:
-        """The root mean square of those costs of a step that are not zero, shape (m,)."""
+    def _choose_cost_units(self) -> np.ndarray:
+        # The root mean square of those costs of a step that are not zero, the largest so far: the
+        # first rollout may only have touched what costs.
         costs = self.rollout_buffer.costs.astype(np.float64)
         met = np.maximum(np.count_nonzero(costs, axis=(0, 1)), 1)
-        return np.sqrt(np.square(costs).sum(axis=(0, 1)) / met)
-
-    def _choose_cost_units(self) -> np.ndarray:
-        # The largest so far: the first rollout may only have touched what costs.
-        sizes = self._cost_size().astype(np.float32)
-        units = self.cost_units = np.maximum(super()._choose_cost_units(), sizes)
-        known = th.as_tensor(np.where(units, units, np.float32(1.0)))
-        self.policy.action_filter.unit.copy_(known)
+        sizes = np.sqrt(np.square(costs).sum(axis=(0, 1)) / met).astype(np.float32)
+        units = sizes if self.cost_units is None else np.maximum(self.cost_units, sizes)
+        self.cost_units = units
+        self.policy.action_filter.unit.copy_(th.as_tensor(np.where(units, units, np.float32(1.0))))
         return units
 
     def value_rollout(self) -> None:

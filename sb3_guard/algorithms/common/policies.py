@@ -29,7 +29,7 @@ class FilteredPolicy(ActorCriticPolicy):
     Other parameters are those of SB3's ``ActorCriticPolicy``.
     """
 
-    action_filter: ActionFilter
+    action_filter: Any  #: an :class:`~sb3_guard.algorithms.common.action_filters.ActionFilter`
     low: th.Tensor
     high: th.Tensor
     _filter: tuple[Callable[..., ActionFilter], dict[str, Any]] | None = None

@@ -231,28 +231,24 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
     def _choose_cost_units(self) -> np.ndarray:
         """What networks measure costs in, shape (m,), float32, from a rollout just filled.
 
-        The size of what they learn in the first rollout that has any cost, so that it does not
-        depend on the unit of cost.
+        The root mean square of what they learn, discounted costs-to-go, in the first rollout that
+        has any cost, so that it does not depend on the unit of cost.
         """
-        if self.cost_units is None:
-            self.cost_units = np.zeros(self.rollout_buffer.n_costs, np.float32)
-        if not self.cost_units.all():
-            unknown = self.cost_units == 0.0
-            self.cost_units[unknown] = self._cost_size()[unknown]
-        return self.cost_units
-
-    def _cost_size(self) -> np.ndarray:
-        """The root mean square of the rollout's discounted costs-to-go, shape (m,)."""
         buffer = self.rollout_buffer
-        assert self._last_episode_starts is not None
-        ahead = discounted_returns(
-            buffer.costs,
-            buffer.episode_starts,
-            np.zeros_like(buffer.costs[0]),
-            self._last_episode_starts,
-            buffer.cost_gamma,
-        )
-        return np.sqrt(np.mean(np.square(ahead, dtype=np.float64), axis=(0, 1)))
+        if self.cost_units is None:
+            self.cost_units = np.zeros(buffer.n_costs, np.float32)
+        if not self.cost_units.all():
+            assert self._last_episode_starts is not None
+            ahead = discounted_returns(
+                buffer.costs,
+                buffer.episode_starts,
+                np.zeros_like(buffer.costs[0]),
+                self._last_episode_starts,
+                buffer.cost_gamma,
+            )
+            sizes = np.sqrt(np.mean(np.square(ahead, dtype=np.float64), axis=(0, 1)))
+            self.cost_units = np.where(self.cost_units, self.cost_units, sizes).astype(np.float32)
+        return self.cost_units
 
     # Learning
 

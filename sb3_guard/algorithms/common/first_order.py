@@ -20,6 +20,7 @@ from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 from sb3_guard.algorithms.fast.actor import distribution_of
+from sb3_guard.algorithms.fast.optimizers import fuse
 
 #: ``loss(batch, ratio, distribution)``, see :meth:`FirstOrder.loss`
 Loss = Callable[[CostRolloutBufferSamples, th.Tensor, Distribution], th.Tensor]
@@ -55,7 +56,15 @@ class FirstOrder(CostRollouts, PPO):
     ) -> None:
         super().__init__(*args, gae_lambda=gae_lambda, target_kl=target_kl, **kwargs)
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.fuse_adam:
+            fuse(self.policy.optimizer)
+
     # What an algorithm replaces
+
+    #: Whether Adam takes its steps as one operation: faster, and PPO's up to rounding alone.
+    fuse_adam: ClassVar[bool] = False
 
     def loss(
         self, batch: CostRolloutBufferSamples, ratio: th.Tensor, distribution: Distribution

@@ -1,19 +1,79 @@
 """Export a trained agent: ``sb3-guard export --algo cpo --env Goal_Point_8Hazards``.
 
-``sb3_guard.export`` is the function that exports a model, so the command's module has another name.
+The file comes with what the agent was trained at and measured. ``sb3_guard.export`` is the function
+that exports a model, so the command's module has another name.
 """
 
+import hashlib
+import json
 import sys
+from contextlib import closing
+from pathlib import Path
+from typing import Any
 
+from sb3_guard.common.evaluation import evaluate_policy
+from sb3_guard.deployment import onnx_file
+from sb3_guard.deployment.contract import stops
 from sb3_guard.zoo.agents.flags import ExportFlags as Flags
+from sb3_guard.zoo.agents.playback import BATCH, EPISODES, means, open_agent, summary
 from sb3_guard.zoo.cli.flags import command
+from sb3_guard.zoo.cli.usage import UsageError, explained
+from sb3_guard.zoo.run.folder import require_file
+from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
 
 
 def export_agent(flags: Flags) -> int:
-    """Write an agent's ONNX file and contract."""
-    from sb3_guard.zoo.agents.export import export
-
-    return export(flags)
+    """Write the file and its contract, and say what they are."""
+    path = Path(flags.output)
+    if path.suffix != ".onnx":
+        raise UsageError(f"--output {flags.output!r} must end in .onnx")
+    for written in (path, path.with_name(onnx_file.CONTRACT)):
+        require_file(written, "--output")
+    agent = open_agent(flags, None, min(flags.n_episodes or BATCH, BATCH))
+    with closing(agent.env):
+        with explained(f"can't export {agent.path}", ValueError, ImportError):
+            onnx_file.check(agent.model, flags.stochastic, path)
+            stops(agent.model, agent.env, flags.stop or {})
+        how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
+        episodes = flags.n_episodes or EPISODES
+        with explained(f"can't play {agent.path}", *BAD_NUMBERS):
+            evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
+        settings, measured = agent.run.hyperparams(), summary(evaluation)
+        certificate = agent.certificate
+        plain = {
+            name: {key: value for key, value in values.items() if key != "values"}
+            if isinstance(values, dict)
+            else values
+            for name, values in measured.items()
+        }
+        trained = {
+            "algo": flags.algo,
+            "env": agent.env_id,
+            "env_kwargs": settings.get("env_kwargs") or {},
+            "cost_limit": settings.get("cost_limit"),
+            "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
+            "measured": plain,
+            "certificate": json.loads(certificate.to_json()) if certificate else None,
+        }
+        with explained(f"can't export {agent.path}", ValueError, ImportError):
+            contract = onnx_file.export(
+                agent.model,
+                path,
+                env=agent.env,
+                sampled=flags.stochastic,
+                stop=flags.stop,
+                trained=trained,
+            )
+    print(f"{path}: {', '.join(contract['file']['operators'])}")
+    print(f"{path.with_name(onnx_file.CONTRACT)} describes input and output")
+    print(means(evaluation))
+    if agent.run.checkpoint.exists() and not agent.run.result.exists():
+        print(
+            f"warning: the training has not ended: this is its agent after "
+            f"{agent.model.num_timesteps:,} steps",
+            file=sys.stderr,
+        )
+    return 0
 
 
 main = command(Flags, export_agent)

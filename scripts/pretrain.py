@@ -29,7 +29,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_guard import evaluate_policy
 from sb3_guard.costs import estimate
 from sb3_guard.zoo.agents.pretrained import (
-    LIMITS,
     PLAYED,
     PRETRAINED,
     listed,
@@ -44,6 +43,22 @@ from sb3_guard.zoo.run.folder import RunFolder, is_run, run_path
 from sb3_guard.zoo.run.run import Run
 
 RECORDED = Path(__file__).parents[1] / "tests" / "data" / "pretrained.npz"
+# Environments that the grand table is to find an agent for, and the limit it is to keep.
+LIMITS = {
+    "SafetyPointGoal1-v0": 25.0,
+    "SafetyCarGoal1-v0": 25.0,
+    "SafetyPointPush1-v0": 25.0,
+    "SafetyPointCircle1-v0": 25.0,
+    "SafetyHalfCheetahVelocity-v1": 25.0,
+    "SafetyHopperVelocity-v1": 25.0,
+    "SafetyWalker2dVelocity-v1": 25.0,
+    "Goal_Point_8Hazards-v0": 2.0,
+    "Goal_Drone_8Hazards-v0": 2.0,
+    "Goal_Arm3_8Hazards-v0": 2.0,
+    "Goal_Arm6_8Hazards-v0": 2.0,
+    "Goal_Hopper_8Hazards-v0": 2.0,
+    "Goal_Swimmer_8Hazards-v0": 2.0,
+}
 EPISODES = 300
 SEEDS = {"stochastic": 10_000, "deterministic": 20_000}
 # Parameters of a policy that it acts without: critics and targets.

@@ -32,11 +32,10 @@ from matplotlib.ticker import EngFormatter
 
 from sb3_guard.zoo.agents.pretrained import listed
 from sb3_guard.zoo.cli.markdown import escaped, table
-from sb3_guard.zoo.results.curves import read_episodes
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish, save
 from sb3_guard.zoo.results.paper import draw
-from sb3_guard.zoo.results.runs import select
+from sb3_guard.zoo.results.runs import read_episodes, select
 from sb3_guard.zoo.results.splits import SPLITS, judge
 from sb3_guard.zoo.results.statistics import aggregate, normalize, with_safety
 from sb3_guard.zoo.results.tables import markdown, number, spelled, spread, whole

@@ -17,7 +17,6 @@ from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.common.sources import find
 from sb3_guard.envs import registry
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.make_envs import full_id
 from sb3_guard.zoo.run.run import Run
 
 
@@ -72,7 +71,7 @@ def test_native_equals_one_by_one(vec_env, flatten):
 )
 def test_a_missing_version_is_the_latest_everywhere(name, full):
     """In Python, in Gymnasium, in commands and in the entries of hyperparameter files."""
-    assert find(name).env_id == full_id(name) == full
+    assert find(name).env_id == full
     assert Run.check(RunFlags(algo="ppo", env=name)).flags.env == full
     if name in gymnasium.registry or full in gymnasium.registry:
         assert make_vec_env(name).get_attr("spec")[0].id == full

@@ -27,7 +27,6 @@ def test_the_status_is_the_verdict(limit, verdict, tmp_path, capsys):
     ("flags", "match"),
     [
         ([], "cost_limit"),
-        (["--cost-limit", "nan"], "cost_limit"),
         (["--cost-limit", "1", "2"], "cost_limit"),
         (["--cost-limit", "5", "--n-episodes", "19"], "20"),
     ],

@@ -135,17 +135,8 @@ def test_our_environments(tmp_path, capsys):
     config = yaml.safe_load((run / "Goal_Point_3Hazards-v0" / "config.yml").read_text())
     assert config["env_kwargs"]["goal"] == {"size": 0.5}
     capsys.readouterr()
-    play = [
-        *TOY[:2],
-        "--env",
-        "Goal_Point_3Hazards",
-        "-f",
-        str(tmp_path),
-        "--no-render",
-        "-n",
-        "20",
-    ]
-    assert enjoy.main(play) == 0
+    play = ["--env", "Goal_Point_3Hazards", "-f", str(tmp_path), "--no-render", "-n", "20"]
+    assert enjoy.main([*TOY[:2], *play]) == 0
     assert "No episode ended" in capsys.readouterr().out
 
 
@@ -383,12 +374,6 @@ def test_a_run_is_of_the_latest_version_where_none_is_given(tmp_path, name, vers
         (tmp_path / "cpo" / f"{name}-v{number}_1" / f"{name}-v{number}").mkdir(parents=True)
         (tmp_path / "cpo" / f"{name}-v{number}_1" / f"{name}-v{number}" / "args.yml").touch()
     assert playback.find_run(tmp_path, "cpo", name).path.name == f"{name}-v{version}_1"
-
-
-def test_list_says_what_it_takes(capsys):
-    assert cli.main(["list", "robot"]) == 2
-    error = capsys.readouterr().err
-    assert "kind = 'robot': did you mean 'robots'?" in error and error.count("\n") == 1
 
 
 def test_show_prints_an_environment_and_draws_it(tmp_path, monkeypatch, capsys):

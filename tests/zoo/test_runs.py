@@ -8,8 +8,7 @@ import pytest
 from fake_runs import fake_run
 
 from sb3_guard.zoo.cli.usage import UsageError
-from sb3_guard.zoo.results.curves import read_curve
-from sb3_guard.zoo.results.runs import choose, read_results, select
+from sb3_guard.zoo.results.runs import choose, read_curve, read_results, select
 
 HAZARDS, GHOSTS = "Goal_Point_8Hazards", "Goal_Point_8Ghosts"
 

@@ -11,9 +11,8 @@ from fake_runs import LABELS, fake_run
 
 from sb3_guard.costs import interval
 from sb3_guard.zoo.cli.markdown import escaped
-from sb3_guard.zoo.results.curves import read_curve
 from sb3_guard.zoo.results.figure_data import Data
-from sb3_guard.zoo.results.runs import read_results
+from sb3_guard.zoo.results.runs import read_curve, read_results
 from sb3_guard.zoo.results.statistics import (
     SAFETY,
     aggregate,

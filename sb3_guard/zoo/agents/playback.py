@@ -27,7 +27,7 @@ from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_file
 from sb3_guard.zoo.run.hyperparams import check, without_withdrawn
-from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, full_id
+from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, source_of
 from sb3_guard.zoo.run.run import Run
 
 EPISODES = 100  # as many as tell whether a limit is kept, in training's final ones, too
@@ -51,7 +51,7 @@ def find_run(
     number = number or latest_run(parent, name)
     if number:
         return RunFolder(parent if number < 0 else parent / f"{name}_{number}")
-    algorithm(algo), full_id(env_id)  # a misspelled name has a message of its own
+    algorithm(algo), source_of(env_id)  # a misspelled name has a message of its own
     ships = latest_run(PRETRAINED / algo, name)
     runs = [path for path in sorted(Path(folder).glob("*/*_*")) if is_run(path)]
     there = dict.fromkeys(f"{path.parent.name} on {path.name.rpartition('_')[0]}" for path in runs)

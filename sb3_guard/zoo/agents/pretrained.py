@@ -17,22 +17,6 @@ from sb3_guard.zoo.run.run import Run
 
 #: A log folder, written by ``scripts/pretrain.py``; instead of a model a run has ``<env>.pth``.
 PRETRAINED = Path(__file__).parents[2] / "pretrained"
-#: Environments that the grand table is to find an agent for, and the limit it is to keep.
-LIMITS = {
-    "SafetyPointGoal1-v0": 25.0,
-    "SafetyCarGoal1-v0": 25.0,
-    "SafetyPointPush1-v0": 25.0,
-    "SafetyPointCircle1-v0": 25.0,
-    "SafetyHalfCheetahVelocity-v1": 25.0,
-    "SafetyHopperVelocity-v1": 25.0,
-    "SafetyWalker2dVelocity-v1": 25.0,
-    "Goal_Point_8Hazards-v0": 2.0,
-    "Goal_Drone_8Hazards-v0": 2.0,
-    "Goal_Arm3_8Hazards-v0": 2.0,
-    "Goal_Arm6_8Hazards-v0": 2.0,
-    "Goal_Hopper_8Hazards-v0": 2.0,
-    "Goal_Swimmer_8Hazards-v0": 2.0,
-}
 #: Kinds of actions in ``result.json``, and in words.
 PLAYED = {"stochastic": "sampled", "deterministic": "most likely"}
 
@@ -104,11 +88,11 @@ def load_pretrained(
 
 
 def listed() -> str:
-    """A table of them with return and cost, and the environments that have none yet."""
+    """A table of them with return and cost."""
     header = ["environment", "algorithm", "steps", "limit", "trained at"]
     for actions in PLAYED.values():
         header += [f"return, {actions} actions", f"cost, {actions} actions"]
-    rows, certified = [], set()
+    rows = []
     for run in pretrained():
         result = run.checked_result()
         limit = result.get("cost_limit")
@@ -122,8 +106,4 @@ def listed() -> str:
             interval = f"{cost.mean:.1f} [{cost.low:.1f}, {cost.high:.1f}]"
             cells += [f"{played['return'][0]:.1f}", interval + word]
         rows.append(cells)
-        if limit is not None and limit <= LIMITS.get(run.name, 0.0):
-            certified.add(run.name)
-    missing = [f"{env_id} (limit {d:g})" for env_id, d in LIMITS.items() if env_id not in certified]
-    without = f"No certified agent does its task yet: {', '.join(missing)}"
-    return f"{table(header, rows)}\n\n{without}"
+    return table(header, rows)

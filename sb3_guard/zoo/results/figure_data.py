@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_guard.zoo.results.curves import read_curve
-from sb3_guard.zoo.results.runs import REFERENCE
+from sb3_guard.zoo.results.runs import REFERENCE, read_curve
 from sb3_guard.zoo.results.splits import FINAL, judge, read_splits
 from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize
 

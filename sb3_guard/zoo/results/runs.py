@@ -17,13 +17,13 @@ import pandas as pd
 
 from sb3_guard.costs import bounded_name
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.cli.usage import UsageError, one_line
-from sb3_guard.zoo.results.curves import read_episodes
+from sb3_guard.zoo.cli.usage import UsageError, explained, one_line
 from sb3_guard.zoo.run.folder import MEASURES, RunFolder
 
 REFERENCE = "trpo"  # scores are relative to it
 # Columns of the figures of merit, and their key in result.json
 METRICS = dict(zip(("J_r", "M_c", "rho_c"), MEASURES, strict=True))
+CURVE_POINTS = 200  # at most as many per run, of epochs taken together
 VERSIONS = ("sb3_guard", "mujoco", "gymnasium", "stable_baselines3", "torch", "numpy", "python")
 _SUITE = re.compile(r"[A-Za-z][A-Za-z0-9]*_[A-Za-z][A-Za-z0-9]*_\d+[A-Za-z]\w*-v0")
 # Runs that agree in these are the same run, made again.
@@ -181,6 +181,50 @@ def _digest(config: Mapping[str, Any], learned: Any) -> str:
     columns = ("n_timesteps", "cost_limit", "env_kwargs")
     rest = {name: value for name, value in config.items() if name not in columns}
     return hashlib.sha256(_text([rest, learned]).encode()).hexdigest()[:8]
+
+
+# One run's episodes
+
+
+def read_episodes(path: str | Path) -> pd.DataFrame:
+    """
+    All training episodes of a run.
+
+    :return: ``step`` at which the episode ended, ``J_r``, ``M_c`` (NaN where a physics error ended
+        it), of several costs also ``M_c/<key>``, and ``rho_c`` (cumulative cost ÷ steps until then)
+    :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
+    """
+    file = Path(path) / "0.monitor.csv"
+    with explained(f"can't read {file}", OSError, ValueError, KeyError):
+        text = pd.read_csv(file, skiprows=1, keep_default_na=False, dtype=str)
+        text = text.filter(regex="^([rlc]|c_.*)$")
+        table = text.astype(float)
+        steps = table.pop("l").cumsum()
+        rate = table["c"].cumsum() / steps
+    if not len(table) or text.isna().any(axis=None) or table["r"].isna().any():
+        raise UsageError(f"can't use {file}: it has no episodes, or is truncated")
+    names = {"r": "J_r", "c": "M_c"}
+    table.columns = [names.get(name, f"M_c/{name[2:]}") for name in map(str, table)]
+    return table.assign(step=steps, rho_c=rate)
+
+
+def read_curve(path: str | Path, epoch: float = math.nan) -> pd.DataFrame:
+    """
+    How a run went, epoch by epoch.
+
+    :param path: the run folder
+    :param epoch: steps per point; NaN or too few: 1/200 of the run
+    :return: ``step`` (the end of an epoch), ``J_r``, ``M_c`` and ``M_c/<key>`` (means over the
+        episodes that ended in it), and ``rho_c`` (cumulative cost ÷ steps of all episodes until
+        then)
+    :raises UsageError: see :func:`read_episodes`
+    """
+    table = read_episodes(path)
+    total = table["step"].iloc[-1]
+    rollout = epoch if epoch > 0 else total / CURVE_POINTS
+    size = rollout * max(1, math.ceil(total / rollout / CURVE_POINTS))
+    epochs = table.groupby(np.ceil(table["step"] / size) * size)
+    return epochs.mean().assign(rho_c=epochs["rho_c"].last()).drop(columns="step").reset_index()
 
 
 # Which runs

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_guard.costs import bounded_name, verdict
-from sb3_guard.zoo.results.curves import read_episodes
+from sb3_guard.zoo.results.runs import read_episodes
 from sb3_guard.zoo.results.statistics import judging_limits, last_epochs
 
 #: by key what was played; the final ones are in ``result.json``, see ``Training``

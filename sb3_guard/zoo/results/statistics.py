@@ -15,8 +15,7 @@ import pandas as pd
 from scipy.stats import trim_mean
 
 from sb3_guard.costs import interval
-from sb3_guard.zoo.results.curves import read_episodes
-from sb3_guard.zoo.results.runs import METRICS, REFERENCE, compared
+from sb3_guard.zoo.results.runs import METRICS, REFERENCE, compared, read_episodes
 from sb3_guard.zoo.run.folder import EPOCH
 
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
@@ -39,7 +38,7 @@ def last_epochs(episodes: pd.DataFrame, epoch: float) -> pd.DataFrame:
     """
     The episodes of the last ten epochs of a run, with their ``epoch``'s number.
 
-    :param episodes: see :func:`~sb3_guard.zoo.results.curves.read_episodes`
+    :param episodes: see :func:`~sb3_guard.zoo.results.runs.read_episodes`
     :param epoch: steps; NaN, or too few to end an episode: 30,000, or a twentieth of a shorter run
     """
     total = episodes["step"].iloc[-1]
@@ -64,7 +63,7 @@ def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, floa
     """
     What users ask about the safety of a run; all but ``cost_total`` of its last ten epochs.
 
-    :param episodes: see :func:`~sb3_guard.zoo.results.curves.read_episodes`
+    :param episodes: see :func:`~sb3_guard.zoo.results.runs.read_episodes`
     :param epoch: steps, see :func:`last_epochs`
     :param limit: of an episode's cost; NaN: there is none
     :return: ``return_last`` and ``cost_last``, means over epochs of their episodes' means;

@@ -64,12 +64,3 @@ def source_of(env_id: str) -> Source:
     if colon and module not in ("sb3_guard", "safety_gymnasium"):
         raise UsageError(f"--env {env_id}: write --gym-packages {module} --env {name}")
     return source
-
-
-def full_id(env_id: str) -> str:
-    """
-    The id with its version.
-
-    :raises UsageError: it is unknown
-    """
-    return str(source_of(env_id).env_id)

@@ -286,6 +286,7 @@ def test_packed_logs_without_an_entry_for_each_cost_are_read(tmp_path):
     assert (row["limits"], row["cost_limit"]) == ("25", 25)
 
 
+@pytest.mark.slow
 def test_all_of_it(small, tmp_path, capsys):
     paths = [str(tmp_path / name) for name in ("runs.csv", "table.md", "table.tex")]
     run = [str(small), "--figure", "all", "-o", str(tmp_path / "f"), "--format", "svg"]

@@ -217,6 +217,7 @@ def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "sb3_guard.train", *arguments]
 
 
+@pytest.mark.slow
 def test_kill_minus_nine(tmp_path):
     """The same with a real process and a real kill, at whatever moment it comes."""
     arguments = [*TOY, *SHORT, *SMALL, "--eval-freq", "300", "-n", "600"]

@@ -71,6 +71,7 @@ def test_no_trial_is_lost_whatever_is_killed(server, tmp_path):
     assert faults(study) == []
 
 
+@pytest.mark.slow
 def test_the_trial_of_a_silent_worker_is_done_again(server, tmp_path, monkeypatch):
     """By whoever begins a trial after the silence."""
     monkeypatch.setattr(studies, "GRACE", 2)
@@ -126,6 +127,7 @@ def test_a_trial_whose_connection_is_cut_is_done_again(server, tmp_path, monkeyp
     assert states(server) == {"FAIL": 1, "WAITING": 1}
 
 
+@pytest.mark.slow
 def test_a_database_that_is_gone_ends_the_worker_with_a_line(server, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(studies, "HEARTBEAT", 1)
     monkeypatch.setattr(studies, "GRACE", 2)

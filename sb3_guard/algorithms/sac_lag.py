@@ -1,8 +1,6 @@
 """SAC-Lagrangian: SAC with cost critics and a multiplier that follows the violation."""
 
-import torch as th
 from stable_baselines3 import SAC
-from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.soft import SoftActorCritic
 
@@ -21,15 +19,3 @@ class SACLag(SoftActorCritic, SAC):
     """
 
     label, family, paper = "SAC-Lagrangian", "Lagrangian", "Ha et al. 2020"
-
-    def next_values(self, values: tuple[th.Tensor, ...]) -> th.Tensor:
-        return th.cat(values, dim=1).amin(dim=1, keepdim=True)
-
-    def critic_loss(self, values: tuple[th.Tensor, ...], target: th.Tensor) -> th.Tensor:
-        return 0.5 * sum(F.mse_loss(value, target) for value in values)  # type: ignore[return-value]
-
-    def estimate(self, values: tuple[th.Tensor, ...]) -> th.Tensor:
-        return th.min(th.cat(values, dim=1), dim=1, keepdim=True)[0]
-
-    def expected(self, values: tuple[th.Tensor, ...]) -> th.Tensor:
-        return values[0]

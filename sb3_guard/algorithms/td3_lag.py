@@ -49,13 +49,12 @@ class TD3Lag(CostReplay, TD3):
             actions = self.actor(batch.observations)
             self.actor.optimizer.zero_grad()
             weights = self.batch_weights(values[0])
-            with self.critics_constant():
-                loss = -self.critic.q1_forward(batch.observations, actions)
-                if weights.any():
-                    costs = (self.cost_critic(batch.observations, actions) * weights).sum(1, True)
-                    loss = (loss + costs) / (1.0 + float(self.prices.sum()))
-                loss = loss.mean()
-                loss.backward()
+            loss = -self.critic.q1_forward(batch.observations, actions)
+            if weights.any():
+                costs = (self.cost_critic(batch.observations, actions) * weights).sum(1, True)
+                loss = (loss + costs) / (1.0 + float(self.prices.sum()))
+            loss = loss.mean()
+            loss.backward(inputs=[*self.actor.parameters()])
             self.actor.optimizer.step()
             logs["actor_loss"] = loss.item()
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)

@@ -78,13 +78,6 @@ class TRPOUSL(FilteredTrustRegion):
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
         unit = self.policy.action_filter.unit
-        if bool((batch.costs < 0.0).any()):
-            self._warn_once(
-                "costs below zero",
-                "TRPOUSL met costs below zero: to its critic no cost to come is less than 0; add a "
-                "constant to the cost of every step, and its sum over an episode to cost_limit, "
-                "or use TRPOSL",
-            )
         loss = self.policy.action_filter.regression().fit(
             (batch.observations, self._executed(batch)),
             batch.cost_returns / unit,

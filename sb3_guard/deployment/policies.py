@@ -156,8 +156,8 @@ class Acting(nn.Module):
         self.layer: Any = policy.action_filter if corrects else None
         if isinstance(self.layer, SafetyLayer) and len(self.layer.threshold) > 1:
             raise ValueError(
-                f"TRPO-SL with {len(self.layer.threshold)} costs can't be exported: its layer then "
-                "solves a quadratic program; train it with one cost, or use trpo_usl"
+                f"TRPO-SL with {len(self.layer.threshold)} costs can't be exported: train it with "
+                "one cost, or use trpo_usl"
             )
         #: whether what the last step cost is an input
         self.acts_on_cost = corrects and policy.acts_on_cost

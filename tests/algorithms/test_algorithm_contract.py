@@ -296,7 +296,6 @@ def test_trpo_needs_no_cost_and_says_nothing(recwarn: pytest.WarningsRecorder) -
     ("kwargs", "message"),
     [
         ({"n_steps": 0}, "n_steps=0"),
-        ({"n_steps": 1}, "at least two steps"),
         ({"batch_size": 0}, "batch_size=0"),
         ({"gamma": 1.1}, r"gamma=1.1.*\[0, 1\]"),
         ({"cost_gamma": 2.0}, "cost_gamma=2.0"),

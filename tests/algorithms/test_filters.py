@@ -1,6 +1,5 @@
 """The safety layers of TRPO-SL and TRPO-USL: projections, models, and when and where they act."""
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from sb3_guard.algorithms.common import action_filters
 from sb3_guard.algorithms.common.action_filters import (
     SafetyLayer,
     UnrolledSafetyLayer,
-    nearest_in_box,
 )
 from sb3_guard.algorithms.common.filtering import FilteredTrustRegion
 from sb3_guard.algorithms.common.policies import FilteredPolicy
@@ -65,33 +63,27 @@ def clip_along(actions: np.ndarray, normals: np.ndarray, limits: np.ndarray) -> 
 # The safety layer's projection
 
 
-def reference(
-    action: np.ndarray, normals: np.ndarray, limits: np.ndarray, slack: float = np.inf
-) -> np.ndarray:
-    """Nearest point of the box by SLSQP; with a slack per half-space where that is finite."""
-    k, m = len(action), len(limits)
-    soft = np.isfinite(slack)
-    centre = np.append(action, np.zeros(m if soft else 0))
-    rows = np.hstack([normals, -np.eye(m) / np.sqrt(slack)]) if soft else normals
+def reference(action: np.ndarray, normals: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Nearest point of the box by SLSQP."""
     best = None
-    for start in (centre, np.zeros_like(centre)):
+    for start in (action, np.zeros_like(action)):
         answer = minimize(
-            lambda x: (0.5 * np.sum((x - centre) ** 2), x - centre),
+            lambda x: (0.5 * np.sum((x - action) ** 2), x - action),
             start,
             jac=True,
-            bounds=[(-1, 1)] * k + [(0, None)] * (len(centre) - k),
+            bounds=[(-1, 1)] * len(action),
             constraints={
                 "type": "ineq",
-                "fun": lambda x: limits - rows @ x,
-                "jac": lambda x: -rows,
+                "fun": lambda x: limits - normals @ x,
+                "jac": lambda x: -normals,
             },
             method="SLSQP",
             options={"ftol": 1e-14, "maxiter": 500},
         )
-        if np.all(rows @ answer.x <= limits + 1e-7) and (best is None or answer.fun < best.fun):
+        if np.all(normals @ answer.x <= limits + 1e-7) and (best is None or answer.fun < best.fun):
             best = answer
     assert best is not None
-    return best.x[:k]
+    return best.x
 
 
 @pytest.mark.parametrize("k", [1, 2, 6])
@@ -119,38 +111,6 @@ def test_an_unreachable_half_space_is_approached_as_far_as_the_box_goes() -> Non
     np.testing.assert_array_equal(clip_along(actions, 0 * normals, np.array([-1.0])), actions)
 
 
-@pytest.mark.parametrize("m", [2, 3])
-def test_several_half_spaces_against_an_optimiser(m: int) -> None:
-    rng = np.random.default_rng(m)
-    compared = 0
-    for _ in range(300):
-        k = int(rng.integers(2, 6))
-        action, normals = rng.uniform(-1, 1, k), rng.normal(size=(m, k))
-        inside = rng.uniform(-1, 1, k)  # a point that satisfies all of them
-        limits = normals @ inside + rng.uniform(0.0, 0.5, m)
-        x = nearest_in_box(action, normals, limits)
-        np.testing.assert_allclose(x, reference(action, normals, limits), atol=1e-4)
-        assert np.all(normals @ x <= limits + 1e-4)
-        compared += bool(np.any(normals @ action > limits))
-    assert compared > 150
-
-
-def test_contradictory_half_spaces_are_violated_least() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        action, normal = rng.uniform(-0.2, 0.2, 3), rng.normal(size=3)
-        lengths = rng.uniform(0.5, 2.0, 2)
-        unit = normal / np.linalg.norm(normal)
-        normals = np.array([lengths[0] * unit, -lengths[1] * unit])
-        limits = lengths * rng.uniform(-0.2, -0.05, 2)
-        x = nearest_in_box(action, normals, limits)
-        # Between the two, as far from one as from the other.
-        middle = (limits[0] / lengths[0] - limits[1] / lengths[1]) / 2
-        assert unit @ x == pytest.approx(middle, abs=1e-5)
-        units, distances = normals / lengths[:, None], limits / lengths
-        np.testing.assert_allclose(x, reference(action, units, distances, slack=1e4), atol=1e-2)
-
-
 @pytest.mark.parametrize("drift", [False, True])
 @pytest.mark.parametrize("m", [1, 2])
 def test_the_safety_layer_keeps_its_prediction_below_the_threshold(m: int, drift: bool) -> None:
@@ -172,9 +132,11 @@ def test_the_safety_layer_keeps_its_prediction_below_the_threshold(m: int, drift
     np.testing.assert_allclose(corrected[~broken], clipped[~broken], atol=1e-12)
     slopes = layer._split(layer.network(observations))[0].detach().abs().sum(dim=2).numpy()
     reachable = (predicted(0 * actions) - slopes <= 0.1).all(axis=1)
+    assert reachable[broken].any()
     if m == 1:
         assert predicted(corrected)[reachable].max() <= 0.1 + 1e-5
-        assert reachable[broken].any()
+    else:  # corrected in turn: nearly everywhere, where a single correction does for a half
+        assert np.mean(predicted(corrected) <= 0.1 + 1e-3) > 0.95
 
 
 def test_the_safety_layer_learns_a_linear_cost() -> None:
@@ -495,16 +457,6 @@ def test_a_threshold_given_to_load_holds_at_once(cls: Any, tmp_path: Path) -> No
     observation = np.zeros((2, 4), np.float32)
     actions = [each.predict(observation, deterministic=True)[0] for each in (model, again)]
     assert np.abs(actions[1] - actions[0]).max() > 0.01
-
-
-def test_costs_below_zero_are_named_once_where_they_cant_be_learnt() -> None:
-    with pytest.warns(UserWarning, match="TRPOUSL met costs below zero") as record:
-        make(TRPOUSL, points(2, cost_scale=-1.0), n_critic_updates=1).learn(160)
-    assert len([each for each in record if "below zero" in str(each.message)]) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        make(TRPOUSL, n_critic_updates=1, cost_limit=1.0).learn(80)
-        make(TRPOSL, points(2, cost_scale=-1.0), n_critic_updates=1, cost_limit=1.0).learn(80)
 
 
 def test_without_a_cost_the_cost_model_rests() -> None:

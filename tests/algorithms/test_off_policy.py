@@ -215,16 +215,6 @@ def test_several_steps_survive_saving(tmp_path: Path) -> None:
     )
 
 
-def test_sums_end_where_learning_begins_anew() -> None:
-    """No cost of the next ``learn`` counts for an episode that was left in the middle."""
-    env = make_vec_env(lambda: Clock(8, False), 1)
-    model = TD3Lag("MlpPolicy", env, n_steps=3, cost_limit=1.0, **settings())
-    model.learn(12)
-    model.learn(12)
-    batch = model.replay_buffer.sample(256)
-    assert (batch.next_observations > batch.observations).all()
-
-
 def test_cost_quantiles_by_hand() -> None:
     """Two costs, five quantiles of two networks each, the lowest two of the ten dropped."""
     keys = {"cost_keys": ("cost", "again"), "missing_cost": "zero", "cost_limit": [0.1, 1.0]}

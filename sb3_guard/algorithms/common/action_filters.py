@@ -9,7 +9,6 @@ in torch's operators, with gradients written out, so that the same code acts and
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_action_dim
@@ -18,7 +17,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.critics import Regression, StateNetwork
-from sb3_guard.algorithms.common.natural_gradient import shortest
+
+SWEEPS = 20  # corrections of an action where there are several costs
 
 
 class ActionFilter(nn.Module):
@@ -95,43 +95,14 @@ def clip_along(actions: th.Tensor, normals: th.Tensor, limits: th.Tensor) -> th.
     return (actions - mu * normals).clamp(-1.0, 1.0)
 
 
-# Weight of a squared violation against a squared change of the action, both as distances.
-_SLACK = 1e8
-
-
-def nearest_in_box(action: np.ndarray, normals: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Nearest point of the box [-1, 1]ᵏ with ``normals @ x ≤ limits``.
-
-    A limit below what the box can reach on its own is first raised to that. Where the limits then
-    contradict each other, the sum of the squared distances to the half-spaces is least.
-
-    :param action: a point of the box, shape [k]
-    :param normals: shape [m, k]
-    :param limits: shape [m]
-    :return: shape [k]
-    """
-    lengths = np.linalg.norm(normals, axis=1)
-    moves = lengths > 1e-12
-    limits = np.maximum(limits, -np.abs(normals).sum(axis=1))[moves] / lengths[moves]
-    units = normals[moves] / lengths[moves, None]
-    k, m = len(action), len(units)
-    # Unknowns: the change of the action, and a scaled slack per half-space.
-    half_spaces = np.hstack([units, -np.eye(m) / np.sqrt(_SLACK)])
-    walls = np.hstack([np.vstack([np.eye(k), -np.eye(k)]), np.zeros((2 * k, m))])
-    offsets = np.concatenate([units @ action - limits, action - 1.0, -action - 1.0])
-    stacked = np.vstack([half_spaces, walls])
-    multipliers, phi = shortest(stacked, offsets)
-    change = -(stacked.T @ multipliers)[:k] / max(phi, 1e-12)
-    return np.clip(action + change, -1.0, 1.0)
-
-
 class SafetyLayer(ActionFilter):
     """Projects actions on half-spaces of a cost that is linear in the action (Dalal et al., 2018).
 
     The model is ``ĉ_i(s, a) = c_i + g_i(s) · a``, where c_i is what the last step cost and g a
     network; the layer executes the nearest action of the box with ĉ_i ≤ threshold_i. It
     leaves alone what exceeds that by at most noise_i, or where a unit of every action changes ĉ_i
-    by at most noise_i. A second output ``h_i(s) ≈ c_i`` stands in where the last cost is not known.
+    by at most noise_i. Of several costs, the one that is exceeded most is corrected, again and
+    again. A second output ``h_i(s) ≈ c_i`` stands in where the last cost is not known.
 
     :param policy: the policy that carries the filter
     :param n_costs: number m of constraints
@@ -205,10 +176,12 @@ class SafetyLayer(ActionFilter):
         slopes = th.where(certain.unsqueeze(2), slopes, 0.0)
         if len(self.threshold) == 1:
             return clip_along(actions, slopes[:, 0], limits)
-        broken = (certain & (excess > 0.0)).any(dim=1).nonzero().flatten()
-        for i in broken.tolist():
-            parts = (tensor[i].cpu().numpy() for tensor in (actions, slopes, limits))
-            actions[i] = th.as_tensor(nearest_in_box(*parts)).to(actions)
+        lengths = slopes.norm(dim=2).clamp(min=1e-12)
+        for _ in range(SWEEPS):  # to the half-space that is farthest away
+            beyond = ((slopes * actions.unsqueeze(1)).sum(dim=2) - limits) / lengths
+            worst = th.where(certain, beyond, -th.inf).argmax(dim=1)[:, None]  # [B, 1]
+            normal = th.take_along_dim(slopes, worst.unsqueeze(2), dim=1)[:, 0]
+            actions = clip_along(actions, normal, limits.gather(1, worst))
         return actions
 
 

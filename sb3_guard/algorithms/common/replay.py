@@ -5,8 +5,6 @@ Q_C(s, a) = c + γ_C Q_C(s', a'); the latest episodes tell J_C.
 """
 
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -174,19 +172,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
 
     # Collecting
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: Any = None,
-        reset_num_timesteps: bool = True,
-        *args: Any,
-    ) -> tuple[int, BaseCallback]:
-        if isinstance(self.replay_buffer, CostNStepReplayBuffer) and (
-            reset_num_timesteps or self._last_obs is None
-        ):
-            self.replay_buffer.cut()  # new episodes begin
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
-
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, *args: Any, **kwargs: Any
     ) -> RolloutReturn:
@@ -284,16 +269,3 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         margin = self.safety_margin * np.abs(self.costs.limits)
         rate = self.lambda_lr * (self.costs.horizon or 0.0) / self.num_timesteps
         self.step([mean + margin for mean in means], rate)
-
-    @contextmanager
-    def critics_constant(self) -> Iterator[None]:
-        """Let the actor's gradient go through the critics without gradients of their weights."""
-        networks = (*self.critic.q_networks, self.cost_critic.online)  # type: ignore[attr-defined]
-        weights = [w for each in networks for w in each.parameters() if w.requires_grad]
-        for weight in weights:
-            weight.requires_grad_(False)
-        try:
-            yield
-        finally:
-            for weight in weights:
-                weight.requires_grad_(True)

@@ -41,8 +41,8 @@ def _of_length(rows: int, value: Any, length: int) -> Any:
     return filled
 
 
-class CostColumns(ReplayBuffer):
-    """Cost columns in addition to a replay buffer; rows that are still empty are not pickled.
+class CostReplayBuffer(ReplayBuffer):
+    """SB3's replay buffer with the costs of each step; rows that are empty are not pickled.
 
     :param n_costs: number m of costs
     """
@@ -72,15 +72,11 @@ class CostColumns(ReplayBuffer):
         return CostReplayBufferSamples(*samples, costs=costs)
 
 
-class CostReplayBuffer(CostColumns):
-    """SB3's replay buffer with the costs of each step, shape (buffer_size, n_envs, m)."""
-
-
-class CostDictReplayBuffer(CostColumns, DictReplayBuffer):
+class CostDictReplayBuffer(CostReplayBuffer, DictReplayBuffer):
     """The same for Dict observations."""
 
 
-class CostNStepReplayBuffer(CostColumns, NStepReplayBuffer):
+class CostNStepReplayBuffer(CostReplayBuffer, NStepReplayBuffer):
     """The same for n-step returns of rewards and costs.
 
     :param cost_gamma: discount factor of the costs
@@ -89,11 +85,6 @@ class CostNStepReplayBuffer(CostColumns, NStepReplayBuffer):
     def __init__(self, *args: Any, cost_gamma: float = 0.99, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.cost_gamma = cost_gamma
-
-    def cut(self) -> None:
-        """Let no sum reach beyond the latest step: what comes next is another episode."""
-        if self.size() > 0:
-            self.timeouts[self.pos - 1] = 1.0 - self.dones[self.pos - 1]
 
     def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
         # SB3's sums of rewards, drawn anew for each cost in their place, from the same generator.

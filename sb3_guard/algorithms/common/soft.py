@@ -7,6 +7,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import polyak_update
+from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.replay import CostReplay
 from sb3_guard.algorithms.common.replay_buffers import CostReplayBufferSamples
@@ -14,8 +15,6 @@ from sb3_guard.algorithms.common.replay_buffers import CostReplayBufferSamples
 
 class SoftActorCritic(CostReplay):
     """For the classes that maximise E[Σ r + α H(π)].
-
-    A leaf says what its critics are: one estimate a network (SAC), or quantiles (TQC).
 
     SB3 learns log α from 0, at ``learning_rate``: where a step's reward is 0.02, the policy stays
     random for the 14,000 gradient steps in which α falls from 1. With ``"auto_reward"`` α begins at
@@ -72,26 +71,26 @@ class SoftActorCritic(CostReplay):
         if size > 0.0 and self.log_ent_coef is not None:
             self.log_ent_coef.fill_(np.log(size / get_action_dim(self.action_space)))
 
-    # What the critics are
+    # What the critics are: SAC's, one estimate a network
 
     def next_values(self, values: Any) -> th.Tensor:
         """Estimates of the next state's value that the critics learn from, shape [B, K].
 
         :param values: what the target critics say
         """
-        raise NotImplementedError
+        return th.cat(values, dim=1).amin(dim=1, keepdim=True)
 
     def critic_loss(self, values: Any, target: th.Tensor) -> th.Tensor:
         """The loss of the critics' ``values`` against targets of shape [B, K]."""
-        raise NotImplementedError
+        return 0.5 * sum(F.mse_loss(value, target) for value in values)  # type: ignore[return-value]
 
     def estimate(self, values: Any) -> th.Tensor:
         """What the actor climbs of the critics' ``values``, shape [B, 1]."""
-        raise NotImplementedError
+        return th.min(th.cat(values, dim=1), dim=1, keepdim=True)[0]
 
     def expected(self, values: Any) -> th.Tensor:
         """An estimate of Q that the unit of rewards is measured by, shape [B, 1]."""
-        return self.estimate(values)
+        return values[0]
 
     def learn_from(self, batch: CostReplayBufferSamples, step: int) -> dict[str, float]:
         """SB3's order: entropy coefficient, critics, actor, targets."""
@@ -132,16 +131,12 @@ class SoftActorCritic(CostReplay):
         # Actor: down (α log π - Q + Σ w_i Q_Ci) / (1 + Σ λ_i)
         self.actor.optimizer.zero_grad()
         weights = self.batch_weights(self.expected(values))
-        with self.critics_constant():
-            chosen = self.estimate(self.critic(batch.observations, actions))
-            loss = alpha * log_prob - chosen
-            if weights.any():
-                costs = self.cost_critic(batch.observations, actions)
-                loss = (loss + (costs * weights).sum(1, keepdim=True)) / (
-                    1.0 + float(self.prices.sum())
-                )
-            loss = loss.mean()
-            loss.backward()
+        loss = alpha * log_prob - self.estimate(self.critic(batch.observations, actions))
+        if weights.any():
+            costs = (self.cost_critic(batch.observations, actions) * weights).sum(1, keepdim=True)
+            loss = (loss + costs) / (1.0 + float(self.prices.sum()))
+        loss = loss.mean()
+        loss.backward(inputs=[*self.actor.parameters()])
         self.actor.optimizer.step()
         logs["actor_loss"] = loss.item()
 

@@ -112,6 +112,7 @@ def signature(cls: type, fixed: frozenset[str] = frozenset()) -> inspect.Signatu
         _, *arguments = inspect.signature(constructor).parameters.values()
         for argument in arguments:
             if argument.kind in _HANDS_ON or argument.name in fixed | _INTERNAL:
+                positional &= argument.name not in fixed  # its place is not free
                 continue
             kind = argument.kind if positional else _ONLY
             nearest = found.setdefault(argument.name, argument.replace(kind=kind))

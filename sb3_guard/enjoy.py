@@ -7,12 +7,6 @@ from sb3_guard.zoo.agents.flags import EnjoyFlags as Flags
 from sb3_guard.zoo.cli.flags import command
 
 
-def _has_display() -> bool:
-    return sys.platform != "linux" or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
-
-
 def enjoy(flags: Flags) -> int:
     """Play an agent, in a window, for a video, or unseen."""
     if flags.pretrained and not flags.given & {"env", "algo", "folder", "exp_id"}:
@@ -22,7 +16,8 @@ def enjoy(flags: Flags) -> int:
         return 0
     render_mode = "rgb_array" if flags.record is not None else None
     if render_mode is None and not flags.no_render:
-        if flags.window or _has_display():
+        display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        if flags.window or display or sys.platform != "linux":
             render_mode = "human"
         elif flags.verbose > 0:
             print("There is no display: nothing is shown. --record makes a video.", file=sys.stderr)

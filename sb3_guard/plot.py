@@ -2,11 +2,15 @@
 
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import jinja2
+import pandas as pd
+
+from sb3_guard import __version__
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import UsageError
@@ -15,7 +19,6 @@ from sb3_guard.zoo.results import figures, tables
 from sb3_guard.zoo.results import runs as reading
 from sb3_guard.zoo.results.figure_data import Data
 from sb3_guard.zoo.results.paper import FIGURES, draw
-from sb3_guard.zoo.results.report import report
 from sb3_guard.zoo.results.statistics import with_safety
 
 TITLES = "\n".join(f"  {name:<10} {figure.__doc__}" for name, figure in FIGURES.items())
@@ -97,7 +100,7 @@ def plot(flags: Flags) -> int:
     status = _draw(data, ["curves"] if by_default else flags.figure, flags)
     if flags.report:
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
-        page = report(data, title, results.left_out)
+        page = page_of(data, title, results.left_out)
         with tables.written(Path(flags.report)) as handle:
             handle.write(page.encode())
         print(f"wrote {flags.report}")
@@ -125,6 +128,43 @@ def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
                 figures.save(figure, path)
                 print(f"wrote {path}")
     return status
+
+
+def page_of(data: Data, title: str, left_out: Mapping[str, str]) -> str:
+    """
+    The page.
+
+    :param data: the runs
+    :param title: what the page is called
+    :param left_out: why a run could not be read, by its path
+    :return: HTML
+    """
+    loader = jinja2.PackageLoader("sb3_guard.zoo.results", ".")
+    page = jinja2.Environment(loader=loader, autoescape=True).get_template("report.html.jinja")
+    drawn = [
+        (name, FIGURES[kind].__doc__, figures.inline_svg(figure, name))
+        for kind in FIGURES
+        for name, figure in draw(kind, data).items()
+    ]
+    return page.render(
+        title=title,
+        runs=data.runs,
+        made={
+            name: sorted(data.runs[name].dropna().unique())
+            for name in (*reading.VERSIONS, "commit")
+        },
+        version=__version__,
+        left_out=left_out,
+        tables={heading: _html(table) for heading, table in tables.tables(data).items()},
+        captions=tables.CAPTIONS,
+        figures=drawn,
+        run_table=_html(tables.spelled(data.runs, tables.RUNS)),
+    )
+
+
+def _html(table: pd.DataFrame) -> str:
+    with pd.option_context("display.max_colwidth", None):
+        return str(table.to_html(index=False, border=0, justify="left"))
 
 
 main = command(Flags, plot)

@@ -19,7 +19,6 @@ from sb3_guard.zoo.results import figures
 from sb3_guard.zoo.results.figure_data import COLORS, INK, PLACES, Data
 from sb3_guard.zoo.results.figures import save
 from sb3_guard.zoo.results.paper import FIGURES, draw
-from sb3_guard.zoo.results.report import report
 from sb3_guard.zoo.results.runs import read_results, select
 from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import tables
@@ -353,7 +352,7 @@ def test_wrong_usage(small, tmp_path, monkeypatch, capsys, arguments, message):
 def page_of(folder) -> str:
     found = read_results([folder])
     runs = select(with_safety(found.runs))
-    return report(Data(runs), "A <grid>", found.left_out)
+    return plot.page_of(Data(runs), "A <grid>", found.left_out)
 
 
 def test_page_is_complete_and_by_itself(small):

@@ -230,15 +230,12 @@ def _header(
     flags: TuneFlags, settings: Settings, study: optuna.Study, folder: Path, shown: str
 ) -> str:
     finished = len(study.get_trials(deepcopy=False, states=FINISHED))
-    if settings.cost_limit is None:
-        goal = f"the highest return ({settings.algo} has no cost limit; --cost-limit sets one)"
-    else:
-        limits = zip(settings.cost_limit, settings.cost_keys, strict=True)
-        bounds = ", ".join(f"{key} of at most {short(limit)}" for limit, key in limits)
-        goal = f"the highest return with an episode {bounds}"
+    limits = zip(settings.cost_limit or (), settings.cost_keys, strict=False)
+    bounds = [f"{key} of at most {short(limit)}" for limit, key in limits]
+    goal = f"with an episode {', '.join(bounds)}" if bounds else "(--cost-limit sets a limit)"
     seeds = " ".join(map(str, settings.seeds))
     return f"""Study {study.study_name}: {finished} of {flags.n_trials} trials are finished
-  searching    {goal}
+  searching    the highest return {goal}
   each trial   {settings.n_timesteps:,} steps, --seeds {seeds}
   folder       {folder}
   watch with   optuna-dashboard {shown}"""

@@ -1,5 +1,6 @@
 """Grids: refused in full or carried out in full, whatever dies meanwhile."""
 
+import gc
 import json
 import os
 import signal
@@ -59,6 +60,7 @@ class Here(Executor):
 def here(monkeypatch):
     """Carry out grids in this process."""
     executor = Here()
+    monkeypatch.setattr(gc, "collect", lambda: 0)  # it takes most of the time of runs so short
     monkeypatch.setattr(grid, "processes", lambda number: nullcontext(executor))
     return executor
 
@@ -137,9 +139,8 @@ def test_a_grid_file_is_the_flags(tmp_path, monkeypatch, here, capsys):
 REFUSED = [
     (["--preset", "main9"], ["--preset", "leave out"]),
     (["-params", "cost_limt:5"], ["none of the algorithms", "'cost_limt'", "'cost_limit'"]),
-    (["--env-kwargs", "hazards:{'num':200}"], ["Goal_Point_8Hazards-v0", "LayoutError"]),
     (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
-    (["-f", "/dev/null/x"], ["/dev/null/x", "choose another with -f"]),
+    (["-f", "/dev/null/x"], ["-f: can't write", "/dev/null/x"]),
 ]
 
 

@@ -1,5 +1,6 @@
 """Tuning: what is searched, what counts as best, and that nothing is lost on the way."""
 
+import gc
 import os
 import signal
 import socket
@@ -261,6 +262,7 @@ def pretend(monkeypatch, outcome):
         return history, True
 
     monkeypatch.setattr(trials.Objective, "_train", train)
+    monkeypatch.setattr(gc, "collect", lambda: 0)  # no model is made; it takes most of the time
 
 
 def by_kl(values, seed):
@@ -354,7 +356,7 @@ def test_several_costs(tmp_path, folder, monkeypatch, capsys):
 
 
 def test_trains_for_real(tmp_path, folder, monkeypatch, capsys):
-    more = ["--seeds", "0", "1", "-params", "normalize:True"]
+    more = "--seeds 0 1 -params normalize:True -n 120 --n-evaluations 2".split()
     assert run(tmp_path, *more, "--n-trials", "2") == 0
     out = capsys.readouterr().out
     assert "Trial 1: return " in out

@@ -134,24 +134,22 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     :raises UsageError: there is no such agent, or it does not fit the environment
     """
     import_packages(flags.gym_packages)
-    if flags.pretrained and flags.given & {"folder", "exp_id"}:
-        raise UsageError(
-            "--pretrained takes an agent that comes with the package: leave out --folder and "
-            "--exp-id, or leave out --pretrained to take a run of your own"
-        )
     if flags.pretrained:
+        if flags.given & {"folder", "exp_id"}:
+            raise UsageError(
+                "--pretrained takes an agent that comes with the package: leave out --folder and "
+                "--exp-id, or leave out --pretrained to take a run of your own"
+            )
         run = find_pretrained(flags.env, flags.algo if "algo" in flags.given else None)
-        path, flags.algo = weights(run), run.path.parent.name
+        flags.algo = run.path.parent.name
     elif is_run(Path(flags.folder)):
         if flags.given & {"algo", "env", "exp_id"}:
             raise UsageError(f"{flags.folder} is a run: leave out --algo, --env and --exp-id")
         run = RunFolder(Path(flags.folder))
         with explained(f"{run.params / 'args.yml'} is damaged"):
             flags.algo, flags.env = (str(run.args()[name]) for name in ("algo", "env"))
-        path, statistics = find_model(run, flags)
     else:
         run = find_run(flags.folder, flags.algo, flags.env, flags.exp_id, flags.gym_packages)
-        path, statistics = find_model(run, flags)
     filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
     require_named(run.path, flags, filed, "gym_packages")
     hyperparams = {**without_withdrawn(run, algorithm(flags.algo)), "callback": None}
@@ -165,8 +163,9 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         th.set_num_threads(flags.num_threads)
     normalizer = None
     if flags.pretrained:
-        model = load_pretrained(env_id, flags.algo, device=flags.device)
+        path, model = weights(run), load_pretrained(env_id, flags.algo, device=flags.device)
     else:
+        path, statistics = find_model(run, flags)
         model = load_model(played.algorithm, path, None, flags.device)
         normalizer = None if setup.normalize is None else read_normalizer(statistics)
     # A batch has no window, and no wrappers of single environments.

@@ -160,7 +160,6 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     storage, shown = open_storage(flags.storage, folder / "study.journal")
     require_writable(folder, "-f")
     study = open_study(flags, settings, search, name, storage, shown)
-    folder.mkdir(parents=True, exist_ok=True)
     objective = Objective(flags, training, settings, search)
     report = Report(folder, asdict(settings), flags.gym_packages)
     loud = main and flags.verbose > 0

@@ -13,7 +13,8 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_guard.common.certificate import MOST, Certificate, certify, limits_of
+from sb3_guard.checks import check_integer
+from sb3_guard.common.certificate import LEAST, MOST, Certificate, certify, limits_of
 from sb3_guard.common.evaluation import evaluate_policy, sync_normalization
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
@@ -56,7 +57,7 @@ class DeliveryCallback(BaseCallback):
     :param cost_limit: d, one number or one per cost; None: the model's own at the end
     :param candidates: how many policies are kept, the last one among them
     :param screening: episodes of each
-    :param n_episodes: most episodes of a certificate
+    :param n_episodes: most episodes of a certificate, at least 50
     :param deterministic: certify the most likely actions, or sampled ones
     :param seed: the episodes' seeds are drawn from it
     :param verbose: 1 prints what is delivered, or how far the nearest candidate is away
@@ -76,6 +77,7 @@ class DeliveryCallback(BaseCallback):
         verbose: int = 1,
     ) -> None:
         super().__init__(verbose)
+        check_integer("n_episodes", n_episodes, LEAST)
         self.eval_env, self.folder = eval_env, Path(folder)
         self.cost_limit, self.candidates, self.screening = cost_limit, candidates, screening
         self.n_episodes, self.deterministic, self.seed = n_episodes, deterministic, seed

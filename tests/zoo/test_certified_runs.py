@@ -5,12 +5,12 @@ import json
 import pytest
 import torch
 from killed import crash, runs_of
-from typed import LENGTH, SMALL, TOY, trained
+from typed import LENGTH, SMALL, TOY, refused, trained
 
 from sb3_guard import enjoy, export_agent, train
 from sb3_guard.common.certificate import Certificate
 
-CERTIFY = ["--certify", "40", "--eval-freq", "-1", "-n", "240"]
+CERTIFY = ["--certify", "50", "--eval-freq", "-1", "-n", "240"]
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +58,9 @@ def test_a_run_that_is_killed_delivers_the_same(step, tmp_path, monkeypatch):
         one, other = (torch.load(run / "candidates" / name) for run in (whole, cut))
         assert one["num_timesteps"] == other["num_timesteps"]
         assert all(torch.equal(value, other["policy"][key]) for key, value in one["policy"].items())
+
+
+def test_too_few_episodes_are_refused_before_the_training(tmp_path, capsys):
+    arguments = [*LENGTH, *TOY, *SMALL, "-f", str(tmp_path), "-n", "120", "--certify", "49"]
+    refused(train.main, arguments, capsys, "--certify", "at least 50")
+    assert not [*tmp_path.iterdir()]

@@ -54,7 +54,8 @@ class EvaluationFlags(Command):
         else 1)
     :param eval_env_kwargs: arguments of the evaluation environment (default: those of training)
     :param certify: end with the best policy of the last half that is certified to keep its limit,
-        by at most so many fresh episodes each of up to three; 0: with the last policy (default: 0)
+        by at most so many fresh episodes, at least 50, each of up to three; 0: with the last policy
+        (default: 0)
 
     Files:
 

@@ -250,12 +250,12 @@ class Run:
                 )
                 self.evaluation.model = self.model
             if flags.certify and self.constrained:
-                self.delivery = DeliveryCallback(
-                    self.make_evaluation_envs(DELIVERY_ENVS),
-                    n_episodes=flags.certify,
-                    seed=evaluation_seed(flags.seed, 2),
-                    verbose=int(flags.verbose > 0),
-                )
+                env = self.make_evaluation_envs(DELIVERY_ENVS)
+                seed, verbose = evaluation_seed(flags.seed, 2), int(flags.verbose > 0)
+                with explained("--certify", ValueError):
+                    self.delivery = DeliveryCallback(
+                        env, n_episodes=flags.certify, seed=seed, verbose=verbose
+                    )
             if flags.track:
                 self.tracker = self._track()
         except BaseException:

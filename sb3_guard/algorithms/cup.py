@@ -51,15 +51,6 @@ class CUP(Lagrangian, FirstOrder):
     def __init__(self, *args: Any, n_epochs: int = 5, **kwargs: Any) -> None:
         super().__init__(*args, n_epochs=n_epochs, **kwargs)
 
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        name = "gamma" if self.cost_gamma is None else "cost_gamma"
-        if getattr(self, name) == 1.0:
-            raise ValueError(
-                f"{name}=1.0: CUP weighs costs by (1 - γλ)/(1 - γ), which has no bound there; use "
-                "a discount factor below 1, such as 0.99, or PPOLag, which takes any"
-            )
-
     @property
     def factor(self) -> float:
         """(1 - γλ)/(1 - γ), with the discount and the λ of the cost advantages."""

@@ -25,8 +25,6 @@ class PCPO(CPO):
     are kept with a learnt :class:`~sb3_guard.algorithms.common.costs.Margin`, which the paper does
     not have.
 
-    :param recovery: count a violation as at most this share of what a step of the region can take
-        away; 1 for the whole violation, as in the paper
     :param projection: ``"kl"`` for L = F, ``"l2"`` for L = I
     :param line_search: whether to shorten steps that leave the trust region; False takes them
         whole, as the paper does
@@ -36,7 +34,8 @@ class PCPO(CPO):
     search_space: ClassVar[dict[str, Any]] = {"projection": ["kl", "l2"]}
 
     # A step always has the reward's part, so the projection may go as far as the limit asks.
-    recovery: float = hyperparameter(1.0, high=1.0, ends="(]")
+    fixed_arguments: ClassVar[frozenset[str]] = CPO.fixed_arguments | {"recovery"}
+
     projection: Literal["kl", "l2"] = hyperparameter("kl")
     line_search: bool = hyperparameter(True)
 
@@ -44,6 +43,6 @@ class PCPO(CPO):
         g, B, delta = region.gradient, region.cost_gradients, region.delta
         c = self.margin.violation(self.costs)
         v, W = region.solve(g), th.stack([region.solve(b) for b in B])
-        x, pull = projected_step(g, B, c, v, W, delta, self.projection == "l2", self.recovery)
+        x, pull = projected_step(g, B, c, v, W, delta, self.projection == "l2")
         self._record_per_cost("train/projection", pull)
         return x, lambda trial: trial.kl <= (delta if self.line_search else sys.float_info.max)

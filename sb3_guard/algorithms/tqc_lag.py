@@ -33,11 +33,6 @@ class CostQuantiles(CostQ):
     ) -> None:
         kwargs: dict[str, Any] = policy.critic_kwargs  # type: ignore[assignment]
         networks, outputs = kwargs["n_critics"], kwargs["n_quantiles"]
-        if not 0 <= drop < outputs:
-            raise ValueError(
-                f"top_quantiles_to_drop_per_net={drop!r}: must be at least 0 and below the number "
-                f"of quantiles, policy_kwargs={{'n_quantiles': {outputs}}}"
-            )
         super().__init__(policy, n_costs, learning_rate, networks, outputs)
         self.dropped = drop * networks
 

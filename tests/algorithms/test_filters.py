@@ -396,8 +396,6 @@ def test_the_true_last_cost_wins() -> None:
     plain, _ = ActorCriticPolicy.predict(model.policy, observations, deterministic=True)
     np.testing.assert_array_equal(low, plain)
     assert np.abs(high - plain).max() > 0.1
-    with pytest.raises(ValueError, match=r"shape \(2, 2\).*shape \(2, 1\)"):
-        model.predict(observations, (np.zeros((2, 2)),))
 
 
 def test_evaluation_tells_the_layer_what_the_last_step_cost() -> None:

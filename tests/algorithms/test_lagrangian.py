@@ -310,7 +310,6 @@ def test_the_rate_given_to_load_is_the_rate(cls: type[TrustRegion], tmp_path: Pa
     ("cls", "kwargs", "message"),
     [
         (TRPOLag, {"lambda_lr": -1.0}, "lambda_lr=-1.0"),
-        (TRPOLag, {"lambda_init": 2.0, "lambda_max": 1.0}, "lambda_max=1.0: .* lambda_init=2.0"),
         (TRPOFAC, {"lambda_epochs": 0}, "lambda_epochs=0"),
         (TRPOFAC, {"lambda_init": 0.0}, r"lambda_init=0.0.*\(0, inf\)"),
         (TRPOFAC, {"mode": "mean"}, "mode='mean'.*'statewise' or 'expected'"),

@@ -1,6 +1,6 @@
 """Rollout buffers that carry costs in addition to rewards."""
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -33,20 +33,20 @@ _FIELDS = CostRolloutBufferSamples._fields[6:-1]
 _SB3_FIELDS = ("actions", "values", "log_probs", "advantages", "returns")
 
 
-class _Costs:
-    """The cost half of both buffers; mixed in before SB3's class, which owns everything else."""
+class CostRolloutBuffer(RolloutBuffer):
+    """On-policy transitions with their costs, cost advantages and cost returns.
 
-    buffer_size: int
-    n_envs: int
-    action_dim: int
-    gamma: float
-    rewards: np.ndarray
-    episode_starts: np.ndarray
-    generator_ready: bool
-    full: bool
-    observations: Any
-    swap_and_flatten: Any
-    to_torch: Any
+    ``costs`` [T, n_envs, m] are raw; ``cost_bootstraps`` hold what a time-out adds to them.
+
+    :param n_costs: number m of cost signals
+    :param cost_gamma: discount factor of the costs
+    :param cost_gae_lambda: bias-variance trade-off of the cost advantages
+    :param keep_executed: whether there is room for executed actions in addition to the sampled ones
+    :param returns: what the critics learn, of rewards and costs alike: ``"lambda"`` for SB3's
+        λ-returns, ``"discounted"`` for discounted sums to come
+
+    Other parameters are those of SB3's ``RolloutBuffer``.
+    """
 
     def __init__(
         self,
@@ -76,11 +76,11 @@ class _Costs:
         self.previous_costs = np.zeros(shape, dtype=np.float32)
         executed = self.action_dim if self.keep_executed else 0
         self.executed_actions = np.zeros((*shape[:2], executed), dtype=np.float32)
-        super().reset()  # type: ignore[misc]
+        super().reset()
 
     def compute_returns_and_advantage(self, last_values: th.Tensor, dones: np.ndarray) -> None:
         """SB3's advantages and returns; or discounted returns, whatever ``gae_lambda`` is."""
-        super().compute_returns_and_advantage(last_values, dones)  # type: ignore[misc]
+        super().compute_returns_and_advantage(last_values, dones)
         if self.targets == "discounted":
             last = last_values.cpu().numpy().flatten()
             self.returns = discounted_returns(
@@ -114,11 +114,15 @@ class _Costs:
 
     def observations_by_time(self, device: th.device) -> PyTorchObs:
         """All observations before :meth:`get`, step by step, shape [T · n_envs, …]."""
-        if isinstance(self.observations, dict):
-            flat: Any = {k: v.reshape(-1, *v.shape[2:]) for k, v in self.observations.items()}
-        else:
-            flat = self.observations.reshape(-1, *self.observations.shape[2:])
+        flat = self._each(lambda array: array.reshape(-1, *array.shape[2:]))
         return obs_as_tensor(flat, device)
+
+    def _each(self, function: Callable[[np.ndarray], np.ndarray]) -> Any:
+        """The observations, or those of each key, after a function."""
+        stored: Any = self.observations
+        if isinstance(stored, dict):
+            return {key: function(array) for key, array in stored.items()}
+        return function(stored)
 
     def _flatten(self) -> None:
         """[T, n, …] -> [n · T, …]: one environment's steps after the other's, as SB3 does."""
@@ -127,24 +131,20 @@ class _Costs:
         assert self.full, "the rollout has not ended yet"
         for name in (*_SB3_FIELDS, *_FIELDS):
             setattr(self, name, self.swap_and_flatten(getattr(self, name)))
-        stored = self.observations
-        if isinstance(stored, dict):
-            self.observations = {key: self.swap_and_flatten(v) for key, v in stored.items()}
-        else:
-            self.observations = self.swap_and_flatten(stored)
+        self.observations = self._each(self.swap_and_flatten)
         self.generator_ready = True
 
-    def get(self, batch_size: int | None = None) -> Generator[CostRolloutBufferSamples, None, None]:
+    def get(self, batch_size: int | None = None) -> Generator[Any, None, None]:
         self._flatten()
-        yield from super().get(batch_size)  # type: ignore[misc]
+        yield from super().get(batch_size)
 
     def whole(self) -> CostRolloutBufferSamples:
         """The rollout in order, one environment's steps after the other's; nothing is drawn."""
         self._flatten()
         return self._get_samples(np.arange(self.buffer_size * self.n_envs))
 
-    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> CostRolloutBufferSamples:
-        samples = super()._get_samples(batch_inds, env)  # type: ignore[misc]
+    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> Any:
+        samples = super()._get_samples(batch_inds, env)
         arrays = (*(getattr(self, name)[batch_inds] for name in _FIELDS), batch_inds)
         # indexing has copied them
         return CostRolloutBufferSamples(
@@ -152,21 +152,5 @@ class _Costs:
         )
 
 
-class CostRolloutBuffer(_Costs, RolloutBuffer):  # type: ignore[misc]
-    """On-policy transitions with their costs, cost advantages and cost returns.
-
-    ``costs`` [T, n_envs, m] are raw; ``cost_bootstraps`` hold what a time-out adds to them.
-
-    :param n_costs: number m of cost signals
-    :param cost_gamma: discount factor of the costs
-    :param cost_gae_lambda: bias-variance trade-off of the cost advantages
-    :param keep_executed: whether there is room for executed actions in addition to the sampled ones
-    :param returns: what the critics learn, of rewards and costs alike: ``"lambda"`` for SB3's
-        λ-returns, ``"discounted"`` for discounted sums to come
-
-    Other parameters are those of SB3's ``RolloutBuffer``.
-    """
-
-
-class CostDictRolloutBuffer(_Costs, DictRolloutBuffer):  # type: ignore[misc]
+class CostDictRolloutBuffer(CostRolloutBuffer, DictRolloutBuffer):
     """:class:`CostRolloutBuffer` for dictionary observations."""

@@ -8,7 +8,7 @@ import torch as th
 from stable_baselines3.common.policies import BaseModel, BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from stable_baselines3.common.utils import polyak_update
 from torch import nn
 from torch.nn import functional as F
 
@@ -100,7 +100,7 @@ class CostQ(nn.Module):
         online = CostNetworks(policy, networks * n_costs, outputs)
         self.online = online.to(policy.device)
         self.target = copy.deepcopy(self.online)
-        self.train(False)  # but the one that is learning, while it is
+        self.train(False)
         self.optimizer = policy.optimizer_class(
             self.online.parameters(),
             lr=learning_rate,  # type: ignore[call-arg]
@@ -141,7 +141,3 @@ class CostQ(nn.Module):
     def follow(self, tau: float) -> None:
         """Move the target networks by a share of the way."""
         polyak_update(self.online.parameters(), self.target.parameters(), tau)
-        ours, theirs = (
-            get_parameters_by_name(network, ["running_"]) for network in (self.online, self.target)
-        )
-        polyak_update(ours, theirs, 1.0)

@@ -1,7 +1,7 @@
 """The costs of a training: limits, episodes, and what they say about the violation."""
 
 import re
-from collections import deque
+from collections import deque, namedtuple
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Literal
@@ -11,6 +11,9 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_guard.checks import check_per_cost, is_number
 from sb3_guard.costs import EpisodeCosts
+
+# Agents that were saved while the estimate was one of these are read; their costs begin anew.
+CostEstimate = namedtuple("CostEstimate", "episode_cost horizon violation")
 
 _NUMBER = r"(-?\d+\.?\d*(?:e[+-]?\d+)?)"
 _LINE = re.compile(f"lin_{_NUMBER}_{_NUMBER}")

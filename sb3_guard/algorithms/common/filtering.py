@@ -80,13 +80,8 @@ class FilteredTrustRegion(TrustRegion):
         state_dicts, tensors = super()._get_torch_save_params()
         return [*state_dicts, "policy.action_filter.optimizer"], tensors
 
-    def set_parameters(
-        self,
-        load_path_or_dict: str | dict[str, Any],
-        exact_match: bool = True,
-        device: th.device | str = "auto",
-    ) -> None:
-        super().set_parameters(load_path_or_dict, exact_match, device)
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        super().set_parameters(*args, **kwargs)
         # A given threshold is a hyperparameter, which `load` may change.
         self._set_threshold(self.policy.action_filter.threshold.cpu().numpy())
 

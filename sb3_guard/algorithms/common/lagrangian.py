@@ -144,14 +144,6 @@ class Lagrangian(Constrained):
 
     prices: np.ndarray  # λ of the update under way, shape (m,)
 
-    def _check_hyperparameters(self) -> None:
-        super()._check_hyperparameters()
-        if self.lambda_max is not None and self.lambda_max < self.lambda_init:
-            raise ValueError(
-                f"lambda_max={self.lambda_max!r}: must be at least lambda_init="
-                f"{self.lambda_init!r}, where the multipliers begin, or None for no bound"
-            )
-
     def _setup_model(self) -> None:
         super()._setup_model()
         relative = self.lambda_units == "relative"

@@ -137,7 +137,6 @@ def projected_step(
     W: th.Tensor,
     delta: float,
     euclidean: bool = False,
-    recovery: float = 1.0,
 ) -> tuple[th.Tensor, np.ndarray]:
     """The TRPO step, then the nearest point that satisfies the linearised constraints.
 
@@ -157,9 +156,6 @@ def projected_step(
     :param W: F⁻¹b_i, shape (m, P)
     :param delta: trust-region radius δ > 0
     :param euclidean: measure distance by L = I instead of L = F, i.e. to first order by the KL
-    :param recovery: count a violation as at most this share of what a step of the trust region can
-        change it by, so that a limit out of reach does not swallow the reward's part of the step;
-        1 for the whole violation
     :return: the step, shape (P,), and how far it was pulled along each ``-L⁻¹b_i``, shape (m,)
     """
     c = np.asarray(c, dtype=np.float64)
@@ -169,8 +165,6 @@ def projected_step(
     gram = (rows @ images.T).numpy()  # [m, m]
     gram = (gram + gram.T) / 2
     moves = _movable(gram, c, delta)
-    if recovery < 1.0:
-        c = np.minimum(c, recovery * _reach(gram, delta))
     excess = c + (rows @ y.double()).numpy()
     x, pull = y, np.zeros(len(c))
     possible = True

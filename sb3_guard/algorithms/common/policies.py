@@ -132,7 +132,6 @@ class FilteredPolicy(ActorCriticPolicy):
         :param episode_start: where an episode has just begun, shape [B]: nothing has cost yet
         :param deterministic: take the most likely action instead of sampling
         :return: actions to execute, and the state as it was given
-        :raises ValueError: ``state`` has another shape
         """
         actions, _ = super().predict(observation, None, episode_start, deterministic)
         if not self.corrects:
@@ -142,12 +141,6 @@ class FilteredPolicy(ActorCriticPolicy):
         costs = None
         if state is not None and self.acts_on_cost:
             costs = np.asarray(state[0], dtype=np.float64)
-            shape = (len(batch), len(self.action_filter.threshold))
-            if costs.shape != shape:
-                raise ValueError(
-                    f"state[0] has shape {costs.shape}: it must hold the last cost of each "
-                    f"environment and cost key, shape {shape}; or pass state=None"
-                )
             if episode_start is not None:
                 costs = np.where(np.asarray(episode_start, dtype=bool)[:, None], 0.0, costs)
         corrected = self.correct(tensor, batch, costs)

@@ -105,11 +105,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
 
     def _check_hyperparameters(self) -> None:
         super()._check_hyperparameters()
-        if self.cost_gamma is None and self.gamma == 1.0:
-            raise ValueError(
-                f"gamma={self.gamma!r}: cost_gamma, which is gamma unless it is given, must be "
-                "below 1, as undiscounted costs add up without end; give cost_gamma=0.99 too"
-            )
         several = isinstance(self.observation_space, spaces.Dict) or self.optimize_memory_usage
         if self.n_steps > 1 and several:
             raise ValueError(
@@ -203,7 +198,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         """Multipliers follow the episodes that ended, then SB3's loop around :meth:`learn_from`."""
         self._follow_episodes()
         self.policy.set_training_mode(True)
-        self.cost_critic.online.train(True)
         owners: tuple[Any, ...] = (self.actor, self.critic, self.cost_critic)  # type: ignore[attr-defined]
         optimizers: list[th.optim.Optimizer] = [owner.optimizer for owner in owners]
         temperature: th.optim.Optimizer | None = getattr(self, "ent_coef_optimizer", None)
@@ -217,7 +211,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
             for name, value in self.learn_from(batch, step).items():  # type: ignore[arg-type]
                 self._check_finite(name, value)
                 history.setdefault(name, []).append(value)
-        self.cost_critic.online.train(False)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in history.items():
             self.logger.record(f"train/{name}", float(np.mean(values)))

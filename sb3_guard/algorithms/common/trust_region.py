@@ -65,8 +65,8 @@ class TrustRegion(CostRollouts):
     returns: ClassVar[Literal["lambda", "discounted"]] = "discounted"
     # SB3's weights of losses: nothing here mixes those of actor and critic.
     fixed_arguments = CostRollouts.fixed_arguments | {"ent_coef", "vf_coef", "max_grad_norm"}
-    # Reward advantages are standardised; cost advantages are centred but never scaled, since they
-    # share the limit's units.
+    #: Whether the reward advantages are standardised; cost advantages are centred but never scaled,
+    #: since they share the limit's units.
     normalize_advantage = True
     #: Candidates that are tried along a step, each this many times as far as the one before.
     line_search_max_iter, line_search_shrinking_factor = 100, 0.8
@@ -169,9 +169,11 @@ class TrustRegion(CostRollouts):
         """The whole rollout, with advantages and critic targets as the updates use them."""
         batch = self.rollout_buffer.whole()
         advantages, cost_advantages = batch.advantages, batch.cost_advantages
+        if self.normalize_advantage:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         batch = batch._replace(
             actions=self._taken(batch.actions),
-            advantages=(advantages - advantages.mean()) / (advantages.std() + 1e-8),
+            advantages=advantages,
             cost_advantages=cost_advantages - cost_advantages.mean(dim=0),
         )
         return batch._replace(advantages=self.advantages(batch))

@@ -28,8 +28,8 @@ def trained(folder: Path, *more: str) -> RunFolder:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> RunFolder:
-    """Eighty training episodes: an eighth of them is played in the end."""
-    return trained(tmp_path_factory.mktemp("logs"), "-n", "1600")
+    """Forty training episodes: an eighth of them is played in the end."""
+    return trained(tmp_path_factory.mktemp("logs"), "-n", "800")
 
 
 def test_the_final_policy_is_played_in_both_ways(run):
@@ -44,11 +44,11 @@ def test_the_final_policy_is_played_in_both_ways(run):
             None,
         )  # fmt: skip
         seed = evaluation_seed(3, 1)
-        again = evaluate_policy(agent.model, agent.env, 10, name == "greedy", seed=seed)
+        again = evaluate_policy(agent.model, agent.env, 5, name == "greedy", seed=seed)
         agent.env.close()
         np.testing.assert_allclose(played["returns"], again.returns, rtol=1e-5)
         np.testing.assert_allclose(played["costs"], again.costs, rtol=1e-5)
-        assert played["lengths"] == again.lengths.tolist() == [20] * 10
+        assert played["lengths"] == again.lengths.tolist() == [20] * 5
         assert "bounded" not in played
     assert final["stochastic"]["returns"] != final["greedy"]["returns"]
 
@@ -84,5 +84,5 @@ def test_equal_curves_have_equal_hashes(run, tmp_path):
         text += f"{step},{episode_return},{cost}\n"
     curve = run.checked_result()["curve"]
     assert curve == hashlib.sha256(text.encode()).hexdigest()
-    assert trained(tmp_path, "-n", "1600").checked_result()["curve"] == curve
+    assert trained(tmp_path, "-n", "800").checked_result()["curve"] == curve
     assert trained(tmp_path, "-n", "100", "--seed", "4").checked_result()["curve"] != curve

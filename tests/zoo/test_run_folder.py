@@ -199,7 +199,7 @@ def test_nobody_reads_the_output():
     command = [
         sys.executable,
         "-c",
-        "from sb3_guard.cli import main; raise SystemExit(main(['list']))",
+        "from sb3_guard.cli import main; raise SystemExit(main(['list', 'tasks']))",
     ]
     listing = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     listing.stdout.close()

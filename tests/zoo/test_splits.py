@@ -110,7 +110,9 @@ def test_episodes_that_a_wrapper_ended_are_not_judged(tmp_path):
     assert table["split"].tolist() == ["stochastic", "greedy"]
 
 
-@pytest.mark.parametrize(("seeds", "share"), [(1, 0.20), (3, 0.08)])
+@pytest.mark.parametrize(
+    ("seeds", "share"), [(1, 0.20), pytest.param(3, 0.08, marks=pytest.mark.slow)]
+)
 def test_few_seeds_certify_too_often(seeds, share):
     """The shares of docs/leaderboard.md, those of 10,000 cases."""
     rng = np.random.default_rng(1)

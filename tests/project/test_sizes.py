@@ -16,7 +16,7 @@ LINES = {
     "sb3_guard": 29_000,
     "sb3_guard/envs": 9_510,
     "sb3_guard/algorithms": 6_410,
-    "sb3_guard/common": 2_530,
+    "sb3_guard/common": 2_535,
     "sb3_guard/deployment": 1_190,
     "harness": 9_915,
     "tests": 28_160,

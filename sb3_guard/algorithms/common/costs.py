@@ -77,7 +77,8 @@ class Costs:
     """What an algorithm knows of its m costs; saved with it.
 
     Episodes under way outlive rollouts. The estimate, J_C and T, is of the episodes that ended
-    since the last one, and is compared with the limits as they are now.
+    since the last one (off-policy J_C is of the latest ones), and is compared with the limits as
+    they are now.
 
     :param limits: d, shape (m,)
     :param limit_on: what of an episode's costs the limits bound, see :class:`EpisodeCosts`

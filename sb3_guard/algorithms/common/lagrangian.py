@@ -12,7 +12,7 @@ from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.constrained import Constrained
 
 # A limit that nothing keeps raises λ as long as it may; where limits are kept it ends below this.
-HIGHEST = 5.0  # in standard deviations of the advantages
+HIGHEST = 5.0  # in standard deviations of the advantages, or of Q
 
 SLOW = 0.95  # what the slow average of J_C keeps in an update
 
@@ -115,8 +115,8 @@ class Lagrangian(Constrained):
     :param lambda_lr: η, what the multipliers gain per unit of violation and step
     :param lambda_init: multipliers before the first update
     :param lambda_max: bound on the multipliers; None for 5 in relative units, none in those of cost
-    :param lambda_update: whether the policy learns from a rollout with the multipliers that have
-        followed it (``"before"``) or with those before that (``"after"``)
+    :param lambda_update: ``"before"`` moves the multipliers before the policy learns, with the new
+        ones; ``"after"`` lets it learn with the old ones
     :param proportional_gain: with ``derivative_gain``, turns the ascent into a PID controller
         (Stooke et al., 2020, arXiv 2007.03964) whose integral gain is ``lambda_lr``
     :param derivative_gain: of the rise of J_C
@@ -171,13 +171,14 @@ class Lagrangian(Constrained):
         :param costs: J_C of each of their steps, shape (m,); None for one step, with the estimate
         :param rate: η of each step; None for ``lambda_lr``
         """
-        before = self.multiplier.value.clone()
+        old = self.multiplier.value.clone()
         # As with the critics' rate: what the attribute says, not what a file has restored.
         rate = self.lambda_lr if rate is None else rate
         update_learning_rate(self.multiplier.optimizer, rate)
         for cost in [self.costs.episode_cost] if costs is None else costs:
             self.multiplier.update(cost, self.costs.limits)
-        self.prices = (self.multiplier.value if self.lambda_update == "before" else before).numpy()
+        new = self.multiplier.value
+        self.prices = (new if self.lambda_update == "before" else old).numpy()
         self._record_per_cost("train/multiplier", self.multiplier.value.numpy())
 
     def weights(self, spread: np.ndarray | float = 1.0) -> np.ndarray:

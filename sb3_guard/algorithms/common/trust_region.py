@@ -1,4 +1,4 @@
-"""The base of all algorithms here: trust-region policy optimisation with five places to differ.
+"""The base of the trust-region algorithms: TRPO, with a few places to differ.
 
 One update reads like the algorithm box of the papers: find a step within a trust region around the
 old policy, search along it, fit the critics; ``rollouts.py`` has collected the rollout and
@@ -122,7 +122,7 @@ class TrustRegion(CostRollouts):
     def train(self) -> None:
         """One update from the rollout: the policy's step, what a leaf learns, the critics."""
         started = time.perf_counter()
-        self.policy.set_training_mode(False)  # except while the critics are fitted
+        self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
 
         # The policy: where to go, and as far on the way as the line search accepts

@@ -135,7 +135,7 @@ def test_the_safety_layer_keeps_its_prediction_below_the_threshold(m: int, drift
     assert reachable[broken].any()
     if m == 1:
         assert predicted(corrected)[reachable].max() <= 0.1 + 1e-5
-    else:  # corrected in turn: nearly everywhere, where a single correction does for a half
+    else:  # but where the limits nearly contradict each other
         assert np.mean(predicted(corrected) <= 0.1 + 1e-3) > 0.95
 
 

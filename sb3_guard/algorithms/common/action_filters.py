@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.critics import Regression, StateNetwork
 
-SWEEPS = 20  # corrections of an action where there are several costs
+SWEEPS = 50  # corrections of an action where there are several costs
 
 
 class ActionFilter(nn.Module):
@@ -101,8 +101,7 @@ class SafetyLayer(ActionFilter):
     The model is ``ĉ_i(s, a) = c_i + g_i(s) · a``, where c_i is what the last step cost and g a
     network; the layer executes the nearest action of the box with ĉ_i ≤ threshold_i. It
     leaves alone what exceeds that by at most noise_i, or where a unit of every action changes ĉ_i
-    by at most noise_i. Of several costs, the one that is exceeded most is corrected, again and
-    again. A second output ``h_i(s) ≈ c_i`` stands in where the last cost is not known.
+    by at most noise_i. A second output ``h_i(s) ≈ c_i`` stands in where the last cost is not known.
 
     :param policy: the policy that carries the filter
     :param n_costs: number m of constraints
@@ -176,12 +175,20 @@ class SafetyLayer(ActionFilter):
         slopes = th.where(certain.unsqueeze(2), slopes, 0.0)
         if len(self.threshold) == 1:
             return clip_along(actions, slopes[:, 0], limits)
-        lengths = slopes.norm(dim=2).clamp(min=1e-12)
-        for _ in range(SWEEPS):  # to the half-space that is farthest away
-            beyond = ((slopes * actions.unsqueeze(1)).sum(dim=2) - limits) / lengths
-            worst = th.where(certain, beyond, -th.inf).argmax(dim=1)[:, None]  # [B, 1]
-            normal = th.take_along_dim(slopes, worst.unsqueeze(2), dim=1)[:, 0]
-            actions = clip_along(actions, normal, limits.gather(1, worst))
+        limits = th.maximum(limits, -slopes.abs().sum(dim=2))  # what the box can reach
+        # Dykstra's alternating projections, on each half-space and the box, end at the nearest
+        # point of them all.
+        squares = slopes.square().sum(dim=2, keepdim=True).clamp(min=1e-24)
+        moved, clipped = th.zeros_like(slopes), th.zeros_like(actions)
+        for _ in range(SWEEPS):
+            for i in range(len(self.threshold)):
+                start, normal = actions + moved[:, i], slopes[:, i]
+                beyond = (start * normal).sum(dim=1, keepdim=True) - limits[:, i : i + 1]
+                moved[:, i] = beyond.clamp(min=0.0) / squares[:, i] * normal
+                actions = start - moved[:, i]
+            start = actions + clipped
+            actions = start.clamp(-1.0, 1.0)
+            clipped = start - actions
         return actions
 
 

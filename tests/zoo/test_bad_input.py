@@ -47,7 +47,6 @@ TRAIN = [
     ([*LIMITED, "--env", "NoCost-v0"],
      ["no cost key 'cost'", "depth", "cost_keys", "missing_cost='zero'"]),
     # hyperparameters
-    (["--algo", "cup", "-params", "gamma:1"], ["gamma=1.0: CUP weighs costs", "such as 0.99"]),
     (["--algo", "sac_lag", "--env", "CartPole-v1", "-params", "missing_cost:zero", "cost_limit:1"],
      ["continuous actions (Box)", "PPOLag"]),
     (["-params", "policy:MlpPolcy"], ["no policy 'MlpPolcy'", "did you mean 'MlpPolicy'?"]),
@@ -70,8 +69,6 @@ ENJOY = [
     ([], ["there is no run of cpo on Goal_Point_8Hazards-v0 in 'logs'", "sb3-guard train"]),
     (["--exp-id", "7"], ["there is no run folder", "_7"]),
     (["-f", "nowhere"], ["'nowhere'"]),
-    (["--n-episodes", "1", "-n", "5"], ["not allowed with"]),
-    (["--load-bets"], ["unknown argument --load-bets", "--load-best"]),
 ]
 
 

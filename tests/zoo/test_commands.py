@@ -103,11 +103,6 @@ def test_no_episode_ends(tmp_path, capsys):
     assert "no episode has ended" in capsys.readouterr().out
 
 
-def test_a_progress_bar(tmp_path, capsys):
-    trained(tmp_path, "--progress")
-    assert "120/120" in "".join(capsys.readouterr())
-
-
 def test_every_limit_has_a_verdict(tmp_path, capsys):
     limits = ["cost_keys:['cost','heat']", "cost_limit:[1000.0, 0.0]"]
     arguments = [*TOY, *SMALL, "-n", "120", "-f", str(tmp_path)]

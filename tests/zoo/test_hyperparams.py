@@ -76,10 +76,8 @@ def test_python_file_and_module(tmp_path, monkeypatch):
     ("content", "message"),
     [
         ("default: [1, 2", "can't read .* as YAML: .*line 1"),
-        ("- a\n- b\n", "must map environments"),
         ("n_steps: 100\n", "must map environments"),
         ("Goal_Point_8Hazards-v0: {}\n", "no entry for 'Goal_Point_8Hazard'.*did you mean"),
-        ("\x00\x01", "as YAML"),
     ],
 )
 def test_files_that_are_not_hyperparameters(tmp_path, content, message):
@@ -95,7 +93,6 @@ def test_files_that_are_not_hyperparameters(tmp_path, content, message):
     [
         ("absent.yml", "can't read hyperparameter file absent.yml: No such file"),
         ("absent.py", "can't read hyperparameters from absent.py: .*"),
-        ("papr", "can't read hyperparameters from papr: .* or 'paper'"),
     ],
 )
 def test_absent_file(name, message):
@@ -122,11 +119,9 @@ def test_arguments_are_the_leafs_and_the_bases():
         ("n_steps", "1e3", 1000),
         ("n_timesteps", 6e6, 6_000_000),
         ("learning_rate", "1e-3", 0.001),
-        ("learning_rate", 1, 1.0),
         ("batch_size", None, None),
         ("cost_limit", 25, 25.0),
         ("cost_limit", [1, 2.5], [1.0, 2.5]),
-        ("use_sde", False, False),
         ("policy_kwargs", "dict(log_std_init=-1)", {"log_std_init": -1}),
         ("policy_kwargs", "dict(activation_fn=nn.ReLU)", {"activation_fn": "nn.ReLU"}),
     ],

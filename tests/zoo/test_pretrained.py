@@ -176,8 +176,6 @@ def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch)
             "no agent comes with the package for ppo on Goal_Ant_8Hazards-v0",
         ),
         (["-f", "logs"], "leave out --folder and --exp-id"),
-        (["--exp-id", "1"], "leave out --folder and --exp-id"),
-        (["--load-best"], "not allowed with argument"),
     ],
 )
 def test_what_is_not_shipped_is_not_played(arguments, message, capsys):

@@ -548,8 +548,6 @@ def test_nothing_but_failures_ends_it(tmp_path, capsys):
 
 WRONG = [
     (["--cost-limit", "1", "2"], ["selection_limit=[1.0, 2.0]"]),
-    (["--algo", "trpo_lga"], ["'trpo_lga'", "did you mean 'trpo_lag'?"]),
-    (["-params", "lambda_rl:1"], ["'lambda_rl'", "did you mean 'lambda_lr'?"]),
     (["--seeds", "0", "0"], ["--seeds 0 0", "twice"]),
     (["--n-evaluations", "500"], ["--n-evaluations 500", "240 steps"]),
     (["--storage", "redis://here"], ["--storage redis://here", "must be postgresql://"]),

@@ -78,12 +78,3 @@ def check_per_cost(name: str, value: Any, cost_keys: tuple[str, ...]) -> None:
     if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):
         order = f", in the order of cost_keys={cost_keys}" if len(cost_keys) > 1 else ""
         raise ValueError(f"{name}={value!r}: must be finite numbers{order}")
-
-
-def check_choice(name: str, value: Any, *allowed: str) -> None:
-    """
-    :raises ValueError: ``value`` is none of the allowed words
-    """
-    if value not in allowed:
-        words = " or ".join(repr(each) for each in allowed)
-        raise ValueError(f"{name}={value!r}: must be {words}")

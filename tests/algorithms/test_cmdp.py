@@ -307,7 +307,6 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
     assert all(th.isfinite(each).all() for each in model.policy.parameters())
 
 
-@pytest.mark.filterwarnings("ignore:TRPOUSL met costs below zero")
 @pytest.mark.parametrize(
     ("cls", "share", "kwargs"),
     [

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_guard.checks import check_choice, check_integer, check_number
+from sb3_guard.checks import check_integer, check_number
 from sb3_guard.spelling import did_you_mean
 
 # Arguments that SB3's own base classes take from the algorithms, not from users.
@@ -55,7 +55,8 @@ class Hyperparameter(NamedTuple):
             return
         kinds.discard(types.NoneType)
         if typing.get_origin(hint) is typing.Literal:
-            check_choice(name, value, *typing.get_args(hint))
+            if value not in (words := typing.get_args(hint)):
+                raise ValueError(f"{name}={value!r}: must be {' or '.join(map(repr, words))}")
         elif kinds == {bool}:
             if not isinstance(value, bool | np.bool_):
                 raise ValueError(f"{name}={value!r}: must be True or False")

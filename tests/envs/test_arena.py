@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from worlds import world
 
+import sb3_guard
+
 
 def test_everything_is_placed_in_an_arena_of_its_size():
     engine = world("Goal_Point_8Hazards", 3, arena={"size": 3.5})
@@ -45,3 +47,15 @@ def test_pushed_objects_stay_within_solid_walls():
     for _ in range(200):
         engine.step(np.zeros((1, 2)))
         assert ball[0, 0, 0] < 2.0
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ({"arena": {"frame_skip": 10**9}}, "frame_skip"),
+        ({"layout": {"restarts": 10**9}}, "restarts"),
+    ],
+)
+def test_numbers_that_nobody_can_mean_are_refused(given, name):
+    with pytest.raises(ValueError, match=f"{name} = 1000000000 must be"):
+        sb3_guard.make("Goal_Point_8Hazards", **given)

@@ -17,7 +17,7 @@ PRIVATE = re.compile(r"_[a-zA-Z]\w*")
 # Attributes that the package does not define itself, by whose they are.
 ALLOWED = {
     "Stable-Baselines3's hooks for subclasses and their state": {
-        "_convert_train_freq", "_current_progress_remaining", "_get_indices",
+        "_current_progress_remaining", "_get_indices",
         "_last_episode_starts", "_on_event", "_reset_options", "_reset_seeds",
         "_stats_window_size", "_total_timesteps", "_update_features_extractor",
         "_update_learning_rate", "_vec_normalize_env", "_wrap_env",

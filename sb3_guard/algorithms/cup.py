@@ -51,6 +51,11 @@ class CUP(Lagrangian, FirstOrder):
     def __init__(self, *args: Any, n_epochs: int = 5, **kwargs: Any) -> None:
         super().__init__(*args, n_epochs=n_epochs, **kwargs)
 
+    def _check_hyperparameters(self) -> None:
+        super()._check_hyperparameters()
+        if (self.gamma if self.cost_gamma is None else self.cost_gamma) == 1.0:
+            raise ValueError("cost_gamma=1.0: CUP's weight of costs has no bound there; give 0.99")
+
     @property
     def factor(self) -> float:
         """(1 - γλ)/(1 - γ), with the discount and the λ of the cost advantages."""

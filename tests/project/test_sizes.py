@@ -18,7 +18,7 @@ LINES = {
     "sb3_guard/algorithms": 5_930,
     "sb3_guard/common": 2_535,
     "sb3_guard/deployment": 920,
-    "harness": 9_110,
+    "harness": 9_115,
     "tests": 24_560,
 }
 WORDS = 72_100  # of all tracked markdown but the changelog

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -275,16 +275,25 @@ def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
     )  # fmt: skip
 
 
-def test_a_run_that_another_process_has_is_left_to_it(tmp_path, here, capsys):
-    """Two grids in one folder share the work; the same command takes what is left."""
+def test_a_run_that_another_process_has_is_awaited(tmp_path, here, monkeypatch, capsys):
+    """Two grids in one folder share the work, and both come to their end."""
+    monkeypatch.setattr(grid, "ASK_AGAIN", 0.0)
     run = tmp_path / "cpo" / "CostPoint-v0_1"
     run.mkdir(parents=True)
+    asked, other = [], ExitStack()
+    other.enter_context(lock(run))
+
+    def free_at_last(of):
+        asked.append(of.flags.algo)
+        if len(asked) == 4:
+            other.close()
+
+    here.before = free_at_last
     arguments = [*GRID, "--algos", "cpo", "trpo", "--seeds", "0", "-f", str(tmp_path)]
-    with lock(run):
-        assert benchmark.main(arguments) == 1
-    out, err = capsys.readouterr()
-    assert "in use: cpo on" in out and "1 of 2 done" in out and "in use by process" in err
     assert benchmark.main(arguments) == 0
+    out = capsys.readouterr().out
+    assert out.count("in use: cpo on") == 1 and "2 of 2 done" in out
+    assert asked == ["cpo", "trpo", "cpo", "cpo"]
 
 
 def test_asked_to_stop(tmp_path, here, capsys):

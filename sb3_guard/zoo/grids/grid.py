@@ -169,6 +169,8 @@ def _begin_worker() -> None:
 
 # Executors
 
+ASK_AGAIN = 2.0  # seconds between questions after runs that another process has
+
 
 def cores() -> int:
     """How many this process may use."""
@@ -245,15 +247,24 @@ def run_grid(
         command, number = shlex.join(sys.orig_argv), min(jobs or cores(), len(todo))
         hosts = cluster(scheduler) if scheduler else processes(number)
         with hosts as executor, interrupts(ask_to_stop) as received:
-            with interrupts_held():  # by the processes that this starts
-                futures = {executor.submit(carry_out, run, command, stop_file): run for run in todo}
-            for future in as_completed(futures):
-                run = futures[future]
-                # Errors of runs are caught where they run.
-                with explained("a worker or scheduler is gone", fix="the same command continues"):
-                    run.state, run.error = future.result()
-                if run.state != "waiting":
-                    say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}")
+            left = todo
+            while left and not received:
+                with interrupts_held():  # by the processes that this starts
+                    futures = {executor.submit(carry_out, run, command, stop_file): run
+                               for run in left}  # fmt: skip
+                for future in as_completed(futures):
+                    run = futures[future]
+                    before = run.state
+                    # Errors of runs are caught where they run.
+                    with explained(
+                        "a worker or scheduler is gone", fix="the same command continues"
+                    ):
+                        run.state, run.error = future.result()
+                    if run.state not in ("waiting", before):
+                        say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}")
+                # Those that another process has may be done, or free, in a while.
+                left = [run for run in todo if run.state == "in use"]
+                time.sleep(ASK_AGAIN if left else 0.0)
         status = 128 + received[0] if received else 0
         stop_file.unlink(missing_ok=True)
         say(f"{folder}: {summary(runs)}")

@@ -3,6 +3,7 @@
 import gc
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -273,6 +274,13 @@ def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
         benchmark.main, [*GRID, "--algos", "cpo", "--seeds", "0", "-f", str(tmp_path)], capsys,
         "a worker or scheduler is gone", "abruptly", "the same command continues",
     )  # fmt: skip
+
+
+def test_a_run_of_our_environments_reaches_a_worker(tmp_path):
+    grid_run = grid.GridRun.check(RunFlags.of({"env": "Goal_Point_8Hazards", "algo": "cpo"}))
+    assert grid_run.source.batch is not None and grid_run.setup.n_envs
+    there = pickle.loads(pickle.dumps(grid_run))
+    assert there.flags == grid_run.flags and there.hyperparams == grid_run.hyperparams
 
 
 def test_a_run_that_another_process_has_is_awaited(tmp_path, here, monkeypatch, capsys):

@@ -115,6 +115,10 @@ class Run:
         #: what to continue from
         self.begun: dict[str, Any] | None = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Another process gets what the run states, without what was looked up or made here."""
+        return type(self), tuple(getattr(self, entry.name) for entry in dataclasses.fields(self))
+
     @cached_property
     def algorithm(self) -> type[BaseAlgorithm]:
         """The class of ``--algo``; raises :class:`UsageError` where there is none."""

@@ -109,6 +109,9 @@ def test_the_episodes_depend_on_the_seed_alone():
 def test_tries_and_costs_share_the_error():
     bounds = [certify(Idle(), Lottery(), 3.0, seed=1, tries=n).nearest.upper for n in (1, 3)]
     assert bounds[0] < bounds[1]
+    # Where there are others to try, a mean above the limit is not looked at again.
+    episodes = [certify(Idle(), Lottery(), 0.98, seed=1, tries=n).episodes for n in (1, 3)]
+    assert episodes[0] == MOST > episodes[1]
     both = certify(
         Idle(), Lottery(keys=("cost", "other")), (3.0, 6.0), cost_keys=("cost", "other"), seed=1
     )

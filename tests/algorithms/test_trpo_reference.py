@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import sb3_contrib
 import torch as th
-from cost_envs import SB3_POLICY, CostPoint
+from cost_envs import SB3_POLICY, CostPoint, collect
 from sb3_contrib.common.utils import conjugate_gradient_solver
 from stable_baselines3.common.distributions import kl_divergence
 from stable_baselines3.common.env_util import make_vec_env
@@ -30,24 +30,8 @@ def _reference(cls: type, **kwargs: Any) -> Any:
         policy_kwargs=SB3_POLICY,
         **kwargs,
     )
-    _collect(model, 256)
+    collect(model, 256)
     return model
-
-
-class _Stop(Exception):
-    pass
-
-
-def _collect(model: Any, total: int) -> None:
-    """Run up to the first update."""
-
-    def stop() -> None:
-        raise _Stop
-
-    model.train, train = stop, model.train
-    with pytest.raises(_Stop):
-        model.learn(total)
-    model.train = train
 
 
 def test_collection_is_bit_exact_with_sb3_contrib() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from cost_envs import SB3_POLICY, CostPoint
+from cost_envs import SB3_POLICY, CostPoint, collect
 from gymnasium import spaces
 from stable_baselines3.common.distributions import kl_divergence
 from stable_baselines3.common.env_util import make_vec_env
@@ -271,22 +271,6 @@ def test_critics_are_fitted_to_discounted_returns(monkeypatch: pytest.MonkeyPatc
 # TRPO
 
 
-class _Stop(Exception):
-    pass
-
-
-def _collect(model: Any, total: int) -> None:
-    """Run up to the first update."""
-
-    def stop() -> None:
-        raise _Stop
-
-    model.train, train = stop, model.train
-    with pytest.raises(_Stop):
-        model.learn(total)
-    model.train = train
-
-
 def test_costs_do_not_change_trpo() -> None:
     """A missing, a zero and a huge cost give the same policy, and the cost is only logged."""
     policies = []
@@ -421,7 +405,7 @@ class _Still(TRPO):
 
 def test_correct_changes_what_is_executed_and_not_what_is_learnt_from() -> None:
     model = _toy(_Still)
-    _collect(model, 200)
+    collect(model, 200)
     assert np.abs(model.rollout_buffer.actions).mean() > 0.3
     assert np.abs(np.diff(model.rollout_buffer.observations[:40], axis=0)).max() < 0.06
     assert type(model.env).__name__ == "DummyVecEnv"

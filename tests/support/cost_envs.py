@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from gymnasium import spaces
 from scipy.optimize import linprog
 
@@ -298,3 +299,19 @@ class RandomCostEnv(gym.Env):
         over = self.steps >= self.episode_length
         observation = self.observation_space.sample()
         return observation, float(np.mean(action)), False, over, {"cost": cost}
+
+
+class _Collected(Exception):
+    pass
+
+
+def collect(model: Any, total: int) -> None:
+    """Let a model learn up to its first update."""
+
+    def stop() -> None:
+        raise _Collected
+
+    model.train, train = stop, model.train
+    with pytest.raises(_Collected):
+        model.learn(total)
+    model.train = train

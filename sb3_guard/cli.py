@@ -10,7 +10,7 @@ COMMANDS = {
     "train": "train an agent",
     "tune": "search hyperparameters under a cost limit",
     "benchmark": "train a grid of environments, algorithms and seeds",
-    "reproduce": "train a published run again and compare",
+    "reproduce": "train a row of the leaderboard again and compare",
     "enjoy": "play a trained agent, print return and cost, record a video",
     "certify": "say whether a trained agent keeps its limit, by fresh episodes",
     "export": "write a trained agent as one ONNX file",

@@ -19,7 +19,6 @@ from sb3_guard.zoo.results import figures, tables
 from sb3_guard.zoo.results import runs as reading
 from sb3_guard.zoo.results.figure_data import Data
 from sb3_guard.zoo.results.paper import FIGURES, draw
-from sb3_guard.zoo.results.statistics import with_safety
 
 TITLES = "\n".join(f"  {name:<10} {figure.__doc__}" for name, figure in FIGURES.items())
 
@@ -82,7 +81,7 @@ def plot(flags: Flags) -> int:
         print(f"left out: {path}: {why}", file=sys.stderr)
     if not len(results.runs):
         raise UsageError(f"there is no finished run below {', '.join(flags.folders)}")
-    chosen = with_safety(reading.choose(results.runs, flags.env, flags.cost_limit, flags.steps))
+    chosen = reading.choose(results.runs, flags.env, flags.cost_limit, flags.steps)
     means = [file for file in files if file.suffix != ".csv"]
     for file in files:
         if file not in means:

@@ -20,9 +20,8 @@ from archives import DATA, DOCS, archives, pack, unpacked
 
 from sb3_guard.reproduce import final_hash, measures
 from sb3_guard.zoo.cli.markdown import table
-from sb3_guard.zoo.results.runs import select
+from sb3_guard.zoo.results.runs import read_episodes, select
 from sb3_guard.zoo.results.splits import judge
-from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import number
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import RunFolder
@@ -72,7 +71,8 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
         grids = [stack.enter_context(unpacked(name)).runs.assign(grid=name) for name in names]
         if not grids:
             return pd.DataFrame(), pd.DataFrame()
-        all_ = with_safety(pd.concat(grids, ignore_index=True))
+        all_ = pd.concat(grids, ignore_index=True)
+        all_["cost_total"] = [read_episodes(path)["M_c"].sum() for path in all_["path"]]
         all_["row"] = [f"{Path(path).parents[1].name}/{Path(path).parent.name}/"
                         f"{Path(path).name}" for path in all_["path"]]  # fmt: skip
         for run in all_.to_dict("records"):

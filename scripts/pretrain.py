@@ -7,7 +7,7 @@ the highest return is taken. With less than a tenth of the best run's return, of
 hardly does its task and does not count. It is played again, 300 episodes of other seeds with each
 kind of actions, and shipped if these certify it, too; else the next one is tried. An agent that is
 shipped already is kept if its return is as high. Runs from a packed archive have no model:
-``sb3-guard reproduce FOLDER`` trains them again, below ``logs/reproduced``. The package gets the
+``sb3-guard reproduce ROW`` trains them again, below ``logs/reproduced``. The package gets the
 run's settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get
 some observations and actions, ``tests/data/pretrained.npz``.
 """
@@ -95,7 +95,8 @@ def candidates(folder: Path, env_id: str, least: float) -> Iterator[RunFolder]:
         if run.model.exists():
             yield run
         else:
-            print(f"return {mean:.4g}, but no model: sb3-guard reproduce {name}")
+            row = "/".join(run.path.parts[-3:])
+            print(f"return {mean:.4g}, but no model: sb3-guard reproduce {row}")
 
 
 def shipped_return(env_id: str) -> float:

@@ -37,7 +37,12 @@ from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish, save
 from sb3_guard.zoo.results.paper import draw
 from sb3_guard.zoo.results.runs import read_episodes, select
 from sb3_guard.zoo.results.splits import SPLITS, judge
-from sb3_guard.zoo.results.statistics import aggregate, normalize, with_safety
+from sb3_guard.zoo.results.statistics import (
+    aggregate,
+    judging_limits,
+    last_epochs,
+    normalize,
+)
 from sb3_guard.zoo.results.tables import markdown, number, spelled, spread, whole
 
 BLOCK = re.compile(
@@ -45,7 +50,7 @@ BLOCK = re.compile(
     re.DOTALL,
 )
 # A figure of a packed grid: file, grid and kind
-IMAGE = re.compile(r"images/((\w+?)_(pareto|cdf|tiers)_[\w-]+\.png)")
+IMAGE = re.compile(r"images/((\w+?)_(pareto)_[\w-]+\.png)")
 PUBLISHED_STEPS = 1_000_000
 LAST = 90  # episodes: three rollouts of 30 environments
 APART = 3.0  # standard errors: what counts as learnt
@@ -74,6 +79,31 @@ HEALTHY = {
 }
 
 
+def last(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    The runs with the numbers of the pages' tables.
+
+    They are ``return_last`` and ``cost_last``, means over the last ten epochs of their episodes'
+    means; ``above_limit``, the share of the episodes whose cost exceeds the limit, and
+    ``cost_p95``, 95 % of them cost at most this; and ``cost_total``, the cost of all training.
+    """
+    rows = []
+    for row in runs.assign(limit=judging_limits(runs)).to_dict("records"):
+        episodes = read_episodes(row["path"])
+        end, limit = last_epochs(episodes, row["epoch"]), row["limit"]
+        means = end.groupby("epoch")[["J_r", "M_c"]].mean().mean()
+        rows.append(
+            {
+                "return_last": means["J_r"],
+                "cost_last": means["M_c"],
+                "above_limit": limit if pd.isna(limit) else 1 - (end["M_c"] <= limit).mean(),
+                "cost_p95": end["M_c"].quantile(0.95),
+                "cost_total": episodes["M_c"].sum(),
+            }
+        )
+    return runs.assign(**pd.DataFrame(rows, index=runs.index, dtype=float))
+
+
 @cache
 def runs(name: str) -> pd.DataFrame:
     """The runs of a packed grid, with what is asked about their safety."""
@@ -88,7 +118,7 @@ def runs(name: str) -> pd.DataFrame:
             )
         returns = pd.DataFrame([end["J_r"] for end in ends]).T
         means = {"trained": [*returns.mean()], "trained_se": [*returns.sem()]}
-        return with_safety(found.runs).assign(**means)
+        return last(found.runs).assign(**means)
 
 
 def tables(name: str, only: str | None) -> str:
@@ -208,7 +238,7 @@ def sweep(name: str, suite: str) -> str:
 def splits(name: str) -> str:
     """A table of how the agents of a grid keep their limit, a row for each split."""
     with unpacked(name) as found:
-        rows = judge(select(with_safety(found.runs)))
+        rows = judge(select(found.runs))
     highest = rows["return"].abs().max()
     digits = 0 if highest >= 100 else 1
     columns: dict[str, Any] = {
@@ -342,7 +372,7 @@ def main() -> None:
         images = IMAGE.findall(text)
         for name, kind in sorted({(name, kind) for _, name, kind in images}):
             with unpacked(name) as found:
-                runs = with_safety(found.runs)
+                runs = last(found.runs)
                 # Drawn is what the tables have: the last ten epochs, not the last one.
                 means = {"J_r": runs["return_last"], "M_c": runs["cost_last"]}
                 drawings = draw(kind, Data(runs.assign(**means)))

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from typed import LENGTH, SMALL, TOY, refused, trained
 
-from sb3_guard import benchmark, enjoy, reproduce, train
+from sb3_guard import benchmark, enjoy, train
 from sb3_guard.fields import parse_value
 from sb3_guard.zoo.cli.names import as_data, refuse_places
 from sb3_guard.zoo.cli.usage import UsageError
@@ -132,9 +132,6 @@ def test_a_file_names_no_place_to_write(name, path, argument, tmp_path, trap, ru
         refused(enjoy.main, play, capsys, *parts)
         enter(run, "config.yml", **{name: str(hyperparams[name][0])})  # a mapping as text
         refused(enjoy.main, play, capsys, *parts)
-    enter(run, "args.yml", hyperparams=hyperparams)
-    again = [str(run), "-f", str(tmp_path / "again"), *TOY[:2]]
-    refused(reproduce.main, again, capsys, *parts)
     (tmp_path / "conf.yml").write_text(yaml.safe_dump({"default": hyperparams}))
     refused(train.main, [*TOY, *SMALL, "-n", "60", "-conf", "conf.yml"], capsys, *parts)
     assert not list(tmp_path.rglob("trap*"))
@@ -155,18 +152,6 @@ def test_a_run_is_continued_with_the_folders_that_the_user_names_again(tmp_path,
 def test_files_that_are_read_are_no_places():
     mine = {"env_wrapper": {"mine.Wrapper": {"map_file": "m.npz", "dir": "maps"}}}
     refuse_places("config.yml", mine)
-
-
-def test_reproduce_follows_the_files_that_the_user_names(tmp_path, trap, run, capsys):
-    agent = shutil.copy(run / "CostPoint-v0.zip", tmp_path / "agent.zip")
-    again = [str(run), "-f", str(tmp_path / "again"), *TOY[:2]]
-    enter(run, "args.yml", trained_agent=str(agent))
-    refused(reproduce.main, again, capsys, f"then add --trained-agent {agent}")
-    enter(run, "args.yml", trained_agent="", conf_file="hostile.py")
-    refused(reproduce.main, again, capsys, "then add --conf-file hostile.py")
-    assert not trap.exists() and not (tmp_path / "again").exists()
-    reproduce.main([*again, "-conf", "hostile.py"])
-    assert trap.exists()
 
 
 @pytest.mark.parametrize("conf", ["both", "both.py"])

@@ -20,7 +20,6 @@ from sb3_guard.zoo.results.figure_data import COLORS, INK, PLACES, Data
 from sb3_guard.zoo.results.figures import save
 from sb3_guard.zoo.results.paper import FIGURES, draw
 from sb3_guard.zoo.results.runs import read_results, select
-from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import tables
 
 EFFECTS = dict(zip(ALGOS, (1.0, 0.5, 0.6, 0.4, 0.7, 0.9, 0.8, 1.5), strict=True))
@@ -51,11 +50,11 @@ def small(tmp_path):
     return tmp_path / "logs"
 
 
-PER_SUITE = ("curves", "pareto", "cdf", "tiers")
+PER_SUITE = ("curves", "pareto")
 
 
 def read(folder) -> Data:
-    return Data(select(with_safety(read_results([folder]).runs)))
+    return Data(select(read_results([folder]).runs))
 
 
 def lines(axis) -> dict[str, np.ndarray]:
@@ -226,10 +225,10 @@ def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys, monkeyp
     assert [path.name for path in out.iterdir()] == [f"curves_{POINT}.png"]
     printed, err = capsys.readouterr()
     assert max(map(len, printed.splitlines())) <= 120
-    for text in ("return J_r", "5.00\xa0±\xa00.00", "PPO", "0: violating"):
+    for text in ("return", "5.00\xa0±\xa00.00", "PPO", "0: violating"):
         assert text in printed
     assert "left out: " in err and "v0_3/0.monitor.csv: it has no episodes" in err
-    results = printed.partition("\nSafety")[0].splitlines()
+    results = printed.partition("\nTiers")[0].splitlines()
     (row,) = (line.split() for line in results if "CPO  " in line and "0:" in line)
     assert row[:5] == [POINT, "CPO", "0:", "violating", "2"]
 
@@ -344,7 +343,7 @@ def test_wrong_usage(small, tmp_path, monkeypatch, capsys, arguments, message):
 
 def page_of(folder) -> str:
     found = read_results([folder])
-    runs = select(with_safety(found.runs))
+    runs = select(found.runs)
     return plot.page_of(Data(runs), "A <grid>", found.left_out)
 
 
@@ -360,7 +359,7 @@ def test_page_is_complete_and_by_itself(small):
     assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}
     assert INK not in page  # dark pages have light ink
     assert {*re.findall(r"TRPO|PPO|f{10}|pareto_\w+", page)} >= {"TRPO", "PPO", "f" * 10}
-    assert page.count("<table") == 6 and page.count("<svg") > 8
+    assert page.count("<table") == 5 and page.count("<svg") > 7
     assert f"<td>{small / 'trpo' / POINT}-v0_1</td>" in page  # nothing is abbreviated
 
 

@@ -109,7 +109,10 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
     RunFolder(higher).model.unlink()
     made = (there / "pcpo" / before.name).stat().st_mtime_ns
     script["main"]()
-    assert f"return 8, but no model: sb3-guard reproduce {higher}" in capsys.readouterr().out
+    assert (
+        f"return 8, but no model: sb3-guard reproduce grand_table_guard/trpo_ipo/{before.name}"
+        in capsys.readouterr().out
+    )
     assert (there / "pcpo" / before.name).stat().st_mtime_ns == made
 
 

@@ -1,149 +1,92 @@
-"""A published run is trained again from its command, and compared episode by episode."""
+"""A row of the leaderboard is trained again from its command, and compared episode by episode."""
 
+import csv
 import json
-import shutil
 
 import pytest
 
 from sb3_guard import reproduce, train
 
-PACKAGES = ["--gym-packages", "registered_envs"]
+ROW = "table/cpo/CostPoint-v0_4"
 TOY = (
-    "--env CostPoint-v0 --env-kwargs episode_length:20 --seed 3 --eval-freq -1 --verbose 0 "
-    "--device cpu -n 400 --num-threads 1 -params n_envs:2 n_steps:100 n_critic_updates:3 "
-    "cost_limit:2"
+    "--gym-packages registered_envs --env CostPoint-v0 --env-kwargs episode_length:20 --seed 3 "
+    "--eval-freq -1 --verbose 0 --device cpu -n 400 --num-threads 1 -params n_envs:2 n_steps:100 "
+    "n_critic_updates:3 cost_limit:2"
 ).split()
 
 
 @pytest.fixture(scope="module")
-def logs(tmp_path_factory):
+def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
-    assert train.main([*TOY, *PACKAGES, "-f", str(folder)]) == 0
-    return folder
+    assert train.main([*TOY, "-f", str(folder)]) == 0
+    return json.loads((folder / "cpo" / "CostPoint-v0_1" / "result.json").read_text())
 
 
 @pytest.fixture
-def run(logs, tmp_path):
-    return shutil.copytree(logs, tmp_path / "logs") / "cpo" / "CostPoint-v0_1"
+def again(result, tmp_path, monkeypatch, capsys):
+    """Reproduce the row of a table of such rows: the status and what is said."""
+
+    def run(*changes: dict, row: str = ROW) -> tuple[int, str]:
+        names = ("command", "curve", "commit", "processor")
+        own = {name: result[name] for name in names} | reproduce.measures(result)
+        own |= {"row": ROW, "final": reproduce.final_hash(result), "seconds": 9}
+        with (tmp_path / "rows.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, own)
+            writer.writeheader()
+            writer.writerows([own | change for change in changes or [{}]])
+        monkeypatch.setattr(reproduce, "ROWS", tmp_path / "rows.csv")
+        status = reproduce.main([row, "-f", str(tmp_path / "again")])
+        out, err = capsys.readouterr()
+        return status, out + err
+
+    return run
 
 
-def again(tmp_path, *arguments: str) -> int:
-    return reproduce.main([*arguments, "-f", str(tmp_path / "again")])
-
-
-def test_a_run_goes_the_same_way(run, tmp_path, capsys):
-    assert again(tmp_path, str(run), *PACKAGES) == 0
-    out = capsys.readouterr().out
-    result = json.loads((run / "result.json").read_text())
+def test_a_run_goes_the_same_way(again, result, tmp_path):
+    status, out = again()
+    assert status == 0 and "trained already" not in out
     assert result["command"] in out and "The same: all training and final episodes agree" in out
     new = json.loads((tmp_path / "again" / "cpo" / "CostPoint-v0_4" / "result.json").read_text())
-    assert new["final"] == result["final"] and "trained already" not in out
-    assert again(tmp_path, str(run), *PACKAGES) == 0  # trains nothing, and says so
-    out = capsys.readouterr().out
-    assert 0 < out.index("This run was trained already") < out.index("The same")
+    assert new["final"] == result["final"]
+    status, out = again()  # trains nothing, and says so
+    assert status == 0 and 0 < out.index("This run was trained already") < out.index("The same")
 
 
-def test_a_row_that_went_another_way(run, tmp_path, capsys, monkeypatch):
-    result = json.loads((run / "result.json").read_text())
-    cost = result["cost"] + 1
-    rows = tmp_path / "rows.csv"
-    rows.write_text(
-        "row,command,curve,return,cost,commit\n"
-        f'table/cpo/A_1,"{result["command"]}",0123,{result["return"]},{cost},abc\n'
-    )
-    monkeypatch.setattr(reproduce, "ROWS", rows)
-    assert again(tmp_path, "table/cpo/A_1", *PACKAGES) == 1
-    out = capsys.readouterr().out
-    assert (
-        "Not the same" in out
-        and "  cost of the final epoch: before" in out
-        and "The run before is of commit abc" in out
-    )
-    assert again(tmp_path, "table/cpo/A_2") == 2
-    assert "did you mean 'table/cpo/A_1'" in capsys.readouterr().err
+def test_a_row_that_went_another_way(again):
+    status, out = again({"curve": "0123", "cost": 99.0, "commit": "abc"})
+    assert status == 1 and "Not the same: the training episodes differ" in out
+    assert "  cost of the final epoch: before 99, now" in out
+    assert "The run before is of commit abc" in out
+    # Every tier is made of the final episodes.
+    status, out = again({"final": "0123"})
+    assert status == 1 and "the final episodes differ" in out and "training episodes" not in out
+    for name in reproduce.MEASURES:  # which the episodes do not make
+        status, out = again({name: 99.0})
+        assert status == 1 and f"{reproduce.MEASURES[name]}: before 99" in out
 
 
-@pytest.mark.parametrize("split", ["stochastic", "greedy"])
-def test_other_final_episodes_are_another_run(run, tmp_path, capsys, split):
-    """Every tier is made of them."""
-    result = json.loads((run / "result.json").read_text())
-    costs = result["final"][split]["costs"]
-    result["final"][split]["costs"] = [cost + 2 for cost in costs]
-    (run / "result.json").write_text(json.dumps(result))
-    assert again(tmp_path, str(run), *PACKAGES) == 1
-    out = capsys.readouterr().out
-    assert "Not the same: the final episodes differ" in out and "training episodes" not in out
-    assert ("cost of the final policy, sampled actions: before" in out) == (split == "stochastic")
-
-
-def test_a_claim_that_the_episodes_do_not_make(run, tmp_path, capsys):
-    result = json.loads((run / "result.json").read_text())
-    cost = {"mean": 0.1, "low": 0.0, "high": 0.2, "limit": 2.0, "verdict": "kept"}
-    claims = {
-        "return": 99.0, "cost": 0.0, "length": 7.0, "episodes": 1, "cost_limit": 9.0,
-        "physics_errors": 3, "cost_rate": 0.0, "label": "Best", "costs": {"cost": cost},
-    }  # fmt: skip
-    for name, value in claims.items():
-        (run / "result.json").write_text(json.dumps(result | {name: value}))
-        assert again(tmp_path, str(run), *PACKAGES) == 1, name
-        said = capsys.readouterr().out
-        assert reproduce.MEASURES.get(name, name) in said and "The same" not in said
-
-
-def test_a_claim_of_the_table_that_the_episodes_do_not_make(run, tmp_path, capsys, monkeypatch):
-    result = json.loads((run / "result.json").read_text())
-    numbers = reproduce.measures(result)
-    for name in numbers:
-        row = {"row": "table/cpo/A_1", **{key: result[key] for key in ("command", "curve")}}
-        row |= {"final": reproduce.final_hash(result), **numbers, name: numbers[name] + 1}
-        (tmp_path / "rows.csv").write_text(
-            ",".join(row) + "\n" + ",".join(f'"{value}"' for value in row.values()) + "\n"
-        )
-        monkeypatch.setattr(reproduce, "ROWS", tmp_path / "rows.csv")
-        assert again(tmp_path, "table/cpo/A_1", *PACKAGES) == 1
-        assert f"{reproduce.MEASURES[name]}: before" in capsys.readouterr().out
-
-
-def test_another_processor_is_judged_by_the_spread_over_seeds(run, tmp_path, capsys, monkeypatch):
-    result = json.loads((run / "result.json").read_text())
-    monkeypatch.setattr(reproduce, "ROWS", tmp_path / "rows.csv")
+def test_another_processor_is_judged_by_the_spread_over_seeds(again, result):
     for spread, status, said in ((5.0, 0, "Alike"), (0.01, 1, "Not alike"), (None, 1, "one seed")):
-        rows = ["row,command,curve,processor,return,cost"]
+        rows = []
         for seed, sign in ((3, 1), (4, -1))[: 2 if spread else 1]:
+            moved = {
+                name: value + 1 + sign * (spread or 1.0)
+                for name, value in reproduce.measures(result).items()
+            }
             words = result["command"].replace("--seed 3", f"--seed {seed}")
-            numbers = [result[name] + 1 + sign * (spread or 1.0) for name in ("return", "cost")]
-            rows.append(f'table/cpo/A_{seed},"{words}",0123,Pentium,{numbers[0]},{numbers[1]}')
-        (tmp_path / "rows.csv").write_text("\n".join(rows) + "\n")
-        assert again(tmp_path, "table/cpo/A_3", *PACKAGES) == status
-        before, _, after = capsys.readouterr().out.partition("Not the same: the training episodes")
+            rows.append({"row": f"table/cpo/CostPoint-v0_{seed + 1}", "command": words, **moved})
+        rows = [row | {"curve": "0123", "processor": "Pentium"} for row in rows]
+        got, out = again(*rows)
+        before, _, after = out.partition("Not the same: the training episodes")
+        assert got == status
         assert f"of Pentium, this is {result['processor']}" in before and said in after
 
 
-def test_an_older_run_without_a_hash_is_refused(run, tmp_path, capsys):
-    result = json.loads((run / "result.json").read_text())
-    (run / "result.json").write_text(json.dumps(result | {"curve": None}))
-    assert again(tmp_path, str(run), *PACKAGES) == 2
-    assert "no hash of the episodes" in capsys.readouterr().err
-
-
-def test_a_run_is_not_compared_with_itself(run, tmp_path, capsys):
-    assert again(tmp_path, str(run), *PACKAGES) == 0
-    assert again(tmp_path, str(tmp_path / "again/cpo/CostPoint-v0_4"), *PACKAGES) == 2
-    assert "choose another --log-folder" in capsys.readouterr().err
-
-
-def test_a_folder_of_runs_is_told_from_a_run(run, tmp_path, capsys):
-    assert again(tmp_path, str(run.parent)) == 2
-    assert f"run folders in it: {run}" in capsys.readouterr().err
-
-
-def test_nothing_is_the_same_if_no_episode_has_ended(tmp_path, capsys):
-    short = [*TOY, *PACKAGES, "-n", "60", "--env-kwargs", "episode_length:500"]
-    assert train.main([*short, "-f", str(tmp_path / "logs")]) == 0
-    assert again(tmp_path, str(tmp_path / "logs/cpo/CostPoint-v0_1"), *PACKAGES) == 1
-    assert "No episode has ended: there is nothing to compare." in capsys.readouterr().out
+def test_a_row_that_the_package_does_not_have(again, capsys):
+    status, out = again(row=ROW.replace("_4", "_5"))
+    assert status == 2 and f"did you mean {ROW!r}?" in out
 
 
 def test_the_packages_own_table_can_be_read(tmp_path, capsys):
-    assert again(tmp_path, "nothing/of/that_1") == 2
-    assert "is no run folder" in capsys.readouterr().err
+    assert reproduce.main(["nothing/of/that_1", "-f", str(tmp_path)]) == 2
+    assert "has no row 'nothing/of/that_1'" in capsys.readouterr().err

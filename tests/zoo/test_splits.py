@@ -9,11 +9,9 @@ from fake_runs import fake_run
 
 from sb3_guard.zoo.results import splits
 from sb3_guard.zoo.results.figure_data import Data
-from sb3_guard.zoo.results.figures import TIER_STYLES
 from sb3_guard.zoo.results.paper import draw
 from sb3_guard.zoo.results.runs import read_results
 from sb3_guard.zoo.results.splits import judge, nested_interval, tier, violations
-from sb3_guard.zoo.results.statistics import with_safety
 from sb3_guard.zoo.results.tables import tables
 
 NONE = pytest.approx(math.nan, nan_ok=True)
@@ -76,7 +74,7 @@ def runs(tmp_path):
     fake_run(tmp_path, "cpo", seed=0, **limit, final=final([1.0, 3.0], [4.0, 4.0]))
     fake_run(tmp_path, "cpo", seed=1, **limit, final=final([2.0, 4.0], [9.0, 9.0]))
     fake_run(tmp_path, "trpo", seed=0, final=final([6.0, 16.0], [7.0, 8.0]))
-    return with_safety(read_results([tmp_path]).runs)
+    return read_results([tmp_path]).runs
 
 
 def test_a_row_for_each_split(runs):
@@ -101,12 +99,12 @@ def test_a_row_for_each_split(runs):
     text = tables(Data(runs))["Tiers"]
     cells = text[text["episodes"] == "final greedy"].set_index("algorithm").loc["CPO"]
     assert cells["limit"] == "5: undecided" and cells["cost"] == "6.5\xa0±\xa03.5 [4.0, 9.0]"
-    assert cells["above limit, %"] == "50.0" and cells["D⁺"] == "0.80"
+    assert cells["above limit, %"] == "50.0" and cells["excess"] == "0.80"
 
 
 def test_episodes_that_a_wrapper_ended_are_not_judged(tmp_path):
     fake_run(tmp_path, cut=True, final=final([1.0, 2.0], [1.0, 9.0]))
-    table = judge(with_safety(read_results([tmp_path]).runs))
+    table = judge(read_results([tmp_path]).runs)
     assert table["split"].tolist() == ["stochastic", "greedy"]
 
 
@@ -131,12 +129,12 @@ def test_a_limit_on_the_worst_step_has_its_tier_and_says_nothing_of_the_sum(tmp_
     played["stochastic"]["bounded"] = {"cost": [0.25, 0.75]}
     costs = {"cost": {"mean": 0.5, "limit": 5.0, "verdict": "kept"}}
     fake_run(tmp_path, "scpo", cost_limit=5.0, limit_on="max", costs=costs, final=played)
-    runs = with_safety(read_results([tmp_path]).runs)
+    runs = read_results([tmp_path]).runs
     table = judge(runs).set_index(["algo", "split", "key"])
     worst = table.loc["scpo", "stochastic", "worst step of cost"]
     assert (worst["cost"], worst["low"], worst["high"]) == (0.5, 0.25, 0.75)
     assert {*table.drop(worst.name)["tier"]} == {""} and worst["tier"] == "certified"
-    assert runs["above_limit"].isna().all() and runs["limits"].dropna().tolist() == ["5"]
+    assert runs["limits"].dropna().tolist() == ["5"]
     shown = tables(Data(runs))
     assert shown["Results"]["limit"].tolist() == ["–", "5: certified"]
     (row,) = shown["Tiers"][shown["Tiers"]["cost key"] == "worst step of cost"].to_dict("records")
@@ -149,49 +147,9 @@ def test_the_share_of_runs_that_delivered(tmp_path):
     for seed, result in enumerate([{"delivered": {"return": 9.0}}, {}]):
         fake_run(tmp_path, "cpo", seed=seed, args={"certify": 400}, **result)
     fake_run(tmp_path, "trpo")
-    runs = with_safety(read_results([tmp_path]).runs)
+    runs = read_results([tmp_path]).runs
     assert tables(Data(runs))["Results"]["delivered"].tolist() == ["–", "50%"]
     assert "delivered" not in tables(Data(runs[runs["algo"] == "trpo"]))["Results"]
-
-
-def test_the_distribution_of_costs_is_drawn(runs):
-    (drawing,) = draw("cdf", Data(runs)).values()
-    greedy = drawing.axes[1]
-    assert "final greedy" in greedy.get_title()
-    line = {line.get_label(): line for line in greedy.lines}["CPO"]
-    x, y = line.get_data()
-    below = [y[np.flatnonzero(x <= cost)[-1]] for cost in (3.9, 4, 8.9, 9)]
-    assert below == [0, 0.5, 0.5, 1]
-
-
-def test_tiers_are_drawn(runs):
-    (drawing,) = draw("tiers", Data(runs)).values()
-    stochastic, greedy = drawing.axes
-    assert [label.get_text() for label in stochastic.get_yticklabels()] == ["CPO", "TRPO"]
-    (cpo,) = (line for line in greedy.lines if [*line.get_ydata()] == [0, 0])
-    assert [*cpo.get_xdata()] == [4, 9] and cpo.get_color() == TIER_STYLES["undecided"][0]
-    assert stochastic.collections[0].get_label() in ("certified", "violating")
-
-
-@pytest.mark.parametrize("kind", ["cdf", "tiers"])
-def test_no_panel_hides_what_another_shows(tmp_path, kind):
-    """Panels share their cost axis: it shows the agents of all of them, and the limit."""
-    limit = {"config": {"cost_limit": 25.0}, "cost_limit": 25.0}
-    fake_run(tmp_path, "cpo", **limit, final=final([1.0, 1.0, 2.0], [50.0, 60.0, 70.0]))
-    (drawing,) = draw(kind, Data(with_safety(read_results([tmp_path]).runs))).values()
-    for axis in drawing.axes:
-        assert axis.get_xlim()[0] <= 0 and 70 <= axis.get_xlim()[1] < 150
-
-
-def test_agents_with_other_limits_are_told_from_those_without(tmp_path):
-    """Limits on several costs say nothing of their sum."""
-    costs = {key: {"mean": 2.5, "limit": 4.0} for key in ("heat", "wear")}
-    several = {"cost_limit": [4.0, 4.0], "costs": costs}
-    for algo, entries in (("cpo", several), ("trpo", {})):
-        fake_run(tmp_path, algo, **entries, final=final([1.0, 2.0], [1.0, 9.0]))
-    (drawing,) = draw("tiers", Data(with_safety(read_results([tmp_path]).runs))).values()
-    labels = drawing.axes[0].get_legend_handles_labels()[1]
-    assert sorted(labels) == ["no limit", "other limits"]
 
 
 def test_near_the_limit_the_draw_does_not_decide(tmp_path, monkeypatch):
@@ -206,6 +164,6 @@ def test_near_the_limit_the_draw_does_not_decide(tmp_path, monkeypatch):
     for limit, tiers, draws in (25.0, ["undecided"], 2), (26.0, ["certified"], 1):
         drawn.clear()
         fake_run(tmp_path / str(limit), cost_limit=limit, final={"stochastic": played})
-        found = judge(with_safety(read_results([tmp_path / str(limit)]).runs))
+        found = judge(read_results([tmp_path / str(limit)]).runs)
         assert found.query("split == 'stochastic'")["tier"].tolist() == tiers
         assert len(drawn) == 2 * draws  # of the training episodes, too

@@ -14,14 +14,13 @@ from sb3_guard.zoo.cli.markdown import escaped
 from sb3_guard.zoo.results.figure_data import Data
 from sb3_guard.zoo.results.runs import read_curve, read_results
 from sb3_guard.zoo.results.statistics import (
-    SAFETY,
     aggregate,
     by_family,
+    judging_limits,
+    last_epochs,
     mean_curve,
     normalize,
     overall,
-    safety,
-    with_safety,
 )
 from sb3_guard.zoo.results.tables import CAPTIONS, latex, markdown, tables, terminal, write_tables
 
@@ -41,24 +40,13 @@ def means(**metrics) -> pd.DataFrame:
 # One run
 
 
-def test_safety_by_hand():
-    # 12 epochs of 10 steps with two episodes each, of costs 2k and 2k + 1 and the negative returns
-    costs = np.arange(24.0)
-    episodes = pd.DataFrame({"step": 5 * (costs + 1), "J_r": -costs, "M_c": costs})
-    found = safety(episodes, epoch=10, limit=8)
-    # The last ten epochs hold the costs 4 … 23, of which 4 … 8 are within the limit.
-    assert found == pytest.approx(
-        {
-            "return_last": -13.5, "cost_last": 13.5, "above_limit": 15 / 20,
-            "cost_p95": 4 + 0.95 * 19, "cost_max": 23, "cost_total": 276, "feasible_iqm": -6,
-        }
-    )  # fmt: skip
-    assert list(found) == list(SAFETY)
-    unlimited = safety(episodes, epoch=math.nan, limit=math.nan)
-    assert math.isnan(unlimited["above_limit"]) and math.isnan(unlimited["feasible_iqm"])
-    assert math.isnan(safety(episodes, 10, limit=3)["feasible_iqm"])
+def test_the_last_ten_epochs():
+    # 12 epochs of 10 steps with two episodes each
+    episodes = pd.DataFrame({"step": 5 * np.arange(1.0, 25), "J_r": 0.0, "M_c": np.arange(24.0)})
+    assert last_epochs(episodes, 10)["M_c"].tolist() == [*range(4, 24)]
     # Rollouts too short to end an episode, as with n_steps off-policy, are no epochs.
-    assert safety(episodes, 4, limit=8) == safety(episodes, math.nan, limit=8) != found
+    assert last_epochs(episodes, 4).equals(last_epochs(episodes, math.nan))
+    assert len(last_epochs(episodes, 4)) != 20
 
 
 def test_unconstrained_runs_are_judged_by_the_others_limit(tmp_path):
@@ -66,9 +54,9 @@ def test_unconstrained_runs_are_judged_by_the_others_limit(tmp_path):
     fake_run(tmp_path, "cpo", cost=1.0, cost_limit=4.0)
     fake_run(tmp_path, "pcpo", cost=1.0, cost_limit=4.0)
     runs = read_results([tmp_path]).runs
-    assert with_safety(runs)["above_limit"].tolist() == [1.0, 0.0, 0.0]
+    assert judging_limits(runs).tolist() == [4.0, 4.0, 4.0]
     several = runs.assign(cost_limit=[math.nan, 4.0, 5.0])
-    assert math.isnan(with_safety(several)["above_limit"][0])
+    assert math.isnan(judging_limits(several)[0])
 
 
 # Over seeds
@@ -77,14 +65,10 @@ def test_unconstrained_runs_are_judged_by_the_others_limit(tmp_path):
 def test_means_and_deviations_over_seeds(tmp_path):
     for seed, value in enumerate((10.0, 20.0, 60.0)):
         fake_run(tmp_path, seed=seed, returns=value, cost=5.0 + seed, cost_limit=0.0)
-    (row,) = aggregate(with_safety(read_results([tmp_path]).runs)).to_dict("records")
+    (row,) = aggregate(read_results([tmp_path]).runs).to_dict("records")
     assert (row["label"], row["J_r"], row["seeds"], row["limits"]) == ("CPO", 30.0, 3, "0")
     assert row["J_r_std"] == pytest.approx(math.sqrt(700))  # of the sample
-    assert row["cost_last"] == pytest.approx(6) and row["above_limit"] == 1
-    assert row["cost_last_std"] == pytest.approx(1)
-    assert row["cost_total"] == pytest.approx(360)
-    worst = read_results([tmp_path]).runs
-    assert row["cost_max"] == with_safety(worst)["cost_max"].max()
+    assert row["M_c"] == pytest.approx(6) and row["M_c_std"] == pytest.approx(1)
 
 
 def test_interval():
@@ -157,7 +141,7 @@ def test_suites_without_a_score_are_left_out_and_counted(tmp_path):
         for seed in (0, 1):
             fake_run(tmp_path, "trpo", f"{env}-v0", seed, cost=cost)
             fake_run(tmp_path, "cpo", f"{env}-v0", seed, cost=1.0, returns=10.0)
-    runs = with_safety(read_results([tmp_path]).runs)
+    runs = read_results([tmp_path]).runs
     table = overall(runs, aggregate(runs)).set_index("algo")
     assert table.index.tolist() == ["trpo", "cpo"]
     assert table.loc["cpo", ["cost", "cost_n"]].tolist() == [0.25, 1]
@@ -175,7 +159,7 @@ def runs(tmp_path):
             fake_run(
                 tmp_path / "logs", algo, seed=seed, returns=20 * factor + seed, cost=5 * factor
             )
-    return with_safety(read_results([tmp_path / "logs"]).runs)
+    return read_results([tmp_path / "logs"]).runs
 
 
 def test_markdown_and_latex(tmp_path, runs):
@@ -184,8 +168,8 @@ def test_markdown_and_latex(tmp_path, runs):
     text, tex = ((tmp_path / name).read_text() for name in ("r.md", "r.tex"))
     # TRPO's mean is 20.5, CPO's 10.5; no line breaks before or after ±.
     assert "| 20.50\xa0±\xa00.71 " in text and "| 0.51 " in text and "| 100.0 " in text
-    assert r"20.50~$\pm$~0.71 " in tex and r"Goal\_Point\_8Hazards" in tex
-    assert "return $J_r$" in tex and r"cost rate $\rho_c$" in tex and r"above limit, \%" in tex
+    assert "20.50\xa0±\xa00.71 " in tex and r"Goal\_Point\_8Hazards" in tex
+    assert r"above limit, \%" in tex
     lines = [line for line in text.splitlines() if line.startswith("|")][:4]
     assert len({len(line) for line in lines}) == 1
 
@@ -200,19 +184,18 @@ def test_tables_agree(tmp_path):
     for seed in range(3):
         fake_run(tmp_path, seed=seed, returns=20.0 + 5 * seed, cost=6.0 + seed, final=final,
                  config={"cost_limit": 5.5})  # fmt: skip
-    shown = tables(Data(with_safety(read_results([tmp_path]).runs)))
-    assert {*shown} == {"Results", "Safety", "Tiers"}
+    shown = tables(Data(read_results([tmp_path]).runs))
+    assert {*shown} == {"Results", "Tiers"}
     tiers = shown["Tiers"].set_index("episodes")["limit"]
     assert tiers["final stochastic"] == shown["Results"]["limit"][0] == "5.5: undecided"
-    assert shown["Results"]["episode cost M_c"][0] == "7.00\xa0±\xa01.00"
-    assert shown["Safety"]["cost, last epochs"][0] == "7.00\xa0±\xa01.00"
+    assert shown["Results"]["episode cost"][0] == "7.00\xa0±\xa01.00"
     assert all("standard deviation" in CAPTIONS[title] for title in shown)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
 def test_pdflatex_takes_the_tables(tmp_path, runs):
-    write_tables(tmp_path / "t.tex", Data(runs.assign(label="λ-CPO⁺ & é_%")))
+    write_tables(tmp_path / "t.tex", Data(runs.assign(label="CPO & é_%")))
     (tmp_path / "p.tex").write_text(
         "\\documentclass{article}\\IfFileExists{booktabs.sty}{\\usepackage{booktabs}}{\\let"
         "\\toprule\\hline\\let\\midrule\\hline\\let\\bottomrule\\hline}"
@@ -223,7 +206,7 @@ def test_pdflatex_takes_the_tables(tmp_path, runs):
     assert run.returncode == 0, run.stdout[-1500:]
 
 
-@pytest.mark.parametrize("cell", ["_", "%", "&", "#", "ρ", "−3", "\\"])
+@pytest.mark.parametrize("cell", ["_", "%", "&", "#", "\\"])
 def test_latex_escapes(cell):
     assert (
         cell

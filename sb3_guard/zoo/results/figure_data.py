@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_guard.zoo.results.runs import REFERENCE, read_curve
-from sb3_guard.zoo.results.splits import FINAL, judge, read_splits
+from sb3_guard.zoo.results.splits import judge
 from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize
 
 # Text, axes and the reference; a grey that is readable on white and on black. No other colour is
@@ -81,18 +81,6 @@ class Data:
     def splits(self) -> pd.DataFrame:
         """How limits are kept, see :func:`~sb3_guard.zoo.results.splits.judge`."""
         return judge(self.runs)
-
-    def final_splits(self, suite: str) -> list[str]:
-        """The splits of a suite that say most of its agents: the final ones, if there are any."""
-        have = {*self.splits.loc[self.splits["suite"] == suite, "split"]}
-        return [split for split in FINAL if split in have] or sorted(have)
-
-    def costs_of(self, suite: str, algo: str, split: str) -> np.ndarray:
-        """The costs of all seeds' episodes of a split, in their order; none: there are none."""
-        seeds = self.runs_of(suite, algo)[["path", "epoch"]].itertuples(index=False)
-        played = [read_splits(path, epoch) for path, epoch in seeds]
-        costs = [splits[split]["M_c"].dropna() for splits in played if split in splits]
-        return np.sort(np.concatenate([np.zeros(0), *costs]))
 
     @cached_property
     def looks(self) -> dict[str, Look]:

@@ -13,8 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
-from sb3_guard.zoo.results.splits import SPLITS
+from sb3_guard.zoo.results.figure_data import INK, Data
 from sb3_guard.zoo.results.statistics import mean_curve
 from sb3_guard.zoo.results.tables import written
 
@@ -40,16 +39,6 @@ STYLE: dict[Any, Any] = {
                     "grid.color")
     },
 }  # fmt: skip
-
-
-# Colour and marker
-TIER_STYLES = {
-    "certified": (COLORS[2], "o"),
-    "undecided": (COLORS[4], "D"),
-    "violating": (COLORS[1], "X"),
-    "other limits": (INK, "P"),
-    "no limit": (INK, "s"),
-}
 
 
 # Elements
@@ -178,57 +167,6 @@ def pareto(data: Data, suite: str) -> Figure | None:
     figure = Figure(figsize=(width, 0.6 * WIDTH), layout="constrained")
     for axis, cost in zip(figure.subplots(1, len(costs), squeeze=False)[0], costs, strict=True):
         draw_pareto(axis, data, suite, cost)
-    return figure
-
-
-def _split_axes(data: Data, suite: str, height: float) -> tuple[Figure, dict[str, Axes]]:
-    """A figure with a panel for each split that tells most of a suite's agents."""
-    splits = data.final_splits(suite)
-    figure = Figure(figsize=(WIDTH * (0.6 if len(splits) < 2 else 1), height), layout="constrained")
-    panels = figure.subplots(1, len(splits), sharex=True, sharey=True, squeeze=False)[0]
-    for split, axis in zip(splits, panels, strict=True):
-        axis.set(title=f"{suite}, {SPLITS[split]}", xlabel="episode cost")
-    return figure, dict(zip(splits, panels, strict=True))
-
-
-def cdf(data: Data, suite: str) -> Figure | None:
-    """Share of episodes that cost at most x, of the final policies, a figure per environment."""
-    if not data.final_splits(suite):
-        return None
-    figure, panels = _split_axes(data, suite, height=3.4)
-    shown = [0.0]  # of all panels, which share their axis: all but the highest 2 % of the costs
-    for split, axis in panels.items():
-        for algo in data.algos(suite):
-            costs = data.costs_of(suite, algo, split)
-            if len(costs):
-                # From a share of 0 on, and on to the end of the axis.
-                x, y = [-1e9, *costs, 1e9], [*np.linspace(0, 1, len(costs) + 1), 1.0]
-                axis.step(x, y, where="post", linewidth=1.5, **data.looks[algo].line)
-                shown += costs[: len(costs) - len(costs) // 50].tolist()
-        shown.append(1.05 * draw_limit(axis.axvline, data, suite, "M_c"))
-        axis.set(ylim=(-0.02, 1.02), ylabel="share of episodes")
-        axis.label_outer()
-    axis.set_xlim(np.nanmin(shown), np.nanmax(shown) or 1.0)
-    return figure
-
-
-def tiers(data: Data, suite: str) -> Figure | None:
-    """Mean costs with 95 % intervals and the limit: certified or not, a figure per environment."""
-    if not data.final_splits(suite):
-        return None
-    algos = data.algos(suite)[::-1]
-    figure, panels = _split_axes(data, suite, height=1.4 + 0.28 * len(algos))
-    limited = {*data.runs.loc[data.runs["suite"] == suite].dropna(subset=["limits"])["algo"]}
-    totals = data.splits[(data.splits["suite"] == suite) & (data.splits["key"] == "")]
-    for split, axis in panels.items():
-        for row in totals[totals["split"] == split].to_dict("records"):
-            name = row["tier"] or ("other limits" if row["algo"] in limited else "no limit")
-            y, (color, marker) = algos.index(row["algo"]), TIER_STYLES[name]
-            axis.plot([row["low"], row["high"]], [y, y], color=color, linewidth=4, alpha=0.5)
-            axis.scatter(row["cost"], y, s=36, color=color, marker=marker, label=name, zorder=3)
-        axis.set_yticks(range(len(algos)), [data.looks[algo].label for algo in algos])
-        draw_limit(axis.axvline, data, suite, "M_c")
-    axis.set_xlim(left=min(0.0, axis.get_xlim()[0]))
     return figure
 
 

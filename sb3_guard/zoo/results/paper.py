@@ -114,7 +114,7 @@ def q8(data: Data) -> Figure | None:
     return panels(data, places, algorithms(data), [*SCORES.values()])
 
 
-PER_SUITE = (figures.curves, figures.pareto, figures.cdf, figures.tiers)
+PER_SUITE = (figures.curves, figures.pareto)
 FIGURES: dict[str, Callable[..., Figure | None]] = {
     function.__name__: function for function in (*PER_SUITE, q1, q2, q3, q4, q5, q6, q7, q8)
 }

@@ -21,7 +21,6 @@ SPLITS = {
     "stochastic": "final stochastic",
     "greedy": "final greedy",
 }
-FINAL = ("stochastic", "greedy")
 #: SafeRLEval's words for verdicts
 TIERS = {"kept": "certified", "exceeded": "violating"}
 

@@ -1,4 +1,4 @@
-"""Statistics of runs: how safe each is, means over seeds, and scores as the GUARD paper has them.
+"""Statistics of runs: their last epochs, means over seeds, and scores as the GUARD paper has them.
 
 Scores are relative to TRPO's (arXiv 2305.13681). Intervals and interquartile means follow Agarwal
 et al. 2021 (arXiv 2108.13264). Their library, rliable, saw its last release in 2024 and does not
@@ -15,15 +15,11 @@ import pandas as pd
 from scipy.stats import trim_mean
 
 from sb3_guard.costs import interval
-from sb3_guard.zoo.results.runs import METRICS, REFERENCE, compared, read_episodes
+from sb3_guard.zoo.results.runs import REFERENCE, compared
 from sb3_guard.zoo.run.folder import EPOCH
 
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
-EPOCHS = 10  # at the end of a run, that its safety is judged by
-#: of :func:`safety`
-SAFETY = (
-    "return_last", "cost_last", "above_limit", "cost_p95", "cost_max", "cost_total", "feasible_iqm",
-)  # fmt: skip
+EPOCHS = 10  # at the end of a run, that its training is judged by
 
 
 def iqm(values: Any, axis: int = 0) -> Any:
@@ -59,44 +55,6 @@ def judging_limits(runs: pd.DataFrame) -> "pd.Series[float]":
     return runs["cost_limit"].where(runs["limits"].notna(), common).astype(float)
 
 
-def safety(episodes: pd.DataFrame, epoch: float, limit: float) -> dict[str, float]:
-    """
-    What users ask about the safety of a run; all but ``cost_total`` of its last ten epochs.
-
-    :param episodes: see :func:`~sb3_guard.zoo.results.runs.read_episodes`
-    :param epoch: steps, see :func:`last_epochs`
-    :param limit: of an episode's cost; NaN: there is none
-    :return: ``return_last`` and ``cost_last``, means over epochs of their episodes' means;
-        ``above_limit``, the part of the episodes whose cost exceeds the limit; ``cost_p95`` and
-        ``cost_max``, the 95th percentile and the greatest of their costs; ``cost_total``, the cost
-        of all training; ``feasible_iqm``, the interquartile mean of the returns of the episodes
-        within the limit (NaN: none is)
-    """
-    last = last_epochs(episodes, epoch)
-    means = last.groupby("epoch")[["J_r", "M_c"]].mean().mean()
-    within = last.loc[last["M_c"] <= limit, "J_r"]
-    return {
-        "return_last": means["J_r"],
-        "cost_last": means["M_c"],
-        "above_limit": math.nan if math.isnan(limit) else 1 - len(within) / len(last),
-        "cost_p95": last["M_c"].quantile(0.95),
-        "cost_max": last["M_c"].max(),
-        "cost_total": episodes["M_c"].sum(),
-        "feasible_iqm": iqm(within) if len(within) else math.nan,
-    }
-
-
-def with_safety(runs: pd.DataFrame) -> pd.DataFrame:
-    """
-    The table of runs with the columns of :func:`safety`.
-
-    They are judged by :func:`judging_limits`.
-    """
-    judged = runs[["path", "epoch"]].assign(limit=judging_limits(runs)).itertuples(index=False)
-    rows = [safety(read_episodes(path), epoch, limit) for path, epoch, limit in judged]
-    return runs.assign(**pd.DataFrame(rows, columns=list(SAFETY), index=runs.index, dtype=float))
-
-
 # Over seeds
 
 
@@ -105,27 +63,19 @@ def aggregate(runs: pd.DataFrame) -> pd.DataFrame:
     Means over seeds, a row per environment and algorithm.
 
     :param runs: see :func:`~sb3_guard.zoo.results.runs.select`
-    :return: ``suite``, ``algo``, ``label``, ``family``, limits, ``seeds``, ``steps``, and for each
-        of :data:`~sb3_guard.zoo.results.runs.METRICS`, and ``M_c/<key>`` and :data:`SAFETY` if the
-        runs have it, its mean (of ``cost_max`` the greatest) and ``_std`` (of the sample; NaN for
-        one seed)
+    :return: ``suite``, ``algo``, ``label``, ``family``, ``limits``, ``seeds``, ``steps``, and for
+        each other number that the runs have its mean and ``_std`` (of the sample; NaN for one seed)
     """
     groups = runs.groupby(["suite", "algo"], sort=False)
-    stated = runs.filter(regex="^(label|family|limits|cost_limit)").columns
-    measured = [*METRICS, *runs.filter(regex="^M_c/|^delivered$"), *runs.filter(SAFETY)]
-    table = pd.concat(
-        [
-            groups[list(stated)].first(),
-            groups["seed"].nunique().rename("seeds"),
-            groups["steps"].max(),
-            groups[measured].mean(),
-            groups[measured].std().add_suffix("_std"),
-        ],
-        axis=1,
-    )
-    if "cost_max" in runs:
-        table["cost_max"] = groups["cost_max"].max()
-    return table.reset_index()
+    numbers = runs.select_dtypes("number").columns.drop(["seed", "steps"])
+    parts = [
+        groups[["label", "family", "limits"]].first(),
+        groups["seed"].nunique().rename("seeds"),
+        groups["steps"].max(),
+        groups[[*numbers]].mean(),
+        groups[[*numbers]].std().add_suffix("_std"),
+    ]
+    return pd.concat(parts, axis=1).reset_index()
 
 
 def mean_curve(curves: Sequence[pd.DataFrame], name: str) -> pd.DataFrame:

@@ -1,9 +1,7 @@
 """Tables that read well in a terminal, in Markdown, in LaTeX and on a web page."""
 
 import io
-import re
 import shutil
-import unicodedata
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BufferedRandom
@@ -29,7 +27,7 @@ Cell = str | Callable[[Any], str]
 Columns = dict[str, Cell]
 FORMATS = (".md", ".tex", ".csv")
 DIGITS = {"rho_c": 5}
-HEADINGS = {"J_r": "return J_r", "M_c": "episode cost M_c", "rho_c": "cost rate ρ_c"}
+HEADINGS = {"J_r": "return", "M_c": "episode cost", "rho_c": "cost rate"}
 SCORE_HEADINGS = {
     "reward": "reward / TRPO",
     "cost": "cost / TRPO",
@@ -41,21 +39,14 @@ INTERVAL = "Brackets are the 95 % bootstrap interval of the mean."
 CAPTIONS = {
     "Results": "Means over the episodes of the final epoch of training, with sampled actions. "
     f"{SPREAD} Limits have the tier of the final stochastic episodes.",
-    "Safety": "The last ten epochs of training; the cost of training is that of all epochs. "
-    f"{SPREAD}",
     "Tiers": f"{SPREAD} {INTERVAL} A limit is certified if the interval lies at or below it, "
-    "violating if above it, else undecided. D⁺ is the mean relative excess of the episodes above "
-    "the limit.",
+    "violating if above it, else undecided. Excess is relative, a mean over the episodes above the "
+    "limit.",
     "Relative to TRPO": "Return, cost and cost rate of the final epoch relative to TRPO's.",
     "Families, relative to TRPO": "Means over the algorithms of a family.",
     "All environments, relative to TRPO": "Means over environments (their number), and "
     f"interquartile means over runs. {INTERVAL}",
 }
-# What pdfTeX does not take in UTF-8, and what reads better as mathematics
-_LATEX = {
-    "±": r"$\pm$", "−": "$-$", "–": "--", "\N{NO-BREAK SPACE}": "~", "⁺": "$^+$",
-    r" J\_r": " $J_r$", r" M\_c": " $M_c$", r"$\rho$\_c": r"$\rho_c$",
-}  # fmt: skip
 
 
 def terminal(data: pd.DataFrame) -> str:
@@ -77,24 +68,14 @@ def markdown(data: pd.DataFrame) -> str:
 
 
 def latex(data: pd.DataFrame, caption: str) -> str:
-    """A table of text that pdfLaTeX takes; it needs ``\\usepackage{booktabs}``."""
+    """A table of text for LaTeX; it needs ``\\usepackage{booktabs}``."""
     style = (
         data.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis=1)
     )
-    text = style.to_latex(
+    return style.to_latex(
         hrules=True, position_float="centering", column_format="l" * len(data.columns),
         caption=caption.replace("%", r"\%"),
     ).strip()  # fmt: skip
-    text = re.sub("[Α-Ωα-ω]", _greek, text)
-    for plain, symbol in _LATEX.items():
-        text = text.replace(plain, symbol)
-    return text
-
-
-def _greek(letter: re.Match[str]) -> str:
-    """A Greek letter as mathematics."""
-    _, case, *_, name = unicodedata.name(letter[0]).replace("LAMDA", "LAMBDA").split()
-    return f"$\\{name.lower() if case == 'SMALL' else name.capitalize()}$"
 
 
 # Numbers
@@ -170,17 +151,6 @@ def _delivered(row: Any) -> str:
     return "–" if pd.isna(row["delivered"]) else f"{row['delivered']:.0%}"
 
 
-SAFETY_HEADINGS: Columns = {
-    "return, last epochs": _deviation("return_last"),
-    "cost, last epochs": _deviation("cost_last"),
-    "above limit, %": lambda row: number(100 * row["above_limit"], 1),
-    "95 % of costs": "cost_p95",
-    "worst cost": "cost_max",
-    "cost of training": whole("cost_total"),
-    "feasible IQM return": "feasible_iqm",
-}
-
-
 TIER_HEADINGS: Columns = {
     "episodes": lambda row: SPLITS[row["split"]],
     "cost key": lambda row: row["key"] or "total",
@@ -193,17 +163,12 @@ TIER_HEADINGS: Columns = {
         else f"{row['limit']:g}: {row['tier']}" + beside(row["diverged"])
     ),
     "above limit, %": lambda row: number(100 * row["above"], 1),
-    "D⁺": "excess",
+    "excess": "excess",
 }
 
 
 def tables(data: Data) -> dict[str, pd.DataFrame]:
-    """
-    The tables of a report as text, by title.
-
-    :param data: of runs with the columns of
-        :func:`~sb3_guard.zoo.results.statistics.with_safety`
-    """
+    """The tables of a report as text, by title."""
     who: Columns = {"environment": "suite", "algorithm": "label"}
     shown: Columns = {heading: score for score, heading in SCORE_HEADINGS.items()}
     means = {h: _deviation(name, DIGITS.get(name, 2)) for name, h in HEADINGS.items()}
@@ -223,7 +188,6 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
                 **({"delivered": _delivered} if data.runs["delivered"].notna().any() else {}),
             },
         ),
-        "Safety": spelled(data.means, {**who, **SAFETY_HEADINGS}),
         "Tiers": spelled(splits, {**who, **tiers}),
     }
     scores = normalize(data.means, data.means)

@@ -15,7 +15,7 @@ from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.deployment import onnx_file
 from sb3_guard.deployment.contract import stops
 from sb3_guard.zoo.agents.flags import ExportFlags as Flags
-from sb3_guard.zoo.agents.playback import BATCH, EPISODES, means, open_agent, summary
+from sb3_guard.zoo.agents.playback import BATCH, EPISODES, open_agent, summary
 from sb3_guard.zoo.cli.flags import command
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.folder import require_file
@@ -66,7 +66,7 @@ def export_agent(flags: Flags) -> int:
             )
     print(f"{path}: {', '.join(contract['file']['operators'])}")
     print(f"{path.with_name(onnx_file.CONTRACT)} describes input and output")
-    print(means(evaluation))
+    print(evaluation)
     if agent.run.checkpoint.exists() and not agent.run.result.exists():
         print(
             f"warning: the training has not ended: this is its agent after "

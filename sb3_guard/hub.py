@@ -1,10 +1,10 @@
 """Share trained agents on the Hugging Face hub: ``sb3-guard hub push --algo cpo …``.
 
-They have RL-Zoo's layout, and their costs on the card.
+A repository is a run folder, as RL-Zoo lays it out, with a card that tells return and costs.
 """
 
+import dataclasses
 import json
-import shlex
 import shutil
 import sys
 import tempfile
@@ -17,13 +17,13 @@ import yaml
 from huggingface_hub import EvalResult, ModelCard, ModelCardData
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_guard.common.evaluation import Evaluation, evaluate_policy
+from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.zoo.agents.film import filming
 from sb3_guard.zoo.agents.flags import HubFlags as Flags
-from sb3_guard.zoo.agents.playback import EPISODES, Agent, means, open_agent, summary
+from sb3_guard.zoo.agents.playback import EPISODES, Agent, open_agent, summary
 from sb3_guard.zoo.cli.flags import command
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, packages_flag
-from sb3_guard.zoo.run.folder import RunFolder, claim, folder_name, is_run, require_writable
+from sb3_guard.zoo.run.folder import RunFolder, claim, folder_name, is_run
 from sb3_guard.zoo.run.make_envs import source_of
 
 # Said before an agent is downloaded.
@@ -41,7 +41,7 @@ A **{{ model_name }}** agent for **{{ env }}**, trained with
 [sb3_guard](https://arxiv.org/abs/2305.13681) for Stable-Baselines3. With {{ actions }} actions:
 
 ```
-{{ means }}
+{{ evaluation }}
 ```
 
 Cost is the undiscounted sum of `info["cost"]` over an episode.
@@ -65,27 +65,10 @@ sb3-guard enjoy {{ which }} -f logs{{ packages }}
 """
 
 
-def model_name(algo: str, env_id: str) -> str:
-    """RL-Zoo's name of a model on the hub: ``cpo-Goal_Point_8Hazards-v0``."""
-    return f"{algo}-{folder_name(env_id)}"
-
-
-def layout(run: Path, name: str) -> dict[str, Path]:
-    """Files of a repository, by name there, and where a run's folder has them."""
-    return {
-        "0.monitor.csv": run / "0.monitor.csv",
-        "config.yml": run / name / "config.yml",
-        "command.txt": run / name / "command.txt",
-        "vec_normalize.pkl": run / name / "vecnormalize.pkl",
-        "args.yml": run / name / "args.yml",  # last: it makes the folder a run
-    }
-
-
 def push(flags: Flags) -> int:
     """Evaluate an agent, write its card, film it, and upload all to the hub."""
-    require_writable(Path(flags.to or tempfile.gettempdir()), "--to")
     agent = open_agent(flags, None if flags.no_video else "rgb_array")
-    flags.repo_name = flags.repo_name or model_name(flags.algo, agent.env_id)
+    flags.repo_name = flags.repo_name or f"{flags.algo}-{agent.run.name}"
     folder = Path(flags.to or tempfile.mkdtemp(prefix="sb3_guard_hub_"))
     with closing(agent.env):
         stage(agent, flags, folder)
@@ -105,71 +88,62 @@ def push(flags: Flags) -> int:
 
 def stage(agent: Agent, flags: Flags, folder: Path) -> None:
     """
-    Write everything that goes to the hub into a folder.
+    Write everything that goes to the hub into a folder: a run folder with a card.
 
     :param agent: the agent and its environment
     :param flags: of the command
     :param folder: made if it is not there; files of the same names are replaced
-    :raises UsageError: the agent can't be filmed
+    :raises UsageError: the folder can't be written to, or the agent can't be filmed
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, source in layout(agent.run.path, agent.run.name).items():
-        if source.is_file():
-            shutil.copyfile(source, folder / name)
-    shutil.copyfile(agent.path, folder / f"{model_name(flags.algo, agent.env_id)}.zip")
+    trained = agent.run.flags()
+    # names of files, but not where they lie here
+    files: dict[str, Any] = {n: Path(getattr(trained, n) or "").name for n in PATHS}
+    trained = dataclasses.replace(trained, **{n: file for n, file in files.items() if file})
+    command, hyperparams = trained.command(), agent.run.hyperparams()
+    run = RunFolder.create(trained, hyperparams, command, folder)
+    shutil.copyfile(agent.path, run.model)
+    if agent.run.monitor.is_file():
+        shutil.copyfile(agent.run.monitor, run.monitor)
     normalizer = unwrap_vec_normalize(agent.env)
     if normalizer is not None:  # the model's, which may not be the run's last one
-        normalizer.save(str(folder / "vec_normalize.pkl"))
-    trained = agent.run.args()
-    trained |= {name: Path(trained[name]).name for name in PATHS if trained.get(name)}
-    (folder / "args.yml").write_text(yaml.safe_dump(trained), encoding="utf-8")
-    (folder / "command.txt").write_text(command_of(agent), encoding="utf-8")
+        normalizer.save(str(run.normalizer))
     how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
     evaluation = evaluate_policy(agent.model, agent.env, flags.n_episodes or EPISODES, **how)
     if not flags.no_video:
-        with filming(agent.env, agent.model, folder / "replay.mp4") as env:
-            evaluate_policy(agent.model, env, 1, **how)
+        with filming(agent.env, agent.model, folder / "replay.mp4") as film:
+            evaluate_policy(agent.model, agent.env, 1, on_step=film, **how)
     results = summary(evaluation)
     results["is_deterministic"] = not flags.stochastic
     (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
-    card(agent, flags, evaluation).save(folder / "README.md")
-
-
-def card(agent: Agent, flags: Flags, evaluation: Evaluation) -> ModelCard:
-    """The model card: metadata that the hub reads, and a page that people read."""
-    env, results = agent.env_id, summary(evaluation)
-    scores = [
-        EvalResult(
-            task_type="reinforcement-learning", dataset_name=env, dataset_type=env,
-            metric_type=kind, metric_value="{mean:.2f} +/- {std:.2f}".format(**results[key]),
-        )
-        for kind, key in (("mean_reward", "return"), ("mean_cost", "cost"))
-    ]  # fmt: skip
     data = ModelCardData(
         library_name="stable-baselines3",
-        tags=[env, *TAGS],
+        tags=[agent.env_id, *TAGS],
         model_name=type(agent.model).__name__,
-        eval_results=scores,
+        eval_results=[
+            EvalResult(
+                task_type="reinforcement-learning",
+                dataset_name=agent.env_id,
+                dataset_type=agent.env_id,
+                metric_type=kind,
+                metric_value="{mean:.2f} +/- {std:.2f}".format(**results[key]),
+            )
+            for kind, key in (("mean_reward", "return"), ("mean_cost", "cost"))
+        ],
     )
-    return ModelCard.from_template(
+    card = ModelCard.from_template(
         data,
         template_str=CARD,
-        env=env,
-        which=f"--algo {flags.algo} --env {env}",
+        env=agent.env_id,
+        which=f"--algo {flags.algo} --env {agent.env_id}",
         organization=flags.organization,
         repo=flags.repo_name,
-        packages=packages_flag(agent.run.args().get("gym_packages") or []),
+        packages=packages_flag(trained.gym_packages),
         actions="sampled" if flags.stochastic else "the most likely",
-        means=means(evaluation),
-        command=command_of(agent),
-        hyperparams=yaml.safe_dump(agent.run.hyperparams()),
+        evaluation=str(evaluation),
+        command=command,
+        hyperparams=yaml.safe_dump(hyperparams),
     )
-
-
-def command_of(agent: Agent) -> str:
-    """The command line of a run, with the names of files, but not where they lie here."""
-    words = shlex.split(agent.run.flags().command())
-    return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
+    card.save(folder / "README.md")
 
 
 def load(flags: Flags) -> int:
@@ -177,42 +151,24 @@ def load(flags: Flags) -> int:
     import_packages(flags.gym_packages)
     if is_run(Path(flags.folder)):
         raise UsageError(f"--folder {flags.folder!r} is a run: name the folder that gets a new one")
-    flags.env = str(source_of(flags.env).env_id)
-    name = model_name(flags.algo, flags.env)
-    repo_id = f"{flags.organization}/{flags.repo_name or name}"
-    require_writable(Path(flags.folder), "--folder")
+    env = folder_name(str(source_of(flags.env).env_id))
+    repo_id = f"{flags.organization}/{flags.repo_name or f'{flags.algo}-{env}'}"
     print(TRUST)
     with _network(f"the download of {repo_id}"):
         downloaded = Path(huggingface_hub.snapshot_download(repo_id))
-    run = install(downloaded, name, flags)
-    print(f"Run folder: {run.path}")
-    return 0
-
-
-def install(downloaded: Path, name: str, flags: Flags) -> RunFolder:
-    """
-    Make a run folder of what was downloaded.
-
-    :param downloaded: folder with the files that :func:`stage` writes
-    :param name: name of the model
-    :raises UsageError: the model or its settings are not there
-    """
-    files = {path.name for path in downloaded.iterdir() if path.is_file()}
-    if absent := {f"{name}.zip", "config.yml", "args.yml"} - files:
+    run = RunFolder(downloaded)
+    there = run.args().get("algo"), run.name
+    if there != (flags.algo, env):
         raise UsageError(
-            f"the repository has no file {', '.join(sorted(absent))}, but "
-            f"{', '.join(sorted(files)) or 'nothing'}; name the agent's own --algo and --env"
+            "the repository has an agent of {} on {}; name its own --algo and --env".format(*there)
         )
-    env = folder_name(flags.env)
     parent = Path(flags.folder) / flags.algo
-    parent.mkdir(parents=True, exist_ok=True)
-    path = claim(parent, env)
-    (path / env).mkdir()
-    shutil.copyfile(downloaded / f"{name}.zip", path / f"{env}.zip")
-    for file, target in layout(path, env).items():
-        if file in files:
-            shutil.copyfile(downloaded / file, target)
-    return RunFolder(path)
+    with explained(f"can't write to {parent}", OSError):
+        parent.mkdir(parents=True, exist_ok=True)
+        path = claim(parent, env)
+        shutil.copytree(downloaded, path, dirs_exist_ok=True)
+    print(f"Run folder: {path}")
+    return 0
 
 
 def _network(what: str) -> AbstractContextManager[None]:

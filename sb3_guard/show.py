@@ -19,7 +19,6 @@ from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.check_part import unsteady
 from sb3_guard.envs.registry import ROBOTS, robot_of_file
 from sb3_guard.envs.rendering import RenderingError
-from sb3_guard.envs.robots.robot import MJCFRobot
 from sb3_guard.list import summary
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.markdown import table
@@ -51,43 +50,6 @@ def action_table(env: GuardVectorEnv) -> str:
         for i, actuator in enumerate(env.actuators)
     ]
     return table(["action", "actuator", "range", "control"], rows)
-
-
-def register_file(path: Path, stated: dict[str, Any]) -> tuple[str, type[MJCFRobot]]:
-    """Register the robot of a file for this process.
-
-    :param stated: what the file does not say, by argument of :func:`register_robot`
-    :return: its name and its class
-    """
-    name = re.sub(r"[^A-Za-z0-9]|^[0-9]+", "", path.stem).capitalize() or "Robot"
-    if name.lower() in map(str.lower, ROBOTS):
-        name += "File"
-    robot: Any = robot_of_file(name, path, stated)
-    ROBOTS[name] = robot  # also one that explodes: it is shown, with a warning
-    return name, robot
-
-
-def file_table(robot: type[MJCFRobot]) -> str:
-    """What was taken from a robot's file: how it is placed, and each joint's range and start."""
-    file = robot.model_file()
-    model, data = file.standing()
-    base = ", ".join(joint.name for joint in file.base) or "none, it stands on a fixed base"
-    about = [
-        ["outermost body", file.root],
-        ["joints of its place", base],
-        ["position", robot.tip or robot.center],
-        ["keepout, arena", f"{robot.keepout:g} m, {robot.defaults['arena']['size']:g} m"]
-        if file.base
-        else ["reach", f"{robot.reach:g} m"],
-        ["left out of the file", ", ".join(file.left_out) or "nothing"],
-    ]
-    rows = []
-    for i in range(model.njnt):
-        joint = model.joint(i)
-        low, high = joint.range if model.jnt_limited[i] else (-np.inf, np.inf)
-        start = " ".join(f"{value:.3g}" for value in data.joint(joint.name).qpos)
-        rows.append([joint.name, f"[{low:.3g}, {high:.3g}]", start])
-    return table(["robot", ""], about) + "\n\n" + table(["joint", "range", "start"], rows)
 
 
 def costs(env: GuardVectorEnv, env_id: str) -> Iterator[str]:
@@ -168,12 +130,16 @@ def show(flags: Flags) -> int:
     file = Path(flags.env)
     if file.suffix in (".xml", ".urdf"):
         stated = {**(flags.robot_kwargs or {})}
+        name = re.sub(r"[^A-Za-z0-9]|^[0-9]+", "", file.stem).capitalize() or "Robot"
+        if name.lower() in map(str.lower, ROBOTS):
+            name += "File"
         with explained("can't show it", ValueError, TypeError, OSError):
-            name, robot = register_file(file, stated)
+            robot = robot_of_file(name, file, stated)
+        ROBOTS[name] = robot  # for this process, also one that explodes: a warning says so
         flags.env = f"Goal_{name}_0Hazards"
         arguments = "".join(f", {key}={value!r}" for key, value in stated.items())
         print(f"sb3_guard.register_robot({name!r}, xml={str(file)!r}{arguments})\n")
-        print(file_table(robot) + "\n")
+        print(f"Left out of the file: {', '.join(robot.model_file().left_out) or 'nothing'}\n")
     elif flags.robot_kwargs:
         raise UsageError("--robot-kwargs goes with a robot's file: sb3-guard show go1.xml ...")
     if flags.window:

@@ -94,7 +94,7 @@ def make_vec_env(
         def make_one() -> gymnasium.Env:
             env = source.make(**kwargs)
             env = env if wrapper_class is None else wrapper_class(env)
-            return CheckedEnv(env, keys, raises=vec_env != "subproc")
+            return CheckedEnv(env, keys)
 
         venv = (
             _subprocesses(make_one, n_envs)

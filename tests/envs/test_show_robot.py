@@ -38,19 +38,8 @@ def test_it_prints_what_was_taken_from_the_file_and_draws_it(run, tmp_path):
     status, out, _ = run("my_dog.xml", "--robot-kwargs", "root:'trunk'", "frame_skip:5")
     assert status == 0 and (tmp_path / "picture.png").is_file()
     assert "sb3_guard.register_robot('Mydog', xml='my_dog.xml', root='trunk', frame_skip=5" in out
-    for row in (
-        "| outermost body       | trunk ",
-        "| left out of the file | body ball, geom ground, sensor to_ball |",
-        "| front_calf  | [-2.62, -0.524] | -1.57 ",
-        "| 1      | front_calf  | [-1, 1] | [-2.61799, -0.523599]",
-    ):
-        assert row in out
-
-
-def test_an_arm_says_how_far_it_reaches(run):
-    status, out, _ = run("crane.xml", "--robot-kwargs", "center:'hand'")
-    assert status == 0 and "| reach                | 0.5" in out
-    assert "none, it stands on a fixed base" in out
+    assert "Left out of the file: body ball, geom ground, sensor to_ball\n" in out
+    assert "| 1      | front_calf  | [-1, 1] | [-2.61799, -0.523599]" in out
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def test_each_cost_has_its_verdict_wherever_one_is_shown(tmp_path, capsys):
         cost = measured["costs"][key]
         assert set(cost) == {"mean", "low", "high", "limit", "verdict"}
         assert cost["limit"] == limit and cost["low"] <= cost["mean"] <= cost["high"]
-        words = rf"  {key} .*\[{cost['low']:.3f}, {cost['high']:.3f}\] .*limit {limit:g}: "
+        words = rf"; {key} .*\[{cost['low']:.3f}, {cost['high']:.3f}\]\), limit {limit:g}: "
         for out in (exported, played):
             assert re.search(words + cost["verdict"], out), out
 

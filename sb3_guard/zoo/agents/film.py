@@ -13,60 +13,47 @@ import imageio_ffmpeg
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.files import replacing
-from sb3_guard.common.monitor import cost_keys_of
+from sb3_guard.common.monitor import find_monitor
 from sb3_guard.common.native import GuardVecEnv
-from sb3_guard.costs import EpisodeCosts, bounded_name, read_costs
+from sb3_guard.costs import bounded_name
 from sb3_guard.zoo.cli.usage import UsageError, explained
 
 
-class Film(VecEnvWrapper):
+class Film:
     """
-    One environment whose pictures are written as it is stepped.
+    Write the pictures of each step: ``evaluate_policy(…, on_step=film)``.
 
-    :param venv: one environment
-    :param model: whose costs and limits are said
+    :param env: one environment, in a ``CostMonitor``
+    :param model: whose limits are said
     :param writer: is sent the pictures, [height, width, 3] uint8
     """
 
-    def __init__(self, venv: VecEnv, model: BaseAlgorithm, writer: Any) -> None:
-        super().__init__(venv)
-        self.writer, self.keys = writer, cost_keys_of(model, venv)
+    def __init__(self, env: VecEnv, model: Any, writer: Any) -> None:
+        self.env, self.writer, self.monitor = env, writer, find_monitor(env)
         limited = isinstance(model, Constrained) and model.constrained
-        self.limits = model.final_cost_limits.tolist() if limited else [None] * len(self.keys)  # type: ignore[attr-defined]
+        keys = self.monitor.cost_keys
+        self.limits = model.final_cost_limits.tolist() if limited else [None] * len(keys)
         self.limit_on = getattr(model, "limit_on", "sum")
-        self.total, self.costs = 0.0, EpisodeCosts(1, len(self.keys))
 
-    def reset(self) -> VecEnvObs:
-        """Begin an episode; nothing is written."""
-        self.total, self.costs = 0.0, EpisodeCosts(1, len(self.keys))
-        return self.venv.reset()
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Pass a step on, and write its pictures."""
-        obs, rewards, dones, infos = self.venv.step_wait()
-        self.total += float(rewards[0])
-        self.costs.step(read_costs(infos, self.keys, zero_if_missing=True)[0], dones)
-        if dones[0]:  # pictures are of the next episode by now
-            self.total = 0.0
-        else:
-            native = self.venv.unwrapped  # of which long control steps have several pictures
-            shots: list[Any] = (
-                native.film() if isinstance(native, GuardVecEnv) else [render(self.venv)]
-            )
-            for picture in shots:
-                self.writer.send(np.ascontiguousarray(below(self.caption(), picture)))
-        return obs, rewards, dones, infos
+    def __call__(self) -> None:
+        """Write the pictures of the step that was taken."""
+        if not self.monitor.episodes.lengths[0]:  # pictures are of the next episode by now
+            return
+        native = self.env.unwrapped  # of which long control steps have several pictures
+        shots: list[Any] = native.film() if isinstance(native, GuardVecEnv) else [render(self.env)]
+        for picture in shots:
+            self.writer.send(np.ascontiguousarray(below(self.caption(), picture)))
 
     def caption(self) -> str:
         """Return and each cost of the episode so far, beside its limit."""
-        words, costs = [f"return {self.total:z.2f}"], self.costs
-        bounded = costs.highest if self.limit_on == "max" else costs.totals
-        for key, cost, limit in zip(self.keys, bounded[0].tolist(), self.limits, strict=True):
+        keys, episodes = self.monitor.cost_keys, self.monitor.episodes
+        costs = episodes.highest if self.limit_on == "max" else episodes.totals
+        words = [f"return {self.monitor.episode_returns[0]:z.2f}"]
+        for key, cost, limit in zip(keys, costs[0, -len(keys) :], self.limits, strict=True):
             name = bounded_name(key, self.limit_on)
             words.append(f"{name} {cost:.2f}" + ("" if limit is None else f" (limit {limit:g})"))
         return "    ".join(words)
@@ -90,7 +77,7 @@ def below(text: str, picture: np.ndarray) -> np.ndarray:
 @contextmanager
 def filming(env: VecEnv, model: BaseAlgorithm, video: Path) -> Iterator[Film]:
     """
-    The environment in which to play an agent that is filmed.
+    What films an agent that is played meanwhile, as ``on_step`` of ``evaluate_policy``.
 
     The first picture is taken at once, so that a machine that can't render says so before anything
     is played, and nothing is written then.

@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 from sb3_guard.common.certificate import Certificate, agent_hash
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
-from sb3_guard.costs import LEAST_EPISODES, Estimate, beside
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
@@ -74,20 +74,21 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     """
     kept = {int(path.stem.split("_")[2]): path for path in run.path.glob("rl_model_*_steps.zip")}
     steps = flags.load_checkpoint
-    if flags.load_last_checkpoint and kept:
-        steps = max(kept)
-    model, statistics = run.model, run.normalizer
+    if flags.load_last_checkpoint:
+        steps = max(kept, default=None)
     certified = run.path / "certified_model.zip"
-    if not (flags.load_best or steps or flags.load_last_checkpoint) and certified.is_file():
-        model, statistics = certified, run.path / "certified_vecnormalize.pkl"
-    elif flags.load_best:
+    if flags.load_best:
         model, statistics = run.path / "best_model.zip", run.path / "best_model_vecnormalize.pkl"
     elif steps is not None:
         if steps not in kept:
             allowed = ", ".join(map(str, sorted(kept))) or "none"
             raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {allowed}")
         model, statistics = kept[steps], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
-    elif flags.load_last_checkpoint or not model.exists():
+    elif certified.is_file() and not flags.load_last_checkpoint:
+        model, statistics = certified, run.path / "certified_vecnormalize.pkl"
+    elif run.model.is_file() and not flags.load_last_checkpoint:
+        model, statistics = run.model, run.normalizer
+    else:
         model = statistics = run.checkpoint
     if not model.is_file():
         fix = "the run has not reached that point"
@@ -219,21 +220,26 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         print(f"Playing {agent.path} on {agent.env_id}{trained_at}")
         if agent.certificate is not None:
             print(agent.certificate)
-    stage: AbstractContextManager[VecEnv] = nullcontext(agent.env)
+    shown: AbstractContextManager[Any] = nullcontext(None)
     if video is not None:
-        stage = filming(agent.env, agent.model, video)
-    with closing(agent.env), explained(f"can't play {agent.path}", *BAD_NUMBERS), stage as env:
+        shown = filming(agent.env, agent.model, video)
+    elif render_mode == "human":
+        shown = nullcontext(partial(render, agent.env))
+    with closing(agent.env), explained(f"can't play {agent.path}", *BAD_NUMBERS), shown as on_step:
         evaluation = evaluate_policy(
             agent.model,
-            env,
+            agent.env,
             n_eval_episodes=episodes or flags.n_timesteps or 1,
             deterministic=not flags.stochastic,
             seed=flags.seed,
             max_steps=flags.n_timesteps,
-            on_step=(lambda: render(env)) if render_mode == "human" else None,
+            on_step=on_step,
             on_episode=(lambda *ended: print(_episode(*ended))) if flags.verbose > 0 else None,
         )
-    print(means(evaluation))
+    if len(evaluation):
+        print(evaluation)
+    else:
+        print("No episode ended; play more steps with -n, or whole episodes with --n-episodes")
     if flags.verbose > 0:
         for cut in evaluation.unfinished:
             print(_episode(*cut), "so far: this episode did not end and is not counted")
@@ -260,7 +266,13 @@ def summary(evaluation: Evaluation) -> dict[str, Any]:
         ``result.json``; its key's worst step is meant where that is limited
     """
     out: dict[str, Any] = {"episodes": len(evaluation)}
-    for name, values in _columns(evaluation).items():
+    columns = {
+        "return": evaluation.returns,
+        "cost": evaluation.costs,
+        "length": evaluation.lengths,
+        **({"worst": evaluation.worst} if evaluation.limit_on == "max" else {}),
+    }
+    for name, values in columns.items():
         estimate = evaluation.estimate(values)._asdict()
         if diverged := estimate.pop("diverged"):
             out["physics_errors"] = diverged
@@ -281,41 +293,5 @@ def _finite(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def _columns(evaluation: Evaluation) -> dict[str, np.ndarray]:
-    return {
-        "return": evaluation.returns,
-        "cost": evaluation.costs,
-        "length": evaluation.lengths,
-        **({"worst": evaluation.worst} if evaluation.limit_on == "max" else {}),
-    }
-
-
 def _episode(episode_return: float, cost: float, length: float) -> str:
     return f"  return {episode_return:9.3f}   cost {cost:9.3f}   {length:.0f} steps"
-
-
-def means(evaluation: Evaluation) -> str:
-    """The means in words, with their intervals and what these say of the limits."""
-    count = len(evaluation)
-    if count == 0:
-        return "No episode ended; play more steps with -n, or whole episodes with --n-episodes"
-    rows: dict[str, tuple[Estimate, float | None]] = {
-        name: (evaluation.estimate(values), None) for name, values in _columns(evaluation).items()
-    }
-    if len(evaluation.cost_keys) > 1:  # each has its limit, their sum has none
-        rows |= evaluation.by_key()
-    elif evaluation.limits:
-        name = "worst" if evaluation.limit_on == "max" else "cost"
-        rows[name] = rows[name][0], evaluation.limits[0]
-    title = f"Mean ± std of {count} episodes"
-    if count >= LEAST_EPISODES:
-        title += ", 95 % interval of the mean"
-    lines = ["One episode:" if count == 1 else f"{title}:"]
-    width = max(map(len, rows))
-    for name, (estimate, limit) in rows.items():
-        mean, std, low, high, diverged = estimate
-        spread = f" ± {std:.3f}" if count > 1 else ""
-        interval = "" if np.isnan(low) else f"   [{low:.3f}, {high:.3f}]"
-        end = beside(diverged) if limit is None else f"   {estimate.against(limit)}"
-        lines.append(f"  {name:<{width}} {mean:9.3f}{spread}{interval}{end}")
-    return "\n".join(lines)

@@ -145,11 +145,10 @@ class RunFolder:
         """
         name = folder_name(flags.env)
         parent = Path(flags.log_folder) / flags.algo
-        suffix = f"_{uuid.uuid4()}" if flags.uuid else ""
-        what = f"can't write to log folder {flags.log_folder!r}"
-        with explained(what, OSError, fix="choose another with -f"):
-            parent.mkdir(parents=True, exist_ok=True)
-            path = path or claim(parent, name, suffix)
+        with explained(f"can't write to {path or parent}", OSError):
+            if path is None:
+                parent.mkdir(parents=True, exist_ok=True)
+                path = claim(parent, name, f"_{uuid.uuid4()}" if flags.uuid else "")
             params = path / name
             params.mkdir(parents=True, exist_ok=True)
             (params / "command.txt").write_text(command, encoding="utf-8")

@@ -192,37 +192,20 @@ class Run:
         with explained("hyperparameter", ValueError):
             return selection_limits(self.setup.selection_limit, cost_limit, self.cost_keys)
 
-    def try_out(self) -> Self:
+    def try_out(self) -> None:
         """
-        Check what no value shows: a step of the environment.
+        Take a step in one environment, so that nothing is begun that fails for want of a cost.
 
-        :return: the same run
-        :raises UsageError: the environment refuses a value, has no cost, or diverges at rest
+        :raises UsageError: the environment refuses a value, or has no cost
         """
-        self._try_environment(self.setup.env_kwargs)
-        if self.flags.eval_freq > 0 and self.flags.eval_env_kwargs is not None:
-            self._try_environment(self.flags.eval_env_kwargs)
-        return self
-
-    def _try_environment(self, env_kwargs: Mapping[str, Any]) -> None:
-        """Make one environment and take a step, so that nothing fails later for want of a cost."""
         vec_env = "dummy" if self.flags.vec_env == "subproc" else self.flags.vec_env
-        env = self.make_envs(1, self.flags.seed, vec_env=vec_env, env_kwargs=env_kwargs)
+        env = self.make_envs(1, self.flags.seed, vec_env=vec_env)
         env.action_space.seed(self.flags.seed)
         with closing(env), explained(f"{self.flags.env} fails at its first step", *BAD_NUMBERS):
             env.reset()
             infos = env.step(np.array([env.action_space.sample()]))[3]
-        if self.source.batch is not None:
-            from sb3_guard.envs.check_part import diverges
-
-            world: Any = self.source.batch(1, **env_kwargs)
-            with closing(world):
-                unsteady = diverges(world.envs.engine)
-            if unsteady is not None:
-                raise UsageError(f"{self.flags.env}: {unsteady}")
-        if self.constrained:
-            optional = self.setup.model.get("missing_cost") == "zero"
-            with explained(f"{self.flags.env} reports no such cost", ValueError):
+            if self.constrained:
+                optional = self.setup.model.get("missing_cost") == "zero"
                 read_costs(infos, self.cost_keys, zero_if_missing=optional)
 
     # Made
@@ -235,6 +218,7 @@ class Run:
         :raises UsageError: something can't be made, or is not there
         """
         flags = self.flags
+        self.try_out()
         self.callbacks = self.setup.callbacks()
         if self.folder is not None:
             self.begun = read_checkpoint(self.folder.checkpoint)
@@ -462,14 +446,10 @@ class Run:
         :return: exit status, see :meth:`train`
         :raises UsageError: something can't be made; nothing has been written then
         """
-        self.try_out().make()
-        try:
+        with closing(self.make()):
             folder = RunFolder.create(self.flags, self.hyperparams, shlex.join(sys.orig_argv))
-        except UsageError:
-            self.close()
-            raise
-        with lock(folder.path):
-            return self.train(folder)
+            with lock(folder.path):
+                return self.train(folder)
 
     @property
     def path(self) -> Path:
@@ -517,9 +497,10 @@ class Run:
                 return 0
             folder = RunFolder(path) if is_run(path) else None
             quiet = dataclasses.replace(flags, progress=False, verbose=0)
-            run = Run(quiet, values, folder if state == "resume" else None).try_out().make()
-            folder = folder or RunFolder.create(flags, values, command, path)
-            return run.train(folder, asked_to_stop)
+            run = Run(quiet, values, folder if state == "resume" else None)
+            with closing(run.make()):
+                folder = folder or RunFolder.create(flags, values, command, path)
+                return run.train(folder, asked_to_stop)
 
     @classmethod
     def resume(cls, given: RunFlags) -> int:
@@ -558,7 +539,8 @@ class Run:
             if 0 < given.n_timesteps < done or (total <= done and folder.read_result() is not None):
                 print(f"{folder.path} is finished: {done} steps; a larger -n continues it")
                 return 0
-            return run.try_out().make().train(folder)
+            with closing(run.make()):
+                return run.train(folder)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -567,26 +549,13 @@ class Run:
 
     def train(self, folder: RunFolder, asked_to_stop: Callable[[], bool] = lambda: False) -> int:
         """
-        Train to the end, or to an interrupt, report, and release what was made.
+        Train what was made to the end, or to an interrupt, and report.
 
         :param folder: the run's folder, owned by this process
         :param asked_to_stop: training ends after the rollout under way when this says so
         :return: exit status: 0, or 128 + the signal's number when interrupted
         :raises UsageError: training can't continue
         """
-        try:
-            return self._train(folder, asked_to_stop)
-        except PROCESS_DIED as error:
-            if self.flags.vec_env != "subproc":
-                raise
-            raise UsageError(
-                "a process of --vec-env subproc has died, because of an error printed above, by a "
-                f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
-            ) from error
-        finally:
-            self.close()
-
-    def _train(self, folder: RunFolder, asked_to_stop: Callable[[], bool]) -> int:
         state, flags, verbose = self.begun, self.flags, self.flags.verbose > 0
         if verbose:
             print(f"Run folder: {folder.path} (seed {flags.seed})")
@@ -623,7 +592,7 @@ class Run:
                 # In this order, and only now: a result in the folder is always that of its config.
                 folder.result.unlink(missing_ok=True)
                 write_config(folder.params, flags, self.hyperparams)
-            finished = self._learn(checkpoints)
+            finished = self._learn(folder, checkpoints)
             logger.close()
             result = self._finish(folder, epochs.result(), finished)
         if verbose:
@@ -664,7 +633,7 @@ class Run:
             asked_to_stop=asked_to_stop,
         )
 
-    def _learn(self, checkpoints: Checkpoints) -> bool:
+    def _learn(self, folder: RunFolder, checkpoints: Checkpoints) -> bool:
         """Whether training came to its end."""
         left = self.setup.n_timesteps - (self.model.num_timesteps if self.begun else 0)
         interval = self.flags.log_interval
@@ -685,6 +654,13 @@ class Run:
         except BAD_NUMBERS as error:
             raise TrainingStopped(
                 f"training stopped at {self.model.num_timesteps} steps: {one_line(error)}"
+            ) from error
+        except PROCESS_DIED as error:
+            if self.flags.vec_env != "subproc":
+                raise
+            raise UsageError(
+                "a process of --vec-env subproc has died, because of an error printed above, by a "
+                f"signal or for lack of memory; continue with: {folder.again(self.flags)}"
             ) from error
         return True
 

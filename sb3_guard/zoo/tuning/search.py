@@ -66,7 +66,7 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     search = Search(flags.algo, values, space, fixed)
     for corner in search.corners():
         check(flags.algo, run.algorithm, corner)
-    run.try_out().make().close()
+    run.make().close()
     limits = run.limits().tolist()
     settings = Settings(
         algo=run.flags.algo,

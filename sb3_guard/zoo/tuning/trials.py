@@ -223,7 +223,7 @@ class Objective:
         """One training: its evaluations, and whether it went to the end."""
         settings = self.settings
         checked = check(settings.algo, algorithm(settings.algo), values)
-        training = Run(replace(self.training, seed=seed), checked).try_out().make()
+        training = Run(replace(self.training, seed=seed), checked).make()
 
         evaluations = Evaluations(training, settings, after, self.stopped)
         try:

@@ -24,11 +24,12 @@ def certify_agent(flags: Flags) -> int:
     if flags.json:
         require_file(Path(flags.json), "--json")
     agent = open_agent(flags, None, BATCH)
+    limits = flags.cost_limit
     with closing(agent.env), explained(f"can't certify {agent.path}", ValueError, *BAD_NUMBERS):
         certificate = certify(
             agent.model,
             agent.env,
-            flags.cost_limit or None,
+            limits[0] if len(limits) == 1 else limits or None,
             n_episodes=flags.n_episodes or MOST,
             deterministic=not flags.stochastic,
             seed=flags.seed,

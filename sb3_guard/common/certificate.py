@@ -14,11 +14,16 @@ import numpy as np
 import torch as th
 from scipy import stats
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.checks import check_integer
-from sb3_guard.common.evaluation import Evaluation, evaluate_policy, lacks_statistics
+from sb3_guard.checks import check_cost_keys, check_integer, check_number, check_per_cost
+from sb3_guard.common.evaluation import (
+    Evaluation,
+    evaluate_policy,
+    lacks_statistics,
+    moments_of,
+)
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.costs import bounded_name
 
@@ -27,6 +32,7 @@ LOOKS = {0.25: 0.1, 0.5: 0.3, 1.0: 0.6}
 FIRST = 100  # episodes before which there is no look but the last
 LEAST, MOST = 50, 400  # episodes of a certificate; of nine zeros in ten, 50 seldom see none
 ERROR = 0.05  # probability that an agent whose mean cost is above the limit is certified
+PACKAGES = "sb3-guard", "stable-baselines3", "torch", "mujoco"
 
 Verdict = Literal["certified", "exceeds", "undecided"]
 
@@ -105,7 +111,7 @@ class CostBound:
             "undecided": f"bounds {self.lower:.4g} and {self.upper:.4g}",
         }[self.verdict]
         return (
-            f"cost {self.mean:.4g}, {words}, limit {self.limit:g}; "
+            f"{self.mean:.4g}, {words}, limit {self.limit:g}; "
             f"{self.share_above:.0%} of the episodes cost more"
         )
 
@@ -180,8 +186,9 @@ class Certificate:
         if self.physics_errors:
             tail += f"; {self.physics_errors} more ended in a physics error"
         if len(self.costs) == 1:
-            return f"{self.verdict}: {next(iter(self.costs.values()))}; {tail}"
-        lines = [f"  {name}: {cost.verdict}, {cost}" for name, cost in self.costs.items()]
+            ((key, cost),) = self.costs.items()
+            return f"{self.verdict}: {key} {cost}; {tail}"
+        lines = [f"  {cost.verdict}: {key} {cost}" for key, cost in self.costs.items()]
         return "\n".join([f"{self.verdict}: {tail}", *lines])
 
     def summary(self) -> dict[str, Any]:
@@ -206,19 +213,15 @@ class Certificate:
 
 
 def agent_hash(model: Any, env: VecEnv) -> str:
-    """SHA-256 of the policy's weights and of the statistics that normalise its observations."""
+    """SHA-256 of a policy's weights and what normalises its observations; "" of other objects."""
     digest = hashlib.sha256()
     policy = getattr(model, "policy", model)
     weights = policy.state_dict() if isinstance(policy, th.nn.Module) else {}
     for name, tensor in sorted(weights.items()):
         digest.update(name.encode() + np.ascontiguousarray(tensor.cpu()).tobytes())
-    normalizer = unwrap_vec_normalize(env)
-    if normalizer is not None and normalizer.norm_obs:
-        moments = normalizer.obs_rms
-        parts = sorted(moments.items()) if isinstance(moments, dict) else [("", moments)]
-        for name, part in parts:
-            digest.update(name.encode() + part.mean.tobytes() + part.var.tobytes())
-    return digest.hexdigest()
+    for name, part in sorted(moments_of(env).items()):
+        digest.update(name.encode() + part.mean.tobytes() + part.var.tobytes())
+    return digest.hexdigest() if weights else ""
 
 
 def _described(env: VecEnv) -> dict[str, Any]:
@@ -260,20 +263,21 @@ def certify(
     :param cost_keys: entries of info that are costs; None: those of the model or the environment
     :param seed: the episodes' seeds are drawn from it, and are not those that training or
         evaluation with the same seed draw; None draws one
-    :param error: probability of a false certificate
+    :param error: probability of a false certificate, below 0.5
     :param tries: how many agents share this error, such as candidates of one training. If there
         are others, one whose mean is above the limit at a look is not looked at again
     :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
         a cost, or the normalisation of the model's observations is absent
     """
     check_integer("n_episodes", n_episodes, LEAST)
+    check_integer("tries", tries)
+    check_number("error", error, 0.0, 0.5, "()")
     if not isinstance(env, VecEnv):
         lone = env
         env = DummyVecEnv([lambda: lone])
-    keys = tuple(cost_keys_of(model, env) if cost_keys is None else cost_keys)
+    keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
     limits = limits_of(model, cost_limit, keys)
-    if seed is None:
-        seed = int(np.random.SeedSequence().generate_state(1)[0])
+    seed = int(np.random.SeedSequence().generate_state(1)[0] if seed is None else seed)
     names = [bounded_name(key, getattr(model, "limit_on", "sum")) for key in keys]
     costs, returns = np.zeros((0, len(keys))), np.zeros(0)
     for look, (share, part) in enumerate(LOOKS.items()):
@@ -305,10 +309,7 @@ def certify(
             tries=tries,
             env=_described(env),
             agent=agent_hash(model, env),
-            versions={
-                name: version(name)
-                for name in ("sb3-guard", "stable-baselines3", "torch", "mujoco")
-            },
+            versions={name: version(name) for name in PACKAGES},
         )
         above = any(cost.mean > cost.limit for cost in certificate.costs.values())
         if certificate.verdict != "undecided" or (above and tries > 1):
@@ -316,25 +317,19 @@ def certify(
     return certificate
 
 
-def limits_of(model: Any, cost_limit: Any, keys: Sequence[str]) -> list[float]:
+def limits_of(model: Any, cost_limit: Any, keys: tuple[str, ...]) -> list[float]:
     """
     One limit for each cost.
 
+    :param cost_limit: one number or one per cost key; None: the model's own
     :raises ValueError: they are not finite, too many or too few, or there is none
     """
-    given: Any = cost_limit
     if cost_limit is None and isinstance(model, Constrained) and model.constrained:
-        given = model.final_cost_limits
-    limits = np.asarray(given)
-    if (
-        limits.dtype.kind not in "iuf"
-        or not np.isfinite(limits).all()
-        or limits.shape not in ((), (1,), (len(keys),))
-    ):
-        need = "must be a finite number" if len(keys) == 1 else f"one number for each of {keys}"
-        hint = ": the model has no limit of its own" if cost_limit is None else ""
-        raise ValueError(f"cost_limit={cost_limit!r}{hint}, {need}")
-    return [float(limit) for limit in np.broadcast_to(limits, len(keys))]
+        cost_limit = model.final_cost_limits
+    if cost_limit is None:
+        raise ValueError("the agent has no cost limit of its own: give cost_limit")
+    check_per_cost("cost_limit", cost_limit, keys)
+    return [float(limit) for limit in np.broadcast_to(cost_limit, len(keys))]
 
 
 def _play(
@@ -364,6 +359,7 @@ def _play(
             "with gymnasium.wrappers.TimeLimit(env, 1000) or, in commands, --env-kwargs "
             "max_episode_steps:1000"
         )
-    if not played.reported:
-        raise ValueError(f"no step reported a cost as {', '.join(keys)} in info: name cost_keys")
+    if played.absent and getattr(model, "missing_cost", "error") == "error":
+        absent = ", ".join(played.absent)
+        raise ValueError(f"no step reported a cost as {absent} in info: name cost_keys")
     return played

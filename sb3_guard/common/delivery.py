@@ -1,6 +1,6 @@
 """A training that ends with a certified agent: candidates, screening, certificate."""
 
-import copy
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_guard.checks import check_integer
 from sb3_guard.common.certificate import LEAST, MOST, Certificate, certify, limits_of
-from sb3_guard.common.evaluation import evaluate_policy, sync_normalization
+from sb3_guard.common.evaluation import evaluate_policy, moments_of, sync_normalization
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
 
@@ -47,10 +47,12 @@ class DeliveryCallback(BaseCallback):
     statistics. After its end each plays a few episodes; of those whose mean cost plus its standard
     error is within the limit, the one of highest return is certified by fresh episodes
     (:func:`~sb3_guard.certify`), then the next, up to three, which share the error. The first that
-    is certified is written as ``certified_model.zip``, with ``certified_vecnormalize.pkl`` where
-    observations are normalised, and ``certificate.json``; the model itself keeps its last weights.
+    is certified is written as ``certified_model.zip``, with ``certified_model_vecnormalize.pkl``
+    where observations are normalised, and ``certificate.json``, which vouches for them: it is of
+    the last training that ended in this folder. The model itself keeps its last weights.
 
-    A training that was cut and continues keeps the candidates that it has, and ends alike.
+    A training that was cut and continues keeps the candidates that it has, and ends alike; one that
+    begins takes those of another away.
 
     :param eval_env: environment to play in, wrapped as the training environment is
     :param folder: where the files are written; the current one unless it is given
@@ -78,55 +80,60 @@ class DeliveryCallback(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         check_integer("n_episodes", n_episodes, LEAST)
+        check_integer("candidates", candidates)
+        check_integer("screening", screening, 2)
         self.eval_env, self.folder = eval_env, Path(folder)
         self.cost_limit, self.candidates, self.screening = cost_limit, candidates, screening
         self.n_episodes, self.deterministic, self.seed = n_episodes, deterministic, seed
-        self._kept = -1
         #: of the agent that was delivered; None: none was
         self.certificate: Certificate | None = None
 
     def _init_callback(self) -> None:
         """
-        :raises ValueError: the limit is not finite, or does not fit the costs
+        :raises ValueError: the limit is not finite, or does not fit the costs, or ``eval_env`` is
+            not normalised as the training is
         """
         self._limits()
+        sync_normalization(self.training_env, self.eval_env)
 
     def _limits(self) -> list[float]:
         keys = cost_keys_of(self.model, self.eval_env)
         return limits_of(self.model, self.cost_limit, keys)
 
-    @property
-    def _end(self) -> int:
-        """Steps at which the training ends."""
-        return self.model._total_timesteps
+    def _on_training_start(self) -> None:
+        self.certificate = None
+        for file in self._files():
+            steps = self._load(file)["num_timesteps"]
+            if steps > self.num_timesteps or self._candidate(steps) != file:
+                file.unlink()  # of another training
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
-        part = self._part(self.num_timesteps)
-        if part <= self._kept:
-            return
-        self._kept, file = part, self._candidate(part)
-        steps = self._load(file)["num_timesteps"] if file.exists() else 0
-        if self._part(steps) != part or steps > self.num_timesteps:
+        file = self._candidate(self.num_timesteps)
+        if 2 * self.num_timesteps >= self.model._total_timesteps and not file.exists():
             self._keep(file)
 
-    def _part(self, steps: int) -> int:
-        """Which of equal parts of the training's last half; below 0 before it."""
-        return int(np.floor((2 * steps / self._end - 1) * (self.candidates - 1)))
+    def _files(self) -> list[Path]:
+        return sorted((self.folder / "candidates").glob("*.pt"))
 
-    def _candidate(self, part: int) -> Path:
+    def _candidate(self, steps: int) -> Path:
+        """Where the first policy of one of equal parts of the training's last half is kept."""
+        share = 2 * min(steps / self.model._total_timesteps, 1.0) - 1.0
+        part = math.floor(share * (self.candidates - 1))
         return self.folder / "candidates" / f"{part:03d}.pt"
 
     def _keep(self, file: Path) -> None:
-        normalizer = unwrap_vec_normalize(self.training_env)
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as written:
             content = {
                 "num_timesteps": self.num_timesteps,
                 "policy": self.model.policy.state_dict(),
-                "statistics": _statistics(normalizer),
+                "statistics": {
+                    name: (th.from_numpy(part.mean), th.from_numpy(part.var), float(part.count))
+                    for name, part in moments_of(self.training_env).items()
+                },
             }
             th.save(content, written)
 
@@ -135,16 +142,18 @@ class DeliveryCallback(BaseCallback):
         return th.load(file, map_location="cpu", weights_only=True)
 
     def _on_training_end(self) -> None:
-        if self.num_timesteps < self._end:  # stopped before
+        if self.num_timesteps < self.model._total_timesteps:  # stopped before
             return
-        self._keep(self._candidate(self.candidates - 1))
+        last = self._candidate(self.num_timesteps)
+        self._keep(last)
+        (self.folder / "certificate.json").unlink(missing_ok=True)
         began = time.process_time()
-        policy = copy.deepcopy(self.model.policy.state_dict())
-        sync_normalization(self.training_env, self.eval_env)
         try:
             tried = self._deliver()
+        except ValueError as error:  # such as episodes without an end: the training is kept
+            tried = f"Nothing is delivered: {error}"
         finally:
-            self.model.policy.load_state_dict(policy)
+            self._put(last)
         if self.verbose > 0:
             taken = f"({time.process_time() - began:.0f} s of a processor)"
             print(f"{tried} {taken}")
@@ -152,10 +161,7 @@ class DeliveryCallback(BaseCallback):
     def _deliver(self) -> str:
         """Certify the best candidate; what to say of it."""
         limits = self._limits()
-        screened = [
-            self._screen(file, np.array(limits))
-            for file in sorted((self.folder / "candidates").glob("*.pt"))
-        ]
+        screened = [self._screen(file, np.array(limits)) for file in self._files()]
         screened.sort(key=lambda candidate: candidate.order, reverse=True)
         refused: list[Certificate] = []
         for number, candidate in enumerate(screened[:TRIES]):
@@ -183,23 +189,21 @@ class DeliveryCallback(BaseCallback):
         played = evaluate_policy(
             self.model, self.eval_env, self.screening, self.deterministic, seed=self.seed
         )
-        costs = played.limited  # [E, m]; NaN after a physics error, which looks right nowhere
-        error = costs.std(axis=0, ddof=1) / np.sqrt(len(costs)) if len(costs) > 1 else np.inf
-        excess = float(np.max(costs.mean(axis=0) + error - limits)) if len(costs) else np.inf
-        mean_return = float(played.returns.mean()) if len(costs) else -np.inf
-        return Screened(file, mean_return, np.inf if np.isnan(excess) else excess)
+        costs = played.limited  # [E, m]; NaN after a physics error
+        if len(costs) < self.screening or np.isnan(costs).any():
+            return Screened(file, -np.inf, np.inf)
+        error = costs.std(axis=0, ddof=1) / np.sqrt(len(costs))
+        excess = np.max(costs.mean(axis=0) + error - limits)
+        return Screened(file, float(played.returns.mean()), float(excess))
 
     def _put(self, file: Path) -> int:
         """Give the model and the environment the weights and statistics of a candidate."""
         content = self._load(file)
         self.model.policy.load_state_dict(content["policy"])
-        normalizer = unwrap_vec_normalize(self.eval_env)
-        if normalizer is not None and content["statistics"]:
-            moments = normalizer.obs_rms
-            parts = moments if isinstance(moments, dict) else {"": moments}
-            for name, (mean, var, count) in content["statistics"].items():
-                parts[name].mean, parts[name].var = mean.numpy(), var.numpy()
-                parts[name].count = count
+        moments = moments_of(self.eval_env)
+        for name, (mean, var, count) in content["statistics"].items():
+            part = moments[name]
+            part.mean, part.var, part.count = mean.numpy(), var.numpy(), count
         return int(content["num_timesteps"])
 
     def _write(self, certificate: Certificate) -> None:
@@ -208,18 +212,6 @@ class DeliveryCallback(BaseCallback):
             self.model.save(file)
         normalizer = unwrap_vec_normalize(self.eval_env)
         if normalizer is not None:
-            normalizer.save(str(self.folder / "certified_vecnormalize.pkl"))
+            normalizer.save(str(self.folder / "certified_model_vecnormalize.pkl"))
         with replacing(self.folder / "certificate.json") as file:  # last: it vouches for the others
             file.write(certificate.to_json().encode())
-
-
-def _statistics(normalizer: Any) -> dict[str, tuple[th.Tensor, th.Tensor, float]]:
-    """Mean, variance and count of each part of normalised observations; empty: none are."""
-    if normalizer is None or not normalizer.norm_obs:
-        return {}
-    moments = normalizer.obs_rms
-    parts = moments if isinstance(moments, dict) else {"": moments}
-    return {
-        name: (th.from_numpy(part.mean.copy()), th.from_numpy(part.var.copy()), float(part.count))
-        for name, part in parts.items()
-    }

@@ -14,6 +14,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -59,7 +60,7 @@ class Evaluation:
     :param limit_on: what of the costs the model's limits bound, their ``"sum"`` or ``"max"``
     :param limits: the model's limits, one for each cost key; empty if it has none
     :param cost_keys: the m entries of info that were read as costs
-    :param reported: whether any step had one of them
+    :param absent: those of them that no step had
     """
 
     returns: np.ndarray
@@ -72,7 +73,7 @@ class Evaluation:
     limit_on: str = "sum"
     limits: tuple[float, ...] = ()
     cost_keys: tuple[str, ...] = ("cost",)
-    reported: bool = True
+    absent: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.returns)
@@ -195,16 +196,22 @@ def share_environment(one: VecEnv, other: VecEnv) -> bool:
     return not parts[0].isdisjoint(parts[1])
 
 
+def moments_of(env: VecEnv | None) -> dict[str, RunningMeanStd]:
+    """What normalises observations, by their entries (``""``: they have none); empty: nothing."""
+    normalizer = None if env is None else unwrap_vec_normalize(env)
+    if normalizer is None or not normalizer.norm_obs:
+        return {}
+    moments = normalizer.obs_rms
+    return moments if isinstance(moments, dict) else {"": moments}
+
+
 def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
     """Whether an agent learnt from normalised observations, and ``env`` has no means of them."""
     if not getattr(model, "learnt_normalized", False):
         return False
-    normalizer = None if env is None else unwrap_vec_normalize(env)
-    if normalizer is None or not normalizer.norm_obs:
-        return True
-    means = normalizer.obs_rms
+    moments = moments_of(env)
     # Those of a new VecNormalize are of no observation.
-    return any(m.count < 1 for m in (means.values() if isinstance(means, dict) else [means]))
+    return not moments or any(part.count < 1 for part in moments.values())
 
 
 @contextmanager
@@ -331,10 +338,10 @@ def evaluate_policy(
             )
             observations, rewards, starts, infos = env.step(actions)
             steps += 1
-            last_costs, seen = read_costs(infos, keys, zero_if_missing, tally.costs.lengths)
+            last_costs, _ = read_costs(infos, keys, zero_if_missing, tally.costs.lengths)
             if on_step is not None:
                 on_step()
-            tally.step(rewards, last_costs, starts, infos, seen)
+            tally.step(rewards, last_costs, starts, infos)
             last_costs[np.flatnonzero(starts)] = 0.0
     return tally.evaluation(getattr(model, "limit_on", "sum"), _limits_on(model, keys))
 
@@ -374,7 +381,7 @@ class _Tally:
         self.ended: list[tuple[float, int, EpisodeCost]] = []  # return, steps, costs
         self.unfinished: list[np.ndarray] = []
         self.successes: list[bool] = []
-        self.reported = False  # whether any step reported a cost
+        self.absent = {*keys}  # costs that no step has reported
 
     def step(
         self,
@@ -382,11 +389,11 @@ class _Tally:
         costs: np.ndarray,
         dones: np.ndarray,
         infos: list[dict[str, Any]],
-        reported: bool,
     ) -> None:
         """Add a step of every environment, and the episodes that it ends; give up endless ones."""
         self.returns += rewards
-        self.reported |= reported
+        if self.absent:
+            self.absent.difference_update(*infos)
         if len(self.keys) == 1:
             totals = costs
         else:
@@ -434,7 +441,7 @@ class _Tally:
 
     def evaluation(self, limit_on: str, limits: tuple[float, ...]) -> Evaluation:
         """What was seen."""
-        if self.keys != ("cost",) and not self.reported and not limits:
+        if self.keys != ("cost",) and self.absent == {*self.keys} and not limits:
             warnings.warn(
                 f"no step reported a cost as info[{self.keys[0]!r}], so costs are 0: cost_keys, or "
                 "the monitor's, name the entries of info that are costs",
@@ -461,5 +468,5 @@ class _Tally:
             limit_on=limit_on,
             limits=limits,
             cost_keys=self.keys,
-            reported=self.reported,
+            absent=tuple(key for key in self.keys if key in self.absent),
         )

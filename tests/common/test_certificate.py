@@ -11,6 +11,7 @@ from scipy import stats
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_guard import CPO, SCPO
 from sb3_guard.common.certificate import ERROR, LOOKS, MOST, Certificate, certify, mean_bounds
 
 
@@ -88,12 +89,13 @@ def test_without_skewness_the_bounds_are_students():
     [(3.0, "certified", 100), (0.4, "exceeds", 100), (1.02, "undecided", MOST)],
 )
 def test_the_first_look_that_decides_is_the_last(limit, verdict, episodes):
-    certificate = certify(Idle(), Lottery(), limit, seed=1)
+    certificate = certify(Idle(), Lottery(), limit, seed=np.int64(1))
     assert (certificate.verdict, certificate.episodes) == (verdict, episodes)
     cost = certificate.costs["cost"]
     assert cost.lower < cost.mean < cost.upper and certificate.mean_return == 2.0
     assert str(certificate).startswith(f"{verdict}: cost ") and "\n" not in str(certificate)
     assert (certificate.to_decide is not None) == (verdict == "undecided")
+    assert certificate.agent == ""  # there are no weights
     text = certificate.to_json()
     assert json.loads(text)["verdict"] == verdict
     assert Certificate.from_json(text) == certificate
@@ -116,11 +118,8 @@ def test_tries_and_costs_share_the_error():
         Idle(), Lottery(keys=("cost", "other")), (3.0, 6.0), cost_keys=("cost", "other"), seed=1
     )
     assert both.verdict == "certified" and [*both.costs] == ["cost", "other"]
-    assert [line.split(":")[0].strip() for line in str(both).splitlines()] == [
-        "certified",
-        "cost",
-        "other",
-    ]
+    lines = ("certified: return", "  certified: cost", "  certified: other")
+    assert all(map(str.startswith, str(both).splitlines(), lines))
     assert both.costs["cost"].limit == 3.0 and both.costs["other"].limit == 6.0
     assert (
         certify(
@@ -147,6 +146,12 @@ def test_a_limit_is_a_finite_number(limit):
         certify(Idle(), Lottery(), limit)
 
 
+@pytest.mark.parametrize("wrong", [{"error": 0.95}, {"error": 5}, {"error": 0.0}, {"tries": 0}])
+def test_an_error_is_a_small_probability(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        certify(Idle(), Lottery(), 3.0, **wrong)
+
+
 def test_fewer_than_fifty_episodes_are_refused():
     with pytest.raises(ValueError, match=r"n_episodes.*50"):
         certify(Idle(), Lottery(), 1.0, n_episodes=49)
@@ -155,6 +160,18 @@ def test_fewer_than_fifty_episodes_are_refused():
 def test_absent_costs_are_refused():
     with pytest.raises(ValueError, match="cost"):
         certify(Idle(), Lottery(keys=("price",)), 1.0)
+    with pytest.raises(ValueError, match="no step reported a cost as othr"):
+        certify(Idle(), Lottery(keys=("cost", "other")), 9.0, cost_keys=("cost", "othr"))
+
+
+def test_costs_that_may_be_absent_are_0_of_a_safe_agent():
+    model = CPO("MlpPolicy", Lottery(), cost_limit=1.0, missing_cost="zero", n_steps=8)
+    assert certify(model, Lottery(keys=("price",)), seed=1).costs["cost"].upper == 0.0
+
+
+def test_a_limit_on_the_worst_step_says_so():
+    model = SCPO("MlpPolicy", Lottery(), cost_limit=3.0, n_steps=8)
+    assert str(certify(model, Lottery(), seed=1)).startswith("certified: worst step of cost ")
 
 
 class Breaks(Lottery):

@@ -1,5 +1,7 @@
 """A training ends with a certified agent, or says how far the nearest is away."""
 
+import shutil
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -33,13 +35,15 @@ def envs(normalize=True):
     return VecNormalize(env, norm_reward=False) if normalize else env
 
 
-def trained(folder, limit, steps=600):
-    model = CPO("MlpPolicy", envs(), n_steps=10, cost_limit=1.0, seed=0, device="cpu")
+def trained(folder, limit, seed=0, eval_env=None, done=0, **kwargs):
+    model = CPO("MlpPolicy", envs(), n_steps=10, cost_limit=1.0, seed=seed, device="cpu", **kwargs)
     model.n_critic_updates = 5
-    eval_env = envs()
-    eval_env.training = False
+    if eval_env is None:
+        eval_env = envs()
+        eval_env.training = False
     deliver = DeliveryCallback(eval_env, folder, limit, candidates=3, screening=20, verbose=1)
-    model.learn(steps, callback=deliver)
+    model.num_timesteps = done
+    model.learn(600 - done, callback=deliver, reset_num_timesteps=not done)
     return model, deliver
 
 
@@ -60,7 +64,7 @@ def test_the_first_candidate_that_is_certified_is_delivered(delivered):
     assert certificate == deliver.certificate and certificate.verdict == "certified"
     assert certificate.tries == 3 and certificate.costs["cost"].limit == 1.6
     # The file is the agent of the certificate, and its play is within the limit.
-    env = VecNormalize.load(str(folder / "certified_vecnormalize.pkl"), envs(normalize=False))
+    env = VecNormalize.load(str(folder / "certified_model_vecnormalize.pkl"), envs(normalize=False))
     env.training = False
     agent = CPO.load(folder / "certified_model.zip", env=env)
     assert agent_hash(agent, env) == certificate.agent
@@ -83,19 +87,63 @@ def test_nothing_is_delivered_where_nothing_keeps_the_limit(tmp_path, capsys):
 
 def test_a_training_that_continues_keeps_the_candidates_that_it_has(delivered, tmp_path):
     """Not those of a shorter training, nor those that it has not come to again."""
-    first, second, last = kept(delivered[0])
+    first, _, last = kept(delivered[0])
     (tmp_path / "candidates").mkdir()
     for number, candidate, steps in ((0, last, 300), (1, last, 550), (2, first, 200)):
         there = {**candidate, "num_timesteps": steps}
         th.save(there, tmp_path / "candidates" / f"{number:03d}.pt")
-    trained(tmp_path, 1.6)
+    trained(tmp_path, 1.6, done=400)
     after = kept(tmp_path)
     assert [candidate["num_timesteps"] for candidate in after] == [300, 500, 600]
 
     def same(one, other):
         return all(th.equal(value, other["policy"][name]) for name, value in one["policy"].items())
 
-    assert same(after[0], last) and same(after[1], second) and same(after[2], last)
+    assert same(after[0], last) and not same(after[1], last) and not same(after[2], first)
+
+
+def test_another_training_in_the_folder_has_nothing_of_the_first(delivered, tmp_path, capsys):
+    shutil.copytree(delivered[0], tmp_path, dirs_exist_ok=True)
+    _, deliver = trained(tmp_path, -1.0, seed=1, policy_kwargs={"net_arch": [8]})
+    assert [candidate["num_timesteps"] for candidate in kept(tmp_path)] == [300, 500, 600]
+    assert "Nothing is delivered" in capsys.readouterr().out
+    assert deliver.certificate is None and not (tmp_path / "certificate.json").exists()
+
+
+def test_a_callback_delivers_each_training_and_leaves_the_model_and_its_statistics(tmp_path):
+    env = envs()
+    model, deliver = trained(tmp_path, 1.6, eval_env=env)  # one of its own keeps them, too
+    first = [candidate["policy"] for candidate in kept(tmp_path)]
+    model.set_env(env)
+    model.learn(600, callback=deliver)
+    assert [candidate["num_timesteps"] for candidate in kept(tmp_path)] == [300, 500, 600]
+    for before, after in zip(first, kept(tmp_path), strict=True):
+        assert any(not th.equal(value, after["policy"][name]) for name, value in before.items())
+    last = kept(tmp_path)[-1]
+    np.testing.assert_array_equal(env.obs_rms.mean, last["statistics"][""][0])
+    weights = model.policy.state_dict()
+    assert all(th.equal(value, weights[name]) for name, value in last["policy"].items())
+
+
+class Endless(Dose):
+    def step(self, action):
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, False, False, info
+
+
+def test_a_training_whose_agent_never_ends_an_episode_is_kept(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sb3_guard.common.evaluation.LONGEST", 50)
+    eval_env = VecNormalize(make_vec_env(Endless, n_envs=10), norm_reward=False)
+    with pytest.warns(UserWarning, match="had not ended"):
+        model, deliver = trained(tmp_path, 1.6, eval_env=eval_env)
+    assert deliver.certificate is None and model.num_timesteps == 600
+    assert "Nothing is delivered: 100 of 100 episodes did not end" in capsys.readouterr().out
+
+
+def test_an_absent_normaliser_is_told_before_the_training(tmp_path):
+    with pytest.raises(ValueError, match="VecNormalize"):
+        trained(tmp_path, 1.6, eval_env=envs(normalize=False))
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("limit", [np.nan, (1.0, 2.0)])

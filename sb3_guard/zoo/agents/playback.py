@@ -76,7 +76,6 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     steps = flags.load_checkpoint
     if flags.load_last_checkpoint:
         steps = max(kept, default=None)
-    certified = run.path / "certified_model.zip"
     if flags.load_best:
         model, statistics = run.path / "best_model.zip", run.path / "best_model_vecnormalize.pkl"
     elif steps is not None:
@@ -84,8 +83,9 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
             allowed = ", ".join(map(str, sorted(kept))) or "none"
             raise UsageError(f"{run.path} kept no model at {steps} steps; allowed: {allowed}")
         model, statistics = kept[steps], run.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
-    elif certified.is_file() and not flags.load_last_checkpoint:
-        model, statistics = certified, run.path / "certified_vecnormalize.pkl"
+    elif (run.path / "certificate.json").is_file() and not flags.load_last_checkpoint:
+        model = run.path / "certified_model.zip"
+        statistics = run.path / "certified_model_vecnormalize.pkl"
     elif run.model.is_file() and not flags.load_last_checkpoint:
         model, statistics = run.model, run.normalizer
     else:

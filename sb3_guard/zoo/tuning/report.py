@@ -16,11 +16,6 @@ from sb3_guard.common.files import replacing
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
-def short(value: Any) -> str:
-    """A number as short as it may be."""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
 def rank(trial: FrozenTrial) -> tuple[bool, float, float]:
     """How good a trial is: a feasible one by its return, others first by violation."""
     result = trial.user_attrs["result"]
@@ -49,7 +44,7 @@ class Report:
     def write(self, study: optuna.Study) -> None:
         """Write ``trials.csv`` and ``best.yml``."""
         trial = best(study.get_trials(deepcopy=False))
-        with FileLock(self.folder / ".report.lock"):
+        with FileLock(self.folder / ".report.lock"):  # replacing is for one writer at a time
             with replacing(self.folder / "trials.csv") as file:
                 file.write(self.table(study).encode())
             if trial is not None:
@@ -74,12 +69,10 @@ class Report:
     def outcome(self, trial: FrozenTrial) -> str:
         """Return and costs in words."""
         result, limited = trial.user_attrs["result"], self.settings["cost_limit"] is not None
-        costs = (
-            f"{'' if key == 'cost' else 'cost '}{key} {short(result[key])}" for key in self.keys
-        )
+        costs = [f"{'cost ' * (key != 'cost')}{key} {result[key]:.4g}" for key in self.keys]
         over = result["violation"]
-        verdict = [f"{short(over)} over the limit" if over else "within the limit"] * limited
-        return ", ".join([f"return {short(result['return'])}", *costs, *verdict])
+        verdict = [f"{over:.4g} over the limit" if over else "within the limit"] * limited
+        return ", ".join([f"return {result['return']:.4g}", *costs, *verdict])
 
     def hyperparams(self, trial: FrozenTrial) -> str:
         """A trial's hyperparameters as a file for ``train -conf``."""
@@ -111,20 +104,17 @@ class Report:
 
     def summary(self, study: optuna.Study) -> str:
         """What the study came to."""
-        complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        pruned = len(study.get_trials(deepcopy=False, states=(TrialState.PRUNED,)))
-        top, limits = best(complete), self.settings["cost_limit"]
-        lines = [f"finished trials: {len(complete) + pruned}, of them pruned: {pruned}"]
+        finished = study.get_trials(deepcopy=False, states=FINISHED)
+        complete = [trial for trial in finished if trial.state == TrialState.COMPLETE]
+        pruned = len(finished) - len(complete)
+        counts = f"finished trials: {len(finished)}, of them pruned: {pruned}"
+        top = best(complete)
         if top is None:
-            return f"{lines[0]}\n  No trial went to its end: there is no best one."
-        if limits is not None:
+            return f"{counts}\n  No trial went to its end: there is no best one."
+        if self.settings["cost_limit"] is not None:
             feasible = sum(rank(trial)[0] for trial in complete)
-            lines[0] += f"; {feasible} of {len(complete)} kept the cost limit"
-            if not feasible:
-                lines.append(
-                    f"  No trial kept the cost limit {', '.join(map(short, limits))}: the best one "
-                    "is that of least violation."
-                )
-        lines.append(f"  best         trial {top.number}: {self.outcome(top)}")
-        lines.append(f"  train with   {self.command()}")
-        return "\n".join(lines)
+            counts += f"; {feasible} of {len(complete)} kept the cost limit"
+        return (
+            f"{counts}\n  best         trial {top.number}: {self.outcome(top)}\n"
+            f"  train with   {self.command()}"
+        )

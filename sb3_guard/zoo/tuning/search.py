@@ -30,7 +30,7 @@ from sb3_guard.zoo.run.hyperparams import check
 from sb3_guard.zoo.run.run import Run, differences
 from sb3_guard.zoo.tuning import studies
 from sb3_guard.zoo.tuning.flags import TuneFlags
-from sb3_guard.zoo.tuning.report import FINISHED, Report, short
+from sb3_guard.zoo.tuning.report import FINISHED, Report
 from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space
 from sb3_guard.zoo.tuning.studies import Storage, open_storage, repeat_lost_trials
 from sb3_guard.zoo.tuning.trials import Objective, Settings, Stopped
@@ -46,8 +46,6 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     :return: the flags of a training, and what the study is
     :raises UsageError: something is wrong with the flags
     """
-    if len(set(flags.seeds)) < len(flags.seeds):
-        raise UsageError(f"--seeds {' '.join(map(str, flags.seeds))}: a seed is given twice")
     fixed = dict(flags.hyperparams or {})
     hyperparams = dict(fixed)
     if flags.cost_limit is not None:
@@ -57,11 +55,6 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "verbose": 0, "progress": False}
     run = Run.check(RunFlags.shared(flags, **how))
     values, n_timesteps = run.hyperparams, run.setup.n_timesteps
-    n_evaluations = flags.n_evaluations or max(n_timesteps // 100_000, 4)
-    if n_evaluations > n_timesteps:
-        raise UsageError(
-            f"--n-evaluations {n_evaluations} is not allowed; there are {n_timesteps} steps"
-        )
     space = read_space(flags.search_space) if flags.search_space else None
     search = Search(flags.algo, values, space, fixed)
     for corner in search.corners():
@@ -74,8 +67,8 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         hyperparams=values,
         space=search.space,
         n_timesteps=n_timesteps,
-        seeds=flags.seeds,
-        n_evaluations=n_evaluations,
+        seeds=list(dict.fromkeys(flags.seeds)),
+        n_evaluations=flags.n_evaluations or max(n_timesteps // 100_000, 4),
         eval_episodes=flags.eval_episodes,
         cost_keys=list(run.cost_keys),
         cost_limit=limits if np.isfinite(limits).all() else None,
@@ -93,12 +86,11 @@ def _pruner(flags: TuneFlags, settings: Settings) -> BasePruner:
 
 
 def open_study(
-    flags: TuneFlags, settings: Settings, search: Search, name: str, storage: Storage, shown: str
+    flags: TuneFlags, settings: Settings, search: Search, name: str, storage: Storage
 ) -> optuna.Study:
     """
     Begin the study, or join it.
 
-    :param shown: address of the storage, for the message
     :raises UsageError: it was begun with other settings
     """
     study = optuna.create_study(
@@ -109,11 +101,6 @@ def open_study(
         load_if_exists=True,
     )
     saved, begun = study.user_attrs.get(SETTINGS), bool(study.trials)
-    if saved is None and begun:
-        raise UsageError(
-            f"{shown} has a study {name!r} that is not one of sb3_guard's; "
-            "choose another --study-name"
-        )
     if saved is None:
         saved = asdict(settings)
         study.set_user_attr(SETTINGS, saved)
@@ -161,7 +148,7 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     name = flags.study_name or f"{settings.algo}_{settings.env}"
     storage, shown = open_storage(flags.storage, folder / "study.journal")
     require_writable(folder, "-f")
-    study = open_study(flags, settings, search, name, storage, shown)
+    study = open_study(flags, settings, search, name, storage)
     objective = Objective(flags, training, settings, search)
     report = Report(folder, asdict(settings), flags.gym_packages)
     loud = main and flags.verbose > 0
@@ -232,7 +219,7 @@ def _header(
 ) -> str:
     finished = len(study.get_trials(deepcopy=False, states=FINISHED))
     limits = zip(settings.cost_limit or (), settings.cost_keys, strict=False)
-    bounds = [f"{key} of at most {short(limit)}" for limit, key in limits]
+    bounds = [f"{key} of at most {limit:.4g}" for limit, key in limits]
     goal = f"with an episode {', '.join(bounds)}" if bounds else "(--cost-limit sets a limit)"
     seeds = " ".join(map(str, settings.seeds))
     return f"""Study {study.study_name}: {finished} of {flags.n_trials} trials are finished

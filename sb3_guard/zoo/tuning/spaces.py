@@ -12,7 +12,6 @@ space in the class attribute ``search_space``, to which those of its bases are a
 """
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -83,17 +82,13 @@ def _checked(name: str, entry: Any, where: str) -> Any:
     with explained(f"search space: {name}: {entry} in {where}", fix=fix):
         if isinstance(entry, list) and len(entry) > 1:
             return entry
-        bounds: dict[str, Any] = {key: _bound(entry[key]) for key in ("low", "high")}
+        bounds: dict[str, Any] = {
+            key: entry[key] if type(entry[key]) is int else float(entry[key])
+            for key in ("low", "high")
+        }
         bounds = {"log": False, **entry, **bounds}
         (IntDistribution if _is_whole(bounds) else FloatDistribution)(**bounds)
         return bounds
-
-
-def _bound(value: Any) -> int | float:
-    number = value if type(value) is int else float(str(value))
-    if not math.isfinite(number):
-        raise ValueError(f"{value} is not finite")
-    return number
 
 
 def _is_whole(entry: Mapping[str, Any]) -> bool:

@@ -56,23 +56,17 @@ def open_storage(address: str | None, journal: Path) -> tuple[Storage, str]:
         explained(f"{path} is not a study, or damaged", *damage),
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
-        content = path.read_bytes() if path.exists() else b""
-        if content and not content.startswith(b'{"op_code":'):
-            raise ValueError("it is not an Optuna journal")
         lock = JournalFileOpenLock(str(path))
         return JournalStorage(JournalFileBackend(str(path), lock)), str(path)
 
 
 def _open_database(address: str) -> tuple[Storage, str]:
-    url, shown = None, address.partition("@")[2] or "…"
-    with suppress(ArgumentError, ValueError):
+    form = "postgresql://user:password@host/database, or the path of a journal file"
+    with explained("--storage", ArgumentError, ValueError, fix=f"it must be {form}"):
         url = make_url(address)
-        shown = url.render_as_string(hide_password=True)
-    if url is None or url.get_backend_name() != "postgresql":
-        raise UsageError(
-            f"--storage {shown} is not allowed; it must be "
-            "postgresql://user:password@host/database, or the path of a journal file"
-        )
+    shown = url.render_as_string(hide_password=True)
+    if url.get_backend_name() != "postgresql":
+        raise UsageError(f"--storage {shown} is not allowed; it must be {form}")
     if url.drivername == "postgresql":
         url = url.set(drivername="postgresql+psycopg")
 

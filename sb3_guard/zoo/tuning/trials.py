@@ -32,6 +32,7 @@ from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
 FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError)
 FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
 INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
+After = Callable[[int, list[float]], None]
 
 
 @dataclass(frozen=True)
@@ -79,22 +80,17 @@ class Evaluations(BaseCallback):
 
     :param training: what is trained
     :param settings: of the study
-    :param after: called with all evaluations so far, each a list of the mean return and the mean
-        episode costs; False ends the training
+    :param after: called after each evaluation, with their number so far, and the mean return and
+        the mean episode costs of this one
     :param stopped: whether to stop, asked at each step
     """
 
     def __init__(
-        self,
-        training: Run,
-        settings: Settings,
-        after: Callable[[list[list[float]]], bool],
-        stopped: Callable[[], bool],
+        self, training: Run, settings: Settings, after: After, stopped: Callable[[], bool]
     ):
         super().__init__()
         self.training, self.settings, self.after, self.stopped = training, settings, after, stopped
-        self.history: list[list[float]] = []
-        self.ended = False
+        self.done = 0
 
     def _on_rollout_start(self) -> None:
         # After an update, not in the rollout before it. The last one is made by finish.
@@ -105,19 +101,19 @@ class Evaluations(BaseCallback):
     def _on_step(self) -> bool:
         if self.stopped():
             raise Stopped
-        return not self.ended
+        return True
 
     def finish(self) -> None:
-        """Evaluate what training came to, unless it was ended."""
+        """Evaluate what training came to."""
         self._evaluate_until(self.settings.n_evaluations)
 
     def _evaluate_until(self, due: int) -> None:
         """Have this number of evaluations; those of one agent are the same."""
         row: list[float] | None = None
-        while len(self.history) < due and not self.ended:
+        while self.done < due:
             row = row or self._evaluate()
-            self.history.append(row)
-            self.ended = not self.after(self.history)
+            self.done += 1
+            self.after(self.done, row)
 
     def _evaluate(self) -> list[float]:
         assert self.training.evaluation is not None
@@ -161,7 +157,7 @@ class Objective:
         """
         try:
             trial.set_user_attr(WORKER, f"{socket.gethostname()}-{os.getpid()}")
-            mean = self._train_seeds(trial)
+            self._train_seeds(trial)
         except (TrialPruned, UpdateFinishedTrialError):  # the latter: it was given to another
             raise
         except FAILURES as error:
@@ -176,7 +172,7 @@ class Objective:
                 repeat(trial.study, trial.study.trials[trial.number], most=None)
             raise
         self.failures = 0
-        return mean[0]
+        return float(trial.user_attrs["result"]["return"])
 
     def _constrain(self, trial: optuna.Trial, mean: Sequence[float] | None) -> None:
         """Tell the sampler by how much each cost is below its limit; once in a trial."""
@@ -188,39 +184,33 @@ class Objective:
         ):
             trial.set_constraint(key, cost - limit)
 
-    def _train_seeds(self, trial: optuna.Trial) -> list[float]:
+    def _train_seeds(self, trial: optuna.Trial) -> None:
         values = self.search.draw(trial)
         trial.set_user_attr("hyperparams", values)
-        settings, finished = self.settings, list[list[list[float]]]()
+        settings, finished = self.settings, list[list[float]]()
         last = settings.n_evaluations * len(settings.seeds)
-        mean: list[float] = []
 
-        def after(history: list[list[float]]) -> bool:
-            """Report the mean of the seeds so far; whether to continue."""
-            mean[:] = np.mean([rows[-1] for rows in [*finished, history]], axis=0).tolist()
+        def after(done: int, row: list[float]) -> None:
+            """Report the mean of the seeds so far."""
+            mean = np.mean([*finished, row], axis=0).tolist()
             outcome = settings.outcome(mean)
             trial.set_user_attr("result", outcome)
-            step = settings.n_evaluations * len(finished) + len(history)
+            step = settings.n_evaluations * len(finished) + done
             violation = outcome["violation"]
             trial.report(INFEASIBLE - violation if violation else mean[0], step)
-            return step == last or not trial.should_prune()
+            pruned = step < last and trial.should_prune()
+            if pruned or step == last:
+                self._constrain(trial, mean)
+            if pruned:
+                raise TrialPruned
+            if done == settings.n_evaluations:
+                finished.append(row)
 
         for seed in settings.seeds:
-            history, on = self._train(values, seed, after)
-            if not on:
-                self._constrain(trial, mean)
-                raise TrialPruned
-            finished.append(history)
-        self._constrain(trial, mean)
-        return mean
+            self._train(values, seed, after)
 
-    def _train(
-        self,
-        values: Mapping[str, Any],
-        seed: int,
-        after: Callable[[list[list[float]]], bool],
-    ) -> tuple[list[list[float]], bool]:
-        """One training: its evaluations, and whether it went to the end."""
+    def _train(self, values: Mapping[str, Any], seed: int, after: After) -> None:
+        """Train an agent, and evaluate it on the way."""
         settings = self.settings
         checked = check(settings.algo, algorithm(settings.algo), values)
         training = Run(replace(self.training, seed=seed), checked).make()
@@ -236,4 +226,3 @@ class Objective:
             raise UsageError("a process of --vec-env subproc has died") from error
         finally:
             training.close()
-        return evaluations.history, not evaluations.ended

@@ -57,8 +57,8 @@ class Flags(EvaluationFlags, TrainingFlags):
   sb3-guard benchmark --preset paper45 --scheduler tcp://node1:8786
 """
 
-    envs: list[str] | None = flag(metavar="ENV", role=IDENTITY)
-    preset: str | None = flag(metavar="NAME", role=IDENTITY)
+    envs: list[str] | None = flag(metavar="ENV", role=IDENTITY, exclusive="what")
+    preset: str | None = flag(metavar="NAME", role=IDENTITY, exclusive="what")
     algos: list[str] | None = flag(metavar="ALGO", role=IDENTITY)
     seeds: list[int] = flag(default=[0, 1], low=0, high=2**32, metavar="K", role=IDENTITY)
     scale: float = flag(default=1.0, low=0, ends="()", metavar="X", role=IDENTITY)
@@ -73,18 +73,14 @@ class Flags(EvaluationFlags, TrainingFlags):
         """
         The environments and algorithms that are asked for.
 
-        :raises UsageError: nothing says which, or two flags do
+        :raises UsageError: nothing says which
         """
         from sb3_guard.zoo.grids.presets import ALGOS, preset
 
-        algos: list[str] | None = None
-        if self.algos is not None:
-            algos = [key for algo in self.algos for key in (ALGOS if algo == "all" else [algo])]
+        algos = self.algos
+        if algos is not None:
+            algos = [key for algo in algos for key in (ALGOS if algo == "all" else [algo])]
         if self.preset is not None:
-            if self.envs is not None:
-                raise UsageError(
-                    "--preset has environments of its own; leave out --envs or --preset"
-                )
             return preset(self.preset, algos)
         if self.envs is None:
             raise UsageError("which grid? Give --envs, --preset or --grid")
@@ -137,8 +133,7 @@ def benchmark(flags: Flags) -> int:
     runs = expand(flags.pairs(), flags.seeds, of_a_run, flags.scale)
     if flags.dry_run:
         for run in runs:
-            without = f", without {', '.join(run.ignored)}" if run.ignored else ""
-            print(f"{run.state:<7} {run.path}  {run.steps:,} steps{without}")
+            print(f"{run.state:<7} {run.path}  {run.steps:,} steps")
         print(f"{summary(runs)}; {sum(run.steps for run in runs):,} steps in all")
         return 0
     for run in {run.flags.env: run for run in runs if run.state != "done"}.values():

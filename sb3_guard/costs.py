@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -30,30 +30,19 @@ def number(value: Any, name: str) -> float:
     return number
 
 
-def interval(
-    groups: Sequence[np.ndarray],
-    statistic: Callable[..., np.ndarray] = np.mean,
-    resamples: int = RESAMPLES,
-) -> tuple[float, float]:
-    """A 95 % percentile bootstrap interval, stratified: each group is resampled by itself.
+def interval(values: np.ndarray, resamples: int = RESAMPLES) -> tuple[float, float]:
+    """A 95 % percentile bootstrap interval of a mean.
 
     The resampling has its own fixed seed: the same values give the same interval.
 
-    :param groups: independent values, such as one per episode or run, [n_g] each
-    :param statistic: called with ``axis=1`` on [resamples, Σ n_g] values; returns [resamples]
+    :param values: independent, such as one per episode, [n]
     :param resamples: number of bootstrap samples
-    :return: lower and upper end; NaN where no group has two values, since one says nothing about
-        another
+    :return: lower and upper end; NaN for fewer than two values
     """
-    if not any(len(group) > 1 for group in groups):
+    if len(values) < 2:
         return math.nan, math.nan
-    rng = np.random.default_rng(0)
-    draws = [
-        group[rng.integers(len(group), size=(resamples, len(group)))]
-        for group in groups
-        if len(group)
-    ]
-    low, high = np.quantile(statistic(np.concatenate(draws, axis=1), axis=1), [0.025, 0.975])
+    drawn = np.random.default_rng(0).integers(len(values), size=(resamples, len(values)))
+    low, high = np.quantile(values[drawn].mean(axis=1), [0.025, 0.975])
     return float(low), float(high)
 
 
@@ -132,7 +121,7 @@ def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
         return Estimate(math.nan, math.nan, math.nan, math.nan, diverged)
     ends = float("nan"), float("nan")
     if len(values) >= LEAST_EPISODES:
-        ends = interval([values], resamples=resamples)
+        ends = interval(values, resamples)
     return Estimate(float(np.mean(values)), float(np.std(values)), *ends, diverged)
 
 

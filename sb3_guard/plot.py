@@ -37,8 +37,7 @@ class Flags(Command):
     :param env: only runs on these environments
     :param cost_limit: only runs with this cost limit (one value per cost); unconstrained runs are
         always included
-    :param steps: only runs of N steps, where an algorithm has runs of several lengths on an
-        environment
+    :param steps: only runs of N steps
     """
 
     prog: ClassVar[str] = "sb3-guard plot"
@@ -148,22 +147,18 @@ def page_of(data: Data, title: str, left_out: Mapping[str, str]) -> str:
     return page.render(
         title=title,
         runs=data.runs,
-        made={
-            name: sorted(data.runs[name].dropna().unique())
-            for name in (*reading.VERSIONS, "commit")
-        },
         version=__version__,
         left_out=left_out,
         tables={heading: _html(table) for heading, table in tables.tables(data).items()},
         captions=tables.CAPTIONS,
         figures=drawn,
-        run_table=_html(tables.spelled(data.runs, tables.RUNS)),
+        run_table=_html(data.runs),
     )
 
 
 def _html(table: pd.DataFrame) -> str:
     with pd.option_context("display.max_colwidth", None):
-        return str(table.to_html(index=False, border=0, justify="left"))
+        return str(table.to_html(index=False, border=0, justify="left", na_rep="–"))
 
 
 main = command(Flags, plot)

@@ -60,7 +60,7 @@ def trainings() -> Iterator[str]:
 
 def measured(episodes: dict[str, list[float]], limit: float | None) -> dict[str, Any]:
     """Mean return and cost of a policy's final episodes, and whether its limit was kept."""
-    low, high = interval([np.array(episodes["costs"])])
+    low, high = interval(np.array(episodes["costs"]))
     return {
         "episodes": len(episodes["costs"]),
         "return": round(float(np.mean(episodes["returns"])), 2),

@@ -199,7 +199,7 @@ def scores(name: str) -> str:
     """A table of the algorithms' returns and costs as parts of TRPO's, a column per suite."""
     found = runs(name)
     means = aggregate(found.assign(J_r=found["return_last"], M_c=found["cost_last"]))
-    rows = normalize(means, means).set_index(["suite", "label"])
+    rows = normalize(means).set_index(["suite", "label"])
     labels = pd.DataFrame({"label": means["label"].unique()})
 
     def cell(row: Any, suite: str) -> str:

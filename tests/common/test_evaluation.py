@@ -135,7 +135,11 @@ def evaluation(values) -> Evaluation:
 
 def test_estimate_by_hand():
     # Of two values a resample has mean 1, 2 or 3, with probabilities 1/4, 1/2, 1/4.
-    assert interval([np.array([1.0, 3.0])]) == (1.0, 3.0)
+    assert interval(np.array([1.0, 3.0])) == (1.0, 3.0)
+    values = np.random.default_rng(0).normal(3.0, 2.0, size=400)
+    error = 1.96 * values.std() / 20
+    normal = values.mean() - error, values.mean() + error
+    assert interval(values) == pytest.approx(normal, abs=0.02)
     # Of five of which one is 5 it has k/5 times 5, k binomial: 0 in 33 %, at most 2 in 94 %.
     mean, std, low, high, _ = estimate(np.array([0.0, 0.0, 0.0, 0.0, 5.0]))
     assert (mean, std, low, high) == (1.0, 2.0, 0.0, 3.0)

@@ -302,7 +302,7 @@ def test_a_table_of_runs_has_those_asked_for(small, tmp_path, capsys):
         ([], 9),  # several limits and lengths
         (["--env", POINT], 7),
         (["--cost-limit", "5"], 3),
-        (["--steps", "300"], 8),
+        (["--steps", "300"], 1),
     ):
         assert plot.main([str(small), "--table", str(file), *flags]) == 0
         assert len(file.read_text().splitlines()) == 1 + rows, flags

@@ -531,14 +531,6 @@ def test_a_failing_trial_is_the_worst(tmp_path, folder, monkeypatch, capsys):
     assert pd.read_csv(folder / "trials.csv")["error"][0] == "the policy is NaN"
 
 
-def test_nothing_but_failures_ends_it(tmp_path, capsys):
-    """Here, for costs that are not finite."""
-    more = ["--env", "Flickering-v0", "--env-kwargs", "episode_length:50", "--n-trials", "9"]
-    refused(
-        lambda argv: run(tmp_path, *argv), more, capsys, "3 trials in a row failed", "nan"
-    )  # fmt: skip
-
-
 # What is typed wrongly
 
 WRONG = [

@@ -22,7 +22,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +40,10 @@ class GridRun(Run):
     """
     One run of a grid.
 
-    :param ignored: those given for the grid that its algorithm does not have
     :param state: at first ``done``, ``resume`` or ``new``; then as :func:`carry_out` returns it
     :param error: what went wrong, in a line
     """
 
-    ignored: list[str] = field(default_factory=list)
     state: str = ""
     error: str = ""
 
@@ -97,20 +95,22 @@ def expand(
     for name in given.keys() - names:
         hint = did_you_mean(name, names)
         raise UsageError(f"none of the algorithms has a hyperparameter {name!r}; {hint}")
-    first = {}
+    first: dict[tuple[str, str], Run] = {}
     flags = replace(flags, progress=False, num_threads=max(flags.num_threads, 1))
     for env_id, algo in pairs:
         hyperparams = {name: value for name, value in given.items() if name in taken[algo]}
         run = Run.check(
             replace(flags, env=env_id, algo=algo, seed=0, hyperparams=hyperparams or None)
         )
-        shared, values = run.flags, run.hyperparams
-        shared.n_timesteps = values["n_timesteps"] = max(round(values["n_timesteps"] * scale), 1)
-        first[shared.env, algo] = shared, values, sorted(given.keys() - hyperparams.keys())
+        if ignored := given.keys() - hyperparams.keys():
+            warnings.warn(f"{algo} has no {', '.join(ignored)}: left out there", stacklevel=2)
+        steps = max(round(run.hyperparams["n_timesteps"] * scale), 1)
+        run.flags.n_timesteps = run.hyperparams["n_timesteps"] = steps
+        first[run.flags.env, algo] = run
     runs = [
-        GridRun(replace(shared, seed=seed), values, ignored=ignored)
+        GridRun(replace(run.flags, seed=seed), run.hyperparams)
         for seed in dict.fromkeys(seeds)
-        for shared, values, ignored in first.values()
+        for run in first.values()
     ]
     for run in runs:
         run.state = run.standing()
@@ -237,8 +237,6 @@ def run_grid(
         stop_file.touch()
         say("Stopping after the rollouts under way; Ctrl-C again stops immediately.")
 
-    for algo, names in {run.flags.algo: run.ignored for run in runs if run.ignored}.items():
-        say(f"{algo} has no {', '.join(names)}: left out there")
     say(f"{folder}: {summary(runs)}")
     status, stop_file, todo = 0, folder / "stop", [run for run in runs if run.state != "done"]
     if todo:

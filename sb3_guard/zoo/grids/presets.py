@@ -58,11 +58,9 @@ def preset(name: str, algos: Sequence[str] | None = None) -> list[tuple[str, str
     """
     if name not in PRESETS:
         raise UsageError(f"unknown preset {name!r}; {did_you_mean(name, PRESETS)}")
-    blocks = PRESETS[name]
-    pairs = [
-        (f"{env_id}-v0", algo)
-        for env_ids, usual in blocks
+    return [
+        (env_id, algo)
+        for env_ids, usual in PRESETS[name]
         for env_id in env_ids
         for algo in algos or usual
     ]
-    return list(dict.fromkeys(pairs))

@@ -73,7 +73,7 @@ class Data:
     @cached_property
     def scores(self) -> pd.DataFrame:
         """Means with scores, of algorithms and of families; index environment and either's key."""
-        scores = normalize(self.means, self.means)
+        scores = normalize(self.means)
         families = by_family(scores).rename(columns={"family": "algo"})
         return pd.concat([scores, families]).set_index(["suite", "algo"])
 

@@ -27,7 +27,7 @@ CURVE_POINTS = 200  # at most as many per run, of epochs taken together
 VERSIONS = ("sb3_guard", "mujoco", "gymnasium", "stable_baselines3", "torch", "numpy", "python")
 _SUITE = re.compile(r"[A-Za-z][A-Za-z0-9]*_[A-Za-z][A-Za-z0-9]*_\d+[A-Za-z]\w*-v0")
 # Runs that agree in these are the same run, made again.
-_SAME = ["suite", "world", "wrappers", "algo", "limits", "seed", "steps", "started_from", "config"]
+_SAME = ["suite", "world", "algo", "limits", "seed", "steps", "config"]
 
 
 class Results(NamedTuple):
@@ -79,9 +79,7 @@ def read_results(folders: Sequence[str | Path]) -> Results:
 
 def find_runs(folder: Path) -> list[Path]:
     """The run folders at or below a folder, complete or not, in the order of their numbers."""
-    marks = {"result.json": 0, "0.monitor.csv": 0, "error.txt": 0, "args.yml": 1, "command.txt": 1}
-    paths = {path.parents[up] for name, up in marks.items() for path in folder.rglob(name)}
-    return sorted(paths, key=_natural)
+    return sorted({path.parents[1] for path in folder.rglob("args.yml")}, key=_natural)
 
 
 def _natural(value: Any) -> list[tuple[int, str]]:
@@ -99,10 +97,9 @@ def read_run(path: Path) -> dict[str, Any]:
         (cumulative cost ÷ steps), ``delivered`` (1 or 0: whether ``--certify`` found an agent),
         ``cost_limit`` (of the total cost; NaN: there is none), ``limits`` (of all costs, "1 2";
         missing: unconstrained), ``seconds`` of training, ``epoch`` (steps of a rollout), ``world``
-        (``env_kwargs``), ``wrappers``,
-        ``started_from`` (the model that training started from) and ``config`` (the same for the
-        same hyperparameters). If the limits are on other costs than the total, there are
-        ``M_c/<key>`` and ``cost_limit/<key>`` of each
+        (``env_kwargs``) and ``config`` (the same for the same hyperparameters and start). If the
+        limits are on other costs than the total, there are ``M_c/<key>`` and ``cost_limit/<key>``
+        of each
     :raises UsageError: the run is not finished, or damaged
     """
     folder = RunFolder(path)
@@ -131,10 +128,8 @@ def read_run(path: Path) -> dict[str, Any]:
         **by_key,
         "epoch": math.nan if None in rollout else math.prod(rollout),
         "world": _text(config.get("env_kwargs") or {}),
-        "wrappers": _text([config.get(f"{kind}env_wrapper") for kind in ("", "vec_")]),
-        "started_from": args.get("trained_agent") or "",
         "delivered": float("delivered" in result) if args.get("certify") else math.nan,
-        "config": _digest(config, result.get("learned")),
+        "config": _digest(config, args.get("trained_agent") or "", result.get("learned")),
         **{name: versions.get(name) for name in VERSIONS},
         "commit": result.get("commit"),
         "platform": result.get("platform"),
@@ -171,16 +166,17 @@ def _limits(limits: Iterable[float]) -> str:
     return " ".join(f"{limit:.12g}" for limit in limits)
 
 
-def _digest(config: Mapping[str, Any], learned: Any) -> str:
+def _digest(config: Mapping[str, Any], start: str, learned: Any) -> str:
     """
     The same for runs that differ in nothing but what has a column of its own.
 
+    :param start: the model that training started from
     :param learned: step counts of earlier calls of ``learn``: a warm-up or a schedule is stretched
         over one call, so an extended run is not the run that was as long from the start
     """
     columns = ("n_timesteps", "cost_limit", "env_kwargs")
     rest = {name: value for name, value in config.items() if name not in columns}
-    return hashlib.sha256(_text([rest, learned]).encode()).hexdigest()[:8]
+    return hashlib.sha256(_text([rest, start, learned]).encode()).hexdigest()[:8]
 
 
 # One run's episodes
@@ -242,8 +238,7 @@ def choose(
     :param suites: None: all. The version may be left out
     :param cost_limit: runs of this limit, or of these limits on several costs, and the
         unconstrained ones; None: all
-    :param steps: only runs of this length, where an algorithm has several on an environment;
-        None: all
+    :param steps: only runs of this length; None: all
     :raises UsageError: an environment, limit or length without runs
     """
     if suites is not None:
@@ -258,8 +253,7 @@ def choose(
         runs = runs[runs["limits"].isna() | (runs["limits"] == limit)]
     if steps is not None:
         _require(steps, runs["steps"], "of length")
-        several = runs.groupby(["suite", "algo"])["steps"].transform("nunique") > 1
-        runs = runs[~several | (runs["steps"] == steps)]
+        runs = runs[runs["steps"] == steps]
     return runs.reset_index(drop=True)
 
 
@@ -280,16 +274,14 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
     The runs that may be averaged: of runs that are the same, seed included, the last one counts.
 
     :raises UsageError: an environment has several cost limits or ``env_kwargs``, or an algorithm
-        on it several lengths or wrappers
+        on it several lengths, hyperparameters or models that training started from
     """
     other = "give the folders of one kind only"
     for column, name, keys, fix in (
         ("limits", "cost limit", ["suite"], "choose one, such as --cost-limit {}"),
         ("world", "env_kwargs", ["suite"], other),
         ("steps", "length", ["suite", "algo"], "choose one, such as --steps {}"),
-        ("wrappers", "wrappers", ["suite", "algo"], other),
-        ("started_from", "the model they started from", ["suite", "algo"], other),
-        ("config", "hyperparameters", ["suite", "algo"], other),
+        ("config", "hyperparameters or the model they started from", ["suite", "algo"], other),
     ):
         for key, group in runs.groupby(keys):
             values = _values(group[column])

@@ -1,30 +1,19 @@
 """Statistics of runs: their last epochs, means over seeds, and scores as the GUARD paper has them.
 
-Scores are relative to TRPO's (arXiv 2305.13681). Intervals and interquartile means follow Agarwal
-et al. 2021 (arXiv 2108.13264). Their library, rliable, saw its last release in 2024 and does not
-import with pandas 3 (through ``arch``), so the stratified bootstrap, the one piece needed, is
-:func:`~sb3_guard.costs.interval`.
+Scores are relative to TRPO's (arXiv 2305.13681).
 """
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import trim_mean
 
-from sb3_guard.costs import interval
 from sb3_guard.zoo.results.runs import REFERENCE, compared
 from sb3_guard.zoo.run.folder import EPOCH
 
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
 EPOCHS = 10  # at the end of a run, that its training is judged by
-
-
-def iqm(values: Any, axis: int = 0) -> Any:
-    """The mean of the middle half of the values along an axis."""
-    return trim_mean(values, 0.25, axis=axis)
 
 
 # One run
@@ -93,7 +82,7 @@ def mean_curve(curves: Sequence[pd.DataFrame], name: str) -> pd.DataFrame:
 # Scores
 
 
-def normalize(rows: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
+def normalize(means: pd.DataFrame) -> pd.DataFrame:
     """
     Scores relative to TRPO's, by the paper's three equations and its rule for negative returns.
 
@@ -102,23 +91,20 @@ def normalize(rows: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
     less 1 % of their range (if all are equal: less their size) is first subtracted from all of its
     returns.
 
-    :param rows: a table with ``suite``, ``algo`` and the metrics, of means or of runs
-    :param means: the means, of :func:`aggregate`, that TRPO's values and the shift come from;
-        unconstrained baselines do not count for the shift
-    :return: ``rows`` with the scores; NaN where TRPO has no runs or its value is 0
+    :param means: see :func:`aggregate`; unconstrained baselines do not count for the shift
+    :return: the same with the scores; NaN where TRPO has no runs or its value is 0
     """
-    rows = rows.copy()
     ours = means[compared(means)].groupby("suite")["J_r"]
     low, high = ours.min(), ours.max()
     margin = (0.01 * (high - low)).where(high > low, -low)
     shift = (margin - low).where(low < 0, 0.0)
-    reference = means[means["algo"] == REFERENCE].set_index("suite")
+    suites, reference = means["suite"], means[means["algo"] == REFERENCE].set_index("suite")
+    scores = {}
     for name, score in SCORES.items():
-        offset = rows["suite"].map(shift) if name == "J_r" else 0.0
-        unit = rows["suite"].map(reference[name]) + offset
-        rows[score] = ((rows[name] + offset) / unit.where(unit != 0)).astype(float)
-    rows["reward"] = rows["reward"].clip(upper=1.0)
-    return rows
+        offset = suites.map(shift) if name == "J_r" else 0.0
+        unit = suites.map(reference[name]) + offset
+        scores[score] = ((means[name] + offset) / unit.where(unit != 0)).astype(float)
+    return means.assign(**scores | {"reward": scores["reward"].clip(upper=1.0)})
 
 
 def by_family(scores: pd.DataFrame) -> pd.DataFrame:
@@ -133,28 +119,3 @@ def by_family(scores: pd.DataFrame) -> pd.DataFrame:
     means = groups[list(SCORES.values())].mean()
     means.insert(0, "algorithms", groups["algo"].nunique())
     return means.reset_index()
-
-
-def overall(runs: pd.DataFrame, means: pd.DataFrame) -> pd.DataFrame:
-    """
-    Scores of each algorithm over all environments.
-
-    :return: ``algo``, ``label``; for each score its mean over environments, ``_n`` (number of
-        environments that have one), ``_iqm`` (interquartile mean over runs and environments) with
-        ``_low`` and ``_high`` (95 % stratified bootstrap interval)
-    """
-    scores, single = normalize(means, means), normalize(runs, means)
-    order = means.sort_values("algo", key=lambda a: a != REFERENCE, kind="stable")
-    rows: list[dict[str, Any]] = []
-    for algo in dict.fromkeys(order["algo"]):
-        suites, seeds = (table[table["algo"] == algo] for table in (scores, single))
-        row: dict[str, Any] = {"algo": algo, "label": suites["label"].iloc[0]}
-        for score in SCORES.values():
-            groups = [group.dropna().to_numpy() for _, group in seeds.groupby("suite")[score]]
-            values = np.concatenate(groups)
-            low, high = interval(groups, iqm)
-            row |= {score: suites[score].mean(), f"{score}_n": int(suites[score].notna().sum())}
-            row[f"{score}_iqm"] = iqm(values) if len(values) else math.nan
-            row |= {f"{score}_low": low, f"{score}_high": high}
-        rows.append(row)
-    return pd.DataFrame(rows)

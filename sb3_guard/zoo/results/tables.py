@@ -20,7 +20,7 @@ from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.results.figure_data import Data
 from sb3_guard.zoo.results.splits import SPLITS
-from sb3_guard.zoo.results.statistics import by_family, normalize, overall
+from sb3_guard.zoo.results.statistics import by_family, normalize
 
 # A column's name, or a function of a row; by heading
 Cell = str | Callable[[Any], str]
@@ -33,19 +33,17 @@ SCORE_HEADINGS = {
     "cost": "cost / TRPO",
     "cost_rate": "cost rate / TRPO",
 }
-#: What the caption of each table says; ± and brackets mean the same in all of them.
+#: What the caption of each table says; ± means the same in all of them.
 SPREAD = "± is the standard deviation over seeds."
-INTERVAL = "Brackets are the 95 % bootstrap interval of the mean."
 CAPTIONS = {
     "Results": "Means over the episodes of the final epoch of training, with sampled actions. "
     f"{SPREAD} Limits have the tier of the final stochastic episodes.",
-    "Tiers": f"{SPREAD} {INTERVAL} A limit is certified if the interval lies at or below it, "
-    "violating if above it, else undecided. Excess is relative, a mean over the episodes above the "
-    "limit.",
+    "Tiers": f"{SPREAD} Brackets are the 95 % bootstrap interval of the mean. A limit is "
+    "certified if the interval lies at or below it, violating if above it, else undecided. Excess "
+    "is relative, a mean over the episodes above the limit.",
     "Relative to TRPO": "Return, cost and cost rate of the final epoch relative to TRPO's.",
     "Families, relative to TRPO": "Means over the algorithms of a family.",
-    "All environments, relative to TRPO": "Means over environments (their number), and "
-    f"interquartile means over runs. {INTERVAL}",
+    "All environments, relative to TRPO": "Means over environments, with their number.",
 }
 
 
@@ -122,10 +120,10 @@ def _deviation(name: str, digits: int = 2) -> Callable[[Any], str]:
     return lambda row: spread(row[name], row[f"{name}_std"], digits)
 
 
-def _interval(row: Any, name: str, digits: int = 2) -> str:
-    """The interval of a mean in brackets; empty: there is none."""
-    low, high = (row[end] for end in (f"{name}low", f"{name}high"))
-    return "" if pd.isna(low) else f" [{number(low, digits)}, {number(high, digits)}]"
+def _cost(row: Any) -> str:
+    """A cell with a cost, its standard deviation over seeds, and its interval if there is one."""
+    interval = f" [{number(row['low'], 1)}, {number(row['high'], 1)}]" * (not pd.isna(row["low"]))
+    return spread(row["cost"], row["cost_std"], 1) + interval
 
 
 def _limits(splits: pd.DataFrame) -> Callable[[Any], str]:
@@ -156,7 +154,7 @@ TIER_HEADINGS: Columns = {
     "cost key": lambda row: row["key"] or "total",
     "seeds": whole("seeds"),
     "return": _deviation("return"),
-    "cost": lambda row: spread(row["cost"], row["cost_std"], 1) + _interval(row, "", 1),
+    "cost": _cost,
     "limit": lambda row: (
         "–"
         if pd.isna(row["limit"])
@@ -190,7 +188,7 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
         ),
         "Tiers": spelled(splits, {**who, **tiers}),
     }
-    scores = normalize(data.means, data.means)
+    scores = normalize(data.means)
     if scores[["reward", "cost"]].notna().any(axis=None):
         result["Relative to TRPO"] = spelled(scores, who | shown)
         families: Columns = {
@@ -198,26 +196,13 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
         }  # fmt: skip
         result["Families, relative to TRPO"] = spelled(by_family(scores), families)
         if scores["suite"].nunique() > 1:
+            groups = scores.groupby(["algo", "label"], sort=False)[[*SCORE_HEADINGS]]
+            table = groups.mean().join(groups.count().add_suffix("_n")).reset_index()
             columns: Columns = {"algorithm": "label"}
             for score, heading in SCORE_HEADINGS.items():
                 columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"  # type: ignore[misc]
-                columns[f"{heading}, IQM"] = lambda row, s=score: (  # type: ignore[misc]
-                    number(row[f"{s}_iqm"]) + _interval(row, f"{s}_")
-                )
-            table = spelled(overall(data.runs, data.means), columns)
-            result["All environments, relative to TRPO"] = table
+            result["All environments, relative to TRPO"] = spelled(table, columns)
     return {title: table for title, table in result.items() if len(table)}
-
-
-RUNS: Columns = {
-    "environment": "suite", "algorithm": "label", "seed": whole("seed"),
-    "limit": lambda row: "–" if pd.isna(row["limits"]) else row["limits"],
-    "steps": whole("steps"), **{heading: name for name, heading in HEADINGS.items()},
-    "physics errors": whole("physics_errors"), "seconds": whole("seconds"),
-    "commit": lambda row: "–" if pd.isna(row["commit"])
-    else row["commit"][:10] + "-dirty" * row["commit"].endswith("-dirty"),
-    "folder": "path",
-}  # fmt: skip
 
 
 # Files

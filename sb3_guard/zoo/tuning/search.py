@@ -35,7 +35,6 @@ from sb3_guard.zoo.tuning.spaces import SAMPLERS, Search, read_space
 from sb3_guard.zoo.tuning.studies import Storage, open_storage, repeat_lost_trials
 from sb3_guard.zoo.tuning.trials import Objective, Settings, Stopped
 
-MOST_FAILURES = 3  # in a row, until it is not the hyperparameters' fault
 SETTINGS = "settings"
 
 
@@ -164,10 +163,6 @@ def _tune(flags: TuneFlags, main: bool) -> int:
         report.write(study)
         if flags.verbose:
             print(report.line(trial), flush=True)
-        if objective.failures >= MOST_FAILURES:
-            raise UsageError(
-                f"{MOST_FAILURES} trials in a row failed, the last one: {trial.user_attrs['error']}"
-            )
         if objective.stopped():
             study.stop()
 

@@ -140,7 +140,6 @@ class Objective:
         self.flags, self.training = flags, training
         self.settings, self.search = settings, search
         self.stop = False
-        self.failures = 0  # in a row
 
     def stopped(self) -> bool:
         """Whether to stop: a signal came, or the process that started this one is gone."""
@@ -163,7 +162,6 @@ class Objective:
         except FAILURES as error:
             if self.flags.verbose > 1:
                 raise
-            self.failures += 1
             trial.set_user_attr("error", one_line(error)[:600])
             self._constrain(trial, None)
             raise TrialPruned from error
@@ -171,7 +169,6 @@ class Objective:
             with suppress(*DATABASE_ERRORS):
                 repeat(trial.study, trial.study.trials[trial.number], most=None)
             raise
-        self.failures = 0
         return float(trial.user_attrs["result"]["return"])
 
     def _constrain(self, trial: optuna.Trial, mean: Sequence[float] | None) -> None:

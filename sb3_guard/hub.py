@@ -107,6 +107,9 @@ def stage(agent: Agent, flags: Flags, folder: Path) -> None:
     normalizer = unwrap_vec_normalize(agent.env)
     if normalizer is not None:  # the model's, which may not be the run's last one
         normalizer.save(str(run.normalizer))
+    certificate = agent.certificate
+    for path in agent.run.path.glob("certifi*") if certificate else ():
+        shutil.copyfile(path, folder / path.name)
     how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
     evaluation = evaluate_policy(agent.model, agent.env, flags.n_episodes or EPISODES, **how)
     if not flags.no_video:
@@ -139,7 +142,7 @@ def stage(agent: Agent, flags: Flags, folder: Path) -> None:
         repo=flags.repo_name,
         packages=packages_flag(trained.gym_packages),
         actions="sampled" if flags.stochastic else "the most likely",
-        evaluation=str(evaluation),
+        evaluation=f"{evaluation}\n{certificate or ''}".rstrip(),
         command=command,
         hyperparams=yaml.safe_dump(hyperparams),
     )

@@ -7,7 +7,7 @@ import torch
 from killed import crash, runs_of
 from typed import LENGTH, SMALL, TOY, refused, trained
 
-from sb3_guard import enjoy, export_agent, train
+from sb3_guard import enjoy, export_agent, hub, train
 from sb3_guard.common.certificate import Certificate
 
 CERTIFY = ["--certify", "50", "--eval-freq", "-1", "-n", "240"]
@@ -31,6 +31,19 @@ def test_a_run_delivers_and_says_so(run, capsys, tmp_path):
     assert export_agent.main([*here, "-o", str(tmp_path / "policy.onnx")]) == 0
     trained_at = json.loads((tmp_path / "contract.json").read_text())["trained"]
     assert trained_at["certificate"] == json.loads((run / "certificate.json").read_text())
+    # Of sampled actions nothing is certified.
+    sampled = [*here, "--stochastic", "-o", str(tmp_path / "policy.onnx")]
+    assert export_agent.main(sampled) == 0
+    assert json.loads((tmp_path / "contract.json").read_text())["trained"]["certificate"] is None
+
+
+def test_a_repository_has_the_certificate(run, capsys, tmp_path):
+    card = ["push", "-f", str(run), *TOY[:2], "--n-episodes", "2", "-orga", "me", "--no-video"]
+    assert hub.main([*card, "--to", str(tmp_path)]) == 0
+    certificate = Certificate.from_json((tmp_path / "certificate.json").read_text())
+    assert str(certificate) in (tmp_path / "README.md").read_text()
+    assert enjoy.main(["-f", str(tmp_path), *TOY[:2], "--n-episodes", "2", "--no-render"]) == 0
+    assert str(certificate) in capsys.readouterr().out
 
 
 def test_a_certificate_of_another_agent_is_not_shown(run, capsys):

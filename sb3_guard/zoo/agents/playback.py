@@ -106,6 +106,7 @@ class Agent:
     :param run: where it comes from
     :param path: its model file
     :param env_id: full id of the environment
+    :param stochastic: whether its actions are sampled
     """
 
     run: RunFolder
@@ -113,16 +114,18 @@ class Agent:
     env_id: str
     model: BaseAlgorithm
     env: VecEnv
+    stochastic: bool
 
     @property
     def certificate(self) -> Certificate | None:
-        """What was certified of this very agent when its training ended."""
+        """What was certified of this very agent, and of such actions, when its training ended."""
         file = self.path.with_name("certificate.json")
         if self.path.name != "certified_model.zip" or not file.is_file():
             return None
         with explained(f"{file} is damaged"):
             certificate = Certificate.from_json(file.read_text())
-        return certificate if certificate.agent == agent_hash(self.model, self.env) else None
+        same = certificate.agent == agent_hash(self.model, self.env)
+        return certificate if same and certificate.deterministic != self.stochastic else None
 
 
 def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> Agent:
@@ -190,7 +193,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
             f"{path} was trained on observations {model.observation_space}, "
             f"but {env_id} has {env.observation_space}"
         )
-    return Agent(run, path, env_id, model, env)
+    return Agent(run, path, env_id, model, env, flags.stochastic)
 
 
 def play(flags: EnjoyFlags, render_mode: str | None) -> int:

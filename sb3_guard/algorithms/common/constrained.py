@@ -49,6 +49,10 @@ class Constrained(BaseAlgorithm):
         falls to ``cost_limit`` along a line. 1 for ``cost_limit`` from the first step on; a limit
         of 0 is 0 throughout, and a schedule begins where it says
     :param limit_fall: share of the training over which it falls
+    :param aim: what the training keeps within the limit: ``"mean"``, the mean cost of an episode;
+        or ``"certificate"``, the mean and the half-width of its interval
+        (:meth:`~sb3_guard.algorithms.common.costs.Costs.half_width`), so that the agent can be
+        certified
     :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
         absent key means that nothing was charged
     :raises TypeError: an argument is not known; the message names the nearest one
@@ -75,6 +79,7 @@ class Constrained(BaseAlgorithm):
     cost_keys: Sequence[str] = hyperparameter(("cost",))
     limit_start: float = hyperparameter(1.0, low=1.0)
     limit_fall: float = hyperparameter(0.6, high=1.0, ends="(]")
+    aim: Literal["mean", "certificate"] = hyperparameter("mean")
     missing_cost: Literal["error", "zero"] = hyperparameter("error")
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -185,7 +190,13 @@ class Constrained(BaseAlgorithm):
         # The last rollout may go beyond the training's end, which no schedule knows of.
         steps = min(num_timesteps, total_timesteps)
         super()._update_current_progress_remaining(steps, total_timesteps)
-        self.costs.limits = self.cost_limits
+        self._aim()
+
+    def _aim(self) -> None:
+        """Set the limits that the next update keeps to."""
+        self.costs.limits = limits = self.cost_limits
+        if self.aim == "certificate":
+            self.costs.limits = limits - self.costs.half_width(limits)
 
     # Episodes
 
@@ -244,7 +255,7 @@ class Constrained(BaseAlgorithm):
         :param rate: see :meth:`Costs.estimate`
         :return: whether there is a new estimate
         """
-        self.costs.limits = self.cost_limits
+        self._aim()
         # Until an episode has ended, the longest so far stands for its length.
         longest = float(self.costs.episodes.lengths.max())
         if not self.costs.estimate(rate, lambda: time_limit(self.env) or longest):
@@ -283,8 +294,10 @@ class Constrained(BaseAlgorithm):
     def _record_violation(self) -> None:
         """Record J_C - d, in units of an episode's cost."""
         if self.constrained:
-            excess = self.costs.violation * self.costs.horizon
+            excess = self.costs.episode_cost - self.cost_limits
             self._record_per_cost("train/constraint_violation", excess)
+        if self.aim == "certificate":
+            self._record_per_cost("train/cost_aim", self.costs.limits)
 
     def dump_logs(self, *args: Any) -> None:
         costs = self.costs

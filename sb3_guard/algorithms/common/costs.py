@@ -15,6 +15,9 @@ from sb3_guard.costs import EpisodeCosts
 # Agents that were saved while the estimate was one of these are read; their costs begin anew.
 CostEstimate = namedtuple("CostEstimate", "episode_cost horizon violation")
 
+# A certificate's last look: its episodes, and the quantile of its error, 5 % shared by three agents.
+LAST_LOOK, QUANTILE = 400, 2.33
+
 _NUMBER = r"(-?\d+\.?\d*(?:e[+-]?\d+)?)"
 _LINE = re.compile(f"lin_{_NUMBER}_{_NUMBER}")
 
@@ -80,7 +83,8 @@ class Costs:
     since the last one (off-policy J_C is of the latest ones), and is compared with the limits as
     they are now.
 
-    :param limits: d, shape (m,)
+    :param limits: what the next update keeps J_C within, d unless the algorithm aims lower,
+        shape (m,)
     :param limit_on: what of an episode's costs the limits bound, see :class:`EpisodeCosts`
     :param window: number of the latest episodes that logs are about
     """
@@ -88,7 +92,7 @@ class Costs:
     def __init__(
         self, limits: np.ndarray, limit_on: Literal["sum", "max"] = "sum", window: int = 100
     ) -> None:
-        #: d, bounds on the costs of an episode, shape (m,)
+        #: bounds on the costs of an episode, shape (m,)
         self.limits = limits
         self.limit_on = limit_on
         #: J_C, mean cost of the episodes that ended, shape (m,); None before the first estimate
@@ -109,6 +113,8 @@ class Costs:
         self.episodes = EpisodeCosts(*shape, self.limit_on)
         #: what the last step cost, 0 before the first one of an episode, shape (n_envs, m)
         self.last = np.zeros(shape)
+        # What the limits bound, of the latest episodes, each of shape (m,)
+        self._recent: deque[np.ndarray] = deque(maxlen=100)
 
     def forget(self) -> None:
         """Forget the episodes that have ended: the next estimate is about others."""
@@ -132,6 +138,7 @@ class Costs:
             if episode.row in broken:
                 continue
             self.ended.append(episode.bounded)
+            self._recent.append(episode.bounded)
             self._lengths.append(episode.length)
             self.latest.append(episode.total)
         self.seen_lately |= seen
@@ -156,9 +163,26 @@ class Costs:
             self.episode_cost = rate * self.horizon
         return bool(self.ended) or rate is not None
 
+    def half_width(self, limits: np.ndarray) -> np.ndarray:
+        """How far J_C has to stay below the limits for a certificate, shape (m,).
+
+        ::
+
+            h = min(z s / √n, |d| / 2)        z = 2.33, n = 400
+
+        s is the standard deviation of the latest 100 episodes' costs; h is half of the interval of
+        :func:`sb3_guard.certify` at its last look, where three agents share an error of 5 %.
+
+        :param limits: d, shape (m,)
+        """
+        if len(self._recent) < 2:
+            return np.zeros(len(limits))
+        width = QUANTILE * np.std(self._recent, axis=0, ddof=1) / np.sqrt(LAST_LOOK)
+        return np.minimum(width, np.abs(limits) / 2)
+
     @property
     def violation(self) -> np.ndarray:
-        """(J_C - d) / T, in the per-step units of mean(ratio · cost advantage), shape (m,)."""
+        """(J_C - limits) / T, in the per-step units of mean(ratio · cost advantage), shape (m,)."""
         return (self.episode_cost - self.limits) / self.horizon
 
 

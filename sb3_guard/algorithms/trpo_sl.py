@@ -61,7 +61,6 @@ class TRPOSL(FilteredTrustRegion):
         some, none = costly.nonzero().flatten(), (~costly).nonzero().flatten()
         if not len(some):
             return
-        regression = layer.regression()
         actions, previous = self._executed(batch), batch.previous_costs / layer.unit
         data = (batch.observations, actions, previous)
         targets = th.cat([batch.costs / layer.unit, previous], dim=1)
@@ -69,7 +68,7 @@ class TRPOSL(FilteredTrustRegion):
         for _ in range(self.n_critic_updates):
             drawn = th.randperm(len(none))[: len(some)].to(none.device)
             index = th.cat([some, none[drawn]])
-            loss = regression.fit(rows(data, index), targets[index], 1, self.batch_size)
+            loss = layer.learn(rows(data, index), targets[index], 1, self.batch_size)
         self._check_finite("cost_model_loss", loss)
         error = layer.error(batch.observations, actions, batch.previous_costs, batch.costs)
         layer.noise.copy_(self.tolerance * error)

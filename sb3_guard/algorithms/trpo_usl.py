@@ -78,7 +78,7 @@ class TRPOUSL(FilteredTrustRegion):
     def fit(self, batch: CostRolloutBufferSamples) -> None:
         super().fit(batch)
         unit = self.policy.action_filter.unit
-        loss = self.policy.action_filter.regression().fit(
+        loss = self.policy.action_filter.learn(
             (batch.observations, self._executed(batch)),
             batch.cost_returns / unit,
             self.n_critic_updates,

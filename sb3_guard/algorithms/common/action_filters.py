@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.critics import Regression, StateNetwork
+from sb3_guard.algorithms.common.critics import StateNetwork, regress
 
 SWEEPS = 50  # corrections of an action where there are several costs
 
@@ -47,6 +47,15 @@ class ActionFilter(nn.Module):
     def optimizer(self) -> th.optim.Optimizer:
         """The network's."""
         return self.network.optimizer
+
+    def predicted(self, batch: Any) -> th.Tensor:
+        """What the filter believes of costs, in units of ``unit``, shape [B, k]."""
+        raise NotImplementedError
+
+    def learn(self, batch: Any, targets: th.Tensor, n_epochs: int, batch_size: int | None) -> float:
+        """Fit :meth:`predicted` to targets, see :func:`regress`."""
+        moving = self.network.parameters()
+        return regress(self.predicted, moving, self.optimizer, batch, targets, n_epochs, batch_size)
 
     def forward(
         self, observations: PyTorchObs, actions: th.Tensor, costs: th.Tensor | None
@@ -142,21 +151,12 @@ class SafetyLayer(ActionFilter):
         predicted = last + self.unit * change
         return (predicted - costs).square().mean(dim=0).sqrt()
 
-    def regression(self) -> Regression:
-        """Fits batches (observations, executed actions, last costs) to (costs, last costs).
-
-        Both costs are in units of ``unit``.
-        """
-
-        def readout(outputs: th.Tensor, batch: Any) -> th.Tensor:
-            _, actions, costs = batch
-            slopes, last, drifts = self._split(outputs)
-            predicted = costs + (slopes * actions[:, None]).sum(dim=2) + drifts
-            return th.cat([predicted, last], dim=1)
-
-        return Regression.of_network(
-            self.network, lambda batch: self.network.extract_features(batch[0]), readout
-        )
+    def predicted(self, batch: Any) -> th.Tensor:
+        """Costs of a step and of the one before it, from (observations, executed actions, last)."""
+        observations, actions, costs = batch
+        slopes, last, drifts = self._split(self.network(observations))
+        now = costs + (slopes * actions[:, None]).sum(dim=2) + drifts
+        return th.cat([now, last], dim=1)
 
     def forward(
         self, observations: PyTorchObs, actions: th.Tensor, costs: th.Tensor | None
@@ -231,14 +231,9 @@ class UnrolledSafetyLayer(ActionFilter):
             )
         super().__init__(StateNetwork(policy, n_costs, self.n_actions), n_costs)
 
-    def regression(self) -> Regression:
-        """Fits batches (observations, actions) to costs to come in units of ``unit``."""
-
-        def inputs(batch: Any) -> th.Tensor:
-            observations, actions = batch
-            return th.cat([self.network.extract_features(observations), actions], dim=1)
-
-        return Regression.of_network(self.network, inputs, lambda outputs, _: F.softplus(outputs))
+    def predicted(self, batch: Any) -> th.Tensor:
+        """Costs to come, from (observations, actions)."""
+        return F.softplus(self.network(*batch))
 
     @th.no_grad()
     def values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:

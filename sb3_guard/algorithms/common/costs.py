@@ -15,7 +15,7 @@ from sb3_guard.costs import EpisodeCosts
 # Agents that were saved while the estimate was one of these are read; their costs begin anew.
 CostEstimate = namedtuple("CostEstimate", "episode_cost horizon violation")
 
-# A certificate's last look: its episodes, and the quantile of its error, 5 % shared by three agents.
+# A certificate's last look: its episodes, and the quantile of its error, which three agents share.
 LAST_LOOK, QUANTILE = 400, 2.33
 
 _NUMBER = r"(-?\d+\.?\d*(?:e[+-]?\d+)?)"

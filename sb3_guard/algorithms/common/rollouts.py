@@ -25,7 +25,7 @@ from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import discounted_limit, inverse
-from sb3_guard.algorithms.common.critics import CostCritic, Regression
+from sb3_guard.algorithms.common.critics import CostCritic, regress
 from sb3_guard.algorithms.fast.threads import one_thread
 
 SMALL = 500_000  # weights of a policy that acts on one thread
@@ -293,7 +293,10 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         units = np.where(self.cost_units, self.cost_units, np.float32(1.0))
         targets = batch.cost_returns / th.as_tensor(units).to(batch.cost_returns)
         learnt = self.critic_rows(batch.cost_returns)
-        loss = Regression.of_network(self.cost_critic).fit(
+        loss = regress(
+            self.cost_critic,
+            self.cost_critic.parameters(),
+            self.cost_critic.optimizer,
             rows(batch.observations, learnt),
             targets[learnt],
             getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,

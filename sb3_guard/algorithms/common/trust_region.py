@@ -21,10 +21,10 @@ from stable_baselines3.common.policies import (
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_guard.algorithms.common.actor import Accept, Region, Trial
+from sb3_guard.algorithms.common.actor import Accept, Region, Trial, value_parameters
 from sb3_guard.algorithms.common.arguments import hyperparameter
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
-from sb3_guard.algorithms.common.critics import Regression
+from sb3_guard.algorithms.common.critics import regress
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
 from sb3_guard.algorithms.common.vectors import assign, flatten
 from sb3_guard.algorithms.fast.actor import actor_of
@@ -139,8 +139,14 @@ class TrustRegion(CostRollouts):
 
         # The critics
         moved = time.perf_counter()
-        loss = Regression.of_value(self.policy).fit(
-            batch.observations, batch.returns[:, None], self.n_critic_updates, self.batch_size
+        loss = regress(
+            self.policy.predict_values,
+            value_parameters(self.policy),
+            self.policy.optimizer,
+            batch.observations,
+            batch.returns[:, None],
+            self.n_critic_updates,
+            self.batch_size,
         )
         self._check_finite("value_loss", loss)
         if self.uses_cost_critic:

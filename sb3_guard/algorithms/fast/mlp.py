@@ -1,21 +1,15 @@
 """Forward, tangent and adjoint passes of a tanh network, written out.
 
-Two loops dominate an update: full-batch regressions, eighty steps for each critic, and a few dozen
-Fisher products. Both run over the same small network. Written out, over slices that fit the cache,
-a regression step takes three quarters of autograd's time and a Fisher product a quarter, for the
-same numbers.
+A few dozen Fisher products over the whole rollout are the larger part of an update. Written out,
+over slices that fit the cache, each takes a quarter of autograd's time, for the same numbers.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch as th
 from torch import nn
-from torch.nn import functional as F
-
-from sb3_guard.algorithms.common.batches import chunks
-from sb3_guard.algorithms.fast.threads import accumulate
 
 
 def _tanh_(x: th.Tensor) -> th.Tensor:
@@ -130,39 +124,3 @@ class Written(th.autograd.Function):
         total = [th.zeros_like(parameter) for parameter in ctx.network.parameters]
         ctx.network.adjoint(ctx.activations, gradients[0], total)
         return None, None, *total
-
-
-def squared_error(
-    network: TanhMlp,
-    inputs: th.Tensor,
-    targets: th.Tensor,
-    readout: Callable[[th.Tensor, slice], th.Tensor] | None = None,
-) -> float:
-    """Set the parameters' gradients of the mean squared error; return the error.
-
-    :param inputs: shape [N, d]
-    :param targets: shape [N, m]
-    :param readout: maps outputs of a slice, and the slice, to predictions; None: they are equal
-    """
-    slices = chunks(len(targets))
-
-    def add(number: int, gradients: list[th.Tensor]) -> float:
-        index = slices[number]
-        activations = network.forward(inputs[index])
-        outputs = activations[-1]
-        if readout is None:
-            error = outputs - targets[index]
-            total = float(error.flatten() @ error.flatten())
-            slope = error.mul_(2.0 / targets.numel())
-        else:
-            outputs.requires_grad_()
-            loss = F.mse_loss(readout(outputs, index), targets[index], reduction="sum")
-            total = loss.item()
-            (slope,) = th.autograd.grad(loss / targets.numel(), outputs)
-        network.adjoint(activations, slope, gradients)
-        return total
-
-    gradients, total = accumulate(add, len(slices), network.parameters)
-    for parameter, gradient in zip(network.parameters, gradients, strict=True):
-        parameter.grad = gradient
-    return total / targets.numel()

@@ -120,11 +120,10 @@ def test_the_safety_layer_keeps_its_prediction_below_the_threshold(m: int, drift
     actions = np.random.default_rng(0).uniform(-3, 3, (200, 3))
     corrected = corrected_by(layer, observations, actions, costs)
     assert np.abs(corrected).max() <= 1.0
-    regression = layer.regression()
 
     def predicted(a: np.ndarray) -> np.ndarray:
         batch = (observations, th.as_tensor(a).float(), th.as_tensor(costs).float())
-        return regression.values(batch)[:, :m].detach().numpy()
+        return layer.predicted(batch)[:, :m].detach().numpy()
 
     clipped = np.clip(actions, -1, 1)
     broken = (predicted(clipped) > 0.1).any(axis=1)
@@ -149,30 +148,11 @@ def test_the_safety_layer_learns_a_linear_cost() -> None:
     for group in layer.optimizer.param_groups:
         group["lr"] = 1e-2
     targets = th.cat([costs, last], dim=1)
-    loss = layer.regression().fit((observations, actions, last), targets, 400)
+    loss = layer.learn((observations, actions, last), targets, 400, None)
     assert loss < 1e-3
     found, estimated, _ = layer._split(layer.network(observations))
     th.testing.assert_close(found[:, 0], slopes, atol=0.15, rtol=0)
     th.testing.assert_close(estimated, last, atol=0.15, rtol=0)
-
-
-@pytest.mark.parametrize("kind", ["safety layer", "unrolled"])
-def test_written_out_gradients_are_autograds(kind: str) -> None:
-    layer: Any
-    if kind == "unrolled":
-        layer = UnrolledSafetyLayer(policy_of(2), 2)
-        batch: Any = (th.randn(5000, 4), th.rand(5000, 2))
-    else:
-        layer = SafetyLayer(policy_of(2), 1, drift=True)
-        batch = (th.randn(5000, 4), th.rand(5000, 2), th.rand(5000, 1))
-    regression, targets = layer.regression(), th.randn(5000, 2)
-    assert regression.network is not None
-    loss = F.mse_loss(regression.values(batch), targets)
-    expected = th.autograd.grad(loss, regression.parameters)
-    found = regression._gradients(batch, targets, regression.inputs(batch))
-    assert found == pytest.approx(loss.item(), rel=1e-4)
-    for parameter, gradient in zip(regression.parameters, expected, strict=True):
-        th.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-5)
 
 
 # The unrolled layer's descent
@@ -466,15 +446,13 @@ def test_without_a_cost_the_cost_model_rests() -> None:
 def test_as_many_steps_without_cost_are_drawn_as_with() -> None:
     model = make(TRPOSL, points(4, hazard=(-0.5, 0.6)), n_steps=200)
     drawn: list[Any] = []
-    original = model.policy.action_filter.regression
+    learn = model.policy.action_filter.learn
 
-    def spy() -> Any:
-        regression = original()
-        fit = regression.fit
-        regression.fit = lambda *args: drawn.append(args[1][:, 0]) or fit(*args)
-        return regression
+    def spy(*args: Any) -> float:
+        drawn.append(args[1][:, 0])
+        return learn(*args)
 
-    model.policy.action_filter.regression = spy
+    model.policy.action_filter.learn = spy
     model.learn(800)
     total = int((model.rollout_buffer.costs != 0).sum())
     assert 0 < total < 400 and len(drawn) == 3

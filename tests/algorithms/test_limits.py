@@ -1,6 +1,7 @@
 """Limits that change over the training."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,14 +9,17 @@ import numpy as np
 import pytest
 from cost_envs import CostPoint
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 
 from sb3_guard import CostEvalCallback, evaluate_policy, train
-from sb3_guard.algorithms import CPO, TRPOIPO, PPOLag, SACLag
-from sb3_guard.algorithms.common.costs import limits_at
+from sb3_guard.algorithms import CPO, SCPO, TRPOIPO, PPOLag, SACLag
+from sb3_guard.algorithms.common.costs import Costs, limits_at
+from sb3_guard.common.certificate import LOOKS, mean_bounds
 
 
-def points(n_envs: int = 2) -> Any:
-    return make_vec_env(lambda: CostPoint(episode_length=20, hazard=(-1.0, 0.0)), n_envs, seed=0)
+def points(n_envs: int = 2, **kwargs: Any) -> Any:
+    point = partial(CostPoint, episode_length=20, **{"hazard": (-1.0, 0.0), **kwargs})
+    return make_vec_env(point, n_envs, seed=0)
 
 
 @pytest.mark.parametrize(
@@ -118,3 +122,40 @@ def test_an_agent_is_judged_by_the_last_limit(tmp_path: Path) -> None:
     assert train.main([*arguments.split(), *hyperparams.split(), *folder]) == 0
     result = json.loads((tmp_path / "cpo" / "CostPoint-v0_1" / "result.json").read_text())
     assert result["cost_limit"] == result["costs"]["cost"]["limit"] == 2.0
+
+
+def test_an_agent_at_the_aim_is_just_certified() -> None:
+    """At the last look of three agents; symmetric costs, of which Student's bound is right."""
+    costs, limit = Costs(np.array([25.0, 0.2, -4.0, 0.0])), np.array([25.0, 0.2, -4.0, 0.0])
+    costs.begin(400)
+    assert costs.half_width(limit).tolist() == [0.0] * 4, "nothing is known of the spread"
+    spread = np.where(np.arange(400)[:, None] % 2 == 0, 10.0, -10.0) * [1.0, 1.0, 0.1, 1.0]
+    costs.step(spread, np.ones(400, bool), True)
+    width = costs.half_width(limit)
+    assert width[1:].tolist() == pytest.approx([0.1, 0.117, 0.0], abs=1e-3), "half of d at most"
+    for share, certified in ((1.01, True), (0.97, False)):
+        mean = limit[0] - share * width[0]
+        bound = mean_bounds(mean + spread[:, 0], 0.05 / 3 * LOOKS[1.0])[1]
+        assert (bound <= limit[0]) is np.bool_(certified)
+
+
+@pytest.mark.parametrize("cls", [CPO, PPOLag, SACLag, SCPO])
+def test_updates_keep_to_the_aim(cls: Any, tmp_path: Path) -> None:
+    settings = {"learning_starts": 40} if cls is SACLag else {"n_steps": 40}
+    model = cls("MlpPolicy", points(4), cost_limit=9.0, aim="certificate", seed=0, **settings)
+    assert model.costs.limits == 9.0
+    model.set_logger(configure(str(tmp_path), ["json"]))
+    seen: list[list[float]] = []
+
+    def note(theirs: Any, _: Any) -> bool:
+        seen.append([info["cost"] for info in theirs["infos"]])
+        return True
+
+    model.learn(400, callback=note)
+    steps = np.array(seen).reshape(-1, 20, 4)
+    episodes = (steps.max(axis=1) if cls is SCPO else steps.sum(axis=1)).ravel()[-100:]
+    assert len(episodes) > 10 and 0 < episodes.std()
+    aim = 9.0 - min(2.33 * episodes.std(ddof=1) / 20, 4.5)
+    assert model.costs.limits == pytest.approx(aim) and model.final_cost_limits == 9.0
+    row = json.loads((tmp_path / "progress.json").read_text().splitlines()[-1])
+    assert 4.5 <= row["train/cost_aim"] < 9.0 and row["rollout/cost_limit"] == 9.0

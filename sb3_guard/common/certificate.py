@@ -192,9 +192,14 @@ class Certificate:
         return "\n".join([f"{self.verdict}: {tail}", *lines])
 
     def summary(self) -> dict[str, Any]:
-        """Return, and of each cost its mean, upper bound and limit, as plain data."""
+        """Return, and of each cost its mean, bound, limit and share above it, as plain data."""
         costs = {
-            key: {"mean": cost.mean, "upper": cost.upper, "limit": cost.limit}
+            key: {
+                "mean": cost.mean,
+                "upper": cost.upper,
+                "limit": cost.limit,
+                "share_above": cost.share_above,
+            }
             for key, cost in self.costs.items()
         }
         return {"return": self.mean_return, "costs": costs, "episodes": self.episodes}

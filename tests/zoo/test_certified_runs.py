@@ -1,6 +1,7 @@
 """A run that ends with a certified agent: trained, cut and continued, played, exported."""
 
 import json
+from contextlib import closing
 
 import pytest
 import torch
@@ -9,6 +10,8 @@ from typed import LENGTH, SMALL, TOY, refused, trained
 
 from sb3_guard import enjoy, export_agent, hub, train
 from sb3_guard.common.certificate import Certificate
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.run import Run
 
 CERTIFY = ["--certify", "50", "--eval-freq", "-1", "-n", "240"]
 
@@ -77,3 +80,11 @@ def test_too_few_episodes_are_refused_before_the_training(tmp_path, capsys):
     arguments = [*LENGTH, *TOY, *SMALL, "-f", str(tmp_path), "-n", "120", "--certify", "49"]
     refused(train.main, arguments, capsys, "--certify", "at least 50")
     assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(("steps", "most"), [("999999", 0), ("1000000", 400)])
+def test_a_training_of_a_thousand_episodes_ends_with_a_certificate(steps, most):
+    world = ["--algo", "cpo", "--env", "Goal_Point_8Hazards", *SMALL]
+    flags = RunFlags.parse([*world, "-n", steps])
+    with closing(Run.check(flags).make()) as run:
+        assert (run.delivery.n_episodes if run.delivery else 0) == most

@@ -144,9 +144,9 @@ def test_a_limit_on_the_worst_step_has_its_tier_and_says_nothing_of_the_sum(tmp_
 
 
 def test_the_share_of_runs_that_delivered(tmp_path):
-    for seed, result in enumerate([{"delivered": {"return": 9.0}}, {}]):
-        fake_run(tmp_path, "cpo", seed=seed, args={"certify": 400}, **result)
-    fake_run(tmp_path, "trpo", args={"certify": 400})  # which has no limit
+    for seed, delivered in enumerate([{"return": 9.0}, None]):
+        fake_run(tmp_path, "cpo", seed=seed, delivered=delivered)
+    fake_run(tmp_path, "trpo")
     runs = read_results([tmp_path]).runs
     assert tables(Data(runs))["Results"]["delivered"].tolist() == ["–", "50%"]
     assert "delivered" not in tables(Data(runs[runs["algo"] == "trpo"]))["Results"]

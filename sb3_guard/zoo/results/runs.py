@@ -128,7 +128,7 @@ def read_run(path: Path) -> dict[str, Any]:
         **by_key,
         "epoch": math.nan if None in rollout else math.prod(rollout),
         "world": _text(config.get("env_kwargs") or {}),
-        "delivered": float("delivered" in result) if args.get("certify") and limits else math.nan,
+        "delivered": float(result["delivered"] is not None) if "delivered" in result else math.nan,
         "config": _digest(config, args.get("trained_agent") or "", result.get("learned")),
         **{name: versions.get(name) for name in VERSIONS},
         "commit": result.get("commit"),

@@ -55,7 +55,7 @@ class EvaluationFlags(Command):
     :param eval_env_kwargs: arguments of the evaluation environment (default: those of training)
     :param certify: end with the best policy of the last half that is certified to keep its limit,
         by at most so many fresh episodes, at least 50, each of up to three; 0: with the last policy
-        (default: 0)
+        (default: 400 if the training has the steps of 1,000 full episodes, else 0)
 
     Files:
 
@@ -78,7 +78,7 @@ class EvaluationFlags(Command):
     eval_episodes: int = flag(default=30, low=1, metavar="N", role=IDENTITY)
     n_eval_envs: int | None = flag(low=1, metavar="N", role=IDENTITY)
     eval_env_kwargs: dict[str, Any] | None = flag(role=IDENTITY)
-    certify: int = flag(default=0, low=0, metavar="N", role=IDENTITY)
+    certify: int | None = flag(low=0, metavar="N", role=IDENTITY)
     save_freq: int = flag(default=-1, metavar="N", role=IDENTITY)
     checkpoint_every: float = flag(default=10.0, low=0, metavar="S", role=HOST)
     tensorboard_log: str = flag("-tb", default="", metavar="DIR", role=HOST)

@@ -30,7 +30,9 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
+from sb3_guard.algorithms.common.costs import time_limit
 from sb3_guard.common.callbacks import CostEvalCallback, LogCosts, selection_limits
+from sb3_guard.common.certificate import MOST
 from sb3_guard.common.delivery import DeliveryCallback
 from sb3_guard.common.evaluation import check_normalizer, evaluate_policy, sync_normalization
 from sb3_guard.common.files import replacing
@@ -237,12 +239,12 @@ class Run:
                     verbose=int(flags.verbose > 0),
                 )
                 self.evaluation.model = self.model
-            if flags.certify and self.constrained:
+            if self.constrained and (episodes := self._certificate_episodes()):
                 env = self.make_evaluation_envs(DELIVERY_ENVS)
                 seed, verbose = evaluation_seed(flags.seed, 2), int(flags.verbose > 0)
                 with explained("--certify", ValueError):
                     self.delivery = DeliveryCallback(
-                        env, n_episodes=flags.certify, seed=seed, verbose=verbose
+                        env, n_episodes=episodes, seed=seed, verbose=verbose
                     )
             if flags.track:
                 self.tracker = self._track()
@@ -250,6 +252,13 @@ class Run:
             self.close()
             raise
         return self
+
+    def _certificate_episodes(self) -> int:
+        """Most episodes of the certificate that the training ends with; 0: it ends without one."""
+        if self.flags.certify is not None:
+            return self.flags.certify
+        episode = time_limit(self.env)  # None: unknown
+        return MOST if episode and self.setup.n_timesteps >= 1000 * episode else 0
 
     def close(self) -> None:
         """Release the environments, and let Weights & Biases have what it has not yet."""
@@ -675,8 +684,9 @@ class Run:
             normalizer.save(str(folder.normalizer))
         final = self._play_final() if finished else {}
         result = {"algo": self.flags.algo, "env": self.flags.env, **result, "final": final}
-        if self.delivery is not None and self.delivery.certificate is not None:
-            result["delivered"] = self.delivery.certificate.summary()
+        if self.delivery is not None:
+            certificate = self.delivery.certificate
+            result["delivered"] = certificate.summary() if certificate else None
         if finished:
             made = {"command": folder.flags().command(), "curve": folder.curve_hash()}
             folder.write_result(result | made)

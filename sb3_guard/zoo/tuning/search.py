@@ -52,7 +52,7 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         limit = flags.cost_limit
         hyperparams["selection_limit"] = limit[0] if len(limit) == 1 else limit
     how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "verbose": 0, "progress": False}
-    run = Run.check(RunFlags.shared(flags, **how))
+    run = Run.check(RunFlags.shared(flags, certify=0, **how))
     values, n_timesteps = run.hyperparams, run.setup.n_timesteps
     space = read_space(flags.search_space) if flags.search_space else None
     search = Search(flags.algo, values, space, fixed)

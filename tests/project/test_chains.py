@@ -22,4 +22,4 @@ def test_cpo_is_small() -> None:
     files = {Path(inspect.getfile(base)) for base in chain(CPO)}
     assert sum(len(file.read_text().splitlines()) for file in files) <= 1000
     names = [name for name in inspect.signature(CPO).parameters if not name.startswith("_")]
-    assert len(names) <= 28
+    assert len(names) <= 29  # with the aim

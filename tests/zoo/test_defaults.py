@@ -57,7 +57,7 @@ SEED, ROLLOUT, N_ENVS = 3, 100, 4
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_entries_hold_only_what_depends_on_the_environment(algo: str, env_id: str) -> None:
     values, known = read_hyperparams(algo, env_id), parameters(ALGORITHMS[algo])
-    assert values.get("policy_kwargs", {}).keys() <= {"net_arch"}
+    assert values.get("policy_kwargs", {}).keys() <= {"net_arch", "optimizer_kwargs"}
     beside = values.keys() - OF_THE_ENVIRONMENT
     assert beside == DEPARTURES.get((algo, env_id), set())
     assert all(values[name] != known[name].default for name in beside)  # else it can go

@@ -1,4 +1,4 @@
-"""Refusing bad hyperparameters in one way: the name, the value, what is allowed."""
+"""Errors of environments, and checks of what costs are called and of values for each of them."""
 
 from typing import Any
 
@@ -21,30 +21,6 @@ def is_number(value: Any) -> bool:
     """Whether a value is a finite number; booleans are not."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     return number and bool(np.isfinite(value))
-
-
-def check_integer(name: str, value: Any, least: int = 1) -> None:
-    """
-    :raises ValueError: ``value`` is not an integer of at least ``least``
-    """
-    integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not (integer and value >= least):
-        raise ValueError(f"{name}={value!r}: must be an integer of at least {least}")
-
-
-def check_number(
-    name: str, value: Any, low: float = 0.0, high: float = np.inf, ends: str = "[)"
-) -> None:
-    """
-    :param ends: brackets of the interval from ``low`` to ``high``, such as ``"[)"``
-    :raises ValueError: ``value`` is not a number of the interval
-    """
-    above = is_number(value) and (value >= low if ends[0] == "[" else value > low)
-    below = is_number(value) and (value <= high if ends[1] == "]" else value < high)
-    if not (above and below):
-        raise ValueError(
-            f"{name}={value!r}: must be a number in {ends[0]}{low:g}, {high:g}{ends[1]}"
-        )
 
 
 def check_cost_keys(keys: Any) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ COMMANDS = {
     "certify": "say whether a trained agent keeps its limit, by fresh episodes",
     "export": "write a trained agent as one ONNX file",
     "plot": "make tables, figures and a page of trained runs",
-    "hub": "upload a trained agent to the Hugging Face hub, or download one",
+    "hub": "write a trained agent and its card for the Hugging Face hub",
     "list": "print environments, robots, tasks, constraints and pretrained agents",
     "show": "describe an environment and draw it",
 }

@@ -128,8 +128,8 @@ def reproduce(flags: Flags) -> int:
             f"The run before is of {there}, this is {here}: another processor rounds differently, "
             "and the episodes may be others."
         )
-    took = timedelta(seconds=int(row["seconds"]))
-    print(f"{row['command']}\n{run.setup.n_timesteps:,} steps, which took {took}, in {run.path} …")
+    took, steps = timedelta(seconds=int(row["seconds"])), run.hyperparams["n_timesteps"]
+    print(f"{row['command']}\n{steps:,} steps, which took {took}, in {run.path} …")
     if run.standing() == "done":
         print("This run was trained already; to train it again, remove its folder or change -f.")
     if status := run.complete(row["command"]):

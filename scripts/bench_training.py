@@ -30,7 +30,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_guard import ALGORITHMS, make_vec_env
-from sb3_guard.zoo.run.hyperparams import build, check, read_hyperparams
+from sb3_guard.zoo.run.hyperparams import check, model_arguments, read_hyperparams
 
 N_ENVS, N_STEPS = 30, 1000
 # What one of SB3's algorithms becomes, and how much longer its update may then take.
@@ -121,10 +121,10 @@ def main() -> None:
     for algo in args.algos:
         env = make_vec_env(args.env, N_ENVS, seed=0, num_threads=args.threads)
         algorithm = ALGORITHMS[algo]
-        setup = build(check(algo, algorithm, read_hyperparams(algo, args.env)))
-        if "warmup" in setup.model:
-            setup.model["warmup"] = 0
-        model = algorithm(env=env, seed=0, **setup.model)
+        arguments = model_arguments(check(algo, algorithm, read_hyperparams(algo, args.env)))
+        if "warmup" in arguments:
+            arguments["warmup"] = 0
+        model = algorithm(env=env, seed=0, **arguments)
         best: dict[str, float] = {}
         for _ in range(args.updates):
             started = time.perf_counter()

@@ -109,7 +109,7 @@ def shipped_return(env_id: str) -> float:
 def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
     """The agent of a run as it was saved, with environments to play in."""
     played = Run(RunFlags.of({"algo": run.args()["algo"], "env": run.name}), run.hyperparams())
-    normalizer = None if played.setup.normalize is None else read_normalizer(run.normalizer)
+    normalizer = read_normalizer(run.normalizer) if run.normalizer.is_file() else None
     env = played.make_envs(n_envs, seed, vec_env="native", evaluation=True, normalizer=normalizer)
     return load_model(played.algorithm, run.model, env, "cpu")
 

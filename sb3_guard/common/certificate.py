@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.checks import check_cost_keys, check_integer, check_number, check_per_cost
+from sb3_guard.checks import check_cost_keys, check_per_cost
 from sb3_guard.common.evaluation import (
     Evaluation,
     evaluate_policy,
@@ -26,6 +26,7 @@ from sb3_guard.common.evaluation import (
 )
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.costs import bounded_name
+from sb3_guard.fields import fit
 
 #: The looks at the episodes, as shares of all episodes, and the share of the error that each takes.
 LOOKS = {0.25: 0.1, 0.5: 0.3, 1.0: 0.6}
@@ -274,9 +275,9 @@ def certify(
     :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
         a cost, or the normalisation of the model's observations is absent
     """
-    check_integer("n_episodes", n_episodes, LEAST)
-    check_integer("tries", tries)
-    check_number("error", error, 0.0, 0.5, "()")
+    fit("n_episodes", n_episodes, int, LEAST, ends="[)")
+    fit("tries", tries, int, 1, ends="[)")
+    fit("error", error, float, 0.0, 0.5)
     if not isinstance(env, VecEnv):
         lone = env
         env = DummyVecEnv([lambda: lone])

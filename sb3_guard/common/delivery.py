@@ -13,11 +13,11 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_guard.checks import check_integer
 from sb3_guard.common.certificate import LEAST, MOST, Certificate, certify, limits_of
 from sb3_guard.common.evaluation import evaluate_policy, moments_of, sync_normalization
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
+from sb3_guard.fields import fit
 
 TRIES = 3  # candidates that may be certified; they share the error
 
@@ -79,9 +79,9 @@ class DeliveryCallback(BaseCallback):
         verbose: int = 1,
     ) -> None:
         super().__init__(verbose)
-        check_integer("n_episodes", n_episodes, LEAST)
-        check_integer("candidates", candidates)
-        check_integer("screening", screening, 2)
+        fit("n_episodes", n_episodes, int, LEAST, ends="[)")
+        fit("candidates", candidates, int, 1, ends="[)")
+        fit("screening", screening, int, 2, ends="[)")
         self.eval_env, self.folder = eval_env, Path(folder)
         self.cost_limit, self.candidates, self.screening = cost_limit, candidates, screening
         self.n_episodes, self.deterministic, self.seed = n_episodes, deterministic, seed

@@ -13,8 +13,8 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.checks import check_number
 from sb3_guard.costs import read_costs
+from sb3_guard.fields import fit
 
 
 def end_rows(venv: VecEnv, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
@@ -160,13 +160,9 @@ class VecRemainingBudget(Counted):
         unsafe_reward: float | None = None,
         cost_key: str = "cost",
     ) -> None:
-        check_number("budget", budget, ends="()")
-        self.budget = float(budget)
-        check_number("discount", discount, 0.0, 1.0, "(]")
-        self.discount = float(discount)
-        if unsafe_reward is not None:
-            check_number("unsafe_reward", unsafe_reward, -np.inf, ends="()")
-        self.unsafe_reward = unsafe_reward
+        self.budget = fit("budget", budget, float, 0.0)
+        self.discount = fit("discount", discount, float, 0.0, 1.0, "(]")
+        self.unsafe_reward = fit("unsafe_reward", unsafe_reward, float | None)
         self.cost_key = cost_key
         super().__init__(env, 1)
 
@@ -228,10 +224,8 @@ class VecEarlyTermination(VecEnvWrapper):
     def __init__(
         self, env: VecEnv, budget: float, final_reward: float = 0.0, cost_key: str = "cost"
     ) -> None:
-        check_number("budget", budget)
-        self.budget = float(budget)
-        check_number("final_reward", final_reward, -np.inf, ends="()")
-        self.final_reward = float(final_reward)
+        self.budget = fit("budget", budget, float, 0.0, ends="[)")
+        self.final_reward = fit("final_reward", final_reward, float)
         self.cost_key = cost_key
         super().__init__(env)
         self.episode_costs = np.zeros(env.num_envs)

@@ -61,7 +61,7 @@ def test_a_limit_falls_to_what_is_asked_for_and_stays_there() -> None:
     np.testing.assert_allclose(seen[2:], [[10.0, -4.0, 0.0]] * 3, atol=1e-12)
     assert model.final_cost_limits.tolist() == [10.0, -4.0, 0.0]
     for name, value in (("limit_start", 0.5), ("limit_fall", 0.0), ("limit_fall", 1.5)):
-        with pytest.raises(ValueError, match=f"{name}={value}"):
+        with pytest.raises(ValueError, match=f"{name} = {value} must be"):
             CPO("MlpPolicy", points(), cost_limit=2.0, **{name: value})
 
 

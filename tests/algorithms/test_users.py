@@ -12,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_guard import CPO, PPOLag, SACLag
 from sb3_guard.algorithms import CostReplay
-from sb3_guard.zoo.run.hyperparams import build
+from sb3_guard.zoo.run.hyperparams import model_arguments
 
 SMALL = {"n_steps": 40, "batch_size": 40, "n_epochs": 1, "n_critic_updates": 1}
 
@@ -39,7 +39,7 @@ def test_no_function_is_asked_about_a_time_after_the_training(cls: Any) -> None:
 
 def test_a_rate_of_a_file_ends_at_zero() -> None:
     values = {"learning_rate": "lin_0.1", "n_envs": 1, "n_timesteps": 100}
-    rate = build(values).model["learning_rate"]
+    rate = model_arguments(values)["learning_rate"]
     assert [rate(remaining) for remaining in (1.0, 0.5, 0.0, -0.2)] == [0.1, 0.05, 0.0, 0.0]
 
 

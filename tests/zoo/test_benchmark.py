@@ -278,7 +278,7 @@ def test_a_dead_worker_ends_the_grid_with_a_line(tmp_path, here, capsys):
 
 def test_a_run_of_our_environments_reaches_a_worker(tmp_path):
     grid_run = grid.GridRun.check(RunFlags.of({"env": "Goal_Point_8Hazards", "algo": "cpo"}))
-    assert grid_run.source.batch is not None and grid_run.setup.n_envs
+    assert grid_run.source.batch is not None and grid_run.arguments
     there = pickle.loads(pickle.dumps(grid_run))
     assert there.flags == grid_run.flags and there.hyperparams == grid_run.hyperparams
 

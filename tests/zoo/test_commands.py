@@ -1,14 +1,12 @@
 """The commands as users type them."""
 
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import threading
-import time
 import tomllib
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +22,7 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from typed import PLAY, SMALL, TOY, require_rendering, trained
 
-from sb3_guard import CPO, cli, enjoy, make_vec_env, train
+from sb3_guard import CPO, cli, enjoy, train
 from sb3_guard.envs import Scenario, register
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS
 from sb3_guard.zoo.agents import playback
@@ -246,39 +244,13 @@ def test_enjoy_normalises_as_training_did(tmp_path, capsys):
     assert "can't read the observation statistics" in capsys.readouterr().err
 
 
-def test_an_interrupt_while_environments_are_made(tmp_path, monkeypatch):
-    """It comes when they are made, and nothing is written."""
-    made = []
-
-    def make(*args, **kwargs):
-        os.kill(os.getpid(), signal.SIGINT)
-        made.append(make_vec_env(*args, **kwargs))
-        return made[-1]
-
-    monkeypatch.setattr("sb3_guard.zoo.run.run.make_vec_env", make)
-    assert train.main([*TOY, *SMALL, "-f", str(tmp_path / "logs")]) == 130
-    assert len(made) == 1 and not (tmp_path / "logs").exists()
-
-
-def ignores_an_interrupt() -> None:
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(0.1)
-    sys.exit(7)
-
-
-@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
-def test_processes_see_no_interrupt(method):
-    """Nor is it lost here, where other threads might take it."""
-    threading.Thread(target=time.sleep, args=(5.0,), daemon=True).start()
-    process = multiprocessing.get_context(method).Process(target=ignores_an_interrupt)
-    reached = False
-    with pytest.raises(KeyboardInterrupt), usage.interrupts_held():
-        process.start()
-        os.kill(os.getpid(), signal.SIGINT)
-        process.join()
-        reached = True
-    assert reached and process.exitcode == 7
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+def test_processes_of_environments_see_no_interrupt():
+    flags = {"env": "CostPoint-v0", "gym_packages": ["registered_envs"], "vec_env": "subproc"}
+    usage.import_packages(flags["gym_packages"])
+    run = Run(RunFlags(**flags), {"cost_limit": 1.0})
+    with closing(run.make_envs(1, 0)) as env:
+        os.kill(env.unwrapped.processes[0].pid, signal.SIGINT)
+        env.reset()
 
 
 def test_an_interrupt_while_python_imports(tmp_path, monkeypatch, capsys):

@@ -12,9 +12,18 @@ from torch import nn
 
 from sb3_guard import ALGORITHMS, make_model, make_vec_env, train
 from sb3_guard.algorithms import CostReplay
+from sb3_guard.zoo.cli.names import classes
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import baselines
-from sb3_guard.zoo.run.hyperparams import RUN_KEYS, build, check, parameters, read_hyperparams
+from sb3_guard.zoo.run.hyperparams import (
+    RUN_KEYS,
+    action_noise,
+    check,
+    model_arguments,
+    normalization,
+    parameters,
+    read_hyperparams,
+)
 from sb3_guard.zoo.run.make_envs import seed_rows
 
 ENVS = ["SafetyPointGoal1-v0", "Goal_Point_8Hazards-v0"]
@@ -106,14 +115,14 @@ def test_command_function_and_class_train_the_same_agent(
     made = weights(model.learn(steps))
 
     env = make_vec_env(env_id, N_ENVS)
-    setup = build(check(algo, cls, {**entry, **short}))
-    for wrapper, arguments in setup.vec_env_wrapper:
+    values = check(algo, cls, {**entry, **short})
+    for wrapper, arguments in classes("vec_env_wrapper", values.get("vec_env_wrapper")):
         env = wrapper(env, **arguments)
-    if setup.normalize is not None:
-        env = VecNormalize(env, **setup.normalize)
-    noise = setup.action_noise(env.action_space.shape[0])
+    if (scaled := normalization(values)) is not None:
+        env = VecNormalize(env, **scaled)
+    noise = action_noise(values, env.action_space)
     extra = {} if noise is None else {"action_noise": noise}
-    model = cls(env=env, seed=SEED, device="cpu", **setup.model, **extra)
+    model = cls(env=env, seed=SEED, device="cpu", **model_arguments(values), **extra)
     seed_rows(env, SEED)
     by_class = weights(model.learn(steps))
 

@@ -34,18 +34,18 @@ class Toy(Command):
     params: dict[str, Any] | None = flag("-params", role=IDENTITY)
     seeds: list[int] = flag(default=[0, 1], exclusive="seed")
     seed: int = flag(default=0, exclusive="seed")
-    bar: bool | None = flag("-P", role=HOST)
+    bar: bool = flag("-P", default=False, role=HOST)
     dry_run: bool = flag(default=False)
     rate: float = flag(default=1.0)
     secret: str | None = flag()
 
 
 def test_typed_attributes_and_what_was_given():
-    toy = Toy.parse(["small", "-n", "3e2", "-params", "a:1", "b:dict(c=[x])", "--no-bar"])
+    toy = Toy.parse(["small", "-n", "3e2", "-params", "a:1", "b:dict(c=[x])", "-P"])
     assert (toy.kind, toy.length, toy.params) == ("small", 300, {"a": 1, "b": "dict(c=[x])"})
-    assert (toy.bar, toy.dry_run, toy.seeds, toy.rate) == (False, False, [0, 1], 1.0)
+    assert (toy.bar, toy.dry_run, toy.seeds, toy.rate) == (True, False, [0, 1], 1.0)
     assert toy.given == {"kind", "length", "params", "bar"}
-    assert Toy.parse([]).given == frozenset() and Toy.parse([]).bar is None
+    assert Toy.parse([]).given == frozenset()
     Toy.parse([]).seeds.append(2)
     assert Toy.parse([]).seeds == [0, 1]
 
@@ -71,7 +71,7 @@ def test_what_is_not_allowed_on_the_command_line(arguments, message):
 def test_a_files_values_are_checked_the_same_way():
     toy = Toy.read({"length": "3e2", "params": {"a": "1"}, "seeds": 5, "dry-run": True}, "x.yml")
     assert (toy.length, toy.params, toy.seeds, toy.dry_run) == (300, {"a": "1"}, [5], True)
-    assert Toy.read({"params": ["a:1"], "bar": None}, "x.yml").params == {"a": 1}
+    assert Toy.read({"params": ["a:1"], "kind": None}, "x.yml").params == {"a": 1}
     assert Toy.read({"length": -1}, "x.yml").length == -1  # a default may be no value to give
     assert toy.given == {"length", "params", "seeds", "dry_run"}
 

@@ -1,6 +1,5 @@
 """Hyperparameters: which entry is read, what is refused, what becomes of the values."""
 
-import gymnasium as gym
 import pytest
 import torch
 from torch import nn
@@ -8,13 +7,15 @@ from torch import nn
 from sb3_guard.algorithms import ALGORITHMS, CPO, SACLag
 from sb3_guard.envs import env_ids
 from sb3_guard.fields import parse_value
+from sb3_guard.zoo.cli.names import BASES, classes
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import baselines
 from sb3_guard.zoo.run.hyperparams import (
     annotations,
-    build,
     check,
     hyperparams_folder,
+    model_arguments,
+    normalization,
     read_file,
     read_hyperparams,
 )
@@ -160,7 +161,7 @@ def test_how_often_to_train_in_episodes():
     """As in RL-Zoo's own files, e.g. that of DDPG."""
     values = check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": (1, "episode")})
     assert values["train_freq"] == [1, "episode"]  # as a file holds it
-    assert build(values).model["train_freq"] == (1, "episode")
+    assert model_arguments(values)["train_freq"] == (1, "episode")
     for bad in ([1], ["episode", 1], [1, 2], "episode"):
         with pytest.raises(UsageError, match="an integer or a list of an integer and text"):
             check("sac_lag", SACLag, {"n_timesteps": 100, "train_freq": bad})
@@ -174,25 +175,21 @@ def test_training_takes_a_million_steps_unless_somebody_says_otherwise():
 
 
 def test_objects_are_made():
-    setup = build(
-        checked(
-            learning_rate="lin_0.01",
-            policy_kwargs="dict(activation_fn=nn.ReLU)",
-            policy="stable_baselines3.common.policies.ActorCriticPolicy",
-            normalize=True,
-            gamma=0.9,
-            env_wrapper="gymnasium.wrappers.FlattenObservation",
-            env_kwargs="dict(a=1)",
-        )
+    values = checked(
+        learning_rate="lin_0.01",
+        policy_kwargs="dict(activation_fn=nn.ReLU)",
+        policy="stable_baselines3.common.policies.ActorCriticPolicy",
+        normalize=True,
+        gamma=0.9,
+        env_wrapper="gymnasium.wrappers.FlattenObservation",
+        env_kwargs="dict(a=1)",
     )
-    assert setup.model["learning_rate"](0.5) == pytest.approx(0.005)
-    assert setup.model["policy_kwargs"] == {"activation_fn": nn.ReLU}
-    assert setup.model["policy"].__name__ == "ActorCriticPolicy"
-    assert setup.normalize == {"gamma": 0.9}
-    assert setup.env_wrapper == [(gym.wrappers.FlattenObservation, {})]
-    assert setup.env_kwargs == {"a": 1}
-    assert (setup.n_envs, setup.n_timesteps, setup.callbacks()) == (1, 100, [])
-    assert "env_kwargs" not in setup.model and "n_envs" not in setup.model
+    model = model_arguments(values)
+    assert model.keys() == {"learning_rate", "policy_kwargs", "policy", "gamma"}
+    assert model["learning_rate"](0.5) == pytest.approx(0.005)
+    assert model["policy_kwargs"] == {"activation_fn": nn.ReLU}
+    assert model["policy"].__name__ == "ActorCriticPolicy"
+    assert normalization(values) == {"gamma": 0.9} and values["env_kwargs"] == {"a": 1}
 
 
 @pytest.mark.parametrize(
@@ -206,7 +203,7 @@ def test_objects_are_made():
     ],
 )  # fmt: skip
 def test_expressions_are_data_and_classes_of_torch(text, value):
-    assert build(checked(policy_kwargs=text)).model["policy_kwargs"] == value
+    assert model_arguments(checked(policy_kwargs=text))["policy_kwargs"] == value
 
 
 @pytest.mark.parametrize(
@@ -225,7 +222,9 @@ def test_expressions_are_data_and_classes_of_torch(text, value):
 )
 def test_text_that_names_nothing(name, value, message):
     with pytest.raises(UsageError, match=message):
-        build(checked(**{name: value}))
+        classes(name, checked(**{name: value})[name]) if name in BASES else model_arguments(
+            checked(**{name: value})
+        )
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,9 @@ from typed import LENGTH, SMALL, TOY, refused, trained
 
 from sb3_guard import benchmark, enjoy, train
 from sb3_guard.fields import parse_value
-from sb3_guard.zoo.cli.names import as_data, refuse_places
+from sb3_guard.zoo.cli.names import BASES, as_data, classes, refuse_places
 from sb3_guard.zoo.cli.usage import UsageError
-from sb3_guard.zoo.run.hyperparams import build
+from sb3_guard.zoo.run.hyperparams import model_arguments
 
 # What `eval("dict(...)")` without builtins still ran.
 ESCAPE = (
@@ -210,5 +210,4 @@ def test_printed_commands_name_the_modules(tmp_path, capsys):
 )
 def test_only_classes_of_their_kind(name, value):
     with pytest.raises(UsageError, match=name):
-        values = {"n_envs": 1, "n_timesteps": 1, name: as_data(name, value)}
-        build(values).callbacks()
+        classes(name, value) if name in BASES else model_arguments({name: as_data(name, value)})

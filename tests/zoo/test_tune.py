@@ -27,7 +27,13 @@ from sb3_guard import train, tune
 from sb3_guard.algorithms import ALGORITHMS, TRPO
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import algorithm
-from sb3_guard.zoo.run.hyperparams import annotations, build, check, parameters, read_hyperparams
+from sb3_guard.zoo.run.hyperparams import (
+    annotations,
+    check,
+    model_arguments,
+    parameters,
+    read_hyperparams,
+)
 from sb3_guard.zoo.tuning import studies, trials
 from sb3_guard.zoo.tuning.report import best
 from sb3_guard.zoo.tuning.spaces import RELATIVES, SAMPLERS, Search, read_space, space_of
@@ -64,7 +70,7 @@ def test_spaces_hold_what_algorithms_accept(algo):
         check(algo, algorithm(algo), corner)
     hints = annotations(algorithm(algo))
     values = {**draw(search), "buffer_size" if "buffer_size" in hints else "n_steps": 30}
-    algorithm(algo)(env=CostPoint(), **build(check(algo, algorithm(algo), values)).model)
+    algorithm(algo)(env=CostPoint(), **model_arguments(check(algo, algorithm(algo), values)))
 
 
 @pytest.mark.parametrize("algo", sorted(ALGORITHMS))

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_guard.checks import check_integer, check_number
+from sb3_guard.fields import fit
 from sb3_guard.spelling import did_you_mean
 
 # Arguments that SB3's own base classes take from the algorithms, not from users.
@@ -46,24 +46,16 @@ class Hyperparameter(NamedTuple):
     high: float
     ends: str
 
-    def check(self, name: str, value: Any, hint: Any) -> None:
+    def fitted(self, name: str, value: Any, hint: Any) -> Any:
         """
-        :raises ValueError: ``value`` is not what the annotation and the range allow
+        :return: ``value``, checked if it is a number, a boolean or a literal
+        :raises ValueError: it is not what the annotation and the range allow
         """
-        kinds = {*(typing.get_args(hint) or (hint,))}
-        if value is None and types.NoneType in kinds:
-            return
-        kinds.discard(types.NoneType)
-        if typing.get_origin(hint) is typing.Literal:
-            if value not in (words := typing.get_args(hint)):
-                raise ValueError(f"{name}={value!r}: must be {' or '.join(map(repr, words))}")
-        elif kinds == {bool}:
-            if not isinstance(value, bool | np.bool_):
-                raise ValueError(f"{name}={value!r}: must be True or False")
-        elif kinds == {int}:
-            check_integer(name, value, 1 if self.low is None else int(self.low))
-        elif kinds == {float}:
-            check_number(name, value, self.low or 0.0, self.high, self.ends)
+        kinds = {*(typing.get_args(hint) or (hint,))} - {types.NoneType}
+        if kinds not in ({bool}, {int}, {float}) and typing.get_origin(hint) is not typing.Literal:
+            return value
+        low = float(kinds == {int}) if self.low is None else self.low
+        return fit(name, value, hint, low, self.high, self.ends)
 
 
 def hyperparameter(
@@ -165,6 +157,6 @@ def check_theirs(algorithm: Any) -> None:
     """
     for name, value in vars(algorithm).items():
         if name in _INTEGERS and value is not None:
-            check_integer(name, value)
+            setattr(algorithm, name, fit(name, value, int, 1, ends="[)"))
         elif name in _NUMBERS and isinstance(value, int | float):  # else a schedule, or "auto"
-            check_number(name, value, 0.0, *_NUMBERS[name])
+            fit(name, value, float, 0.0, *_NUMBERS[name])

@@ -143,7 +143,8 @@ class Constrained(BaseAlgorithm):
         stated_ones = stated(type(self))
         for name, parameter in inspect.signature(type(self)).parameters.items():
             if name in stated_ones:
-                stated_ones[name].check(name, getattr(self, name), parameter.annotation)
+                value = stated_ones[name].fitted(name, getattr(self, name), parameter.annotation)
+                setattr(self, name, value)
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
         check_theirs(self)
         for remaining in (1.0, 0.0):

@@ -19,7 +19,8 @@ from sb3_guard.algorithms.common.policies import (
     FilteredPolicy,
 )
 from sb3_guard.algorithms.common.trust_region import TrustRegion
-from sb3_guard.checks import check_integer, check_number, check_per_cost
+from sb3_guard.checks import check_per_cost
+from sb3_guard.fields import fit
 
 
 class FilteredTrustRegion(TrustRegion):
@@ -70,9 +71,9 @@ class FilteredTrustRegion(TrustRegion):
                 f"(FilteredPolicy, {name}), with FilteredPolicy from {FilteredPolicy.__module__}"
             )
         if isinstance(self.warmup, int | np.integer):
-            check_integer("warmup", self.warmup, 0)
+            fit("warmup", self.warmup, int, 0, ends="[)")
         else:
-            check_number("warmup", self.warmup, 0.0, 1.0, "[]")
+            fit("warmup", self.warmup, float, 0.0, 1.0, "[]")
         if self.threshold is not None:
             check_per_cost("threshold", self.threshold, tuple(self.cost_keys))
 

@@ -150,33 +150,22 @@ class ExportFlags(AgentFlags):
 @dataclass
 class HubFlags(AgentFlags):
     """
-    Upload a trained agent to the Hugging Face hub, or download one. Downloaded agents are programs:
-    load only from people you trust.
+    Write a trained agent and its model card into a folder that is ready for the Hugging Face hub.
 
-    Which agent:
+    The command hf uploads and downloads it. Downloaded agents are programs: load only from people
+    you trust.
 
-    :param direction: push: upload an agent; load: download one
-    :param organization: user or organization that owns the repository
-    :param repo_name: name of the repository (default: <algo>-<env>)
+    Output:
 
-    Push:
-
-    :param commit_message: message of the upload (default: 'Upload a trained agent')
-    :param private: make the repository private
+    :param output: folder to write to (default: agent)
     :param no_video: record no video of an episode
-    :param to: write all files to this folder and upload nothing
     """
 
     prog: ClassVar[str] = "sb3-guard hub"
     examples: ClassVar[str] = """examples:
-  sb3-guard hub push --algo cpo --env Goal_Point_8Hazards -f logs -orga me
-  sb3-guard hub push --algo cpo --env Goal_Point_8Hazards -orga me --to card
-  sb3-guard hub load --algo cpo --env Goal_Point_8Hazards -orga me -f logs
+  sb3-guard hub --algo cpo --env Goal_Point_8Hazards -f logs -o agent
+  hf upload me/cpo-Goal_Point_8Hazards-v0 agent
+  hf download me/cpo-Goal_Point_8Hazards-v0 --local-dir logs/cpo/Goal_Point_8Hazards-v0_1
 """
-    direction: Literal["push", "load"] = flag(positional=True)
-    organization: str = flag("-orga", required=True, metavar="NAME")
-    repo_name: str | None = flag("-name", metavar="NAME")
-    commit_message: str = flag("-m", default="Upload a trained agent", metavar="TEXT")
-    private: bool = flag(default=False)
+    output: str = flag("-o", default="agent", metavar="DIR")
     no_video: bool = flag(default=False)
-    to: str | None = flag(metavar="DIR")

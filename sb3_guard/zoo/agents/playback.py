@@ -161,8 +161,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     hyperparams = check(flags.algo, algorithm(flags.algo), hyperparams)
     named = {"algo": flags.algo, "env": flags.env, "gym_packages": flags.gym_packages}
     played = Run(RunFlags.of(named), hyperparams)
-    setup, source = played.setup, played.source
-    env_id, ours = str(source.env_id), source.batch is not None
+    env_id, ours = str(played.source.env_id), played.source.batch is not None
     if flags.num_threads > 0:
         th.set_num_threads(flags.num_threads)
     normalizer = None
@@ -171,15 +170,15 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     else:
         path, statistics = find_model(run, flags)
         model = load_model(played.algorithm, path, None, flags.device)
-        normalizer = None if setup.normalize is None else read_normalizer(statistics)
+        normalizer = read_normalizer(statistics) if hyperparams.get("normalize") else None
     # A batch has no window, and no wrappers of single environments.
-    native = ours and not setup.env_wrapper and render_mode != "human"
+    native = ours and not hyperparams.get("env_wrapper") and render_mode != "human"
     size = VIDEO if ours and render_mode else {}
     env = played.make_envs(
         n_envs if native else 1,
         flags.seed,
         vec_env="native" if native else "dummy",
-        env_kwargs={**size, **setup.env_kwargs, **(flags.env_kwargs or {})},
+        env_kwargs={**size, **(hyperparams.get("env_kwargs") or {}), **(flags.env_kwargs or {})},
         evaluation=True,
         normalizer=normalizer,
         render_mode=render_mode,

@@ -21,8 +21,8 @@ value in a file, and whether it is part of what a run *is*::
 
 The long name is the field's (``--n-timesteps``), headings and help are the docstring's; a flag that
 has no line there is not shown. Annotations choose how a value is read, from the command line as
-from a file: ``bool`` is a switch, ``bool | None`` has a ``--no-…``, ``list[int]`` takes several,
-``dict`` takes ``key:value``, ``Literal`` one of its values.
+from a file: ``bool`` is a switch, ``list[int]`` takes several, ``dict`` takes ``key:value``,
+``Literal`` one of its values.
 """
 
 import argparse
@@ -119,8 +119,7 @@ class Command:
                 group = groups[name]
             options: dict[str, Any] = {"help": help_}
             if kind is bool:
-                switch = hint is bool
-                options["action"] = "store_true" if switch else argparse.BooleanOptionalAction
+                options["action"] = "store_true"
             elif kind is dict:  # may be repeated; what comes later wins
                 options |= {"nargs": "+", "action": "extend", "metavar": "KEY:VALUE"}
             elif kind is list:
@@ -131,7 +130,8 @@ class Command:
             if meta["positional"]:
                 group.add_argument(field.name, **{"default": None, **options})
             else:
-                group.add_argument(*_names(field), dest=field.name, **options)
+                names = [*meta["names"], _long(field.name)]
+                group.add_argument(*names, dest=field.name, **options)
         return result
 
     @classmethod
@@ -205,7 +205,7 @@ class Command:
             if field.name not in names or value == _default(field):
                 continue
             if isinstance(value, bool):
-                words.append(name if value else name.replace("--", "--no-", 1))
+                words.append(name)
             elif isinstance(value, Mapping):
                 words += [name, *(f"{key}:{item}" for key, item in value.items())]
             else:
@@ -257,10 +257,6 @@ def command(flags: type[Any], function: Callable[[Any], int]) -> Callable[..., i
         return run(lambda: function(flags.parse(sys.argv[1:] if argv is None else argv)))
 
     return main
-
-
-def _names(field: "dataclasses.Field[Any]") -> list[str]:
-    return [*field.metadata["names"], _long(field.name)]
 
 
 def _long(name: str) -> str:

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, interrupts_held, one_line
+from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, one_line
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, RunInUse, require_writable
@@ -154,6 +154,7 @@ def carry_out(run: GridRun, command: str, stop: Path) -> tuple[str, str]:
 def _begin_worker() -> None:
     """Let a process of this machine's pool end when the grid's process does, however that ends."""
     warnings.simplefilter("ignore")  # which the process that checked the grid has shown
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is for the grid's process
     # A batch system sends it to all processes, and the file asks the runs to stop. It is not
     # ignored, as processes of environments, which are ended by it, would inherit that.
     signal.signal(signal.SIGTERM, lambda number, frame: None)
@@ -247,9 +248,7 @@ def run_grid(
         with hosts as executor, interrupts(ask_to_stop) as received:
             left = todo
             while left and not received:
-                with interrupts_held():  # by the processes that this starts
-                    futures = {executor.submit(carry_out, run, command, stop_file): run
-                               for run in left}  # fmt: skip
+                futures = {executor.submit(carry_out, run, command, stop_file): run for run in left}
                 for future in as_completed(futures):
                     run = futures[future]
                     before = run.state

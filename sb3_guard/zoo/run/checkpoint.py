@@ -9,7 +9,7 @@ import pickle
 import random
 import time
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,21 +57,11 @@ class ResumableEnv(gym.Wrapper):
     by ``env_method`` even in another process.
     """
 
-    def layers(self) -> list[Any]:
-        """The wrappers from the outside in, and the environment itself last."""
-        layers: list[Any] = []
-        env: gym.Env = self.env
-        while isinstance(env, gym.Wrapper):
-            layers.append(env)
-            env = env.env
-        return [*layers, env]
-
     def state(self) -> bytes | None:
         """Everything the next step depends on; None if it can't be pickled."""
-        *wrappers, base = self.layers()
-        own = hasattr(base, "state") and hasattr(base, "restore")
-        parts = [_attributes(wrapper) for wrapper in wrappers]
-        parts.append(base.state() if own else _attributes(base))
+        parts = [
+            layer.state() if _tells(layer) else _attributes(layer) for layer in layers(self.env)
+        ]
         try:
             return cloudpickle.dumps(parts)
         except Exception:
@@ -80,49 +70,58 @@ class ResumableEnv(gym.Wrapper):
 
     def restore(self, state: bytes) -> None:
         """Go on from :meth:`state`; the environment has been reset before."""
-        *wrappers, base = self.layers()
-        *parts, last = pickle.loads(state)
-        for wrapper, attributes in zip(wrappers, parts, strict=True):
-            vars(wrapper).update(attributes)
-        if hasattr(base, "state") and hasattr(base, "restore"):
-            base.restore(last)
-        else:
-            vars(base).update(last)
+        for layer, part in zip(layers(self.env), pickle.loads(state), strict=True):
+            if _tells(layer):
+                layer.restore(part)
+            else:
+                vars(layer).update(part)
 
 
-def capture(layer: VecEnv) -> list[Any]:
+def layers(env: Any) -> Iterator[Any]:
+    """The wrappers of an environment from the outside in, and the environment itself last."""
+    while isinstance(env, gym.Wrapper | VecEnvWrapper):
+        yield env
+        env = env.env if isinstance(env, gym.Wrapper) else env.venv
+    yield env
+
+
+def _tells(layer: Any) -> bool:
+    return hasattr(type(layer), "state") and hasattr(type(layer), "restore")
+
+
+def capture(env: VecEnv) -> list[Any]:
     """
     The state of a vectorised environment: of its wrappers from the outside in, then its own.
 
     :return: picklable parts; the last one is None if the environment itself can't tell its state
     """
-    own: Any = layer if hasattr(type(layer), "state") else None
-    if isinstance(layer, VecEnvWrapper):
-        return [_attributes(layer) if own is None else own.state(), *capture(layer.venv)]
-    try:
-        states = layer.env_method("state") if own is None else own.state()
-    except AttributeError:
-        return [None]
-    return [None if own is None and None in states else states]
+    parts: list[Any] = []
+    for layer in layers(env):
+        if _tells(layer):
+            parts.append(layer.state())
+        elif isinstance(layer, VecEnvWrapper):
+            parts.append(_attributes(layer))
+        else:
+            states = layer.env_method("state") if layer.has_attr("state") else [None]
+            parts.append(None if None in states else states)
+    return parts
 
 
-def restore(layer: Any, parts: list[Any]) -> None:
+def restore(env: VecEnv, parts: list[Any]) -> None:
     """
     Put an environment that was made the same way, and reset, into a captured state.
 
     :raises UsageError: it was made in another way, as by another version
     """
-    part, *rest = parts
-    if hasattr(type(layer), "restore") and part is not None:
-        with explained("the checkpoint belongs to another environment", ValueError):
-            layer.restore(part)
-    elif rest:
-        vars(layer).update(part)
-    else:
-        for index, state in enumerate(part or []):
-            layer.env_method("restore", state, indices=index)
-    if rest:
-        restore(layer.venv, rest)
+    for layer, part in zip(layers(env), parts, strict=True):
+        if _tells(layer):
+            with explained("the checkpoint belongs to another environment", ValueError):
+                layer.restore(part)
+        elif isinstance(layer, VecEnvWrapper):
+            vars(layer).update(part)
+        else:
+            for index, state in enumerate(part or []):
+                layer.env_method("restore", state, indices=index)
 
 
 class Interrupted(Exception):

@@ -2,8 +2,8 @@
 
 They are RL-Zoo's files: ``hyperparams/<algo>.yml`` with a ``default`` entry, entries for single
 environments or patterns of them (``Safety*``), and YAML anchors. What is read stays plain data, so
-that the run folder's ``config.yml`` says exactly what was used; only :func:`build` makes objects of
-it.
+that the run folder's ``config.yml`` says exactly what was used; only the last three functions here
+make objects of it.
 """
 
 import importlib
@@ -12,16 +12,15 @@ import math
 import runpy
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import (
     ActionNoise,
     NormalActionNoise,
@@ -35,7 +34,6 @@ from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.names import (
     PAPER,
     as_data,
-    classes,
     import_class,
     refuse_places,
     with_classes,
@@ -220,54 +218,13 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     return dict(sorted(checked.items()))
 
 
-@dataclass
-class Setup:
-    """Hyperparameters as objects, ready for the constructors."""
-
-    model: dict[str, Any]  # arguments of the algorithm
-    n_envs: int
-    n_timesteps: int
-    normalize: dict[str, Any] | None = None  # arguments of VecNormalize; None: not used
-    frame_stack: int | None = None
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
-    env_wrapper: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
-    vec_env_wrapper: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
-    monitor_kwargs: dict[str, Any] = field(default_factory=dict)
-    callback: Any = None  # names, see callbacks()
-    selection_limit: float | list[float] | None = None
-    noise_type: str | None = None
-    noise_std: float = 0.0  # in the units of the actions
-
-    @property
-    def cuts_episodes(self) -> bool:
-        """Whether a wrapper ends episodes of the training alone, as EarlyTermination does."""
-        wrappers = [*self.env_wrapper, *self.vec_env_wrapper]
-        return any(getattr(cls, "training_only", False) for cls, _ in wrappers)
-
-    def callbacks(self) -> list[BaseCallback]:
-        """The callbacks, made only where somebody trains."""
-        callbacks = classes("callback", self.callback)
-        with explained("a callback can't be made"):
-            return [cls(**kwargs) for cls, kwargs in callbacks]
-
-    def action_noise(self, actions: int) -> ActionNoise | None:
-        """Exploration noise for this number of action dimensions, if there is any."""
-        if self.noise_type is None:
-            return None
-        mean, std = np.zeros(actions), np.full(actions, self.noise_std)
-        if self.noise_type == "normal":
-            return NormalActionNoise(mean, std)
-        return OrnsteinUhlenbeckActionNoise(mean, std)
-
-
-def build(values: Mapping[str, Any]) -> Setup:
+def model_arguments(values: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Make objects of checked hyperparameters: schedules, classes, wrappers.
+    What the algorithm's constructor takes, of checked hyperparameters: schedules and classes made.
 
     :raises UsageError: text that should name a class or be an expression does not
     """
-    not_models = {**RUN_KEYS, **NOISE_KEYS}
-    model = {name: value for name, value in values.items() if name not in not_models}
+    model = {n: value for n, value in values.items() if n not in {**RUN_KEYS, **NOISE_KEYS}}
     for name, value in model.items():
         if name == "policy":
             if "." in value:
@@ -284,13 +241,21 @@ def build(values: Mapping[str, Any]) -> Setup:
             model[name] = tuple(value)
         elif isinstance(value, str) and name.endswith("_class"):
             model[name] = import_class(name, value, BaseBuffer)
-    run = {n: value for n, value in values.items() if n in not_models and value is not None}
-    if run.get("normalize"):
-        # Returns are scaled by the discount they are learned with.
-        learned = {"gamma": values["gamma"]} if "gamma" in values else {}
-        run["normalize"] = {**learned, **({} if run["normalize"] is True else run["normalize"])}
-    else:
-        run["normalize"] = None
-    for name in ("env_wrapper", "vec_env_wrapper"):
-        run[name] = classes(name, run.get(name))
-    return Setup(model, **run)
+    return model
+
+
+def normalization(values: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Arguments of VecNormalize; None: it is not used."""
+    if not (given := values.get("normalize")):
+        return None
+    # Returns are scaled by the discount they are learned with.
+    learned = {"gamma": values["gamma"]} if "gamma" in values else {}
+    return learned | (given if isinstance(given, dict) else {})
+
+
+def action_noise(values: Mapping[str, Any], space: spaces.Box) -> ActionNoise | None:
+    """Exploration noise for actions of a space, if there is any."""
+    noises = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
+    if (kind := values.get("noise_type")) is None:
+        return None
+    return noises[kind](np.zeros(space.shape), np.full(space.shape, values.get("noise_std", 0.0)))

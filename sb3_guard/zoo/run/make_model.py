@@ -87,7 +87,7 @@ def make_model(
         objects = {n: v for n, v in hyperparams.items() if n in names and not is_data(v)}
         flags.hyperparams = {n: v for n, v in hyperparams.items() if n not in objects}
         run = Run.check(flags)
-        run.setup.model.update(objects)
+        run.arguments.update(objects)
         model = run.make_model()
     except UsageError as error:
         raise ValueError(str(error)) from error

@@ -230,14 +230,4 @@ def summary(result: Mapping[str, Any]) -> str:
             f"{words}{beside(cost.get('physics_errors', 0))}"
         )
     lines.append(f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}")
-    for name, played in result["final"].items():
-        total = estimate(np.array(played["costs"], float))
-        lines.append(
-            f"  final, {name:<12}return {np.mean(played['returns']):.3f}, cost {total}, "
-            f"{len(played['costs'])} episodes{beside(total.diverged)}"
-        )
-        for key, values in played.get("bounded", {}).items():
-            mean, limit = estimate(np.array(values, float)), result["costs"][key]["limit"]
-            against = "" if limit is None else f"   {mean.against(limit)}"
-            lines.append(f"    {bounded_name(key, limit_on):<16} {mean}{against}")
     return "\n".join(lines)

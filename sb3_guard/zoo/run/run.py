@@ -42,14 +42,13 @@ from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.costs import read_costs
 from sb3_guard.fields import plain
 from sb3_guard.zoo.cli.flags import IDENTITY, START
-from sb3_guard.zoo.cli.names import FOLLOWED, refuse_places, require_named
+from sb3_guard.zoo.cli.names import FOLLOWED, classes, refuse_places, require_named
 from sb3_guard.zoo.cli.usage import (
     TrainingStopped,
     UsageError,
     explained,
     import_packages,
     interrupts,
-    interrupts_held,
     one_line,
 )
 from sb3_guard.zoo.run.algos import algorithm
@@ -64,9 +63,10 @@ from sb3_guard.zoo.run.checkpoint import (
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, is_run, lock, run_path, write_config
 from sb3_guard.zoo.run.hyperparams import (
-    Setup,
-    build,
+    action_noise,
     check,
+    model_arguments,
+    normalization,
     read_hyperparams,
     without_withdrawn,
 )
@@ -132,9 +132,24 @@ class Run:
         return source_of(self.flags.env)
 
     @cached_property
-    def setup(self) -> Setup:
-        """Hyperparameters as objects; raises :class:`UsageError` where a name means nothing."""
-        return build(self.hyperparams)
+    def arguments(self) -> dict[str, Any]:
+        """Of the algorithm; raises :class:`UsageError` where a name means nothing."""
+        return model_arguments(self.hyperparams)
+
+    def wrappers(self, kind: str, evaluation: bool = False) -> list[tuple[Any, dict[str, Any]]]:
+        """
+        The classes that ``env_wrapper`` or ``vec_env_wrapper`` names, and their arguments.
+
+        :param evaluation: without what ends episodes early, or changes rewards
+        """
+        wrappers = []
+        for cls, arguments in classes(kind, self.hyperparams.get(kind)):
+            if evaluation:
+                for name in getattr(cls, "training_arguments", ()):
+                    arguments.pop(name, None)
+            if not (evaluation and getattr(cls, "training_only", False)):
+                wrappers.append((cls, arguments))
+        return wrappers
 
     @property
     def constrained(self) -> bool:
@@ -145,7 +160,7 @@ class Run:
     def cost_keys(self) -> tuple[str, ...]:
         """Entries of info that are costs."""
         ours = hasattr(self.algorithm, "constrained")
-        values = self.setup.model if ours else self.setup.monitor_kwargs
+        values = self.arguments if ours else self.hyperparams.get("monitor_kwargs", {})
         return tuple(values.get("cost_keys") or ("cost",))
 
     # Checked
@@ -190,9 +205,10 @@ class Run:
 
         :raises UsageError: ``selection_limit`` does not fit the cost keys
         """
-        cost_limit = self.setup.model.get("cost_limit") if self.constrained else None
+        values = self.hyperparams
+        cost_limit = values.get("cost_limit") if self.constrained else None
         with explained("hyperparameter", ValueError):
-            return selection_limits(self.setup.selection_limit, cost_limit, self.cost_keys)
+            return selection_limits(values.get("selection_limit"), cost_limit, self.cost_keys)
 
     def try_out(self) -> None:
         """
@@ -207,7 +223,7 @@ class Run:
             env.reset()
             infos = env.step(np.array([env.action_space.sample()]))[3]
             if self.constrained:
-                optional = self.setup.model.get("missing_cost") == "zero"
+                optional = self.hyperparams.get("missing_cost") == "zero"
                 read_costs(infos, self.cost_keys, zero_if_missing=optional)
 
     # Made
@@ -221,7 +237,9 @@ class Run:
         """
         flags = self.flags
         self.try_out()
-        self.callbacks = self.setup.callbacks()
+        named = classes("callback", self.hyperparams.get("callback"))
+        with explained("a callback can't be made"):
+            self.callbacks = [cls(**arguments) for cls, arguments in named]
         if self.folder is not None:
             self.begun = read_checkpoint(self.folder.checkpoint)
         self.model = self.make_model()
@@ -232,10 +250,10 @@ class Run:
                 self.limits()
                 self.evaluation = CostEvalCallback(
                     self.make_evaluation_envs(flags.eval_episodes),
-                    selection_limit=self.setup.selection_limit,
+                    selection_limit=self.hyperparams.get("selection_limit"),
                     seed=evaluation_seed(flags.seed),
                     n_eval_episodes=flags.eval_episodes,
-                    eval_freq=max(flags.eval_freq // self.setup.n_envs, 1),
+                    eval_freq=max(flags.eval_freq // self.hyperparams["n_envs"], 1),
                     verbose=int(flags.verbose > 0),
                 )
                 self.evaluation.model = self.model
@@ -258,7 +276,7 @@ class Run:
         if self.flags.certify is not None:
             return self.flags.certify
         episode = time_limit(self.env)  # None: unknown
-        return MOST if episode and self.setup.n_timesteps >= 1000 * episode else 0
+        return MOST if episode and self.hyperparams["n_timesteps"] >= 1000 * episode else 0
 
     def close(self) -> None:
         """Release the environments, and let Weights & Biases have what it has not yet."""
@@ -320,11 +338,13 @@ class Run:
         :param render_mode: as for :func:`gymnasium.make`
         :raises UsageError: the environment refuses an argument, or can't be made
         """
-        flags, setup, source = self.flags, self.setup, self.source
+        flags, values, source = self.flags, self.hyperparams, self.source
         vec_env = vec_env or flags.vec_env
-        packages, single = flags.gym_packages, _wrappers(setup.env_wrapper, evaluation)
+        packages, single = flags.gym_packages, self.wrappers("env_wrapper", evaluation)
 
         def make(**arguments: Any) -> gym.Env:
+            if vec_env == "subproc":  # Ctrl-C is for the run, which finishes its rollout
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
             import_packages(packages)  # which a process of its own has not imported
             return source.make(**arguments)
 
@@ -333,25 +353,24 @@ class Run:
                 env = cls(env, **arguments)
             return ResumableEnv(env)
 
-        drawn = f" with render_mode={render_mode!r}" if render_mode else ""
+        monitored = {"cost_keys": self.cost_keys, **values.get("monitor_kwargs", {})}
         errors = (*BAD_ARGUMENTS, *PROCESS_DIED, MemoryError)
         with ExitStack() as made:
-            # Processes see no interrupt, so that a rollout under way can be finished.
-            with explained(f"can't make {source.env_id}{drawn}", *errors), interrupts_held():
+            with explained(f"can't make {source.env_id}", *errors):
                 env = make_vec_env(
                     source._replace(make=make),
                     n_envs,
                     seed,
                     vec_env=vec_env,
-                    env_kwargs=setup.env_kwargs if env_kwargs is None else env_kwargs,
+                    env_kwargs=values.get("env_kwargs") if env_kwargs is None else env_kwargs,
                     num_threads=flags.num_threads if flags.num_threads > 0 else None,
                     render_mode=render_mode,
-                    wrapper_class=wrap if vec_env != "native" or setup.env_wrapper else None,
-                    monitor_kwargs={"cost_keys": self.cost_keys, **setup.monitor_kwargs},
+                    wrapper_class=wrap if vec_env != "native" or single else None,
+                    monitor_kwargs=monitored,
                 )
                 made.callback(env.close)
             with explained(f"can't wrap {source.env_id}", *BAD_ARGUMENTS):
-                for cls, arguments in _wrappers(setup.vec_env_wrapper, evaluation):
+                for cls, arguments in self.wrappers("vec_env_wrapper", evaluation):
                     env = cls(env, **arguments)
                 # A replay buffer keeps what VecNormalize is given, which thus has all of it.
                 if replays := issubclass(self.algorithm, OffPolicyAlgorithm):
@@ -362,8 +381,8 @@ class Run:
                     check_normalizer(normalizer, env.observation_space)
                     normalizer.set_venv(env)
                     env = normalizer
-                elif setup.normalize is not None:
-                    env = VecNormalize(env, **setup.normalize)
+                elif (scaled := normalization(values)) is not None:
+                    env = VecNormalize(env, **scaled)
                 if evaluation and isinstance(env, VecNormalize):
                     env.training = env.norm_reward = False
             made.pop_all()
@@ -371,8 +390,8 @@ class Run:
 
     def _reshaped(self, env: VecEnv) -> VecEnv:
         """Frames stacked, and images channels first, in evaluation as in training."""
-        if self.setup.frame_stack is not None:
-            env = VecFrameStack(env, self.setup.frame_stack)
+        if frames := self.hyperparams.get("frame_stack"):
+            env = VecFrameStack(env, frames)
         return BaseAlgorithm._wrap_env(env, monitor_wrapper=False)
 
     def make_evaluation_envs(self, episodes: int) -> VecEnv:
@@ -402,7 +421,7 @@ class Run:
         if flags.num_threads > 0:
             th.set_num_threads(flags.num_threads)
         set_random_seed(flags.seed)
-        env = self.make_envs(self.setup.n_envs, flags.seed)
+        env = self.make_envs(self.hyperparams["n_envs"], flags.seed)
         try:
             model = self._make_model(env)
             seed_rows(env, flags.seed)
@@ -415,18 +434,18 @@ class Run:
         flags = self.flags
         if self.folder is not None:
             return load_model(self.algorithm, self.folder.checkpoint, env, flags.device)
-        arguments = copy.deepcopy(self.setup.model)  # some algorithms add to their policy_kwargs
+        arguments = copy.deepcopy(self.arguments)  # some algorithms add to their policy_kwargs
         arguments["seed"] = flags.seed
         if flags.trained_agent:
             # What the networks are is for the saved agent to say.
             for name in ("policy", "policy_kwargs"):
                 arguments.pop(name, None)
             path = Path(flags.trained_agent)
-            if self.setup.normalize is not None and self._statistics_beside() is None:
+            if self.hyperparams.get("normalize") and self._statistics_beside() is None:
                 print(f"no vecnormalize.pkl next to {path}: observation statistics begin anew")
             return load_model(self.algorithm, path, env, flags.device, **arguments)
         space = env.action_space
-        noise = self.setup.action_noise(space.shape[0]) if isinstance(space, spaces.Box) else None
+        noise = action_noise(self.hyperparams, space) if isinstance(space, spaces.Box) else None
         if noise is not None:
             arguments["action_noise"] = noise
         errors = (*BAD_ARGUMENTS, RuntimeError, MemoryError)
@@ -439,7 +458,7 @@ class Run:
     def _statistics_beside(self) -> Path | None:
         """Observation statistics that a run or an evaluation wrote next to its model."""
         agent = Path(self.flags.trained_agent)
-        if self.folder is not None or not agent.name or self.setup.normalize is None:
+        if self.folder is not None or not agent.name or not self.hyperparams.get("normalize"):
             return None
         best = agent.with_name(f"{agent.stem}_vecnormalize.pkl")  # of best_model.zip
         if best.is_file():
@@ -544,7 +563,7 @@ class Run:
                     f"{name} = {new} contradicts {old}, with which {folder.path} was trained; put "
                     "it back or leave it out, or start a new run with it, without -i"
                 )
-            done, total = state["num_timesteps"], run.setup.n_timesteps
+            done, total = state["num_timesteps"], run.hyperparams["n_timesteps"]
             if 0 < given.n_timesteps < done or (total <= done and folder.read_result() is not None):
                 print(f"{folder.path} is finished: {done} steps; a larger -n continues it")
                 return 0
@@ -591,7 +610,9 @@ class Run:
                 )
 
         began = time.monotonic()
-        epochs = Epochs(self.setup.n_timesteps, cut=self.setup.cuts_episodes)
+        wrappers = [*self.wrappers("env_wrapper"), *self.wrappers("vec_env_wrapper")]
+        cut_short = any(getattr(cls, "training_only", False) for cls, _ in wrappers)
+        epochs = Epochs(self.hyperparams["n_timesteps"], cut=cut_short)
         with interrupts(stop) as received:
             checkpoints = self._checkpoints(
                 folder, epochs, lambda: bool(received) or asked_to_stop()
@@ -624,7 +645,7 @@ class Run:
         if not isinstance(self.model, Constrained):
             others.append(LogCosts())
         if flags.save_freq > 0:
-            every = max(flags.save_freq // self.setup.n_envs, 1)
+            every = max(flags.save_freq // self.hyperparams["n_envs"], 1)
             others.append(CheckpointCallback(every, str(folder.path), save_vecnormalize=True))
         if self.evaluation is not None:
             self.evaluation.log_path = str(folder.path / "evaluations")
@@ -644,7 +665,7 @@ class Run:
 
     def _learn(self, folder: RunFolder, checkpoints: Checkpoints) -> bool:
         """Whether training came to its end."""
-        left = self.setup.n_timesteps - (self.model.num_timesteps if self.begun else 0)
+        left = self.hyperparams["n_timesteps"] - (self.model.num_timesteps if self.begun else 0)
         interval = self.flags.log_interval
         kwargs: dict[str, Any] = {}
         if interval != -1:
@@ -722,6 +743,8 @@ class Run:
                 )
                 if not len(played):  # no episode of the greedy policy ends
                     continue
+                if self.flags.verbose > 0:
+                    print(f"Final policy, {name} actions, {played}")
                 final[name] = {
                     "returns": rounded(played.returns),
                     "costs": rounded(played.costs),
@@ -731,19 +754,6 @@ class Run:
                     bounded = zip(played.cost_keys, played.limited.T, strict=True)
                     final[name]["bounded"] = {key: rounded(costs) for key, costs in bounded}
         return final
-
-
-def _wrappers(
-    wrappers: list[tuple[Any, dict[str, Any]]], evaluation: bool
-) -> list[tuple[Any, dict[str, Any]]]:
-    """Evaluation is without what ends episodes early, or changes rewards."""
-    if not evaluation:
-        return wrappers
-    return [
-        (cls, {k: v for k, v in given.items() if k not in getattr(cls, "training_arguments", ())})
-        for cls, given in wrappers
-        if not getattr(cls, "training_only", False)
-    ]
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:

@@ -6,6 +6,7 @@ report; ``study.optimize``, samplers, pruners and storages are Optuna's.
 """
 
 import multiprocessing
+import signal
 import sys
 import time
 import warnings
@@ -23,7 +24,7 @@ from optuna.storages import JournalStorage
 from optuna.study import MaxTrialsCallback
 from optuna.trial import FrozenTrial
 
-from sb3_guard.zoo.cli.usage import UsageError, interrupts, interrupts_held, run
+from sb3_guard.zoo.cli.usage import UsageError, interrupts, run
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import folder_name, require_writable
 from sb3_guard.zoo.run.hyperparams import check
@@ -53,7 +54,7 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
         hyperparams["selection_limit"] = limit[0] if len(limit) == 1 else limit
     how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "verbose": 0, "progress": False}
     run = Run.check(RunFlags.shared(flags, certify=0, **how))
-    values, n_timesteps = run.hyperparams, run.setup.n_timesteps
+    values, n_timesteps = run.hyperparams, run.hyperparams["n_timesteps"]
     space = read_space(flags.search_space) if flags.search_space else None
     search = Search(flags.algo, values, space, fixed)
     for corner in search.corners():
@@ -193,9 +194,8 @@ def _other_workers(flags: TuneFlags, n: int) -> Iterator[list[BaseProcess]]:
     others: list[BaseProcess] = [
         context.Process(target=_work_beside, args=(flags,)) for _ in range(n)
     ]
-    with interrupts_held():  # by those that inherit it; Ctrl-C reaches this process
-        for process in others:
-            process.start()
+    for process in others:
+        process.start()
     try:
         yield others
     finally:
@@ -206,6 +206,7 @@ def _other_workers(flags: TuneFlags, n: int) -> Iterator[list[BaseProcess]]:
 
 
 def _work_beside(flags: TuneFlags) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that began it
     sys.exit(run(lambda: tune(flags, main=False)))
 
 

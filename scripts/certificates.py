@@ -3,10 +3,10 @@
 ``python scripts/certificates.py`` draws episode costs in place of playing them: of agents whose
 true mean cost is just above the limit, where every certificate is false, and of agents at 0.7 of
 it. Costs are exponential; zero-inflated (90 % zeros, the others constant, gamma or exponential);
-log-normal; exponential, but for one in a hundred that is 40 limits; or drawn from the final episodes
-of a run in ``docs/data``. *alone* is one agent, with every look; *delivered* a training whose
-candidates are all alike: screening, then up to three tries with fresh episodes. The target is 5 %
-of false certificates at most.
+log-normal; exponential, but for one in a hundred that is 40 limits; or drawn from the final
+episodes of a run in ``docs/data``. *alone* is one agent, with every look; *delivered* a training
+whose candidates are all alike: screening, then up to three tries with fresh episodes. The target is
+5 % of false certificates at most.
 """
 
 import argparse

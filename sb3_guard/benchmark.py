@@ -5,16 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from sb3_guard.zoo.cli.flags import HOST, IDENTITY, command, flag
-from sb3_guard.zoo.cli.usage import (
-    UsageError,
-    read_mapping,
-)
-from sb3_guard.zoo.run.flags import (
-    EvaluationFlags,
-    RunFlags,
-    TrainingFlags,
-)
+from sb3_guard.zoo.cli.flags import command, flag
+from sb3_guard.zoo.cli.usage import UsageError, read_mapping
+from sb3_guard.zoo.run.flags import EvaluationFlags, RunFlags, TrainingFlags
 
 # Flags that no grid file states
 HOW = ("grid", "log_folder", "dry_run", "scheduler", "verbose")
@@ -57,17 +50,17 @@ class Flags(EvaluationFlags, TrainingFlags):
   sb3-guard benchmark --preset paper45 --scheduler tcp://node1:8786
 """
 
-    envs: list[str] | None = flag(metavar="ENV", role=IDENTITY, exclusive="what")
-    preset: str | None = flag(metavar="NAME", role=IDENTITY, exclusive="what")
-    algos: list[str] | None = flag(metavar="ALGO", role=IDENTITY)
-    seeds: list[int] = flag(default=[0, 1], low=0, high=2**32, metavar="K", role=IDENTITY)
-    scale: float = flag(default=1.0, low=0, ends="()", metavar="X", role=IDENTITY)
-    grid: str | None = flag(metavar="FILE", role=HOST)
-    log_folder: str = flag("-f", default="logs/benchmark", metavar="DIR", role=HOST)
-    dry_run: bool = flag(default=False, role=HOST)
-    jobs: int | None = flag(low=1, metavar="N", role=HOST)
-    scheduler: str | None = flag(metavar="ADDRESS", role=HOST)
-    verbose: Literal[0, 1] = flag(default=1, role=HOST)
+    envs: list[str] | None = flag(metavar="ENV", exclusive="what")
+    preset: str | None = flag(metavar="NAME", exclusive="what")
+    algos: list[str] | None = flag(metavar="ALGO")
+    seeds: list[int] = flag(default=[0, 1], low=0, high=2**32, metavar="K")
+    scale: float = flag(default=1.0, low=0, ends="()", metavar="X")
+    grid: str | None = flag(metavar="FILE")
+    log_folder: str = flag("-f", default="logs/benchmark", metavar="DIR")
+    dry_run: bool = flag(default=False)
+    jobs: int | None = flag(low=1, metavar="N")
+    scheduler: str | None = flag(metavar="ADDRESS")
+    verbose: Literal[0, 1] = flag(default=1)
 
     def pairs(self) -> list[tuple[str, str]]:
         """

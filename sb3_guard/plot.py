@@ -14,7 +14,6 @@ from sb3_guard import __version__
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import UsageError
-from sb3_guard.zoo.grids.presets import PRESETS
 from sb3_guard.zoo.results import figures, tables
 from sb3_guard.zoo.results import runs as reading
 from sb3_guard.zoo.results.figure_data import Data
@@ -68,7 +67,8 @@ def plot(flags: Flags) -> int:
     """
     Carry out the command.
 
-    :return: exit status, 1 if a figure lacks all its runs
+    :raises UsageError: there are no such runs, none of a figure that is asked for by name, or runs
+        that can't be averaged
     """
     files = [*map(Path, flags.table)]
     for file in files:
@@ -95,7 +95,7 @@ def plot(flags: Flags) -> int:
     for file in means:
         tables.write_tables(file, data)
         print(f"wrote {file}")
-    status = _draw(data, ["curves"] if by_default else flags.figure, flags)
+    _draw(data, ["curves"] if by_default else flags.figure, flags)
     if flags.report:
         title = f"Safe reinforcement learning: {', '.join(flags.folders)}"
         page = page_of(data, title, results.left_out)
@@ -106,26 +106,20 @@ def plot(flags: Flags) -> int:
         for title, table in tables.tables(data).items():
             print(f"\n{title}\n\n{tables.terminal(table)}\n")
             print(textwrap.fill(tables.CAPTIONS[title], 100))
-    return status
+    return 0
 
 
-def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> int:
-    """Draw figures; 1 if one that was asked for by name could not be drawn."""
-    status = 0
+def _draw(data: Data, kinds: Sequence[str], flags: Flags) -> None:
     for kind in FIGURES if "all" in kinds else kinds:
         drawn = draw(kind, data)
         if kind in kinds and not drawn:
-            lists = f"; sb3-guard benchmark --preset {kind} --dry-run lists them" * (
-                kind in PRESETS
-            )
-            print(f"{kind} is not drawn: there are no runs for it{lists}", file=sys.stderr)
-            status = 1
+            lists = f"sb3-guard benchmark --preset {kind} --dry-run lists them"
+            raise UsageError(f"{kind} is not drawn: there are no runs for it; {lists}")
         for name, figure in drawn.items():
             for form in dict.fromkeys(flags.format):
                 path = Path(flags.output) / f"{name}.{form}"
                 figures.save(figure, path)
                 print(f"wrote {path}")
-    return status
 
 
 def page_of(data: Data, title: str, left_out: Mapping[str, str]) -> str:

@@ -50,17 +50,15 @@ class Flags(Command):
 
 
 def measures(result: Mapping[str, Any]) -> dict[str, float]:
-    """By key of :data:`MEASURES` the numbers of a result; older ones have no final episodes."""
-    values = {n: math.nan if result[n] is None else result[n] for n in ("return", "cost")}
-    if played := (result.get("final") or {}).get("stochastic"):
-        values |= {f"final_{name}": fmean(played[f"{name}s"]) for name in ("return", "cost")}
-    return values
+    """By key of :data:`MEASURES` the numbers of a result."""
+    played = result["final"]["stochastic"]
+    final = {f"final_{name}": fmean(played[f"{name}s"]) for name in ("return", "cost")}
+    return {"return": result["return"], "cost": result["cost"], **final}
 
 
-def final_hash(result: Mapping[str, Any]) -> str | None:
-    """SHA-256 of the final episodes, from which tiers are made; older results have none."""
-    final = result.get("final") or None
-    return final and hashlib.sha256(json.dumps(final, sort_keys=True).encode()).hexdigest()
+def final_hash(result: Mapping[str, Any]) -> str:
+    """SHA-256 of the final episodes, from which tiers are made."""
+    return hashlib.sha256(json.dumps(result["final"], sort_keys=True).encode()).hexdigest()
 
 
 def differences(row: Mapping[str, str], result: Mapping[str, Any]) -> list[str]:

@@ -21,7 +21,7 @@ from archives import DATA, DOCS, archives, pack, unpacked
 from sb3_guard.reproduce import final_hash, measures
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.results.runs import read_episodes, select
-from sb3_guard.zoo.results.splits import judge
+from sb3_guard.zoo.results.statistics import judge
 from sb3_guard.zoo.results.tables import number
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import RunFolder
@@ -61,7 +61,7 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     What the packed logs say.
 
-    :return: the rows of the page, as :func:`~sb3_guard.zoo.results.splits.judge` has them, with
+    :return: the rows of the page, as :func:`~sb3_guard.zoo.results.statistics.judge` has them, with
         ``budget`` (millions of steps), ``cost_total`` and ``row``, the first run's; and those of
         the package, a row per run
     """
@@ -87,7 +87,8 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
             extra = own.groupby(["suite", "algo"]).agg(
                 cost_total=("cost_total", "mean"), row=("row", "first")
             )
-            judged = judge(own, own["suite"].map(limit_of))
+            limits = own["suite"].map(limit_of)
+            judged = judge(own.assign(cost_limit=limits, limits=limits.astype(str)))
             judged = judged.merge(extra.reset_index(), on=["suite", "algo"])
             pages.append(judged.assign(budget=budget))
     return pd.concat(pages), pd.DataFrame(runs)

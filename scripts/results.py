@@ -36,9 +36,10 @@ from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish, save
 from sb3_guard.zoo.results.paper import draw
 from sb3_guard.zoo.results.runs import read_episodes, select
-from sb3_guard.zoo.results.splits import SPLITS, judge
 from sb3_guard.zoo.results.statistics import (
+    SPLITS,
     aggregate,
+    judge,
     judging_limits,
     last_epochs,
     normalize,

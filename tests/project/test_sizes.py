@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_630,
+    "sb3_guard": 26_557,
     "sb3_guard/envs": 8_915,
     "sb3_guard/algorithms": 5_829,
     "sb3_guard/common": 2_525,
     "sb3_guard/deployment": 916,
-    "harness": 8_445,
-    "tests": 24_349,
+    "harness": 8_372,
+    "tests": 24_343,
 }
-WORDS = 71_724  # of all tracked markdown but the changelog
+WORDS = 71_723  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -10,7 +10,7 @@ from worlds import own_parts
 from sb3_guard import CPO, CostEvalCallback, enjoy, evaluate_policy, make_vec_env, plot, train
 from sb3_guard.envs import register_robot, registry
 from sb3_guard.zoo.results.runs import read_curve
-from sb3_guard.zoo.results.splits import read_splits
+from sb3_guard.zoo.results.statistics import read_splits
 
 NAN = """<mujoco><option gravity="0 0 nan"/><worldbody><body name="base" pos="0 0 .2"><freejoint/>
 <geom size=".1"/><body name="leg"><joint name="hip" axis="0 1 0" range="-1 1"/><geom size=".1"/>

@@ -575,7 +575,7 @@ def test_a_study_is_continued_as_it_was_begun(tmp_path, folder, monkeypatch, cap
 def test_files_that_are_no_studies_are_left_alone(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"two lines\nof text")
-    with pytest.raises(UsageError, match="not a study"):
+    with pytest.raises(UsageError, match="as a study"):
         studies.open_storage(str(path), tmp_path)
     assert path.read_bytes() == b"two lines\nof text" and list(tmp_path.iterdir()) == [path]
 

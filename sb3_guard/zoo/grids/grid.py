@@ -230,9 +230,9 @@ def run_grid(
     :raises UsageError: a worker or the scheduler is gone
     """
 
-    def say(text: str) -> None:
-        if verbose:
-            print(text, flush=True)
+    def say(text: str, error: str = "") -> None:
+        if verbose or error:
+            print(text, file=sys.stderr if error else sys.stdout, flush=True)
 
     def ask_to_stop(number: int) -> None:
         stop_file.touch()
@@ -258,16 +258,13 @@ def run_grid(
                     ):
                         run.state, run.error = future.result()
                     if run.state not in ("waiting", before):
-                        say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}")
+                        say(f"{time.strftime('%H:%M:%S')}  {run.outcome()}", run.error)
                 # Those that another process has may be done, or free, in a while.
                 left = [run for run in todo if run.state == "in use"]
                 time.sleep(ASK_AGAIN if left else 0.0)
         status = 128 + received[0] if received else 0
         stop_file.unlink(missing_ok=True)
         say(f"{folder}: {summary(runs)}")
-    for run in todo:
-        if run.error:
-            print(f"{run.state}: {run}: {run.error}", file=sys.stderr)
     if all(run.state == "done" for run in runs):
         say(f"See the results with: sb3-guard plot {shlex.quote(str(folder))}")
         return status

@@ -12,8 +12,13 @@ import numpy as np
 import pandas as pd
 
 from sb3_guard.zoo.results.runs import REFERENCE, read_curve
-from sb3_guard.zoo.results.splits import judge
-from sb3_guard.zoo.results.statistics import aggregate, by_family, normalize
+from sb3_guard.zoo.results.statistics import (
+    SCORES,
+    aggregate,
+    by_family,
+    judge,
+    normalize,
+)
 
 # Text, axes and the reference; a grey that is readable on white and on black. No other colour is
 # the same, so a page can replace it by its own.
@@ -72,14 +77,21 @@ class Data:
 
     @cached_property
     def scores(self) -> pd.DataFrame:
-        """Means with scores, of algorithms and of families; index environment and either's key."""
+        """
+        Means with scores, of algorithms and of families; index environment and either's key.
+
+        Of several environments, ``all environments`` has the means over those that have a score.
+        """
         scores = normalize(self.means)
-        families = by_family(scores).rename(columns={"family": "algo"})
-        return pd.concat([scores, families]).set_index(["suite", "algo"])
+        scores = pd.concat([scores, by_family(scores)])
+        groups = scores.groupby(["algo", "label"], sort=False)[[*SCORES.values()]]
+        every = groups.mean().reset_index().assign(suite="all environments")
+        parts = [scores, every] if len(self.suites) > 1 else [scores]
+        return pd.concat(parts).set_index(["suite", "algo"])
 
     @cached_property
     def splits(self) -> pd.DataFrame:
-        """How limits are kept, see :func:`~sb3_guard.zoo.results.splits.judge`."""
+        """How limits are kept, see :func:`~sb3_guard.zoo.results.statistics.judge`."""
         return judge(self.runs)
 
     @cached_property
@@ -88,9 +100,8 @@ class Data:
         table = self.runs.drop_duplicates("algo").fillna({"family": ""})
         table = table.assign(first=table["algo"] != REFERENCE)
         looks: dict[str, Look] = {}
-        families = [family for family in sorted({*table["family"]}) if family]
-        styled = [*FAMILIES, *(family for family in families if family not in FAMILIES)]
-        dashes = dict(zip(styled, cycle(DASHES), strict=False)) | {"": LOOSE}
+        families = dict.fromkeys([*FAMILIES, *sorted({*table["family"]} - {""})])
+        dashes = dict(zip(families, cycle(DASHES), strict=False)) | {"": LOOSE}
         others = sorted({*table["algo"]} - {*PLACES, REFERENCE})
         places = PLACES | {
             algo: ((8 + 5 * n) % len(COLORS), OTHERS[n % len(OTHERS)])
@@ -102,10 +113,9 @@ class Data:
                 continue
             color, marker = places[row["algo"]]
             looks[row["algo"]] = Look(row["label"], COLORS[color], dashes[row["family"]], marker)
-        for family in families:
-            members = table.loc[(table["family"] == family) & table["first"], "algo"]
-            if len(members):
-                looks[family] = looks[members.min()]._replace(label=family)
+        for family in sorted({*table["family"]} - {""}):
+            first = table.loc[table["family"] == family, "algo"].min()
+            looks[family] = looks[first]._replace(label=family)
         return looks
 
     @property

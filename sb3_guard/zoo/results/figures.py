@@ -15,11 +15,10 @@ from matplotlib.ticker import EngFormatter
 
 from sb3_guard.zoo.results.figure_data import INK, Data
 from sb3_guard.zoo.results.statistics import mean_curve
-from sb3_guard.zoo.results.tables import written
+from sb3_guard.zoo.results.tables import HEADINGS, written
 
 FORMATS = ("png", "svg", "pdf")
 WIDTH = 8.0  # inches: at the width of a page, text has the size of the page's
-AXES = {"J_r": "return", "M_c": "episode cost", "rho_c": "cost rate, per step"}
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -56,9 +55,9 @@ def fit_costs(axis: Axes, limit: float, way: str = "y") -> None:
     getattr(axis, f"set_{way}lim")(1.1 * min(lowest, 0.0), end)
 
 
-def cost_name(column: str) -> str:
-    """What an axis calls a column of :meth:`Data.costs`."""
-    return "episode cost" + (f", {column[4:]}" if column != "M_c" else "")
+def name_of(column: str) -> str:
+    """What an axis calls a column."""
+    return HEADINGS.get(column, f"episode cost, {column[4:]}")
 
 
 def draw_limit(line: Callable[..., Any], data: Data, suite: str, cost: str) -> float:
@@ -84,9 +83,7 @@ def draw_curves(axis: Axes, data: Data, suite: str, metric: str) -> None:
         if len(curves) > 1:
             low, high = table["mean"] - table["std"], table["mean"] + table["std"]
             axis.fill_between(steps, low, high, color=look.color, alpha=0.15, linewidth=0)
-    axis.set(
-        xlabel="steps", ylabel=AXES.get(metric) or cost_name(metric).replace(" cost, ", " cost,\n")
-    )
+    axis.set(xlabel="steps", ylabel=name_of(metric).replace(", ", ",\n"))
     axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_xlim(left=0)
     if metric.startswith("M_c"):
@@ -105,7 +102,7 @@ def draw_pareto(axis: Axes, data: Data, suite: str, cost: str = "M_c") -> None:
             row[cost], row["J_r"], row["J_r_std"], row[f"{cost}_std"], markersize=8.5,
             elinewidth=0.9, capsize=2, zorder=3, linestyle="none", label=look.label, **style,
         )  # fmt: skip
-    axis.set(xlabel=cost_name(cost), ylabel="return", title=title_of(data, suite))
+    axis.set(xlabel=name_of(cost), ylabel="return", title=title_of(data, suite))
     axis.margins(0.08)
     fit_costs(axis, limit, "x")
     if not np.isnan(limit) and limit < (end := axis.get_xlim()[1]):
@@ -158,10 +155,8 @@ def curves(data: Data, suite: str) -> Figure | None:
     return curves_of(data, [suite])
 
 
-def pareto(data: Data, suite: str) -> Figure | None:
+def pareto(data: Data, suite: str) -> Figure:
     """Return against each cost and the limit, a figure per environment."""
-    if not len(data.means[data.means["suite"] == suite].dropna(subset=["M_c", "J_r"])):
-        return None
     costs = data.costs(suite)
     width = WIDTH * (0.7 if len(costs) == 1 else 0.5 * len(costs))
     figure = Figure(figsize=(width, 0.6 * WIDTH), layout="constrained")

@@ -46,12 +46,10 @@ def read_results(folders: Sequence[str | Path]) -> Results:
     """
     Read all runs at or below some folders; one that can't be read is left out, with the reason.
 
-    :raises UsageError: a folder does not exist, or holds no trace of a run
+    :raises UsageError: a folder holds no trace of a run
     """
     paths: dict[Path, Path] = {}  # folders may contain one another
     for folder in map(Path, folders):
-        if not folder.is_dir():
-            raise UsageError(f"there is no folder {str(folder)!r}; give one that train wrote to")
         below = find_runs(folder)
         if not below:
             raise UsageError(
@@ -110,8 +108,12 @@ def read_run(path: Path) -> dict[str, Any]:
     read_episodes(path)  # raises if there are none
     limit = result.get("cost_limit")
     limits = limit if isinstance(limit, list) else [] if limit is None else [limit]
-    by_key = _by_key(result)
-    total = len(limits) == 1 and not by_key
+    costs, limit_on, by_key = result["costs"], result.get("limit_on", "sum"), {}
+    if len(costs) > 1 or limit_on != "sum":  # limits are on other costs than the total
+        for key, cost in costs.items():
+            name = bounded_name(key, limit_on)
+            by_key[f"M_c/{name}"] = _number(cost["mean"])
+            by_key[f"cost_limit/{name}"] = _number(cost["limit"])
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
     versions = result.get("versions") or {}
     numbers = {**METRICS, **{k: k for k in ("episodes", "physics_errors", "seconds")}}
@@ -123,7 +125,7 @@ def read_run(path: Path) -> dict[str, Any]:
         "seed": seed,
         "steps": result["n_timesteps"],
         **{name: _number(result.get(key)) for name, key in numbers.items()},
-        "cost_limit": _number(limits[0] if total else None),
+        "cost_limit": _number(limits[0] if len(limits) == 1 and not by_key else None),
         "limits": _limits(limits) if limits else None,
         **by_key,
         "epoch": math.nan if None in rollout else math.prod(rollout),
@@ -135,22 +137,6 @@ def read_run(path: Path) -> dict[str, Any]:
         "platform": result.get("platform"),
         "path": str(path),
     }
-
-
-def _by_key(result: Mapping[str, Any]) -> dict[str, Any]:
-    """Columns of the costs that have limits of their own, rather than their total."""
-    costs, limit_on = result["costs"], result.get("limit_on", "sum")
-    means = [_number(cost["mean"]) for cost in costs.values()]
-    # Both are means of the same episodes, but may be rounded differently.
-    total = np.allclose(means, [_number(result["cost"])] * len(means), equal_nan=True)
-    if limit_on == "sum" and total and len(means) == 1:
-        return {}
-    columns: dict[str, Any] = {}
-    for key, cost in costs.items():
-        name = bounded_name(key, limit_on)
-        columns[f"M_c/{name}"] = _number(cost["mean"])
-        columns[f"cost_limit/{name}"] = _number(cost["limit"])
-    return columns
 
 
 def _number(value: Any) -> float:
@@ -265,8 +251,8 @@ def _names(suite: str) -> set[str]:
 def _require(value: Any, column: "pd.Series[Any]", which: str) -> None:
     """Raise if no run has a value."""
     if value not in {*column}:
-        there = _joined(_values(column)) or "none"
-        raise UsageError(f"there is no run {which} {value}; there are runs {which} {there}")
+        hint = did_you_mean(str(value), map(str, _values(column)))
+        raise UsageError(f"there is no run {which} {value}; {hint}")
 
 
 def select(runs: pd.DataFrame) -> pd.DataFrame:
@@ -286,9 +272,9 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
         for key, group in runs.groupby(keys):
             values = _values(group[column])
             if len(values) > 1:
-                where = " of ".join(map(str, key))
+                where, there = " of ".join(map(str, key)), ", ".join(map(str, values))
                 raise UsageError(
-                    f"runs on {where} differ in {name}, {_joined(values)}, and can't be averaged; "
+                    f"runs on {where} differ in {name}, {there}, and can't be averaged; "
                     + fix.format(values[-1])
                 )
     return runs.drop_duplicates(_SAME, keep="last").reset_index(drop=True)
@@ -297,12 +283,3 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
 def _values(column: "pd.Series[Any]") -> list[Any]:
     """The values that there are."""
     return sorted(column.dropna().unique(), key=_natural)
-
-
-def _joined(values: Iterable[Any]) -> str:
-    return ", ".join(map(str, values))
-
-
-def compared(table: pd.DataFrame) -> "pd.Series[bool]":
-    """Which rows are of the reference or of constrained algorithms, rather than of baselines."""
-    return (table["algo"] == REFERENCE) | (table["family"].fillna("") != "")

@@ -1,22 +1,34 @@
-"""Statistics of runs: their last epochs, means over seeds, and scores as the GUARD paper has them.
+"""Statistics of runs: how they keep their limits, means over seeds, and the GUARD paper's scores.
 
-Scores are relative to TRPO's (arXiv 2305.13681).
+Agents are judged by three kinds of episodes; share of violations, D⁺ and tiers follow SafeRLEval
+(arXiv 2609.15315). Scores are relative to TRPO's (arXiv 2305.13681).
 """
 
+import json
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from sb3_guard.zoo.results.runs import REFERENCE, compared
+from sb3_guard.costs import bounded_name, verdict
+from sb3_guard.zoo.results.runs import REFERENCE, read_episodes
 from sb3_guard.zoo.run.folder import EPOCH
 
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
 EPOCHS = 10  # at the end of a run, that its training is judged by
+#: by key what was played; the final ones are in ``result.json``, see ``Training``
+SPLITS = {
+    "training": "training episodes",
+    "stochastic": "final stochastic",
+    "greedy": "final greedy",
+}
+#: SafeRLEval's words for verdicts
+TIERS = {"kept": "certified", "exceeded": "violating"}
 
 
-# One run
+# Limits
 
 
 def last_epochs(episodes: pd.DataFrame, epoch: float) -> pd.DataFrame:
@@ -42,6 +54,134 @@ def judging_limits(runs: pd.DataFrame) -> "pd.Series[float]":
         lambda limits: limits.max() if limits.nunique() == 1 else math.nan
     )
     return runs["cost_limit"].where(runs["limits"].notna(), common).astype(float)
+
+
+def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataFrame]:
+    """
+    The episodes of a run by split.
+
+    :param path: the run folder
+    :param epoch: steps, as for :func:`last_epochs`
+    :return: for each of :data:`SPLITS` that the run has, its episodes' ``J_r``, ``M_c`` and, of
+        several costs or a limit on the worst step, ``M_c/<name>``: of training those of the last
+        ten epochs, if no wrapper ended them early. Runs of older versions have no final ones
+    :raises UsageError: there is no ``0.monitor.csv``, or it is damaged
+    """
+    result = json.loads((Path(path) / "result.json").read_bytes())
+    splits, limit_on = {}, result.get("limit_on", "sum")
+    if not result.get("cut"):
+        splits["training"] = last_epochs(read_episodes(path), epoch).filter(regex="^(J_r|M_c)")
+    for split, episodes in result.get("final", {}).items():
+        bounded = episodes.get("bounded", {}).items()
+        keys = {f"M_c/{bounded_name(key, limit_on)}": costs for key, costs in bounded}
+        costs = {"M_c": episodes["costs"], **keys}
+        # NaN: a physics error ended it
+        splits[split] = pd.DataFrame({"J_r": episodes["returns"], **costs}, dtype=float)
+    return splits
+
+
+def violations(costs: np.ndarray, limit: float) -> tuple[float, float]:
+    """
+    How often and how far single episodes exceed a limit.
+
+    :param costs: of episodes, [E]
+    :param limit: d
+    :return: the share of the episodes with C > d; and D⁺, the mean of (C − d)/|d| over those, or of
+        C − d where d = 0; NaN if there are none
+    """
+    excess = costs[costs > limit] - limit
+    if not len(excess):
+        return 0.0, math.nan
+    return len(excess) / len(costs), float(excess.mean()) / (abs(limit) or 1.0)
+
+
+def nested_interval(seeds: Sequence[np.ndarray], resamples: int = 10_000) -> tuple[float, float]:
+    """
+    A 95 % percentile bootstrap interval of the mean over seeds and episodes.
+
+    Seeds are drawn with replacement, then episodes of each drawn seed; every seed weighs the same.
+    Of few seeds, each of the possible draws is taken equally often. Of a single seed the interval
+    tells nothing about another.
+
+    :param seeds: costs of the episodes of each seed, [E_s] each, at least one seed
+    :param resamples: least number of bootstrap samples
+    """
+    rng, n = np.random.default_rng(0), len(seeds)
+    if n**n <= resamples:
+        every = np.indices([n] * n).reshape(n, -1).T
+        drawn = np.tile(every, (math.ceil(resamples / n**n), 1))
+    else:
+        drawn = rng.integers(n, size=(resamples, n))
+    means = np.zeros(drawn.shape)
+    for number, costs in enumerate(seeds):
+        parts = 1 + resamples * len(costs) // 10**7  # so many at once as fit into memory
+        for here in np.array_split(np.argwhere(drawn == number), parts):
+            rows = rng.integers(len(costs), size=(len(here), len(costs)))
+            means[tuple(here.T)] = costs[rows].mean(axis=1)
+    low, high = np.quantile(means.mean(axis=1), [0.025, 0.975])
+    return float(low), float(high)
+
+
+def tier(low: float, high: float, limit: float, diverged: int = 0) -> str:
+    """Certified, undecided or violating, see :func:`~sb3_guard.costs.verdict`; empty: no limit."""
+    if math.isnan(limit):
+        return ""
+    return TIERS.get(verdict(low, high, limit, diverged), "undecided")
+
+
+def judge(runs: pd.DataFrame) -> pd.DataFrame:
+    """
+    How agents of an algorithm keep their limits, a row per suite, algorithm, split and cost.
+
+    :param runs: see :func:`~sb3_guard.zoo.results.runs.select`; judged by :func:`judging_limits`
+    :return: ``suite``, ``algo``, ``label``, ``split``, ``key`` of a cost with a limit of its own
+        (empty: the total), ``seeds``, ``limit`` (NaN: none), ``return`` and ``cost``, means over
+        seeds of their episodes' means, with ``_std`` (over seeds; NaN for one), ``low`` and
+        ``high`` of the cost (:func:`nested_interval`), ``tier``, ``diverged`` (further
+        episodes, which a physics error ended), ``above`` and ``excess``
+        (:func:`violations`, of all seeds' episodes)
+    """
+    rows = []
+    limited = runs.assign(judged_by=judging_limits(runs))
+    for (suite, algo), group in limited.groupby(["suite", "algo"], sort=False):
+        seeds = group[["path", "epoch"]].itertuples(index=False)
+        played = [read_splits(path, epoch) for path, epoch in seeds]
+        names = {"suite": suite, "algo": algo, "label": group["label"].iloc[0]}
+        columns = {"": group["judged_by"].iloc[0]}
+        own = group.filter(regex="^cost_limit/").dropna(axis=1, how="all")
+        columns |= {name.removeprefix("cost_limit"): own[name].iloc[0] for name in map(str, own)}
+        for split in SPLITS:
+            episodes = [splits[split] for splits in played if split in splits]
+            for end, limit in columns.items():
+                if episodes and all(f"M_c{end}" in seed for seed in episodes):
+                    row = _row(episodes, f"M_c{end}", limit)
+                    rows.append({**names, "split": split, "key": end[1:], **row})
+    return pd.DataFrame(rows, columns=None if rows else ["suite", "algo", "split", "key", "tier"])
+
+
+def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, object]:
+    """The statistics of a cost in a split."""
+    means = pd.DataFrame([episodes.mean() for episodes in seeds])
+    costs = [episodes[column].dropna().to_numpy(float) for episodes in seeds]
+    diverged = sum(map(len, seeds)) - sum(map(len, costs))
+    low, high = nested_interval(costs) if all(map(len, costs)) else (math.nan, math.nan)
+    if min(abs(low - limit), abs(high - limit)) < 0.02 * (high - low):  # else the draw decides
+        low, high = nested_interval(costs, 1_000_000)
+    above, excess = violations(np.concatenate(costs), limit)
+    return {
+        "seeds": len(seeds),
+        "limit": limit,
+        "return": means["J_r"].mean(),
+        "return_std": means["J_r"].std(),
+        "cost": means[column].mean(),
+        "cost_std": means[column].std(),
+        "low": low,
+        "high": high,
+        "tier": tier(low, high, limit, diverged),
+        "diverged": diverged,
+        "above": math.nan if math.isnan(limit) else above,
+        "excess": excess,
+    }
 
 
 # Over seeds
@@ -94,7 +234,8 @@ def normalize(means: pd.DataFrame) -> pd.DataFrame:
     :param means: see :func:`aggregate`; unconstrained baselines do not count for the shift
     :return: the same with the scores; NaN where TRPO has no runs or its value is 0
     """
-    ours = means[compared(means)].groupby("suite")["J_r"]
+    baseline = (means["family"].fillna("") == "") & (means["algo"] != REFERENCE)
+    ours = means[~baseline].groupby("suite")["J_r"]
     low, high = ours.min(), ours.max()
     margin = (0.01 * (high - low)).where(high > low, -low)
     shift = (margin - low).where(low < 0, 0.0)
@@ -111,11 +252,9 @@ def by_family(scores: pd.DataFrame) -> pd.DataFrame:
     """
     Mean scores of each family's algorithms, per suite.
 
-    :param scores: what :func:`normalize` makes of means
-    :return: ``suite``, ``family``, ``algorithms`` (how many), and the scores
+    :param scores: see :func:`normalize`
+    :return: ``suite``, ``algo`` and ``label`` (both the family), and the scores
     """
-    table = scores[(scores["family"].fillna("") != "") & (scores["algo"] != REFERENCE)]
-    groups = table.groupby(["suite", "family"], sort=False)
-    means = groups[list(SCORES.values())].mean()
-    means.insert(0, "algorithms", groups["algo"].nunique())
-    return means.reset_index()
+    table = scores[scores["family"].fillna("") != ""]
+    means = table.groupby(["suite", "family"], sort=False)[[*SCORES.values()]].mean().reset_index()
+    return means.assign(label=means["family"]).rename(columns={"family": "algo"})

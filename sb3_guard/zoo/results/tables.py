@@ -19,8 +19,7 @@ from sb3_guard.costs import beside
 from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.results.figure_data import Data
-from sb3_guard.zoo.results.splits import SPLITS
-from sb3_guard.zoo.results.statistics import by_family, normalize
+from sb3_guard.zoo.results.statistics import SCORES, SPLITS
 
 # A column's name, or a function of a row; by heading
 Cell = str | Callable[[Any], str]
@@ -28,11 +27,7 @@ Columns = dict[str, Cell]
 FORMATS = (".md", ".tex", ".csv")
 DIGITS = {"rho_c": 5}
 HEADINGS = {"J_r": "return", "M_c": "episode cost", "rho_c": "cost rate"}
-SCORE_HEADINGS = {
-    "reward": "reward / TRPO",
-    "cost": "cost / TRPO",
-    "cost_rate": "cost rate / TRPO",
-}
+SCORE_HEADINGS = {score: f"{score.replace('_', ' ')} / TRPO" for score in SCORES.values()}
 #: What the caption of each table says; ± means the same in all of them.
 SPREAD = "± is the standard deviation over seeds."
 CAPTIONS = {
@@ -41,9 +36,8 @@ CAPTIONS = {
     "Tiers": f"{SPREAD} Brackets are the 95 % bootstrap interval of the mean. A limit is "
     "certified if the interval lies at or below it, violating if above it, else undecided. Excess "
     "is relative, a mean over the episodes above the limit.",
-    "Relative to TRPO": "Return, cost and cost rate of the final epoch relative to TRPO's.",
-    "Families, relative to TRPO": "Means over the algorithms of a family.",
-    "All environments, relative to TRPO": "Means over environments, with their number.",
+    "Relative to TRPO": "Return, cost and cost rate of the final epoch relative to TRPO's. Those "
+    "of families are means over algorithms, those of all environments means over environments.",
 }
 
 
@@ -188,20 +182,9 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
         ),
         "Tiers": spelled(splits, {**who, **tiers}),
     }
-    scores = normalize(data.means)
+    scores = data.scores.reset_index()
     if scores[["reward", "cost"]].notna().any(axis=None):
         result["Relative to TRPO"] = spelled(scores, who | shown)
-        families: Columns = {
-            "environment": "suite", "family": "family", "algorithms": whole("algorithms"), **shown,
-        }  # fmt: skip
-        result["Families, relative to TRPO"] = spelled(by_family(scores), families)
-        if scores["suite"].nunique() > 1:
-            groups = scores.groupby(["algo", "label"], sort=False)[[*SCORE_HEADINGS]]
-            table = groups.mean().join(groups.count().add_suffix("_n")).reset_index()
-            columns: Columns = {"algorithm": "label"}
-            for score, heading in SCORE_HEADINGS.items():
-                columns[heading] = lambda row, s=score: f"{number(row[s])} ({row[f'{s}_n']})"  # type: ignore[misc]
-            result["All environments, relative to TRPO"] = spelled(table, columns)
     return {title: table for title, table in result.items() if len(table)}
 
 

@@ -50,11 +50,8 @@ def open_storage(address: str | None, journal: Path) -> tuple[Storage, str]:
     if address is not None and "://" in address:
         return _open_database(address)
     path = (journal if address is None else Path(address)).absolute()
-    damage = ValueError, KeyError, TypeError, AttributeError
-    with (
-        explained(f"can't write the study {path}", OSError, fix="choose another with -f"),
-        explained(f"{path} is not a study, or damaged", *damage),
-    ):
+    damage = OSError, ValueError, KeyError, TypeError, AttributeError
+    with explained(f"can't use {path} as a study", *damage, fix="choose another with -f"):
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = JournalFileOpenLock(str(path))
         return JournalStorage(JournalFileBackend(str(path), lock)), str(path)
@@ -67,8 +64,7 @@ def _open_database(address: str) -> tuple[Storage, str]:
     shown = url.render_as_string(hide_password=True)
     if url.get_backend_name() != "postgresql":
         raise UsageError(f"--storage {shown} is not allowed; it must be {form}")
-    if url.drivername == "postgresql":
-        url = url.set(drivername="postgresql+psycopg")
+    url = url.set(drivername="postgresql+psycopg")
 
     def connect() -> Database:
         return Database(

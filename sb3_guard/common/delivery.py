@@ -4,7 +4,6 @@ import math
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,23 +19,6 @@ from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
 
 TRIES = 3  # candidates that may be certified; they share the error
-
-
-@dataclass
-class Screened:
-    """What a few episodes say of a candidate."""
-
-    path: Path
-    mean_return: float
-    excess: (
-        float  # largest (mean + standard error of the mean - limit) of a cost; <= 0: looks right
-    )
-
-    @property
-    def order(self) -> tuple[bool, float]:
-        """Those that look right first, by return; then those that are nearest to it."""
-        right = self.excess <= 0.0
-        return right, self.mean_return if right else -self.excess
 
 
 class DeliveryCallback(BaseCallback):
@@ -161,13 +143,14 @@ class DeliveryCallback(BaseCallback):
     def _deliver(self) -> str:
         """Certify the best candidate; what to say of it."""
         limits = self._limits()
-        screened = [self._screen(file, np.array(limits)) for file in self._files()]
-        screened.sort(key=lambda candidate: candidate.order, reverse=True)
+        screened = {file: self._screen(file, np.array(limits)) for file in self._files()}
+        best = sorted(screened, key=lambda file: screened[file], reverse=True)
         refused: list[Certificate] = []
-        for number, candidate in enumerate(screened[:TRIES]):
-            if candidate.excess > 0.0 and number > 0:
+        for number, file in enumerate(best[:TRIES]):
+            looks_right, _ = screened[file]
+            if number > 0 and not looks_right:
                 break  # those that look wrong are not worth a try, but for a verdict
-            steps = self._put(candidate.path)
+            steps = self._put(file)
             certificate = certify(
                 self.model,
                 self.eval_env,
@@ -184,17 +167,18 @@ class DeliveryCallback(BaseCallback):
         nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
         return f"Nothing is delivered. The nearest candidate {nearest}"
 
-    def _screen(self, file: Path, limits: np.ndarray) -> Screened:
+    def _screen(self, file: Path, limits: np.ndarray) -> tuple[bool, float]:
+        """Whether a candidate looks right in a few episodes; its return, or how near it is."""
         self._put(file)
         played = evaluate_policy(
             self.model, self.eval_env, self.screening, self.deterministic, seed=self.seed
         )
         costs = played.limited  # [E, m]; NaN after a physics error
         if len(costs) < self.screening or np.isnan(costs).any():
-            return Screened(file, -np.inf, np.inf)
+            return False, -np.inf
         error = costs.std(axis=0, ddof=1) / np.sqrt(len(costs))
-        excess = np.max(costs.mean(axis=0) + error - limits)
-        return Screened(file, float(played.returns.mean()), float(excess))
+        excess = float(np.max(costs.mean(axis=0) + error - limits))
+        return (True, float(played.returns.mean())) if excess <= 0.0 else (False, -excess)
 
     def _put(self, file: Path) -> int:
         """Give the model and the environment the weights and statistics of a candidate."""

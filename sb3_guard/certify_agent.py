@@ -18,11 +18,8 @@ def certify_agent(flags: Flags) -> int:
     from sb3_guard.common.files import replacing
     from sb3_guard.zoo.agents.playback import BATCH, open_agent
     from sb3_guard.zoo.cli.usage import explained
-    from sb3_guard.zoo.run.folder import require_file
     from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
 
-    if flags.json:
-        require_file(Path(flags.json), "--json")
     agent = open_agent(flags, None, BATCH)
     limits = flags.cost_limit
     with closing(agent.env), explained(f"can't certify {agent.path}", ValueError, *BAD_NUMBERS):
@@ -37,6 +34,7 @@ def certify_agent(flags: Flags) -> int:
     print(f"{agent.path} on {agent.env_id}")
     print(certificate)
     if flags.json:
+        Path(flags.json).parent.mkdir(parents=True, exist_ok=True)
         with replacing(flags.json) as file:
             file.write(certificate.to_json().encode())
     return 0 if certificate.verdict == "certified" else 1

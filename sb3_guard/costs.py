@@ -30,18 +30,17 @@ def number(value: Any, name: str) -> float:
     return number
 
 
-def interval(values: np.ndarray, resamples: int = RESAMPLES) -> tuple[float, float]:
+def interval(values: np.ndarray) -> tuple[float, float]:
     """A 95 % percentile bootstrap interval of a mean.
 
     The resampling has its own fixed seed: the same values give the same interval.
 
     :param values: independent, such as one per episode, [n]
-    :param resamples: number of bootstrap samples
     :return: lower and upper end; NaN for fewer than two values
     """
     if len(values) < 2:
         return math.nan, math.nan
-    drawn = np.random.default_rng(0).integers(len(values), size=(resamples, len(values)))
+    drawn = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
     low, high = np.quantile(values[drawn].mean(axis=1), [0.025, 0.975])
     return float(low), float(high)
 
@@ -106,22 +105,19 @@ def bounded_name(key: str, limit_on: str) -> str:
     return f"worst step of {key}" if limit_on == "max" else key
 
 
-def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
+def estimate(values: np.ndarray) -> Estimate:
     """
     Mean, standard deviation and :func:`interval` of one value an episode.
 
     :param values: one value an episode, shape [E], e.g. ``evaluation.costs``; NaN where it is not
         known, since a physics error ended the episode
-    :param resamples: number of bootstrap samples
     :return: NaNs where there are too few episodes (none; for the interval, LEAST_EPISODES)
     """
     unknown = np.isnan(values)
     values, diverged = values[~unknown], int(unknown.sum())
     if len(values) == 0:
         return Estimate(math.nan, math.nan, math.nan, math.nan, diverged)
-    ends = float("nan"), float("nan")
-    if len(values) >= LEAST_EPISODES:
-        ends = interval(values, resamples)
+    ends = interval(values) if len(values) >= LEAST_EPISODES else (math.nan, math.nan)
     return Estimate(float(np.mean(values)), float(np.std(values)), *ends, diverged)
 
 

@@ -13,12 +13,10 @@ from typing import Any
 
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.deployment import onnx_file
-from sb3_guard.deployment.contract import stops
 from sb3_guard.zoo.agents.flags import ExportFlags as Flags
 from sb3_guard.zoo.agents.playback import BATCH, EPISODES, open_agent, summary
 from sb3_guard.zoo.cli.flags import command
 from sb3_guard.zoo.cli.usage import UsageError, explained
-from sb3_guard.zoo.run.folder import require_file
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
 
 
@@ -27,32 +25,24 @@ def export_agent(flags: Flags) -> int:
     path = Path(flags.output)
     if path.suffix != ".onnx":
         raise UsageError(f"--output {flags.output!r} must end in .onnx")
-    for written in (path, path.with_name(onnx_file.CONTRACT)):
-        require_file(written, "--output")
     agent = open_agent(flags, None, min(flags.n_episodes or BATCH, BATCH))
     with closing(agent.env):
-        with explained(f"can't export {agent.path}", ValueError, ImportError):
-            onnx_file.check(agent.model, flags.stochastic, path)
-            stops(agent.model, agent.env, flags.stop or {})
         how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
         episodes = flags.n_episodes or EPISODES
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
             evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
         settings, measured = agent.run.hyperparams(), summary(evaluation)
         certificate = agent.certificate
-        plain = {
-            name: {key: value for key, value in values.items() if key != "values"}
-            if isinstance(values, dict)
-            else values
-            for name, values in measured.items()
-        }
+        for values in measured.values():
+            if isinstance(values, dict):
+                values.pop("values", None)  # one an episode
         trained = {
             "algo": flags.algo,
             "env": agent.env_id,
             "env_kwargs": settings.get("env_kwargs") or {},
             "cost_limit": settings.get("cost_limit"),
             "model_sha256": hashlib.sha256(agent.path.read_bytes()).hexdigest(),
-            "measured": plain,
+            "measured": measured,
             "certificate": json.loads(certificate.to_json()) if certificate else None,
         }
         with explained(f"can't export {agent.path}", ValueError, ImportError):

@@ -112,26 +112,25 @@ def typed(value: Any, annotation: Any) -> Any:
         if isinstance(value, list | tuple) and (not fixed or len(value) == len(args)):
             kinds = args if fixed else [args[0] if args else Any] * len(value)
             return [*map(typed, value, kinds)]
-    elif kind in (None, types.NoneType) and (value is None or value == "null"):
+    elif kind in (None, types.NoneType) and value in (None, "null"):
         return None
-    elif _fits(value, kind, args):
-        if args and isinstance(value, Mapping):
-            return {key: typed(item, args[1]) for key, item in value.items()}
-        return value
-    raise TypeError
-
-
-def _fits(value: Any, kind: Any, args: Sequence[Any]) -> bool:
-    if kind is typing.Literal:
-        return value in args
-    if kind in (type, Callable):
-        return isinstance(value, str) and ("." in value or value.startswith("lin_"))
-    if kind in (bool, str, None, types.NoneType) or (
-        isinstance(kind, type) and issubclass(kind, Mapping)
+    elif kind is typing.Literal:
+        if value in args:
+            return value
+    elif kind in (type, Callable):
+        if isinstance(value, str) and ("." in value or value.startswith("lin_")):
+            return value
+    elif isinstance(kind, type) and issubclass(kind, Mapping):
+        if isinstance(value, Mapping):
+            return {k: typed(item, args[1]) for k, item in value.items()} if args else value
+    elif kind in (bool, str):
+        if isinstance(value, kind):
+            return value
+    elif kind is Any or not (
+        isinstance(kind, type) and isinstance(value, str | bool | int | float)
     ):
-        return isinstance(value, kind or types.NoneType)
-    free = kind is Any or not isinstance(kind, type)
-    return free or not isinstance(value, str | bool | int | float)
+        return value  # an object of a class, or anything
+    raise TypeError
 
 
 def _number(value: Any, kind: type) -> int | float:

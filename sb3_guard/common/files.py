@@ -17,8 +17,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BufferedRandom]:
 
     :param path: the file to create or to replace; its folder exists
     :return: the open sibling; when the block raises, ``path`` is left as it was
+    :raises OSError: it can't be written, or is a folder or device
     """
     path = Path(path)
+    if path.exists() and not path.is_file():  # the null device would be replaced
+        raise OSError(f"{path} is a folder or device; name a file")
     sibling = path.with_name(f".{path.name}.tmp")
     try:
         with open(sibling, "w+b") as handle:

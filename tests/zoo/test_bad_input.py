@@ -15,8 +15,6 @@ from typed import refused
 
 from sb3_guard import ALGORITHMS, CPO, benchmark, enjoy, train
 from sb3_guard.envs.rendering import RenderingError
-from sb3_guard.plain_yaml import load_yaml
-from sb3_guard.zoo.agents import playback
 from sb3_guard.zoo.run.checkpoint import MEMBER
 
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -102,12 +100,6 @@ def test_constructor_of_an_environment(capsys, empty, monkeypatch):
 def test_track_without_wandb(capsys, empty, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     refused(train.main, [*TOY, *SMALL, "--track"], capsys, "--track needs wandb", "pip install")
-
-
-def test_ordered_mappings_as_rl_zoo_writes_them():
-    tag = "!!python/object/apply:collections.OrderedDict"
-    assert load_yaml(f"{tag}\n- - [a, 1]\n  - [b, {{c: 2}}]") == {"a": 1, "b": {"c": 2}}
-    assert load_yaml(f"{tag} []") == {}
 
 
 def test_more_than_plain_data(capsys, tmp_path):
@@ -224,16 +216,6 @@ def test_damaged_flags(change, parts, capsys, run):
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     refused(train.main, [*GO_ON, str(run), "-n", "120"], capsys, "args.yml: ", *parts)
     assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-
-
-def test_unwritable_video(capsys, run, tmp_path, monkeypatch):
-    def nothing(*args, **kwargs):
-        raise AssertionError("played before the file was known to be writable")
-
-    monkeypatch.setattr(playback.Run, "make_envs", nothing)
-    play = [*TOY, "-f", str(tmp_path), "--record"]
-    refused(enjoy.main, [*play, "/dev/null/foo.mp4"], capsys, "--record", "choose another")
-    refused(enjoy.main, [*play, "."], capsys, "'.' is a folder")
 
 
 def test_no_backend_for_a_window(capsys, tmp_path, monkeypatch):

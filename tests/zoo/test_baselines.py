@@ -75,8 +75,8 @@ def test_costs_of_other_names_are_those_of_the_monitor(tmp_path, capsys):
     assert min(result["final"]["greedy"]["costs"]) > 0
     out = capsys.readouterr().out
     for name, played in result["final"].items():
-        said = out.partition(f"final, {name}")[2].partition("\n")[2]
-        assert f"    noise            {np.mean(played['bounded']['noise']):.3f}" in said
+        said = out.partition(f"Final policy, {name} actions")[2].partition("\n")[0]
+        assert f"; noise {np.mean(played['bounded']['noise']):.3f}" in said
     assert set(result["final"]["greedy"]["bounded"]) == set(result["costs"]) == {"heat", "noise"}
     assert result["costs"]["noise"]["mean"] == pytest.approx(2 * result["costs"]["heat"]["mean"])
 

@@ -141,7 +141,7 @@ REFUSED = [
     (["--preset", "main8"], ["--preset", "--envs"]),
     (["-params", "cost_limt:5"], ["none of the algorithms", "'cost_limt'", "'cost_limit'"]),
     (["--grid", "absent.yml"], ["can't read grid file absent.yml", "No such file"]),
-    (["-f", "/dev/null/x"], ["-f: can't write", "/dev/null/x"]),
+    (["-f", "/dev/null/x"], ["Not a directory", "/dev/null/x"]),
 ]
 
 

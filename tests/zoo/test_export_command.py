@@ -10,7 +10,6 @@ import pytest
 from typed import refused, trained
 
 from sb3_guard import cli, enjoy, export_agent
-from sb3_guard.zoo.agents import playback
 from sb3_guard.zoo.agents.playback import find_run
 
 WHICH = ["--env", "CostPoint-v0", "--gym-packages", "registered_envs", "--n-episodes", "5"]
@@ -72,7 +71,7 @@ def test_the_agent_of_a_training_that_has_not_ended_is_told(logs, tmp_path, caps
     refused(export_agent.main, here, capsys, "leave out --folder and --exp-id")
 
 
-def test_what_can_not_be_exported_is_said_before_it_is_played(logs, tmp_path, capsys):
+def test_what_can_not_be_exported_is_said_in_a_line(logs, tmp_path, capsys):
     here = [*WHICH, "-f", str(logs)]
     refused(export_agent.main, [*here, "-o", "policy.pt"], capsys, "'policy.pt' must end in .onnx")
     refused(export_agent.main, [*here, "--algo", "pcpo"], capsys, "there is no run of pcpo")
@@ -115,31 +114,3 @@ def test_each_cost_has_its_verdict_wherever_one_is_shown(tmp_path, capsys):
         words = rf"; {key} .*\[{cost['low']:.3f}, {cost['high']:.3f}\]\), limit {limit:g}: "
         for out in (exported, played):
             assert re.search(words + cost["verdict"], out), out
-
-
-ENDLESS = 255 * "a"  # the system allows it, but not the hidden file that is written first
-
-
-@pytest.mark.parametrize(
-    ("flags", "names"),
-    [
-        (["-o", "folder.onnx"], "'folder.onnx' is a folder"),
-        (["-o", "beside/policy.onnx"], "contract.json' is a folder"),
-        (["-o", f"{ENDLESS}.onnx"], "choose another"),
-        (["--json", "folder.onnx"], "is a folder"),
-        (["--json", ENDLESS], "choose another"),
-        (["--json", "/dev/null"], "is a folder or device"),
-        (["--record", f"{ENDLESS}.mp4"], "choose another"),
-    ],
-)
-def test_a_file_that_can_not_be_written_is_said_before_episodes(
-    flags, names, logs, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "folder.onnx").mkdir()
-    (tmp_path / "beside" / "contract.json").mkdir(parents=True)
-    monkeypatch.setattr(playback.Run, "make_envs", lambda *a, **k: pytest.fail("was played"))
-    command = export_agent.main if "-o" in flags else enjoy.main
-    window = [] if "-o" in flags else ["--no-render"]
-    refused(command, [*WHICH, "-f", str(logs), *flags, *window], capsys, names)
-    assert {path.name for path in tmp_path.iterdir()} == {"folder.onnx", "beside"}

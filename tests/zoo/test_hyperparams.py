@@ -137,7 +137,6 @@ def test_values_in_their_proper_type(name, value, expected):
     [
         ("n_steps", "many", "an integer"),
         ("n_steps", True, "an integer"),
-        ("n_steps", 0, "at least 1"),
         ("gamma", float("nan"), "a number"),
         ("learning_rate", "fast", "a number or a schedule"),
         ("use_sde", 1, "true or false"),

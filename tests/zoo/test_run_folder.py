@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import yaml
@@ -138,6 +139,12 @@ def test_files_appear_whole_or_not_at_all(tmp_path):
         # Who had opened the old file still has all of it.
         assert (reader.read(), path.read_bytes()) == (b"old", b"new")
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_folder_or_device_is_not_replaced(tmp_path):
+    for path in (tmp_path, Path("/dev/null")):
+        with pytest.raises(OSError, match="is a folder or device"), replacing(path):
+            pass
 
 
 def rows(path) -> list[str]:

@@ -25,7 +25,7 @@ from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, pack
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run, require_file
+from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run
 from sb3_guard.zoo.run.hyperparams import check, without_withdrawn
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, source_of
 from sb3_guard.zoo.run.run import Run
@@ -201,9 +201,6 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
 
     :param render_mode: None, ``"human"``, or ``"rgb_array"`` to record
     """
-    for name in ("record", "json"):
-        if getattr(flags, name):
-            require_file(Path(getattr(flags, name)), f"--{name}")
     alone = render_mode is not None or flags.n_timesteps is not None
     agent = open_agent(flags, render_mode, 1 if alone else min(flags.n_episodes or BATCH, BATCH))
     video = None

@@ -30,7 +30,7 @@ from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, interrupts, one_line
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, RunInUse, require_writable
+from sb3_guard.zoo.run.folder import RunFolder, RunInUse
 from sb3_guard.zoo.run.hyperparams import annotations
 from sb3_guard.zoo.run.run import Run
 
@@ -241,7 +241,7 @@ def run_grid(
     say(f"{folder}: {summary(runs)}")
     status, stop_file, todo = 0, folder / "stop", [run for run in runs if run.state != "done"]
     if todo:
-        require_writable(folder, "-f")
+        folder.mkdir(parents=True, exist_ok=True)
         stop_file.unlink(missing_ok=True)
         command, number = shlex.join(sys.orig_argv), min(jobs or cores(), len(todo))
         hosts = cluster(scheduler) if scheduler else processes(number)

@@ -135,6 +135,11 @@ class RunFlags(EvaluationFlags, TrainingFlags):
         common = {name: value for name, value in other.values().items() if name in cls.names()}
         return cls.of({**common, **own})
 
+    def overrides(self) -> dict[str, Any]:
+        """The hyperparameters that the flags state."""
+        length = {"n_timesteps": self.n_timesteps} if self.n_timesteps > 0 else {}
+        return {**(self.hyperparams or {}), **length}
+
     def command(self) -> str:
         """The command line that trains the same run again, wherever its files go."""
         names = {*self.names(IDENTITY), *AGAIN} - {"algo", "env"}

@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import shlex
-import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -62,35 +61,6 @@ def claim(parent: Path, name: str, suffix: str = "") -> Path:
 def is_run(path: Path) -> bool:
     """Whether a folder holds a run, rather than nothing yet or what was left half made."""
     return any(path.glob("*/args.yml"))
-
-
-def require_writable(folder: Path, flag: str) -> None:
-    """
-    Make a folder and find out whether files can be written there, before work is lost.
-
-    :param flag: the flag that names it, for the message
-    :raises UsageError: they can't
-    """
-    with explained(f"{flag}: can't write to folder {str(folder)!r}", OSError, fix="choose another"):
-        folder.mkdir(parents=True, exist_ok=True)
-        # Permission bits mean little to root and on special file systems: only trying tells.
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-
-
-def require_file(path: Path, flag: str) -> None:
-    """
-    The same of a file that is to be written.
-
-    :raises UsageError: it can't be made, or a folder or device has its name
-    """
-    with explained(f"{flag}: can't write {str(path)!r}", OSError, fix="choose another"):
-        if path.exists() and not path.is_file():  # the null device would be replaced
-            raise UsageError(f"{flag}: {str(path)!r} is a folder or device; name a file")
-        require_writable(path.parent, flag)
-        hidden = path.with_name(f".{path.name}.tmp")  # see replacing; a name may be too long
-        hidden.touch()
-        hidden.unlink()
 
 
 class RunFolder:

@@ -8,7 +8,6 @@ make objects of it.
 
 import importlib
 import inspect
-import math
 import runpy
 import sys
 from collections.abc import Mapping
@@ -56,7 +55,6 @@ RUN_KEYS: dict[str, Any] = {
     "selection_limit": float | list[float] | None,
 }
 N_TIMESTEPS = 1_000_000  # the length of training where neither a file nor a flag says
-COUNTS = ("n_envs", "n_timesteps", "n_steps", "batch_size", "frame_stack")  # at least 1
 # RL-Zoo's two for the exploration noise of off-policy algorithms.
 NOISE_KEYS: dict[str, Any] = {
     "noise_type": Literal["normal", "ornstein-uhlenbeck"] | None,
@@ -192,8 +190,8 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
     The same hyperparameters as data, numbers in their proper type, or an error that says what to
     mend.
 
-    :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, a
-        NaN, or a count below 1
+    :raises UsageError: a name or policy the algorithm does not know, a value of the wrong type, or
+        a NaN
     """
     hints = annotations(algorithm)
     checked = {}
@@ -206,9 +204,8 @@ def check(algo: str, algorithm: type[BaseAlgorithm], values: Mapping[str, Any]) 
                 f"hyperparameter {name}: {value!r} is more than plain data; write classes and "
                 "calls as text, such as policy_kwargs: dict(activation_fn=nn.ReLU)"
             )
-        low = 1 if name in COUNTS else -math.inf
         with explained("hyperparameter", ValueError):
-            checked[name] = fit(name, as_data(name, value), hints[name], low, ends="[]")
+            checked[name] = fit(name, as_data(name, value), hints[name])
     checked.setdefault("n_envs", 1)
     checked.setdefault("n_timesteps", N_TIMESTEPS)
     aliases = algorithm.policy_aliases

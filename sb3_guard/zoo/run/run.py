@@ -181,10 +181,7 @@ class Run:
         flags.env = str(run.source.env_id)
         if flags.seed < 0:
             flags.seed = int(np.random.default_rng().integers(2**31))
-        overrides = dict(flags.hyperparams or {})
-        if flags.n_timesteps > 0:
-            overrides["n_timesteps"] = flags.n_timesteps
-        values = read_hyperparams(flags.algo, flags.env, flags.conf_file, overrides)
+        values = read_hyperparams(flags.algo, flags.env, flags.conf_file, flags.overrides())
         values = run.hyperparams = check(flags.algo, algo, values)
         if run.constrained and "cost_limit" not in values:
             raise UsageError(
@@ -550,9 +547,7 @@ class Run:
             changed |= {name: getattr(saved, name) for name in ("trained_agent", "hyperparams")}
             run = cls(dataclasses.replace(saved, **changed), folder=folder)
             run.flags.env = str(run.source.env_id)
-            overrides = dict(given.hyperparams or {})
-            if given.n_timesteps > 0:
-                overrides["n_timesteps"] = given.n_timesteps
+            overrides = given.overrides()
             refuse_places(folder.path, {n: v for n, v in values.items() if n not in overrides})
             run.hyperparams = check(saved.algo, algorithm(saved.algo), {**values, **overrides})
             free = {"n_timesteps": None, "log_folder": None}

@@ -26,7 +26,7 @@ from optuna.trial import FrozenTrial
 
 from sb3_guard.zoo.cli.usage import UsageError, interrupts, run
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import folder_name, require_writable
+from sb3_guard.zoo.run.folder import folder_name
 from sb3_guard.zoo.run.hyperparams import check
 from sb3_guard.zoo.run.run import Run, differences
 from sb3_guard.zoo.tuning import studies
@@ -147,7 +147,7 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     folder = Path(flags.log_folder) / settings.algo / f"{folder_name(settings.env)}_tune{suffix}"
     name = flags.study_name or f"{settings.algo}_{settings.env}"
     storage, shown = open_storage(flags.storage, folder / "study.journal")
-    require_writable(folder, "-f")
+    folder.mkdir(parents=True, exist_ok=True)
     study = open_study(flags, settings, search, name, storage)
     objective = Objective(flags, training, settings, search)
     report = Report(folder, asdict(settings), flags.gym_packages)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.flags import command, flag
 from sb3_guard.zoo.cli.usage import UsageError, read_mapping
 from sb3_guard.zoo.run.flags import EvaluationFlags, RunFlags, TrainingFlags
@@ -66,18 +67,22 @@ class Flags(EvaluationFlags, TrainingFlags):
         """
         The environments and algorithms that are asked for.
 
-        :raises UsageError: nothing says which
+        :raises UsageError: nothing says which, or there is no preset of that name
         """
-        from sb3_guard.zoo.grids.presets import ALGOS, preset
+        from sb3_guard.zoo.grids.presets import ALGOS, PRESETS
 
-        algos = self.algos
-        if algos is not None:
-            algos = [key for algo in algos for key in (ALGOS if algo == "all" else [algo])]
-        if self.preset is not None:
-            return preset(self.preset, algos)
-        if self.envs is None:
+        if self.preset is None and self.envs is None:
             raise UsageError("which grid? Give --envs, --preset or --grid")
-        return [(env, algo) for env in self.envs for algo in algos or ALGOS]
+        if self.preset is not None and self.preset not in PRESETS:
+            raise UsageError(f"--preset {self.preset}: {did_you_mean(self.preset, PRESETS)}")
+        blocks = PRESETS[self.preset] if self.preset else ((self.envs or (), ALGOS),)
+        return [
+            (env, key)
+            for envs, usual in blocks
+            for env in envs
+            for algo in self.algos or usual
+            for key in (ALGOS if algo == "all" else (algo,))
+        ]
 
 
 def with_file(flags: Flags) -> Flags:

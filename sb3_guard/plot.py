@@ -17,7 +17,7 @@ from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.results import figures, tables
 from sb3_guard.zoo.results import runs as reading
 from sb3_guard.zoo.results.figure_data import Data
-from sb3_guard.zoo.results.paper import FIGURES, draw
+from sb3_guard.zoo.results.figures import FIGURES, draw
 
 TITLES = "\n".join(f"  {name:<10} {figure.__doc__}" for name, figure in FIGURES.items())
 

@@ -33,8 +33,7 @@ from matplotlib.ticker import EngFormatter
 from sb3_guard.zoo.agents.pretrained import listed
 from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
-from sb3_guard.zoo.results.figures import STYLE, WIDTH, finish, save
-from sb3_guard.zoo.results.paper import draw
+from sb3_guard.zoo.results.figures import STYLE, WIDTH, draw, finish, save
 from sb3_guard.zoo.results.runs import read_episodes, select
 from sb3_guard.zoo.results.statistics import (
     SPLITS,

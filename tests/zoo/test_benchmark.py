@@ -23,7 +23,7 @@ from typed import TOY, refused
 
 from sb3_guard import benchmark, enjoy, train
 from sb3_guard.zoo.grids import grid
-from sb3_guard.zoo.grids.presets import PRESETS, preset
+from sb3_guard.zoo.grids.presets import PRESETS
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, lock
 from sb3_guard.zoo.run.run import Run
@@ -78,6 +78,10 @@ def without_clock(result: dict) -> dict:
 
 
 # what a grid is
+
+
+def preset(name: str) -> list[tuple[str, str]]:
+    return benchmark.Flags(preset=name).pairs()
 
 
 def test_presets_are_the_papers():

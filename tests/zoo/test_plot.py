@@ -17,8 +17,7 @@ from sb3_guard.algorithms import CLASSES
 from sb3_guard.zoo.grids.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.results import figures
 from sb3_guard.zoo.results.figure_data import COLORS, INK, PLACES, Data
-from sb3_guard.zoo.results.figures import save
-from sb3_guard.zoo.results.paper import FIGURES, draw
+from sb3_guard.zoo.results.figures import FIGURES, draw, save
 from sb3_guard.zoo.results.runs import read_results, select
 from sb3_guard.zoo.results.tables import tables
 

@@ -13,7 +13,7 @@ from fake_runs import LABELS, fake_run
 from sb3_guard.zoo.cli.markdown import escaped
 from sb3_guard.zoo.results import statistics
 from sb3_guard.zoo.results.figure_data import Data
-from sb3_guard.zoo.results.paper import draw
+from sb3_guard.zoo.results.figures import draw
 from sb3_guard.zoo.results.runs import read_curve, read_results
 from sb3_guard.zoo.results.statistics import (
     SCORES,

@@ -173,11 +173,6 @@ def _begin_worker() -> None:
 ASK_AGAIN = 2.0  # seconds between questions after runs that another process has
 
 
-def cores() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-
-
 @contextmanager
 def processes(number: int) -> Iterator[Executor]:
     """Processes of this machine; they are killed when the block is left by an exception."""
@@ -243,7 +238,8 @@ def run_grid(
     if todo:
         folder.mkdir(parents=True, exist_ok=True)
         stop_file.unlink(missing_ok=True)
-        command, number = shlex.join(sys.orig_argv), min(jobs or cores(), len(todo))
+        cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+        command, number = shlex.join(sys.orig_argv), min(jobs or cores, len(todo))
         hosts = cluster(scheduler) if scheduler else processes(number)
         with hosts as executor, interrupts(ask_to_stop) as received:
             left = todo

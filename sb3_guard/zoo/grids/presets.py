@@ -1,13 +1,11 @@
 """The questions of the GUARD paper (arXiv 2305.13681), with the environments and algorithms.
 
-``benchmark --preset`` trains them, and :mod:`sb3_guard.zoo.results.paper` draws what came of it.
+``benchmark --preset`` trains them, and :mod:`sb3_guard.zoo.results.figures` draws what came of it.
 """
 
 from collections.abc import Sequence
 
 from sb3_guard.envs.suites.guard import LADDER
-from sb3_guard.spelling import did_you_mean
-from sb3_guard.zoo.cli.usage import UsageError
 
 ALGOS = (
     "trpo", "cpo", "pcpo", "trpo_lag", "trpo_fac", "trpo_ipo", "trpo_sl", "trpo_usl",
@@ -47,20 +45,3 @@ PRESETS: dict[str, tuple[tuple[Sequence[str], Sequence[str]], ...]] = {
     "q8": ((PAPER45, ALGOS),),
     "ladder": ((RUNGS, ALGOS),),
 }
-
-
-def preset(name: str, algos: Sequence[str] | None = None) -> list[tuple[str, str]]:
-    """
-    The pairs of environment and algorithm of a preset.
-
-    :param algos: take these on all of its environments; None: what its question needs
-    :raises UsageError: there is no preset of that name
-    """
-    if name not in PRESETS:
-        raise UsageError(f"unknown preset {name!r}; {did_you_mean(name, PRESETS)}")
-    return [
-        (env_id, algo)
-        for env_ids, usual in PRESETS[name]
-        for env_id in env_ids
-        for algo in algos or usual
-    ]

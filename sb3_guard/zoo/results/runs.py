@@ -26,8 +26,6 @@ METRICS = dict(zip(("J_r", "M_c", "rho_c"), MEASURES, strict=True))
 CURVE_POINTS = 200  # at most as many per run, of epochs taken together
 VERSIONS = ("sb3_guard", "mujoco", "gymnasium", "stable_baselines3", "torch", "numpy", "python")
 _SUITE = re.compile(r"[A-Za-z][A-Za-z0-9]*_[A-Za-z][A-Za-z0-9]*_\d+[A-Za-z]\w*-v0")
-# Runs that agree in these are the same run, made again.
-_SAME = ["suite", "world", "algo", "limits", "seed", "steps", "config"]
 
 
 class Results(NamedTuple):
@@ -277,7 +275,7 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
                     f"runs on {where} differ in {name}, {there}, and can't be averaged; "
                     + fix.format(values[-1])
                 )
-    return runs.drop_duplicates(_SAME, keep="last").reset_index(drop=True)
+    return runs.drop_duplicates(["suite", "algo", "seed"], keep="last").reset_index(drop=True)
 
 
 def _values(column: "pd.Series[Any]") -> list[Any]:

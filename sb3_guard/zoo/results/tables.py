@@ -64,10 +64,8 @@ def latex(data: pd.DataFrame, caption: str) -> str:
     style = (
         data.style.hide(axis="index").format(escape="latex").format_index(escape="latex", axis=1)
     )
-    return style.to_latex(
-        hrules=True, position_float="centering", column_format="l" * len(data.columns),
-        caption=caption.replace("%", r"\%"),
-    ).strip()  # fmt: skip
+    caption = caption.replace("%", r"\%")
+    return style.to_latex(hrules=True, position_float="centering", caption=caption).strip()
 
 
 # Numbers

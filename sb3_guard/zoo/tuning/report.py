@@ -1,9 +1,8 @@
 """What tuning leaves behind: the best as a file that ``train`` reads, and a table."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import optuna
 import pandas as pd
@@ -12,6 +11,7 @@ from filelock import FileLock
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_guard.common.files import replacing
+from sb3_guard.zoo.tuning.trials import Settings
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
@@ -33,13 +33,12 @@ class Report:
     The files of a study.
 
     :param folder: where they go; several processes may write them
-    :param settings: of the study, as data
+    :param settings: of the study
     :param packages: modules that register the environment
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], packages: Sequence[str] = ()):
+    def __init__(self, folder: Path, settings: Settings, packages: Sequence[str] = ()):
         self.folder, self.settings, self.packages = folder, settings, packages
-        self.keys: list[str] = settings["cost_keys"]
 
     def write(self, study: optuna.Study) -> None:
         """Write ``trials.csv`` and ``best.yml``."""
@@ -68,27 +67,27 @@ class Report:
 
     def outcome(self, trial: FrozenTrial) -> str:
         """Return and costs in words."""
-        result, limited = trial.user_attrs["result"], self.settings["cost_limit"] is not None
-        costs = [f"{'cost ' * (key != 'cost')}{key} {result[key]:.4g}" for key in self.keys]
-        over = result["violation"]
+        result, keys = trial.user_attrs["result"], self.settings.cost_keys
+        costs = [f"{'cost ' * (key != 'cost')}{key} {result[key]:.4g}" for key in keys]
+        over, limited = result["violation"], self.settings.cost_limit is not None
         verdict = [f"{over:.4g} over the limit" if over else "within the limit"] * limited
         return ", ".join([f"return {result['return']:.4g}", *costs, *verdict])
 
     def hyperparams(self, trial: FrozenTrial) -> str:
         """A trial's hyperparameters as a file for ``train -conf``."""
         settings = self.settings
-        seeds = " ".join(map(str, settings["seeds"]))
-        values = {settings["env"]: trial.user_attrs["hyperparams"]}
+        seeds = " ".join(map(str, settings.seeds))
+        values = {settings.env: trial.user_attrs["hyperparams"]}
         return (
-            f"# Trial {trial.number} of tuning {settings['algo']} on {settings['env']}:\n"
-            f"# {self.outcome(trial)} ({settings['n_timesteps']:,} steps, --seeds {seeds}).\n"
+            f"# Trial {trial.number} of tuning {settings.algo} on {settings.env}:\n"
+            f"# {self.outcome(trial)} ({settings.n_timesteps:,} steps, --seeds {seeds}).\n"
             f"# Train with: {self.command()}\n"
             + yaml.safe_dump(values, default_flow_style=None, allow_unicode=True)
         )
 
     def command(self) -> str:
         """The command line that trains with the best."""
-        flags = ["--algo", self.settings["algo"], "--env", self.settings["env"]]
+        flags = ["--algo", self.settings.algo, "--env", self.settings.env]
         flags += ["--gym-packages", *self.packages] if self.packages else []
         return shlex.join(["sb3-guard", "train", *flags, "-conf", str(self.folder / "best.yml")])
 
@@ -98,7 +97,7 @@ class Report:
             return f"Trial {trial.number}: failed: {trial.user_attrs['error']}"
         text = f"Trial {trial.number}: {self.outcome(trial)}"
         if trial.state == TrialState.PRUNED:
-            total = self.settings["n_evaluations"] * len(self.settings["seeds"])
+            total = self.settings.n_evaluations * len(self.settings.seeds)
             text += f"; pruned after {trial.last_step} of {total} evaluations"
         return text
 
@@ -111,7 +110,7 @@ class Report:
         top = best(complete)
         if top is None:
             return f"{counts}\n  No trial went to its end: there is no best one."
-        if self.settings["cost_limit"] is not None:
+        if self.settings.cost_limit is not None:
             feasible = sum(rank(trial)[0] for trial in complete)
             counts += f"; {feasible} of {len(complete)} kept the cost limit"
         return (

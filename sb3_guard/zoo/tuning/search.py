@@ -46,11 +46,9 @@ def prepare(flags: TuneFlags) -> tuple[RunFlags, Settings, Search]:
     :return: the flags of a training, and what the study is
     :raises UsageError: something is wrong with the flags
     """
-    fixed = dict(flags.hyperparams or {})
-    hyperparams = dict(fixed)
-    if flags.cost_limit is not None:
+    fixed, hyperparams = flags.hyperparams or {}, dict(flags.hyperparams or {})
+    if limit := flags.cost_limit:
         # Beside the trials: training with the result keeps the best model by the same limit.
-        limit = flags.cost_limit
         hyperparams["selection_limit"] = limit[0] if len(limit) == 1 else limit
     how = {"hyperparams": hyperparams, "seed": flags.seeds[0], "verbose": 0, "progress": False}
     run = Run.check(RunFlags.shared(flags, certify=0, **how))
@@ -150,7 +148,7 @@ def _tune(flags: TuneFlags, main: bool) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     study = open_study(flags, settings, search, name, storage)
     objective = Objective(flags, training, settings, search)
-    report = Report(folder, asdict(settings), flags.gym_packages)
+    report = Report(folder, settings, flags.gym_packages)
     loud = main and flags.verbose > 0
     if loud:
         print(_header(flags, settings, study, folder, shown), flush=True)

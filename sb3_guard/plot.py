@@ -104,7 +104,8 @@ def plot(flags: Flags) -> int:
         print(f"wrote {flags.report}")
     if by_default:
         for title, table in tables.tables(data).items():
-            print(f"\n{title}\n\n{tables.terminal(table)}\n")
+            print(f"\n{title}")
+            tables.show(table)
             print(textwrap.fill(tables.CAPTIONS[title], 100))
     return 0
 

@@ -2,8 +2,6 @@
 
 import itertools
 import math
-import shutil
-import subprocess
 
 import numpy as np
 import pandas as pd
@@ -28,7 +26,7 @@ from sb3_guard.zoo.results.statistics import (
     tier,
     violations,
 )
-from sb3_guard.zoo.results.tables import CAPTIONS, latex, markdown, tables, write_tables
+from sb3_guard.zoo.results.tables import CAPTIONS, markdown, tables, write_tables
 
 HAZARDS, GHOSTS = "Goal_Point_8Hazards", "Goal_Point_8Ghosts"
 NONE = pytest.approx(math.nan, nan_ok=True)
@@ -332,28 +330,6 @@ def test_tables_agree(tmp_path):
     assert tiers["final stochastic"] == shown["Results"]["limit"][0] == "5.5: undecided"
     assert shown["Results"]["episode cost"][0] == "7.00\xa0±\xa01.00"
     assert all("standard deviation" in CAPTIONS[title] for title in shown)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
-def test_pdflatex_takes_the_tables(tmp_path, runs):
-    write_tables(tmp_path / "t.tex", Data(runs.assign(label="CPO & é_%")))
-    (tmp_path / "p.tex").write_text(
-        "\\documentclass{article}\\IfFileExists{booktabs.sty}{\\usepackage{booktabs}}{\\let"
-        "\\toprule\\hline\\let\\midrule\\hline\\let\\bottomrule\\hline}"
-        "\\begin{document}\\input{t}\\end{document}"
-    )
-    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "p.tex"]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert run.returncode == 0, run.stdout[-1500:]
-
-
-@pytest.mark.parametrize("cell", ["_", "%", "&", "#", "\\"])
-def test_latex_escapes(cell):
-    assert (
-        cell
-        not in latex(pd.DataFrame({"a": [cell]}), "").splitlines()[6].removesuffix(r" \\").split()
-    )
 
 
 @pytest.mark.parametrize(

@@ -18,11 +18,14 @@ import pandas as pd
 from sb3_guard.costs import bounded_name
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, one_line
-from sb3_guard.zoo.run.folder import MEASURES, RunFolder
+from sb3_guard.zoo.run.folder import RunFolder
 
 REFERENCE = "trpo"  # scores are relative to it
-# Columns of the figures of merit, and their key in result.json
-METRICS = dict(zip(("J_r", "M_c", "rho_c"), MEASURES, strict=True))
+# Columns of numbers, and their key in result.json
+NUMBERS = {
+    "J_r": "return", "M_c": "cost", "rho_c": "cost_rate", "episodes": "episodes",
+    "physics_errors": "physics_errors", "seconds": "seconds",
+}  # fmt: skip
 CURVE_POINTS = 200  # at most as many per run, of epochs taken together
 VERSIONS = ("sb3_guard", "mujoco", "gymnasium", "stable_baselines3", "torch", "numpy", "python")
 _SUITE = re.compile(r"[A-Za-z][A-Za-z0-9]*_[A-Za-z][A-Za-z0-9]*_\d+[A-Za-z]\w*-v0")
@@ -114,7 +117,6 @@ def read_run(path: Path) -> dict[str, Any]:
             by_key[f"cost_limit/{name}"] = _number(cost["limit"])
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]
     versions = result.get("versions") or {}
-    numbers = {**METRICS, **{k: k for k in ("episodes", "physics_errors", "seconds")}}
     return {
         "suite": env.removesuffix("-v0") if _SUITE.fullmatch(env) else env,
         "algo": algo,
@@ -122,7 +124,7 @@ def read_run(path: Path) -> dict[str, Any]:
         "family": (result.get("family") or "").replace("unconstrained", ""),
         "seed": seed,
         "steps": result["n_timesteps"],
-        **{name: _number(result.get(key)) for name, key in numbers.items()},
+        **{name: _number(result.get(key)) for name, key in NUMBERS.items()},
         "cost_limit": _number(limits[0] if len(limits) == 1 and not by_key else None),
         "limits": _limits(limits) if limits else None,
         **by_key,

@@ -1,6 +1,5 @@
 """Tables that read well in a terminal, in Markdown, in LaTeX and on a web page."""
 
-import io
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -41,17 +40,14 @@ CAPTIONS = {
 }
 
 
-def terminal(data: pd.DataFrame) -> str:
-    """A table of text that fits the terminal, or 120 columns; intervals have their own lines."""
-    console = Console(width=shutil.get_terminal_size((120, 0)).columns, file=io.StringIO())
+def show(data: pd.DataFrame) -> None:
+    """Print a table of text on the terminal, or 120 columns; intervals have their own lines."""
     grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in map(str, data):
         grid.add_column(name, no_wrap=name in ("environment", "algorithm"))
     for row in data.astype(str).to_numpy():
         grid.add_row(*(Text(cell.replace(" [", "\n[")) for cell in row))
-    with console.capture() as captured:
-        console.print(grid)
-    return "\n".join(map(str.rstrip, captured.get().splitlines())).strip("\n")
+    Console(width=shutil.get_terminal_size((120, 0)).columns).print(grid)
 
 
 def markdown(data: pd.DataFrame) -> str:

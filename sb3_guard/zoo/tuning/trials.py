@@ -30,7 +30,7 @@ from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
 
 # What the hyperparameters of a trial may lead to; anything else is a mistake in the code.
 FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError)
-FAILED_VIOLATION = 1e9  # puts a trial that failed behind all others, for the sampler
+FAILED_COST = 1e9  # puts a trial that failed behind all others, for the sampler
 INFEASIBLE = -1e9  # what an evaluation over the limit is reported as, less the violation
 After = Callable[[int, list[float]], None]
 
@@ -63,11 +63,16 @@ class Settings:
     cost_keys: list[str]
     cost_limit: list[float] | None
 
+    def excess(self, costs: Sequence[float]) -> dict[str, float]:
+        """By how much each cost is above its limit, below 0 if under it; empty without limits."""
+        limits = self.cost_limit or ()
+        return {key: c - d for key, c, d in zip(self.cost_keys, costs, limits, strict=False)}
+
     def outcome(self, mean: Sequence[float]) -> dict[str, float]:
         """Return, costs by key, and by how much they exceed their limits in all."""
-        over = np.subtract(mean[1:], np.inf if self.cost_limit is None else self.cost_limit)
         costs = dict(zip(self.cost_keys, mean[1:], strict=True))
-        return {"return": mean[0], **costs, "violation": float(np.maximum(over, 0.0).sum())}
+        over = [max(excess, 0.0) for excess in self.excess(mean[1:]).values()]
+        return {"return": mean[0], **costs, "violation": float(sum(over))}
 
 
 class Stopped(Exception):
@@ -163,7 +168,7 @@ class Objective:
             if self.flags.verbose > 1:
                 raise
             trial.set_user_attr("error", one_line(error)[:600])
-            self._constrain(trial, None)
+            self._constrain(trial, [FAILED_COST] * len(self.settings.cost_keys))
             raise TrialPruned from error
         except BaseException:  # a signal, a lost connection: not the hyperparameters' fault
             with suppress(*DATABASE_ERRORS):
@@ -171,15 +176,10 @@ class Objective:
             raise
         return float(trial.user_attrs["result"]["return"])
 
-    def _constrain(self, trial: optuna.Trial, mean: Sequence[float] | None) -> None:
-        """Tell the sampler by how much each cost is below its limit; once in a trial."""
-        if self.settings.cost_limit is None:
-            return
-        costs = [FAILED_VIOLATION] * len(self.settings.cost_keys) if mean is None else mean[1:]
-        for key, cost, limit in zip(
-            self.settings.cost_keys, costs, self.settings.cost_limit, strict=True
-        ):
-            trial.set_constraint(key, cost - limit)
+    def _constrain(self, trial: optuna.Trial, costs: Sequence[float]) -> None:
+        """Tell the sampler by how much each cost is above its limit; once in a trial."""
+        for key, excess in self.settings.excess(costs).items():
+            trial.set_constraint(key, excess)
 
     def _train_seeds(self, trial: optuna.Trial) -> None:
         values = self.search.draw(trial)
@@ -197,7 +197,7 @@ class Objective:
             trial.report(INFEASIBLE - violation if violation else mean[0], step)
             pruned = step < last and trial.should_prune()
             if pruned or step == last:
-                self._constrain(trial, mean)
+                self._constrain(trial, mean[1:])
             if pruned:
                 raise TrialPruned
             if done == settings.n_evaluations:

@@ -90,10 +90,7 @@ class CheckedEnv(gym.Wrapper, RecordConstructorArgs):
                 self._check(observation.get(key), space[key], f"{name}'s {key!r}")
             return
         if isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary):
-            try:
-                values = np.asarray(observation)
-            except ValueError:  # rows of several lengths
-                values = np.array(None)
+            values = np.asarray(observation)
             fits = values.shape == space.shape and values.dtype.kind in "biuf"
         else:
             fits = space.contains(observation)

@@ -54,15 +54,10 @@ def export_agent(flags: Flags) -> int:
                 stop=flags.stop,
                 trained=trained,
             )
-    print(f"{path}: {', '.join(contract['file']['operators'])}")
+    steps = f"{agent.model.num_timesteps:,} steps"
+    print(f"{path}: {agent.path} after {steps}; {', '.join(contract['file']['operators'])}")
     print(f"{path.with_name(onnx_file.CONTRACT)} describes input and output")
     print(evaluation)
-    if agent.run.checkpoint.exists() and not agent.run.result.exists():
-        print(
-            f"warning: the training has not ended: this is its agent after "
-            f"{agent.model.num_timesteps:,} steps",
-            file=sys.stderr,
-        )
     return 0
 
 

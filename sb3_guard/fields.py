@@ -17,16 +17,16 @@ import numpy as np
 
 from sb3_guard.spelling import did_you_mean
 
-_WORDS: dict[Any, tuple[str, str]] = {  # one value of a type, and several
-    float: ("a number", "numbers"),
-    int: ("an integer", "integers"),
-    bool: ("true or false", "true or false"),
-    str: ("text", "texts"),
-    dict: ("a mapping", "mappings"),
-    Mapping: ("a mapping", "mappings"),
-    types.NoneType: ("null", "null"),
-    type: ("the dotted name of a class", "dotted names of classes"),
-    Callable: ("a schedule (lin_…)", "schedules (lin_…)"),
+_WORDS: dict[Any, str] = {
+    float: "a number",
+    int: "an integer",
+    bool: "true or false",
+    str: "text",
+    dict: "a mapping",
+    Mapping: "a mapping",
+    types.NoneType: "null",
+    type: "the dotted name of a class",
+    Callable: "a schedule (lin_…)",
 }
 
 
@@ -146,31 +146,20 @@ def _number(value: Any, kind: type) -> int | float:
 
 
 def in_words(
-    annotation: Any,
-    low: float = -math.inf,
-    high: float = math.inf,
-    ends: str = "[]",
-    many: bool = False,
+    annotation: Any, low: float = -math.inf, high: float = math.inf, ends: str = "[]"
 ) -> str:
-    """What an annotation and a range allow, in the words of JSON and YAML.
-
-    :param many: whether it is said of several values
-    """
+    """What an annotation and a range allow, in the words of JSON and YAML."""
     kind, args = typing.get_origin(annotation) or annotation, typing.get_args(annotation)
     if kind in (typing.Union, types.UnionType):
-        text = " or ".join(dict.fromkeys(in_words(arm, many=many) for arm in args))
+        text = " or ".join(dict.fromkeys(map(in_words, args)))
     elif kind is typing.Literal:
         text = " or ".join(map(repr, args))
+    elif kind is tuple and args and args[-1] is not ...:
+        text = f"a list of {' and '.join(map(in_words, args))}"
     elif kind in (list, tuple, Sequence):
-        count = f"{len(args)} " if kind is tuple and args and args[-1] is not ... else ""
-        items = f"{count}{in_words(args[0], many=True)}" if args else "anything"
-        if count and len({*args}) > 1:
-            items = " and ".join(map(in_words, args))
-        text = f"{'lists' if many else 'a list'} of {items}"
-    elif kind in _WORDS:
-        text = _WORDS[kind][many]
+        text = "a list" + (f", each item {in_words(args[0])}" if args else "")
     else:
-        text = str(getattr(annotation, "__name__", annotation))
+        text = _WORDS.get(kind) or str(getattr(annotation, "__name__", annotation))
     bounds = _bounds(low, high, ends)
     return f"{text}, {bounds}" if bounds else text
 

@@ -5,7 +5,6 @@ hub's own command uploads it (``hf upload me/my_agent agent``) and downloads it.
 """
 
 import dataclasses
-import json
 import shutil
 import sys
 from contextlib import closing
@@ -20,7 +19,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.zoo.agents.film import filming
 from sb3_guard.zoo.agents.flags import HubFlags as Flags
-from sb3_guard.zoo.agents.playback import EPISODES, Agent, open_agent, summary
+from sb3_guard.zoo.agents.playback import EPISODES, Agent, open_agent
 from sb3_guard.zoo.cli.flags import command
 from sb3_guard.zoo.cli.usage import UsageError, packages_flag
 from sb3_guard.zoo.run.folder import RunFolder
@@ -90,9 +89,6 @@ def stage(agent: Agent, flags: Flags) -> None:
     if not flags.no_video:
         with filming(agent.env, agent.model, folder / "replay.mp4") as film:
             evaluate_policy(agent.model, agent.env, 1, on_step=film, **how)
-    results = summary(evaluation)
-    results["is_deterministic"] = not flags.stochastic
-    (folder / "results.json").write_text(json.dumps(results, indent=2), encoding="utf-8")
     card(agent, run, flags, evaluation).save(folder / "README.md")
 
 

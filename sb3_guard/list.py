@@ -2,6 +2,7 @@
 
 import re
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -22,17 +23,11 @@ def summary(part: type) -> str:
 def stated(part: type, name: str) -> str:
     """What a part says of itself; nothing where a user's own part does not."""
     value = getattr(part, name, "")
+    if isinstance(value, bool):
+        words = ["yes", "no"] if value else ["no", "yes"]
+        solid = name != "interactive" and "solid" in part.__dataclass_fields__  # type: ignore[attr-defined]
+        return f"{words[0]}; {words[1]} if solid" if solid else words[0]
     return ", ".join(value) if isinstance(value, tuple) else str(value)
-
-
-def yes(part: type, name: str) -> str:
-    """A column of the taxonomy; parts that can be made solid change it then."""
-    if not hasattr(part, name):
-        return ""
-    value = "yes" if getattr(part, name) else "no"
-    if name != "interactive" and "solid" in part.__dataclass_fields__:  # type: ignore[attr-defined]
-        return f"{value}; {'no' if value == 'yes' else 'yes'} if solid"
-    return value
 
 
 def _of_one(suite: Suite) -> str:
@@ -63,24 +58,21 @@ def robots() -> str:
     return table(["robot", "actions", "workspace", "control step, s", "what it is"], rows)
 
 
+def _taxonomy(parts: Mapping[str, type], attributes: Sequence[str], header: Sequence[str]) -> str:
+    rows = [[n, *(stated(cls, a) for a in attributes), summary(cls)] for n, cls in parts.items()]
+    return table(header, rows)
+
+
 def tasks() -> str:
     """The tasks with their place in the paper's taxonomy."""
-    rows = [
-        [name, yes(cls, "interactive"), yes(cls, "contact"), stated(cls, "targets"),
-         stated(cls, "spaces"), summary(cls)]
-        for name, cls in TASKS.items()
-    ]  # fmt: skip
-    return table(["task", "interactive", "contact", "targets", "spaces", "what it asks"], rows)
+    attributes = ["interactive", "contact", "targets", "spaces"]
+    return _taxonomy(TASKS, attributes, ["task", *attributes, "what it asks"])
 
 
 def constraints() -> str:
     """The constraints with their place in the paper's taxonomy."""
-    rows = [
-        [name, yes(cls, "trespassable"), stated(cls, "movable"), stated(cls, "spaces"),
-         summary(cls)]
-        for name, cls in CONSTRAINTS.items()
-    ]  # fmt: skip
-    return table(["constraint", "trespassable", "moves", "spaces", "what it is"], rows)
+    header = ["constraint", "trespassable", "moves", "spaces", "what it is"]
+    return _taxonomy(CONSTRAINTS, ["trespassable", "movable", "spaces"], header)
 
 
 def agents() -> str:

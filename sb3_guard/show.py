@@ -6,7 +6,7 @@ Or a robot's file, before it is registered: ``sb3-guard show go1.xml``.
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 import yaml
+from gymnasium.wrappers import Autoreset
 
 from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.check_part import unsteady
@@ -108,19 +109,14 @@ class Flags(Command):
 def watch(flags: Flags) -> int:
     """Let a robot act at random in a window, until that is closed."""
     chosen = {"render_mode": "human", "camera": flags.camera, **(flags.env_kwargs or {})}
-    with (
-        explained("can't show it", ValueError, TypeError, RuntimeError),
-        ExitStack() as last,
-        suppress(KeyboardInterrupt),
-    ):
+    errors = ValueError, TypeError, RuntimeError
+    with suppress(KeyboardInterrupt), explained("can't show it", *errors):
         env = gymnasium.make(env_spec(flags.env), disable_env_checker=True, **chosen)
-        last.callback(env.close)
-        env.reset(seed=flags.seed)
-        env.action_space.seed(flags.seed)
-        while True:
-            *_, terminated, truncated, _ = env.step(env.action_space.sample())
-            if terminated or truncated:
-                env.reset()
+        with closing(Autoreset(env)) as watched:
+            watched.reset(seed=flags.seed)
+            watched.action_space.seed(flags.seed)
+            while True:
+                watched.step(watched.action_space.sample())
     return 0
 
 

@@ -62,7 +62,6 @@ FAULTS = {
     "no cost": ({4: {}}, "no cost key 'cost'"),
     "shape": ({0: np.zeros((1, 3), np.float32)}, r"shape \(1, 3\)"),
     "word": ({0: "left"}, "'left'"),
-    "rows": ({0: [[1.0], [1.0, 2.0]]}, "observation is"),
     "truncated": ({3: "no"}, "truncated is 'no'"),
     "four values": ({-1: 4}, "4 values"),
 }

@@ -62,7 +62,10 @@ def test_bad_ids_say_what_is_wrong(name, message):
         ({"hazards": {"nmu": 3}}, "hazards has no parameter 'nmu': did you mean 'num'"),
         ({"hazards": {"num": -1}}, "hazards.num = -1 must be .*at least 0"),
         ({"hazards": {"size": -0.1}}, "hazards.size = -0.1 must be .*greater than 0"),
-        ({"hazards": {"locations": [0, 1]}}, r"\(0, 1\) must be a list of lists of 2 numbers$"),
+        (
+            {"hazards": {"locations": [0, 1]}},
+            r"\(0, 1\) must be a list, each item a list of a number and a number$",
+        ),
         (
             {"chase": {"num": 3}},
             "unknown parameter 'chase': .*allowed: .*, goal, ",
@@ -403,7 +406,7 @@ def test_bad_registrations_are_refused(tmp_path):
     for attributes, message in (
         ({"timstep": 0.01}, "has no 'timstep': did you mean 'timestep'"),
         ({"timestep": -1.0}, "timestep = -1.0 must be .*greater than 0"),
-        ({"lidar_bodies": "tip"}, "lidar_bodies = 'tip' must be a list of texts"),
+        ({"lidar_bodies": "tip"}, "lidar_bodies = 'tip' must be a list, each item text"),
         ({"center": 3}, "center = 3 must be text or null"),
         ({"workspace": "3d"}, "workspace = '3d': allowed: planar, spatial"),
     ):

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-import shutil
 
 import onnxruntime
 import pytest
@@ -45,30 +44,14 @@ def test_an_exported_run_says_what_it_was_trained_at(logs, tmp_path, capsys):
     assert contract["inputs"][0]["normalized"] is True
 
 
-def test_the_folder_of_a_run_says_which_it_is(logs, tmp_path, capsys):
+def test_the_folder_of_a_run_says_which_it_is(logs, tmp_path):
     run = find_run(logs, "cpo", "CostPoint-v0")
     here = [*WHICH[2:], "-f", str(run.path), "-o", str(tmp_path / "policy.onnx")]
     args = run.params / "args.yml"
     args.write_text(args.read_text() + "optimize_hyperparameters: false\n")  # as RL-Zoo's has
     assert export_agent.main(here) == 0
-    assert "warning" not in capsys.readouterr().err
     trained_at = json.loads((tmp_path / "contract.json").read_text())["trained"]
     assert (trained_at["algo"], trained_at["env"]) == ("cpo", "CostPoint-v0")
-    refused(export_agent.main, [*here, "--algo", "cpo"], capsys, "is a run: leave out --algo")
-
-
-def test_the_agent_of_a_training_that_has_not_ended_is_told(logs, tmp_path, capsys):
-    shutil.copytree(logs, tmp_path / "logs")
-    run = find_run(tmp_path / "logs", "cpo", "CostPoint-v0")
-    here = [*WHICH, "-f", str(tmp_path / "logs"), "-o", str(tmp_path / "policy.onnx")]
-    run.result.unlink()
-    assert export_agent.main(here) == 0
-    assert "warning: the training has not ended" in capsys.readouterr().err
-    run.checkpoint.unlink()  # one from the hub has neither
-    assert export_agent.main(here) == 0
-    assert "warning" not in capsys.readouterr().err
-    here = ["--pretrained", "-f", str(tmp_path)]
-    refused(export_agent.main, here, capsys, "leave out --folder and --exp-id")
 
 
 def test_what_can_not_be_exported_is_said_in_a_line(logs, tmp_path, capsys):
@@ -85,10 +68,9 @@ def test_what_can_not_be_exported_is_said_in_a_line(logs, tmp_path, capsys):
     refused(export_agent.main, [*WHICH, "-f", str(tmp_path)], capsys, "can't export", "gSDE's")
 
 
-def test_a_pretrained_agent_says_which_limit_it_keeps_and_which_it_was_trained_at(tmp_path, capsys):
+def test_a_pretrained_agent_says_which_limit_it_keeps_and_which_it_was_trained_at(tmp_path):
     which = ["--pretrained", "--env", "Goal_Point_8Ghosts", "--n-episodes", "2"]
     assert export_agent.main([*which, "-o", str(tmp_path / "policy.onnx")]) == 0
-    assert "warning" not in capsys.readouterr().err
     contract = json.loads((tmp_path / "contract.json").read_text())
     assert contract["costs"][0]["limit"] == 5.0 and contract["trained"]["cost_limit"] == 4
 

@@ -171,19 +171,11 @@ def test_the_film_of_the_readme_is_made_of_shipped_agents(tmp_path, monkeypatch)
         assert (film.n_frames, film.size) == (2, (300, 250))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ["--algo", "ppo", "--env", "Goal_Ant_8Hazards"],
-            "no agent comes with the package for ppo on Goal_Ant_8Hazards-v0",
-        ),
-        (["-f", "logs"], "leave out --folder and --exp-id"),
-    ],
-)
-def test_what_is_not_shipped_is_not_played(arguments, message, capsys):
-    assert enjoy.main(["--pretrained", "--no-render", *arguments]) == 2
-    assert message in capsys.readouterr().err
+def test_what_is_not_shipped_is_not_played(capsys):
+    which = ["--algo", "ppo", "--env", "Goal_Ant_8Hazards"]
+    assert enjoy.main(["--pretrained", "--no-render", *which]) == 2
+    error = capsys.readouterr().err
+    assert "no agent comes with the package for ppo on Goal_Ant_8Hazards-v0" in error
 
 
 @pytest.mark.parametrize("command", [["list", "agents"], ["enjoy", "--pretrained"]])

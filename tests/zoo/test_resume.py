@@ -140,10 +140,9 @@ def test_finished_run_goes_on_as_a_longer_one(undisturbed, tmp_path, capsys):
     assert train.main(["-i", str(run), *TOY[:2]]) == 0
     assert "is finished: 120 steps" in capsys.readouterr().out
     before = outcome(run)
-    for damaged in ('{"n_timest', "[]", json.dumps({**before, "return": "high"})):
-        (run / "result.json").write_text(damaged)
-        assert train.main(["-i", str(run), *TOY[:2]]) == 0  # writes it again
-        assert outcome(run) == before
+    (run / "result.json").write_text('{"n_timest')
+    assert train.main(["-i", str(run), *TOY[:2]]) == 0  # writes it again
+    assert outcome(run) == before
     assert train.main(["-i", str(run), *TOY[:2], "-n", "300"]) == 0
     assert_same_run(undisturbed(300), tmp_path)
     # For those whose warm-up or schedule would have been another.

@@ -139,16 +139,9 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     """
     import_packages(flags.gym_packages)
     if flags.pretrained:
-        if flags.given & {"folder", "exp_id"}:
-            raise UsageError(
-                "--pretrained takes an agent that comes with the package: leave out --folder and "
-                "--exp-id, or leave out --pretrained to take a run of your own"
-            )
         run = find_pretrained(flags.env, flags.algo if "algo" in flags.given else None)
         flags.algo = run.path.parent.name
     elif is_run(Path(flags.folder)):
-        if flags.given & {"algo", "env", "exp_id"}:
-            raise UsageError(f"{flags.folder} is a run: leave out --algo, --env and --exp-id")
         run = RunFolder(Path(flags.folder))
         with explained(f"{run.params / 'args.yml'} is damaged"):
             flags.algo, flags.env = (str(run.args()[name]) for name in ("algo", "env"))
@@ -187,11 +180,6 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     if shipped is not None:
         sync_envs_normalization(shipped, env)
         shipped.close()
-    if env.observation_space != model.observation_space:
-        raise UsageError(
-            f"{path} was trained on observations {model.observation_space}, "
-            f"but {env_id} has {env.observation_space}"
-        )
     return Agent(run, path, env_id, model, env, flags.stochastic)
 
 
@@ -224,7 +212,8 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         shown = filming(agent.env, agent.model, video)
     elif render_mode == "human":
         shown = nullcontext(partial(render, agent.env))
-    with closing(agent.env), explained(f"can't play {agent.path}", *BAD_NUMBERS), shown as on_step:
+    errors = (ValueError, *BAD_NUMBERS)  # SB3's, of observations of another shape
+    with closing(agent.env), explained(f"can't play {agent.path}", *errors), shown as on_step:
         evaluation = evaluate_policy(
             agent.model,
             agent.env,

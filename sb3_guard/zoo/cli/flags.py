@@ -290,7 +290,5 @@ def _value(field: "dataclasses.Field[Any]", hint: Any, value: Any, label: str) -
             if not (key and colon):
                 raise ValueError(f"{label}: {key!r} is not of the form key:value")
         return {key: parse_value(text) for key, _, text in pairs}
-    if kind is list and not items:
-        raise ValueError(f"{label} = [] must be one value or a list of them")
     value = items if kind is list else value
     return fit(label, value, _bare(hint), *field.metadata["range"])

@@ -65,10 +65,8 @@ def read_mapping(path: str | Path, what: str, form: str) -> dict[Any, Any]:
     :param form: what it must be, for the message
     :raises UsageError: it can't be read, or is not a mapping
     """
-    with explained(f"can't read {what} {path}", OSError):
-        text = Path(path).read_bytes()
-    with explained(f"can't read {what} {path} as YAML", ValueError, TypeError, yaml.YAMLError):
-        content = load_yaml(text.decode())
+    with explained(f"can't read {what} {path}", OSError, ValueError, TypeError, yaml.YAMLError):
+        content = load_yaml(Path(path).read_bytes().decode())
     if not isinstance(content, dict):
         raise UsageError(f"{what} {path} is damaged: it must map {form}")
     return content

@@ -4,7 +4,6 @@ import csv
 import glob
 import hashlib
 import json
-import math
 import shlex
 import uuid
 from collections.abc import Iterator, Mapping
@@ -186,14 +185,11 @@ class RunFolder:
         fix = f"sb3-guard train -i {self.path} writes it again"
         with explained("result.json is damaged", fix=fix):
             result: dict[str, Any] = json.loads(self.result.read_bytes())
-            for key in ("n_timesteps", *MEASURES):
-                if result[key] is not None and not math.isfinite(result[key]):
-                    raise ValueError(f"{key} = {result[key]!r} should be a number")
-        if "costs" not in result:  # as older versions wrote it: of several costs only the total
-            limit = result.get("cost_limit")
-            bounded = None if "limit_on" in result else result["cost"]
-            limit = None if isinstance(limit, list) else limit
-            result["costs"] = {"cost": {"mean": bounded, "limit": limit}}
+            if "costs" not in result:  # as older versions wrote it: of several costs the total
+                limit = result.get("cost_limit")
+                bounded = None if "limit_on" in result else result["cost"]
+                limit = None if isinstance(limit, list) else limit
+                result["costs"] = {"cost": {"mean": bounded, "limit": limit}}
         return result
 
     def read_result(self) -> dict[str, Any] | None:

@@ -18,7 +18,7 @@ import sb3_guard
 from sb3_guard.algorithms.common.costs import limits_at
 from sb3_guard.checks import NumberError
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
-from sb3_guard.costs import beside, bounded_name, estimate
+from sb3_guard.costs import estimate
 from sb3_guard.zoo.run.folder import EPOCH
 
 DIVERGED = 10  # episodes in a row that a physics error ended, after which training stops
@@ -211,23 +211,8 @@ class Epochs(BaseCallback):
 
 
 def summary(result: Mapping[str, Any]) -> str:
-    """What a run came to, as the paper measures it, on a few lines."""
-
-    def number(value: float | None, digits: int) -> str:
-        return "– (no episode has ended)" if value is None else f"{value:.{digits}f}"
-
-    limit_on = result.get("limit_on", "sum")
-    lines = [
-        f"  return       J_r   {number(result['return'], 3)}",
-        f"  episode cost M_c   {number(result['cost'], 3)}",
-    ]
-    for key, cost in result["costs"].items():
-        interval = f"   [{cost['low']:.3f}, {cost['high']:.3f}]" if "low" in cost else ""
-        limit = "" if cost["limit"] is None else f"   limit {cost['limit']:g}"
-        words = f": {cost['verdict']}" if "verdict" in cost else ""
-        lines.append(
-            f"    {bounded_name(key, limit_on):<16} {number(cost['mean'], 3)}{interval}{limit}"
-            f"{words}{beside(cost.get('physics_errors', 0))}"
-        )
-    lines.append(f"  cost rate    ρ_c   {number(result['cost_rate'], 5)}")
-    return "\n".join(lines)
+    """What a training came to, as the paper measures it, in a line."""
+    if result["return"] is None:
+        return "no episode has ended"
+    line = "return J_r {return:.5g}, episode cost M_c {cost:.5g}, cost rate ρ_c {cost_rate:.5g}"
+    return line.format(**result)

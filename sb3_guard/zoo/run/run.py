@@ -290,25 +290,22 @@ class Run:
 
         It comes before they are: events of files that are open already would not be seen.
         """
-        with explained("--track needs wandb", ImportError, fix="pip install wandb"):
-            import wandb
+        import wandb
 
         flags = self.flags
         file = None if self.folder is None else self.folder.params / WANDB
         run_id = file.read_text().strip() if file is not None and file.exists() else None
-        fix = "log in with: wandb login, set WANDB_MODE=offline, or leave out --track"
-        with explained("--track: Weights & Biases can't be used", fix=fix):
-            return wandb.init(
-                id=run_id,
-                resume="allow" if run_id else None,
-                name=f"{flags.env}__{flags.algo}__{flags.seed}__{int(time.time())}",
-                project=flags.wandb_project_name,
-                entity=flags.wandb_entity,
-                group=flags.wandb_group,
-                tags=flags.wandb_tags,
-                config={**flags.values(), "hyperparams": self.hyperparams},
-                sync_tensorboard=True,
-            )
+        return wandb.init(
+            id=run_id,
+            resume="allow" if run_id else None,
+            name=f"{flags.env}__{flags.algo}__{flags.seed}__{int(time.time())}",
+            project=flags.wandb_project_name,
+            entity=flags.wandb_entity,
+            group=flags.wandb_group,
+            tags=flags.wandb_tags,
+            config={**flags.values(), "hyperparams": self.hyperparams},
+            sync_tensorboard=True,
+        )
 
     def make_envs(
         self,
@@ -599,10 +596,7 @@ class Run:
 
         def stop(number: int) -> None:
             if verbose:
-                print(
-                    "\nStopping after this rollout; Ctrl-C again stops immediately.",
-                    file=sys.stderr,
-                )
+                print("\nStopping after this rollout; Ctrl-C again stops now.", file=sys.stderr)
 
         began = time.monotonic()
         wrappers = [*self.wrappers("env_wrapper"), *self.wrappers("vec_env_wrapper")]
@@ -624,7 +618,7 @@ class Run:
             words = "Finished" if finished else "Interrupted"
             seconds = time.monotonic() - began
             print(f"{words} at {result['n_timesteps']:,} steps, {seconds:.0f} s")
-            print(f"  run folder         {folder.path}\n{summary(result)}")
+            print(f"  last epoch         {summary(result)}\n  run folder         {folder.path}")
             if finished:
                 print(f"  see the agent      {folder.play(flags)}")
             else:

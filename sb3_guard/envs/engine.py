@@ -115,17 +115,20 @@ class Engine:
         for part in self.parts:
             part.bind(self)
         self.drawn.bind(self.model)
-        self._motion = Motion(self.parts)
+        # a part that does not define a verb is not asked
+        movers, acting, self._enders = (
+            [p for p in self.parts if getattr(type(p), verb) is not getattr(Part, verb)]
+            for verb in ("moving", "before_step", "terminated")
+        )
+        self._motion = Motion(movers)
         self.observer = Observer(self.robot, self.parts, lidar, self.extras.components)
         # of each named component, in the order of the flat observation: where it lies; its size,
         # bounds and unit
         self.observation_layout: dict[str, slice] = self.observer.slices
         self.channels: dict[str, Channel] = self.observer.channels
         # what moves before every physics step instead of before a control step
-        self._quick = [part for part in self.parts if part.every == "physics"]
-        self._slow = [part for part in self.parts if part.every != "physics"]
-        # a part that cannot end an episode is not asked
-        self._enders = [p for p in self.parts if type(p).terminated is not Part.terminated]
+        self._quick = [part for part in acting if part.every == "physics"]
+        self._slow = [part for part in acting if part.every != "physics"]
         self._before = self.array("before", np.shape(self.task.measure())[1:])
 
     def array(self, name: str, shape: tuple[int, ...] = (), dtype: Any = float) -> Array:

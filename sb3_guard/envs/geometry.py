@@ -20,8 +20,11 @@ def by_coordinate(points: Array) -> Array:
 def dot(a: Array, b: Array) -> Array:
     """Inner product over the first axis, of size 2 or 3, of vectors by coordinate."""
     products = a * b
-    total = products[0] + products[1]
-    return total if len(products) == 2 else total + products[2]
+    total = products[0]
+    total += products[1]
+    if len(products) == 3:
+        total += products[2]
+    return total
 
 
 def length(v: Array) -> Array:

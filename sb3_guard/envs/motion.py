@@ -134,9 +134,8 @@ class MoverGroup:
         case = np.where(within[k : 2 * k], self._inside, self._outside)
         case += within[:k]
         speed = self._speeds.take(case, axis=1)  # [2, K, N]
-        np.maximum(distance, TINY, out=distance)
         if self._unit:
-            speed /= distance[: 2 * k].reshape(2, k, n)
+            speed /= np.maximum(distance[: 2 * k], TINY).reshape(2, k, n)
         aims = offset[:, : 2 * k].reshape(-1, 2, k, n)
         aims *= speed
         move = aims[:, 0] + aims[:, 1]
@@ -144,7 +143,7 @@ class MoverGroup:
         if len(close):
             self._part(move, offset, distance, close)
         for live, columns in zip(self._live, self._columns, strict=True):
-            live += move[:, columns]
+            np.add(self._points[:, columns], move[:, columns], out=live)
 
     def _update_gaps(self) -> None:
         """Movers part below the gap, not at it."""
@@ -156,13 +155,13 @@ class MoverGroup:
 
         :param move: what to add to, by coordinate, [2 or 3, K, N] m
         :param offset: to robots, to origins and within pairs, [2 or 3, 2 K + pairs, N] m
-        :param distance: the same for distances, [2 K + pairs, N] m, not 0
+        :param distance: the same for distances, [2 K + pairs, N] m
         :param close: which are closer than the gap: flat indices of [pairs, N], rising
         """
         _, k, n = move.shape
         pair, where = close // n, close + 2 * k * n
         push = offset.reshape(len(offset), -1).take(where, axis=1)
-        push *= self._apart.take(pair) / distance.take(where)
+        push *= self._apart.take(pair) / np.maximum(distance.take(where), TINY)
         moved = self._shift.take(pair, axis=1)
         moved += close
         # each mover's pushes are summed in the order of the others, whatever the number of rows

@@ -1,5 +1,6 @@
 """The observation: what all parts let the robot observe, in one pass over all points."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -30,12 +31,13 @@ class Observer:
         lidar: Lidar,
         components: Sequence[str] | None = None,
     ) -> None:
-        self._robot, self._parts, self._lidar = robot, parts, lidar
+        self._robot, self._lidar = robot, lidar
+        self._parts = [part for part in parts if part.observations()]  # always of the same names
         self._level = robot.workspace == "planar"
         self._bodies = robot.frames[0].shape[1]
         self._seen: list[tuple[str, tuple[int, ...], bool]] = []  # name, shape, planar
         known: dict[str, Channel] = {}
-        for part in parts:
+        for part in self._parts:
             for name, channel in self.channels_of(part).items():
                 if name in known:
                     raise ValueError(
@@ -101,22 +103,26 @@ class Observer:
         for name, what in points.items():
             kind = (isinstance(what, Compass), self._coordinates(what))
             kinds.setdefault(kind, []).append(name)
-        self._order = [name for kind in sorted(kinds) for name in kinds[kind]]
-        self._size = max((size for _, size in kinds), default=2)
-        self._flat = 0  # points seen as lying on the floor, whatever their height; they come first
+        self._size = max(size for _, size in kinds)
         self._scans: list[tuple[int, slice, list[int], list[str]]] = []
         self._compasses: list[tuple[int, slice, list[str]]] = []
+        nums = {name: math.prod(what[0].shape[1:-1]) for name, what in points.items()}
+        # all points by coordinate, [2 or 3, K, N] m, and where in it those of each are
+        self._points = np.zeros((3, sum(nums.values()), len(next(iter(points.values()))[0])))
+        self._places: dict[str, Array] = {}
         start = 0
         for towards, size in sorted(kinds):
-            names = kinds[towards, size]
-            each = [1 if towards else points[name][0].shape[1] for name in names]
-            where = slice(start, start + sum(each))
+            names, first = kinds[towards, size], start
+            for name in names:
+                columns = start if towards else slice(start, start + nums[name])
+                # the z that a planar scan leaves out stays 0: it sees points as lying on the floor
+                self._places[name] = self._points[: 3 if towards else size, columns]
+                start += nums[name]
+            where = slice(first, start)
             if towards:
                 self._compasses.append((size, where, names))
             else:
-                self._scans.append((size, where, each, names))
-                self._flat = where.stop if size == 2 else self._flat
-            start = where.stop
+                self._scans.append((size, where, [nums[name] for name in names], names))
 
     def look(self, observations: Observations) -> dict[str, Array]:
         """What is observed, by name: [N, bodies · bins], [N, bodies · coordinates] or values."""
@@ -134,10 +140,9 @@ class Observer:
             self._arrange(points)
             self._seen = seen
         origin, rotation = self._robot.frames
-        columns = [points[name][0].T for name in self._order]  # of a compass [3, N]
-        places = np.concatenate([c if c.ndim == 3 else c[:, None] for c in columns], axis=1)
-        places[2, : self._flat] = 0.0
-        v = into_frames(origin, rotation, places, self._size)  # [2 or 3, B, K, N]
+        for name, places in self._places.items():  # [2 or 3, K, N]; of a compass [3, N]
+            places[:] = points[name][0].T[: len(places)]
+        v = into_frames(origin, rotation, self._points, self._size)  # [2 or 3, B, K, N]
         n = len(origin)
         for size, where, groups, names in self._scans:
             closeness = self._lidar.scan(v[:size, :, where], groups)

@@ -126,7 +126,7 @@ def parameters_of_environments() -> str:
     rows = [[f"`{name}`", ", ".join(of), doc] for (name, doc), of in drawn.items()]
     parts += ["## Drawn anew in each episode", table(["parameter", "of", "what it is"], rows)]
     rows = [[f"`{name}`", escaped(default), escaped(meaning)]
-            for name, (default, meaning) in ATTRIBUTES.items()]  # fmt: skip
+            for name, (default, meaning, _) in ATTRIBUTES.items()]  # fmt: skip
     parts += ["## `register_robot`", "Further arguments: what the file of the robot does not say."]
     parts += [table(["argument", "default", "what it is"], rows)]
     return "\n\n".join(parts) + "\n"

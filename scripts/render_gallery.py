@@ -156,14 +156,12 @@ def clip(env_id: str, path: Path, camera: str, folder: str, seed: int, zoom: flo
 
 def write_clip(model: BaseAlgorithm, env: VecEnv, path: Path, deterministic: bool = True) -> None:
     """Write a small film of an agent in its environment, which is closed afterwards."""
-    rate, smooth = env.envs.metadata["render_fps"], env.envs.film_fps
+    rate = env.envs.metadata["render_fps"]
     every = max(1, round(rate / CLIP_FPS))
     frames: list[np.ndarray] = []
     obs = env.reset()
     for step in range(10_000):
-        if smooth > rate:
-            frames += env.film()[:: round(smooth / CLIP_FPS)]
-        elif step % every == 0:
+        if step % every == 0:
             frames += env.get_images()
         if len(frames) >= CLIP:
             break
@@ -172,8 +170,8 @@ def write_clip(model: BaseAlgorithm, env: VecEnv, path: Path, deterministic: boo
     left, top = (frames[0].shape[1] - 600) // 2, (frames[0].shape[0] - 500) // 2
     whole = [Image.fromarray(frame).crop((left, top, left + 600, top + 500)) for frame in frames]
     first, *others = [frame.resize((300, 250)) for frame in whole[:CLIP]]
-    first.save(path, save_all=True, append_images=others, duration=round(1000 / CLIP_FPS), loop=0,
-               quality=50)  # fmt: skip
+    first.save(path, save_all=True, append_images=others, duration=round(1000 * every / rate),
+               loop=0, quality=50)  # fmt: skip
     print(f"{path} {path.stat().st_size / 1024:.0f} KiB", flush=True)
 
 

@@ -102,10 +102,6 @@ class GuardVecEnv(VecEnv):
     def get_images(self) -> Sequence[np.ndarray | None]:
         return [self.envs.frame(row) for row in range(self.num_envs)]
 
-    def film(self, row: int = 0) -> list[np.ndarray]:
-        """The pictures of one row since the last call, ``envs.film_fps`` for each second."""
-        return self.envs.film(row)
-
     def state(self) -> dict[str, Any]:
         """Everything the coming steps depend on, the generators included."""
         return self.envs.state()

@@ -104,11 +104,6 @@ def unsteady(engine: Engine) -> str | None:
     return explodes(engine) or _sinks(engine) or explodes(engine, alone=False)
 
 
-def diverges(engine: Engine) -> str | None:
-    """What is wrong if the physics diverges within a second in which nobody acts."""
-    return explodes(engine, speed=np.inf)
-
-
 def explodes(engine: Engine, alone: bool = True, speed: float = 50.0) -> str | None:
     """What is wrong with a robot that explodes within a second; None: it does not.
 

@@ -84,9 +84,6 @@ class Engine:
         self.steps[:] = -1  # no episode has begun
         self._begun = False
         layout = layout or Layout()
-        self._randomize = layout.randomize
-        # where the generators begin every episode of rows whose layout is not to change
-        self._origins: dict[int, Any] = {}
         self.placing = Placing(self.parts, layout, self.arena.placements, self.array)
         self.footprints: dict[str, Footprint] = self.placing.footprints
         self._bind(lidar or Lidar())
@@ -166,7 +163,6 @@ class Engine:
         """Give one row its generator; its layouts and its movers draw from nothing else."""
         self.rngs[row] = rng
         self.placing.forget(row)
-        self._origins.pop(row, None)
 
     def reset(self, ids: Array) -> None:
         """Begin an episode in rows ``ids``, sorted, with no cost and no goal reached at the start.
@@ -176,11 +172,6 @@ class Engine:
         self._check_open()
         ids = np.asarray(ids, dtype=np.int32)
         self.steps[ids] = 0
-        if not self._randomize:
-            self.placing.forget(ids)
-            for row in ids.tolist():
-                bits = self.rngs[row].bit_generator
-                bits.state = self._origins.setdefault(row, bits.state)
         if self.drawn.ranges:
             self.drawn.draw(ids)
             self.placing.forget(ids)  # layouts that are kept may be of another number of objects
@@ -350,7 +341,6 @@ class Engine:
             "batch": self.batch.snapshot(),
             "arrays": {name: a.copy() for name, a in self._arrays.items()},
             "rngs": [rng.bit_generator.state for rng in self.rngs],
-            "origins": dict(self._origins),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -367,7 +357,6 @@ class Engine:
         for name, value in state["arrays"].items():
             self._arrays[name][:] = value
         self.rngs = [_generator(s) for s in state["rngs"]]
-        self._origins = dict(state["origins"])
         self.drawn.apply(np.arange(self.num_envs))
         self.batch.restore(state["batch"])
         self._begun = bool((self.steps >= 0).all())

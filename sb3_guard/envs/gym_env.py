@@ -1,6 +1,5 @@
 """One environment with Gymnasium's interface: the batch of one."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from sb3_guard.fields import fit
 from sb3_guard.spelling import did_you_mean
 
 ROW = np.zeros(1, dtype=np.int32)
-SMOOTH = 25  # pictures a second of a film, at least
 
 
 def as_scenario(
@@ -175,29 +173,9 @@ class Simulated:
 
     def frame(self, row: int) -> Array:
         """A picture of one row, [height, width, 3] uint8; never advances physics."""
-        return self._camera_man.frame(row)
-
-    def film(self, row: int = 0) -> list[Array]:
-        """The pictures since the last call, at :attr:`film_fps`: frames between control steps too.
-
-        Robots that are controlled a few times a second, such as Ant, then move smoothly in videos.
-        """
-        return self._camera_man.film(row, self._frames_per_step)
-
-    @property
-    def _frames_per_step(self) -> int:
-        return math.ceil(SMOOTH / self.metadata["render_fps"])
-
-    @property
-    def film_fps(self) -> int:
-        """Pictures of :meth:`film` in a second of the simulation, at least 25."""
-        return self._frames_per_step * int(self.metadata["render_fps"])
-
-    @property
-    def _camera_man(self) -> Renderer:
         if self._renderer is None:
             self._renderer = Renderer(self.engine, *self._window)
-        return self._renderer
+        return self._renderer.frame(row)
 
     def _free(self) -> None:
         for renderer in (self._renderer, self._eye):

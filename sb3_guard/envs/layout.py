@@ -51,7 +51,6 @@ class Layout(Parameters):
         high=10**6,
     )
     overlap: bool = param(False, "whether keep-outs may let solid objects begin inside each other")
-    randomize: bool = param(True, "false: all episodes of an environment are the same")
 
 
 class LayoutError(WorldError, RuntimeError):

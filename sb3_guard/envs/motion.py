@@ -18,7 +18,6 @@ from sb3_guard.envs.geometry import length
 from sb3_guard.envs.types import Array
 
 TINY = 1e-12  # m: the unit vector of a zero offset is zero
-LARGE = 32  # movers of a group that moves on its own
 
 
 @dataclass(frozen=True)
@@ -200,15 +199,9 @@ class Motion:
 
 
 def grouped(moving: Iterable[Moving]) -> list[MoverGroup]:
-    """Movers that move alike together, in few groups; those of no movers are left out.
-
-    Large groups move on their own: together they would leave the processor's cache.
-    """
+    """Movers that move alike together, in few groups; those of no movers are left out."""
     alike: dict[tuple[bool, bool], list[Moving]] = {}
-    large = []
     for group in moving:
-        if group.points.shape[1] > LARGE:
-            large.append([group])
-        elif group.points.shape[1]:
+        if group.points.shape[1]:
             alike.setdefault((group.planar, group.law.unit), []).append(group)
-    return [MoverGroup(groups) for groups in [*alike.values(), *large]]
+    return [MoverGroup(groups) for groups in alike.values()]

@@ -4,6 +4,7 @@ Adding one to its table here, or with :func:`register_robot`, :func:`register_ta
 :func:`register_constraint` from outside, is all it takes to use it in ids, scenarios and commands.
 """
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -13,7 +14,7 @@ from typing import Any, TypeVar
 import mujoco
 
 from sb3_guard.envs.arena import Arena
-from sb3_guard.envs.check_part import diverges
+from sb3_guard.envs.check_part import explodes
 from sb3_guard.envs.constraints import limits
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.part import Constraint, Part, Robot, Task
@@ -129,7 +130,7 @@ def register_robot(
         own: Any = robot.from_params({}, "robot")
         goal = TASKS["Goal"].from_params(own.defaults.get("goal", {}))
         arena = Arena.from_params(own.defaults.get("arena", {}))
-        unsteady = diverges(Engine(own, goal, arena=arena))
+        unsteady = explodes(Engine(own, goal, arena=arena), speed=math.inf)  # it diverges
         if unsteady is not None:
             raise ValueError(f"robot {name!r}: {unsteady}")
     elif attributes:

@@ -6,7 +6,6 @@ A frame is made from a copy of one row's state, so looking never changes the phy
 
 from __future__ import annotations
 
-import copy
 import functools
 import importlib
 import os
@@ -114,7 +113,6 @@ class Renderer:
     ) -> None:
         self._engine = engine
         self._data = mujoco.MjData(engine.model)
-        self._last: tuple[int, mujoco.MjData] | None = None  # what film showed last
         self._human = mode == "human"
         self._camera = mujoco.MjvCamera()
         self._explain = camera in CAMERAS
@@ -186,7 +184,7 @@ class Renderer:
         self._engine.batch.get_data(row, self._data)
         with window.lock():
             window.user_scn.ngeom = 0
-            self._paint(window.user_scn, self._data, row)
+            self._paint(window.user_scn, row)
         window.set_texts((None, None, "\n".join(words), "\n".join(words.values())))
         window.sync()
         began, since = self._pace
@@ -205,43 +203,13 @@ class Renderer:
         if code == ord(" "):
             self._paused = not self._paused
 
-    def film(self, row: int, count: int) -> list[Array]:
-        """Pictures from the last call's state to the present one, evenly spaced in time.
-
-        Between the two, joints and mocap bodies are interpolated; zones are where they are now. One
-        picture if an episode has begun since.
-
-        :param count: how many, the last one of now
-        """
-        model = self._engine.model
-        now = mujoco.MjData(model)
-        self._engine.batch.get_data(row, now)
-        frames = []
-        if self._last is not None and self._last[0] == row and self._last[1].time < now.time:
-            before, step = self._last[1], np.zeros(model.nv)
-            root = model.body(self._engine.robot.root).id
-            mujoco.mj_differentiatePos(model, step, 1.0, before.qpos, now.qpos)
-            for moment in np.arange(1, count) / count:
-                between = copy.copy(before)
-                mujoco.mj_integratePos(model, between.qpos, step, moment)
-                between.mocap_pos += moment * (now.mocap_pos - before.mocap_pos)
-                between.mocap_quat[:] = now.mocap_quat
-                mujoco.mj_kinematics(model, between)
-                mujoco.mj_camlight(model, between)
-                frames.append(self._shoot(between, row, between.xpos[root] - now.xpos[root]))
-        self._last = row, now
-        return [*frames, self._shoot(now, row)]
-
     def frame(self, row: int) -> Array:
         """A picture of one row, [height, width, 3] uint8."""
         self._engine.batch.get_data(row, self._data)
-        return self._shoot(self._data, row)
-
-    def _shoot(self, data: mujoco.MjData, row: int, shift: Array | float = 0.0) -> Array:
         if self._explain:
-            self._look_at(self._camera, data)
-        self._screen.update_scene(data, self._camera)
-        self._paint(self._screen.scene, data, row, shift)
+            self._look_at(self._camera, self._data)
+        self._screen.update_scene(self._data, self._camera)
+        self._paint(self._screen.scene, row)
         return self._screen.render()
 
     def _look_at(self, camera: mujoco.MjvCamera, data: mujoco.MjData) -> None:
@@ -265,11 +233,9 @@ class Renderer:
         at, distance = frame_all(np.array([*points, *near]), elevation, self._aspect, fovy)
         camera.lookat[:], camera.distance = at, distance
 
-    def _paint(
-        self, scene: mujoco.MjvScene, data: mujoco.MjData, row: int, shift: Array | float = 0.0
-    ) -> None:
+    def _paint(self, scene: mujoco.MjvScene, row: int) -> None:
         engine = self._engine
-        painter = ScenePainter(scene, engine, data, row, shift)
+        painter = ScenePainter(scene, engine, self._data, row)
         if self._explain and not self._human:
             painter.shadows()
         for part in engine.parts:
@@ -281,7 +247,7 @@ class Renderer:
         painter.heading()
         pays = any(c.cost()[row] > 0 for c in engine.constraints)
         if pays:
-            painter.glow(engine.robot.position[row] + shift)
+            painter.glow(engine.robot.position[row])
         if self._has_arena:
             painter.border(self._middle, self._half, COST_COLOR if pays else (0.45, 0.5, 0.56))
         if not self._human:

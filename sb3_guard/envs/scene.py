@@ -39,19 +39,13 @@ class ScenePainter:
     :param engine: whose parts draw
     :param data: one row's state
     :param row: which row
-    :param shift: from where the robot is to where it is drawn, [3] m
     """
 
     def __init__(
-        self,
-        scene: mujoco.MjvScene,
-        engine: Engine,
-        data: mujoco.MjData,
-        row: int,
-        shift: Array | float = 0.0,
+        self, scene: mujoco.MjvScene, engine: Engine, data: mujoco.MjData, row: int
     ) -> None:
         self._scene, self._engine, self._data, self._row = scene, engine, data, row
-        self._shift, self._rings = shift, 0
+        self._rings = 0
 
     def zone(
         self, center: Array, radius: float, half_height: float, color: tuple[float, ...]
@@ -83,7 +77,7 @@ class ScenePainter:
         origin, rotation = robot.frames
         # above robots on the floor, where it can be seen
         lift = [0.0, 0.0, 0.25 if robot.workspace == "planar" else 0.0]
-        centers = origin[self._row] + lift + self._shift
+        centers = origin[self._row] + lift
         thick = _thickness(model, self._data, robot_geoms(model, robot), centers)
         return centers, rotation[self._row], np.maximum(RING, thick + 1.5 * BEAD)
 
@@ -157,7 +151,7 @@ class ScenePainter:
             return
         ahead /= length
         reach = float(self._first_ring[2][0]) + 0.05
-        start = origin[row, 0] + self._shift + reach * ahead
+        start = origin[row, 0] + reach * ahead
         start[2] = self.floor + 0.03
         dart = self._add(_SPHERE, (1.0, 1.0, 1.0), start, (0.15, 0.15, 0.2, 1.0))
         if dart is not None:

@@ -96,17 +96,16 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         self.single_action_space = action_space(self.engine)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._everyone = np.arange(self.num_envs, dtype=np.int32)
 
-    def begin(self, seeds: Sequence[int | None], ids: Array | None = None) -> Array:
-        """Begin episodes in rows ``ids`` (by default all); a seed renews a row's generator.
+    def begin(self, seeds: Sequence[int | None]) -> Array:
+        """Begin an episode in every row; a seed renews a row's generator.
 
         :return: flat observations of every row, [N, D]
         """
         for row, seed in enumerate(seeds):
             if seed is not None:
                 self.engine.seed(row, seeding.np_random(int(seed))[0])
-        self.engine.reset(self._everyone if ids is None else ids)
+        self.engine.reset(np.arange(self.num_envs))
         return self.engine.observe()
 
     def advance(self, actions: Array) -> Transition:
@@ -127,7 +126,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode in every row, or in the rows of ``options["reset_mask"]``.
+        """Begin an episode in every row.
 
         :param seed: row i gets seed + i; or one seed (or None) per row
         """
@@ -140,14 +139,7 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
             seeds = list(seed)
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments")
-        ids = None
-        if options is not None and "reset_mask" in options:
-            mask = np.asarray(options["reset_mask"], dtype=bool)
-            if mask.shape != (self.num_envs,) or not mask.any():
-                raise ValueError(f"reset_mask must be [{self.num_envs}] bool with a True in it")
-            ids = np.flatnonzero(mask)
-            seeds = [s if m else None for s, m in zip(seeds, mask, strict=True)]
-        obs = self.begin(seeds, ids)
+        obs = self.begin(seeds)
         infos: dict[str, Any] = self.engine.drawn.info()
         everyone = np.ones(self.num_envs, dtype=bool)
         infos |= {f"_{name}": everyone for name in infos}

@@ -146,17 +146,6 @@ def test_values_are_not_drawn_again_where_the_layout_is():
     assert 0.4 < np.mean(np.array(sizes) > 0.8) < 0.6
 
 
-def test_a_layout_that_is_not_to_change_keeps_what_was_drawn():
-    engine = world(
-        "Goal_Point_8Hazards",
-        hazards={"size": {"low": 0.1, "high": 0.3}},
-        layout={"randomize": False},
-    )
-    first = drawn_of(engine)
-    engine.reset(ROW)
-    assert drawn_of(engine) == first
-
-
 def test_absent_objects_are_neither_seen_nor_felt_nor_drawn(monkeypatch):
     engine = world(
         "Goal_Point_8Hazards",

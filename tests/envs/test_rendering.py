@@ -339,21 +339,3 @@ def test_bodies_throw_shadows_and_zones_do_not():
     for body, shadow in zip(list(painted.geoms[1:bodies]), shadows, strict=True):
         assert shadow.pos[2] < 0.01 < height
         assert np.linalg.norm(shadow.pos[:2] - body.pos[:2]) < body.pos[2]
-
-
-def test_a_film_shows_what_happens_between_control_steps():
-    env = GuardEnv(
-        "Goal_Ant_1Hazards", render_mode="rgb_array", width=64, height=48, camera="track"
-    )
-    assert env.film_fps == 25 and env.metadata["render_fps"] == 5
-    env.reset(seed=0)
-    assert len(env.film()) == 1
-    for _ in range(2):
-        env.step(np.ones(8))
-    frames = env.film()
-    assert len(frames) == 5
-    np.testing.assert_array_equal(frames[-1], env.render())
-    assert len({frame.tobytes() for frame in frames}) == 5
-    env.reset(seed=1)
-    assert len(env.film()) == 1  # nothing lies between two episodes
-    env.close()

@@ -113,11 +113,3 @@ def test_a_restored_engine_draws_the_same_layouts(env):
     other = GuardVectorEnv(3, "SafetyPointButton1-v0", num_threads=1)
     other.engine.restore(state)
     np.testing.assert_equal([episode(other) for _ in range(4)], first)
-
-
-def test_without_randomisation_all_episodes_are_the_same():
-    env = GuardVectorEnv(3, "SafetyPointButton1-v0", layout={"randomize": False})
-    env.reset(seed=3)
-    first = episode(env)
-    for _ in range(3):
-        np.testing.assert_equal(episode(env), first)

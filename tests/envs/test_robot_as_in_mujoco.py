@@ -1,6 +1,5 @@
 """A robot of a file behaves as its file does in MuJoCo: files, options, floor, keyframe."""
 
-import os
 import struct
 import zlib
 
@@ -145,22 +144,6 @@ def test_what_mujoco_finds_is_found(layout, given, tmp_path):
     assert theirs.nmesh == model.nmesh and theirs.nmesh + theirs.ntex > 0
     np.testing.assert_array_equal(theirs.mesh_vert, model.mesh_vert)
     assert model.ntex - theirs.ntex == 2  # the arena's
-
-
-@pytest.mark.parametrize("pipe", ["include", "model", "mesh", "texture", "in an include"])
-def test_pipes_and_devices_are_refused(pipe, tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    texts = {
-        "include": '<include file="pipe"/>',
-        "model": '<asset><model name="arm" file="pipe"/></asset>',
-        "mesh": '<asset><mesh name="m" file="/dev/zero" content_type="model/obj"/></asset>',
-        "texture": '<asset><texture name="t" type="cube" filedown="pipe"/></asset>',
-        "in an include": '<include file="i.xml"/>',
-    }
-    (tmp_path / "i.xml").write_text('<mujocoinclude><include file="pipe"/></mujocoinclude>')
-    (tmp_path / "r.xml").write_text(robot('<geom size="0.1"/>', texts[pipe]))
-    with own_parts(), pytest.raises(ValueError, match="is a pipe or a device: name a regular file"):
-        register_robot("Waiter", xml=tmp_path / "r.xml")
 
 
 OPTIONS = {

@@ -257,7 +257,6 @@ def test_solid_targets_stop_the_robot_and_others_do_not(task):
             f"{task}_Point_0Hazards",
             **{task.lower(): {"solid": solid, "speed": 0.0, "num": 1, "locations": [[0.0, 0.0]]}},
         )
-        assert engine.task.contact == solid and engine.task.targets == "one"
         put_point(engine, -1.0, 0.0)
         touched = 0
         for _ in range(120):
@@ -348,9 +347,6 @@ TAXONOMY = {  # interactive, contact, targets, spaces
 def test_tasks_state_the_papers_taxonomy():
     stated = {n: (t.interactive, t.contact, t.targets, t.spaces) for n, t in guard(TASKS).items()}
     assert stated == TAXONOMY
-    for name, task in guard(TASKS).items():
-        part = task()
-        assert (part.interactive, part.contact, part.targets) == TAXONOMY[name][:3]
 
 
 @pytest.mark.parametrize(

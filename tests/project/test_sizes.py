@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_370,
-    "sb3_guard/envs": 8_915,
+    "sb3_guard": 26_221,
+    "sb3_guard/envs": 8_777,
     "sb3_guard/algorithms": 5_829,
-    "sb3_guard/common": 2_512,
+    "sb3_guard/common": 2_508,
     "sb3_guard/deployment": 916,
-    "harness": 8_201,
-    "tests": 24_224,
+    "harness": 8_194,
+    "tests": 24_151,
 }
-WORDS = 71_723  # of all tracked markdown but the changelog
+WORDS = 71_707  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -34,10 +34,6 @@ class Ghosts(Movers, Obstacles):
     v1: float | None = param(None, "speed towards the robot; null: speed", low=0)
     r1: float = param(1.5, "distance to the robot at which they wait, m", low=0)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.trespassable = not self.solid
-
     def bind(self, sim: Simulation) -> None:
         super().bind(sim)
         if not self.solid:

@@ -18,40 +18,30 @@ from sb3_guard.fields import fit
 from sb3_guard.spelling import did_you_mean
 
 OF_FILE = ("root", "complete", "keyframe")  # what settle() is told
-#: What a user may state: what holds if it is not stated, and what it is.
-ATTRIBUTES: dict[str, tuple[str, str]] = {
-    "root": ("the only one with joints", "the robot's outermost body"),
+#: What a user may state: what holds if it is not stated, what it is, and what it may be, see
+#: :func:`~sb3_guard.fields.fit`.
+ATTRIBUTES: dict[str, tuple[str, str, tuple[Any, ...]]] = {
+    "root": ("the only one with joints", "the robot's outermost body", (str | None,)),
     "complete": ("False", "True: the file's world is kept: its floor, options and names are used, "
-        "and the robot begins where the file puts it"),
-    "keyframe": ("start, home or the only one", "the keyframe in which it starts"),
+        "and the robot begins where the file puts it", (bool,)),
+    "keyframe": ("start, home or the only one", "the keyframe in which it starts", (str | None,)),
     "center": ("the outermost body", "the body or site whose place is the robot's position: of an "
-        "arm, its end effector"),
+        "arm, its end effector", (str | None,)),
     "reach": ("infinite; of an arm, measured", "how far an arm reaches from its base, m; goals are "
-        "drawn within"),
-    "keepout": ("what covers the robot", "radius kept clear around it at the start, m"),
+        "drawn within", (float, 0)),
+    "keepout": ("what covers the robot", "radius kept clear around it at the start, m",
+        (float, 0, math.inf, "[)")),
     "defaults": ("for arms, sizes that suit their reach; for large robots, a larger arena",
-        'parameters of tasks, constraints and arena with this robot: {"goal": {"size": 0.05}}'),
+        'parameters of tasks, constraints and arena with this robot: {"goal": {"size": 0.05}}',
+        (dict[str, dict[str, Any]],)),
     "workspace": ('"planar"; of an arm "spatial"', '"spatial" for robots that leave the plane: '
-        "tasks and constraints are then in the air"),
-    "lidar_bodies": ("the body of center", "bodies that carry lidar and compass"),
-    "timestep": ("the file's", "of one physics step, s"),
-    "integrator": ("the file's", '"Euler", "RK4", "implicit" or "implicitfast"'),
-    "frame_skip": ("10", "physics steps in a control step"),
+        "tasks and constraints are then in the air", (Literal["planar", "spatial"],)),
+    "lidar_bodies": ("the body of center", "bodies that carry lidar and compass", (list[str],)),
+    "timestep": ("the file's", "of one physics step, s", (float | None, 0)),
+    "integrator": ("the file's", '"Euler", "RK4", "implicit" or "implicitfast"',
+        (Literal["Euler", "RK4", "implicit", "implicitfast"] | None,)),
+    "frame_skip": ("10", "physics steps in a control step", (int, 1, 1000, "[]")),
 }  # fmt: skip
-#: What they may be, see :func:`~sb3_guard.fields.fit`.
-RULES: dict[str, tuple[Any, ...]] = {
-    "root": (str | None,),
-    "center": (str | None,),
-    "keyframe": (str | None,),
-    "complete": (bool,),
-    "keepout": (float, 0, math.inf, "[)"),
-    "defaults": (dict[str, dict[str, Any]],),
-    "timestep": (float | None, 0),
-    "reach": (float, 0),
-    "integrator": (Literal["Euler", "RK4", "implicit", "implicitfast"] | None,),
-    "workspace": (Literal["planar", "spatial"],),
-    "lidar_bodies": (list[str],),
-}
 
 
 def robot_class(
@@ -67,8 +57,7 @@ def robot_class(
     for key, value in stated.items():
         if key not in ATTRIBUTES:
             raise ValueError(f"robot {name!r} has no {key!r}: {did_you_mean(key, ATTRIBUTES)}")
-        if key in RULES:
-            fit(f"robot {name!r}: {key}", value, *RULES[key])
+        fit(f"robot {name!r}: {key}", value, *ATTRIBUTES[key][2])
     grounded = stated.get("workspace", "planar") == "planar"
     file = settle(
         source, grounded=grounded, **{key: stated[key] for key in OF_FILE if key in stated}

@@ -1,8 +1,5 @@
 """Reading an MJCF file, and what a world takes over from it: options, contact bits."""
 
-import os
-import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -11,9 +8,6 @@ import numpy as np
 from sb3_guard.envs.types import Array
 
 _FREE, _SLIDE = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE
-_TAGS = re.compile(r"<(\w+)([^<>]*)>")
-_FILES = re.compile(r"\bfile\w*\s*=\s*[\"']([^\"']+)")
-_FOLDERS = re.compile(r"\b(?:mesh|texture|asset)dir\s*=\s*[\"']([^\"']+)")
 
 
 def label_of(source: Path | mujoco.MjSpec) -> str:
@@ -29,7 +23,12 @@ def load(source: Path | mujoco.MjSpec) -> mujoco.MjSpec:
     label = label_of(source)
     try:
         if isinstance(source, Path):
-            _check_files(source)
+            if source.suffix == ".urdf" or "<robot" in source.read_text(errors="replace"):
+                raise ValueError(
+                    "it is URDF, not MJCF: convert it once with mujoco.MjSpec.from_file("
+                    f"{source.name!r}).to_file('robot.xml'), and give its outermost body "
+                    "<freejoint/> if it can go anywhere"
+                )
             spec = mujoco.MjSpec.from_file(str(source))
         else:
             spec = source.copy()
@@ -39,38 +38,6 @@ def load(source: Path | mujoco.MjSpec) -> mujoco.MjSpec:
     except ValueError as error:
         raise ValueError(f"{label}: {' '.join(str(error).split())}") from None
     return spec
-
-
-def _check_files(path: Path) -> None:
-    """Refuse what MuJoCo would wait for, or read for ever, in a file and what it brings in.
-
-    :raises ValueError: it is URDF, or names a pipe or a device
-    """
-    if path.suffix == ".urdf" or re.search(r"<robot\b", path.read_text(errors="replace")):
-        raise ValueError(
-            "it is URDF, not MJCF: convert it once with mujoco.MjSpec.from_file("
-            f"{path.name!r}).to_file('robot.xml'), and give its outermost body <freejoint/> if it "
-            "can go anywhere"
-        )
-    for file in _named(path, [path.parent], set()):
-        if not file.is_dir():
-            raise ValueError(f"{file} is a pipe or a device: name a regular file")
-
-
-def _named(path: Path, folders: list[Path], seen: set[Path]) -> Iterator[Path]:
-    """What a file and those that it brings in name and is there, but is no regular file."""
-    seen.add(path)
-    text = path.read_text(errors="replace")
-    folders = [*folders, path.parent]
-    folders += [folder / name for name in _FOLDERS.findall(text) for folder in folders]
-    for tag, attributes in _TAGS.findall(text):
-        names = [part for name in _FILES.findall(attributes) for part in (name, Path(name).name)]
-        for file in {folder / name for folder in folders for name in names}:
-            if os.path.isfile(file):
-                if tag in ("include", "model") and file not in seen:
-                    yield from _named(file, folders, seen)
-            elif os.path.exists(file):
-                yield file
 
 
 def _state_masses(spec: mujoco.MjSpec) -> None:

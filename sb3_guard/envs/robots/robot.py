@@ -159,7 +159,7 @@ class MJCFRobot(Robot):
         super().build(world)
         file = self.model_file()
         self._base, self._posing = [joint.name for joint in file.base], file.posing
-        self._label, self._start, self.stop = file.label, file.start, file.stop
+        self._start, self.stop = file.start, file.stop
         self._own = {sensor.name for sensor in file.spec.sensors if sensor.name}
         self._own |= {values["name"] for kind, values in file.on_floor if kind == "sensor"}
         bodies = [body.name for body in file.spec.bodies[1:] if body.name]
@@ -190,8 +190,6 @@ class MJCFRobot(Robot):
                 'ctrlrange: give it finite numbers, as ctrlrange="-1 1", or, if it is a position '
                 'servo of a joint with a range, inheritrange="1"'
             )
-        if not model.nu:
-            raise ValueError(f"{self._label} has no actuators: the robot could not act")
         self._center, self._half = (low + high) / 2, (high - low) / 2
         if not self.scaled:
             self.action_range = low, high

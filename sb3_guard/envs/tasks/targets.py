@@ -33,11 +33,6 @@ class Targets(Movers, Task):
         10.0, "dense rewards are cut off at ± this; null: they are not", above=0
     )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.contact = self.solid
-        self.targets = "one" if self.num == 1 else "many"
-
     def invalid_start(self) -> Array:
         """Whether a solid target is touched: it hangs in the link of an arm, [N] bool."""
         return self.group.touched.sum(axis=1) > 0

@@ -18,7 +18,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
-from sb3_guard.common.native import GuardVecEnv
 from sb3_guard.costs import bounded_name
 from sb3_guard.zoo.cli.usage import UsageError, explained
 
@@ -40,12 +39,9 @@ class Film:
         self.limit_on = getattr(model, "limit_on", "sum")
 
     def __call__(self) -> None:
-        """Write the pictures of the step that was taken."""
-        if not self.monitor.episodes.lengths[0]:  # pictures are of the next episode by now
-            return
-        native = self.env.unwrapped  # of which long control steps have several pictures
-        shots: list[Any] = native.film() if isinstance(native, GuardVecEnv) else [render(self.env)]
-        for picture in shots:
+        """Write the picture of the step that was taken."""
+        if self.monitor.episodes.lengths[0]:  # else a picture is of the next episode by now
+            picture: Any = render(self.env)
             self.writer.send(np.ascontiguousarray(below(self.caption(), picture)))
 
     def caption(self) -> str:
@@ -93,11 +89,8 @@ def filming(env: VecEnv, model: BaseAlgorithm, video: Path) -> Iterator[Film]:
     height, width = below("", first).shape[:2]
     video.parent.mkdir(parents=True, exist_ok=True)
     with explained(f"can't write {video}", OSError), replacing(video) as file:
-        if isinstance(env.unwrapped, GuardVecEnv):
-            fps: float = env.unwrapped.envs.film_fps
-        else:
-            metadata = env.get_attr("metadata")[0] if env.has_attr("metadata") else {}
-            fps = float(metadata.get("render_fps", 30))
+        metadata = env.get_attr("metadata")[0] if env.has_attr("metadata") else {}
+        fps = float(metadata.get("render_fps", 30))
         writer = imageio_ffmpeg.write_frames(
             file.name, (width, height), fps=fps, macro_block_size=2,
             output_params=["-f", "mp4"],

@@ -4,8 +4,8 @@ The runs below the folder are those that ``scripts/leaderboard.py --train`` writ
 certified if the 95 % intervals of the mean cost of its final episodes, with sampled actions and
 with the most likely ones, end at or below the limit; of an environment's certified runs that with
 the highest return is taken. With less than a tenth of the best run's return, of whatever cost, it
-hardly does its task and does not count. It is played again, 300 episodes of other seeds with each
-kind of actions, and shipped if these certify it, too; else the next one is tried. An agent that is
+hardly does its task and does not count. It is certified with each kind of actions, by fresh
+episodes, and shipped if it is; else the next one is tried. An agent that is
 shipped already is kept if its return is as high. Runs from a packed archive have no model:
 ``sb3-guard reproduce ROW`` trains them again, below ``logs/reproduced``. The package gets the
 run's settings, its policy's tensors, ``<env>.pth``, and what it got, ``result.json``; the tests get
@@ -26,7 +26,8 @@ import torch as th
 from archives import with_log_folder
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard import evaluate_policy
+from sb3_guard import Certificate, certify
+from sb3_guard.common.delivery import TRIES
 from sb3_guard.costs import estimate
 from sb3_guard.zoo.agents.pretrained import (
     PLAYED,
@@ -59,7 +60,6 @@ LIMITS = {
     "Goal_Hopper_8Hazards-v0": 2.0,
     "Goal_Swimmer_8Hazards-v0": 2.0,
 }
-EPISODES = 300
 SEEDS = {"stochastic": 10_000, "deterministic": 20_000}
 # Parameters of a policy that it acts without: critics and targets.
 TRAINING_ONLY = (
@@ -103,7 +103,7 @@ def shipped_return(env_id: str) -> float:
     """Of the agent with a limit that the package has; minus infinity without one."""
     results = [run.checked_result() for run in pretrained() if run.name == env_id]
     limited = [got for got in results if (got.get("cost_limit") or np.inf) <= LIMITS[env_id]]
-    return max((got["played"]["stochastic"]["return"][0] for got in limited), default=-np.inf)
+    return max((got["played"]["stochastic"]["mean_return"] for got in limited), default=-np.inf)
 
 
 def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
@@ -114,16 +114,15 @@ def loaded(run: RunFolder, n_envs: int, seed: int) -> BaseAlgorithm:
     return load_model(played.algorithm, run.model, env, "cpu")
 
 
-def played(run: RunFolder) -> dict[str, Any]:
-    """Return and cost of an agent in 300 episodes of each kind of actions."""
+def played(run: RunFolder) -> dict[str, Certificate]:
+    """What fresh episodes show of an agent, with each kind of actions."""
     values = {}
     for actions, seed in SEEDS.items():
-        model = loaded(run, 100, seed)
-        got = evaluate_policy(
-            model, model.env, EPISODES, deterministic=actions == "deterministic", seed=seed
+        model, greedy = loaded(run, 100, seed), actions == "deterministic"
+        values[actions] = certify(
+            model, model.env, LIMITS[run.name], deterministic=greedy, seed=seed, tries=TRIES
         )
         model.env.close()
-        values[actions] = {"return": estimate(got.returns), "cost": estimate(got.costs)}
     return values
 
 
@@ -135,7 +134,7 @@ def actions_of(model: BaseAlgorithm, raw: np.ndarray, actions: str) -> np.ndarra
     return model.predict(seen, deterministic=actions == "deterministic")[0]
 
 
-def write(run: RunFolder, limit: float | None, got: dict[str, Any]) -> RunFolder:
+def write(run: RunFolder, limit: float | None, got: dict[str, Certificate]) -> RunFolder:
     """
     Copy a run to the package; the copy acts as the original does, to the last bit.
 
@@ -161,7 +160,8 @@ def write(run: RunFolder, limit: float | None, got: dict[str, Any]) -> RunFolder
         if "cost_limit" in kept:
             kept.setdefault("trained_at", kept["cost_limit"])
         kept["cost_limit"] = limit
-    copy.write_result({**kept, "played": got, "episodes_played": EPISODES})
+    shown = {actions: json.loads(certificate.to_json()) for actions, certificate in got.items()}
+    copy.write_result({**kept, "played": shown})
     record(original, load_pretrained(run.name, algo), f"{algo}/{run.name}")
     return copy
 
@@ -194,12 +194,9 @@ def main() -> None:
         shipped = shipped_return(env_id)
         for run in candidates(args.folder, env_id, shipped):
             got = played(run)
-            costs = [got[actions]["cost"] for actions in PLAYED]
-            print(run.path, got["stochastic"]["return"], *costs, sep="\n  ", flush=True)
-            if (
-                max(cost.high for cost in costs) > limit
-                or got["stochastic"]["return"].mean <= shipped
-            ):
+            print(run.path, *got.values(), sep="\n  ", flush=True)
+            certified = all(one.verdict == "certified" for one in got.values())
+            if not certified or got["stochastic"].mean_return <= shipped:
                 continue
             for old in PRETRAINED.glob(f"*/{env_id}_1"):
                 limited = "cost_limit" in json.loads((old / "result.json").read_text())

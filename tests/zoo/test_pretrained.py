@@ -3,6 +3,7 @@
 import json
 import runpy
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from typed import require_rendering
 
 from sb3_guard import cli, enjoy, load_pretrained, train
-from sb3_guard.costs import Estimate
+from sb3_guard.common.certificate import Certificate
 from sb3_guard.zoo.agents import pretrained
 from sb3_guard.zoo.run.folder import RunFolder
 
@@ -32,7 +33,10 @@ def test_a_shipped_agent_is_small_and_acts_as_the_one_that_was_trained(run):
     text = "".join(path.read_text() for path in files if path.suffix != ".pth")
     assert "/tmp" not in text and "/work" not in text
     result = run.checked_result()
-    assert result["played"]["stochastic"]["cost"][0] < result.get("cost_limit", np.inf)
+    for actions, shown in pretrained.certificates(run).items():
+        assert shown.deterministic is (actions == "deterministic") and shown.env["id"] == env_id
+        assert shown.verdict == ("certified" if "cost_limit" in result else "exceeds")
+        assert shown.nearest.limit == result.get("cost_limit", shown.nearest.limit)
 
     model = load_pretrained(env_id, algo, device="cpu")
     assert model.num_timesteps == result["n_timesteps"] >= 1e6  # contract.json states it
@@ -86,8 +90,9 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
     result = json.loads((before / "result.json").read_text())
     (before / "result.json").write_text(json.dumps(result | {"cost_limit": 5}))
     names = script["main"].__globals__
-    estimates = {"return": Estimate(6, 0, 6, 6), "cost": Estimate(1.5, 0, 1.4, 1.6)}
-    monkeypatch.setitem(names, "played", lambda run: dict.fromkeys(pretrained.PLAYED, estimates))
+    text = json.dumps(json.loads((before / "result.json").read_text())["played"]["stochastic"])
+    shown = replace(Certificate.from_json(text), mean_return=6.0)
+    monkeypatch.setitem(names, "played", lambda run: dict.fromkeys(pretrained.PLAYED, shown))
     monkeypatch.setitem(names, "RECORDED", tmp_path / "pretrained.npz")
     for module in (names, vars(pretrained)):
         monkeypatch.setitem(module, "PRETRAINED", there)
@@ -101,7 +106,7 @@ def test_a_certified_run_of_the_grand_table_is_shipped(tmp_path, monkeypatch, ca
     line = next(
         line for line in capsys.readouterr().out.splitlines() if line.startswith("| Goal_P")
     )
-    assert "1.5 [1.4, 1.6], kept" in line
+    assert f"6.0 | certified: {shown.nearest.mean:.4g}, upper bound" in line
 
     best, higher = (tmp_path / "grand" / "grand_table_guard" / algo / before.name
                     for algo in ("pcpo", "trpo_ipo"))  # fmt: skip

@@ -19,7 +19,13 @@ from sb3_guard.common.files import replacing
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
-from sb3_guard.zoo.agents.pretrained import PRETRAINED, find_pretrained, load_pretrained, weights
+from sb3_guard.zoo.agents.pretrained import (
+    PRETRAINED,
+    certificates,
+    find_pretrained,
+    load_pretrained,
+    weights,
+)
 from sb3_guard.zoo.cli.names import refuse_places, require_named
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, packages_flag
 from sb3_guard.zoo.run.algos import algorithm
@@ -118,7 +124,9 @@ class Agent:
 
     @property
     def certificate(self) -> Certificate | None:
-        """What was certified of this very agent, and of such actions, when its training ended."""
+        """What was certified of this very agent, and of such actions."""
+        if PRETRAINED in self.path.parents:
+            return certificates(self.run)["stochastic" if self.stochastic else "deterministic"]
         file = self.path.with_name("certificate.json")
         if self.path.name != "certified_model.zip" or not file.is_file():
             return None

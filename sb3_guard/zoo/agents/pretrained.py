@@ -1,12 +1,13 @@
 """The agents that come with the package: settings as text, weights as tensors, no programs."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_guard.costs import Estimate, verdict
+from sb3_guard.common.certificate import Certificate
 from sb3_guard.ids import with_version
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.markdown import table
@@ -87,23 +88,27 @@ def load_pretrained(
     return model
 
 
+def certificates(run: RunFolder) -> dict[str, Certificate]:
+    """What an agent's fresh episodes have shown, of each of :data:`PLAYED`."""
+    played = run.checked_result()["played"]
+    return {
+        actions: Certificate.from_json(json.dumps(content)) for actions, content in played.items()
+    }
+
+
 def listed() -> str:
-    """A table of them with return and cost."""
-    header = ["environment", "algorithm", "steps", "limit", "trained at"]
+    """A table of them with return and cost, and the confidence bound that decides."""
+    header = ["environment", "algorithm", "steps", "trained at"]
     for actions in PLAYED.values():
         header += [f"return, {actions} actions", f"cost, {actions} actions"]
     rows = []
     for run in pretrained():
         result = run.checked_result()
-        limit = result.get("cost_limit")
-        limits = [limit, result.get("trained_at")]
-        words = ["–" if value is None else f"{value:g}" for value in limits]
-        cells = [run.name, run.path.parent.name, f"{result['n_timesteps']:,}", *words]
-        for actions in PLAYED:
-            played = result["played"][actions]
-            cost = Estimate(*played["cost"])
-            word = "" if limit is None else ", " + verdict(cost.low, cost.high, limit)
-            interval = f"{cost.mean:.1f} [{cost.low:.1f}, {cost.high:.1f}]"
-            cells += [f"{played['return'][0]:.1f}", interval + word]
+        limit = result.get("trained_at", result.get("cost_limit"))
+        trained_at = "–" if limit is None else f"{limit:g}"
+        cells = [run.name, run.path.parent.name, f"{result['n_timesteps']:,}", trained_at]
+        for certificate in certificates(run).values():
+            cost, _, _ = str(certificate.nearest).partition(";")
+            cells += [f"{certificate.mean_return:.1f}", f"{certificate.verdict}: {cost}"]
         rows.append(cells)
     return table(header, rows)

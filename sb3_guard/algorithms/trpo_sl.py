@@ -44,6 +44,9 @@ class TRPOSL(FilteredTrustRegion):
         "tolerance": {"low": 0.0, "high": 4.0},
     }
 
+    #: Passes over the steps that cost, which are few, and as many others.
+    model_passes = 80
+
     tolerance: float = hyperparameter(1.0)
     drift: bool = hyperparameter(False)
 
@@ -65,7 +68,7 @@ class TRPOSL(FilteredTrustRegion):
         data = (batch.observations, actions, previous)
         targets = th.cat([batch.costs / layer.unit, previous], dim=1)
         loss = 0.0
-        for _ in range(self.n_critic_updates):
+        for _ in range(self.model_passes):
             drawn = th.randperm(len(none))[: len(some)].to(none.device)
             index = th.cat([some, none[drawn]])
             loss = layer.learn(rows(data, index), targets[index], 1, self.batch_size)

@@ -41,7 +41,7 @@ class DeliveryCallback(BaseCallback):
     :param cost_limit: d, one number or one per cost; None: the model's own at the end
     :param candidates: how many policies are kept, the last one among them
     :param screening: episodes of each
-    :param n_episodes: most episodes of a certificate, at least 50
+    :param n_episodes: most episodes of a certificate, at least 100
     :param deterministic: certify the most likely actions, or sampled ones
     :param seed: the episodes' seeds are drawn from it
     :param verbose: 1 prints what is delivered, or how far the nearest candidate is away
@@ -53,8 +53,8 @@ class DeliveryCallback(BaseCallback):
         folder: str | os.PathLike[str] = ".",
         cost_limit: float | Sequence[float] | None = None,
         *,
-        candidates: int = 12,
-        screening: int = 20,
+        candidates: int = 8,
+        screening: int = 40,
         n_episodes: int = MOST,
         deterministic: bool = True,
         seed: int = 0,

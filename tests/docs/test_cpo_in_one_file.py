@@ -31,6 +31,8 @@ def collected(limit):
         cost_limit=limit,
         margin_lr=0.0,
         recovery=1.0,
+        batch_size=None,
+        n_critic_updates=80,
         seed=0,
         device="cpu",
     )

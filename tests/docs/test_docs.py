@@ -41,7 +41,7 @@ SHORTER = {
     # Off-policy, n_steps are those of a return.
     r"(make_model\(\"(?!sac|td3|tqc)[^()]*?),?\s*\)": r"\g<1>, n_envs=2, n_steps=20)",
     r"n_eval_episodes=\d+": "n_eval_episodes=2",
-    r"(certify|DeliveryCallback)\((.*?)cost_limit=": r"\1(\2n_episodes=50, cost_limit=",
+    r"(certify|DeliveryCallback)\((.*?)cost_limit=": r"\1(\2n_episodes=100, cost_limit=",
     r"progress_bar=True": "progress_bar=False",
 }
 

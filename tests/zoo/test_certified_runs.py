@@ -13,7 +13,7 @@ from sb3_guard.common.certificate import Certificate
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.run import Run
 
-CERTIFY = ["--certify", "50", "--eval-freq", "-1", "-n", "240"]
+CERTIFY = ["--certify", "100", "--eval-freq", "-1", "-n", "240"]
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +77,8 @@ def test_a_run_that_is_killed_delivers_the_same(step, tmp_path, monkeypatch):
 
 
 def test_too_few_episodes_are_refused_before_the_training(tmp_path, capsys):
-    arguments = [*LENGTH, *TOY, *SMALL, "-f", str(tmp_path), "-n", "120", "--certify", "49"]
-    refused(train.main, arguments, capsys, "--certify", "at least 50")
+    arguments = [*LENGTH, *TOY, *SMALL, "-f", str(tmp_path), "-n", "120", "--certify", "99"]
+    refused(train.main, arguments, capsys, "--certify", "at least 100")
     assert not [*tmp_path.iterdir()]
 
 

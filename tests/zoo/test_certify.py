@@ -28,7 +28,7 @@ def test_the_status_is_the_verdict(limit, verdict, tmp_path, capsys):
     [
         ([], "cost_limit"),
         (["--cost-limit", "1", "2"], "cost_limit"),
-        (["--cost-limit", "5", "--n-episodes", "49"], "50"),
+        (["--cost-limit", "5", "--n-episodes", "99"], "100"),
     ],
 )
 def test_what_is_wrong_is_a_line_and_writes_nothing(flags, match, tmp_path, capsys):

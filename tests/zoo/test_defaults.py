@@ -31,7 +31,7 @@ FOREIGN = "CliffWalking-v1"  # an id that has no entry
 #: Entries hold what depends on the environment: its limit, the shape of rollouts, wrappers …
 OF_THE_ENVIRONMENT = {*RUN_KEYS, "policy", "policy_kwargs", "cost_limit", "n_steps", "batch_size"}
 OF_THE_ENVIRONMENT |= {"noise_type", "noise_std", "learning_starts", "train_freq", "gradient_steps"}
-OF_THE_ENVIRONMENT |= {"buffer_size"}
+OF_THE_ENVIRONMENT |= {"buffer_size", "aim"}  # what a command trains is certified
 #: … and where robots need other values than known optima.
 DEPARTURES = {
     ("trpo_lag", ENVS[0]): {

@@ -16,7 +16,7 @@ from sb3_guard.costs import EpisodeCosts
 CostEstimate = namedtuple("CostEstimate", "episode_cost horizon violation")
 
 # A certificate's last look: its episodes, and the quantile of its error, which three agents share.
-LAST_LOOK, QUANTILE = 400, 2.33
+LAST_LOOK, QUANTILE = 400, 2.22
 
 _NUMBER = r"(-?\d+\.?\d*(?:e[+-]?\d+)?)"
 _LINE = re.compile(f"lin_{_NUMBER}_{_NUMBER}")
@@ -168,7 +168,7 @@ class Costs:
 
         ::
 
-            h = min(z s / √n, |d| / 2)        z = 2.33, n = 400
+            h = min(z s / √n, |d| / 2)        z = 2.22, n = 400
 
         s is the standard deviation of the latest 100 episodes' costs; h is half of the interval of
         :func:`sb3_guard.certify` at its last look, where three agents share an error of 5 %.

@@ -103,7 +103,7 @@ class CertifyFlags(AgentFlags):
 
     What is played:
 
-    :param n_episodes: most episodes to play, at least 50 (default: 400)
+    :param n_episodes: most episodes to play, at least 100 (default: 400)
     :param cost_limit: limit of an episode's cost, or one for each cost (default: the agent's own)
 
     Output:

@@ -54,7 +54,7 @@ class EvaluationFlags(Command):
         else 1)
     :param eval_env_kwargs: arguments of the evaluation environment (default: those of training)
     :param certify: end with the best policy of the last half that is certified to keep its limit,
-        by at most so many fresh episodes, at least 50, each of up to three; 0: with the last policy
+        by so many fresh episodes, at least 100, each of up to three; 0: with the last policy
         (default: 400 if the training has the steps of 1,000 full episodes, else 0)
 
     Files:

@@ -82,7 +82,7 @@ from sb3_guard.zoo.run.make_envs import (
 from sb3_guard.zoo.run.progress import Epochs, summary
 
 FINAL_EPISODES = 100  # of each policy, after training
-DELIVERY_ENVS = 20  # in which candidates are screened and certified
+DELIVERY_ENVS = 40  # in which candidates are screened and certified
 #: what is played after training: the policy that was trained, and its most likely actions
 SPLITS = ("stochastic", "greedy")
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases

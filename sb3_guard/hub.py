@@ -116,6 +116,7 @@ def card(agent: Agent, run: RunFolder, flags: Flags, evaluation: Evaluation) -> 
     return ModelCard.from_template(
         data,
         template_str=CARD,
+        model_name=data.model_name,
         env=agent.env_id,
         folder=f"logs/{flags.algo}/{run.name}_1",
         packages=packages_flag(trained.gym_packages),

@@ -36,6 +36,7 @@ def test_what_is_uploaded(logs, tmp_path):
     metrics = yaml.safe_load(metadata)["model-index"][0]["results"][0]["metrics"]
     values = {one["type"]: float(one["value"].split()[0]) for one in metrics}
     said = re.search(r"5 episodes: return (\S+) .*, cost (\S+) .*, limit 2: ", page)
+    assert "# CPO on Filmed-v0\n\nA **CPO** agent" in page
     got = [values["mean_reward"], values["mean_cost"]]
     assert got == pytest.approx([float(said[1]), float(said[2])], abs=0.006)
 

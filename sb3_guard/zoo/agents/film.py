@@ -4,7 +4,7 @@ Gymnasium's and SB3's recorders keep all pictures of an episode in memory, some 
 at this size; here each is written as it is taken.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,37 +22,23 @@ from sb3_guard.costs import bounded_name
 from sb3_guard.zoo.cli.usage import UsageError, explained
 
 
-class Film:
+def caption(env: VecEnv, model: BaseAlgorithm | None) -> str:
     """
-    Write the pictures of each step: ``evaluate_policy(…, on_step=film)``.
+    Return and each cost of the episode so far, beside its limit.
 
     :param env: one environment, in a ``CostMonitor``
     :param model: whose limits are said
-    :param writer: is sent the pictures, [height, width, 3] uint8
     """
-
-    def __init__(self, env: VecEnv, model: Any, writer: Any) -> None:
-        self.env, self.writer, self.monitor = env, writer, find_monitor(env)
-        limited = isinstance(model, Constrained) and model.constrained
-        keys = self.monitor.cost_keys
-        self.limits = model.final_cost_limits.tolist() if limited else [None] * len(keys)
-        self.limit_on = getattr(model, "limit_on", "sum")
-
-    def __call__(self) -> None:
-        """Write the picture of the step that was taken."""
-        if self.monitor.episodes.lengths[0]:  # else a picture is of the next episode by now
-            picture: Any = render(self.env)
-            self.writer.send(np.ascontiguousarray(below(self.caption(), picture)))
-
-    def caption(self) -> str:
-        """Return and each cost of the episode so far, beside its limit."""
-        keys, episodes = self.monitor.cost_keys, self.monitor.episodes
-        costs = episodes.highest if self.limit_on == "max" else episodes.totals
-        words = [f"return {self.monitor.episode_returns[0]:z.2f}"]
-        for key, cost, limit in zip(keys, costs[0, -len(keys) :], self.limits, strict=True):
-            name = bounded_name(key, self.limit_on)
-            words.append(f"{name} {cost:.2f}" + ("" if limit is None else f" (limit {limit:g})"))
-        return "    ".join(words)
+    monitor, limit_on = find_monitor(env), getattr(model, "limit_on", "sum")
+    keys, episodes = monitor.cost_keys, monitor.episodes
+    limited = isinstance(model, Constrained) and model.constrained
+    limits: Any = model.final_cost_limits.tolist() if limited else [None] * len(keys)  # type: ignore[union-attr]
+    costs = episodes.highest if limit_on == "max" else episodes.totals
+    words = [f"return {monitor.episode_returns[0]:z.2f}"]
+    for key, cost, limit in zip(keys, costs[0, -len(keys) :], limits, strict=True):
+        name = bounded_name(key, limit_on)
+        words.append(f"{name} {cost:.2f}" + ("" if limit is None else f" (limit {limit:g})"))
+    return "    ".join(words)
 
 
 def below(text: str, picture: np.ndarray) -> np.ndarray:
@@ -71,14 +57,15 @@ def below(text: str, picture: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def filming(env: VecEnv, model: BaseAlgorithm, video: Path) -> Iterator[Film]:
+def filming(env: VecEnv, model: BaseAlgorithm | None, video: Path) -> Iterator[Callable[[], None]]:
     """
-    What films an agent that is played meanwhile, as ``on_step`` of ``evaluate_policy``.
+    What writes the picture of a step that was taken: ``evaluate_policy(…, on_step=film)``.
 
     The first picture is taken at once, so that a machine that can't render says so before anything
     is played, and nothing is written then.
 
-    :param env: one environment
+    :param env: one environment, in a ``CostMonitor``
+    :param model: whose limits are said
     :param video: mp4 to write
     :raises UsageError: no picture can be rendered, or the file can't be written
     """
@@ -96,8 +83,14 @@ def filming(env: VecEnv, model: BaseAlgorithm, video: Path) -> Iterator[Film]:
             output_params=["-f", "mp4"],
         )  # fmt: skip
         writer.send(None)
+
+        def film() -> None:
+            if find_monitor(env).episodes.lengths[0]:  # else it is of the next episode by now
+                picture: Any = render(env)
+                writer.send(np.ascontiguousarray(below(caption(env, model), picture)))
+
         with closing(writer):
-            yield Film(env, model, writer)
+            yield film
 
 
 def render(env: VecEnv) -> np.ndarray | None:

@@ -96,7 +96,7 @@ def test_runs_at_several_limits_are_not_averaged(tmp_path):
         select(found)
     assert select(choose(found, cost_limit=[50, 50]))["algo"].tolist() == ["trpo", "cpo"]
     with pytest.raises(UsageError, match=r"no run at cost limit 1; .* 1 2, 3, 50 50"):
-        choose(found, cost_limit=1)
+        choose(found, cost_limit=[1])
 
 
 def test_an_environment_is_chosen_with_or_without_its_version(tmp_path):

@@ -215,15 +215,14 @@ def read_curve(path: str | Path, epoch: float = math.nan) -> pd.DataFrame:
 def choose(
     runs: pd.DataFrame,
     suites: Sequence[str] | None = None,
-    cost_limit: float | Sequence[float] | None = None,
+    cost_limit: Sequence[float] | None = None,
     steps: int | None = None,
 ) -> pd.DataFrame:
     """
     The runs that are asked for.
 
     :param suites: None: all. The version may be left out
-    :param cost_limit: runs of this limit, or of these limits on several costs, and the
-        unconstrained ones; None: all
+    :param cost_limit: runs of this limit for each cost, and the unconstrained ones; None: all
     :param steps: only runs of this length; None: all
     :raises UsageError: an environment, limit or length without runs
     """
@@ -234,7 +233,7 @@ def choose(
                 raise UsageError(f"there is no run of {suite!r}; {did_you_mean(suite, names)}")
         runs = runs[[not names[suite].isdisjoint(suites) for suite in runs["suite"]]]
     if cost_limit is not None:
-        limit = _limits([cost_limit] if isinstance(cost_limit, (int, float)) else cost_limit)
+        limit = _limits(cost_limit)
         _require(limit, runs["limits"], "at cost limit")
         runs = runs[runs["limits"].isna() | (runs["limits"] == limit)]
     if steps is not None:

@@ -167,7 +167,7 @@ class Lidar(Parameters):
             closeness /= limit
         turn = np.arctan2(v[1], v[0])
         turn *= columns / (2 * math.pi)
-        turn += columns * (turn < 0)  # a quarter of the time of %
+        turn += columns * (turn < 0)  # as turn %= columns, in a third of its time
         column = np.minimum(turn.astype(np.intp), columns - 1)
         cell = column
         if self.alias:

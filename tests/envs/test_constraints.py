@@ -305,7 +305,7 @@ def test_what_hangs_in_the_air_can_be_met():
 def test_parts_of_one_name_are_refused():
     from sb3_guard.envs.constraints import Hazards, Pillars
     from sb3_guard.envs.engine import Engine
-    from sb3_guard.envs.robots import Point
+    from sb3_guard.envs.robots.guard import Point
     from sb3_guard.envs.tasks import Goal
 
     with pytest.raises(ValueError, match="two parts are called 'pillars'"):

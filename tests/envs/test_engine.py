@@ -14,7 +14,7 @@ from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.layout import LayoutError
 from sb3_guard.envs.observation import Values
 from sb3_guard.envs.part import Constraint, Task
-from sb3_guard.envs.robots import Point
+from sb3_guard.envs.robots.guard import Point
 from sb3_guard.envs.tasks import Goal
 
 

@@ -11,7 +11,7 @@ from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.observation import Compass, Lidar, Scan, Values, compass
 from sb3_guard.envs.observer import Observer
-from sb3_guard.envs.robots import Point
+from sb3_guard.envs.robots.guard import Point
 from sb3_guard.envs.tasks import Goal
 
 

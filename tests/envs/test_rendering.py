@@ -26,7 +26,7 @@ from sb3_guard.envs import scene as scene_module
 from sb3_guard.envs.constraints import Hazards
 from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.extras import EYE, Extras
-from sb3_guard.envs.robots import Point
+from sb3_guard.envs.robots.guard import Point
 from sb3_guard.envs.tasks import Goal
 
 BLUE, GREEN, RED = (0.0, 0.4, 0.85), (0.0, 0.65, 0.45), (0.85, 0.1, 0.1)

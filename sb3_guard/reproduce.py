@@ -136,7 +136,8 @@ def reproduce(flags: Flags) -> int:
     result = RunFolder(run.path).checked_result()
     lines = differences(row, result)
     same = not lines
-    if there != here and row["curve"] != result["curve"]:
+    other = there != here or row["commit"] != (result["commit"] or "")
+    if other and row["curve"] != result["curve"]:
         alike = SEED.sub("", row["command"])
         seeds = [other for other in rows.values() if SEED.sub("", other["command"]) == alike]
         same, judged = as_another_seed(seeds, measures(result))

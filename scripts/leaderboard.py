@@ -18,6 +18,7 @@ from typing import Any
 import pandas as pd
 from archives import DATA, DOCS, archives, pack, unpacked
 
+from sb3_guard.algorithms import TrustRegion
 from sb3_guard.reproduce import final_hash, measures
 from sb3_guard.zoo.cli.markdown import table
 from sb3_guard.zoo.results.runs import read_episodes, select
@@ -25,6 +26,7 @@ from sb3_guard.zoo.results.statistics import judge
 from sb3_guard.zoo.results.tables import number
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.folder import RunFolder
+from sb3_guard.zoo.run.hyperparams import read_hyperparams
 
 PAGE = DOCS / "leaderboard.md"
 TABLE = DATA / "leaderboard.csv"
@@ -57,6 +59,22 @@ def limit_of(env_id: str) -> float:
     return 25.0 if env_id.startswith("Safety") else 2.0
 
 
+def as_then(result: dict[str, Any]) -> str:
+    """The command of a run, with the settings that were the defaults when it was trained."""
+    command, algo = result["command"], result["algo"]
+    if "delivered" in result:
+        return command
+    then = ["aim:mean"] if "aim" in read_hyperparams(algo, result["env"]) else []
+    if issubclass(algorithm(algo), TrustRegion):
+        then += ["batch_size:None", "n_critic_updates:80"]
+    if then:
+        option = " --hyperparams " if " --hyperparams " in command else " --vec-env"
+        before, _, after = command.partition(option)
+        after = after if option == " --hyperparams " else f"--vec-env{after}"
+        command = f"{before} --hyperparams {' '.join(then)} {after}"
+    return f"{command} --certify 0"
+
+
 def read() -> tuple[pd.DataFrame, pd.DataFrame]:
     """
     What the packed logs say.
@@ -78,7 +96,8 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
         for run in all_.to_dict("records"):
             result = RunFolder(Path(run["path"])).checked_result()
             if "curve" in result:
-                kept = {key: result.get(key) for key in ("command", "curve", "commit", "processor")}
+                kept = {key: result.get(key) for key in ("curve", "commit", "processor")}
+                kept["command"] = as_then(result)
                 kept |= {"final": final_hash(result), "seconds": round(result["seconds"])}
                 runs.append({"row": run["row"], **kept, **measures(result)})
         all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)

@@ -18,6 +18,7 @@ from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
 
+HELP = "more steps (-n), a lower cost_limit than is certified, or SAC-Lagrangian may help"
 TRIES = 3  # candidates that may be certified; they share the error
 
 
@@ -165,7 +166,7 @@ class DeliveryCallback(BaseCallback):
                 return f"Delivered, the policy of {steps:,} steps: {certificate}"
             refused.append(certificate)
         nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
-        return f"Nothing is delivered. The nearest candidate {nearest}"
+        return f"Nothing is delivered. The nearest candidate {nearest}; {HELP}"
 
     def _screen(self, file: Path, limits: np.ndarray) -> tuple[bool, float]:
         """Whether a candidate looks right in a few episodes; its return, or how near it is."""

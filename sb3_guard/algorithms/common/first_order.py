@@ -19,7 +19,6 @@ from sb3_guard.algorithms.common.actor import Before
 from sb3_guard.algorithms.common.batches import chunks, rows
 from sb3_guard.algorithms.common.buffers import CostRolloutBufferSamples
 from sb3_guard.algorithms.common.rollouts import CALM, CostRollouts
-from sb3_guard.algorithms.fast.actor import distribution_of
 from sb3_guard.algorithms.fast.optimizers import fuse
 
 #: ``loss(batch, ratio, distribution)``, see :meth:`FirstOrder.loss`
@@ -138,14 +137,13 @@ class FirstOrder(CostRollouts, PPO):
         names = "policy_gradient_loss", "approx_kl"
         loss_name, kl_name = names if values else ("projection_loss", "projection_kl")
         history[kl_name] = []  # of the last pass alone, as SB3 logs it
-        policy = distribution_of(self.policy)
         parameters = list(self.policy.parameters())
         for batch in self.rollout_buffer.get(self.batch_size):
             if values:
                 predicted, log_prob, entropy = _evaluate(self, batch)
                 distribution = self.policy.action_dist
             else:
-                distribution = policy(batch.observations)
+                distribution = self.policy.get_distribution(batch.observations)
                 log_prob = distribution.log_prob(self._taken(batch.actions))
             advantages = batch.advantages
             if self.normalize_advantage and len(advantages) > 1:

@@ -6,7 +6,6 @@ the head, so a product takes one tangent and one adjoint pass.
 """
 
 import copy
-from collections.abc import Callable
 
 import torch as th
 from stable_baselines3.common.distributions import (
@@ -28,7 +27,7 @@ from torch import nn
 from sb3_guard.algorithms.common.actor import Actor
 from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.vectors import flatten, unflatten
-from sb3_guard.algorithms.fast.mlp import TanhMlp, Written
+from sb3_guard.algorithms.fast.mlp import TanhMlp
 from sb3_guard.algorithms.fast.threads import accumulate
 
 
@@ -63,23 +62,6 @@ def tanh_actor(policy: ActorCriticPolicy) -> TanhMlp | None:
     ):
         return None
     return TanhMlp.of([*policy.mlp_extractor.policy_net, policy.action_net])
-
-
-def distribution_of(policy: ActorCriticPolicy) -> Callable[[PyTorchObs], Distribution]:
-    """``policy.get_distribution``, in the fastest way that is exact for this policy."""
-    network, head = tanh_actor(policy), policy.action_dist
-    if network is None or policy.device.type != "cpu":
-        return policy.get_distribution
-    gaussian = isinstance(head, DiagGaussianDistribution)
-
-    def distribution(observations: PyTorchObs) -> Distribution:
-        features = super(ActorCriticPolicy, policy).extract_features(
-            observations, policy.pi_features_extractor
-        )
-        inputs = Written.apply(network, features, *network.parameters)
-        return head.proba_distribution(inputs, *([policy.log_std] if gaussian else []))
-
-    return distribution
 
 
 class TanhActor(Actor):

@@ -5,7 +5,6 @@ over slices that fit the cache, each takes a quarter of autograd's time, for the
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch as th
@@ -104,23 +103,3 @@ class TanhMlp:
             dbias.addmv_(gradient.t(), ones)
             if i > 0:
                 gradient = _tanh_backward(gradient @ weights[i], activations[i])
-
-
-class Written(th.autograd.Function):
-    """A tanh network as one operation of autograd, which its passes above are the two halves of."""
-
-    @staticmethod
-    def forward(ctx: Any, network: TanhMlp, x: th.Tensor, *parameters: th.Tensor) -> th.Tensor:
-        """
-        :param x: a constant, shape [n, d]
-        :param parameters: ``network.parameters``
-        :return: shape [n, k]
-        """
-        ctx.network, ctx.activations = network, network.forward(x)
-        return ctx.activations[-1]
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: th.Tensor) -> Any:
-        total = [th.zeros_like(parameter) for parameter in ctx.network.parameters]
-        ctx.network.adjoint(ctx.activations, gradients[0], total)
-        return None, None, *total

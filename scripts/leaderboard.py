@@ -97,7 +97,7 @@ def read() -> tuple[pd.DataFrame, pd.DataFrame]:
             result = RunFolder(Path(run["path"])).checked_result()
             if "curve" in result:
                 kept = {key: result.get(key) for key in ("curve", "commit", "processor")}
-                kept["command"] = as_then(result)
+                kept = {"command": as_then(result), **kept}
                 kept |= {"final": final_hash(result), "seconds": round(result["seconds"])}
                 runs.append({"row": run["row"], **kept, **measures(result)})
         all_["budget"] = (all_["steps"] / MILLION).round().clip(lower=1).astype(int)

@@ -77,8 +77,6 @@ class Flags(Command):
     :param env_kwargs: arguments of the environment, e.g. "ghosts:{'num': 4}"
     :param robot_kwargs: arguments of register_robot, for a robot's MJCF file
     :param output: PNG file for the picture (default: <env>.png)
-    :param mjcf: MJCF file for the model: robot and objects before an episode places them; zones
-        without bodies, such as hazards, are not in it
     :param camera: fixed, track, top, or a camera of the robot's file (default: fixed, or track
         where the robot runs far away)
     :param window: open MuJoCo's viewer with random actions instead: Space pauses, Tab opens menus,
@@ -91,7 +89,6 @@ class Flags(Command):
     examples: ClassVar[str] = """examples:
   sb3-guard show Goal_Ant_8Ghosts
   sb3-guard show my_scenario.yml -o mine.png
-  sb3-guard show SafetyPointGoal1-v0 --mjcf point.xml
   sb3-guard show Goal_Drone_8Hazards --env-kwargs "ghosts:{'num': 4}" --camera track
   sb3-guard show go1.xml --robot-kwargs "root:'trunk'" "keyframe:'home'"
 """
@@ -99,7 +96,6 @@ class Flags(Command):
     env_kwargs: dict[str, Any] | None = flag()
     robot_kwargs: dict[str, Any] | None = flag()
     output: str | None = flag("-o", metavar="FILE.png")
-    mjcf: str | None = flag(metavar="FILE")
     camera: str | None = flag(metavar="NAME")
     window: bool = flag(default=False)
     seed: int = flag(default=0)
@@ -160,10 +156,6 @@ def show(flags: Flags) -> int:
     print(yaml.safe_dump(data, sort_keys=False))
     print(*costs(env, spec.id), "", sep="\n")
     print(observation_table(env), action_table(env), sep="\n\n")
-    if flags.mjcf:
-        with explained(f"can't write {flags.mjcf}", OSError):
-            Path(flags.mjcf).write_text(env.engine.spec.to_xml())
-        print(f"\nwrote {flags.mjcf}")
     path = Path(flags.output) if flags.output else Path(f"{file.stem}.png")
     with explained("no picture", RenderingError, OSError, ValueError):
         from matplotlib import image

@@ -49,9 +49,9 @@ COLUMNS = [
     "high", "tier", "above", "excess", "greedy_return", "greedy_cost", "greedy_tier", "cost_total",
     "row",
 ]  # fmt: skip
-MARKS = {"certified": " ✓", "violating": " ✗"}
+MARKS = {"kept": " ✓", "exceeded": " ✗"}
 MILLION = 1_000_000
-SEEDS = 3  # from which on a certified row has a place
+SEEDS = 3  # from which on a row that keeps its limit has a place
 
 
 def limit_of(env_id: str) -> float:
@@ -117,13 +117,13 @@ def leaderboard(rows: pd.DataFrame) -> pd.DataFrame:
     """
     A row for each environment, budget and algorithm, with the columns that the page explains.
 
-    Rows with a place, certified with enough seeds, come first, by return.
+    Rows with a place, their limit kept with enough seeds, come first, by return.
     """
     greedy = rows[rows["split"] == "greedy"].set_index("row")[["return", "cost", "tier"]]
     final = rows[rows["split"] == "stochastic"].join(greedy.add_prefix("greedy_"), on="row")
-    final["certified"] = final["tier"] == "certified"
-    final["placed"] = final["certified"] & (final["seeds"] >= SEEDS)
-    order = ["placed", "certified", "return"]
+    final["kept"] = final["tier"] == "kept"
+    final["placed"] = final["kept"] & (final["seeds"] >= SEEDS)
+    order = ["placed", "kept", "return"]
     final = final.sort_values(order, ascending=False, kind="stable")
     suites = {suite: n for n, suite in enumerate(dict.fromkeys(rows["suite"]))}
     final = final.sort_values(["suite", "budget"], key=lambda of: of.replace(suites), kind="stable")

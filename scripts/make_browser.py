@@ -110,7 +110,7 @@ def pack(logs: Path, source: Path = SOURCE) -> None:
 
 
 def mjcf(engine: Engine) -> str:
-    """The model as ``sb3-guard show --mjcf`` writes it, as MuJoCo 3.14 reads it: a velocity
+    """The model of ``engine.spec.to_xml()``, as MuJoCo 3.14 reads it: a velocity
     actuator does not state its input."""
     return str(engine.spec.to_xml()).replace(' input="vel"', "")
 

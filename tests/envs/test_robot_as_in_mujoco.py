@@ -139,7 +139,7 @@ def test_what_mujoco_finds_is_found(layout, given, tmp_path):
         engine = Scenario(robot="Finder").build()
         model = engine.model
         if layout != "strippath of a cube":  # whose sides MuJoCo does not tell
-            again = mujoco.MjModel.from_xml_string(engine.spec.to_xml())  # as show --mjcf writes it
+            again = mujoco.MjModel.from_xml_string(engine.spec.to_xml())
             assert again.nmeshvert == model.nmeshvert
     assert theirs.nmesh == model.nmesh and theirs.nmesh + theirs.ntex > 0
     np.testing.assert_array_equal(theirs.mesh_vert, model.mesh_vert)

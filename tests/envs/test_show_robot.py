@@ -1,4 +1,4 @@
-"""``sb3-guard show``: a robot's file before it is registered, and the model as a file."""
+"""``sb3-guard show``: a robot's file before it is registered; and the model as MJCF."""
 
 import re
 
@@ -58,11 +58,9 @@ def test_a_file_that_is_no_robot_yet_is_answered_in_a_line(run, words, message):
 
 
 @pytest.mark.parametrize("env_id", ["SafetyPointPush1-v0", "Goal_Ant_4Pillars-v0"])
-def test_the_model_as_a_file_moves_as_the_environment_does(run, tmp_path, env_id):
-    status, out, _ = run(env_id, "--mjcf", "model.xml")
-    assert status == 0 and "wrote model.xml" in out
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+def test_the_model_as_a_file_moves_as_the_environment_does(env_id):
     env = GuardEnv(**env_spec(env_id).kwargs)
+    model = mujoco.MjModel.from_xml_string(env.engine.spec.to_xml())
     env.reset(seed=0)
     batch, data = env.engine.batch, mujoco.MjData(model)
     for name in ("qpos", "qvel", "mocap_pos", "mocap_quat"):
@@ -76,25 +74,3 @@ def test_the_model_as_a_file_moves_as_the_environment_does(run, tmp_path, env_id
     moved = np.abs(data.qpos - model.qpos0).max()
     assert moved > 0.01
     np.testing.assert_allclose(data.qpos, batch.bind("qpos")[0], atol=1e-4)
-
-
-def test_the_model_refers_to_the_meshes_of_the_robots_file(run, tmp_path):
-    (tmp_path / "shapes").mkdir()
-    corners, faces = ("0 0 0", "1 0 0", "0 1 0", "0 0 1"), ("1 3 2", "1 2 4", "2 3 4", "1 4 3")
-    lines = [f"v {corner}" for corner in corners] + [f"f {face}" for face in faces]
-    (tmp_path / "shapes" / "wedge.obj").write_text("\n".join(lines))
-    text = (tmp_path / "crane.xml").read_text()
-    text = text.replace("<worldbody>", '<asset><mesh file="wedge.obj"/></asset><worldbody>', 1)
-    text = text.replace("<worldbody>", '<compiler meshdir="shapes"/><worldbody>', 1)
-    (tmp_path / "crane.xml").write_text(text)
-    (tmp_path / "out").mkdir()
-    stated = "--robot-kwargs", "center:'hand'"
-    status, *_ = run("crane.xml", "--mjcf", "out/model.xml", *stated)
-    assert status == 0
-    assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml")).nmesh == 1
-
-
-def test_a_model_that_cannot_be_written_is_an_error_in_one_line(run):
-    status, _, err = run("Goal_Point_8Hazards", "--mjcf", "none/model.xml")
-    assert status == 2 and "can't write none/model.xml: No such file or directory" in err
-    assert len(err.strip().splitlines()) == 1

@@ -79,7 +79,7 @@ def test_a_run_counts_them_apart(tmp_path, capfd):
     assert plot.main([str(tmp_path), "--table", str(table)]) == 0
     text = table.read_text()
     assert "episodes ended in a physics error" in text
-    assert "2: undecided (" in text and "2: certified" not in text
+    assert "2: undecided (" in text and "2: kept" not in text
     capfd.readouterr()
     assert enjoy.main(["-f", str(folder), "--n-episodes", "9", "--json", f"{tmp_path}/e.json"]) == 0
     assert "undecided" in capfd.readouterr()[0]

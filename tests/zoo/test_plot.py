@@ -224,12 +224,12 @@ def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys, monkeyp
     assert [path.name for path in out.iterdir()] == [f"curves_{POINT}.png"]
     printed, err = capsys.readouterr()
     assert max(map(len, printed.splitlines())) <= 120
-    for text in ("return", "5.00\xa0±\xa00.00", "PPO", "0: violating"):
+    for text in ("return", "5.00\xa0±\xa00.00", "PPO", "0: exceeded"):
         assert text in printed
     assert "left out: " in err and "v0_3/0.monitor.csv: it has no episodes" in err
     results = printed.partition("\nTiers")[0].splitlines()
     (row,) = (line.split() for line in results if "CPO  " in line and "0:" in line)
-    assert row[:5] == [POINT, "CPO", "0:", "violating", "2"]
+    assert row[:5] == [POINT, "CPO", "0:", "exceeded", "2"]
 
 
 def limited(folder, seed: int) -> None:
@@ -253,9 +253,9 @@ def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
     (row,) = found.runs.to_dict("records")
     assert (row["M_c/heat"], row["cost_limit/noise"]) == (4, 2)
     shown = tables(found)
-    assert shown["Results"]["limit"].tolist() == ["5 2: violating"]
+    assert shown["Results"]["limit"].tolist() == ["5 2: exceeded"]
     assert shown["Tiers"][["cost key", "limit"]].to_numpy().tolist() == [
-        ["heat", "5: certified"], ["noise", "2: violating"]
+        ["heat", "5: kept"], ["noise", "2: exceeded"]
     ]  # fmt: skip
     limited(tmp_path / "logs", 1)
     fake_run(tmp_path / "logs", "trpo")  # which knows the total only
@@ -268,7 +268,7 @@ def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
     heat = next(axis for axis in drawing.axes if "heat" in axis.get_ylabel())
     assert lines(heat)["CPO"] == pytest.approx([4.0] * 6)
     assert lines(heat)["heat limit, 5"].tolist() == [5, 5] and "TRPO" not in lines(heat)
-    assert page_of(tmp_path / "logs").count("2: violating") == 2
+    assert page_of(tmp_path / "logs").count("2: exceeded") == 2
 
 
 def test_packed_logs_without_an_entry_for_each_cost_are_read(tmp_path):

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from fake_runs import LABELS, fake_run
 
+from sb3_guard.costs import verdict
 from sb3_guard.zoo.cli.markdown import escaped
 from sb3_guard.zoo.results import statistics
 from sb3_guard.zoo.results.figure_data import Data
@@ -23,7 +24,6 @@ from sb3_guard.zoo.results.statistics import (
     mean_curve,
     nested_interval,
     normalize,
-    tier,
     violations,
 )
 from sb3_guard.zoo.results.tables import CAPTIONS, markdown, tables, write_tables
@@ -102,10 +102,9 @@ def test_each_draw_of_few_seeds_is_taken_equally_often(monkeypatch):
 
 
 def test_tiers():
-    assert tier(1, 2, 2) == "certified"
-    assert tier(2, 3, 2) == tier(1, 3, 2) == "undecided"
-    assert tier(2.1, 3, 2) == "violating"
-    assert tier(1, 2, math.nan) == ""
+    assert verdict(1, 2, 2) == "kept"
+    assert verdict(2, 3, 2) == verdict(1, 3, 2) == "undecided"
+    assert verdict(2.1, 3, 2) == "exceeded"
 
 
 def final(stochastic, greedy) -> dict:
@@ -127,7 +126,7 @@ def judged(tmp_path):
 def test_a_row_for_each_split(judged):
     table = judge(judged).set_index(["algo", "split"])
     row = table.loc["cpo", "stochastic"]
-    assert (row["seeds"], row["limit"], row["tier"]) == (2, 5, "certified")
+    assert (row["seeds"], row["limit"], row["tier"]) == (2, 5, "kept")
     assert (row["return"], row["return_std"]) == (10.5, 0)
     assert (row["cost"], row["cost_std"]) == (2.5, pytest.approx(0.5**0.5))  # seeds: 2 and 3
     assert (row["above"], row["excess"]) == (0, NONE)
@@ -137,7 +136,7 @@ def test_a_row_for_each_split(judged):
     assert (row["above"], row["excess"]) == (0.5, (9 - 5) / 5)
     row = table.loc["trpo", "stochastic"]  # judged by the limit of the others
     assert (row["tier"], row["above"], row["excess"]) == (
-        "violating",
+        "exceeded",
         1,
         pytest.approx((0.2 + 2.2) / 2),
     )
@@ -158,15 +157,15 @@ def test_episodes_that_a_wrapper_ended_are_not_judged(tmp_path):
 @pytest.mark.parametrize(
     ("seeds", "share"), [(1, 0.20), pytest.param(3, 0.08, marks=pytest.mark.slow)]
 )
-def test_few_seeds_certify_too_often(seeds, share):
+def test_few_seeds_keep_the_limit_too_often(seeds, share):
     """The shares of docs/leaderboard.md, those of 10,000 cases."""
     rng = np.random.default_rng(1)
-    certified = []
+    kept = []
     for _ in range(600):
         means = np.maximum(rng.normal(25, 4, seeds), 0.1)
         ends = nested_interval([rng.exponential(mean, 100) for mean in means], resamples=3125)
-        certified.append(tier(*ends, 25) == "certified")
-    assert abs(np.mean(certified) - share) < 3 * (share / 600) ** 0.5
+        kept.append(verdict(*ends, 25) == "kept")
+    assert abs(np.mean(kept) - share) < 3 * (share / 600) ** 0.5
 
 
 def test_a_limit_on_the_worst_step_has_its_tier_and_says_nothing_of_the_sum(tmp_path):
@@ -180,12 +179,12 @@ def test_a_limit_on_the_worst_step_has_its_tier_and_says_nothing_of_the_sum(tmp_
     table = judge(runs).set_index(["algo", "split", "key"])
     worst = table.loc["scpo", "stochastic", "worst step of cost"]
     assert (worst["cost"], worst["low"], worst["high"]) == (0.5, 0.25, 0.75)
-    assert {*table.drop(worst.name)["tier"]} == {""} and worst["tier"] == "certified"
+    assert {*table.drop(worst.name)["tier"]} == {""} and worst["tier"] == "kept"
     assert runs["limits"].dropna().tolist() == ["5"]
     shown = tables(Data(runs))
-    assert shown["Results"]["limit"].tolist() == ["–", "5: certified"]
+    assert shown["Results"]["limit"].tolist() == ["–", "5: kept"]
     (row,) = shown["Tiers"][shown["Tiers"]["cost key"] == "worst step of cost"].to_dict("records")
-    assert (row["limit"], row["cost"]) == ("5: certified", "0.5 [0.2, 0.8]")
+    assert (row["limit"], row["cost"]) == ("5: kept", "0.5 [0.2, 0.8]")
     for kind in ("curves", "pareto"):
         assert draw(kind, Data(runs))
 
@@ -208,7 +207,7 @@ def test_near_the_limit_the_draw_does_not_decide(tmp_path, monkeypatch):
 
     monkeypatch.setattr(statistics, "nested_interval", rough)
     played = {"returns": [1.0] * 4, "costs": [20.0] * 4, "lengths": [9] * 4}
-    for limit, tiers, draws in (25.0, ["undecided"], 2), (26.0, ["certified"], 1):
+    for limit, tiers, draws in (25.0, ["undecided"], 2), (26.0, ["kept"], 1):
         drawn.clear()
         fake_run(tmp_path / str(limit), cost_limit=limit, final={"stochastic": played})
         found = judge(read_results([tmp_path / str(limit)]).runs)

@@ -1,4 +1,4 @@
-"""The flags of the commands that take a trained agent: ``enjoy``, ``export`` and ``hub``."""
+"""The flags of the commands that take a trained agent: ``enjoy``, ``certify`` and ``export``."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -145,27 +145,3 @@ class ExportFlags(AgentFlags):
 """
     output: str = flag("-o", default="policy.onnx", metavar="FILE.onnx")
     stop: dict[str, Any] | None = flag(metavar="ACTUATOR:VALUE")
-
-
-@dataclass
-class HubFlags(AgentFlags):
-    """
-    Write a trained agent and its model card into a folder that is ready for the Hugging Face hub.
-
-    The command hf uploads and downloads it. Downloaded agents are programs: load only from people
-    you trust.
-
-    Output:
-
-    :param output: folder to write to (default: agent)
-    :param no_video: record no video of an episode
-    """
-
-    prog: ClassVar[str] = "sb3-guard hub"
-    examples: ClassVar[str] = """examples:
-  sb3-guard hub --algo cpo --env Goal_Point_8Hazards -f logs -o agent
-  hf upload me/cpo-Goal_Point_8Hazards-v0 agent
-  hf download me/cpo-Goal_Point_8Hazards-v0 --local-dir logs/cpo/Goal_Point_8Hazards-v0_1
-"""
-    output: str = flag("-o", default="agent", metavar="DIR")
-    no_video: bool = flag(default=False)

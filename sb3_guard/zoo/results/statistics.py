@@ -24,8 +24,6 @@ SPLITS = {
     "stochastic": "final stochastic",
     "greedy": "final greedy",
 }
-#: SafeRLEval's words for verdicts
-TIERS = {"kept": "certified", "exceeded": "violating"}
 
 
 # Limits
@@ -122,13 +120,6 @@ def nested_interval(seeds: Sequence[np.ndarray], resamples: int = 10_000) -> tup
     return float(low), float(high)
 
 
-def tier(low: float, high: float, limit: float, diverged: int = 0) -> str:
-    """Certified, undecided or violating, see :func:`~sb3_guard.costs.verdict`; empty: no limit."""
-    if math.isnan(limit):
-        return ""
-    return TIERS.get(verdict(low, high, limit, diverged), "undecided")
-
-
 def judge(runs: pd.DataFrame) -> pd.DataFrame:
     """
     How agents of an algorithm keep their limits, a row per suite, algorithm, split and cost.
@@ -137,8 +128,9 @@ def judge(runs: pd.DataFrame) -> pd.DataFrame:
     :return: ``suite``, ``algo``, ``label``, ``split``, ``key`` of a cost with a limit of its own
         (empty: the total), ``seeds``, ``limit`` (NaN: none), ``return`` and ``cost``, means over
         seeds of their episodes' means, with ``_std`` (over seeds; NaN for one), ``low`` and
-        ``high`` of the cost (:func:`nested_interval`), ``tier``, ``diverged`` (further
-        episodes, which a physics error ended), ``above`` and ``excess``
+        ``high`` of the cost (:func:`nested_interval`), ``tier`` (SafeRLEval's word for
+        :func:`~sb3_guard.costs.verdict`; empty: no limit), ``diverged`` (further episodes, which a
+        physics error ended), ``above`` and ``excess``
         (:func:`violations`, of all seeds' episodes)
     """
     rows = []
@@ -177,7 +169,7 @@ def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, 
         "cost_std": means[column].std(),
         "low": low,
         "high": high,
-        "tier": tier(low, high, limit, diverged),
+        "tier": "" if math.isnan(limit) else verdict(low, high, limit, diverged) or "undecided",
         "diverged": diverged,
         "above": math.nan if math.isnan(limit) else above,
         "excess": excess,

@@ -33,7 +33,7 @@ CAPTIONS = {
     "Results": "Means over the episodes of the final epoch of training, with sampled actions. "
     f"{SPREAD} Limits have the tier of the final stochastic episodes.",
     "Tiers": f"{SPREAD} Brackets are the 95 % bootstrap interval of the mean. A limit is "
-    "certified if the interval lies at or below it, violating if above it, else undecided. Excess "
+    "kept if the interval lies at or below it, exceeded if above it, else undecided. Excess "
     "is relative, a mean over the episodes above the limit.",
     "Relative to TRPO": "Return, cost and cost rate of the final epoch relative to TRPO's. Those "
     "of families are means over algorithms, those of all environments means over environments.",
@@ -126,7 +126,8 @@ def _limits(splits: pd.DataFrame) -> Callable[[Any], str]:
         for split in ("stochastic", "training"):
             tiers = {*here.loc[here["split"] == split, "tier"]} - {""}
             if tiers and not pd.isna(row["limits"]):
-                return f"{row['limits']}: {max(tiers)}"  # certified < undecided < violating
+                worst = next(tier for tier in ("exceeded", "undecided", "kept") if tier in tiers)
+                return f"{row['limits']}: {worst}"
         return "–" if pd.isna(row["limits"]) else str(row["limits"])
 
     return cell

@@ -113,7 +113,7 @@ class TanhActor(Actor):
     def score(self, weights: th.Tensor) -> th.Tensor:
         n = len(self.network.parameters)
 
-        def add(number: int, total: list[th.Tensor]) -> float:
+        def add(number: int, total: list[th.Tensor]) -> None:
             activations, index = self.activations[number], self.slices[number]
             distribution, inputs = self._head(activations[-1])
             log_prob = distribution.log_prob(self.actions[index])
@@ -121,22 +121,20 @@ class TanhActor(Actor):
             self.network.adjoint(activations, slopes[0], total[:n])
             for each, slope in zip(total[n:], slopes[1:], strict=True):
                 each.add_(slope)
-            return 0.0
 
-        return flatten(accumulate(add, len(self.slices), self.parameters)[0])
+        return flatten(accumulate(add, len(self.slices), self.parameters))
 
     @th.no_grad()
     def fisher(self, vector: th.Tensor) -> th.Tensor:
         pieces = unflatten(vector, self.parameters)
         n = len(self.network.parameters)
 
-        def add(number: int, total: list[th.Tensor]) -> float:
+        def add(number: int, total: list[th.Tensor]) -> None:
             activations = self.activations[number]
             change = self.network.tangent(activations, pieces[:n])
             self.network.adjoint(activations, self._curvature(number, change), total)
-            return 0.0
 
-        total, _ = accumulate(add, len(self.slices), self.network.parameters)
+        total = accumulate(add, len(self.slices), self.network.parameters)
         size = len(self.old_log_prob)
         # A Gaussian's log standard deviations have Fisher matrix 2 I, apart from the mean.
         return flatten([*(each / size for each in total), *(2.0 * p for p in pieces[n:])])

@@ -24,22 +24,22 @@ def one_thread() -> Iterator[int]:
 
 
 def accumulate(
-    work: Callable[[int, list[th.Tensor]], float], n_slices: int, parameters: Sequence[th.Tensor]
-) -> tuple[list[th.Tensor], float]:
+    work: Callable[[int, list[th.Tensor]], None], n_slices: int, parameters: Sequence[th.Tensor]
+) -> list[th.Tensor]:
     """Sum over slices, in an order that depends on the number of threads alone.
 
-    :param work: adds slice i's share to the tensors that it is given, and returns a number; called
-        from several threads at once, with no other effect
+    :param work: adds slice i's share to the tensors that it is given; called from several threads
+        at once, with no other effect
     :param n_slices: how many slices there are
     :param parameters: what the sums are shaped like
-    :return: the sums, and that of the numbers
+    :return: the sums
     """
 
-    def part(numbers: range) -> tuple[list[th.Tensor], float]:
-        sums, number = [th.zeros_like(parameter) for parameter in parameters], 0.0
+    def part(numbers: range) -> list[th.Tensor]:
+        sums = [th.zeros_like(parameter) for parameter in parameters]
         for i in numbers:
-            number += work(i, sums)
-        return sums, number
+            work(i, sums)
+        return sums
 
     with one_thread() as threads:
         if parameters[0].device.type != "cpu":
@@ -49,10 +49,8 @@ def accumulate(
             return part(first)
         with ThreadPoolExecutor(len(others)) as pool:
             jobs = [pool.submit(part, numbers) for numbers in others]
-            sums, number = part(first)
+            sums = part(first)
             for job in jobs:
-                more, another = job.result()
-                number += another
-                for total, each in zip(sums, more, strict=True):
+                for total, each in zip(sums, job.result(), strict=True):
                     total.add_(each)
-    return sums, number
+    return sums

@@ -7,8 +7,9 @@ one environment in short, ``<!-- runs: NAME SUITE -->``. Instead of ``runs`` the
 NAME``, returns in the end and those of the untrained agents of ``docs/data/untrained.csv``;
 ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep: NAME SUITE``, return and cost at
 each limit N of ``NAME_limitN.tar.xz``; ``splits: NAME``, how the agents keep their limit in
-training and after it; and ``agents: pretrained``, those of ``enjoy --pretrained``. A row of a
-single run is in italics, which the site shows in grey.
+training and after it; ``delivered: NAME``, the certified agents that its runs end with, beside
+their final policies; and ``agents: pretrained``, those of ``enjoy --pretrained``. A row of a single
+run is in italics, which the site shows in grey.
 ``--pack FOLDER NAME`` packs the logs of a folder.
 
 ``--curves`` draws the learning curves: of each algorithm's page, beside an unconstrained algorithm,
@@ -25,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from archives import DATA, DOCS, pack, unpacked
 from matplotlib.figure import Figure
@@ -44,9 +46,11 @@ from sb3_guard.zoo.results.statistics import (
     normalize,
 )
 from sb3_guard.zoo.results.tables import markdown, number, spelled, spread, whole
+from sb3_guard.zoo.run.folder import RunFolder
 
 BLOCK = re.compile(
-    r"(<!-- (runs|learnt|scores|sweep|splits|agents): (\S+)(?: (\S+))? -->\n?).*?(<!-- end -->)",
+    r"(<!-- (runs|learnt|scores|sweep|splits|delivered|agents): (\S+)(?: (\S+))? -->\n?)"
+    r".*?(<!-- end -->)",
     re.DOTALL,
 )
 # A figure of a packed grid: file, grid and kind
@@ -257,6 +261,33 @@ def splits(name: str) -> str:
     return grey(rows, columns)
 
 
+def delivered(name: str) -> str:
+    """A table of the certified agents that runs end with, beside their final policies."""
+    rows = []
+    with unpacked(name) as found:
+        for (suite, label), group in found.runs.groupby(["suite", "label"], sort=False):
+            results = [RunFolder(Path(path)).checked_result() for path in group["path"]]
+            given = [one["delivered"] for one in results if one["delivered"]]
+            means = pd.DataFrame(
+                {"return": one["return"], **next(iter(one["costs"].values()))} for one in given
+            ).mean()
+            digits = 0 if abs(results[0]["return"]) >= 100 else 1
+            cells = [suite, label, f"{len(given)} of {len(results)}"]
+            if given:
+                cells += [number(means["return"], digits), number(means["mean"], 1),
+                          number(means["upper"], 1), percent(means["share_above"])]  # fmt: skip
+            else:
+                cells += ["–"] * 4
+            for kind in ("stochastic", "greedy"):
+                final = pd.DataFrame([one["final"][kind] for one in results])
+                ends = [final[key].map(np.mean).mean() for key in ("returns", "costs")]
+                cells.append(f"{number(ends[0], digits)} / {number(ends[1], 1)}")
+            rows.append(cells)
+    header = ["environment", "algorithm", "delivered", "return", "cost", "bound", "above the limit",
+              "final, sampled", "final, most likely"]  # fmt: skip
+    return table(header, rows)
+
+
 def _published(known: pd.DataFrame, algo: str) -> str:
     if algo not in known.index:
         return "–"
@@ -271,7 +302,8 @@ def filled(page: str) -> str:
     def remade(match: re.Match[str]) -> str:
         begin, kind, name, only, end = match.groups()
         made = {
-            "learnt": learnt, "scores": scores, "splits": splits, "agents": lambda _: listed()
+            "learnt": learnt, "scores": scores, "splits": splits, "delivered": delivered,
+            "agents": lambda _: listed(),
         }  # fmt: skip
         if kind == "sweep":
             text = sweep(name, only)

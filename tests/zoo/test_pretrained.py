@@ -188,7 +188,7 @@ def test_the_pretrained_agents_are_listed(command, capsys):
     assert cli.main(command) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     head, *cells = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
-    assert head[:5] == ["environment", "algorithm", "steps", "limit", "trained at"]
+    assert head[:4] == ["environment", "algorithm", "steps", "trained at"]
     assert [(row[0], row[1]) for row in cells] == [
         (run.name, run.path.parent.name) for run in SHIPPED
     ]

@@ -13,13 +13,13 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_085,
+    "sb3_guard": 26_081,
     "sb3_guard/envs": 8_758,
-    "sb3_guard/algorithms": 5_791,
+    "sb3_guard/algorithms": 5_787,
     "sb3_guard/common": 2_505,
     "sb3_guard/deployment": 916,
     "harness": 8_115,
-    "tests": 24_093,
+    "tests": 24_091,
 }
 WORDS = 71_409  # of all tracked markdown but the changelog
 

@@ -14,7 +14,6 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.costs import limits_at
-from sb3_guard.checked_env import refuse_vector_env
 from sb3_guard.common.evaluation import (
     Evaluation,
     evaluate_policy,
@@ -143,7 +142,6 @@ class CostEvalCallback(EvalCallback):
         deterministic: bool | None = None,
         verbose: int = 1,
     ):
-        refuse_vector_env(eval_env)
         super().__init__(
             eval_env,
             callback_on_new_best=callback_on_new_best,

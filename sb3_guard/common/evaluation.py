@@ -26,7 +26,6 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.checked_env import checked
 from sb3_guard.checks import NumberError, check_cost_keys, is_number
 from sb3_guard.common.monitor import cost_keys_of, total_cost
 from sb3_guard.costs import (
@@ -303,10 +302,9 @@ def evaluate_policy(
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
     if not isinstance(env, VecEnv):
-        lone = checked(env)
+        lone = env
         env = DummyVecEnv([lambda: lone])
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
-    checked(env, keys)
     check_agent(model, env)
     takes_masks = "action_masks" in inspect.signature(model.predict).parameters
     masked = takes_masks and env.has_attr("action_masks")

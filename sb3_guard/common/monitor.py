@@ -12,7 +12,6 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor, is_vecenv_wrapped
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_guard.checked_env import checked
 from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.vec_budgets import end_rows
 from sb3_guard.costs import EpisodeCost, EpisodeCosts, number, read_costs
@@ -65,7 +64,7 @@ class CostMonitor(VecMonitor):
         cost_keys: Sequence[str] = ("cost",),
     ):
         self.cost_keys = check_cost_keys(cost_keys)
-        super().__init__(checked(venv, self.cost_keys), info_keywords=tuple(info_keywords))
+        super().__init__(venv, info_keywords=tuple(info_keywords))
         self._columns = (
             [f"c_{key}" for key in self.cost_keys] if self.cost_keys != ("cost",) else []
         )

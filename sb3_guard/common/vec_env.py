@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from sb3_guard.checked_env import CheckedEnv, refuse_vector_env
-from sb3_guard.checks import check_cost_keys
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.common.sources import Source, find
 from sb3_guard.fields import fit
@@ -89,12 +87,10 @@ def make_vec_env(
             )
         venv = source.batch(n_envs, num_threads=num_threads, **kwargs)
     elif vec_env in VEC_ENVS:
-        keys = check_cost_keys((monitor_kwargs or {}).get("cost_keys", ("cost",)))
 
         def make_one() -> gymnasium.Env:
             env = source.make(**kwargs)
-            env = env if wrapper_class is None else wrapper_class(env)
-            return CheckedEnv(env, keys)
+            return env if wrapper_class is None else wrapper_class(env)
 
         venv = (
             _subprocesses(make_one, n_envs)
@@ -111,8 +107,7 @@ def make_vec_env(
 
 
 def _refuse_made(env_id: Any) -> None:
-    refuse_vector_env(env_id)
-    if isinstance(env_id, gymnasium.Env | VecEnv):
+    if isinstance(env_id, gymnasium.Env | gymnasium.vector.VectorEnv | VecEnv):
         spec = getattr(env_id, "spec", None)
         name = repr(spec.id) if spec else "MyEnv"
         raise TypeError(

@@ -15,7 +15,6 @@ from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.arguments import (
     check_names,
@@ -26,9 +25,9 @@ from sb3_guard.algorithms.common.arguments import (
     stated,
 )
 from sb3_guard.algorithms.common.costs import Costs, limits_of, time_limit
-from sb3_guard.checked_env import checked
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.costs import read_costs
+from sb3_guard.lost_costs import refuse_lost_costs
 
 
 class Constrained(BaseAlgorithm):
@@ -162,10 +161,6 @@ class Constrained(BaseAlgorithm):
         self._choose_buffer()
         super()._setup_model()  # type: ignore[safe-super]
 
-    @staticmethod
-    def _wrap_env(env: Any, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        return BaseAlgorithm._wrap_env(checked(env), verbose, monitor_wrapper)
-
     def _choose_buffer(self) -> None:
         """Say which buffer SB3 is to make, and what it has to know of the costs."""
 
@@ -214,7 +209,7 @@ class Constrained(BaseAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        checked(self.env, self.cost_keys)
+        refuse_lost_costs(self.env)
         normalizer = self.get_vec_normalize_env()
         self.learnt_normalized = normalizer is not None and normalizer.norm_obs
         if self.begin_anew:

@@ -166,7 +166,7 @@ def _tune(flags: TuneFlags, main: bool) -> int:
             study.stop()
 
     with interrupts(stop) as received:
-        if isinstance(storage, JournalStorage):
+        if main and isinstance(storage, JournalStorage):
             repeat_lost_trials(study)
         with _other_workers(flags, flags.n_jobs - 1 if main else 0) as others:
             if len(study.get_trials(deepcopy=False, states=FINISHED)) < flags.n_trials:

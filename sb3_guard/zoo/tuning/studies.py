@@ -8,7 +8,6 @@ import os
 import socket
 import time
 from contextlib import suppress
-from datetime import datetime, timedelta
 from pathlib import Path
 
 import optuna
@@ -73,7 +72,7 @@ def _open_database(address: str) -> tuple[Storage, str]:
             engine_kwargs={"pool_pre_ping": True, "connect_args": {"connect_timeout": 10}},
             heartbeat_interval=HEARTBEAT,
             grace_period=GRACE,
-            heartbeat_stale_trial_callback=repeat,
+            heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(MOST_REPEATS),
         )
 
     install = "install it with: pip install 'sb3-guard[postgres]'"
@@ -97,32 +96,20 @@ def database_error(error: BaseException | None) -> str | None:
     return None if error is None else " ".join(str(getattr(error, "orig", None) or error).split())
 
 
-def repeat(study: optuna.Study, trial: FrozenTrial, most: int | None = MOST_REPEATS) -> None:
-    """
-    Queue a trial again, with its hyperparameters.
-
-    :param trial: a copy
-    :param most: give it up after so many repetitions; None: never
-    """
-    trial.user_attrs.pop(WORKER, None)
-    RetryHeartbeatStaleTrialCallback(most)(study, trial)
-
-
 def repeat_lost_trials(study: optuna.Study) -> None:
-    """Queue the trials of a journal again whose worker is gone; Optuna does so for a database."""
+    """Queue the trials of a journal again whose process is gone; Optuna does so for a database."""
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
         if _is_lost(trial):
             # Another worker may do the same at the same moment.
             with suppress(ValueError, UpdateFinishedTrialError):
                 study.tell(trial.number, state=TrialState.FAIL)
-                repeat(study, trial)
+                RetryHeartbeatStaleTrialCallback(MOST_REPEATS)(study, trial)
 
 
 def _is_lost(trial: FrozenTrial) -> bool:
     host, _, process = trial.user_attrs.get(WORKER, "").rpartition("-")
     if not host:  # killed before it said who it is
-        begun = trial.datetime_start
-        return begun is not None and datetime.now() - begun > timedelta(seconds=GRACE)
+        return True
     if host != socket.gethostname() or os.name != "posix":  # elsewhere signal 0 is no question
         return False
     try:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import optuna
 from optuna.exceptions import TrialPruned, UpdateFinishedTrialError
+from optuna.storages import RetryHeartbeatStaleTrialCallback
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
@@ -26,7 +27,7 @@ from sb3_guard.zoo.run.make_envs import PROCESS_DIED
 from sb3_guard.zoo.run.run import Run
 from sb3_guard.zoo.tuning.flags import TuneFlags
 from sb3_guard.zoo.tuning.spaces import Search
-from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER, repeat
+from sb3_guard.zoo.tuning.studies import DATABASE_ERRORS, WORKER
 
 # What the hyperparameters of a trial may lead to; anything else is a mistake in the code.
 FAILURES = (UsageError, ValueError, FloatingPointError, RuntimeError, AssertionError)
@@ -172,7 +173,7 @@ class Objective:
             raise TrialPruned from error
         except BaseException:  # a signal, a lost connection: not the hyperparameters' fault
             with suppress(*DATABASE_ERRORS):
-                repeat(trial.study, trial.study.trials[trial.number], most=None)
+                RetryHeartbeatStaleTrialCallback()(trial.study, trial.study.trials[trial.number])
             raise
         return float(trial.user_attrs["result"]["return"])
 

@@ -1,6 +1,8 @@
-"""How does CPO work? Constrained policy optimisation (Achiam et al., 2017, arXiv 1705.10528), with
-one limit, in one file. Equation numbers and letters are the paper's, but g, b, c are of an ascent.
-``sb3_guard.CPO`` makes the same update: ``tests/docs/test_cpo_in_one_file.py`` compares them.
+"""How does CPO work?
+
+Constrained policy optimisation (Achiam et al., 2017, arXiv 1705.10528) with one limit. Equation
+numbers and letters are the paper's, but g, b, c are of an ascent. ``sb3_guard.CPO`` makes the
+same update: ``tests/docs/test_cpo_in_one_file.py`` compares them.
 """
 
 import copy

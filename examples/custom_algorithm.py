@@ -1,4 +1,4 @@
-"""An algorithm of your own, which the commands can train, tune and plot.
+"""How do I write an algorithm of my own that the commands train, tune and plot?
 
 sb3-guard train --gym-packages custom_algorithm --algo trpo_price \
     -conf custom_algorithm.py --env Goal_Point_8Hazards -n 1e6

@@ -1,4 +1,4 @@
-"""A constraint of your own."""
+"""How do I write a constraint of my own? (A task is written alike.)"""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""A robot of your own, from an MJCF file."""
+"""How do I use a robot of my own, from an MJCF file?"""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Run an exported agent at 50 Hz, with onnxruntime alone."""
+"""How do I run an exported agent at 50 Hz, with onnxruntime alone?"""
 
 import json
 import time
@@ -8,15 +8,15 @@ import onnxruntime
 
 import sb3_guard  # the simulation that stands in for the robot
 
-contract = json.load(open("contract.json"))  # sb3-guard export --pretrained writes both files
-policy = onnxruntime.InferenceSession("policy.onnx")
-period, output, trained = contract["control_step"], contract["outputs"][0], contract["trained"]
+# sb3-guard export --pretrained writes both files
+contract, policy = json.load(open("contract.json")), onnxruntime.InferenceSession("policy.onnx")
+period, output, bound = contract["control_step"], contract["outputs"][0], contract["costs"][0]
 inputs = {part["name"]: part["shape"][1:] for part in contract["inputs"]}
 if other := inputs.keys() - {"observation", "last_cost"} | {*contract["wrappers"]}:
     raise SystemExit(f"this loop does not compute {', '.join(other)}, which contract.json names")
 assert None not in output["stop"], "say what stops the robot: sb3-guard export --stop 0:0.0"
 stop = np.array([np.nan if value == "hold" else value for value in output["stop"]], np.float32)
-robot = sb3_guard.make(trained["env"], **trained.get("env_kwargs", {}))
+robot = sb3_guard.make(contract["trained"]["env"], **contract["trained"].get("env_kwargs", {}))
 (latest, _), rng = robot.reset(seed=0), np.random.default_rng(0)
 frames = np.resize(latest, inputs["observation"])  # of a stack: the first one, repeated
 observation, missing, stops, cost, costs, sent = latest, 0, 0, 0.0, [], None
@@ -37,5 +37,4 @@ for _ in range(500):
         frames = np.resize(latest, inputs["observation"])
     time.sleep(max(0.0, began + period - time.perf_counter()))
 np.savetxt("costs.csv", costs)
-limit = "limit {limit} per {per}".format(**contract["costs"][0])
-print(f"cost {sum(costs):.2f} in {len(costs)} steps, {limit}; stopped {stops} times")
+print(f"cost {sum(costs):.2f}, limit {bound['limit']} per {bound['per']}; stopped {stops} times")

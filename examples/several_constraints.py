@@ -1,4 +1,4 @@
-"""Two constraints, each with a limit of its own."""
+"""How do I give two costs a limit each?"""
 
 from sb3_guard import evaluate_policy, make_model
 

@@ -1,4 +1,4 @@
-"""Search for the hyperparameters with the highest return within a cost limit.
+"""How do I find the hyperparameters with the highest return within a cost limit?
 
 `sb3-guard tune` does this for several seeds, processes and machines, with pruning and a report.
 """

@@ -1,4 +1,4 @@
-"""An environment of your own that reports a cost, and one to which you add a cost."""
+"""How do I train in an environment of my own, or add a cost to one that has none?"""
 
 import gymnasium
 import numpy as np

@@ -234,9 +234,8 @@ def examples() -> str:
     ]
     for file in sorted((ROOT / "examples").glob("*.py")):
         says = (ast.get_docstring(ast.parse(file.read_text())) or "").splitlines()[0]
-        link = f"[examples/{file.name}](../examples/{file.name})"
         code = f"```{{literalinclude}} ../examples/{file.name}\n:language: python\n```"
-        parts += [f"## {says.rstrip('.')}", link, code]
+        parts += [f"## {says}", f"[{file.name}](../examples/{file.name})", code]
     return "\n\n".join(parts) + "\n"
 
 

@@ -8,7 +8,6 @@ filmed is an agent of the package's where there is one, else TRPO from a run in 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -48,7 +47,7 @@ SAFETY = {
     for task in ("Goal1", "Button1", "Push1", "Circle1", "Run0")
 }
 SAFETY |= {f"velocity_{robot.lower()}": f"Safety{robot}Velocity-v1" for robot in TABLE}
-# Robots of other packages, of examples/robots.py: filmed with CPO's runs in the log folder
+# Robots of other packages, of scripts/robots.py: filmed with CPO's runs in the log folder
 FILES = {"file_go1": ("WalkingGo1-v0", 1.6), "file_yam": ("ReachingYam-v0", 2.2)}
 # Small robots are shown nearer: the middle of a picture that is so many times as large
 ZOOM = {"Arm3": 1.0, "Arm6": 1.0, "Humanoid": 1.3, "Hopper": 1.4}
@@ -176,8 +175,7 @@ def write_clip(model: BaseAlgorithm, env: VecEnv, path: Path, deterministic: boo
 
 
 def file_clips(output: Path, folder: str, seed: int) -> None:
-    """A clip and a still of each robot of another package with a task in examples/robots.py."""
-    sys.path.append(str(Path(__file__).parents[1] / "examples"))
+    """A clip and a still of each robot of another package with a task in scripts/robots.py."""
     for stem, (env_id, zoom) in FILES.items():
         window = {"width": round(600 * zoom), "height": round(500 * zoom), "camera": "track"}
         flags = AgentFlags(env=env_id, folder=folder, seed=seed, env_kwargs=window,

@@ -72,7 +72,7 @@ def path(source: Source) -> Path:
     if source.wheel is None:
         return Path(str(files("gymnasium.envs.mujoco") / "assets" / source.file))
     with contextlib.redirect_stdout(io.StringIO()):
-        fetch = runpy.run_path(str(ROOT / "examples" / "robots.py"))["fetch"]
+        fetch = runpy.run_path(str(ROOT / "scripts" / "robots.py"))["fetch"]
     folder: Path = fetch(source.wheel)
     return folder / source.file
 

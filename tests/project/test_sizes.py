@@ -19,9 +19,9 @@ LINES = {
     "sb3_guard/common": 2_495,
     "sb3_guard/deployment": 916,
     "harness": 7_972,
-    "tests": 23_982,
+    "tests": 23_985,
 }
-WORDS = 71_405  # of all tracked markdown but the changelog
+WORDS = 71_247  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -135,13 +135,14 @@ def _subprocesses(make: Callable[[], gymnasium.Env], n_envs: int) -> VecEnv:
                         "__name__ == '__main__': register parts above that, or in a module"
                     )
                 with suppress(OSError):  # another one has told already
-                    Path(folder, str(os.getpid())).write_text(text)
+                    Path(folder, str(os.getpid())).write_text(text, encoding="utf-8")
                 raise SystemExit(1) from error
 
         try:
             return VEC_ENVS["subproc"]([make_or_tell] * int(n_envs))
         except (EOFError, ConnectionError):
-            said = max((path.read_text() for path in Path(folder).iterdir()), key=len, default="")
+            told = (path.read_text(encoding="utf-8") for path in Path(folder).iterdir())
+            said = max(told, key=len, default="")
             if not said:
                 raise
             raise ValueError(f"a process of vec_env='subproc' says {said}") from None

@@ -1,12 +1,14 @@
 """What the project says of itself in several places is the same."""
 
 import re
+import shlex
 import tomllib
 from pathlib import Path
 
 import yaml
 
 import sb3_guard
+from sb3_guard import cli
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -34,3 +36,14 @@ def test_the_version_is_the_changelogs_latest():
     released = re.findall(r"(?m)^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text())
     assert released[:2] == ["Unreleased", sb3_guard.__version__]
     assert f"version: {sb3_guard.__version__}" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_the_commands_that_other_systems_are_tested_with_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    jobs = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]
+    lines = [step["run"] for step in jobs["systems"]["steps"] if "run" in step]
+    commands = [shlex.split(line)[1:] for line in lines if line.startswith("sb3-guard ")]
+    assert [command[0] for command in commands] == ["train", "enjoy", "export"]
+    for command in commands:
+        assert cli.main(command) == 0, command
+    assert {path.name for path in tmp_path.iterdir()} == {"logs", "contract.json", "policy.onnx"}

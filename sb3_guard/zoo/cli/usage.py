@@ -116,7 +116,7 @@ def run(command: Callable[[], int]) -> int:
         return status
     except BrokenPipeError:  # `list | head` has read enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return 128 + signal.SIGPIPE
+        return 141  # as a process that SIGPIPE ends, which Windows has not
     except (UsageError, ImportError, OSError) as error:  # an absent package, a full disk
         print(f"error: {one_line(error)}", file=sys.stderr)
         return getattr(error, "status", 2)

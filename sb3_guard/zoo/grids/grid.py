@@ -146,7 +146,7 @@ def carry_out(run: GridRun, command: str, stop: Path) -> tuple[str, str]:
         except Exception as error:
             # The grid's summary says it too, so a record that can't be written is no failure.
             with suppress(OSError):
-                error_file.write_text(traceback.format_exc())
+                error_file.write_text(traceback.format_exc(), encoding="utf-8")
             return "failed", one_line(error)
     return "stopped" if status else "done", ""
 

@@ -12,11 +12,11 @@ import pytest
 from fake_runs import LABELS, fake_run
 from matplotlib.colors import to_rgb
 
-from sb3_guard import algorithms, cli, plot
+from sb3_guard import cli, plot
 from sb3_guard.algorithms import CLASSES
 from sb3_guard.zoo.grids.presets import ALGOS, OPTIONS, RADAR4, ROBOTS
 from sb3_guard.zoo.results import figures
-from sb3_guard.zoo.results.figure_data import COLORS, INK, PLACES, Data
+from sb3_guard.zoo.results.figure_data import COLORS, INK, MARKS, Data
 from sb3_guard.zoo.results.figures import FIGURES, draw, save
 from sb3_guard.zoo.results.runs import read_results, select
 from sb3_guard.zoo.results.tables import tables
@@ -186,13 +186,10 @@ def test_no_two_algorithms_look_alike_and_ones_own_has_a_name(tmp_path):
     assert looks["mine"].dashes == looks["trpo_lag"].dashes != looks["cpo"].dashes
 
 
-def test_no_two_algorithms_of_a_family_have_one_colour():
-    ours = [
-        (getattr(algorithms, CLASSES[key]).family, PLACES[key][0])
-        for key in PLACES
-        if key in CLASSES
-    ]
-    assert len({*ours}) == len(ours) == len(CLASSES) - 1  # TRPO is grey
+def test_no_two_algorithms_have_one_colour_or_one_marker():
+    assert {*CLASSES} - {"trpo"} <= MARKS.keys()
+    for one in zip((INK, "o"), *MARKS.values(), strict=True):
+        assert len({*one}) == len(one)
 
 
 @pytest.mark.parametrize("form", figures.FORMATS)

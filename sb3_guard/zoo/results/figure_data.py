@@ -1,7 +1,7 @@
 """The data of tables and figures: runs, means, scores, curves, and the look of each algorithm.
 
-Colours are readable on white and on black, and in the manner of Okabe and Ito's told apart by
-colour-blind readers; line styles and markers tell algorithms apart without them.
+Colours are readable on white and on black; the first eight are in the manner of Okabe and Ito's
+told apart by colour-blind readers, and line styles and markers tell algorithms apart without them.
 """
 
 from functools import cached_property
@@ -23,22 +23,21 @@ from sb3_guard.zoo.results.statistics import (
 # Text, axes and the reference; a grey that is readable on white and on black. No other colour is
 # the same, so a page can replace it by its own.
 INK = "#7b7b7b"
-COLORS = (
-    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#C08A00", "#3D9BD6", "#8F6FD1", "#8A8A00",
-    "#A65E3A", "#4FA38F",
-)  # fmt: skip
-OTHERS = "*^pXPvhD"  # markers of algorithms that are not in PLACES
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.5, 1)), (0, (5, 1, 1, 1)))
 LOOSE = (0, (4, 2.5))  # baselines, which are of no family
-# An algorithm has its colour and marker in every figure, and a family its line style. Algorithms
-# that share a colour are rarely in one figure.
-PLACES = {
-    "cpo": (0, "D"), "pcpo": (1, "d"), "trpo_lag": (2, "s"), "ppo_lag": (3, "v"),
-    "focops": (4, "^"), "cup": (5, "P"), "cppo_pid": (6, "*"), "p3o": (7, "X"), "crpo": (8, "p"),
-    "ppo": (9, "h"), "trpo_fac": (4, "<"), "trpo_ipo": (5, ">"), "trpo_sl": (6, "H"),
-    "trpo_usl": (7, "8"), "rcpo": (8, "s"), "scpo": (9, "D"), "sac_lag": (0, "v"),
-    "td3_lag": (1, "^"), "tqc_lag": (7, "P"), "sac": (3, "X"), "td3": (4, "d"), "tqc": (5, "D"),
+# An algorithm has its colour and marker in every figure, and a family its line style.
+MARKS: dict[str, tuple[str, Any]] = {
+    "cpo": ("#0072B2", "D"), "pcpo": ("#D55E00", "d"), "trpo_lag": ("#009E73", "s"),
+    "ppo_lag": ("#CC79A7", "v"), "focops": ("#C08A00", "^"), "cup": ("#3D9BD6", "P"),
+    "cppo_pid": ("#8F6FD1", "*"), "p3o": ("#8A8A00", "X"), "crpo": ("#8F5000", "p"),
+    "ppo": ("#187068", "h"), "sac_lag": ("#C70028", (4, 1, 0)), "td3_lag": ("#087000", (5, 0, 180)),
+    "tqc_lag": ("#5038FF", (6, 1, 0)), "trpo_fac": ("#FF00FF", "<"), "trpo_ipo": ("#B70080", ">"),
+    "trpo_sl": ("#00AF00", "H"), "trpo_usl": ("#A700FF", "8"), "rcpo": ("#FF0868", (3, 1, 0)),
+    "scpo": ("#3078FF", (4, 1, 45)), "sac": ("#805087", (8, 1, 0)), "td3": ("#CF48C7", (7, 0, 0)),
+    "tqc": ("#7840C7", (3, 1, 60)),
 }  # fmt: skip
+COLORS = [color for color, _ in MARKS.values()]
+OTHERS = [*MARKS.values()][::-1]  # of algorithms that are not among them
 FAMILIES = ("CPO-based", "Lagrangian", "hierarchical", "First-order", "Primal", "State-wise")
 
 
@@ -48,7 +47,7 @@ class Look(NamedTuple):
     label: str
     color: str
     dashes: Any
-    marker: str
+    marker: Any
 
     @property
     def line(self) -> dict[str, Any]:
@@ -102,17 +101,12 @@ class Data:
         looks: dict[str, Look] = {}
         families = dict.fromkeys([*FAMILIES, *sorted({*table["family"]} - {""})])
         dashes = dict(zip(families, cycle(DASHES), strict=False)) | {"": LOOSE}
-        others = sorted({*table["algo"]} - {*PLACES, REFERENCE})
-        places = PLACES | {
-            algo: ((8 + 5 * n) % len(COLORS), OTHERS[n % len(OTHERS)])
-            for n, algo in enumerate(others)
-        }
+        others = sorted({*table["algo"]} - {*MARKS, REFERENCE})
+        marks = MARKS | dict(zip(others, cycle(OTHERS), strict=False)) | {REFERENCE: (INK, "o")}
         for row in table.sort_values(["first", "family", "label"]).to_dict("records"):
-            if row["algo"] == REFERENCE:
-                looks[REFERENCE] = Look(row["label"], INK, "-", "o")
-                continue
-            color, marker = places[row["algo"]]
-            looks[row["algo"]] = Look(row["label"], COLORS[color], dashes[row["family"]], marker)
+            color, marker = marks[row["algo"]]
+            line = "-" if row["algo"] == REFERENCE else dashes[row["family"]]
+            looks[row["algo"]] = Look(row["label"], color, line, marker)
         for family in sorted({*table["family"]} - {""}):
             first = table.loc[table["family"] == family, "algo"].min()
             looks[family] = looks[first]._replace(label=family)

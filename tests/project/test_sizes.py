@@ -13,13 +13,13 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 25_924,
+    "sb3_guard": 25_918,
     "sb3_guard/envs": 8_758,
     "sb3_guard/algorithms": 5_782,
     "sb3_guard/common": 2_496,
     "sb3_guard/deployment": 916,
-    "harness": 7_972,
-    "tests": 23_998,
+    "harness": 7_966,
+    "tests": 23_995,
 }
 WORDS = 71_256  # of all tracked markdown but the changelog
 

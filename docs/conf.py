@@ -4,6 +4,7 @@ The pages are Markdown that also reads well on GitHub. Equations become MathML w
 built, so that a browser shows them without a script or the network.
 """
 
+import re
 from typing import Any
 
 from docutils import nodes
@@ -64,5 +65,11 @@ def display_math(writer: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+def name_lab(app: Any, page: str, source: list[str]) -> None:
+    """Links to lab/, which is not part of the site, become the paths of its files."""
+    source[0] = re.sub(r"\[([^]]*)\]\((?:\.\./)+(lab/\w+\.md)[^)]*\)", r"\1 (`\2`)", source[0])
+
+
 def setup(app: Any) -> None:
+    app.connect("source-read", name_lab)
     app.add_html_math_renderer("mathml", (inline_math, None), (display_math, None))

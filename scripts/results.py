@@ -4,7 +4,7 @@
 of a grid of runs, as ``benchmark`` writes them, without models; ``docs/data/NAME.yml`` is the grid.
 Between ``<!-- runs: NAME -->`` and ``<!-- end -->`` of a page stands the table of its runs, or of
 one environment in short, ``<!-- runs: NAME SUITE -->``. Instead of ``runs`` there are ``learnt:
-NAME``, returns in the end and those of the untrained agents of ``docs/data/untrained.csv``;
+NAME``, returns in the end, beside the untrained agents' of ``docs/data/untrained.csv``;
 ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep: NAME SUITE``, return and cost at
 each limit N of ``NAME_limitN.tar.xz``; ``splits: NAME``, how the agents keep their limit in
 training and after it; ``delivered: NAME``, the certified agents that its runs end with, beside
@@ -65,7 +65,7 @@ GRIDS = (
     (("guard_limit2",), "Goal_Point_8Hazards", "trpo"),
 )
 
-# Of docs/notes/paper_settings.md, with the paper's settings: archive and suites.
+# With the GUARD paper's settings: archive and suites.
 PAPER = {
     "guard_paper": [f"Goal_{robot}_8Hazards" for robot in ("Point", "Drone", "Arm3")],
 }
@@ -180,23 +180,19 @@ def grey(rows: pd.DataFrame, columns: dict[str, Any]) -> str:
 
 
 def learnt(name: str) -> str:
-    """A table of what was learnt on each suite, by one seed, beside random and zero actions."""
+    """Returns of one seed, a row for each robot and a column for each task; bold: learnt."""
     untrained = pd.read_csv(DATA / "untrained.csv", index_col="suite")
     untrained.index = untrained.index.str.removesuffix("-v0")
     rows = runs(name).set_index("suite").join(untrained)
-    rows = rows.loc[[suite for suite in untrained.index if suite in rows.index]].reset_index()
     error = (rows["trained_se"] ** 2 + rows["random_se"] ** 2) ** 0.5
-    columns: dict[str, Any] = {
-        "environment": "suite",
-        "random": lambda row: spread(row["random"], row["random_se"]),
-        "zero": lambda row: spread(row["zero"], row["zero_se"]),
-        "trained": lambda row: spread(row["trained"], row["trained_se"]),
-        "apart": lambda row: number(row["apart"], 1),
-        "learnt": lambda row: "yes" if row["apart"] >= APART else "no",
-        "episode cost": lambda row: number(row["cost_last"], 1),
-    }
-    rows["apart"] = (rows["trained"] - rows[["random", "zero"]].max(axis=1)) / error
-    return markdown(spelled(rows, columns))
+    apart = (rows["trained"] - rows[["random", "zero"]].max(axis=1)) / error
+    cells = rows["trained"].map(lambda mean: number(mean, 2))
+    cells += apart.map(lambda errors: f" ({number(errors, 1)})")
+    cells = cells.where(apart < APART, "**" + cells + "**")
+    names = [suite.split("_")[:2] for suite in untrained.index if suite in rows.index]
+    tasks, robots = ([*dict.fromkeys(of)] for of in zip(*names, strict=True))
+    lines = [[robot, *(cells[f"{task}_{robot}_8Hazards"] for task in tasks)] for robot in robots]
+    return table(["robot", *tasks], lines)
 
 
 def scores(name: str) -> str:
@@ -319,7 +315,7 @@ def pages() -> dict[Path, str]:
     files = [
         DOCS.parent / "README.md",
         *sorted(DOCS.glob("*.md")),
-        *sorted(DOCS.glob("notes/*.md")),
+        *sorted(DOCS.parent.glob("lab/*.md")),
     ]
     texts = {path: path.read_text() for path in files}
     return {path: filled(text) for path, text in texts.items() if BLOCK.search(text)}

@@ -3,7 +3,7 @@
 Writes ``docs/data/untrained.csv``: for each environment the mean return and cost of 20 episodes of
 uniformly random actions and of actions of zero, with standard errors of the returns; and where
 goals can be reached, the goals of an episode, and the cost of all episodes ÷ all goals. The tables
-of what was learnt in docs/notes/learnable.md and docs/leaderboard.md have them
+of what was learnt in lab/learnable.md and docs/leaderboard.md have them
 (``scripts/results.py``, ``scripts/leaderboard.py``).
 """
 

@@ -19,9 +19,9 @@ LINES = {
     "sb3_guard/common": 2_496,
     "sb3_guard/deployment": 916,
     "harness": 7_966,
-    "tests": 23_995,
+    "tests": 23_993,
 }
-WORDS = 71_256  # of all tracked markdown but the changelog
+WORDS = 67_575  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:
@@ -46,7 +46,8 @@ def test_every_module_is_in_a_sum():
 
 
 def test_words():
-    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("sb3_guard/**/*.md")]
+    folders = ("*.md", "docs/**/*.md", "lab/**/*.md", "sb3_guard/**/*.md")
+    pages = [page for folder in folders for page in ROOT.glob(folder)]
     texts = (
         page.read_text()
         for page in pages

@@ -33,6 +33,14 @@ class Outcome:
     ended_by: dict[str, Array]
     drawn: dict[str, Array]
 
+    def forget(self, rows: list[int]) -> None:
+        """Nothing happened in these rows, which took no step."""
+        for amounts in (self.reward, self.cost, *self.costs.values()):
+            amounts[rows] = 0.0
+        ends = self.terminated, self.unplaced, *self.ended_by.values()
+        for happened in (self.goal_met, self.physics_error, *ends):
+            happened[rows] = False
+
     @property
     def details(self) -> dict[str, Array]:
         """What info says of every row in addition to the cost, by key, [N] each."""

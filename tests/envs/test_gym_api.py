@@ -68,25 +68,75 @@ def test_pickled_and_copied_environments_continue_bit_for_bit(env_id):
         np.testing.assert_array_equal(twin.reset()[0], obs)
 
 
-def test_the_vector_environment_follows_gymnasiums_own():
-    ours = gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=3, max_episode_steps=5)
+@pytest.mark.parametrize(
+    ("env_id", "params"),
+    [
+        ("SafetyHopperVelocity-v1", {}),  # falls
+        ("SafetyPointButton1-v0", {"robot": {"action_noise": 0.1}}),  # every step draws numbers
+    ],
+)
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_the_vector_environment_follows_gymnasiums_own(mode, env_id, params):
+    params = {"max_episode_steps": 7, **params}
+    ours = gymnasium.make_vec(env_id, num_envs=3, autoreset_mode=mode, **params)
     theirs = gymnasium.vector.SyncVectorEnv(
-        [lambda: gymnasium.make("Goal_Point_8Hazards-v0", max_episode_steps=5)] * 3,
-        autoreset_mode=AutoresetMode.SAME_STEP,
+        [lambda: gymnasium.make(env_id, **params)] * 3, autoreset_mode=mode
     )
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
+    assert ours.metadata["autoreset_mode"] is mode
     np.testing.assert_array_equal(ours.reset(seed=5)[0], theirs.reset(seed=5)[0])
     ours.action_space.seed(0)
-    for _ in range(12):
+    ends = set()
+    for step in range(40):
         action = ours.action_space.sample()
         a, b = ours.step(action), theirs.step(action)
         for x, y in zip(a[:4], b[:4], strict=True):
             np.testing.assert_array_equal(x, y)
-        assert ("final_obs" in a[4]) == ("final_obs" in b[4])
+        done = a[2] | a[3]
+        ends.add(tuple(done))
+        if mode is not AutoresetMode.SAME_STEP:
+            for name in ("cost", "_cost"):
+                np.testing.assert_array_equal(a[4][name], b[4].get(name, np.zeros(3)))
+        assert ("final_obs" in a[4]) == ("final_obs" in b[4]) == ("final_info" in a[4])
         if "final_obs" in b[4]:
-            np.testing.assert_array_equal(np.stack(a[4]["final_obs"]), np.stack(b[4]["final_obs"]))
+            for x, y in zip(a[4]["final_obs"], b[4]["final_obs"], strict=True):
+                np.testing.assert_array_equal(x, y)
             np.testing.assert_array_equal(a[4]["final_info"]["cost"], b[4]["final_info"]["cost"])
+        rows = done & (mode is AutoresetMode.DISABLED) | np.array([step == 2, False, False])
+        if rows.any():
+            begun = [env.reset(options={"reset_mask": rows.copy()})[0] for env in (ours, theirs)]
+            np.testing.assert_array_equal(*begun)
+    assert len(ends) > 2
+
+
+def test_a_row_that_has_ended_waits_for_its_reset():
+    ours = gymnasium.make_vec(
+        "Goal_Point_8Hazards-v0", num_envs=2, max_episode_steps=1, autoreset_mode="Disabled"
+    )
+    ours.reset(seed=0)
+    ours.step(np.zeros((2, 2)))
+    ours.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"rows \[1\] have ended"):
+        ours.step(np.zeros((2, 2)))
+    with pytest.raises(ValueError, match="must be 2 truth values, not all False"):
+        ours.reset(options={"reset_mask": np.array([1, 0])})
+    with pytest.raises(ValueError, match="unknown autoreset_mode 'NextStap': did you mean 'Next"):
+        gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=2, autoreset_mode="NextStap")
+
+
+def test_gymnasiums_vector_wrappers_go_around():
+    envs = gymnasium.make_vec(
+        "Goal_Point_8Hazards-v0", num_envs=2, max_episode_steps=3, flatten=False,
+        autoreset_mode="NextStep",
+    )  # fmt: skip
+    for wrapper in ("FlattenObservation", "NormalizeObservation", "RecordEpisodeStatistics"):
+        envs = getattr(gymnasium.wrappers.vector, wrapper)(envs)
+    obs, _ = envs.reset(seed=0)
+    assert obs.shape == envs.observation_space.shape
+    infos = [envs.step(np.zeros((2, 2)))[4] for _ in range(8)]
+    lengths = [info["episode"]["l"].tolist() for info in infos if "episode" in info]
+    assert lengths == [[3, 3], [3, 3]]
 
 
 def test_dict_observations_hold_the_components_by_name():

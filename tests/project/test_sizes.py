@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 25_918,
-    "sb3_guard/envs": 8_758,
+    "sb3_guard": 25_987,
+    "sb3_guard/envs": 8_827,
     "sb3_guard/algorithms": 5_782,
     "sb3_guard/common": 2_496,
     "sb3_guard/deployment": 916,
     "harness": 7_966,
-    "tests": 23_993,
+    "tests": 24_044,
 }
-WORDS = 67_575  # of all tracked markdown but the changelog
+WORDS = 67_570  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

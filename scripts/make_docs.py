@@ -2,7 +2,7 @@
 
 Robots, tasks and constraints have a page a kind: pictures, docstrings, the parameters with defaults
 and limits, what is added to the observation. Further pages list the parameters that belong to no
-part, the files in ``examples/``, the flags of the commands and the default hyperparameters.
+part, the files in ``examples/`` and the flags of the commands.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from sb3_guard.envs.robots.from_file import ATTRIBUTES
 from sb3_guard.list import KINDS, summary
 from sb3_guard.zoo.cli.flags import Command
 from sb3_guard.zoo.cli.markdown import escaped, table
-from sb3_guard.zoo.run.hyperparams import hyperparams_folder, read_file
 
 ROOT = Path(__file__).parents[1]
 # Robots that tell the sizes of an observation apart: in the plane, in space, with several lidars.
@@ -281,49 +280,10 @@ def command_line() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def hyperparameter_tables() -> str:
-    """The page of the default hyperparameters, algorithm by algorithm."""
-    parts = [
-        "# Default hyperparameters",
-        "The entries of `hyperparams/<algo>.yml`, which [Hyperparameter "
-        "files](hyperparameter_files.md) explains. A hyperparameter that is not in a table has the "
-        "default of its class, which the page of the algorithm states.",
-    ]
-    for path in sorted(hyperparams_folder().glob("*.yml")):
-        if (
-            path.stem == "paper"
-            or not (ROOT / "docs" / "algorithms" / path.name).with_suffix(".md").is_file()
-        ):
-            continue
-        entries: dict[str, list[str]] = {}
-        for pattern, values in read_file(path).items():
-            entries.setdefault(repr(values), []).append(f"`{pattern}`")
-        content = read_file(path)
-        rows = []
-        for patterns in entries.values():
-            values = content[patterns[0].strip("`")]
-            shown = ", ".join(f"`{key}` {_plain(value)}" for key, value in values.items())
-            rows.append([", ".join(patterns), shown])
-        parts += [
-            f"## [{path.stem}](algorithms/{path.stem}.md)",
-            table(["environments", "hyperparameters"], rows),
-        ]
-    return "\n\n".join(parts) + "\n"
-
-
-def _plain(value: object) -> str:
-    """A value as YAML has it, on one line."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_plain(one)}" for key, one in value.items()) + "}"
-    if isinstance(value, float) and value.is_integer() and abs(value) >= 1e4:
-        return f"{value:,.0f}".replace(",", "_")
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
 def pages() -> dict[str, str]:
     """Every page by its path below docs/."""
     overviews = {f"{kind}s.md": overview(kind, GROUPS[kind]) for kind in ABOUT}
-    others = (robots, gallery, examples, command_line, hyperparameter_tables)
+    others = (robots, gallery, examples, command_line)
     rest = {f"{page.__name__}.md": page() for page in others}
     return {**overviews, **rest, "parameters.md": parameters_of_environments()}
 

@@ -21,7 +21,7 @@ LINES = {
     "harness": 7_966,
     "tests": 24_044,
 }
-WORDS = 67_570  # of all tracked markdown but the changelog
+WORDS = 66_095  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

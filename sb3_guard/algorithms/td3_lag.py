@@ -54,7 +54,7 @@ class TD3Lag(CostReplay, TD3):
                 costs = (self.cost_critic(batch.observations, actions) * weights).sum(1, True)
                 loss = (loss + costs) / (1.0 + float(self.prices.sum()))
             loss = loss.mean()
-            loss.backward(inputs=[*self.actor.parameters()])
+            loss.backward(inputs=[part for part in self.actor.parameters() if part.requires_grad])
             self.actor.optimizer.step()
             logs["actor_loss"] = loss.item()
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)

@@ -18,6 +18,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecEnv,
@@ -132,6 +133,28 @@ def test_dictionaries_are_saved_and_loaded(cls: Any, tmp_path: Path) -> None:
     again = cls.load(tmp_path / "model", device="cpu")
     np.testing.assert_array_equal(again.predict(observation, deterministic=True)[0], action)
     assert_equal(parameters(model), parameters(again))
+
+
+class Frozen(BaseFeaturesExtractor):
+    """Somebody's pretrained layers."""
+
+    def __init__(self, space: spaces.Box) -> None:
+        super().__init__(space, 8)
+        self.layer = th.nn.Linear(space.shape[0], 8).requires_grad_(False)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.layer(observations)
+
+
+@pytest.mark.parametrize("cls", [CPO, PPOLag, *OFF_POLICY])
+def test_frozen_layers_stay(cls: Any) -> None:
+    kwargs: Any = {"net_arch": [8], "features_extractor_class": Frozen}
+    model = small(cls, points(), cost_limit=0.1, policy_kwargs=kwargs)
+    before = parameters(model)["policy"]
+    after = parameters(model.learn(160))["policy"]
+    layers = {name for name in before if ".layer." in name}
+    moved = {name for name in before if not th.allclose(before[name], after[name], rtol=1e-6)}
+    assert layers and moved and not layers & moved
 
 
 @pytest.mark.parametrize(("cls", "critic"), [(CPO, "vf"), (ALGORITHMS["sac_lag"], "qf")])

@@ -98,7 +98,7 @@ def test_only_all_of_the_episodes_certify(limit, verdict, episodes):
     assert (certificate.verdict, certificate.episodes) == (verdict, episodes)
     cost = certificate.costs["cost"]
     assert cost.lower < cost.mean < cost.upper and certificate.mean_return == 2.0
-    assert str(certificate).startswith(f"{verdict}: cost ") and "\n" not in str(certificate)
+    assert str(certificate).startswith(f"{verdict}: mean cost ") and "\n" not in str(certificate)
     assert (certificate.to_decide is not None) == (verdict == "undecided")
     assert certificate.agent == ""  # there are no weights
     text = certificate.to_json()
@@ -123,7 +123,7 @@ def test_tries_and_costs_share_the_error():
         Idle(), Lottery(keys=("cost", "other")), (3.0, 6.0), cost_keys=("cost", "other"), seed=1
     )
     assert both.verdict == "certified" and [*both.costs] == ["cost", "other"]
-    lines = ("certified: return", "  certified: cost", "  certified: other")
+    lines = ("certified: return", "  mean cost ", "  mean other ")
     assert all(map(str.startswith, str(both).splitlines(), lines))
     assert both.costs["cost"].limit == 3.0 and both.costs["other"].limit == 6.0
     assert (
@@ -176,7 +176,7 @@ def test_costs_that_may_be_absent_are_0_of_a_safe_agent():
 
 def test_a_limit_on_the_worst_step_says_so():
     model = SCPO("MlpPolicy", Lottery(), cost_limit=3.0, n_steps=8)
-    assert str(certify(model, Lottery(), seed=1)).startswith("certified: worst step of cost ")
+    assert str(certify(model, Lottery(), seed=1)).startswith("certified: mean worst step of cost ")
 
 
 class Breaks(Lottery):

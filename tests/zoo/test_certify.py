@@ -14,7 +14,7 @@ def test_the_status_is_the_verdict(limit, verdict, tmp_path, capsys):
     file = tmp_path / "certificate.json"
     status = certify_agent.main([*SHORT, "--cost-limit", limit, "--json", str(file)])
     assert status == (verdict != "certified")
-    assert f"\n{verdict}: cost " in capsys.readouterr().out
+    assert f"\n{verdict}: mean cost " in capsys.readouterr().out
     content = json.loads(file.read_text())
     assert content["verdict"] == verdict and content["costs"]["cost"]["limit"] == float(limit)
     assert content["env"] == {

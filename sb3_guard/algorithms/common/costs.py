@@ -92,7 +92,6 @@ class Costs:
     def __init__(
         self, limits: np.ndarray, limit_on: Literal["sum", "max"] = "sum", window: int = 100
     ) -> None:
-        #: bounds on the costs of an episode, shape (m,)
         self.limits = limits
         self.limit_on = limit_on
         #: J_C, mean cost of the episodes that ended, shape (m,); None before the first estimate
@@ -171,7 +170,7 @@ class Costs:
             h = min(z s / √n, |d| / 2)        z = 2.22, n = 400
 
         s is the standard deviation of the latest 100 episodes' costs; h is half of the interval of
-        :func:`sb3_guard.certify` at its last look, where three agents share an error of 5 %.
+        :func:`sb3_guard.certify` for one cost, where three agents share an error of 5 %.
 
         :param limits: d, shape (m,)
         """

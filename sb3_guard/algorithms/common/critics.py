@@ -109,7 +109,8 @@ def regress(
     :param rng: shuffles the rows; None for torch's own generator
     :return: mean squared error during the last pass
     """
-    n, moving, loss = len(targets), list(parameters), 0.0
+    n, loss = len(targets), 0.0
+    moving = [part for part in parameters if part.requires_grad]  # a user may have frozen some
     parts = -(-n // (batch_size or n))  # of equal size, so that no step is taken on a small rest
     for _ in range(n_epochs):
         loss = 0.0

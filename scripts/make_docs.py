@@ -112,7 +112,7 @@ def parameters_of_environments() -> str:
     parts = [
         "# Parameters",
         "[Robots](robots.md), [tasks](tasks.md) and [constraints](constraints.md) list their own. "
-        "[Customizing](customizing.md) shows how to set them.",
+        "[Change an environment](customizing.md) shows how to set them.",
     ]
     for name, (kind, about) in OF_NO_PART.items():
         parts += [f"## `{name}={{...}}`", about, parameters(kind)]

@@ -1,4 +1,4 @@
-"""What docs/customizing.md shows: its samples run, and its limits are what it says.
+"""What the pages on environments show: samples run, and limits are what they say.
 
 The vector wrappers and masses that the pages of environments and robots state, too.
 """
@@ -17,11 +17,11 @@ from sb3_guard.envs import Scenario, tasks
 from sb3_guard.envs.registry import ROBOTS, guard
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE = (DOCS / "customizing.md").read_text()
+PAGE = "".join((DOCS / f"{name}.md").read_text() for name in ("customizing", "own_parts"))
 
 
 def test_samples_run(tmp_path, monkeypatch):
-    """Each alone, in the order of the page: files of earlier ones are there, names are not."""
+    """Each alone, in the order of the pages: files of earlier ones are there, names are not."""
     monkeypatch.chdir(tmp_path)
     (scenario,) = re.findall(r"```yaml\n(.*?)```", PAGE, flags=re.DOTALL)
     Path("my_scenario.yml").write_text(scenario)
@@ -32,7 +32,7 @@ def test_samples_run(tmp_path, monkeypatch):
         with own_parts():
             for sample in samples:
                 namespace = {"__name__": "customizing"}
-                exec(compile(sample, "customizing.md", "exec"), namespace)
+                exec(compile(sample, "a page", "exec"), namespace)
                 if isinstance(env := namespace["env"], gymnasium.Env):
                     env.reset(seed=0)
                     env.step(env.action_space.sample())
@@ -46,7 +46,7 @@ def test_limits_of_the_page_are_what_they_say():
         s for s in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "ForceLimit" in s
     ]
     with own_parts():
-        exec(compile(sample, "customizing.md", "exec"), {"__name__": "limits"})
+        exec(compile(sample, "a page", "exec"), {"__name__": "limits"})
         limits = {"speedlimit": {"limit": 0.1}, "forcelimit": {"limit": 0.05}}
         engine = Scenario.parse("Goal_Ant_1TiltLimit").override(**limits).build(2, 1)
         with pytest.raises(ValueError, match="no sensor 'robot/gyra': did you mean 'robot/gyro'"):

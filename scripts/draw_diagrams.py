@@ -2,8 +2,7 @@
 
 ``limits`` shows return and cost at each limit of a training, and ``costs`` the costs of single
 episodes, from the logs in docs/data; ``speed`` steps per second, from the tables of docs/speed.md;
-``which_algorithm`` is a flow chart; ``reward_and_cost`` an annotated picture; ``poster`` has
-robots, tasks and constraints.
+``reward_and_cost`` is an annotated picture; ``poster`` has robots, tasks and constraints.
 """
 
 from __future__ import annotations
@@ -32,15 +31,6 @@ from sb3_guard.zoo.results.statistics import aggregate
 DOCS = Path(__file__).parents[1] / "docs"
 IMAGES = DOCS / "images"
 SUITE = "Goal_Point_8Hazards"
-# Questions of the flow chart, with the answer to yes; REST is the answer to the last no.
-QUESTIONS = (
-    ("Is there no limit yet?", "trpo, ppo"),
-    ("Are steps slow and\nactions continuous?", "sac_lag, td3_lag, tqc_lag"),
-    ("Must the worst step\nbe bounded?", "scpo"),
-    ("Shall a filter stay on\nafter training?", "trpo_usl"),
-    ("Do you know PPO, or\ntrain for 1e7 steps?", "ppo_lag, cppo_pid"),
-)
-REST = "cpo, trpo_lag"
 # Parts of the annotated picture: text, and where text and object are, as shares of the picture.
 NOTES: tuple[tuple[str, tuple[float, float], tuple[float, float]], ...] = (
     (
@@ -137,28 +127,6 @@ def costs() -> Figure:
     return figure
 
 
-def which_algorithm() -> Figure:
-    """A column of questions: yes leads to the right, no down."""
-    figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
-    axis = figure.subplots()
-    axis.set(xlim=(0, 10), ylim=(0, len(QUESTIONS) + 1))
-    axis.set_axis_off()
-    box = {"boxstyle": "round,pad=0.5", "facecolor": "none", "edgecolor": INK}
-    answer = box | {"edgecolor": COLORS[0], "linewidth": 1.5}
-    arrow = {"arrowstyle": "-|>", "color": INK, "shrinkA": 0, "shrinkB": 0}
-    for number, (question, algorithms) in enumerate(QUESTIONS):
-        y = len(QUESTIONS) + 0.5 - number
-        axis.text(3, y, question, ha="center", va="center", bbox=box)
-        axis.text(8, y, algorithms, ha="center", va="center", bbox=answer, color=COLORS[0])
-        axis.annotate("", (6.7, y), (4.5, y), arrowprops=arrow)
-        axis.text(5.6, y + 0.1, "yes", ha="center")
-        axis.annotate("", (3, y - 0.66), (3, y - 0.34), arrowprops=arrow)
-        axis.text(3.15, y - 0.5, "no", va="center")
-    axis.text(3, 0.5, REST, ha="center", va="center", bbox=answer, color=COLORS[0])
-    axis.text(4.4, 0.5, "start here if unsure, and compare the two", va="center", fontsize=8)
-    return figure
-
-
 def reward_and_cost() -> Figure:
     """A robot among hazards from above, with what gives reward and what gives cost."""
     size = 900
@@ -206,8 +174,7 @@ def poster() -> Figure:
 
 
 DIAGRAMS: dict[str, Callable[[], Figure]] = {
-    function.__name__: function
-    for function in (limits, speed, costs, which_algorithm, reward_and_cost, poster)
+    function.__name__: function for function in (limits, speed, costs, reward_and_cost, poster)
 }
 
 

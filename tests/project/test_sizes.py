@@ -21,7 +21,7 @@ LINES = {
     "harness": 7_966,
     "tests": 24_067,
 }
-WORDS = 66_119  # of all tracked markdown but the changelog
+WORDS = 65_883  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

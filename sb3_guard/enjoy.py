@@ -15,7 +15,8 @@ def enjoy(flags: Flags) -> int:
         print(f"{listed()}\n\nPlay one: sb3-guard enjoy --pretrained --env {flags.env}")
         return 0
     render_mode = "rgb_array" if flags.record is not None else None
-    if render_mode is None and not flags.no_render:
+    unseen = flags.no_render or (flags.dataset is not None and not flags.window)
+    if render_mode is None and not unseen:
         display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
         if flags.window or display or sys.platform != "linux":
             render_mode = "human"

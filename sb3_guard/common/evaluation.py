@@ -243,11 +243,16 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
         normalizer.training = training
 
 
-def _limits_on(model: Any, keys: Sequence[str]) -> tuple[float, ...]:
+def limits_on(model: Any, keys: Sequence[str]) -> tuple[float, ...]:
     """The model's limits on these costs; empty if it has none."""
     if isinstance(model, Constrained) and model.constrained and keys == tuple(model.cost_keys):
         return tuple(model.final_cost_limits.tolist())
     return ()
+
+
+def shares(n_episodes: int, n_envs: int) -> np.ndarray:
+    """How many of the episodes each environment plays, shape [n_envs]."""
+    return np.array([(n_episodes + i) // n_envs for i in range(n_envs)])
 
 
 def evaluate_policy(
@@ -341,7 +346,7 @@ def evaluate_policy(
                 on_step()
             tally.step(rewards, last_costs, starts, infos)
             last_costs[np.flatnonzero(starts)] = 0.0
-    return tally.evaluation(getattr(model, "limit_on", "sum"), _limits_on(model, keys))
+    return tally.evaluation(getattr(model, "limit_on", "sum"), limits_on(model, keys))
 
 
 def _longest_episode(env: VecEnv) -> int:
@@ -373,7 +378,7 @@ class _Tally:
         self.keys, self.on_episode, self.longest = keys, on_episode, longest
         self.monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
         self.asked = n_eval_episodes
-        self.left = np.array([(n_eval_episodes + i) // n for i in range(n)])
+        self.left = shares(n_eval_episodes, n)
         self.returns = np.zeros(n)
         self.costs = EpisodeCosts(n, len(keys) + 1)  # each of the keys, then all costs
         self.ended: list[tuple[float, int, EpisodeCost]] = []  # return, steps, costs

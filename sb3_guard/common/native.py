@@ -46,6 +46,8 @@ class GuardVecEnv(VecEnv):
         # algorithms read the length of an episode from it; a registered one is not ours to change
         self.spec = copy.deepcopy(spec or envs.env_spec(self.envs.scenario))
         self.spec.max_episode_steps = self.envs.max_episode_steps
+        others = {"num_threads", "max_episode_steps"}  # which are no arguments of a single one
+        self.spec.kwargs |= {name: kwargs[name] for name in kwargs.keys() - others}
         self.envs.spec = self.spec
         self.render_mode = self.envs.render_mode  # read by VecEnv.__init__
         super().__init__(

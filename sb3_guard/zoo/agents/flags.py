@@ -71,6 +71,8 @@ class EnjoyFlags(AgentFlags):
     :param record: write a video with return, cost and limit in the frame; needs no display (default
         file: next to the model, for a pretrained agent in the current folder)
     :param json: write the statistics to this JSON file
+    :param dataset: write the episodes as a dataset of Minari's with this name (point/cpo-v0), or to
+        this file in DSRL's layout (cpo.hdf5); needs the extra sb3-guard[datasets]
     :param window: open MuJoCo's viewer (default where there is a display): Space pauses, Tab opens
         menus, F shows contact forces
     :param no_render: open no window
@@ -83,11 +85,13 @@ class EnjoyFlags(AgentFlags):
   sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards -f logs
   sb3-guard enjoy --algo cpo --env Goal_Point_8Hazards --load-best --n-episodes 20
   sb3-guard enjoy --pretrained --env Goal_Point_8Hazards --record agent.mp4
+  sb3-guard enjoy --pretrained --env Goal_Point_8Hazards --dataset point/usl-v0
 """
     n_timesteps: int | None = flag("-n", low=1, metavar="N", exclusive="length")
     deterministic: bool = flag(default=False, exclusive="actions")
     record: str | None = flag(nargs="?", const="", metavar="FILE.mp4")
     json: str | None = flag(metavar="FILE")
+    dataset: str | None = flag(metavar="NAME")
     window: bool = flag(default=False, exclusive="window")
     no_render: bool = flag(default=False, exclusive="window")
     verbose: Literal[0, 1] = flag(default=1)

@@ -17,6 +17,7 @@ from sb3_guard.common.certificate import Certificate, agent_hash
 from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.files import replacing
 from sb3_guard.ids import with_version
+from sb3_guard.zoo.agents.dataset import recording
 from sb3_guard.zoo.agents.film import filming, render
 from sb3_guard.zoo.agents.flags import AgentFlags, EnjoyFlags
 from sb3_guard.zoo.agents.pretrained import (
@@ -220,12 +221,15 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
         shown = filming(agent.env, agent.model, video)
     elif render_mode == "human":
         shown = nullcontext(partial(render, agent.env))
+    asked = episodes or flags.n_timesteps or 1
+    recorded = recording(agent, flags, asked) if flags.dataset else nullcontext()
     errors = (ValueError, *BAD_NUMBERS)  # SB3's, of observations of another shape
-    with closing(agent.env), explained(f"can't play {agent.path}", *errors), shown as on_step:
+    playing = explained(f"can't play {agent.path}", *errors)
+    with closing(agent.env), playing, shown as on_step, recorded:
         evaluation = evaluate_policy(
             agent.model,
             agent.env,
-            n_eval_episodes=episodes or flags.n_timesteps or 1,
+            n_eval_episodes=asked,
             deterministic=not flags.stochastic,
             seed=flags.seed,
             max_steps=flags.n_timesteps,

@@ -238,11 +238,10 @@ def examples() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def flags_of(command: type[Command]) -> str:
-    """A table per heading of a command's help: flag, values, meaning."""
-    headings: dict[str, list[list[str]]] = {}
-    groups = command.parser()._action_groups
-    for group in groups:
+def flags_of(command: type[Command]) -> dict[str, list[tuple[str, str, str]]]:
+    """The flags of a command by the headings of its help: names, values, meaning."""
+    headings: dict[str, list[tuple[str, str, str]]] = {}
+    for group in command.parser()._action_groups:
         for action in group._group_actions:
             if action.help == argparse.SUPPRESS or action.dest == "help":
                 continue
@@ -250,33 +249,40 @@ def flags_of(command: type[Command]) -> str:
             values = action.metavar or (action.choices and " ".join(map(str, action.choices))) or ""
             values = f"`{values}`" if values and action.nargs != 0 else ""
             meaning = escaped(str(action.help).replace("%%", "%"))
-            headings.setdefault(str(group.title), []).append([names, values, meaning])
-    parts = []
-    for title, rows in headings.items():
-        parts += [f"{title.capitalize()}:", table(["flag", "value", "meaning"], rows)]
-    return "\n\n".join(parts)
+            headings.setdefault(str(group.title), []).append((names, values, meaning))
+    return headings
 
 
 def command_line() -> str:
     """The page of the commands and their flags."""
+    commands = {name: importlib.import_module(module_of(name)).Flags for name in COMMANDS}
+    headings = {name: flags_of(flags) for name, flags in commands.items()}
+    every = [row for of in headings.values() for rows in of.values() for row in rows]
+    common = [row for row in dict.fromkeys(every) if every.count(row) >= 3]
     parts = [
         "# Command line",
         "`sb3-guard <command>` and `python -m sb3_guard.<command>` are the same (`export`: "
-        "`sb3_guard.export_agent`). `--help` prints these tables, "
+        "`sb3_guard.export_agent`). `--help` prints all flags of a command, "
         "and a misspelled flag or value is an error that names the nearest one or all. "
         "Flags that take KEY:VALUE take Python literals: `-params n_envs:10 normalize:True`.",
         table(
             ["command", "what it does"],
             [[f"[`{name}`](#{name})", text] for name, text in COMMANDS.items()],
         ),
+        "## Flags of several commands",
+        table(["flag", "value", "meaning"], common),
     ]
-    for name in COMMANDS:
-        flags = importlib.import_module(module_of(name)).Flags
+    for name, flags in commands.items():
         says = " ".join(flags.parser().description.split())
         examples = inspect.cleandoc(flags.examples).partition("\n")[2]
         examples = inspect.cleandoc(examples.partition("\n\n")[0])
         examples = re.sub(r" {3,}(?=\w)", "  # ", examples)
-        parts += [f"## {name}", says, f"```bash\n{examples}\n```", flags_of(flags)]
+        parts += [f"## {name}", says, f"```bash\n{examples}\n```"]
+        rows = [row for of in headings[name].values() for row in of]
+        if own := [row for row in rows if row not in common]:
+            parts.append(table(["flag", "value", "meaning"], own))
+        if shared := [row[0].split(", ")[-1] for row in rows if row in common]:
+            parts.append(f"[Of several commands](#flags-of-several-commands): {', '.join(shared)}.")
     return "\n\n".join(parts) + "\n"
 
 

@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 25_989,
+    "sb3_guard": 26_263,
     "sb3_guard/envs": 8_827,
     "sb3_guard/algorithms": 5_782,
-    "sb3_guard/common": 2_498,
+    "sb3_guard/common": 2_505,
     "sb3_guard/deployment": 916,
-    "harness": 7_966,
-    "tests": 24_067,
+    "harness": 8_233,
+    "tests": 24_323,
 }
-WORDS = 64_450  # of all tracked markdown but the changelog
+WORDS = 64_487  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

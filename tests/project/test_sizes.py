@@ -19,9 +19,9 @@ LINES = {
     "sb3_guard/common": 2_505,
     "sb3_guard/deployment": 916,
     "harness": 8_233,
-    "tests": 24_323,
+    "tests": 24_335,
 }
-WORDS = 64_487  # of all tracked markdown but the changelog
+WORDS = 62_338  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -94,7 +94,7 @@ def with_file(flags: Flags) -> Flags:
     :raises UsageError: the file can't be read, has an unknown entry, or names files or modules that
         the command line does not name
     """
-    from sb3_guard.zoo.cli.names import FOLLOWED, refuse_places, require_named
+    from sb3_guard.zoo.cli.names import FOLLOWED, require_named
 
     if flags.grid is None:
         return flags
@@ -104,7 +104,6 @@ def with_file(flags: Flags) -> Flags:
     filed = Flags.read(content, path, HOW)
     given = {name: getattr(filed, name) for name in filed.given}
     require_named(path, flags, filed, "conf_file", *FOLLOWED)
-    refuse_places(path, filed.hyperparams or {})
     for name in flags.given:
         value, old = getattr(flags, name), given.get(name)
         given[name] = {**old, **value} if isinstance(old, dict) else value

@@ -14,7 +14,7 @@ from typing import Any
 from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.deployment import onnx_file
 from sb3_guard.zoo.agents.flags import ExportFlags as Flags
-from sb3_guard.zoo.agents.playback import BATCH, EPISODES, open_agent, summary
+from sb3_guard.zoo.agents.playback import BATCH, EPISODES, open_agent
 from sb3_guard.zoo.cli.flags import command
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
@@ -31,11 +31,14 @@ def export_agent(flags: Flags) -> int:
         episodes = flags.n_episodes or EPISODES
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
             evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
-        settings, measured = agent.run.hyperparams(), summary(evaluation)
-        certificate = agent.certificate
-        for values in measured.values():
-            if isinstance(values, dict):
-                values.pop("values", None)  # one an episode
+        settings, certificate = agent.run.hyperparams(), agent.certificate
+        by_key = evaluation.by_key().values()
+        costs = [cost.judged(limit) for cost, limit in by_key]
+        measured = {
+            "episodes": len(evaluation),
+            "return": evaluation.estimate(evaluation.returns).judged(None),
+            "costs": dict(zip(evaluation.cost_keys, costs, strict=True)),
+        }
         trained = {
             "algo": flags.algo,
             "env": agent.env_id,

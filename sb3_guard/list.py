@@ -2,7 +2,6 @@
 
 import re
 import sys
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -18,16 +17,6 @@ from sb3_guard.zoo.cli.usage import import_packages
 def summary(part: type) -> str:
     """The first line of a part's documentation."""
     return (part.__doc__ or "").strip().partition("\n")[0]
-
-
-def stated(part: type, name: str) -> str:
-    """What a part says of itself; nothing where a user's own part does not."""
-    value = getattr(part, name, "")
-    if isinstance(value, bool):
-        words = ["yes", "no"] if value else ["no", "yes"]
-        solid = name != "interactive" and "solid" in part.__dataclass_fields__  # type: ignore[attr-defined]
-        return f"{words[0]}; {words[1]} if solid" if solid else words[0]
-    return ", ".join(value) if isinstance(value, tuple) else str(value)
 
 
 def _of_one(suite: Suite) -> str:
@@ -58,21 +47,15 @@ def robots() -> str:
     return table(["robot", "actions", "workspace", "control step, s", "what it is"], rows)
 
 
-def _taxonomy(parts: Mapping[str, type], attributes: Sequence[str], header: Sequence[str]) -> str:
-    rows = [[n, *(stated(cls, a) for a in attributes), summary(cls)] for n, cls in parts.items()]
-    return table(header, rows)
-
-
 def tasks() -> str:
-    """The tasks with their place in the paper's taxonomy."""
-    attributes = ["interactive", "contact", "targets", "spaces"]
-    return _taxonomy(TASKS, attributes, ["task", *attributes, "what it asks"])
+    """The tasks."""
+    return table(["task", "what it asks"], [[name, summary(cls)] for name, cls in TASKS.items()])
 
 
 def constraints() -> str:
-    """The constraints with their place in the paper's taxonomy."""
-    header = ["constraint", "trespassable", "moves", "spaces", "what it is"]
-    return _taxonomy(CONSTRAINTS, ["trespassable", "movable", "spaces"], header)
+    """The constraints."""
+    rows = [[name, summary(cls)] for name, cls in CONSTRAINTS.items()]
+    return table(["constraint", "what it is"], rows)
 
 
 def agents() -> str:

@@ -36,7 +36,6 @@ class Flags(Command):
     :param env: only runs on these environments
     :param cost_limit: only runs with this cost limit (one value per cost); unconstrained runs are
         always included
-    :param steps: only runs of N steps
     """
 
     prog: ClassVar[str] = "sb3-guard plot"
@@ -60,7 +59,6 @@ figures:
     report: str | None = flag(metavar="FILE.html")
     env: list[str] | None = flag(metavar="ID")
     cost_limit: list[float] | None = flag(metavar="D")
-    steps: int | None = flag(low=1, metavar="N")
 
 
 def plot(flags: Flags) -> int:
@@ -80,7 +78,7 @@ def plot(flags: Flags) -> int:
         print(f"left out: {path}: {why}", file=sys.stderr)
     if not len(results.runs):
         raise UsageError(f"there is no finished run below {', '.join(flags.folders)}")
-    chosen = reading.choose(results.runs, flags.env, flags.cost_limit, flags.steps)
+    chosen = reading.choose(results.runs, flags.env, flags.cost_limit)
     means = [file for file in files if file.suffix != ".csv"]
     for file in files:
         if file not in means:

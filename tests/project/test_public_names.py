@@ -27,7 +27,7 @@ ALLOWED = {
     },
     "the seeds of a VecEnv: its `seed` knows only seed, seed + 1, …": {"_seeds"},
     "Gymnasium's hook for vector environments": {"_add_info"},
-    "documented in Python": {"_asdict", "_exit", "_replace"},
+    "documented in Python": {"_exit", "_replace"},
 }  # fmt: skip
 # MuJoCo's Renderer takes no backend, and MuJoCo chooses one before it is known whether it works.
 # Python calls the second for every warning that it shows: a command has a process of its own.

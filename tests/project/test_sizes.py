@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_263,
+    "sb3_guard": 26_155,
     "sb3_guard/envs": 8_827,
     "sb3_guard/algorithms": 5_782,
     "sb3_guard/common": 2_505,
     "sb3_guard/deployment": 916,
-    "harness": 8_233,
-    "tests": 24_335,
+    "harness": 8_125,
+    "tests": 24_278,
 }
-WORDS = 62_338  # of all tracked markdown but the changelog
+WORDS = 62_127  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

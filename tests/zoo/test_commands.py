@@ -185,19 +185,6 @@ def test_enjoy_says_what_was_cut(logs, capsys):
     assert line.startswith("2 episodes: ") and line.endswith("limit 2")  # two decide nothing
 
 
-def test_enjoy_writes_its_statistics(logs, tmp_path):
-    file = tmp_path / "made" / "played.json"
-    assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "5", "--json", str(file)]) == 0
-    played = json.loads(file.read_text())
-    assert played["episodes"] == 5 and played["algo"] == "cpo" and played["env"] == "Filmed-v0"
-    for name in ("return", "cost", "length"):
-        values = played[name]["values"]
-        assert len(values) == 5 and played[name]["mean"] == pytest.approx(np.mean(values))
-        assert played[name]["low"] <= played[name]["mean"] <= played[name]["high"]
-    assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "1", "--json", str(file)]) == 0
-    assert json.loads(file.read_text())["cost"]["low"] is None
-
-
 def test_enjoy_is_seeded_and_deterministic_by_default(logs, capsys):
     def play(*arguments):
         assert enjoy.main([*PLAY, "-f", str(logs), "--n-episodes", "2", *arguments]) == 0
@@ -302,8 +289,6 @@ def test_list_prints_what_there_is(capsys):
         first = names.index(kind) + 1
         assert names[first : first + len(known)] == list(known)
     assert ["Ant", "8", "planar", "0.2"] in [row[:4] for row in cells]
-    assert ["Goal", "no", "no", "one", "planar, spatial"] in [row[:5] for row in cells]
-    assert ["Ghosts", "yes; no if solid", "active", "planar, spatial"] in [r[:4] for r in cells]
     assert cli.main(["list", "robots"]) == 0
     assert [row[0] for row in rows(capsys.readouterr().out)] == ["robot", *ROBOTS]
 

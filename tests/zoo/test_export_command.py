@@ -37,9 +37,8 @@ def test_an_exported_run_says_what_it_was_trained_at(logs, tmp_path, capsys):
     assert trained_at["model_sha256"] == digest
     assert (trained_at["algo"], trained_at["env"]) == ("cpo", "CostPoint-v0")
     assert trained_at["env_kwargs"] == {"episode_length": 20} and trained_at["cost_limit"] == 2
-    assert (
-        trained_at["measured"]["episodes"] == 5 and trained_at["measured"]["length"]["mean"] == 20
-    )
+    assert trained_at["measured"]["episodes"] == 5
+    assert {*trained_at["measured"]["costs"]["cost"]} == {"mean", "low", "high", "limit", "verdict"}
     assert contract["costs"] == [{"name": "cost", "limit": 2.0, "per": "episode"}]
     assert contract["inputs"][0]["normalized"] is True
 
@@ -80,15 +79,14 @@ def test_each_cost_has_its_verdict_wherever_one_is_shown(tmp_path, capsys):
     kwargs = ["--env-kwargs", "cost_keys:('cost','heat')", "episode_length:20"]
     trained(tmp_path, "-params", *limits, *kwargs)
     which = [*WHICH[:4], "-f", str(tmp_path)]
-    path, statistics = tmp_path / "policy.onnx", tmp_path / "played.json"
+    path = tmp_path / "policy.onnx"
     capsys.readouterr()
     assert export_agent.main([*which, "-o", str(path)]) == 0
     exported = capsys.readouterr().out
-    assert enjoy.main([*which, "--no-render", "--verbose", "0", "--json", str(statistics)]) == 0
+    assert enjoy.main([*which, "--no-render", "--verbose", "0"]) == 0
     played = capsys.readouterr().out
     measured = json.loads((tmp_path / "contract.json").read_text())["trained"]["measured"]
     assert "100 episodes" in exported and "100 episodes" in played and measured["episodes"] == 100
-    assert json.loads(statistics.read_text())["costs"] == measured["costs"]
     for key, limit in (("cost", 2.0), ("heat", 1000.0)):
         cost = measured["costs"][key]
         assert set(cost) == {"mean", "low", "high", "limit", "verdict"}

@@ -12,7 +12,7 @@ from typed import LENGTH, SMALL, TOY, refused, trained
 
 from sb3_guard import benchmark, enjoy, train
 from sb3_guard.fields import parse_value
-from sb3_guard.zoo.cli.names import BASES, as_data, classes, refuse_places
+from sb3_guard.zoo.cli.names import BASES, as_data, classes
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.hyperparams import model_arguments
 
@@ -22,7 +22,6 @@ ESCAPE = (
     "('touch {}', shell=True))"
 )
 SHORTEST = {"n_timesteps": 1, "seeds": [0]}
-MONITOR = "stable_baselines3.common.monitor.Monitor"
 COST = "sb3_guard.common.adapters.CostFromFunction"
 
 
@@ -57,7 +56,6 @@ def test_values_are_read_not_evaluated(trap):
         ({"conf_file": "hostile"}, "then add --conf-file hostile"),
         ({"conf_file": "my.yml"}, "then add --conf-file my.yml"),
         ({"tensorboard_log": "events"}, "then add --tensorboard-log events"),
-        ({"hyperparams": {"env_wrapper": {MONITOR: {"filename": "{}"}}}}, "filename = "),
         ({"envs": ["hostile:X-v0"]}, "write --gym-packages hostile --env X-v0"),
         ({"hyperparams": {"env_wrapper": "hostile.Wrapper"}}, "add --gym-packages hostile"),
         ({"hyperparams": {"policy": "hostile.Policy"}}, "add --gym-packages hostile"),
@@ -110,33 +108,6 @@ def test_a_runs_files_run_nothing(tmp_path, trap, run, capsys):
     assert trap.exists()
 
 
-@pytest.mark.parametrize(
-    ("name", "path", "argument"),
-    [
-        ("env_wrapper", MONITOR, "filename"),
-        ("env_wrapper", "gymnasium.wrappers.RecordVideo", "video_folder"),
-        ("vec_env_wrapper", "stable_baselines3.common.vec_env.VecMonitor", "filename"),
-        ("callback", "stable_baselines3.common.callbacks.CheckpointCallback", "save_path"),
-    ],
-)
-def test_a_file_names_no_place_to_write(name, path, argument, tmp_path, trap, run, capsys):
-    play = ["-f", str(run), *TOY[:2], "--no-render", "--n-episodes", "1"]
-    go_on = ["-i", str(run), *TOY[:2], "-n", "240", "--verbose", "0"]
-    hyperparams = {name: [{path: {argument: str(trap)}}]}
-    if name == "callback":
-        hyperparams[name][0][path]["save_freq"] = 10
-    parts = (name, argument, str(trap), "only the command line may name")
-    enter(run, "config.yml", **hyperparams)
-    refused(train.main, go_on, capsys, *parts)
-    if name != "callback":  # nobody makes one there
-        refused(enjoy.main, play, capsys, *parts)
-        enter(run, "config.yml", **{name: str(hyperparams[name][0])})  # a mapping as text
-        refused(enjoy.main, play, capsys, *parts)
-    (tmp_path / "conf.yml").write_text(yaml.safe_dump({"default": hyperparams}))
-    refused(train.main, [*TOY, *SMALL, "-n", "60", "-conf", "conf.yml"], capsys, *parts)
-    assert not list(tmp_path.rglob("trap*"))
-
-
 def test_a_run_is_continued_with_the_folders_that_the_user_names_again(tmp_path, run, capsys):
     go_on = ["-i", str(run), *TOY[:2], "-n", "240", "--verbose", "0"]
     for name, value, words in (
@@ -147,11 +118,6 @@ def test_a_run_is_continued_with_the_folders_that_the_user_names_again(tmp_path,
         refused(train.main, go_on, capsys, f"{run} needs {name}", f"then add {words}")
         enter(run, "args.yml", **{name: type(value)()})
     assert not list(tmp_path.rglob("trap*"))
-
-
-def test_files_that_are_read_are_no_places():
-    mine = {"env_wrapper": {"mine.Wrapper": {"map_file": "m.npz", "dir": "maps"}}}
-    refuse_places("config.yml", mine)
 
 
 @pytest.mark.parametrize("conf", ["both", "both.py"])

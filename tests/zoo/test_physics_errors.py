@@ -81,10 +81,8 @@ def test_a_run_counts_them_apart(tmp_path, capfd):
     assert "episodes ended in a physics error" in text
     assert "2: undecided (" in text and "2: kept" not in text
     capfd.readouterr()
-    assert enjoy.main(["-f", str(folder), "--n-episodes", "9", "--json", f"{tmp_path}/e.json"]) == 0
+    assert enjoy.main(["-f", str(folder), "--n-episodes", "9"]) == 0
     assert "undecided" in capfd.readouterr()[0]
-    played = json.loads((tmp_path / "e.json").read_text())
-    assert played["physics_errors"] == played["cost"]["values"].count(None) > 0
 
 
 def test_a_training_of_nothing_else_stops_in_a_line(tmp_path, capfd):

@@ -298,12 +298,11 @@ def test_a_table_of_runs_has_those_asked_for(small, tmp_path, capsys):
         ([], 9),  # several limits and lengths
         (["--env", POINT], 7),
         (["--cost-limit", "5"], 3),
-        (["--steps", "300"], 1),
     ):
         assert plot.main([str(small), "--table", str(file), *flags]) == 0
         assert len(file.read_text().splitlines()) == 1 + rows, flags
     file.unlink()
-    for flags in (["--env", "Goal_Pint_8Hazards"], ["--cost-limit", "77"], ["--steps", "1"]):
+    for flags in (["--env", "Goal_Pint_8Hazards"], ["--cost-limit", "77"]):
         assert plot.main([str(small), "--table", str(file), *flags]) == 2
         assert "there is no run" in capsys.readouterr().err
     assert not file.exists()

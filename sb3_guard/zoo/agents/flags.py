@@ -70,7 +70,6 @@ class EnjoyFlags(AgentFlags):
 
     :param record: write a video with return, cost and limit in the frame; needs no display (default
         file: next to the model, for a pretrained agent in the current folder)
-    :param json: write the statistics to this JSON file
     :param dataset: write the episodes as a dataset of Minari's with this name (point/cpo-v0), or to
         this file in DSRL's layout (cpo.hdf5); needs the extra sb3-guard[datasets]
     :param window: open MuJoCo's viewer (default where there is a display): Space pauses, Tab opens
@@ -90,7 +89,6 @@ class EnjoyFlags(AgentFlags):
     n_timesteps: int | None = flag("-n", low=1, metavar="N", exclusive="length")
     deterministic: bool = flag(default=False, exclusive="actions")
     record: str | None = flag(nargs="?", const="", metavar="FILE.mp4")
-    json: str | None = flag(metavar="FILE")
     dataset: str | None = flag(metavar="NAME")
     window: bool = flag(default=False, exclusive="window")
     no_render: bool = flag(default=False, exclusive="window")
@@ -102,8 +100,8 @@ class CertifyFlags(AgentFlags):
     """
     Say whether a trained agent's mean episode cost is within its limit, by fresh episodes.
 
-    After 100, 200 and 400 episodes an upper 95 % confidence bound of the mean is compared with the
-    limit. The status is 0 if the agent is certified, else 1.
+    After 400 episodes an upper 95 % confidence bound of the mean is compared with the limit. The
+    status is 0 if the agent is certified, else 1.
 
     What is played:
 

@@ -1,6 +1,5 @@
 """A trained agent found in its run folder, played, and filmed."""
 
-import json
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
@@ -8,14 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_guard.common.certificate import Certificate, agent_hash
-from sb3_guard.common.evaluation import Evaluation, evaluate_policy
-from sb3_guard.common.files import replacing
+from sb3_guard.common.evaluation import evaluate_policy
 from sb3_guard.ids import with_version
 from sb3_guard.zoo.agents.dataset import recording
 from sb3_guard.zoo.agents.film import filming, render
@@ -27,7 +24,7 @@ from sb3_guard.zoo.agents.pretrained import (
     load_pretrained,
     weights,
 )
-from sb3_guard.zoo.cli.names import refuse_places, require_named
+from sb3_guard.zoo.cli.names import require_named
 from sb3_guard.zoo.cli.usage import UsageError, explained, import_packages, packages_flag
 from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
@@ -159,7 +156,6 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     filed = RunFlags.read({"gym_packages": run.args().get("gym_packages")}, run.path)
     require_named(run.path, flags, filed, "gym_packages")
     hyperparams = {**without_withdrawn(run, algorithm(flags.algo)), "callback": None}
-    refuse_places(run.path, hyperparams)
     hyperparams = check(flags.algo, algorithm(flags.algo), hyperparams)
     named = {"algo": flags.algo, "env": flags.env, "gym_packages": flags.gym_packages}
     played = Run(RunFlags.of(named), hyperparams)
@@ -243,54 +239,9 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     if flags.verbose > 0:
         for cut in evaluation.unfinished:
             print(_episode(*cut), "so far: this episode did not end and is not counted")
-    if flags.json:
-        played = {name: getattr(flags, name) for name in ("algo", "seed", "stochastic")}
-        content = {"model": str(agent.path), "env": agent.env_id, **played, **summary(evaluation)}
-        Path(flags.json).parent.mkdir(parents=True, exist_ok=True)
-        with replacing(flags.json) as file:
-            file.write(json.dumps(content, indent=2, allow_nan=False).encode())
     if video is not None and flags.verbose > 0:
         print(f"Video: {video}")
     return 0
-
-
-def summary(evaluation: Evaluation) -> dict[str, Any]:
-    """
-    Return, cost and length as plain data.
-
-    :return: the number of ``episodes``, and for ``return``, ``cost`` and ``length``, and ``worst``,
-        the highest cost of a step, of an agent that limits that, the ``mean``,
-        ``std``, the 95 % interval of the mean (``low``, ``high``) and the ``values``, one an
-        episode; None where there are too few episodes for it, or where it is not known, of the
-        ``physics_errors`` episodes that one ended. ``costs`` has each cost with a limit, as in
-        ``result.json``; its key's worst step is meant where that is limited
-    """
-    out: dict[str, Any] = {"episodes": len(evaluation)}
-    columns = {
-        "return": evaluation.returns,
-        "cost": evaluation.costs,
-        "length": evaluation.lengths,
-        **({"worst": evaluation.worst} if evaluation.limit_on == "max" else {}),
-    }
-    for name, values in columns.items():
-        estimate = evaluation.estimate(values)._asdict()
-        if diverged := estimate.pop("diverged"):
-            out["physics_errors"] = diverged
-        numbers = {key: _finite(value) for key, value in estimate.items()}
-        out[name] = {**numbers, "values": [_finite(value) for value in values.tolist()]}
-    if evaluation.limits:
-        out["costs"] = {
-            key: cost.judged(limit)
-            for key, (cost, _), limit in zip(
-                evaluation.cost_keys, evaluation.by_key().values(), evaluation.limits, strict=True
-            )
-        }
-    return out
-
-
-def _finite(value: float) -> float | None:
-    """A number, or None in place of NaN, which JSON lacks."""
-    return None if np.isnan(value) else value
 
 
 def _episode(episode_return: float, cost: float, length: float) -> str:

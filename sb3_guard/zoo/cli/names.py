@@ -9,7 +9,7 @@ import importlib
 import operator
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -29,8 +29,6 @@ BASES: dict[str, type] = {
     "env_wrapper": gym.Wrapper, "vec_env_wrapper": VecEnvWrapper, "callback": BaseCallback
 }  # fmt: skip
 ALLOWED = "allowed: dict(name=value), literals, and classes of torch such as nn.ReLU"
-# Arguments of the monitors, recorders and callbacks of KNOWN packages that say where to write
-PLACES = {"filename", "save_path", "log_path", "best_model_save_path", "log_dir", "video_folder"}
 # Flags that name files, folders, modules or a service, which a run's record does not bring back
 FOLLOWED = ("gym_packages", "tensorboard_log", "track")
 
@@ -145,27 +143,3 @@ def require_named(where: object, given: "Command", filed: "Command", *names: str
                 f"{where} needs {name}, which only the command line may name; look at that, then "
                 f"add {shlex.join(filed.words({name}))}"
             )
-
-
-def refuse_places(where: object, hyperparams: Mapping[str, Any]) -> None:
-    """
-    Refuse arguments of monitors, wrappers and callbacks that say where to write.
-
-    :param where: the file that states the hyperparameters
-    :raises UsageError: there is one
-    """
-    for name in ("monitor_kwargs", *BASES):
-        for argument, place in _places(as_data(name, hyperparams.get(name))):
-            raise UsageError(
-                f"{where}: {name} has {argument} = {place!r}, a place to write to, which only the "
-                f"command line may name (train -params {name}:…); remove it from the file"
-            )
-
-
-def _places(value: Any) -> Iterator[tuple[str, str]]:
-    for item in value if isinstance(value, list | tuple) else [value]:
-        if isinstance(item, Mapping):
-            for key, inner in item.items():
-                if isinstance(inner, str) and key in PLACES:
-                    yield key, inner
-                yield from _places(inner)

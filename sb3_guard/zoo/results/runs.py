@@ -216,15 +216,13 @@ def choose(
     runs: pd.DataFrame,
     suites: Sequence[str] | None = None,
     cost_limit: Sequence[float] | None = None,
-    steps: int | None = None,
 ) -> pd.DataFrame:
     """
     The runs that are asked for.
 
     :param suites: None: all. The version may be left out
     :param cost_limit: runs of this limit for each cost, and the unconstrained ones; None: all
-    :param steps: only runs of this length; None: all
-    :raises UsageError: an environment, limit or length without runs
+    :raises UsageError: an environment or limit without runs
     """
     if suites is not None:
         names = {suite: _names(suite) for suite in sorted({*runs["suite"]})}
@@ -234,24 +232,16 @@ def choose(
         runs = runs[[not names[suite].isdisjoint(suites) for suite in runs["suite"]]]
     if cost_limit is not None:
         limit = _limits(cost_limit)
-        _require(limit, runs["limits"], "at cost limit")
+        if limit not in {*runs["limits"]}:
+            hint = did_you_mean(limit, map(str, _values(runs["limits"])))
+            raise UsageError(f"there is no run at cost limit {limit}; {hint}")
         runs = runs[runs["limits"].isna() | (runs["limits"] == limit)]
-    if steps is not None:
-        _require(steps, runs["steps"], "of length")
-        runs = runs[runs["steps"] == steps]
     return runs.reset_index(drop=True)
 
 
 def _names(suite: str) -> set[str]:
     """An environment with and without its version."""
     return {suite, f"{suite}-v0", re.sub(r"-v\d+$", "", suite)}
-
-
-def _require(value: Any, column: "pd.Series[Any]", which: str) -> None:
-    """Raise if no run has a value."""
-    if value not in {*column}:
-        hint = did_you_mean(str(value), map(str, _values(column)))
-        raise UsageError(f"there is no run {which} {value}; {hint}")
 
 
 def select(runs: pd.DataFrame) -> pd.DataFrame:
@@ -265,7 +255,7 @@ def select(runs: pd.DataFrame) -> pd.DataFrame:
     for column, name, keys, fix in (
         ("limits", "cost limit", ["suite"], "choose one, such as --cost-limit {}"),
         ("world", "env_kwargs", ["suite"], other),
-        ("steps", "length", ["suite", "algo"], "choose one, such as --steps {}"),
+        ("steps", "length", ["suite", "algo"], other),
         ("config", "hyperparameters or the model they started from", ["suite", "algo"], other),
     ):
         for key, group in runs.groupby(keys):

@@ -34,7 +34,6 @@ from sb3_guard.zoo.cli.names import (
     PAPER,
     as_data,
     import_class,
-    refuse_places,
     with_classes,
 )
 from sb3_guard.zoo.cli.usage import UsageError, explained, read_mapping
@@ -147,8 +146,6 @@ def read_hyperparams(
     if values is None:
         hint = did_you_mean(env_id, content)
         raise UsageError(f"{path} has no entry for {env_id!r} and no 'default'; {hint}")
-    if str(path).endswith((".yml", ".yaml")):  # a program says what it likes
-        refuse_places(path, values)
     return {**values, **changes, **(overrides or {})}
 
 

@@ -42,7 +42,7 @@ from sb3_guard.common.vec_env import make_vec_env
 from sb3_guard.costs import read_costs
 from sb3_guard.fields import plain
 from sb3_guard.zoo.cli.flags import IDENTITY, START
-from sb3_guard.zoo.cli.names import FOLLOWED, classes, refuse_places, require_named
+from sb3_guard.zoo.cli.names import FOLLOWED, classes, require_named
 from sb3_guard.zoo.cli.usage import (
     TrainingStopped,
     UsageError,
@@ -545,7 +545,6 @@ class Run:
             run = cls(dataclasses.replace(saved, **changed), folder=folder)
             run.flags.env = str(run.source.env_id)
             overrides = given.overrides()
-            refuse_places(folder.path, {n: v for n, v in values.items() if n not in overrides})
             run.hyperparams = check(saved.algo, algorithm(saved.algo), {**values, **overrides})
             free = {"n_timesteps": None, "log_folder": None}
             was = {**saved.values(START), **state["identity"], **free}

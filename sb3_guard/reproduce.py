@@ -61,47 +61,39 @@ def final_hash(result: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(result["final"], sort_keys=True).encode()).hexdigest()
 
 
-def differences(row: Mapping[str, str], result: Mapping[str, Any]) -> list[str]:
-    """How a run that was trained again differs from the published one, in lines; none: nothing."""
-    lines = [
-        f"Not the same: the {kind} episodes differ."
-        for kind, name, new in (
-            ("training", "curve", result["curve"]),
-            ("final", "final", final_hash(result)),
-        )
-        if row[name] != new
-    ]
-    for name, new in measures(result).items():
-        if not math.isclose(float(row[name]), new, rel_tol=1e-6, abs_tol=1e-9):
-            lines.append(f"  {MEASURES[name]}: before {float(row[name]):.6g}, now {new:.6g}")
-    return lines
-
-
-def as_another_seed(
-    seeds: Sequence[Mapping[str, str]], new: Mapping[str, float]
+def compare(
+    row: Mapping[str, str], result: Mapping[str, Any], seeds: Sequence[Mapping[str, str]]
 ) -> tuple[bool, list[str]]:
     """
-    Whether a run that rounding led another way could be a further seed of its row.
+    Whether a run that was trained again is the published one, and in lines what differs.
 
-    :param seeds: rows of the same command with any seed
-    :param new: :func:`measures` of the new run
-    :return: whether return and cost of the final policy lie where 95 % of further seeds do
-        (Student's t on the spread over seeds); and that in lines
+    A run that rounding led another way could be a further seed of its row: return and cost of its
+    final policy lie where 95 % of further seeds would (Student's t on the spread over seeds).
+
+    :param seeds: rows of the same command with any seed; empty: rounding explains nothing
     """
     from scipy.stats import t
 
-    if (n := len(seeds)) < 2:
-        return False, ["Not judged: of one seed nothing tells how far another may differ."]
-    lines, within = [], []
-    for name in ("final_return", "final_cost"):
-        values = [float(row[name]) for row in seeds]
-        half = float(t.ppf(0.975, n - 1)) * stdev(values) * math.sqrt(1 + 1 / n)
-        low, high = fmean(values) - half, fmean(values) + half
-        within.append(low <= new[name] <= high)
-        where = "within" if within[-1] else "outside"
-        lines.append(f"  {MEASURES[name]}: {new[name]:.4g}, {where} [{low:.4g}, {high:.4g}]")
-    word = "Alike" if all(within) else "Not alike"
-    return all(within), [f"{word}: where 95 % of further seeds beside these {n} would be,", *lines]
+    new = {"training": result["curve"], "final": final_hash(result)}
+    old = {"training": row["curve"], "final": row["final"]}
+    lines = [f"Not the same: the {kind} episodes differ." for kind in new if new[kind] != old[kind]]
+    n = len(seeds) if new["training"] != old["training"] else 0
+    alike = n > 1
+    for name, value in measures(result).items():
+        if math.isclose(float(row[name]), value, rel_tol=1e-6, abs_tol=1e-9):
+            continue
+        line = f"  {MEASURES[name]}: before {float(row[name]):.6g}, now {value:.6g}"
+        if n > 1 and name.startswith("final"):
+            values = [float(seed[name]) for seed in seeds]
+            half = float(t.ppf(0.975, n - 1)) * stdev(values) * math.sqrt(1 + 1 / n)
+            alike &= abs(value - fmean(values)) <= half
+            line += f"; 95 % of further seeds: {fmean(values):.4g} ± {half:.4g}"
+        lines.append(line)
+    if n == 1:
+        lines.append("Not judged: of one seed nothing tells how far another may differ.")
+    elif n:
+        lines.append(f"{'Alike' if alike else 'Not alike'}, beside {n} seeds of this row.")
+    return alike or not lines, lines
 
 
 def reproduce(flags: Flags) -> int:
@@ -134,14 +126,10 @@ def reproduce(flags: Flags) -> int:
         print("The same command continues it.")
         return status
     result = RunFolder(run.path).checked_result()
-    lines = differences(row, result)
-    same = not lines
     other = there != here or row["commit"] != (result["commit"] or "")
-    if other and row["curve"] != result["curve"]:
-        alike = SEED.sub("", row["command"])
-        seeds = [other for other in rows.values() if SEED.sub("", other["command"]) == alike]
-        same, judged = as_another_seed(seeds, measures(result))
-        lines += judged
+    alike = SEED.sub("", row["command"])
+    seeds = [one for one in rows.values() if other and SEED.sub("", one["command"]) == alike]
+    same, lines = compare(row, result, seeds)
     print("\n".join(lines) or "The same: all training and final episodes agree, and all measures.")
     if row["commit"] != (result["commit"] or ""):
         print(f"The run before is of commit {row['commit']}, the new one of {result['commit']}.")

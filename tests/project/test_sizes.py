@@ -13,12 +13,12 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_155,
+    "sb3_guard": 26_141,
     "sb3_guard/envs": 8_827,
     "sb3_guard/algorithms": 5_782,
     "sb3_guard/common": 2_505,
     "sb3_guard/deployment": 916,
-    "harness": 8_125,
+    "harness": 8_111,
     "tests": 24_278,
 }
 WORDS = 62_127  # of all tracked markdown but the changelog

@@ -102,8 +102,6 @@ def open_study(
     if saved is None:
         saved = asdict(settings)
         study.set_user_attr(SETTINGS, saved)
-    if saved.get("pareto") is False:  # of a version that had such a setting
-        saved = {name: value for name, value in saved.items() if name != "pareto"}
     for then, now in ((saved["hyperparams"], settings.hyperparams), (saved, asdict(settings))):
         for part, old, value in differences(then, now):
             raise UsageError(

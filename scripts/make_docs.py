@@ -12,6 +12,7 @@ import ast
 import dataclasses
 import importlib
 import inspect
+import itertools
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -90,8 +91,8 @@ def parameters(part: type[Parameters]) -> str:
     return parameter_table(dataclasses.fields(part))  # type: ignore[arg-type]
 
 
-def parameter_table(fields: Iterable[Any]) -> str:
-    """A row per parameter: name, default, what it is and what is allowed."""
+def parameter_table(fields: Iterable[Any], of: Iterable[str] = ()) -> str:
+    """A row per parameter: name, default, what it is, what is allowed, and which parts have it."""
     rows = []
     for field in fields:
         meaning = field.metadata.get("doc", "")
@@ -104,7 +105,11 @@ def parameter_table(fields: Iterable[Any]) -> str:
         if field.metadata.get("drawn"):
             limits.append("may be [drawn](customizing.md#domain-randomisation)")
         rows.append([f"`{field.name}`", f"`{field.default}`", meaning, "; ".join(limits)])
-    return table(["parameter", "default", "what it is", "allowed"], rows)
+    header = ["parameter", "default", "what it is", "allowed"]
+    if of:
+        header.append("of")
+        rows = [[*row, parts] for row, parts in zip(rows, of, strict=True)]
+    return table(header, rows)
 
 
 def parameters_of_environments() -> str:
@@ -122,7 +127,9 @@ def parameters_of_environments() -> str:
             for field in dataclasses.fields(part):  # type: ignore[arg-type]
                 if field.metadata.get("drawn"):
                     drawn.setdefault((field.name, field.metadata["doc"]), []).append(name)
-    rows = [[f"`{name}`", ", ".join(of), doc] for (name, doc), of in drawn.items()]
+    robots = ", ".join(GROUPS["robot"])
+    rows = [[f"`{name}`", ", ".join(of).replace(robots, "all robots"), doc]
+            for (name, doc), of in drawn.items()]  # fmt: skip
     parts += ["## Drawn anew in each episode", table(["parameter", "of", "what it is"], rows)]
     rows = [[f"`{name}`", escaped(default), escaped(meaning)]
             for name, (default, meaning, _) in ATTRIBUTES.items()]  # fmt: skip
@@ -131,17 +138,18 @@ def parameters_of_environments() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def perceived(kind: str, name: str) -> str:
-    """What a task or a constraint adds to the observation of some robots."""
-    rows: dict[str, list[str]] = {}
-    for robot in SIZED:
+def perceived(kind: str) -> str:
+    """What each task or constraint adds to the observation of some robots."""
+    rows: dict[tuple[str, str], list[str]] = {}
+    for name, robot in itertools.product(GROUPS[kind], SIZED):
         task, constraint = (name, "Hazards") if kind == "task" else ("Goal", name)
         engine = GuardVectorEnv(1, f"{task}_{robot}_8{constraint}").engine
         part = engine.task if kind == "task" else engine.constraints[0]
         for what, channel in engine.observer.channels_of(part).items():
             bounds = f"[{channel.low:g}, {channel.high:g}]"
-            rows.setdefault(what, [f"`{what}`", bounds, channel.unit]).append(str(channel.size))
-    return table(["observation", "bounds", "unit", *SIZED], list(rows.values()))
+            row = rows.setdefault((name, what), [name, f"`{what}`", bounds, channel.unit])
+            row.append(str(channel.size))
+    return table([kind, "observation", "bounds", "unit", *SIZED], list(rows.values()))
 
 
 def overview(kind: str, names: Iterable[str]) -> str:
@@ -153,22 +161,24 @@ def overview(kind: str, names: Iterable[str]) -> str:
 
 
 def sections(kind: str) -> str:
-    """A section per part of a kind, after the parameters that at least three have alike."""
-    fields: dict[Any, list[Any]] = {}
-    for part in GROUPS[kind].values():
+    """A section per part of a kind, after the parameters that at least two have alike."""
+    fields: dict[Any, dict[str, Any]] = {}
+    for name, part in GROUPS[kind].items():
         for field in dataclasses.fields(part):  # type: ignore[arg-type]
-            fields.setdefault(key_of(field), []).append(field)
-    common = {key: alike[0] for key, alike in fields.items() if len(alike) >= 3}
-    texts = [f"Parameters that several {kind}s have:", parameter_table(common.values())]
+            fields.setdefault(key_of(field), {})[name] = field
+    common = {key: alike for key, alike in fields.items() if len(alike) >= 2}
+    every = {*GROUPS[kind]}
+    of = ["all" if {*alike} == every else ", ".join(alike) for alike in common.values()]
+    shared = parameter_table([next(iter(alike.values())) for alike in common.values()], of)
+    texts = [f"Parameters that several {kind}s have:", shared]
+    if kind != "robot":
+        texts += ["Added to the observation, with the size for some robots:", perceived(kind)]
     for name, part in GROUPS[kind].items():
         own = [f for f in dataclasses.fields(part) if key_of(f) not in common]  # type: ignore[arg-type]
         about = inspect.cleandoc(part.__doc__ or "").replace("``", "`")
         texts += [f"## {name}", pictures(kind, name), about]
         if own:
             texts += [f"Set with `{part.name or name.lower()}={{...}}`:", parameter_table(own)]
-        if kind != "robot":
-            texts += ["Added to the observation, with the size for some robots:"]
-            texts.append(perceived(kind, name))
     return "\n\n".join(texts)
 
 

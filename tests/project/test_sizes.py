@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_111,
     "tests": 24_278,
 }
-WORDS = 62_127  # of all tracked markdown but the changelog
+WORDS = 61_012  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -22,6 +22,7 @@ from sb3_guard.common.evaluation import (
 )
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
+from sb3_guard.vector import as_vec_env
 
 # What a run continues with
 KEPT = (
@@ -129,7 +130,7 @@ class CostEvalCallback(EvalCallback):
 
     def __init__(
         self,
-        eval_env: gym.Env | VecEnv,
+        eval_env: gym.Env | gym.vector.VectorEnv | VecEnv,
         *,
         selection_limit: float | Sequence[float] | None = None,
         seed: int = 0,
@@ -143,7 +144,7 @@ class CostEvalCallback(EvalCallback):
         verbose: int = 1,
     ):
         super().__init__(
-            eval_env,
+            as_vec_env(eval_env),
             callback_on_new_best=callback_on_new_best,
             callback_after_eval=callback_after_eval,
             n_eval_episodes=n_eval_episodes,

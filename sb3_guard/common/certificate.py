@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 from scipy import stats
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.checks import check_cost_keys, check_per_cost
@@ -27,6 +27,7 @@ from sb3_guard.common.evaluation import (
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.costs import bounded_name
 from sb3_guard.fields import fit
+from sb3_guard.vector import as_vec_env
 
 #: The looks at the episodes, as shares of all. Only the last one can certify: costs that are rare
 #: and high are often absent from fewer episodes, which then all look safe.
@@ -245,7 +246,7 @@ def _described(env: VecEnv) -> dict[str, Any]:
 
 def certify(
     model: PolicyPredictor,
-    env: gym.Env | VecEnv,
+    env: gym.Env | gym.vector.VectorEnv | VecEnv,
     cost_limit: float | Sequence[float] | None = None,
     *,
     n_episodes: int = MOST,
@@ -282,9 +283,7 @@ def certify(
     fit("n_episodes", n_episodes, int, LEAST, ends="[)")
     fit("tries", tries, int, 1, ends="[)")
     fit("error", error, float, 0.0, 0.5)
-    if not isinstance(env, VecEnv):
-        lone = env
-        env = DummyVecEnv([lambda: lone])
+    env = as_vec_env(env)
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
     limits = limits_of(model, cost_limit, keys)
     seed = int(np.random.SeedSequence().generate_state(1)[0] if seed is None else seed)

@@ -17,7 +17,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
     VecEnv,
     VecMonitor,
     VecNormalize,
@@ -37,6 +36,7 @@ from sb3_guard.costs import (
     estimate,
     read_costs,
 )
+from sb3_guard.vector import as_vec_env
 
 LONGEST = 20_000  # steps of an episode that nothing ends, after which it is given up
 
@@ -190,8 +190,9 @@ def share_environment(one: VecEnv, other: VecEnv) -> bool:
     """Whether to reset one of two vectorised environments resets something of the other, too."""
     parts: list[set[int]] = []
     for env in (one.unwrapped, other.unwrapped):
-        lone = env.envs if isinstance(env, DummyVecEnv) else []
-        parts.append({id(env), *(id(part.unwrapped) for part in lone)})
+        inner = getattr(env, "envs", [])  # a list of single environments, or one batch
+        inner = inner if isinstance(inner, list) else [inner]
+        parts.append({id(env), *(id(part.unwrapped) for part in inner)})
     return not parts[0].isdisjoint(parts[1])
 
 
@@ -257,7 +258,7 @@ def shares(n_episodes: int, n_envs: int) -> np.ndarray:
 
 def evaluate_policy(
     model: PolicyPredictor,
-    env: gym.Env | VecEnv,
+    env: gym.Env | gym.vector.VectorEnv | VecEnv,
     n_eval_episodes: int = 10,
     deterministic: bool = True,
     *,
@@ -306,9 +307,7 @@ def evaluate_policy(
     """
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
-    if not isinstance(env, VecEnv):
-        lone = env
-        env = DummyVecEnv([lambda: lone])
+    env = as_vec_env(env)
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
     check_agent(model, env)
     takes_masks = "action_masks" in inspect.signature(model.predict).parameters

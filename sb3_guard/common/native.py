@@ -11,23 +11,24 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
+
+from sb3_guard.vector import BatchVecEnv
 
 if TYPE_CHECKING:
+    from sb3_guard.envs import GuardVectorEnv
     from sb3_guard.envs.scenario import Scenario
 
 
-class GuardVecEnv(VecEnv):
+class GuardVecEnv(BatchVecEnv):
     """N environments of sb3_guard on one batch of simulations, for Stable-Baselines3.
 
     Equals, bit for bit, a ``DummyVecEnv`` of N single environments with seeds s, s + 1, …, and is
     many times faster.
 
-    :param scenario: an id, a scenario, its plain data or its YAML file
+    :param scenario: an id, a scenario, its plain data or its YAML file; or the vector environment,
+        which is then stepped itself, and has been given the other arguments
     :param num_envs: number of environments N
     :param spec: what Gymnasium calls it, if it is registered
     :param kwargs: as for :class:`~sb3_guard.envs.vector_env.GuardVectorEnv`
@@ -35,25 +36,28 @@ class GuardVecEnv(VecEnv):
 
     def __init__(
         self,
-        scenario: str | Path | Mapping[str, Any] | Scenario,
+        scenario: str | Path | Mapping[str, Any] | Scenario | GuardVectorEnv,
         num_envs: int = 1,
         spec: EnvSpec | None = None,
         **kwargs: Any,
     ) -> None:
         import sb3_guard.envs as envs
 
-        self.envs = envs.GuardVectorEnv(num_envs, scenario, **kwargs)
+        batch = scenario
+        if not isinstance(batch, envs.GuardVectorEnv):
+            batch = envs.GuardVectorEnv(num_envs, batch, **kwargs)
         # algorithms read the length of an episode from it; a registered one is not ours to change
-        self.spec = copy.deepcopy(spec or envs.env_spec(self.envs.scenario))
-        self.spec.max_episode_steps = self.envs.max_episode_steps
-        others = {"num_threads", "max_episode_steps"}  # which are no arguments of a single one
-        self.spec.kwargs |= {name: kwargs[name] for name in kwargs.keys() - others}
-        self.envs.spec = self.spec
-        self.render_mode = self.envs.render_mode  # read by VecEnv.__init__
+        spec = copy.deepcopy(spec or envs.env_spec(batch.scenario))
+        spec.max_episode_steps = batch.max_episode_steps
+        # which are no arguments of a single one
+        others = {"num_threads", "num_envs", "max_episode_steps", "autoreset_mode"}
+        others |= {"vectorization_mode"}
+        given = batch.spec.kwargs if batch.spec is not None else kwargs
+        spec.kwargs |= {name: given[name] for name in given.keys() - others}
+        batch.spec = spec
         super().__init__(
-            num_envs, self.envs.single_observation_space, self.envs.single_action_space
+            batch, batch.num_envs, batch.single_observation_space, batch.single_action_space
         )
-        self._actions = np.zeros((num_envs, *self.action_space.shape))  # type: ignore[misc]
 
     def reset(self) -> Any:
         obs = self.envs.begin(self._seeds)
@@ -65,9 +69,6 @@ class GuardVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         return self.envs.view(obs, self.envs.look())
-
-    def step_async(self, actions: np.ndarray) -> None:
-        self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         t = self.envs.advance(self._actions)
@@ -98,9 +99,6 @@ class GuardVecEnv(VecEnv):
         self.envs.engine.reset(np.asarray(rows))
         return self.envs.view(self.envs.engine.observe(), self.envs.look())
 
-    def close(self) -> None:
-        self.envs.close()
-
     def get_images(self) -> Sequence[np.ndarray | None]:
         return [self.envs.frame(row) for row in range(self.num_envs)]
 
@@ -111,25 +109,3 @@ class GuardVecEnv(VecEnv):
     def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a :meth:`state` bit for bit, whatever the number of threads."""
         self.envs.restore(state)
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        raise AttributeError(
-            f"cannot set {attr_name!r} on environments that share one batch of simulations; make "
-            "them with the parameter changed, or use make_vec_env(..., vec_env='dummy')"
-        )
-
-    def env_method(
-        self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
-    ) -> list[Any]:
-        raise AttributeError(
-            f"cannot call {method_name!r} on one of the environments that share a batch of "
-            "simulations; use make_vec_env(..., vec_env='dummy')"
-        )
-
-    def env_is_wrapped(
-        self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None
-    ) -> list[bool]:
-        return [False] * len(list(self._get_indices(indices)))

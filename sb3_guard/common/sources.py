@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -35,12 +35,21 @@ class Source(NamedTuple):
     :param batch: makes n on one batch of simulations, ``batch(n, **kwargs)``; None where that is
         not possible: environments of others, and ours with wrappers in their registration
     :param scenario: what ours are; None: those of others
+    :param spec: how those are registered with Gymnasium that may have a vector environment
     """
 
     env_id: str | None
     make: Callable[..., gymnasium.Env]
     batch: Callable[..., VecEnv] | None = None
     scenario: Scenario | None = None
+    spec: EnvSpec | None = None
+
+    @property
+    def vec_env(self) -> Literal["native", "dummy", "gymnasium"]:
+        """How its environments are stepped if nobody says it."""
+        if self.batch is not None:
+            return "native"
+        return "gymnasium" if self.spec is not None and self.spec.entry_point is None else "dummy"
 
 
 def find(
@@ -71,7 +80,7 @@ def find(
         raise
     if spec is not None:
         # The description, not the id: other processes may not have registered it.
-        return Source(spec.id, partial(gymnasium.make, spec))
+        return Source(spec.id, partial(gymnasium.make, spec), spec=spec)
     if ":" in env_id:
         return Source(env_id, partial(gymnasium.make, env_id))  # which imports the module
     return _ours(env_id)

@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
+from gymnasium.vector import VectorEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from sb3_guard.common.monitor import CostMonitor
@@ -21,18 +22,21 @@ from sb3_guard.common.sources import Source, find
 from sb3_guard.fields import fit
 from sb3_guard.ids import UnknownPart
 from sb3_guard.spelling import did_you_mean
+from sb3_guard.vector import BatchVecEnv, as_vec_env
 
 if TYPE_CHECKING:
     from sb3_guard.envs.scenario import Scenario
 
-VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {
-    "dummy": DummyVecEnv,
-    "subproc": SubprocVecEnv,
-}
-
 
 def make_vec_env(
-    env_id: str | Path | Mapping[str, Any] | Scenario | Callable[..., gymnasium.Env] | Source,
+    env_id: str
+    | Path
+    | Mapping[str, Any]
+    | Scenario
+    | Callable[..., gymnasium.Env]
+    | Source
+    | VectorEnv
+    | BatchVecEnv,
     n_envs: int = 1,
     seed: int | None = None,
     *,
@@ -49,12 +53,14 @@ def make_vec_env(
 
     :param env_id: an id of sb3_guard (the version may be left out), a scenario, its plain data or
         its YAML file, any id registered with Gymnasium, one of Safety-Gymnasium where that package
-        is installed, a class or function that makes an environment, or what
-        :func:`~sb3_guard.common.sources.find` returns
+        is installed, a class or function that makes an environment, what
+        :func:`~sb3_guard.common.sources.find` returns; or a vector environment, such as
+        ``gymnasium.make_vec(id, num_envs=8)``, which takes a seed and a monitor alone
     :param n_envs: how many; 30 is a good number for training
     :param seed: the environments get seed, seed + 1, …
     :param vec_env: ``"native"`` (one batch of simulations; the default for our ids), ``"dummy"``
-        (one by one; the default for others) or ``"subproc"`` (a process each)
+        (one by one; the default for others), ``"subproc"`` (a process each) or ``"gymnasium"``
+        (the vector environment that is registered for the id, else one by one)
     :param env_kwargs: parameters of the environment, such as ``{"hazards": {"num": 4}}``
     :param monitor_path: csv file for the episode statistics
     :param max_episode_steps: control steps after which an episode is cut, if not the id's own
@@ -69,51 +75,70 @@ def make_vec_env(
     fit("n_envs", n_envs, int, 1, 10**6, "[]")
     given = {"render_mode": render_mode, "max_episode_steps": max_episode_steps}
     kwargs = {**(env_kwargs or {}), **{k: v for k, v in given.items() if v is not None}}
-    _refuse_made(env_id)
-    source = env_id if isinstance(env_id, Source) else find(env_id)
-    batched = source.batch is not None and wrapper_class is None
-    vec_env = vec_env or ("native" if batched else "dummy")
-    venv: VecEnv
-    if vec_env == "native":
-        if source.batch is None:
-            raise ValueError(
-                f"{source.env_id or env_id!r} is not an sb3_guard environment, or has wrappers of "
-                "its own: use vec_env 'dummy' or 'subproc'"
-            )
-        if wrapper_class is not None:
-            raise ValueError(
-                "wrapper_class, or env_wrapper of a run, needs vec_env 'dummy' or 'subproc': "
-                "native envs share one batch"
-            )
-        venv = source.batch(n_envs, num_threads=num_threads, **kwargs)
-    elif vec_env in VEC_ENVS:
-
-        def make_one() -> gymnasium.Env:
-            env = source.make(**kwargs)
-            return env if wrapper_class is None else wrapper_class(env)
-
-        venv = (
-            _subprocesses(make_one, n_envs)
-            if vec_env == "subproc"
-            else DummyVecEnv([make_one] * int(n_envs))
-        )
+    rest = kwargs or vec_env or wrapper_class or num_threads
+    if isinstance(env_id, VectorEnv | BatchVecEnv) and not rest and n_envs in (1, env_id.num_envs):
+        venv = as_vec_env(env_id)
+    elif isinstance(env_id, gymnasium.Env | VectorEnv | VecEnv):
+        raise _is_made(env_id)
     else:
-        raise ValueError(
-            f"unknown vec_env {vec_env!r}: {did_you_mean(vec_env, ['native', *VEC_ENVS])}"
-        )
+        source = env_id if isinstance(env_id, Source) else find(env_id)
+        venv = _make(source, n_envs, vec_env, wrapper_class, num_threads, kwargs)
     if seed is not None:
         venv.seed(seed)
     return CostMonitor(venv, monitor_path, **(monitor_kwargs or {}))
 
 
-def _refuse_made(env_id: Any) -> None:
-    if isinstance(env_id, gymnasium.Env | gymnasium.vector.VectorEnv | VecEnv):
-        spec = getattr(env_id, "spec", None)
-        name = repr(spec.id) if spec else "MyEnv"
-        raise TypeError(
-            f"this {type(env_id).__name__} is made already: give an id, a class, or a function "
-            f"that makes another one, as make_vec_env({name}, n_envs=4)"
-        )
+def _make(
+    source: Source,
+    n_envs: int,
+    vec_env: str | None,
+    wrapper_class: Callable[[gymnasium.Env], gymnasium.Env] | None,
+    num_threads: int | None,
+    kwargs: Mapping[str, Any],
+) -> VecEnv:
+    batched, spec = wrapper_class is None, source.spec
+    vec_env = vec_env or (source.vec_env if batched else "dummy")
+    if vec_env == "gymnasium":
+        if batched and spec is not None and spec.vector_entry_point is not None:
+            return as_vec_env(gymnasium.make_vec(spec, num_envs=n_envs, **kwargs))
+        vec_env = "native" if batched and source.batch is not None else "dummy"
+    if vec_env == "native":
+        if source.batch is None:
+            raise ValueError(
+                f"{source.env_id or source.make!r} is not an sb3_guard environment, or has "
+                "wrappers of its own: use vec_env 'dummy' or 'subproc'"
+            )
+        if not batched:
+            raise ValueError(
+                "wrapper_class, or env_wrapper of a run, needs vec_env 'dummy' or 'subproc': "
+                "native envs share one batch"
+            )
+        return source.batch(n_envs, num_threads=num_threads, **kwargs)
+    if vec_env not in ("dummy", "subproc"):
+        allowed = ["native", "gymnasium", "dummy", "subproc"]
+        raise ValueError(f"unknown vec_env {vec_env!r}: {did_you_mean(vec_env, allowed)}")
+
+    def make_one() -> gymnasium.Env:
+        env = source.make(**kwargs)
+        if isinstance(env, VectorEnv):
+            raise TypeError(
+                f"what was to make single environments makes a {type(env).__name__}, a vector "
+                "environment: hand that over itself, make_vec_env(gymnasium.make_vec(...))"
+            )
+        return env if wrapper_class is None else wrapper_class(env)
+
+    if vec_env == "subproc":
+        return _subprocesses(make_one, n_envs)
+    return DummyVecEnv([make_one] * int(n_envs))
+
+
+def _is_made(env: Any) -> TypeError:
+    spec = getattr(env, "spec", None)
+    name = repr(spec.id) if spec else "MyEnv"
+    return TypeError(
+        f"this {type(env).__name__} is made already: give an id, a class, or a function "
+        f"that makes another one, as make_vec_env({name}, n_envs=4)"
+    )
 
 
 def _subprocesses(make: Callable[[], gymnasium.Env], n_envs: int) -> VecEnv:
@@ -139,7 +164,7 @@ def _subprocesses(make: Callable[[], gymnasium.Env], n_envs: int) -> VecEnv:
                 raise SystemExit(1) from error
 
         try:
-            return VEC_ENVS["subproc"]([make_or_tell] * int(n_envs))
+            return SubprocVecEnv([make_or_tell] * int(n_envs))
         except (EOFError, ConnectionError):
             told = (path.read_text(encoding="utf-8") for path in Path(folder).iterdir())
             said = max(told, key=len, default="")

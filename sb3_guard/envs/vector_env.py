@@ -23,7 +23,6 @@ from sb3_guard.envs.scenario import Scenario
 from sb3_guard.envs.suites import EPISODE_STEPS, episode_steps
 from sb3_guard.envs.types import Array
 from sb3_guard.fields import fit
-from sb3_guard.spelling import did_you_mean
 
 
 @dataclass
@@ -74,6 +73,8 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         "autoreset_mode": AutoresetMode.SAME_STEP,
         "render_modes": ["rgb_array"],
     }
+    #: what steps it for Stable-Baselines3
+    vec_entry_point = "sb3_guard.common.native:GuardVecEnv"
 
     def __init__(
         self,
@@ -89,12 +90,9 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         **params: Any,
     ) -> None:
-        modes = {mode.value: mode for mode in AutoresetMode}
         name = getattr(autoreset_mode, "value", autoreset_mode)
-        if name not in modes:
-            hint = did_you_mean(str(name), modes)
-            raise ValueError(f"unknown autoreset_mode {name!r}: {hint}")
-        self.metadata = {**self.metadata, "autoreset_mode": modes[name]}
+        name = fit("autoreset_mode", name, choices=[mode.value for mode in AutoresetMode])
+        self.metadata = {**self.metadata, "autoreset_mode": AutoresetMode(name)}
         if max_episode_steps is None:
             steps = episode_steps(scenario) if isinstance(scenario, str) else EPISODE_STEPS
             max_episode_steps = steps
@@ -177,10 +175,8 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments")
         everyone = np.ones(self.num_envs, dtype=bool)
         rows = np.asarray((options or {}).get("reset_mask", everyone))
-        if rows.dtype != bool or rows.shape != everyone.shape or not rows.any():
-            raise ValueError(
-                f"reset_mask = {rows.tolist()} must be {self.num_envs} truth values, not all False"
-            )
+        if rows.dtype != bool or rows.shape != everyone.shape:
+            raise ValueError(f"reset_mask = {rows.tolist()} must be {self.num_envs} truth values")
         obs = self.begin(seeds, rows)
         infos: dict[str, Any] = self.engine.drawn.info()
         infos |= {f"_{name}": rows for name in infos}

@@ -119,9 +119,9 @@ def test_a_row_that_has_ended_waits_for_its_reset():
     ours.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"rows \[1\] have ended"):
         ours.step(np.zeros((2, 2)))
-    with pytest.raises(ValueError, match="must be 2 truth values, not all False"):
+    with pytest.raises(ValueError, match="must be 2 truth values"):
         ours.reset(options={"reset_mask": np.array([1, 0])})
-    with pytest.raises(ValueError, match="unknown autoreset_mode 'NextStap': did you mean 'Next"):
+    with pytest.raises(ValueError, match="autoreset_mode = 'NextStap': did you mean 'Next"):
         gymnasium.make_vec("Goal_Point_8Hazards-v0", num_envs=2, autoreset_mode="NextStap")
 
 

@@ -147,7 +147,7 @@ def test_only_the_bridge_imports_both_worlds():
         for m in MODULES
         if not m.startswith(("sb3_guard.zoo", *commands))
         and touches(m, "sb3_guard.envs")
-        and touches(m, "stable_baselines3", "torch")
+        and touches(m, "stable_baselines3", "torch", "sb3_guard.vector")
     ]
     assert both == ["sb3_guard.common.native"]
 

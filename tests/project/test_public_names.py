@@ -26,6 +26,7 @@ ALLOWED = {
         "_num_timesteps_at_start",
     },
     "the seeds of a VecEnv: its `seed` knows only seed, seed + 1, …": {"_seeds"},
+    "the options of the next reset: SB3's own subclasses read them so": {"_options"},
     "Gymnasium's hook for vector environments": {"_add_info"},
     "documented in Python": {"_exit", "_replace"},
 }  # fmt: skip

@@ -29,7 +29,7 @@ from processes import wait_for
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_guard import make_vec_env, train
-from sb3_guard.common.vec_env import VEC_ENVS
+from sb3_guard.common import vec_env
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run import checkpoint
 from sb3_guard.zoo.run import run as run_module
@@ -54,7 +54,7 @@ def undisturbed(tmp_path_factory):
 @pytest.fixture
 def forked(monkeypatch):
     """Worker processes that start quickly."""
-    monkeypatch.setitem(VEC_ENVS, "subproc", partial(SubprocVecEnv, start_method="fork"))
+    monkeypatch.setattr(vec_env, "SubprocVecEnv", partial(SubprocVecEnv, start_method="fork"))
 
 
 # What a checkpoint must hold, all at once

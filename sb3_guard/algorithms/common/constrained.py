@@ -11,10 +11,12 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import VectorEnv
 from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from sb3_guard.algorithms.common.arguments import (
     check_names,
@@ -28,6 +30,7 @@ from sb3_guard.algorithms.common.costs import Costs, limits_of, time_limit
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.costs import read_costs
 from sb3_guard.lost_costs import refuse_lost_costs
+from sb3_guard.vector import as_vec_env
 
 
 class Constrained(BaseAlgorithm):
@@ -136,6 +139,13 @@ class Constrained(BaseAlgorithm):
         if "policy_kwargs" in kwargs:  # SB3 compares them with those of the file
             kwargs["policy_kwargs"] = cls.policy_defaults | (kwargs["policy_kwargs"] or {})
         return super().load(path, *args, **kwargs)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """Take Gymnasium's vector environments, too."""
+        if isinstance(env, VectorEnv):
+            env = VecMonitor(as_vec_env(env)) if monitor_wrapper else as_vec_env(env)
+        return BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
 
     def _check_hyperparameters(self) -> None:
         """Refuse values that could only fail later or silently do harm."""

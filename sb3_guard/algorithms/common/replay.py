@@ -87,7 +87,7 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
     ) -> None:
         if isinstance(env, str):  # made here already, to look at its actions
             env = maybe_make_env(env, kwargs.get("verbose", 0))
-        space = getattr(env, "action_space", None)
+        space = getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
         if space is not None and not isinstance(space, spaces.Box):
             raise ValueError(
                 f"{type(self).__name__} needs continuous actions (Box), not {space}: for others "

@@ -175,7 +175,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     env = played.make_envs(
         n_envs if native else 1,
         flags.seed,
-        vec_env="native" if native else "dummy",
+        vec_env="native" if native else ("dummy" if ours else played.source.vec_env),
         env_kwargs={**size, **(hyperparams.get("env_kwargs") or {}), **(flags.env_kwargs or {})},
         evaluation=True,
         normalizer=normalizer,

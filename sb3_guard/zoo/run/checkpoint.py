@@ -26,6 +26,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from sb3_guard.common.evaluation import check_agent
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import find_monitor
+from sb3_guard.vector import BatchVecEnv
 from sb3_guard.zoo.cli.usage import UsageError, explained
 from sb3_guard.zoo.run.logger import RunLogger
 from sb3_guard.zoo.run.make_envs import seed_rows
@@ -102,7 +103,8 @@ def capture(env: VecEnv) -> list[Any]:
         elif isinstance(layer, VecEnvWrapper):
             parts.append(_attributes(layer))
         else:
-            states = layer.env_method("state") if layer.has_attr("state") else [None]
+            rows = not isinstance(layer, BatchVecEnv) and layer.has_attr("state")
+            states = layer.env_method("state") if rows else [None]
             parts.append(None if None in states else states)
     return parts
 

@@ -24,8 +24,9 @@ class TrainingFlags(Command):
     :param conf_file: hyperparameters: 'paper' for the GUARD paper's table, a YAML file, or a Python
         file or module with a dictionary 'hyperparams' (default: hyperparams/<algo>.yml)
     :param env_kwargs: arguments of the environment, e.g. "hazards:{'num': 4}"
-    :param vec_env: how environments are stepped: native (one batch), dummy (one after another) or
-        subproc (one process each); default: native if the environment supports it, else dummy
+    :param vec_env: how environments are stepped: native (one batch), dummy (one after another),
+        subproc (one process each) or gymnasium (the vector environment registered for the id, else
+        dummy); default: native if the environment supports it, else dummy
     :param device: torch device (default: auto)
     :param gym_packages: modules to import before training, which register environments, parts or
         algorithms
@@ -35,7 +36,7 @@ class TrainingFlags(Command):
     hyperparams: dict[str, Any] | None = flag("-params")
     conf_file: str | None = flag("-conf", metavar="FILE")
     env_kwargs: dict[str, Any] | None = flag()
-    vec_env: Literal["native", "dummy", "subproc"] | None = flag(role=IDENTITY)
+    vec_env: Literal["native", "dummy", "subproc", "gymnasium"] | None = flag(role=IDENTITY)
     device: str = flag(default="auto", role=IDENTITY)
     gym_packages: list[str] = flag(default=[], metavar="MODULE", role=HOST)
 

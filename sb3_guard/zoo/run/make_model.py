@@ -52,7 +52,7 @@ def make_model(
         ``hyperparams/<algo>.yml``
     :param seed: of networks and environments; None for a random one
     :param env_kwargs: parameters of the environment, such as ``{"hazards": {"num": 4}}``
-    :param vec_env: ``"native"``, ``"dummy"`` or ``"subproc"``; None chooses
+    :param vec_env: ``"native"``, ``"dummy"``, ``"subproc"`` or ``"gymnasium"``; None chooses
     :param device: torch device
     :param num_threads: threads of torch and of the simulations; None for their own choice
     :param monitor_path: csv file for the episode statistics

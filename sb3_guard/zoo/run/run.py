@@ -192,8 +192,8 @@ class Run:
         if flags.env_kwargs:
             values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
         # What wraps single environments needs single ones.
-        native = run.source.batch is not None and values.get("env_wrapper") is None
-        flags.vec_env = flags.vec_env or ("native" if native else "dummy")
+        lone = values.get("env_wrapper") is not None
+        flags.vec_env = flags.vec_env or ("dummy" if lone else run.source.vec_env)
         return run
 
     def limits(self) -> np.ndarray:
@@ -324,7 +324,7 @@ class Run:
 
         :param n_envs: how many
         :param seed: the environments get seed, seed + 1, …
-        :param vec_env: native, dummy or subproc; None: that of the flags
+        :param vec_env: native, dummy, subproc or gymnasium; None: that of the flags
         :param env_kwargs: arguments of the environment; None: those of training
         :param evaluation: observations are normalised with given statistics, rewards not at all,
             and wrappers that are ``training_only`` and their ``training_arguments`` are left out
@@ -359,7 +359,7 @@ class Run:
                     env_kwargs=values.get("env_kwargs") if env_kwargs is None else env_kwargs,
                     num_threads=flags.num_threads if flags.num_threads > 0 else None,
                     render_mode=render_mode,
-                    wrapper_class=wrap if vec_env != "native" or single else None,
+                    wrapper_class=wrap if single or vec_env in ("dummy", "subproc") else None,
                     monitor_kwargs=monitored,
                 )
                 made.callback(env.close)

@@ -1,0 +1,216 @@
+"""Anyone's vector environment, as Stable-Baselines3 steps it.
+
+Constructors of algorithms, ``make_vec_env`` and evaluations take what Gymnasium calls a vector
+environment and ask :func:`as_vec_env` for a ``VecEnv``. :class:`GymnasiumVecEnv` is the adapter of
+those that are nothing simpler.
+"""
+
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import SyncVectorEnv, VectorEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+
+from sb3_guard.checks import ContractError
+from sb3_guard.fields import fit
+
+#: ``cost(obs, actions, next_obs, infos)``, of N rows at once
+BatchCost = Callable[[Any, Any, Any, Any], Any]
+MODES = "NextStep", "SameStep", "Disabled"  # when rows that have ended are reset
+
+
+def as_vec_env(env: Any) -> VecEnv:
+    """Anyone's environment as a ``VecEnv``; one that is a ``VecEnv`` stays as it is.
+
+    :param env: a vector environment of Gymnasium, or a single one, which becomes the only row.
+        Ours become the native batch, and single ones that Gymnasium steps one by one SB3's
+        ``DummyVecEnv``, so that they keep their methods, wrappers and states
+    :raises ValueError: its autoreset mode is unknown
+    """
+    if isinstance(env, VecEnv):
+        return env
+    if not isinstance(env, VectorEnv):
+        return DummyVecEnv([lambda: env])
+    if type(env) is SyncVectorEnv:
+        return DummyVecEnv([partial(list(env.envs).__getitem__, i) for i in range(env.num_envs)])
+    entry_point = getattr(env, "vec_entry_point", None)
+    return pkgutil.resolve_name(entry_point)(env) if entry_point else GymnasiumVecEnv(env)
+
+
+def each(function: Callable[..., Any], *obs: Any) -> Any:
+    """Apply a function to observations, or to those of each entry of dictionaries."""
+    if isinstance(obs[0], Mapping):
+        return {key: each(function, *(o[key] for o in obs)) for key in obs[0]}
+    return function(*obs)
+
+
+def info_rows(infos: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
+    """What Gymnasium tells by arrays of N rows, as a dictionary for each row.
+
+    :param infos: by name an array or a dictionary of such; ``infos["_cost"]``, [N] bool, says which
+        rows have a cost. Anything else is the same for all rows
+    :param n: N
+    """
+    rows: list[dict[str, Any]] = [{} for _ in range(n)]
+    for name, values in infos.items():
+        if name[:1] == "_" and name[1:] in infos:
+            continue
+        if isinstance(values, Mapping):
+            values = info_rows(values, n)
+        elif np.ndim(values) == 0 or len(values) != n:
+            values = [values] * n
+        else:  # numbers of Python's, or copies
+            values = values.tolist() if np.ndim(values) == 1 else list(np.array(values))
+        mask = infos.get(f"_{name}")
+        for i in range(n) if mask is None else np.flatnonzero(mask).tolist():
+            rows[i][name] = values[i]
+    return rows
+
+
+class BatchVecEnv(VecEnv):
+    """N environments that step as one object, ``envs``, which has facts of all, but no rows."""
+
+    def __init__(
+        self, envs: Any, num_envs: int, observation_space: spaces.Space, action_space: spaces.Space
+    ) -> None:
+        self.envs = envs
+        spec = getattr(envs, "spec", None)
+        self.spec = spec if isinstance(spec, EnvSpec) else None  # EnvPool's is another
+        super().__init__(num_envs, observation_space, action_space)
+        self._actions: Any = None
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._actions = actions
+
+    def close(self) -> None:
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        owner = self.envs if hasattr(self.envs, attr_name) else self.spec
+        return [getattr(owner, attr_name)] * len(list(self._get_indices(indices)))
+
+    def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> list[Any]:
+        raise AttributeError(
+            f"{method_name!r}: environments that step as one batch are not called or changed one "
+            "by one; make them with a parameter, or use make_vec_env(..., vec_env='dummy')"
+        )
+
+    set_attr = env_method  # type: ignore[assignment]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        return [False] * len(list(self._get_indices(indices)))
+
+
+class GymnasiumVecEnv(BatchVecEnv):
+    """A vector environment of Gymnasium, in any autoreset mode, for Stable-Baselines3.
+
+    Equals a ``DummyVecEnv`` of the same environments one by one: every row is a transition of the
+    agent, and the last observation, truncation and info of an episode are in the step that ended
+    it. Where the environment leaves a reset to the next step or to the caller, the rows that ended
+    are reset at once, by ``reset(options={"reset_mask": rows})``, as Gymnasium's own environments
+    and EnvPool's allow. An environment that begins other episodes, too, is refused when it does.
+
+    :param env: the vector environment
+    :param cost: ``cost(obs, actions, next_obs, infos)`` of N rows at once: the observations before
+        a step, the actions, the observations after it (of episodes that it ended the last ones),
+        and what ``step`` calls ``infos``. It returns ``info["cost"]``, N numbers
+    :raises TypeError: it is no vector environment
+    :raises ValueError: its autoreset mode is unknown
+    """
+
+    def __init__(self, env: VectorEnv, cost: BatchCost | None = None) -> None:
+        if not isinstance(env, VectorEnv):
+            raise TypeError(f"{type(env).__name__} is no vector environment of Gymnasium")
+        self.name = type(env.unwrapped).__name__
+        mode = env.metadata.get("autoreset_mode")
+        mode = fit(f"autoreset_mode of {self.name}", getattr(mode, "value", mode), choices=MODES)
+        self.same_step, self.cost = mode == "SameStep", cost
+        super().__init__(env, env.num_envs, env.single_observation_space, env.single_action_space)
+        self._obs: Any = None
+
+    def reset(self) -> Any:
+        """Begin an episode in every row; the environment counts from the first row's seed.
+
+        :raises ContractError: the space of a row is not that of a row
+        """
+        obs, infos = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
+
+        def check(space: spaces.Space, values: Any) -> None:
+            if np.shape(values) != (self.num_envs, *(space.shape or ())):
+                raise ContractError(
+                    f"{self.name} mixes up single and vector spaces: {self.num_envs} rows of "
+                    f"single_observation_space, {space}, are not of shape {np.shape(values)}"
+                )
+
+        each(check, self.observation_space, obs)
+        self._obs, self.reset_infos = each(np.array, obs), info_rows(infos, self.num_envs)
+        self._reset_seeds()
+        self._reset_options()
+        return self._obs
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        :raises ContractError: a row has ended without its last observation, its reset begins
+            episodes of other rows, or ``cost`` does not return N numbers
+        """
+        obs, rewards, terminated, truncated, infos = self.envs.step(self._actions)
+        dones, n = np.logical_or(terminated, truncated), self.num_envs
+        rows, ended = info_rows(infos, n), np.flatnonzero(dones).tolist()
+        # copies: the environment may write the next step into the same arrays
+        after = each(np.array, obs)
+        for i in ended if self.same_step else ():
+            if "final_obs" not in rows[i]:
+                raise ContractError(f"{self.name} has ended a row without infos['final_obs']")
+            each(lambda o, last, i=i: o.__setitem__(i, last), after, rows[i].pop("final_obs"))
+            # what else the row has is of its new episode
+            rows[i] = rows[i].pop("final_info", rows[i])
+        for info, cut in zip(rows, (dones & ~np.asarray(terminated)).tolist(), strict=True):
+            info["TimeLimit.truncated"] = cut
+        for i in ended:
+            rows[i]["terminal_observation"] = each(lambda o, i=i: o[i], after)
+        if self.cost is not None:
+            costs = np.asarray(self.cost(self._obs, self._actions, after, infos))
+            if costs.shape != (n,):
+                raise ContractError(f"cost(...) returned shape {costs.shape}, expected ({n},)")
+            for info, cost in zip(rows, costs.tolist(), strict=True):
+                info["cost"] = cost
+        self._obs = after
+        if ended and self.same_step:
+            self._obs = each(np.array, obs)
+        elif ended:
+            self.end_rows(ended, rows)
+        return self._obs, np.array(rewards, np.float32), dones, rows
+
+    def end_rows(self, rows: Sequence[int], infos: list[dict[str, Any]]) -> Any:
+        """Begin new episodes in some rows; the observations of all rows."""
+        mask = np.isin(np.arange(self.num_envs), rows)
+
+        def replaced(obs: np.ndarray, new: Any) -> np.ndarray:
+            new = np.asarray(new)
+            if len(new) == len(mask):  # of all rows; EnvPool has those of these alone
+                if not np.array_equal(new[~mask], obs[~mask], equal_nan=True):
+                    raise ContractError(
+                        f"{self.name} begins other episodes, too, when rows that have ended are "
+                        "reset by reset(options={'reset_mask': rows}): make it with "
+                        "vectorization_mode='sync', or let it reset rows in the same step"
+                    )
+                new = new[mask]
+            out = obs.copy()
+            out[mask] = new
+            return out
+
+        new, _ = self.envs.reset(options={"reset_mask": mask.copy()})
+        self._obs = each(replaced, self._obs, new)
+        return self._obs
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        return self.envs.render() or [None] * self.num_envs

@@ -106,17 +106,9 @@ def robot(source: Source) -> Path | mujoco.MjSpec:
 
 
 def observed(engine: Engine) -> str:
-    """The robot's observations in words, those of many sensors by their number."""
+    """How many numbers of the robot are observed."""
     names = [n for n in engine.observation_layout if n not in ("goal_compass", "hazards_lidar")]
-    computed = ("base_", "gravity", "joint_", "last_action")
-    of_sensors = [n for n in names if not n.startswith(computed)]
-    words = [f"`{n}`" for n in names if n not in of_sensors]
-    if 0 < len(of_sensors) <= 5:
-        words += [f"`{n}`" for n in of_sensors]
-    elif of_sensors:
-        words.append(f"{len(of_sensors)} sensors")
-    size = sum(engine.channels[n].size for n in names)
-    return f"{', '.join(words)}: {size} numbers"
+    return str(sum(engine.channels[n].size for n in names))
 
 
 def main() -> None:
@@ -142,7 +134,8 @@ def main() -> None:
              f"{speed[name] / speed['Point']:.2f}"]
         )  # fmt: skip
         ROBOTS.pop(name)
-    head = ["file", "what was needed", "tasks that make sense", "actions", "observes", "speed"]
+    head = ["file", "what was needed", "tasks that make sense", "actions", "numbers observed",
+            "speed"]  # fmt: skip
     text = PAGE.read_text()
     PAGE.write_text(BLOCK.sub(lambda m: m[1] + table(head, rows) + "\n" + m[2], text))
 

@@ -2,7 +2,7 @@
 
 Constructors of algorithms, ``make_vec_env`` and evaluations take what Gymnasium calls a vector
 environment and ask :func:`as_vec_env` for a ``VecEnv``. :class:`GymnasiumVecEnv` is the adapter of
-those that are nothing simpler.
+those that are nothing simpler, :class:`TensorVecEnv` that of simulators that step torch tensors.
 """
 
 import pkgutil
@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv, VectorEnv
@@ -214,3 +215,77 @@ class GymnasiumVecEnv(BatchVecEnv):
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         return self.envs.render() or [None] * self.num_envs
+
+
+class TensorVecEnv(BatchVecEnv):
+    """A simulator that steps torch tensors of N rows, as mjlab and Isaac Lab do.
+
+    ``step`` returns observations by group, reward, terminated, truncated and ``extras``; rows that
+    have ended are new episodes already. All that Stable-Baselines3 needs of a step leaves the
+    device in one copy. The simulator does not tell the last observation of an episode: the one
+    before it stands in, where a time-out is bootstrapped.
+
+    :param env: the simulator, with ``num_envs``, ``device``, ``max_episode_length`` and the spaces
+        of a row
+    :param cost: the entry of ``extras`` that is the cost, [N], or a function ``cost(obs, actions,
+        next_obs, extras)`` of tensors that returns it; it becomes ``info["cost"]``
+    :param group: which observations the agent sees; None for ``"policy"``, ``"actor"`` or the first
+    :param clip_actions: actions are within ± that; the simulator's have no bounds
+    :raises TypeError: the environment steps no tensors
+    :raises ValueError: there is no such group
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        cost: str | BatchCost = "cost",
+        group: str | None = None,
+        clip_actions: float = 5.0,
+    ) -> None:
+        if not hasattr(env, "device"):
+            raise TypeError(f"{type(env).__name__} has no device: algorithms take it as it is")
+        groups = env.single_observation_space.spaces
+        first = next(name for name in ("policy", "actor", *groups) if name in groups)
+        self.group = fit("group", group or first, choices=[*groups])
+        self.cost = cost
+        bound = np.full(env.single_action_space.shape, clip_actions, np.float32)
+        seen = spaces.Box(-np.inf, np.inf, groups[self.group].shape)
+        super().__init__(env, env.num_envs, seen, spaces.Box(-bound, bound))
+        self.spec = EnvSpec(f"{type(env).__name__}-v0", max_episode_steps=env.max_episode_length)
+        self._tensor, self._obs = th.zeros(0), np.zeros(0)  # the same, on the device and here
+
+    def reset(self) -> np.ndarray:
+        obs, _ = self.envs.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        self._reset_options()
+        self._tensor = obs[self.group].clone()
+        self._obs = self._tensor.float().cpu().numpy()
+        return self._obs
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """
+        :raises ContractError: ``extras`` have no such cost, or it is not a number for each row
+        """
+        actions = th.as_tensor(self._actions, dtype=th.float32, device=self.envs.device)
+        obs, reward, terminated, truncated, extras = self.envs.step(actions)
+        before, self._tensor = self._tensor, obs[self.group].clone()
+        if callable(self.cost):
+            cost = self.cost(before, actions, self._tensor, extras)
+        else:
+            cost = extras.get(self.cost)
+        if getattr(cost, "shape", None) != reward.shape:
+            raise ContractError(
+                f"cost={self.cost!r} is no tensor of {len(reward)} numbers; extras: {[*extras]}"
+            )
+        columns = th.stack([reward, terminated, truncated, cost], dim=1)
+        together = th.cat([columns, self._tensor.flatten(1)], dim=1).float().cpu().numpy()
+        rewards, died, late, costs = together[:, :4].T
+        infos: list[dict[str, Any]] = [
+            {"cost": cost, "TimeLimit.truncated": cut}
+            for cost, cut in zip(costs.tolist(), (late > died).tolist(), strict=True)
+        ]
+        dones = (died + late) > 0.0
+        for i in np.flatnonzero(dones).tolist():
+            infos[i]["terminal_observation"] = self._obs[i]
+        self._obs = together[:, 4:].reshape(self._obs.shape)
+        return self._obs, rewards, dones, infos

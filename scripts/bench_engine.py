@@ -9,7 +9,8 @@ had, it hardly counts.
 ``--beside PYTHON`` runs the real Safety-Gymnasium, in the environment that
 ``scripts/safety_gymnasium/check.py`` sets up, in turn with our task of the same id: on one core by
 its time, or with ``--threads 2`` ours on two, both by the clock on the wall. The best slices of 40
-steps count.
+steps count. ``--vector N`` compares N rows of the vector environment with the same in the adapter
+that makes a VecEnv of Gymnasium's, in each autoreset mode.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from mujoco.batch import Batch
 
 from sb3_guard.common.native import GuardVecEnv
@@ -33,6 +35,7 @@ from sb3_guard.envs.engine import Engine
 from sb3_guard.envs.mujoco_gaps import profiling_clock
 from sb3_guard.envs.physics import ACC, FRAME_SKIP
 from sb3_guard.envs.vector_env import GuardVectorEnv
+from sb3_guard.vector import GymnasiumVecEnv
 from sb3_guard.zoo.cli.markdown import table
 
 CLOCK = profiling_clock()
@@ -185,6 +188,40 @@ def beside(python: str, env_id: str, threads: int = 1) -> None:
     print(f"times as many {ours / theirs:>6.1f} {own / whole:>7.1f}")
 
 
+def adapted(env_id: str, n: int, seconds: float, slices: int, threads: int | None) -> None:
+    """Print what Stable-Baselines3's interface adds to a step of Gymnasium's vector environment."""
+    rows = []
+    for mode in AutoresetMode:
+        envs = [
+            GuardVectorEnv(n, env_spec(env_id).kwargs["scenario"], num_threads=threads,
+                           autoreset_mode=mode)
+            for _ in range(2)
+        ]  # fmt: skip
+        bare, adapter = envs[0], GymnasiumVecEnv(envs[1])
+        bare.reset(seed=0)
+        adapter.seed(0)
+        adapter.reset()
+        action = np.zeros(bare.action_space.shape, np.float32)
+
+        def step(bare: GuardVectorEnv = bare, action: np.ndarray = action) -> int:
+            *_, died, cut, _ = bare.step(action)
+            if bare.metadata["autoreset_mode"] is AutoresetMode.DISABLED and (died | cut).any():
+                bare.reset(options={"reset_mask": died | cut})
+            return n
+
+        def step_adapted(adapter: GymnasiumVecEnv = adapter, action: np.ndarray = action) -> int:
+            adapter.step(action)
+            return n
+
+        clock = time.process_time if threads == 1 else time.perf_counter
+        rates = best({"alone": step, "adapted": step_adapted}, seconds, slices, clock)
+        values = [1e3 * n / rates[name] for name in ("alone", "adapted")]
+        share = f"{values[1] / values[0] - 1:+.1%}"
+        rows.append([mode.value, *(f"{value:.3f}" for value in values), share])
+    print(f"{env_id}, N = {n}")
+    print(table(["mode", "step, ms", "with the adapter, ms", "more"], rows))
+
+
 def print_table(env_ids: list[str], args: argparse.Namespace) -> None:
     """Print the marks of environments, the best of each over the rounds."""
     full, bare = dict.fromkeys(env_ids, 0.0), dict.fromkeys(env_ids, 0.0)
@@ -208,6 +245,7 @@ def main() -> None:
         help="environments whose ids match, such as '*_Arm?_*' (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--beside", metavar="PYTHON", help="that Python's Safety-Gymnasium instead")
+    parser.add_argument("--vector", type=int, metavar="N", help="the adapter's share of a step")
     parser.add_argument("--seconds", type=float, default=1.0, help="time for each environment")
     parser.add_argument("--slices", type=int, default=20, help="slices that alternate")
     parser.add_argument("--rounds", type=int, default=1, help="times through the table")
@@ -219,6 +257,10 @@ def main() -> None:
     if args.beside:
         for env_id in matching:
             beside(args.beside, env_id, args.threads or 1)
+        return
+    if args.vector:
+        for env_id in matching:
+            adapted(env_id, args.vector, args.seconds, args.slices, args.threads)
         return
     print(f"mujoco {mujoco.__version__}, stage {ACC}, {FRAME_SKIP} physics steps per control step")
     print_table(matching, args)

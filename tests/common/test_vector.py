@@ -357,3 +357,48 @@ def test_a_command_steps_the_vector_environment_that_is_registered(tmp_path, mon
         assert 4 in made
     finally:
         del gym.registry["Batched-v0"]
+
+
+# Peers
+
+
+def hoppers(n: int) -> Any:
+    envpool = pytest.importorskip("envpool")
+    return envpool.make_gymnasium("Hopper-v4", num_envs=n, seed=0, max_episode_steps=30)
+
+
+@pytest.mark.slow
+def test_envpools_episodes_are_those_of_its_own_resets():
+    """Each row is given its actions in order, whether the next step resets it or a mask does."""
+    ended: list[list[Any]] = [[], []]
+    for mine in (False, True):
+        env = GymnasiumVecEnv(hoppers(N)) if mine else hoppers(N)
+        env.reset()
+        rows = [iter(np.random.default_rng(i).uniform(-1, 1, (200, 3))) for i in range(N)]
+        resting = [False] * N
+        for _ in range(120):
+            actions = np.stack([np.zeros(3) if resting[i] else next(rows[i]) for i in range(N)])
+            obs, rewards, *ends, infos = env.step(actions)
+            dones = np.any(ends, axis=0).tolist()
+            for i in np.flatnonzero(dones).tolist():
+                last = infos[i]["terminal_observation"] if mine else obs[i]
+                ended[mine].append((i, np.float32(rewards[i]), *last))
+            resting = [False] * N if mine else dones
+    for i in range(N):
+        theirs, ours = ([end for end in ends if end[0] == i] for ends in ended)
+        assert len(theirs) > 2
+        np.testing.assert_array_equal(theirs, ours[: len(theirs)])
+
+
+@pytest.mark.slow
+def test_envpool_trains_within_a_limit():
+    """The cost counts fast steps; a first policy has 3.7 of them in an episode."""
+
+    def fast(obs, actions, next_obs, infos):
+        return infos["x_velocity"] > 0.1
+
+    env = make_vec_env(GymnasiumVecEnv(hoppers(8), cost=fast))
+    model = PPOLag("MlpPolicy", env, n_steps=250, cost_limit=1.5, seed=0, learning_rate=1e-3)
+    first = model.learn(2000).costs.episode_cost[0]
+    model.learn(60_000)
+    assert model.costs.episode_cost[0] < 2.5 < first

@@ -14,7 +14,7 @@ if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get(
     os.environ.setdefault("MUJOCO_GL", "egl")
 
 try:
-    import mujoco  # noqa: F401
+    import mujoco.batch  # noqa: F401  # before modules that name what an older MuJoCo lacks
 except (RuntimeError, AttributeError) as error:  # what a backend that is not there raises
     raise ImportError(
         f"mujoco does not import with MUJOCO_GL={os.environ.get('MUJOCO_GL')!r} ({error}): "

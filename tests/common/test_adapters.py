@@ -262,6 +262,9 @@ def test_adapters_need_neither_torch_nor_mujoco():
 def test_only_mujoco_and_gymnasium_may_be_absent():
     run = without("mujoco", "mujoco.batch", code="import sb3_guard")
     assert run.returncode == 0, run.stderr
+    older = "import mujoco; del mujoco.MjSpec; import sb3_guard"  # as MuJoCo 2.3
+    run = without("mujoco.batch", code=older)
+    assert run.returncode == 0, run.stderr
 
 
 @pytest.mark.slow

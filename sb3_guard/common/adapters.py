@@ -143,6 +143,7 @@ class CostFromFunction(gym.Wrapper, RecordConstructorArgs):
     """Charge what a function of yours says: any environment becomes a constrained one.
 
     A wrapper each, with keys of their own, makes several costs that ``cost_keys`` limit one by one.
+    For vector environments there is :class:`~sb3_guard.vector.GymnasiumVecEnv`.
 
     :param env: the environment
     :param cost: ``cost(obs, action, next_obs, info)``, called after each step with the observation
@@ -150,14 +151,10 @@ class CostFromFunction(gym.Wrapper, RecordConstructorArgs):
         number. Its name, ``"package.module:function"``, will do, so that a hyperparameter file can
         say it; the module must have been imported, because a file may not run code
     :param key: entry of ``info`` that becomes the cost
-    :raises TypeError: it is a vector environment
     :raises ValueError: there is no function of that name, or its module is not imported
     """
 
     def __init__(self, env: gym.Env, cost: CostFunction | str, key: str = "cost") -> None:
-        if isinstance(env, gym.vector.VectorEnv):
-            name = type(env).__name__
-            raise TypeError(f"{name} is a vector environment: GymnasiumVecEnv(env, cost=...)")
         RecordConstructorArgs.__init__(self, cost=cost, key=key)
         gym.Wrapper.__init__(self, env)
         self.key = key

@@ -27,16 +27,12 @@ from sb3_guard.vector import BatchVecEnv, as_vec_env
 if TYPE_CHECKING:
     from sb3_guard.envs.scenario import Scenario
 
+    Wrapper = Callable[[gymnasium.Env], gymnasium.Env]
+    EnvId = str | Path | Mapping[str, Any] | Scenario | Callable[..., gymnasium.Env] | Source
+
 
 def make_vec_env(
-    env_id: str
-    | Path
-    | Mapping[str, Any]
-    | Scenario
-    | Callable[..., gymnasium.Env]
-    | Source
-    | VectorEnv
-    | BatchVecEnv,
+    env_id: EnvId | VectorEnv | BatchVecEnv,
     n_envs: int = 1,
     seed: int | None = None,
     *,
@@ -46,7 +42,7 @@ def make_vec_env(
     max_episode_steps: int | None = None,
     num_threads: int | None = None,
     render_mode: str | None = None,
-    wrapper_class: Callable[[gymnasium.Env], gymnasium.Env] | None = None,
+    wrapper_class: Wrapper | None = None,
     monitor_kwargs: Mapping[str, Any] | None = None,
 ) -> VecEnv:
     """Make environments for Stable-Baselines3, with episode statistics that include the cost.
@@ -92,7 +88,7 @@ def _make(
     source: Source,
     n_envs: int,
     vec_env: str | None,
-    wrapper_class: Callable[[gymnasium.Env], gymnasium.Env] | None,
+    wrapper_class: Wrapper | None,
     num_threads: int | None,
     kwargs: Mapping[str, Any],
 ) -> VecEnv:

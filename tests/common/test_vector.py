@@ -208,7 +208,9 @@ def test_our_own_become_the_native_batch(mode):
         arrays = [getattr(model.rollout_buffer, name) for model in (ours, other)]
         np.testing.assert_array_equal(*arrays)
     assert ours.costs.horizon == 20 and [e["l"] for e in ours.ep_info_buffer] == [20] * 9
-    assert isinstance(make_vec_env(envs, seed=1), CostMonitor)
+    assert isinstance(make_vec_env(envs, seed=1).unwrapped, GuardVecEnv)
+    by_id = make_vec_env("Goal_Point_8Hazards", 2, vec_env="gymnasium")
+    assert isinstance(by_id.unwrapped, GuardVecEnv)
 
 
 # Costs of a function
@@ -305,7 +307,7 @@ REFUSED = {
     "the space of rows": (lambda: as_vec_env(mixed_up()).reset(), "mixes up single and vector"),
     "a single one": (lambda: GymnasiumVecEnv(Staggered()), "Staggered is no vector environment"),
     "a function of them": (lambda: make_vec_env(sync, 2), "makes a SyncVectorEnv, a vector env"),
-    "a function of single ones": (lambda: CostFromFunction(sync(), far), "is a vector environment"),
+    "a function of single ones": (lambda: CostFromFunction(sync(), far), "Expected env to be a"),
     "made already": (lambda: make_vec_env(sync(), 2), "SyncVectorEnv is made already"),
     "no cost": (lambda: CPO("MlpPolicy", Batch(), **SMALL).learn(20), "no cost key 'cost'"),
     "discrete actions": (

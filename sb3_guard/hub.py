@@ -16,7 +16,7 @@ from sb3_guard.common.certificate import Certificate
 from sb3_guard.costs import estimate
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import packages_flag
-from sb3_guard.zoo.run.folder import RunFolder
+from sb3_guard.zoo.run.folder import PLAYED, RunFolder
 from sb3_guard.zoo.run.progress import summary
 
 # Flags that name files of this machine
@@ -82,7 +82,7 @@ def hub(flags: Flags) -> int:
     figures = [f"{result['n_timesteps']:,} steps{at}, last epoch: {summary(result)}"]
     for actions, played in result["final"].items():
         numbers = (estimate(np.array(played[name], float)) for name in ("returns", "costs"))
-        figures.append("{} actions: return {}, cost {}".format(actions, *numbers))
+        figures.append("{}: return {}, cost {}".format(PLAYED[actions], *numbers))
     if (file := run.path / "certificate.json").is_file():
         figures.append(str(Certificate.from_json(file.read_text())))
     card = CARD.format(

@@ -57,7 +57,7 @@ def measures(result: Mapping[str, Any]) -> dict[str, float]:
 
 
 def final_hash(result: Mapping[str, Any]) -> str:
-    """SHA-256 of the final episodes, from which tiers are made."""
+    """SHA-256 of the final episodes, from which verdicts are made."""
     return hashlib.sha256(json.dumps(result["final"], sort_keys=True).encode()).hexdigest()
 
 

@@ -46,8 +46,8 @@ GRIDS = (
 FOLDERS = (*dict.fromkeys(folder for _, folder in GRIDS),)
 COLUMNS = [
     "environment", "million_steps", "place", "algo", "seeds", "return", "return_std", "cost", "low",
-    "high", "tier", "above", "excess", "greedy_return", "greedy_cost", "greedy_tier", "cost_total",
-    "row",
+    "high", "verdict", "above", "excess", "most_likely_return", "most_likely_cost",
+    "most_likely_verdict", "cost_total", "row",
 ]  # fmt: skip
 MARKS = {"kept": " ✓", "exceeded": " ✗"}
 MILLION = 1_000_000
@@ -119,9 +119,9 @@ def leaderboard(rows: pd.DataFrame) -> pd.DataFrame:
 
     Rows with a place, their limit kept with enough seeds, come first, by return.
     """
-    greedy = rows[rows["split"] == "greedy"].set_index("row")[["return", "cost", "tier"]]
-    final = rows[rows["split"] == "stochastic"].join(greedy.add_prefix("greedy_"), on="row")
-    final["kept"] = final["tier"] == "kept"
+    other = rows[rows["split"] == "greedy"].set_index("row")[["return", "cost", "verdict"]]
+    final = rows[rows["split"] == "stochastic"].join(other.add_prefix("most_likely_"), on="row")
+    final["kept"] = final["verdict"] == "kept"
     final["placed"] = final["kept"] & (final["seeds"] >= SEEDS)
     order = ["placed", "kept", "return"]
     final = final.sort_values(order, ascending=False, kind="stable")
@@ -165,10 +165,10 @@ def glance(rows: pd.DataFrame) -> str:
 
 
 def _at_a_glance(row: dict[str, Any]) -> str:
-    """A cell: return, cost, tier and seeds."""
+    """A cell: return, cost, verdict and seeds."""
     digits = 0 if abs(row["return"]) >= 100 else 1
     values = f"{number(row['return'], digits)} / {number(row['cost'], 1)}"
-    return f"{values}{MARKS.get(row['tier'], '')} ({row['seeds']})"
+    return f"{values}{MARKS.get(row['verdict'], '')} ({row['seeds']})"
 
 
 def page(rows: pd.DataFrame) -> str:

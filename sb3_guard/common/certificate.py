@@ -37,7 +37,7 @@ LEAST, MOST = 100, 400  # episodes of a certificate
 ERROR = 0.05  # probability that an agent whose mean cost is above the limit is certified
 PACKAGES = "sb3-guard", "stable-baselines3", "torch", "mujoco"
 
-Verdict = Literal["certified", "exceeds", "undecided"]
+Verdict = Literal["certified", "exceeded", "undecided"]
 
 
 def mean_bounds(values: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
@@ -106,12 +106,12 @@ class CostBound:
     def verdict(self) -> Verdict:
         if self.upper <= self.limit:
             return "certified"
-        return "exceeds" if self.lower > self.limit else "undecided"
+        return "exceeded" if self.lower > self.limit else "undecided"
 
     def __str__(self) -> str:
         words = {
             "certified": f"upper bound {self.upper:.4g}",
-            "exceeds": f"lower bound {self.lower:.4g}",
+            "exceeded": f"lower bound {self.lower:.4g}",
             "undecided": f"bounds {self.lower:.4g} and {self.upper:.4g}",
         }[self.verdict]
         return f"{self.mean:.4g}, {words}, limit {self.limit:g}"
@@ -155,10 +155,10 @@ class Certificate:
 
     @property
     def verdict(self) -> Verdict:
-        """*certified* if every cost is, *exceeds* if any does."""
+        """*certified* if every cost is, *exceeded* if any limit is."""
         verdicts = {cost.verdict for cost in self.costs.values()}
-        if "exceeds" in verdicts:
-            return "exceeds"
+        if "exceeded" in verdicts:
+            return "exceeded"
         safe = verdicts == {"certified"} and self.physics_errors == 0
         return "certified" if safe else "undecided"
 

@@ -166,7 +166,7 @@ class DeliveryCallback(BaseCallback):
                 return f"Delivered, the policy of {steps:,} steps: {certificate}"
             refused.append(certificate)
         nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
-        return f"Nothing is delivered. The nearest candidate {nearest}; {HELP}"
+        return f"Nothing is delivered. The nearest candidate: {nearest}; {HELP}"
 
     def _screen(self, file: Path, limits: np.ndarray) -> tuple[bool, float]:
         """Whether a candidate looks right in a few episodes; its return, or how near it is."""

@@ -91,7 +91,7 @@ def test_without_skewness_the_bounds_are_students():
 
 @pytest.mark.parametrize(
     ("limit", "verdict", "episodes"),
-    [(3.0, "certified", MOST), (0.4, "exceeds", 100), (1.02, "undecided", MOST)],
+    [(3.0, "certified", MOST), (0.4, "exceeded", 100), (1.02, "undecided", MOST)],
 )
 def test_only_all_of_the_episodes_certify(limit, verdict, episodes):
     certificate = certify(Idle(), Lottery(), limit, seed=np.int64(1))
@@ -130,7 +130,7 @@ def test_tries_and_costs_share_the_error():
         certify(
             Idle(), Lottery(keys=("cost", "other")), (3.0, 0.1), cost_keys=("cost", "other"), seed=1
         ).verdict
-        == "exceeds"
+        == "exceeded"
     )
 
 
@@ -195,7 +195,7 @@ def test_an_agent_that_breaks_the_simulation_is_not_certified():
     assert certificate.verdict == "undecided" and certificate.to_decide is None
     assert (certificate.episodes, certificate.physics_errors) == (80, 40)
     assert certificate.costs["cost"].upper < 3.0 and "40 more" in str(certificate)
-    assert certify(Idle(), Breaks(), 0.3, n_episodes=120, seed=1).verdict == "exceeds"
+    assert certify(Idle(), Breaks(), 0.3, n_episodes=120, seed=1).verdict == "exceeded"
 
 
 class Endless(Lottery):

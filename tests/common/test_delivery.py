@@ -82,7 +82,7 @@ def test_nothing_is_delivered_where_nothing_keeps_the_limit(tmp_path, capsys):
     _, deliver = trained(tmp_path, 0.01)
     assert deliver.certificate is None
     assert [path.name for path in tmp_path.iterdir()] == ["candidates"]
-    assert "Nothing is delivered. The nearest candidate exceeds: " in capsys.readouterr().out
+    assert "Nothing is delivered. The nearest candidate: exceeded: " in capsys.readouterr().out
 
 
 def test_a_training_that_continues_keeps_the_candidates_that_it_has(delivered, tmp_path):

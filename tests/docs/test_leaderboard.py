@@ -42,7 +42,7 @@ def test_certified_rows_come_first_by_return(scripts, tmp_path):
     assert {"| PCPO | 12.0 / 24.0 ✓ (3) |", "| TRPO-Lagrangian | 20.0 / 30.0 ✗ (2) |"} < {*glance}
     table = board.leaderboard(rows)
     # Two seeds are too few for a place.
-    assert table[["algo", "seeds", "tier"]].values.tolist() == [
+    assert table[["algo", "seeds", "verdict"]].values.tolist() == [
         ["pcpo", 3, "kept"], ["cpo", 3, "kept"], ["p3o", 2, "kept"],
         ["trpo_lag", 2, "exceeded"],
     ]  # fmt: skip
@@ -70,7 +70,7 @@ def test_an_unconstrained_row_is_judged_by_the_limit_of_the_page(scripts, tmp_pa
     archives.pack(tmp_path / "logs", "grand_table")
     rows, _ = board.read()
     (row,) = rows.query("split == 'stochastic'").to_dict("records")
-    assert row["tier"] == "exceeded" and row["above"] == 1
+    assert row["verdict"] == "exceeded" and row["above"] == 1
 
 
 def test_packed_logs_are_small(scripts, tmp_path):

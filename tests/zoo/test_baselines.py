@@ -74,7 +74,7 @@ def test_costs_of_other_names_are_those_of_the_monitor(tmp_path, capsys):
     result = json.loads((run / "result.json").read_text())
     assert min(result["final"]["greedy"]["costs"]) > 0
     out = capsys.readouterr().out
-    for name, played in result["final"].items():
+    for name, played in zip(("sampled", "most likely"), result["final"].values(), strict=True):
         said = out.partition(f"Final policy, {name} actions")[2].partition("\n")[0]
         assert f"; noise {np.mean(played['bounded']['noise']):.3f}" in said
     assert set(result["final"]["greedy"]["bounded"]) == set(result["costs"]) == {"heat", "noise"}

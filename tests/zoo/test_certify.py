@@ -9,7 +9,7 @@ from sb3_guard import certify_agent
 SHORT = ["--pretrained", "--algo", "trpo", "--env-kwargs", "max_episode_steps:5"]
 
 
-@pytest.mark.parametrize(("limit", "verdict"), [("5", "certified"), ("-1", "exceeds")])
+@pytest.mark.parametrize(("limit", "verdict"), [("5", "certified"), ("-1", "exceeded")])
 def test_the_status_is_the_verdict(limit, verdict, tmp_path, capsys):
     file = tmp_path / "certificate.json"
     status = certify_agent.main([*SHORT, "--cost-limit", limit, "--json", str(file)])

@@ -31,7 +31,7 @@ def test_what_is_uploaded(run, tmp_path):
     assert not {*tmp_path.glob("checkpoint.zip"), *tmp_path.glob("result.json")}
     assert "Filmed-v0" in yaml.safe_load(metadata)["tags"]
     assert "# CPO on Filmed-v0\n" in page and "480 steps at cost limit 2.0, last epoch: " in page
-    assert "stochastic actions: return " in page and "greedy actions: return " in page
+    assert "sampled actions: return " in page and "most likely actions: return " in page
 
 
 def test_the_commands_of_the_card_are_commands(run, tmp_path, capsys):

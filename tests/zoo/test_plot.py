@@ -224,7 +224,7 @@ def test_default_draws_curves_and_prints_tables(small, tmp_path, capsys, monkeyp
     for text in ("return", "5.00\xa0±\xa00.00", "PPO", "0: exceeded"):
         assert text in printed
     assert "left out: " in err and "v0_3/0.monitor.csv: it has no episodes" in err
-    results = printed.partition("\nTiers")[0].splitlines()
+    results = printed.partition("\nVerdicts")[0].splitlines()
     (row,) = (line.split() for line in results if "CPO  " in line and "0:" in line)
     assert row[:5] == [POINT, "CPO", "0:", "exceeded", "2"]
 
@@ -251,13 +251,13 @@ def test_each_of_several_costs_has_its_verdict_and_its_panel(tmp_path, capsys):
     assert (row["M_c/heat"], row["cost_limit/noise"]) == (4, 2)
     shown = tables(found)
     assert shown["Results"]["limit"].tolist() == ["5 2: exceeded"]
-    assert shown["Tiers"][["cost key", "limit"]].to_numpy().tolist() == [
+    assert shown["Verdicts"][["cost key", "limit"]].to_numpy().tolist() == [
         ["heat", "5: kept"], ["noise", "2: exceeded"]
     ]  # fmt: skip
     limited(tmp_path / "logs", 1)
     fake_run(tmp_path / "logs", "trpo")  # which knows the total only
     found = read(tmp_path / "logs")
-    assert tables(found)["Tiers"]["cost key"].tolist() == ["total", "heat", "noise"]
+    assert tables(found)["Verdicts"]["cost key"].tolist() == ["total", "heat", "noise"]
     for kind, panels in (("curves", 5), ("pareto", 3)):
         (drawing,) = draw(kind, found).values()
         assert len(drawing.axes) == panels

@@ -35,7 +35,7 @@ def test_a_shipped_agent_is_small_and_acts_as_the_one_that_was_trained(run):
     result = run.checked_result()
     for actions, shown in pretrained.certificates(run).items():
         assert shown.deterministic is (actions == "deterministic") and shown.env["id"] == env_id
-        assert shown.verdict == ("certified" if "cost_limit" in result else "exceeds")
+        assert shown.verdict == ("certified" if "cost_limit" in result else "exceeded")
         assert shown.nearest.limit == result.get("cost_limit", shown.nearest.limit)
 
     model = load_pretrained(env_id, algo, device="cpu")

@@ -57,7 +57,7 @@ def test_a_row_that_went_another_way(again):
     assert status == 1 and "Not the same: the training episodes differ" in out
     assert "  cost of the final epoch: before 99, now" in out
     assert "The run before is of commit abc" in out
-    # Every tier is made of the final episodes.
+    # Every verdict is made of the final episodes.
     status, out = again({"final": "0123"})
     assert status == 1 and "the final episodes differ" in out and "training episodes" not in out
     for name in reproduce.MEASURES:  # which the episodes do not make

@@ -101,7 +101,7 @@ def test_each_draw_of_few_seeds_is_taken_equally_often(monkeypatch):
     assert sorted(seen[0]) == pytest.approx(sorted(draws * 371))
 
 
-def test_tiers():
+def test_verdicts():
     assert verdict(1, 2, 2) == "kept"
     assert verdict(2, 3, 2) == verdict(1, 3, 2) == "undecided"
     assert verdict(2.1, 3, 2) == "exceeded"
@@ -126,24 +126,24 @@ def judged(tmp_path):
 def test_a_row_for_each_split(judged):
     table = judge(judged).set_index(["algo", "split"])
     row = table.loc["cpo", "stochastic"]
-    assert (row["seeds"], row["limit"], row["tier"]) == (2, 5, "kept")
+    assert (row["seeds"], row["limit"], row["verdict"]) == (2, 5, "kept")
     assert (row["return"], row["return_std"]) == (10.5, 0)
     assert (row["cost"], row["cost_std"]) == (2.5, pytest.approx(0.5**0.5))  # seeds: 2 and 3
     assert (row["above"], row["excess"]) == (0, NONE)
     row = table.loc["cpo", "greedy"]
     # Both seeds are drawn twice in a quarter of the samples each.
-    assert (row["low"], row["high"], row["tier"]) == (4, 9, "undecided")
+    assert (row["low"], row["high"], row["verdict"]) == (4, 9, "undecided")
     assert (row["above"], row["excess"]) == (0.5, (9 - 5) / 5)
     row = table.loc["trpo", "stochastic"]  # judged by the limit of the others
-    assert (row["tier"], row["above"], row["excess"]) == (
+    assert (row["verdict"], row["above"], row["excess"]) == (
         "exceeded",
         1,
         pytest.approx((0.2 + 2.2) / 2),
     )
     # fake_run's last ten epochs are whole: 60 episodes of cost 5 ± a noise whose mean is 0.
     assert table.loc["cpo", "training"]["cost"] == pytest.approx(5)
-    text = tables(Data(judged))["Tiers"]
-    cells = text[text["episodes"] == "final greedy"].set_index("algorithm").loc["CPO"]
+    text = tables(Data(judged))["Verdicts"]
+    cells = text[text["episodes"] == "final, most likely actions"].set_index("algorithm").loc["CPO"]
     assert cells["limit"] == "5: undecided" and cells["cost"] == "6.5\xa0±\xa03.5 [4.0, 9.0]"
     assert cells["above limit, %"] == "50.0" and cells["excess"] == "0.80"
 
@@ -169,7 +169,7 @@ def test_few_seeds_keep_the_limit_too_often(seeds, share):
 
 
 def test_a_limit_on_the_worst_step_has_its_tier_and_says_nothing_of_the_sum(tmp_path):
-    """SCPO's: no tier by the sum of an episode's costs, and none for TRPO by that limit."""
+    """SCPO's: no verdict by the sum of an episode's costs, and none for TRPO by that limit."""
     played = final([6.0, 9.0], [1.0, 9.0])
     fake_run(tmp_path, "trpo", final=played)
     played["stochastic"]["bounded"] = {"cost": [0.25, 0.75]}
@@ -179,11 +179,12 @@ def test_a_limit_on_the_worst_step_has_its_tier_and_says_nothing_of_the_sum(tmp_
     table = judge(runs).set_index(["algo", "split", "key"])
     worst = table.loc["scpo", "stochastic", "worst step of cost"]
     assert (worst["cost"], worst["low"], worst["high"]) == (0.5, 0.25, 0.75)
-    assert {*table.drop(worst.name)["tier"]} == {""} and worst["tier"] == "kept"
+    assert {*table.drop(worst.name)["verdict"]} == {""} and worst["verdict"] == "kept"
     assert runs["limits"].dropna().tolist() == ["5"]
     shown = tables(Data(runs))
     assert shown["Results"]["limit"].tolist() == ["–", "5: kept"]
-    (row,) = shown["Tiers"][shown["Tiers"]["cost key"] == "worst step of cost"].to_dict("records")
+    verdicts = shown["Verdicts"]
+    (row,) = verdicts[verdicts["cost key"] == "worst step of cost"].to_dict("records")
     assert (row["limit"], row["cost"]) == ("5: kept", "0.5 [0.2, 0.8]")
     for kind in ("curves", "pareto"):
         assert draw(kind, Data(runs))
@@ -207,11 +208,11 @@ def test_near_the_limit_the_draw_does_not_decide(tmp_path, monkeypatch):
 
     monkeypatch.setattr(statistics, "nested_interval", rough)
     played = {"returns": [1.0] * 4, "costs": [20.0] * 4, "lengths": [9] * 4}
-    for limit, tiers, draws in (25.0, ["undecided"], 2), (26.0, ["kept"], 1):
+    for limit, verdicts, draws in (25.0, ["undecided"], 2), (26.0, ["kept"], 1):
         drawn.clear()
         fake_run(tmp_path / str(limit), cost_limit=limit, final={"stochastic": played})
         found = judge(read_results([tmp_path / str(limit)]).runs)
-        assert found.query("split == 'stochastic'")["tier"].tolist() == tiers
+        assert found.query("split == 'stochastic'")["verdict"].tolist() == verdicts
         assert len(drawn) == 2 * draws  # of the training episodes, too
 
 
@@ -324,9 +325,9 @@ def test_tables_agree(tmp_path):
         fake_run(tmp_path, seed=seed, returns=20.0 + 5 * seed, cost=6.0 + seed, final=final,
                  config={"cost_limit": 5.5})  # fmt: skip
     shown = tables(Data(read_results([tmp_path]).runs))
-    assert {*shown} == {"Results", "Tiers"}
-    tiers = shown["Tiers"].set_index("episodes")["limit"]
-    assert tiers["final stochastic"] == shown["Results"]["limit"][0] == "5.5: undecided"
+    assert {*shown} == {"Results", "Verdicts"}
+    verdicts = shown["Verdicts"].set_index("episodes")["limit"]
+    assert verdicts["final, sampled actions"] == shown["Results"]["limit"][0] == "5.5: undecided"
     assert shown["Results"]["episode cost"][0] == "7.00\xa0±\xa01.00"
     assert all("standard deviation" in CAPTIONS[title] for title in shown)
 

@@ -1,6 +1,6 @@
 """Statistics of runs: how they keep their limits, means over seeds, and the GUARD paper's scores.
 
-Agents are judged by three kinds of episodes; share of violations, D⁺ and tiers follow SafeRLEval
+Agents are judged by three kinds of episodes; share of violations, D⁺ and verdicts follow SafeRLEval
 (arXiv 2609.15315). Scores are relative to TRPO's (arXiv 2305.13681).
 """
 
@@ -14,15 +14,14 @@ import pandas as pd
 
 from sb3_guard.costs import bounded_name, verdict
 from sb3_guard.zoo.results.runs import REFERENCE, read_episodes
-from sb3_guard.zoo.run.folder import EPOCH
+from sb3_guard.zoo.run.folder import EPOCH, PLAYED
 
 SCORES = {"J_r": "reward", "M_c": "cost", "rho_c": "cost_rate"}
 EPOCHS = 10  # at the end of a run, that its training is judged by
 #: by key what was played; the final ones are in ``result.json``, see ``Training``
 SPLITS = {
     "training": "training episodes",
-    "stochastic": "final stochastic",
-    "greedy": "final greedy",
+    **{split: f"final, {actions}" for split, actions in PLAYED.items()},
 }
 
 
@@ -128,9 +127,9 @@ def judge(runs: pd.DataFrame) -> pd.DataFrame:
     :return: ``suite``, ``algo``, ``label``, ``split``, ``key`` of a cost with a limit of its own
         (empty: the total), ``seeds``, ``limit`` (NaN: none), ``return`` and ``cost``, means over
         seeds of their episodes' means, with ``_std`` (over seeds; NaN for one), ``low`` and
-        ``high`` of the cost (:func:`nested_interval`), ``tier`` (SafeRLEval's word for
-        :func:`~sb3_guard.costs.verdict`; empty: no limit), ``diverged`` (further episodes, which a
-        physics error ended), ``above`` and ``excess``
+        ``high`` of the cost (:func:`nested_interval`), ``verdict``
+        (:func:`~sb3_guard.costs.verdict`, SafeRLEval's tier; empty: no limit), ``diverged``
+        (further episodes, which a physics error ended), ``above`` and ``excess``
         (:func:`violations`, of all seeds' episodes)
     """
     rows = []
@@ -148,7 +147,9 @@ def judge(runs: pd.DataFrame) -> pd.DataFrame:
                 if episodes and all(f"M_c{end}" in seed for seed in episodes):
                     row = _row(episodes, f"M_c{end}", limit)
                     rows.append({**names, "split": split, "key": end[1:], **row})
-    return pd.DataFrame(rows, columns=None if rows else ["suite", "algo", "split", "key", "tier"])
+    return pd.DataFrame(
+        rows, columns=None if rows else ["suite", "algo", "split", "key", "verdict"]
+    )
 
 
 def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, object]:
@@ -169,7 +170,7 @@ def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, 
         "cost_std": means[column].std(),
         "low": low,
         "high": high,
-        "tier": "" if math.isnan(limit) else verdict(low, high, limit, diverged) or "undecided",
+        "verdict": "" if math.isnan(limit) else verdict(low, high, limit, diverged) or "undecided",
         "diverged": diverged,
         "above": math.nan if math.isnan(limit) else above,
         "excess": excess,

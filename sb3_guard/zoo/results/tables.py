@@ -31,8 +31,8 @@ SCORE_HEADINGS = {score: f"{score.replace('_', ' ')} / TRPO" for score in SCORES
 SPREAD = "± is the standard deviation over seeds."
 CAPTIONS = {
     "Results": "Means over the episodes of the final epoch of training, with sampled actions. "
-    f"{SPREAD} Limits have the tier of the final stochastic episodes.",
-    "Tiers": f"{SPREAD} Brackets are the 95 % bootstrap interval of the mean. A limit is "
+    f"{SPREAD} Limits have the verdict of the final episodes with sampled actions.",
+    "Verdicts": f"{SPREAD} Brackets are the 95 % bootstrap interval of the mean. A limit is "
     "kept if the interval lies at or below it, exceeded if above it, else undecided. Excess "
     "is relative, a mean over the episodes above the limit.",
     "Relative to TRPO": "Return, cost and cost rate of the final epoch relative to TRPO's. Those "
@@ -116,17 +116,17 @@ def _cost(row: Any) -> str:
 
 def _limits(splits: pd.DataFrame) -> Callable[[Any], str]:
     """
-    A cell with the limits of an algorithm and the tier of its final stochastic episodes.
+    A cell with an algorithm's limits and the verdict of final episodes with sampled actions.
 
-    Runs of older versions have the tier of their training; several costs have the worst.
+    Runs without final episodes have that of their training; several costs have the worst.
     """
 
     def cell(row: Any) -> str:
         here = splits[(splits["suite"] == row["suite"]) & (splits["algo"] == row["algo"])]
         for split in ("stochastic", "training"):
-            tiers = {*here.loc[here["split"] == split, "tier"]} - {""}
-            if tiers and not pd.isna(row["limits"]):
-                worst = next(tier for tier in ("exceeded", "undecided", "kept") if tier in tiers)
+            verdicts = {*here.loc[here["split"] == split, "verdict"]} - {""}
+            if verdicts and not pd.isna(row["limits"]):
+                worst = next(v for v in ("exceeded", "undecided", "kept") if v in verdicts)
                 return f"{row['limits']}: {worst}"
         return "–" if pd.isna(row["limits"]) else str(row["limits"])
 
@@ -138,7 +138,7 @@ def _delivered(row: Any) -> str:
     return "–" if pd.isna(row["delivered"]) else f"{row['delivered']:.0%}"
 
 
-TIER_HEADINGS: Columns = {
+VERDICT_HEADINGS: Columns = {
     "episodes": lambda row: SPLITS[row["split"]],
     "cost key": lambda row: row["key"] or "total",
     "seeds": whole("seeds"),
@@ -147,7 +147,7 @@ TIER_HEADINGS: Columns = {
     "limit": lambda row: (
         "–"
         if pd.isna(row["limit"])
-        else f"{row['limit']:g}: {row['tier']}" + beside(row["diverged"])
+        else f"{row['limit']:g}: {row['verdict']}" + beside(row["diverged"])
     ),
     "above limit, %": lambda row: number(100 * row["above"], 1),
     "excess": "excess",
@@ -162,7 +162,8 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
     splits = data.splits
     several = splits.groupby(["suite", "algo"])["key"].transform("max") != ""
     splits = splits[(splits["key"] != "") | ~several]
-    tiers = {h: c for h, c in TIER_HEADINGS.items() if h != "cost key" or splits["key"].any()}
+    headings = VERDICT_HEADINGS.items()
+    verdicts = {h: c for h, c in headings if h != "cost key" or splits["key"].any()}
     result = {
         "Results": spelled(
             data.means,
@@ -175,7 +176,7 @@ def tables(data: Data) -> dict[str, pd.DataFrame]:
                 **({"delivered": _delivered} if data.runs["delivered"].notna().any() else {}),
             },
         ),
-        "Tiers": spelled(splits, {**who, **tiers}),
+        "Verdicts": spelled(splits, {**who, **verdicts}),
     }
     scores = data.scores.reset_index()
     if scores[["reward", "cost"]].notna().any(axis=None):

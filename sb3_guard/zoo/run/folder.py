@@ -21,6 +21,8 @@ from sb3_guard.zoo.run.flags import RunFlags
 CHECKPOINT = "checkpoint.zip"
 # What a result measures: return, episode cost and cost rate; null where no episode has ended.
 MEASURES = ("return", "cost", "cost_rate")
+# What is played after training, by its name in a result, in words.
+PLAYED = {"stochastic": "sampled actions", "greedy": "most likely actions"}
 EPOCH = 30_000  # steps, the paper's; of algorithms whose rollouts are a few steps long
 PATIENCE = 1.0  # seconds after which a lock that says nothing is that of a process that died
 

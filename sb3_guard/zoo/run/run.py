@@ -61,7 +61,7 @@ from sb3_guard.zoo.run.checkpoint import (
     read_normalizer,
 )
 from sb3_guard.zoo.run.flags import RunFlags
-from sb3_guard.zoo.run.folder import RunFolder, is_run, lock, run_path, write_config
+from sb3_guard.zoo.run.folder import PLAYED, RunFolder, is_run, lock, run_path, write_config
 from sb3_guard.zoo.run.hyperparams import (
     action_noise,
     check,
@@ -83,8 +83,6 @@ from sb3_guard.zoo.run.progress import Epochs, summary
 
 FINAL_EPISODES = 100  # of each policy, after training
 DELIVERY_ENVS = 40  # in which candidates are screened and certified
-#: what is played after training: the policy that was trained, and its most likely actions
-SPLITS = ("stochastic", "greedy")
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
 
 
@@ -721,7 +719,7 @@ class Run:
 
         with closing(env):
             sync_normalization(self.env, env)
-            for name in SPLITS:
+            for name in PLAYED:
                 played = evaluate_policy(
                     self.model,
                     env,
@@ -732,7 +730,7 @@ class Run:
                 if not len(played):  # no episode of the greedy policy ends
                     continue
                 if self.flags.verbose > 0:
-                    print(f"Final policy, {name} actions, {played}")
+                    print(f"Final policy, {PLAYED[name]}, {played}")
                 final[name] = {
                     "returns": rounded(played.returns),
                     "costs": rounded(played.costs),

@@ -147,9 +147,8 @@ def judge(runs: pd.DataFrame) -> pd.DataFrame:
                 if episodes and all(f"M_c{end}" in seed for seed in episodes):
                     row = _row(episodes, f"M_c{end}", limit)
                     rows.append({**names, "split": split, "key": end[1:], **row})
-    return pd.DataFrame(
-        rows, columns=None if rows else ["suite", "algo", "split", "key", "verdict"]
-    )
+    empty = ["suite", "algo", "split", "key", "verdict"]
+    return pd.DataFrame(rows, columns=None if rows else empty)
 
 
 def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, object]:

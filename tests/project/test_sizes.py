@@ -19,9 +19,9 @@ LINES = {
     "sb3_guard/common": 2_518,
     "sb3_guard/deployment": 916,
     "harness": 8_406,
-    "tests": 24_839,
+    "tests": 24_970,
 }
-WORDS = 61_101  # of all tracked markdown but the changelog
+WORDS = 61_944  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

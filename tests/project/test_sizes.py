@@ -19,7 +19,7 @@ LINES = {
     "sb3_guard/common": 2_511,
     "sb3_guard/deployment": 916,
     "harness": 8_406,
-    "tests": 24_972,
+    "tests": 24_968,
 }
 WORDS = 61_947  # of all tracked markdown but the changelog
 

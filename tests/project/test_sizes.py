@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_406,
     "tests": 24_968,
 }
-WORDS = 61_947  # of all tracked markdown but the changelog
+WORDS = 61_820  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

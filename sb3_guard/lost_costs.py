@@ -1,14 +1,22 @@
 """Environments that lose costs: refused before an agent learns from what is left."""
 
 import gymnasium as gym
-from gymnasium.wrappers import AtariPreprocessing, MaxAndSkipObservation, RepeatAction
+from gymnasium import wrappers
 from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_guard.checks import ContractError
 
-# They take several steps for one of the agent, and tell the cost of the last one alone.
-REPEATING = (AtariPreprocessing, MaxAndSkipObservation, RepeatAction, MaxAndSkipEnv)
+# They take several steps for one of the agent, and tell the cost of the last one alone. Gymnasium
+# 0.29, which the original Safety-Gymnasium needs, has the first one only.
+REPEATING: tuple[type, ...] = (
+    MaxAndSkipEnv,
+    *(
+        getattr(wrappers, name)
+        for name in ("AtariPreprocessing", "MaxAndSkipObservation", "RepeatAction")
+        if hasattr(wrappers, name)
+    ),
+)
 
 
 def refuse_lost_costs(venv: VecEnv | None) -> None:

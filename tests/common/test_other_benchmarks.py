@@ -76,12 +76,12 @@ def test_the_original_safety_gymnasium_trains():
         pytest.skip("needs python3.11 scripts/safety_gymnasium/check.py")
     script = ROOT / "scripts" / "safety_gymnasium" / "check.py"
     done = subprocess.run(
-        [str(python), str(script), "--train-only", "-n", "4000"],
+        [str(python), str(script), "--train-only", "-n", "2000"],
         capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert (
-        "mujoco 2.3.3" in done.stdout and "SafetyPointGoal1-v0, subproc: 4000 steps" in done.stdout
+        "mujoco 2.3.3" in done.stdout and "SafetyPointGoal1-v0, subproc: 2000 steps" in done.stdout
     )
 
 

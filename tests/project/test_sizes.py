@@ -13,13 +13,13 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_448,
+    "sb3_guard": 26_456,
     "sb3_guard/envs": 8_823,
     "sb3_guard/algorithms": 5_792,
     "sb3_guard/common": 2_511,
     "sb3_guard/deployment": 916,
-    "harness": 8_406,
-    "tests": 24_968,
+    "harness": 8_414,
+    "tests": 24_972,
 }
 WORDS = 61_820  # of all tracked markdown but the changelog
 

@@ -47,7 +47,7 @@ def set_up(folder: Path, mujoco: str) -> Path:
     # MuJoCo 2.3 was compiled for NumPy 1
     install("numpy<2", "gymnasium==0.29.1", "stable_baselines3==2.9.2", "scipy")
     # for the commands; RL-Zoo's own pins ask for a newer Gymnasium
-    install("huggingface_hub", "pyyaml", "rich", "tqdm", "wasabi")
+    install("huggingface_hub", "imageio-ffmpeg", "pillow", "pyyaml", "rich", "tqdm", "wasabi")
     zoo = ("rl_zoo3==2.9.2", "sb3_contrib==2.9.2", "sb3-team-hf-integration==3.2")
     install("--no-deps", *zoo)
     if mujoco != "none":

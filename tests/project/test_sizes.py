@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_414,
     "tests": 24_972,
 }
-WORDS = 61_810  # of all tracked markdown but the changelog
+WORDS = 62_262  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -27,7 +27,7 @@ from sb3_guard.zoo.agents.playback import find_run, open_agent
 from sb3_guard.zoo.agents.pretrained import load_pretrained
 from sb3_guard.zoo.cli.usage import UsageError
 
-TRAINED = "Goal_Point_8Hazards-v0"  # the suite of the animation
+TRAINED = "SafetyPointGoal1-v0"  # the suite of the animation
 AGENTS = ("trpo", None)  # in it: the one without a limit, and the one with a limit
 PERIOD = 2  # control steps, of 0.02 s, from frame to frame
 FRAMES = 240
@@ -81,6 +81,13 @@ def picture(
     print(f"{path} {path.stat().st_size / 1024:.0f} KiB")
 
 
+def acts(model: BaseAlgorithm, obs: Any) -> np.ndarray:
+    """The most likely actions of an agent of the package's, which may normalise what it observes."""
+    normalizer = model.get_vec_normalize_env()
+    seen = obs if normalizer is None else normalizer.normalize_obs(obs)
+    return model.predict(seen, deterministic=True)[0]
+
+
 def typical() -> int:
     """Of 100 seeds the one whose returns and costs are nearest to the means of both agents."""
     distance = np.zeros(100)
@@ -89,7 +96,7 @@ def typical() -> int:
         model = load_pretrained(TRAINED, key, device="cpu")
         obs, got = env.reset(), np.zeros((2, 100))
         for _ in range(FRAMES * PERIOD):
-            obs, rewards, _, infos = env.step(model.predict(obs, deterministic=True)[0])
+            obs, rewards, _, infos = env.step(acts(model, obs))
             got += rewards, [info["cost"] for info in infos]
         env.close()
         name = type(model).__name__
@@ -114,9 +121,9 @@ def film(key: str | None, seed: int) -> list[Image.Image]:
             draw = ImageDraw.Draw(frame)
             color = (200, 0, 0) if cost > 0 else (40, 40, 40)
             draw.text((2, 3), f"{model.label}   return {reward:z.1f}", (40, 40, 40), font)
-            draw.text((398, 3), f"cost {cost:.2f}", color, font, anchor="ra")
+            draw.text((398, 3), f"cost {cost:.0f}", color, font, anchor="ra")
             frames.append(frame)
-        obs, rewards, _, infos = env.step(model.predict(obs, deterministic=True)[0])
+        obs, rewards, _, infos = env.step(acts(model, obs))
         reward, cost = reward + rewards[0], cost + infos[0]["cost"]
     env.close()
     return frames

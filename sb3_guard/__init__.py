@@ -17,6 +17,7 @@ _EXPORTS = {
     "sb3_guard.algorithms.common.warm_start": ("warm_start",),
     "sb3_guard.common.callbacks": ("CostEvalCallback", "LogCosts"),
     "sb3_guard.common.certificate": ("Certificate", "certify"),
+    "sb3_guard.common.delivery": ("DeliveryCallback",),
     "sb3_guard.common.evaluation": ("evaluate_policy",),
     "sb3_guard.common.monitor": ("CostMonitor",),
     "sb3_guard.common.native": ("GuardVecEnv",),

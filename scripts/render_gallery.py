@@ -82,7 +82,7 @@ def picture(
 
 
 def acts(model: BaseAlgorithm, obs: Any) -> np.ndarray:
-    """The most likely actions of an agent of the package's, which may normalise what it observes."""
+    """The most likely actions of one of the package's agents, which may normalise observations."""
     normalizer = model.get_vec_normalize_env()
     seen = obs if normalizer is None else normalizer.normalize_obs(obs)
     return model.predict(seen, deterministic=True)[0]
@@ -101,7 +101,7 @@ def typical() -> int:
         env.close()
         name = type(model).__name__
         print(f"{name}: mean return {got[0].mean():.2f}, mean cost {got[1].mean():.2f}")
-        distance += (((got.T - got.mean(axis=1)) / got.std(axis=1)) ** 2).sum(axis=1)
+        distance += abs(got.T / got.mean(axis=1) - 1.0).sum(axis=1)
     return int(distance.argmin())
 
 

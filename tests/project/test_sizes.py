@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_456,
+    "sb3_guard": 26_457,
     "sb3_guard/envs": 8_823,
     "sb3_guard/algorithms": 5_792,
     "sb3_guard/common": 2_511,
     "sb3_guard/deployment": 916,
-    "harness": 8_414,
-    "tests": 24_972,
+    "harness": 8_415,
+    "tests": 24_969,
 }
-WORDS = 62_262  # of all tracked markdown but the changelog
+WORDS = 61_944  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -117,11 +117,8 @@ def test_runs_of_several_lengths_are_not_averaged(tmp_path):
     for epochs in (3, 6):
         fake_run(tmp_path, epochs=epochs)
     found = read_results([tmp_path]).runs
-    with pytest.raises(UsageError, match=r"of cpo differ in length, 300, 600, .* --steps 600"):
+    with pytest.raises(UsageError, match="of cpo differ in length, 300, 600, and can"):
         select(found)
-    with pytest.raises(UsageError, match=r"no run of length 7; .* 300, 400, 600"):
-        choose(found, steps=7)
-    assert select(choose(found, steps=300))["steps"].tolist() == [300]
 
 
 def test_environments_of_other_settings_are_not_compared(tmp_path):

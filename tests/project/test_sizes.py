@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_415,
     "tests": 24_969,
 }
-WORDS = 61_944  # of all tracked markdown but the changelog
+WORDS = 61_973  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

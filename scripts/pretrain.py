@@ -156,7 +156,9 @@ def write(run: RunFolder, limit: float | None, got: dict[str, Certificate]) -> R
             saved[name] = th.as_tensor(getattr(normalizer.obs_rms, name), dtype=th.float64)
     th.save(saved, weights(copy))
     kept = {key: value for key, value in result.items() if key not in DROPPED}
-    if limit is not None:
+    if limit is None:
+        kept.pop("cost_limit", None)
+    else:
         if "cost_limit" in kept:
             kept.setdefault("trained_at", kept["cost_limit"])
         kept["cost_limit"] = limit

@@ -11,9 +11,10 @@ import shlex
 import signal
 import sys
 import time
+import uuid
 import warnings
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -104,14 +105,16 @@ class Run:
     folder: RunFolder | None = None
 
     def __post_init__(self) -> None:
-        if self.flags.track and not self.flags.tensorboard_log:
-            self.flags = dataclasses.replace(self.flags, tensorboard_log="runs")
+        if self.flags.track:
+            import wandb  # noqa: F401  if it is absent, nothing begins
+
+            log = self.flags.tensorboard_log or "runs"
+            self.flags = dataclasses.replace(self.flags, tensorboard_log=log)
         self.model: BaseAlgorithm
         self.env: VecEnv
         self.callbacks: list[BaseCallback]
         self.evaluation: CostEvalCallback | None = None
         self.delivery: DeliveryCallback | None = None
-        self.tracker: Any = None
         #: what to continue from
         self.begun: dict[str, Any] | None = None
 
@@ -259,8 +262,6 @@ class Run:
                     self.delivery = DeliveryCallback(
                         env, n_episodes=episodes, seed=seed, verbose=verbose
                     )
-            if flags.track:
-                self.tracker = self._track()
         except BaseException:
             self.close()
             raise
@@ -274,29 +275,25 @@ class Run:
         return MOST if episode and self.hyperparams["n_timesteps"] >= 1000 * episode else 0
 
     def close(self) -> None:
-        """Release the environments, and let Weights & Biases have what it has not yet."""
+        """Release the environments."""
         others = [callback.eval_env for callback in (self.evaluation, self.delivery) if callback]
         for env in (self.env, *others):
             with suppress(*PROCESS_DIED):
                 env.close()
-        if self.tracker is not None:
-            self.tracker.finish()
 
-    def _track(self) -> Any:
-        """
-        The run at Weights & Biases, which sends its TensorBoard events as they are written.
-
-        It comes before they are: events of files that are open already would not be seen.
-        """
+    def _tracked(self, folder: RunFolder) -> AbstractContextManager[Any]:
+        """The run at Weights & Biases, which sends the TensorBoard files that are opened later."""
+        if not self.flags.track:
+            return nullcontext()
         import wandb
 
-        flags = self.flags
-        file = None if self.folder is None else self.folder.params / WANDB
-        run_id = file.read_text().strip() if file is not None and file.exists() else None
+        flags, file = self.flags, folder.params / WANDB
+        if not file.exists():
+            file.write_text(uuid.uuid4().hex)
         return wandb.init(
-            id=run_id,
-            resume="allow" if run_id else None,
-            name=f"{flags.env}__{flags.algo}__{flags.seed}__{int(time.time())}",
+            id=file.read_text(),
+            resume="allow",
+            name=f"{flags.env}__{flags.algo}__{flags.seed}",
             project=flags.wandb_project_name,
             entity=flags.wandb_entity,
             group=flags.wandb_group,
@@ -576,9 +573,7 @@ class Run:
         state, flags, verbose = self.begun, self.flags, self.flags.verbose > 0
         if verbose:
             print(f"Run folder: {folder.path} (seed {flags.seed})")
-        if self.tracker is not None:
-            (folder.params / WANDB).write_text(self.tracker.id)
-            self.tracker.config.update({"folder": str(folder.path)}, allow_val_change=True)
+        tracked = self._tracked(folder)
         with explained(f"can't write to {folder.path}", OSError):
             # Two lines of the csv are no episodes.
             goes_on = state is not None and cut(folder.monitor, 2 + state["episodes"])
@@ -599,7 +594,7 @@ class Run:
         wrappers = [*self.wrappers("env_wrapper"), *self.wrappers("vec_env_wrapper")]
         cut_short = any(getattr(cls, "training_only", False) for cls, _ in wrappers)
         epochs = Epochs(self.hyperparams["n_timesteps"], cut=cut_short)
-        with interrupts(stop) as received:
+        with tracked, interrupts(stop) as received:
             checkpoints = self._checkpoints(
                 folder, epochs, lambda: bool(received) or asked_to_stop()
             )

@@ -38,6 +38,7 @@ from sb3_guard.zoo.results.figure_data import COLORS, INK, Data
 from sb3_guard.zoo.results.figures import STYLE, WIDTH, draw, finish, save
 from sb3_guard.zoo.results.runs import read_episodes, select
 from sb3_guard.zoo.results.statistics import (
+    SPLITS,
     aggregate,
     judge,
     judging_limits,
@@ -57,10 +58,6 @@ IMAGE = re.compile(r"images/((\w+?)_(pareto)_[\w-]+\.png)")
 PUBLISHED_STEPS = 1_000_000
 LAST = 90  # episodes: three rollouts of 30 environments
 APART = 3.0  # standard errors: what counts as learnt
-# What was played, in the words of docs/results.md
-PLAYED = {
-    "training": "training episodes", "stochastic": "final stochastic", "greedy": "final greedy",
-}  # fmt: skip
 
 # Archives, the suite, and whom an algorithm is beside.
 GRIDS = (
@@ -246,12 +243,12 @@ def splits(name: str) -> str:
     digits = 0 if highest >= 100 else 1
     columns: dict[str, Any] = {
         "algorithm": "label",
-        "episodes": lambda row: PLAYED[row["split"]],
+        "episodes": lambda row: SPLITS[row["split"]],
         "seeds": whole("seeds"),
         "return": lambda row: spread(row["return"], row["return_std"], digits),
         "cost": lambda row: spread(row["cost"], row["cost_std"], 1),
         "95 % interval of the cost": lambda row: f"[{row['low']:.1f}, {row['high']:.1f}]",
-        "tier": "verdict",
+        "verdict": "verdict",
         "episodes above the limit": lambda row: percent(row["above"]),
         "D⁺": lambda row: number(row["excess"], 2),
     }

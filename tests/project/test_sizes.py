@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_410,
     "tests": 24_967,
 }
-WORDS = 61_997  # of all tracked markdown but the changelog
+WORDS = 62_101  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -200,13 +200,13 @@ def test_several_steps_survive_saving(tmp_path: Path) -> None:
     assert changed.replay_buffer.cost_gamma == 0.7
     one = SACLag.load(tmp_path / "model", env=points(), n_steps=1)
     assert type(one.replay_buffer) is CostReplayBuffer
-    with pytest.raises(ValueError, match="is CostNStepReplayBuffer, and the"):
+    with pytest.raises(ValueError, match="must be a CostReplayBuffer of"):
         one.load_replay_buffer(tmp_path / "buffer")
     SAC("MlpPolicy", points(), buffer_size=100).save_replay_buffer(tmp_path / "theirs")
-    with pytest.raises(ValueError, match="replay_buffer is ReplayBuffer"):
+    with pytest.raises(ValueError, match="must be a CostReplayBuffer of"):
         one.load_replay_buffer(tmp_path / "theirs")
     two = TD3Lag("MlpPolicy", points(), cost_keys=("cost", "heat"), n_steps=3, cost_limit=1.0)
-    with pytest.raises(ValueError, match="n_costs is 1, and the model's 2"):
+    with pytest.raises(ValueError, match=r"a CostNStepReplayBuffer of .* and 2 costs"):
         two.load_replay_buffer(tmp_path / "buffer")
     assert type(one.replay_buffer) is CostReplayBuffer
     one.save(tmp_path / "one")

@@ -29,7 +29,7 @@ from sb3_guard.algorithms.common.actor import (
     value_parameters,
 )
 from sb3_guard.algorithms.common.batches import CHUNK
-from sb3_guard.algorithms.common.critics import CostCritic, regress
+from sb3_guard.algorithms.common.critics import StateNetwork, regress
 from sb3_guard.algorithms.common.vectors import assign, flatten
 from sb3_guard.algorithms.fast.actor import TanhActor, actor_of, tanh_actor
 
@@ -210,7 +210,7 @@ def _ids(parameters: Any) -> set[int]:
 def test_a_regression_takes_the_steps_of_a_loop_by_hand(batch_size: int | None) -> None:
     """Equal minibatches, a whole pass each, and the loss of the last one; slices change nothing."""
     n, k = (200, 3) if batch_size else (CHUNK + 100, 1)
-    critic = CostCritic(make_policy(HEADS["gaussian"]), 2)
+    critic = StateNetwork(make_policy(HEADS["gaussian"]), 2)
     twin = copy.deepcopy(critic)
     twin.optimizer = th.optim.SGD(twin.parameters(), lr=0.1)
     observations, targets = th.randn(n, 5), th.randn(n, 2)

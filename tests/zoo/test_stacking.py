@@ -4,16 +4,12 @@ import numpy as np
 import pytest
 from cost_envs import RandomCostEnv
 from gymnasium import register, registry, spaces
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import (
-    VecFrameStack,
-    VecNormalize,
-    VecTransposeImage,
     unwrap_vec_normalize,
 )
 from typed import LENGTH, TOY
 
-from sb3_guard import SACLag, enjoy, export_agent, make_model, train
+from sb3_guard import enjoy, export_agent, make_model, train
 
 ACTIONS = spaces.Box(-1.0, 1.0, (2,), np.float32)
 VECTOR = spaces.Box(-1.0, 1.0, (3,), np.float32)
@@ -70,20 +66,3 @@ def test_a_run_with_normalised_frames_is_resumed_played_and_exported(tmp_path, c
     assert enjoy.main([*which, "--n-episodes", "2", "--no-render", "--load-best"]) == 0
     there = ["--n-episodes", "2", "-o", str(tmp_path / "policy.onnx")]
     assert export_agent.main([*which, *there]) == 0
-
-
-@pytest.mark.parametrize(
-    ("env", "policy", "shape"),
-    [
-        (VECTOR, "MlpPolicy", lambda env: VecFrameStack(env, 2)),
-        (IMAGE, "CnnPolicy", VecTransposeImage),
-    ],
-)
-def test_frames_and_images_outside_of_the_normaliser_are_refused(env, policy, shape):
-    def normalized(venv):
-        return VecNormalize(venv, norm_obs=False)
-
-    venv = make_vec_env(lambda: RandomCostEnv(env, ACTIONS), 1)
-    SACLag(policy, normalized(shape(venv)), cost_limit=1.0, **TINY)
-    with pytest.raises(ValueError, match=r"VecNormalize\(VecFrameStack\(env, 4\)\)"):
-        SACLag(policy, shape(normalized(venv)), cost_limit=1.0, **TINY)

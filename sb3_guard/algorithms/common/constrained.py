@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
-from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -117,12 +116,6 @@ class Constrained(BaseAlgorithm):
         self.begin_anew = False
         self.timing: dict[str, float] = {}
         super().__init__(*args, **kwargs)
-        if new and self.env is not None and is_masking_supported(self.env):
-            self._warn_once(
-                "action masks",
-                f"{type(self).__name__} does not use the environment's action_masks: it takes "
-                "actions that they exclude, too; sb3-contrib's MaskablePPO keeps to them",
-            )
 
     # Construction
 

@@ -80,10 +80,6 @@ class StateNetwork(nn.Module):
         )
 
 
-class CostCritic(StateNetwork):
-    """Expected discounted cost-to-go V_c(s), one output per constraint."""
-
-
 def regress(
     values: Callable[[Any], th.Tensor],
     parameters: Iterable[th.Tensor],

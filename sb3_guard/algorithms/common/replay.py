@@ -14,7 +14,6 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import get_obs_shape
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -124,13 +123,6 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         self.replay_buffer_kwargs = {**given, **chosen, "n_costs": len(self.cost_keys)}
 
     def _setup_model(self) -> None:
-        normalizer, space = self._vec_normalize_env, self.observation_space
-        if normalizer and get_obs_shape(normalizer.observation_space) != get_obs_shape(space):
-            raise ValueError(
-                "the replay buffer keeps what VecNormalize is given, so frames are stacked and "
-                "images transposed within: VecNormalize(VecFrameStack(env, 4)), "
-                "VecNormalize(VecTransposeImage(env))"
-            )
         with warnings.catch_warnings():  # SB3 takes it that no buffer but its own knows n_steps
             warnings.filterwarnings("ignore", "`n_steps=")
             super()._setup_model()
@@ -149,20 +141,12 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
     def load_replay_buffer(self, path: Any, *args: Any, **kwargs: Any) -> None:
         before = self.replay_buffer
         super().load_replay_buffer(path, *args, **kwargs)
-        theirs, ours = (
-            {
-                "replay_buffer": type(buffer).__name__,
-                "n_costs": getattr(buffer, "costs", np.zeros(0)).shape[-1],
-                "n_envs": buffer.n_envs,
-                "observation_space": buffer.observation_space,
-                "action_space": buffer.action_space,
-            }
-            for buffer in (self.replay_buffer, before)
-        )
-        for name, value in theirs.items():
-            if value != ours[name]:
-                self.replay_buffer = before
-                raise ValueError(f"{path}: {name} is {value}, and the model's {ours[name]}")
+        kind, shape = type(before), before.costs.shape[1:]
+        if type(self.replay_buffer) is not kind or self.replay_buffer.costs.shape[1:] != shape:
+            self.replay_buffer = before
+            raise ValueError(
+                f"{path}: must be a {kind.__name__} of {shape[0]} environments and {shape[1]} costs"
+            )
         vars(self.replay_buffer).update(self.replay_buffer_kwargs)  # n_steps and discounts
 
     # Collecting

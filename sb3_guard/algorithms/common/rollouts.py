@@ -25,7 +25,7 @@ from sb3_guard.algorithms.common.batches import rows
 from sb3_guard.algorithms.common.buffers import CostDictRolloutBuffer, CostRolloutBuffer
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.algorithms.common.costs import discounted_limit, inverse
-from sb3_guard.algorithms.common.critics import CostCritic, regress
+from sb3_guard.algorithms.common.critics import StateNetwork, regress
 from sb3_guard.algorithms.fast.threads import one_thread
 
 SMALL = 500_000  # weights of a policy that acts on one thread
@@ -140,8 +140,8 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             self.cost_rng = np.random.default_rng(self.seed)
         if self.uses_cost_critic:
             # Its first weights take nothing from the stream that actions are sampled from.
-            with th.random.fork_rng(devices=[]):
-                self.cost_critic = CostCritic(self.policy, len(self.cost_keys))
+            with th.random.fork_rng(devices=[]):  # V_c(s), an output per cost
+                self.cost_critic = StateNetwork(self.policy, len(self.cost_keys))
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_timeouts"]

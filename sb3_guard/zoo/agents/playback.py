@@ -49,21 +49,16 @@ def find_run(
     :param env_id: without a version it is the latest one
     :param number: of the run; 0: the latest, -1: ``<folder>/<algo>`` itself, as in RL-Zoo
     :param packages: modules that the environment needs, for the command in the message
-    :raises UsageError: there is none; the message lists those that there are
+    :raises UsageError: there is none
     """
     parent, name = Path(folder) / algo, folder_name(with_version(env_id))
     number = number or latest_run(parent, name)
     if number:
         return RunFolder(parent if number < 0 else parent / f"{name}_{number}")
     algorithm(algo), source_of(env_id)  # a misspelled name has a message of its own
-    ships = latest_run(PRETRAINED / algo, name)
-    runs = [path for path in sorted(Path(folder).glob("*/*_*")) if is_run(path)]
-    there = dict.fromkeys(f"{path.parent.name} on {path.name.rpartition('_')[0]}" for path in runs)
     raise UsageError(
         f"there is no run of {algo} on {env_id} in {str(folder)!r}; train one with: "
         f"sb3-guard train --algo {algo} --env {env_id} -f {folder}{packages_flag(packages)}"
-        + (f"; or play one of those there: {', '.join(there)}" if there else "")
-        + ("; or play the package's own with --pretrained" if ships else "")
     )
 
 

@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
@@ -242,6 +242,8 @@ class Checkpoints(BaseCallback):
             # Off-policy algorithms fill their buffers with random actions from here.
             "action_space": self.model.action_space.np_random,
             "environments": capture(self.training_env),
+            # Seeded again for each evaluation, but a wrapper may remember more than its episode.
+            "evaluation": [capture(env) for env in self._evaluation_envs()],
             "callbacks": [
                 (callback.n_calls, callback.state() if hasattr(callback, "state") else None)
                 for callback in self.others
@@ -267,6 +269,9 @@ class Checkpoints(BaseCallback):
         self._last = time.monotonic()
         self._took = self._last - began
 
+    def _evaluation_envs(self) -> list[VecEnv]:
+        return [other.eval_env for other in self.others if isinstance(other, EvalCallback)]
+
     def restore(self, model: BaseAlgorithm, state: dict[str, Any]) -> None:
         """
         Put everything where the checkpoint found it; the last thing before ``learn``.
@@ -280,6 +285,9 @@ class Checkpoints(BaseCallback):
             callback.n_calls = n_calls
             if own is not None:
                 callback.restore(own)  # type: ignore[attr-defined]
+        for evaluation, parts in zip(self._evaluation_envs(), state["evaluation"], strict=True):
+            evaluation.reset()
+            restore(evaluation, parts)
         env = model.get_env()
         assert env is not None
         env.reset()

@@ -24,8 +24,8 @@ class CPO(TrustRegion):
 
     Where no such step makes the policy feasible, it lowers the violation, of several limits
     ``Σ max(0, c_i + b_iᵀx)²``, by ``recovery`` of what the region allows. Until the limits hold,
-    the line search asks for less cost, or less of that sum, and not for more reward. A limit whose
-    cost no step changes is left out. The limits are kept with a learnt
+    the line search asks for no more cost, or no more of that sum, and not for more reward. A limit
+    whose cost no step changes is left out. The limits are kept with a learnt
     :class:`~sb3_guard.algorithms.common.costs.Margin`, which the paper does not have.
 
     :param margin_lr: α, how fast the margin follows J_C - d; 0 for no margin, as in the paper

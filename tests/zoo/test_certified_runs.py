@@ -31,6 +31,8 @@ def test_a_run_delivers_and_says_so(run, capsys, tmp_path):
     assert enjoy.main([*here, "--no-render"]) == 0
     out = capsys.readouterr().out
     assert f"Playing {run / 'certified_model.zip'}" in out and str(certificate) in out
+    assert enjoy.main([*here, "--no-render", "--load-final"]) == 0
+    assert f"Playing {run / 'CostPoint-v0.zip'}" in capsys.readouterr().out
     assert export_agent.main([*here, "-o", str(tmp_path / "policy.onnx")]) == 0
     trained_at = json.loads((tmp_path / "contract.json").read_text())["trained"]
     assert trained_at["certificate"] == json.loads((run / "certificate.json").read_text())

@@ -20,6 +20,7 @@ class AgentFlags(Command):
         0)
     :param load_best: take the best checkpoint (highest return among those within the limit) instead
         of the last one
+    :param load_final: take the final model, also where another one is certified
     :param pretrained: take the agent that comes with the package for --env; enjoy without --env
         lists them
     :param load_checkpoint: take the model that was kept after this number of steps
@@ -44,6 +45,7 @@ class AgentFlags(Command):
     folder: str = flag("-f", default="logs", metavar="DIR")
     exp_id: int = flag(default=0, metavar="K")
     load_best: bool = flag(default=False, exclusive="model")
+    load_final: bool = flag(default=False, exclusive="model")
     pretrained: bool = flag(default=False, exclusive="model")
     load_checkpoint: int | None = flag(low=1, metavar="STEPS", exclusive="model")
     load_last_checkpoint: bool = flag(default=False, exclusive="model")

@@ -141,7 +141,8 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
     def load_replay_buffer(self, path: Any, *args: Any, **kwargs: Any) -> None:
         before = self.replay_buffer
         super().load_replay_buffer(path, *args, **kwargs)
-        kind, shape = type(before), before.costs.shape[1:]
+        kind: Any = self.replay_buffer_class
+        shape = self.n_envs, len(self.cost_keys)
         if type(self.replay_buffer) is not kind or self.replay_buffer.costs.shape[1:] != shape:
             self.replay_buffer = before
             raise ValueError(

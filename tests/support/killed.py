@@ -81,7 +81,6 @@ def outcome(run: Path) -> dict[str, object]:
     """What a run came to, its duration and whether it was made longer aside."""
     result = json.loads((run / "result.json").read_text())
     result.pop("seconds")
-    result.pop("learned", None)
     return result
 
 

@@ -38,7 +38,7 @@ FLAGS = {
 }
 MODULES = {"train": "sb3_guard.train", "grid": "sb3_guard.benchmark"}
 CLOCKS = {"t", "time/fps", "time/time_elapsed"}
-NOT_COMPARED = {"seconds", "learned", "commit"}
+NOT_COMPARED = {"seconds", "commit"}
 STUDY = "kills"
 DONE = (TrialState.COMPLETE, TrialState.PRUNED)
 TUNE = (

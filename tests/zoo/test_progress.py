@@ -40,7 +40,7 @@ def test_a_trained_run_says_what_it_was_made_with(tmp_path):
 @pytest.mark.parametrize(("algorithm", "limit"), [(TRPO, None), (CPO, 3.0)])
 def test_only_constrained_algorithms_have_a_limit(algorithm, limit):
     model = algorithm("MlpPolicy", envs(), n_steps=20, cost_limit=3.0, n_critic_updates=1)
-    epochs = Epochs(20)
+    epochs = Epochs()
     model.learn(20, callback=epochs)
     assert epochs.result()["cost_limit"] == limit
     assert epochs.result()["episodes"] == 2
@@ -49,7 +49,7 @@ def test_only_constrained_algorithms_have_a_limit(algorithm, limit):
 def test_the_worst_step_is_judged_by_the_limit_on_it():
     env = CostMonitor(DummyVecEnv([lambda: CostPoint(10, hazard=(-1, 0))]))
     model = SCPO("MlpPolicy", env, n_steps=40, cost_limit=0.0, n_critic_updates=1)
-    epochs = Epochs(40)
+    epochs = Epochs()
     model.learn(40, callback=epochs)
     result = epochs.result()
     (cost,) = result["costs"].values()
@@ -62,7 +62,7 @@ def test_the_worst_step_is_judged_by_the_limit_on_it():
 def test_off_policy_epochs_are_of_the_papers_length(monkeypatch):
     monkeypatch.setattr(progress, "EPOCH", 45)
     model = SAC("MlpPolicy", envs(), learning_starts=1000, buffer_size=200)
-    epochs = Epochs(100)
+    epochs = Epochs()
     model.learn(100, callback=epochs)
     # A rollout is one step long; episodes ended at 60, 70, 80, 90 and 100 of 100.
     assert epochs.result()["episodes"] == 5

@@ -130,9 +130,8 @@ def test_environments_of_other_settings_are_not_compared(tmp_path):
 
 @pytest.mark.parametrize(
     "other",
-    [{"seed": 1, "config": {"env_wrapper": "a.B"}}, {"args": {"trained_agent": "old.zip"}},
-     {"seed": 1, "learned": [300]}],
-)  # fmt: skip
+    [{"seed": 1, "config": {"env_wrapper": "a.B"}}, {"args": {"trained_agent": "old.zip"}}],
+)
 def test_unequal_runs_are_not_averaged(tmp_path, other):
     fake_run(tmp_path)
     fake_run(tmp_path, **other)

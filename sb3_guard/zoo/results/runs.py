@@ -131,7 +131,7 @@ def read_run(path: Path) -> dict[str, Any]:
         "epoch": math.nan if None in rollout else math.prod(rollout),
         "world": _text(config.get("env_kwargs") or {}),
         "delivered": float(result["delivered"] is not None) if "delivered" in result else math.nan,
-        "config": _digest(config, args.get("trained_agent") or "", result.get("learned")),
+        "config": _digest(config, args.get("trained_agent") or ""),
         **{name: versions.get(name) for name in VERSIONS},
         "commit": result.get("commit"),
         "platform": result.get("platform"),
@@ -152,17 +152,15 @@ def _limits(limits: Iterable[float]) -> str:
     return " ".join(f"{limit:.12g}" for limit in limits)
 
 
-def _digest(config: Mapping[str, Any], start: str, learned: Any) -> str:
+def _digest(config: Mapping[str, Any], start: str) -> str:
     """
     The same for runs that differ in nothing but what has a column of its own.
 
     :param start: the model that training started from
-    :param learned: step counts of earlier calls of ``learn``: a warm-up or a schedule is stretched
-        over one call, so an extended run is not the run that was as long from the start
     """
     columns = ("n_timesteps", "cost_limit", "env_kwargs")
     rest = {name: value for name, value in config.items() if name not in columns}
-    return hashlib.sha256(_text([rest, start, learned]).encode()).hexdigest()[:8]
+    return hashlib.sha256(_text([rest, start]).encode()).hexdigest()[:8]
 
 
 # One run's episodes

@@ -83,14 +83,12 @@ class Epochs(BaseCallback):
     final rollout; :meth:`result` has them. Off-policy algorithms, whose rollouts are too short to
     end many episodes, have epochs of 30,000 steps.
 
-    :param total: steps at which training ends
     :param cut: a wrapper ends the episodes early, so that their costs do not say whether the agent
         keeps its limits
     """
 
-    def __init__(self, total: int, cut: bool = False):
+    def __init__(self, cut: bool = False):
         super().__init__()
-        self.total = total
         self.cut = cut
         # step at which it ended, return, cost, length, and what the m limits bound: the episodes
         # of the epoch under way
@@ -100,8 +98,6 @@ class Epochs(BaseCallback):
         self._diverged = 0  # episodes in a row that a physics error ended
         # Taken now: what lies on disk may change while the run continues.
         self._provenance = provenance()
-        #: steps after each part of the run that was to be shorter than it came to be
-        self.learned: list[int] = []
 
     def _on_rollout_start(self) -> None:
         if not isinstance(self.model, OffPolicyAlgorithm):
@@ -153,9 +149,7 @@ class Epochs(BaseCallback):
             ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the number
             of episodes that one ended, ``cost_limit`` (None: unconstrained), ``limit_on`` of an
             algorithm that limits the worst step, ``cut`` where a wrapper ended the episodes early,
-            ``seconds`` of training, and :func:`provenance`. ``learned``, absent from a straight
-            run, is the steps at which it was made longer, since warm-up and schedules were those of
-            shorter runs until then
+            ``seconds`` of training, and :func:`provenance`
         """
         model: Any = self.model
         monitor, keys = find_monitor(self.training_env), self._keys
@@ -186,7 +180,6 @@ class Epochs(BaseCallback):
             **({"cut": True} if self.cut else {}),
             # SB3's clock, which a resumed run sets back
             "seconds": round((time.time_ns() - model.start_time) / 1e9, 3),
-            **({"learned": self.learned} if self.learned else {}),
             **self._provenance,
         }
 
@@ -196,18 +189,12 @@ class Epochs(BaseCallback):
             "last": self.last,
             "diverged": self._diverged,
             "episodes": self._episodes,
-            "total": self.total,
-            "steps": self.model.num_timesteps,
-            "learned": self.learned,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from :meth:`state`."""
         self.last, self._episodes = state["last"], list(state["episodes"])
         self._diverged = state["diverged"]
-        self.learned = list(state["learned"])
-        if state["total"] != self.total:
-            self.learned.append(state["steps"])
 
 
 def summary(result: Mapping[str, Any]) -> str:

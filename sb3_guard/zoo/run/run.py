@@ -593,7 +593,7 @@ class Run:
         began = time.monotonic()
         wrappers = [*self.wrappers("env_wrapper"), *self.wrappers("vec_env_wrapper")]
         cut_short = any(getattr(cls, "training_only", False) for cls, _ in wrappers)
-        epochs = Epochs(self.hyperparams["n_timesteps"], cut=cut_short)
+        epochs = Epochs(cut_short)
         with tracked, interrupts(stop) as received:
             checkpoints = self._checkpoints(
                 folder, epochs, lambda: bool(received) or asked_to_stop()

@@ -55,8 +55,8 @@ def each(function: Callable[..., Any], *obs: Any) -> Any:
 def info_rows(infos: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
     """What Gymnasium tells by arrays of N rows, as a dictionary for each row.
 
-    :param infos: by name an array or a dictionary of such; ``infos["_cost"]``, [N] bool, says which
-        rows have a cost. Anything else is the same for all rows
+    :param infos: by name an array, a list or a dictionary of such; ``infos["_cost"]``, [N] bool,
+        says which rows have a cost. Anything else is the same for all rows
     :param n: N
     """
     rows: list[dict[str, Any]] = [{} for _ in range(n)]
@@ -65,10 +65,11 @@ def info_rows(infos: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
             continue
         if isinstance(values, Mapping):
             values = info_rows(values, n)
-        elif np.ndim(values) == 0 or len(values) != n:
-            values = [values] * n
-        else:  # numbers of Python's, or copies
+        elif not isinstance(values, list | tuple) and np.ndim(values):
+            # numbers of Python's, or copies
             values = values.tolist() if np.ndim(values) == 1 else list(np.array(values))
+        if not isinstance(values, list | tuple) or len(values) != n:
+            values = [values] * n
         mask = infos.get(f"_{name}")
         for i in range(n) if mask is None else np.flatnonzero(mask).tolist():
             rows[i][name] = values[i]
@@ -123,7 +124,8 @@ class GymnasiumVecEnv(BatchVecEnv):
     :param env: the vector environment
     :param cost: ``cost(obs, actions, next_obs, infos)`` of N rows at once: the observations before
         a step, the actions, the observations after it (of episodes that it ended the last ones),
-        and what ``step`` calls ``infos``. It returns ``info["cost"]``, N numbers
+        and what ``step`` calls ``infos`` (of those what ``final_info`` has). It returns
+        ``info["cost"]``, N numbers
     :raises TypeError: it is no vector environment
     :raises ValueError: its autoreset mode is unknown
     """
@@ -179,6 +181,13 @@ class GymnasiumVecEnv(BatchVecEnv):
         for i in ended:
             rows[i]["terminal_observation"] = each(lambda o, i=i: o[i], after)
         if self.cost is not None:
+            if isinstance(last := infos.get("final_info"), Mapping):
+
+                def told(of: Any, others: Any) -> np.ndarray:
+                    rows = dones.reshape(-1, *[1] * (np.ndim(of) - 1))
+                    return np.where(rows, of, others)
+
+                infos = {**infos, **each(told, last, {**last, **infos})}
             costs = np.asarray(self.cost(self._obs, self._actions, after, infos))
             if costs.shape != (n,):
                 raise ContractError(f"cost(...) returned shape {costs.shape}, expected ({n},)")
@@ -242,16 +251,19 @@ class TensorVecEnv(BatchVecEnv):
         group: str | None = None,
         clip_actions: float = 5.0,
     ) -> None:
-        if not hasattr(env, "device"):
-            raise TypeError(f"{type(env).__name__} has no device: algorithms take it as it is")
-        groups = env.single_observation_space.spaces
+        inner = getattr(env, "unwrapped", env)  # Gymnasium's wrappers pass no attributes on
+        if not hasattr(inner, "device"):
+            raise TypeError(f"{type(inner).__name__} has no device: algorithms take it as it is")
+        self.device, groups = inner.device, inner.single_observation_space.spaces
         first = next(name for name in ("policy", "actor", *groups) if name in groups)
         self.group = fit("group", group or first, choices=[*groups])
         self.cost = cost
-        bound = np.full(env.single_action_space.shape, clip_actions, np.float32)
+        bound = np.full(inner.single_action_space.shape, clip_actions, np.float32)
         seen = spaces.Box(-np.inf, np.inf, groups[self.group].shape)
-        super().__init__(env, env.num_envs, seen, spaces.Box(-bound, bound))
-        self.spec = EnvSpec(f"{type(env).__name__}-v0", max_episode_steps=env.max_episode_length)
+        super().__init__(env, inner.num_envs, seen, spaces.Box(-bound, bound))
+        self.spec = EnvSpec(
+            f"{type(inner).__name__}-v0", max_episode_steps=inner.max_episode_length
+        )
         self._tensor, self._obs = th.zeros(0), np.zeros(0)  # the same, on the device and here
 
     def reset(self) -> np.ndarray:
@@ -266,7 +278,7 @@ class TensorVecEnv(BatchVecEnv):
         """
         :raises ContractError: ``extras`` have no such cost, or it is not a number for each row
         """
-        actions = th.as_tensor(self._actions, dtype=th.float32, device=self.envs.device)
+        actions = th.as_tensor(self._actions, dtype=th.float32, device=self.device)
         obs, reward, terminated, truncated, extras = self.envs.step(actions)
         before, self._tensor = self._tensor, obs[self.group].clone()
         if callable(self.cost):

@@ -23,7 +23,7 @@ def total_cost(info: Mapping[str, Any], cost_keys: Sequence[str] = ("cost",)) ->
 
     Whether an absent key is an error is for the algorithm to say; statistics only count.
     """
-    cost = info.get("cost")
+    cost = info.get("cost", 0.0 if "cost" in cost_keys else None)
     if cost is None:
         return sum(number(info.get(key, 0.0), f"info[{key!r}]") for key in cost_keys)
     return number(cost, "info['cost']")

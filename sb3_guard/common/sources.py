@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
@@ -44,12 +44,19 @@ class Source(NamedTuple):
     scenario: Scenario | None = None
     spec: EnvSpec | None = None
 
-    @property
-    def vec_env(self) -> Literal["native", "dummy", "gymnasium"]:
-        """How its environments are stepped if nobody says it."""
-        if self.batch is not None:
+    def stepped(self, vec_env: str | None = None, wrapped: bool = False) -> Any:
+        """How its environments are stepped: as ``vec_env`` says, if it says something possible.
+
+        :param wrapped: whether single ones are wrapped
+        """
+        spec = self.spec
+        if vec_env not in (None, "gymnasium"):
+            return vec_env
+        if self.batch is not None and not wrapped:
             return "native"
-        return "gymnasium" if self.spec is not None and self.spec.entry_point is None else "dummy"
+        if spec is None or spec.vector_entry_point is None or wrapped:
+            return "dummy"
+        return vec_env or ("dummy" if spec.entry_point else "gymnasium")
 
 
 def find(

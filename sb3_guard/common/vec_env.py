@@ -92,19 +92,16 @@ def _make(
     num_threads: int | None,
     kwargs: Mapping[str, Any],
 ) -> VecEnv:
-    batched, spec = wrapper_class is None, source.spec
-    vec_env = vec_env or (source.vec_env if batched else "dummy")
-    if vec_env == "gymnasium":
-        if batched and spec is not None and spec.vector_entry_point is not None:
-            return as_vec_env(gymnasium.make_vec(spec, num_envs=n_envs, **kwargs))
-        vec_env = "native" if batched and source.batch is not None else "dummy"
+    vec_env = source.stepped(vec_env, wrapper_class is not None)
+    if vec_env == "gymnasium" and source.spec is not None:
+        return as_vec_env(gymnasium.make_vec(source.spec, num_envs=n_envs, **kwargs))
     if vec_env == "native":
         if source.batch is None:
             raise ValueError(
                 f"{source.env_id or source.make!r} is not an sb3_guard environment, or has "
                 "wrappers of its own: use vec_env 'dummy' or 'subproc'"
             )
-        if not batched:
+        if wrapper_class is not None:
             raise ValueError(
                 "wrapper_class, or env_wrapper of a run, needs vec_env 'dummy' or 'subproc': "
                 "native envs share one batch"

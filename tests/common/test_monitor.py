@@ -96,6 +96,7 @@ def test_a_name_alone_is_no_sequence_of_costs():
         ({"cost": True}, ("cost",), 1.0),
         ({}, ("cost",), 0.0),
         ({"a": 1.0, "b": 2.0}, ("a", "b"), 3.0),
+        ({"heat": 5.0}, ("cost", "heat"), 0.0),  # a step without one of them
         # The environment's own total wins: costs may overlap.
         ({"cost": 2.5, "a": 1.0, "b": 2.0}, ("a", "b"), 2.5),
     ],

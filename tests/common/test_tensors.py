@@ -74,6 +74,16 @@ def test_a_step_is_what_stable_baselines3_needs():
     np.testing.assert_array_equal(steps[1][0][0], [2, 1])  # as it was: nothing wrote into it
 
 
+def test_gymnasiums_wrappers_may_be_around():
+    """As around every environment of Isaac Lab, which ``gymnasium.make`` makes."""
+    inner = Simulator()
+    wrapped = SimpleNamespace(unwrapped=inner, reset=inner.reset, step=inner.step, render_mode=None)
+    env = TensorVecEnv(wrapped)
+    np.testing.assert_array_equal(env.reset(), [[0, 1]] * N)
+    np.testing.assert_array_equal(env.step(np.zeros((N, 1)))[0], [[1, 1]] * N)
+    assert env.spec.id == "Simulator-v0"
+
+
 def test_time_outs_are_apart_from_deaths():
     env = TensorVecEnv(Simulator())
     env.reset()

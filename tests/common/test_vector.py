@@ -213,7 +213,7 @@ def test_our_own_become_the_native_batch(mode):
 
 
 def far(obs, action, next_obs, info):
-    return np.abs(next_obs[..., 0] - obs[..., 0]) + action[..., 1] ** 2
+    return np.abs(next_obs[..., 0] - obs[..., 0]) + action[..., 1] ** 2 + np.float32(info["wear"])
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -242,11 +242,13 @@ def test_infos_are_those_of_the_rows_that_have_them():
         "_cost": np.array([True, False, True]),
         "parts": {"force": np.eye(3), "_force": np.array([False, True, False]), "unit": "N"},
         "names": np.array(["a", None, "c"], object),
+        "paths": [[1, 2], None, "p"],
         "time": 0.5,
         "_private": np.arange(3),
     }
     first, second, third = info_rows(infos, 3)
-    assert first == {"cost": 1.0, "parts": {"unit": "N"}, "names": "a", "time": 0.5, "_private": 0}
+    told = {"parts": {"unit": "N"}, "names": "a", "paths": [1, 2], "time": 0.5, "_private": 0}
+    assert first == {"cost": 1.0, **told}
     assert type(third["cost"]) is float and "cost" not in second
     np.testing.assert_array_equal(second["parts"]["force"], [0, 1, 0])
 

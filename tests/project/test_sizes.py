@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_410,
+    "sb3_guard": 26_431,
     "sb3_guard/envs": 8_823,
     "sb3_guard/algorithms": 5_766,
-    "sb3_guard/common": 2_511,
+    "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
-    "harness": 8_394,
-    "tests": 24_920,
+    "harness": 8_411,
+    "tests": 24_967,
 }
-WORDS = 62_120  # of all tracked markdown but the changelog
+WORDS = 62_134  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

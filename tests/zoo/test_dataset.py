@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from killed import SMALL, TOY
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_guard import enjoy, evaluate_policy, load_pretrained
+from sb3_guard import enjoy, evaluate_policy, load_pretrained, train
 from sb3_guard.common.monitor import CostMonitor
 from sb3_guard.zoo.agents import dataset as dataset_module
 from sb3_guard.zoo.agents.dataset import DSRLFile, MinariDataset, Recorder
@@ -66,6 +67,38 @@ def test_minari_plays_every_episode_again(capsys):
             assert episode.infos["cost"][0] == 0.0
     acted, _ = model.predict(episodes[0].observations[:1], deterministic=True)
     np.testing.assert_allclose(acted, episodes[0].actions[:1], atol=1e-5)
+
+
+def test_so_it_does_those_of_other_environments(tmp_path):
+    """Alone, in their wrappers; observations are those that nothing has normalised."""
+    words = [*TOY, "--env-kwargs", "episode_length:25", "-f", str(tmp_path)]
+    normed = ["-params", "normalize:True", "env_wrapper:gymnasium.wrappers.NormalizeReward"]
+    assert train.main([*words, *SMALL, *normed, "--eval-freq", "-1", "-n", "60"]) == 0
+    play = [*words, "--verbose", "0", "--n-episodes", "3", "--seed", "7", "--dataset"]
+    assert enjoy.main([*play, "toy-v0"]) == 0
+    dataset = minari.load_dataset("toy-v0")
+    env = dataset.recover_environment()
+    assert [wrapper.name for wrapper in env.spec.additional_wrappers] == ["NormalizeReward"]
+    for i, episode in enumerate(dataset.iterate_episodes()):
+        obs, _ = env.reset(seed=None if i else 7)
+        for t, action in enumerate(episode.actions):
+            np.testing.assert_array_equal(episode.observations[t], obs)
+            obs, _, _, truncated, info = env.step(action)
+            assert info["cost"] == episode.infos["cost"][t + 1]
+        assert truncated and t == 24
+
+
+def test_without_the_environment_where_nobody_can_make_it(tmp_path):
+    gym.register("Own-v0", entry_point=lambda: Random(0, [], False))
+    try:
+        venv = DummyVecEnv([lambda: gym.make("Own-v0")])
+        kept = MinariDataset("own-v0", venv, {})
+    finally:
+        del gym.registry["Own-v0"]
+    evaluate_policy(
+        Sampling(venv.action_space), CostMonitor(Recorder(venv, 2, KEYS, kept.write, [])), 2
+    )
+    assert minari.load_dataset("own-v0").total_episodes == 2
 
 
 def test_the_metadata_says_whose_episodes_these_are():
@@ -240,7 +273,7 @@ def test_names_that_can_not_be_written(tmp_path, capsys, monkeypatch):
     (tmp_path / "there.hdf5").touch()
     (tmp_path / "minari" / "there-v0").mkdir(parents=True)
     refused("there", "'there'", "point/cpo-v0", "cpo.hdf5")
-    refused("there-v0", "exists; remove it with", "minari delete there-v0")
+    refused("there-v0", "exists; remove the folder", str(tmp_path / "minari" / "there-v0"))
     refused(str(tmp_path / "there.hdf5"), "exists; remove it, or")
     monkeypatch.setattr(
         dataset_module.importlib.util, "find_spec", lambda name: None if name == "minari" else name

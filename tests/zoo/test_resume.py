@@ -111,8 +111,9 @@ def test_killed_at_any_moment(steps, undisturbed, tmp_path, monkeypatch):
     assert_same_run(undisturbed(300), tmp_path)
 
 
-def test_worker_processes(forked, tmp_path, monkeypatch):
-    arguments = [*TOY, *SHORT, *SMALL, "-n", "180", "--vec-env", "subproc", "--eval-freq", "-1"]
+@pytest.mark.parametrize("vec_env", ["subproc", "gymnasium"])
+def test_however_environments_are_stepped(vec_env, forked, tmp_path, monkeypatch):
+    arguments = [*TOY, *SHORT, *SMALL, "-n", "180", "--vec-env", vec_env, "--eval-freq", "-1"]
     assert train.main([*arguments, "-f", str(tmp_path / "whole")]) == 0
     crash(monkeypatch, [*arguments, "-f", str(tmp_path / "cut")], 130)
     assert train.main(["-i", str(runs_of(tmp_path / "cut")), *TOY[:2]]) == 0

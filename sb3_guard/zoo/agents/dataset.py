@@ -10,10 +10,11 @@ import json
 import shlex
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
@@ -22,6 +23,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_guard.common.evaluation import limits_on, shares
 from sb3_guard.common.monitor import cost_keys_of, find_monitor, total_cost
 from sb3_guard.costs import bounded_name, number
+from sb3_guard.vector import each
 from sb3_guard.zoo.agents.flags import EnjoyFlags
 from sb3_guard.zoo.cli.usage import UsageError, interrupts
 
@@ -93,21 +95,14 @@ class Recorder(VecEnvWrapper):
 
 def _row(obs: Any, row: int) -> Any:
     """A copy of one row of a batch of observations."""
-    if isinstance(obs, dict):
-        return {key: np.copy(value[row]) for key, value in obs.items()}
-    return np.copy(obs[row])
+    return each(lambda values: np.copy(values[row]), obs)
 
 
 def _episode(first: Any, steps: list[tuple[Any, ...]]) -> Episode:
     after, actions, rewards, terminations, truncations, costs = zip(*steps, strict=True)
-    seen: Any = [first, *after]
-    if isinstance(first, dict):
-        observations: Any = {key: np.stack([obs[key] for obs in seen]) for key in first}
-    else:
-        observations = np.stack(seen)
     keys = dict.fromkeys(key for step in costs for key in step)
     return {
-        "observations": observations,
+        "observations": each(lambda *seen: np.stack(seen), first, *after),
         "actions": np.stack(actions),
         "rewards": np.array(rewards),
         "terminations": np.array(terminations),
@@ -141,7 +136,12 @@ class MinariDataset:
         self.place = get_dataset_path(name)
         self.dataset: Any = None
         if self.place.exists():
-            raise UsageError(f"--dataset {name} exists; remove it with: minari delete {name}")
+            raise UsageError(f"--dataset {name} exists; remove the folder {self.place}")
+        self.spec, spec = None, venv.get_attr("spec")[0]
+        with suppress(Exception):  # what can't be made again from data says so in many ways
+            spec.to_json()
+            gymnasium.make(spec).close()
+            self.spec = spec
 
     def write(self, episodes: list[Episode]) -> None:
         """Append episodes."""
@@ -157,7 +157,7 @@ class MinariDataset:
             self.dataset = minari.create_dataset_from_buffers(
                 self.name,
                 buffers,
-                env=self.venv.get_attr("spec")[0],
+                env=self.spec,
                 observation_space=self.venv.observation_space,
                 action_space=self.venv.action_space,
                 jpeg_encoding=False,

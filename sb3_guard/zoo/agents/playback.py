@@ -172,7 +172,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     env = played.make_envs(
         n_envs if native else 1,
         flags.seed,
-        vec_env="native" if native else ("dummy" if ours else played.source.vec_env),
+        vec_env=played.source.stepped(wrapped=ours and not native),
         env_kwargs={**size, **(hyperparams.get("env_kwargs") or {}), **(flags.env_kwargs or {})},
         evaluation=True,
         normalizer=normalizer,
@@ -215,7 +215,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     elif render_mode == "human":
         shown = nullcontext(partial(render, agent.env))
     asked = episodes or flags.n_timesteps or 1
-    recorded = recording(agent, flags, asked) if flags.dataset else nullcontext()
+    recorded = recording(agent, flags, asked) if flags.dataset is not None else nullcontext()
     errors = (ValueError, *BAD_NUMBERS)  # SB3's, of observations of another shape
     playing = explained(f"can't play {agent.path}", *errors)
     with closing(agent.env), playing, shown as on_step, recorded:

@@ -58,6 +58,11 @@ class ResumableEnv(gym.Wrapper):
     by ``env_method`` even in another process.
     """
 
+    @property
+    def spec(self) -> Any:  # type: ignore[override]
+        """Of what it wraps: a dataset is to know nothing of runs."""
+        return self.env.spec
+
     def state(self) -> bytes | None:
         """Everything the next step depends on; None if it can't be pickled."""
         parts = [

@@ -194,7 +194,7 @@ class Run:
             values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
         # What wraps single environments needs single ones.
         lone = values.get("env_wrapper") is not None
-        flags.vec_env = flags.vec_env or ("dummy" if lone else run.source.vec_env)
+        flags.vec_env = run.source.stepped(flags.vec_env, lone)
         return run
 
     def limits(self) -> np.ndarray:

@@ -78,7 +78,7 @@ def assert_equal(one, other) -> None:
 
 
 def outcome(run: Path) -> dict[str, object]:
-    """What a run came to, its duration and whether it was made longer aside."""
+    """What a run came to, its duration aside."""
     result = json.loads((run / "result.json").read_text())
     result.pop("seconds")
     return result

@@ -17,6 +17,7 @@ from typing import Any
 
 import pandas as pd
 from archives import DATA, DOCS, archives, pack, unpacked
+from results import certified
 
 from sb3_guard.algorithms import TrustRegion
 from sb3_guard.reproduce import final_hash, measures
@@ -47,7 +48,7 @@ FOLDERS = (*dict.fromkeys(folder for _, folder in GRIDS),)
 COLUMNS = [
     "environment", "million_steps", "place", "algo", "seeds", "return", "return_std", "cost", "low",
     "high", "verdict", "above", "excess", "most_likely_return", "most_likely_cost",
-    "most_likely_verdict", "cost_total", "row",
+    "most_likely_verdict", "delivered", "cost_total", "row",
 ]  # fmt: skip
 MARKS = {"kept": " ✓", "exceeded": " ✗"}
 MILLION = 1_000_000
@@ -130,6 +131,8 @@ def leaderboard(rows: pd.DataFrame) -> pd.DataFrame:
     places = final.groupby(["suite", "budget"]).cumcount() + 1
     final["place"] = places.where(final["placed"]).astype("Int64")
     final["million_steps"], final["environment"] = final["budget"], final["suite"]
+    final = final.merge(certified("delivery")[["suite", "algo", "delivered"]], how="left")
+    final["delivered"] = final["delivered"].where(final["budget"] == 1)
     return final[COLUMNS].round(3)
 
 

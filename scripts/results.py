@@ -8,7 +8,8 @@ NAME``, returns in the end, beside the untrained agents' of ``docs/data/untraine
 ``scores: NAME``, returns and costs as shares of TRPO's; ``sweep: NAME SUITE``, return and cost at
 each limit N of ``NAME_limitN.tar.xz``; ``splits: NAME``, how the agents keep their limit in
 training and after it; ``delivered: NAME``, the certified agents that its runs end with, beside
-their final policies; and ``agents: pretrained``, those of ``enjoy --pretrained``. A row of a single
+their final policies; ``best: NAME``, of each environment the best of these and of the leaderboard;
+and ``agents: pretrained``, those of ``enjoy --pretrained``. A row of a single
 run is in italics, which the site shows in grey.
 ``--pack FOLDER NAME`` packs the logs of a folder.
 
@@ -49,7 +50,7 @@ from sb3_guard.zoo.results.tables import markdown, number, spelled, spread, whol
 from sb3_guard.zoo.run.folder import RunFolder
 
 BLOCK = re.compile(
-    r"(<!-- (runs|learnt|scores|sweep|splits|delivered|agents): (\S+)(?: (\S+))? -->\n?)"
+    r"(<!-- (runs|learnt|scores|sweep|splits|delivered|best|agents): (\S+)(?: (\S+))? -->\n?)"
     r".*?(<!-- end -->)",
     re.DOTALL,
 )
@@ -70,6 +71,7 @@ PAPER = {
     "guard_paper": [f"Goal_{robot}_8Hazards" for robot in ("Point", "Drone", "Arm3")],
 }
 HAZARDS = "Goal_Point_8Hazards-v0"
+ROWS = DOCS.parent / "sb3_guard" / "zoo" / "results" / "rows.csv"
 # Of docs/keeping_a_limit.md, a good run and a bad one: label, limit, archive and folder.
 HEALTHY = {
     "pcpo": (
@@ -257,31 +259,82 @@ def splits(name: str) -> str:
     return grey(rows, columns)
 
 
-def delivered(name: str) -> str:
-    """A table of the certified agents that runs end with, beside their final policies."""
+@cache
+def certified(name: str) -> pd.DataFrame:
+    """A row per environment and algorithm: how many of its runs deliver, and what, in the mean."""
     rows = []
     with unpacked(name) as found:
-        for (suite, label), group in found.runs.groupby(["suite", "label"], sort=False):
+        for (suite, algo), group in found.runs.groupby(["suite", "algo"], sort=False):
             results = [RunFolder(Path(path)).checked_result() for path in group["path"]]
             given = [one["delivered"] for one in results if one["delivered"]]
             means = pd.DataFrame(
-                {"return": one["return"], **next(iter(one["costs"].values()))} for one in given
+                [{"return": one["return"], **next(iter(one["costs"].values()))} for one in given],
+                columns=["return", "mean", "upper", "share_above"],
             ).mean()
-            digits = 0 if abs(results[0]["return"]) >= 100 else 1
-            cells = [suite, label, f"{len(given)} of {len(results)}"]
-            if given:
-                cells += [number(means["return"], digits), number(means["mean"], 1),
-                          number(means["upper"], 1), percent(means["share_above"])]  # fmt: skip
-            else:
-                cells += ["–"] * 4
+            row = {"suite": suite, "algo": algo, "label": group["label"].iloc[0], **means}
+            row["delivered"] = f"{len(given)} of {len(results)}"
             for kind in ("stochastic", "greedy"):
                 final = pd.DataFrame([one["final"][kind] for one in results])
-                ends = [final[key].map(np.mean).mean() for key in ("returns", "costs")]
-                cells.append(f"{number(ends[0], digits)} / {number(ends[1], 1)}")
-            rows.append(cells)
+                row[kind] = tuple(final[key].map(np.mean).mean() for key in ("returns", "costs"))
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def delivered(name: str) -> str:
+    """A table of the certified agents that runs end with, beside their final policies."""
+    rows = []
+    for row in certified(name).to_dict("records"):
+        digits = _digits(row["stochastic"][0])
+        cells = [row["suite"], row["label"], row["delivered"], number(row["return"], digits)]
+        cells += [number(row["mean"], 1), number(row["upper"], 1), percent(row["share_above"])]
+        for kind in ("stochastic", "greedy"):
+            cells.append(f"{number(row[kind][0], digits)} / {number(row[kind][1], 1)}")
+        rows.append(cells)
     header = ["environment", "algorithm", "delivered", "return", "cost", "bound", "above the limit",
               "final, sampled", "final, most likely"]  # fmt: skip
     return table(header, rows)
+
+
+def _digits(value: float) -> int:
+    """Decimals of a return."""
+    return 0 if abs(value) >= 100 else 1
+
+
+def best(name: str) -> str:
+    """
+    A row per environment: the highest return of an agent within the limit.
+
+    Of the runs of a grid what was certified counts, of the leaderboard's rows the final policy with
+    sampled actions. Where nothing is within the limit, an undecided one stands there, else the
+    lowest cost. Minutes are those of the leaderboard's runs, the median over seeds.
+    """
+    board, runs = pd.read_csv(DATA / "leaderboard.csv"), pd.read_csv(ROWS)
+    took = (runs["seconds"] / 60).groupby(runs["row"].str.rsplit("_", n=1).str[0]).median()
+    board["minutes"] = board["row"].str.rsplit("_", n=1).str[0].map(took)
+    found = certified(name).rename(columns={"suite": "environment", "mean": "cost"})
+    found = found.assign(verdict="certified", million_steps=1, seeds=found["delivered"])
+    found = found.dropna(subset="cost").merge(
+        board.loc[board["million_steps"] == 1, ["environment", "algo", "minutes"]], how="left"
+    )
+    rows = pd.concat([board, found])
+    rank = rows["verdict"].map({"undecided": 1, "exceeded": 0}).fillna(2)
+    rows = rows.assign(rank=rank, worth=rows["return"].where(rank > 0, -rows["cost"]))
+    rows = rows.sort_values(["rank", "worth"], ascending=False).drop_duplicates("environment")
+    rows = rows.set_index("environment").loc[board["environment"].unique()].reset_index()
+    rows["limit"] = np.where(rows["environment"].str.startswith("Safety"), 25, 2)
+    columns = {
+        "environment": "environment",
+        "limit": whole("limit"),
+        "algorithm": lambda row: f"`{row['algo']}`",
+        "return": lambda row: number(row["return"], _digits(row["return"])),
+        "cost": lambda row: number(row["cost"], 1),
+        "verdict": "verdict",
+        "seeds": lambda row: str(row["seeds"]),
+        "steps": lambda row: f"{row['million_steps']}e6",
+        "minutes": lambda row: number(row["minutes"], 0),
+    }
+    texts = spelled(rows, columns)
+    return table([*texts], texts.to_numpy().tolist())
 
 
 def _published(known: pd.DataFrame, algo: str) -> str:
@@ -299,7 +352,7 @@ def filled(page: str) -> str:
         begin, kind, name, only, end = match.groups()
         made = {
             "learnt": learnt, "scores": scores, "splits": splits, "delivered": delivered,
-            "agents": lambda _: listed(),
+            "best": best, "agents": lambda _: listed(),
         }  # fmt: skip
         if kind == "sweep":
             text = sweep(name, only)

@@ -4,6 +4,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from fake_runs import fake_run
 
@@ -27,8 +28,10 @@ def scripts(monkeypatch, tmp_path):
         sys.modules.pop(name)
 
 
-def test_certified_rows_come_first_by_return(scripts, tmp_path):
+def test_certified_rows_come_first_by_return(scripts, tmp_path, monkeypatch):
     board, archives = scripts
+    one = {"suite": "SafetyPointGoal1-v0", "algo": "cpo", "delivered": "1 of 3"}
+    monkeypatch.setattr(board, "certified", lambda name: pd.DataFrame([one]))
     for algo, mean, cost, seeds in (
         ("cpo", 10.0, 20.0, 3), ("pcpo", 12.0, 24.0, 3), ("p3o", 15.0, 24.0, 2),
         ("trpo_lag", 20.0, 30.0, 2),
@@ -47,11 +50,43 @@ def test_certified_rows_come_first_by_return(scripts, tmp_path):
         ["trpo_lag", 2, "exceeded"],
     ]  # fmt: skip
     assert table["place"].dropna().tolist() == [1, 2]
+    assert table["delivered"].dropna().to_dict() == {1: "1 of 3"}
     first, last = table.iloc[0], table.iloc[-1]
     assert first["row"] == "grand_table/pcpo/SafetyPointGoal1-v0_1"
     assert (first["cost"], first["low"], first["high"]) == (24.0, 24.0, 24.0)
     assert (last["above"], last["excess"]) == (1.0, 0.2)
     assert board.glance(rows.iloc[:0]) == ""
+
+
+@pytest.mark.usefixtures("scripts")
+def test_the_best_agent_of_each_environment_stands_first(tmp_path, monkeypatch):
+    results = sys.modules["results"]
+    header = "environment,million_steps,algo,seeds,return,cost,verdict,row"
+    lines = [
+        "SafetyA-v0,1,cpo,3,9.0,20.0,kept,g/cpo/SafetyA-v0_1",
+        "SafetyA-v0,1,trpo,3,20.0,60.0,exceeded,g/trpo/SafetyA-v0_1",
+        "SafetyB-v0,1,cpo,1,5.0,24.0,undecided,g/cpo/SafetyB-v0_1",
+        "SafetyB-v0,1,pcpo,1,4.0,20.0,undecided,g/pcpo/SafetyB-v0_1",
+        "Goal_C,2,cpo,1,5.0,9.0,exceeded,g/cpo/Goal_C_1",
+        "Goal_C,1,trpo,1,9.0,10.0,exceeded,g/trpo/Goal_C_1",
+    ]
+    (tmp_path / "data" / "leaderboard.csv").write_text("\n".join([header, *lines]))
+    runs = tmp_path / "rows.csv"
+    times = [f"{line.rpartition(',')[2]},{60 * n}" for n, line in enumerate(lines, 1)]
+    runs.write_text("\n".join(["row,seconds", *times]))
+    monkeypatch.setattr(results, "ROWS", runs)
+    columns = ["suite", "algo", "delivered", "return", "mean"]
+    given = [
+        ["SafetyA-v0", "trpo", "2 of 3", 12.0, 19.5],
+        ["SafetyB-v0", "cpo", "0 of 3", None, None],
+    ]
+    monkeypatch.setattr(results, "certified", lambda name: pd.DataFrame(given, columns=columns))
+    _, _, *rows = results.best("x").splitlines()
+    assert [[*map(str.strip, row.split("|"))][1:-1] for row in rows] == [
+        ["SafetyA-v0", "25", "`trpo`", "12.0", "19.5", "certified", "2 of 3", "1e6", "2"],
+        ["SafetyB-v0", "25", "`cpo`", "5.0", "24.0", "undecided", "1", "1e6", "3"],
+        ["Goal_C", "2", "`cpo`", "5.0", "9.0", "exceeded", "1", "2e6", "5"],
+    ]
 
 
 def played_by(folder: Path, algo: str, mean: float, cost: float, seeds: int) -> None:

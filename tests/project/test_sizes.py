@@ -19,9 +19,9 @@ LINES = {
     "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
     "harness": 8_411,
-    "tests": 24_967,
+    "tests": 25_002,
 }
-WORDS = 62_134  # of all tracked markdown but the changelog
+WORDS = 62_482  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

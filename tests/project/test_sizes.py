@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_431,
+    "sb3_guard": 26_450,
     "sb3_guard/envs": 8_823,
     "sb3_guard/algorithms": 5_766,
     "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
-    "harness": 8_411,
-    "tests": 25_002,
+    "harness": 8_430,
+    "tests": 25_033,
 }
-WORDS = 62_482  # of all tracked markdown but the changelog
+WORDS = 62_509  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -91,6 +91,22 @@ def test_costs_are_in_the_files(tmp_path):
     assert result["cost_rate"] == pytest.approx(episodes["c"].sum() / 120)
 
 
+def test_few_updates_are_told(capsys):
+    sizes = {"n_envs": 10, "n_steps": 500, "cost_limit": 1.0}
+    for steps, said in (
+        (9_000, ""),
+        (12_000, "Only 2 updates in 12,000 steps; -params n_envs:8 n_steps:50 makes 30"),
+        (60_000, ""),
+    ):
+        given = {"env": "CostPoint-v0", "gym_packages": ["registered_envs"]}
+        run = Run.check(RunFlags.of({**given, "n_timesteps": steps, "hyperparams": sizes})).make()
+        capsys.readouterr()
+        run._advise()
+        run.close()
+        out = capsys.readouterr().out
+        assert said in out and bool(said) == bool(out)
+
+
 def test_no_episode_ends(tmp_path, capsys):
     arguments = [*TOY, *SMALL, "-n", "60", "-f", str(tmp_path), "--eval-freq", "-1"]
     assert train.main([*arguments, "--env-kwargs", "episode_length:1000"]) == 0

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import registered_envs  # noqa: F401  an environment with an id
 import torch as th
+from cost_envs import CostPoint
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
@@ -149,6 +151,19 @@ def test_make_model_takes_what_a_file_cannot_hold() -> None:
     assert model.policy.activation_fn is nn.ReLU and (model.policy.log_std == -0.5).all()
     (scenario,) = model.get_env().get_attr("scenario", 0)
     assert scenario.constraints["hazards"]["size"] == 0.2
+
+
+def test_make_model_takes_a_class_or_a_function() -> None:
+    kwargs: dict[str, Any] = {"cost_limit": 3.0, "seed": 1, "n_envs": 2, "n_steps": 30}
+    kwargs["env_kwargs"] = {"episode_length": 20}
+    agents = []
+    for made in "CostPoint-v0", CostPoint, lambda **kwargs: CostPoint(**kwargs):
+        model = make_model("cpo", made, **kwargs).learn(60)
+        agents.append(th.cat([weights.flatten() for weights in model.policy.parameters()]))
+    assert all(th.equal(agents[0], agent) for agent in agents)
+    assert model.costs.horizon == 20.0
+    with pytest.raises(ValueError, match="no cost limit is known for CostPoint: give cost_limit"):
+        make_model("cpo", CostPoint)
 
 
 def test_sizes_of_a_file_are_not_warned_of(tmp_path) -> None:

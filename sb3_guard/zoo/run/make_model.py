@@ -1,12 +1,14 @@
 """A model in Python as the commands make it: environment, normalisation and hyperparameters."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_guard.common.monitor import find_monitor
+from sb3_guard.common.sources import find
 from sb3_guard.fields import is_data
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import algorithm
@@ -22,7 +24,7 @@ ELSEWHERE = {
 
 def make_model(
     algo: str,
-    env_id: str,
+    env_id: str | Callable[..., gym.Env],
     *,
     conf: str | Path | None = None,
     seed: int | None = None,
@@ -47,7 +49,8 @@ def make_model(
     hyperparameters say so.
 
     :param algo: what ``--algo`` takes: an algorithm of this package, or one of RL-Zoo as a baseline
-    :param env_id: an environment; its version may be left out
+    :param env_id: an environment, whose version may be left out; or a class or function that makes
+        one
     :param conf: hyperparameters: ``"paper"`` or a file; None for the defaults in
         ``hyperparams/<algo>.yml``
     :param seed: of networks and environments; None for a random one
@@ -70,7 +73,7 @@ def make_model(
         flags = RunFlags.read(
             {
                 "algo": algo,
-                "env": env_id,
+                "env": getattr(env_id, "__name__", str(env_id)),
                 "seed": seed,
                 "conf_file": None if conf is None else str(conf),
                 "env_kwargs": env_kwargs,
@@ -86,7 +89,7 @@ def make_model(
         # What a file can't hold is not checked as data; the constructor looks at it.
         objects = {n: v for n, v in hyperparams.items() if n in names and not is_data(v)}
         flags.hyperparams = {n: v for n, v in hyperparams.items() if n not in objects}
-        run = Run.check(flags)
+        run = Run.check(flags, find(env_id) if callable(env_id) else None)
         run.arguments.update(objects)
         model = run.make_model()
     except UsageError as error:

@@ -27,6 +27,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize
 
@@ -167,11 +168,12 @@ class Run:
     # Checked
 
     @classmethod
-    def check(cls, flags: RunFlags) -> Self:
+    def check(cls, flags: RunFlags, source: Source | None = None) -> Self:
         """
         A new run, checked as far as that goes without making anything.
 
         :param flags: those given; the rest follows from files and defaults
+        :param source: the environments, where ``flags.env`` is no id but a name for them
         :raises UsageError: anything is wrong with them
         """
         flags = dataclasses.replace(flags)
@@ -179,7 +181,9 @@ class Run:
         run = cls(flags)
         flags = run.flags
         algo = run.algorithm
-        flags.env = str(run.source.env_id)
+        if source is not None:
+            run.source = source
+        flags.env = str(run.source.env_id or flags.env)
         if flags.seed < 0:
             flags.seed = int(np.random.default_rng().integers(2**31))
         values = read_hyperparams(flags.algo, flags.env, flags.conf_file, flags.overrides())
@@ -573,6 +577,7 @@ class Run:
         state, flags, verbose = self.begun, self.flags, self.flags.verbose > 0
         if verbose:
             print(f"Run folder: {folder.path} (seed {flags.seed})")
+            self._advise()
         tracked = self._tracked(folder)
         with explained(f"can't write to {folder.path}", OSError):
             # Two lines of the csv are no episodes.
@@ -616,6 +621,17 @@ class Run:
             else:
                 print(f"  continue with      {folder.again(flags)}")
         return 0 if finished else 128 + (received or [signal.SIGTERM])[0]
+
+    def _advise(self) -> None:
+        """Say it where a training has so few updates that little is learnt."""
+        steps, model = self.hyperparams["n_timesteps"], self.model
+        if isinstance(model, OnPolicyAlgorithm) and steps >= 10_000:
+            updates = max(steps // (model.n_envs * model.n_steps), 1)
+            if updates < 10:
+                print(
+                    f"Only {updates} update{'s' * (updates > 1)} in {steps:,} steps; "
+                    f"-params n_envs:8 n_steps:{steps // 240} makes 30"
+                )
 
     def _checkpoints(
         self, folder: RunFolder, epochs: Epochs, asked_to_stop: Callable[[], bool]

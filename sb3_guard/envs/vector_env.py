@@ -226,6 +226,13 @@ class GuardVectorEnv(Simulated, gymnasium.vector.VectorEnv[Any, Any, Array]):
             infos["final_info"], infos["_final_info"] = details, t.done
         return infos
 
+    def state(self) -> dict[str, Any]:
+        return {**super().state(), "ended": self._ended.copy()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        super().restore(state)
+        self._ended = np.array(state.get("ended", self._ended))  # runs' older checkpoints lack it
+
     def render(self) -> tuple[Array, ...] | None:
         """One frame per row, [height, width, 3] uint8; never advances physics."""
         if self.render_mode is None:

@@ -111,14 +111,19 @@ def test_the_vector_environment_follows_gymnasiums_own(mode, env_id, params):
 
 
 def test_a_row_that_has_ended_waits_for_its_reset():
-    ours = gymnasium.make_vec(
-        "Goal_Point_8Hazards-v0", num_envs=2, max_episode_steps=1, autoreset_mode="Disabled"
+    ours, restored = (
+        gymnasium.make_vec(
+            "Goal_Point_8Hazards-v0", num_envs=2, max_episode_steps=1, autoreset_mode="Disabled"
+        )
+        for _ in range(2)
     )
     ours.reset(seed=0)
     ours.step(np.zeros((2, 2)))
     ours.reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"rows \[1\] have ended"):
-        ours.step(np.zeros((2, 2)))
+    restored.restore(ours.state())
+    for env in (ours, restored):
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"rows \[1\] have ended"):
+            env.step(np.zeros((2, 2)))
     with pytest.raises(ValueError, match="must be 2 truth values"):
         ours.reset(options={"reset_mask": np.array([1, 0])})
     with pytest.raises(ValueError, match="autoreset_mode = 'NextStap': did you mean 'Next"):

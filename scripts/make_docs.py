@@ -207,8 +207,8 @@ def gallery() -> str:
     """The page that shows everything."""
     parts = [
         "# Gallery",
-        "![TRPO, which ignores cost, and TRPO-USL in the same place](images/trained.gif)",
-        "Two of the package's agents in the same place: TRPO ignores cost, TRPO-USL keeps a "
+        "![TRPO, which ignores cost, and SAC-Lagrangian in the same place](images/trained.gif)",
+        "Two of the package's agents in the same place: TRPO ignores cost, SAC-Lagrangian keeps a "
         "limit. "
         "`sb3-guard show Goal_Ant_8Ghosts --window` opens any environment in MuJoCo's viewer, and "
         "`sb3-guard enjoy --pretrained --env Goal_Point_8Hazards --record` films an agent. "

@@ -190,6 +190,14 @@ def test_links_lead_somewhere(document):
             assert anchor in anchors(file.resolve()), f"{document.name} links to {target}#{anchor}"
 
 
+def test_what_a_page_includes_is_there():
+    for page in DOCS.glob("**/*.md"):
+        for path, options in re.findall(r"```\{include\} (\S+)\n(.*?)```", page.read_text(), re.S):
+            text = (page.parent / path).read_text()
+            for mark in re.findall(r":(?:start-after|end-before): \"?(.*?)\"?\n", options):
+                assert mark in text, f"{page}: {mark}"
+
+
 def test_every_page_is_in_the_contents():
     listed = {"index"}
     for page in PAGES:

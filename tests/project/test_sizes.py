@@ -19,9 +19,9 @@ LINES = {
     "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
     "harness": 8_430,
-    "tests": 25_038,
+    "tests": 25_046,
 }
-WORDS = 62_509  # of all tracked markdown but the changelog
+WORDS = 63_023  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -41,7 +41,8 @@ class TrustRegion(CostRollouts):
     :param learning_rate: of the critics, a number or a function of the remaining progress
     :param n_steps: steps per environment and update; a multiple of the episode length makes every
         update see whole episodes
-    :param batch_size: rows per critic step, at most; None for the whole rollout, as in the paper
+    :param batch_size: rows per critic step, at most a tenth of the rollout; None for the whole
+        rollout, as in the paper
     :param gamma: discount factor of the reward
     :param gae_lambda: bias-variance trade-off of the reward advantages
     :param target_kl: δ, bound on the mean KL(old ‖ new) per update, summed over action dimensions
@@ -120,6 +121,12 @@ class TrustRegion(CostRollouts):
 
     # Updating
 
+    @property
+    def critic_batch(self) -> int | None:
+        """``batch_size``, but so few rows that a pass has ten steps."""
+        rows = self.n_steps * self.n_envs
+        return None if self.batch_size is None else min(self.batch_size, -(-rows // 10))
+
     def train(self) -> None:
         """One update from the rollout: the policy's step, what a leaf learns, the critics."""
         started = time.perf_counter()
@@ -147,7 +154,7 @@ class TrustRegion(CostRollouts):
             batch.observations,
             batch.returns[:, None],
             self.n_critic_updates,
-            self.batch_size,
+            self.critic_batch,
         )
         self._check_finite("value_loss", loss)
         if self.uses_cost_critic:

@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_457,
+    "sb3_guard": 26_473,
     "sb3_guard/envs": 8_830,
-    "sb3_guard/algorithms": 5_766,
+    "sb3_guard/algorithms": 5_778,
     "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
-    "harness": 8_430,
+    "harness": 8_434,
     "tests": 25_046,
 }
-WORDS = 63_023  # of all tracked markdown but the changelog
+WORDS = 63_194  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

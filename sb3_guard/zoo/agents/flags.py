@@ -19,7 +19,7 @@ class AgentFlags(Command):
     :param exp_id: number of the run; 0: the latest, -1: <folder>/<algo> itself is the run (default:
         0)
     :param load_best: take the best checkpoint (highest return among those within the limit) instead
-        of the last one
+        of the certified or last one
     :param load_final: take the final model, also where another one is certified
     :param pretrained: take the agent that comes with the package for --env; enjoy without --env
         lists them
@@ -118,7 +118,7 @@ class CertifyFlags(AgentFlags):
     prog: ClassVar[str] = "sb3-guard certify"
     examples: ClassVar[str] = """examples:
   sb3-guard certify --pretrained
-  sb3-guard certify --algo cpo --env Goal_Point_8Hazards -f logs --load-best
+  sb3-guard certify --algo cpo --env Goal_Point_8Hazards -f logs --load-final
   sb3-guard certify --algo ppo --env Goal_Point_8Hazards -f logs --cost-limit 5
 """
     n_episodes: int | None = flag(low=1, metavar="N")
@@ -135,6 +135,10 @@ class ExportFlags(AgentFlags):
     filter; contract.json next to it describes input and output. Sampled actions take their
     random numbers as an input.
 
+    What is played:
+
+    :param n_episodes: number of episodes whose return and cost the contract states (default: 100)
+
     Output:
 
     :param output: the file (default: policy.onnx)
@@ -145,7 +149,7 @@ class ExportFlags(AgentFlags):
     prog: ClassVar[str] = "sb3-guard export"
     examples: ClassVar[str] = """examples:
   sb3-guard export --pretrained
-  sb3-guard export --algo cpo --env Goal_Point_8Hazards -f logs --load-best -o robot/policy.onnx
+  sb3-guard export --algo cpo --env Goal_Point_8Hazards -f logs -o robot/policy.onnx
 """
     output: str = flag("-o", default="policy.onnx", metavar="FILE.onnx")
     stop: dict[str, Any] | None = flag(metavar="ACTUATOR:VALUE")

@@ -71,7 +71,7 @@ class TRPOSL(FilteredTrustRegion):
         for _ in range(self.model_passes):
             drawn = th.randperm(len(none))[: len(some)].to(none.device)
             index = th.cat([some, none[drawn]])
-            loss = layer.learn(rows(data, index), targets[index], 1, self.critic_batch)
+            loss = layer.learn(rows(data, index), targets[index], 1, self.batch_size)
         self._check_finite("cost_model_loss", loss)
         error = layer.error(batch.observations, actions, batch.previous_costs, batch.costs)
         layer.noise.copy_(self.tolerance * error)

@@ -13,9 +13,9 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_473,
+    "sb3_guard": 26_468,
     "sb3_guard/envs": 8_830,
-    "sb3_guard/algorithms": 5_778,
+    "sb3_guard/algorithms": 5_773,
     "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
     "harness": 8_434,

@@ -277,11 +277,6 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             actions.long().flatten() if isinstance(self.action_space, spaces.Discrete) else actions
         )
 
-    @property
-    def critic_batch(self) -> int | None:
-        """Rows per critic step, at most; None for the whole rollout."""
-        return getattr(self, "batch_size", None)
-
     def fit_cost_critic(self, n_epochs: int | None = None) -> None:
         """Fit the cost critic to the rollout's cost returns, with the algorithm's learning rate.
 
@@ -305,7 +300,7 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
             rows(batch.observations, learnt),
             targets[learnt],
             getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,
-            self.critic_batch,
+            getattr(self, "critic_batch", getattr(self, "batch_size", None)),
             self.cost_rng,
         )
         self._check_finite("cost_value_loss", loss)

@@ -123,7 +123,7 @@ class TrustRegion(CostRollouts):
 
     @property
     def critic_batch(self) -> int | None:
-        """``batch_size``, but so few rows that a pass has ten steps."""
+        """Rows per critic step: ``batch_size``, but a pass has ten steps."""
         rows = self.n_steps * self.n_envs
         return None if self.batch_size is None else min(self.batch_size, -(-rows // 10))
 

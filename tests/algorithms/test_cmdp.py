@@ -326,6 +326,7 @@ def test_several_limits_are_kept(
         n_steps=32,
         target_kl=0.05,
         n_critic_updates=20,
+        batch_size=None,
         learning_rate=1e-2,
         cost_keys=("cost", "cost_1"),
         cost_limit=limits,

@@ -119,6 +119,7 @@ def test_its_environments_train(package):
     settings = {
         **SMALL,
         "policy_kwargs": {"net_arch": [8], "ortho_init": True, "log_std_init": 0.0},
+        "batch_size": None,
     }
     costs = {"cost_limit": 0.5, "cost_keys": ("cost_hazards",)}
     model = CPO("MlpPolicy", env, **costs, **settings).learn(128)

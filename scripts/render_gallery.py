@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard import ALGORITHMS, make_vec_env, train
-from sb3_guard.envs import GuardVectorEnv
+from sb3_guard.envs import GuardVectorEnv, env_spec
 from sb3_guard.envs.registry import CONSTRAINTS, ROBOTS, TASKS, guard
 from sb3_guard.envs.suites.velocity import TABLE
 from sb3_guard.zoo.agents.flags import AgentFlags
@@ -70,7 +71,8 @@ def picture(
     # The speeds that MuJoCo writes into a picture have the same size in all: small in large ones.
     width, height = (360, 300) if "Velocity" in env_id else (720, 600)
     window = {"width": round(width * zoom), "height": round(height * zoom), "camera": camera}
-    env = GuardVectorEnv(1, env_id, render_mode="rgb_array", **window, **params)
+    known = env_spec(env_id).kwargs
+    env = GuardVectorEnv(1, render_mode="rgb_array", **{**known, **window, **params})
     env.reset(seed=seed)
     env.step(np.random.default_rng(seed).uniform(-0.2, 0.2, env.action_space.shape))
     (frame,) = env.render() or ()
@@ -182,16 +184,13 @@ def write_clip(model: BaseAlgorithm, env: VecEnv, path: Path, deterministic: boo
 
 
 def file_clips(output: Path, folder: str, seed: int) -> None:
-    """A clip and a still of each robot of another package with a task in scripts/robots.py."""
+    """A clip of each robot of another package with a task in scripts/robots.py."""
     for stem, (env_id, zoom) in FILES.items():
         window = {"width": round(600 * zoom), "height": round(500 * zoom), "camera": "track"}
         flags = AgentFlags(env=env_id, folder=folder, seed=seed, env_kwargs=window,
                            gym_packages=["robots"])  # fmt: skip
         chosen = open_agent(flags, "rgb_array")
         write_clip(chosen.model, chosen.env, output / f"{stem}.webp")
-        with Image.open(output / f"{stem}.webp") as film:
-            film.seek(CLIP // 3)
-            film.convert("RGB").quantize(96).save(output / f"{stem}.png", optimize=True)
 
 
 def save(frames: list[Image.Image], path: Path) -> None:
@@ -230,6 +229,9 @@ def main() -> None:
             picture(env_id, args.output / f"{stem}.png", None, args.seed)
         for stem, (env_id, params) in VARIANTS.items():
             picture(env_id, args.output / f"{stem}.png", "fixed", args.seed, **params)
+        import_module("robots")  # scripts/robots.py fetches and registers them
+        for stem, (env_id, zoom) in FILES.items():  # with seed 2 their goals are seen
+            picture(env_id, args.output / f"{stem}.png", "track", 2, zoom)
 
 
 if __name__ == "__main__":

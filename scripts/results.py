@@ -22,6 +22,7 @@ from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of al
 import argparse
 import re
 import tarfile
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -438,6 +439,20 @@ def curves() -> None:
         save(draw_healthy(algo), DOCS / "images" / f"healthy_{algo}.png")
 
 
+def figures(text: str) -> Iterator[tuple[str, Figure]]:
+    """The figures of packed grids that a page names, with their files' names."""
+    images = IMAGE.findall(text)
+    for name, kind in sorted({(name, kind) for _, name, kind in images}):
+        with unpacked(name) as found:
+            runs = last(found.runs)
+            # Drawn is what the tables have: the last ten epochs, not the last one.
+            means = {"J_r": runs["return_last"], "M_c": runs["cost_last"]}
+            drawings = draw(kind, Data(runs.assign(**means)))
+        for drawn, figure in drawings.items():
+            if (file := f"{name}_{drawn}.png", name, kind) in images:
+                yield file, figure
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--pack", nargs=2, metavar=("FOLDER", "NAME"), help="pack a folder's logs")
@@ -450,16 +465,8 @@ def main() -> None:
     for path, text in pages().items():
         path.write_text(text)
         print(path)
-        images = IMAGE.findall(text)
-        for name, kind in sorted({(name, kind) for _, name, kind in images}):
-            with unpacked(name) as found:
-                runs = last(found.runs)
-                # Drawn is what the tables have: the last ten epochs, not the last one.
-                means = {"J_r": runs["return_last"], "M_c": runs["cost_last"]}
-                drawings = draw(kind, Data(runs.assign(**means)))
-            for drawn, figure in drawings.items():
-                if (file := f"{name}_{drawn}.png", name, kind) in images:
-                    save(figure, DOCS / "images" / file)
+        for file, figure in figures(text):
+            save(figure, DOCS / "images" / file)
 
 
 if __name__ == "__main__":

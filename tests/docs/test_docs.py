@@ -4,6 +4,7 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import itertools
 import re
 import sys
 from pathlib import Path
@@ -31,6 +32,7 @@ GUIDES = [
     *(DOCS / f"{name}.md" for name in SAMPLED),
     *sorted((DOCS / "algorithms").glob("*.md")),
 ]
+RESULTS = (DOCS / "results.md").read_text()
 KINDS = ("cpo", "ppo_lag", "sac_lag", "trpo_usl")  # whose samples run every time
 # The samples as written, but for the length of the training.
 SHORTER = {
@@ -243,6 +245,29 @@ def test_scripts_exist_where_they_are_named_and_each_is_named_somewhere():
         assert not {name for name in scripts if not (ROOT / name).exists()}, path
     scripts = {path.relative_to(ROOT).as_posix() for path in (ROOT / "scripts").rglob("*.py")}
     assert scripts <= set().union(*(named[path] for path in guides))
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param("grand_table", marks=pytest.mark.slow), "guard_limit2", "guard_limit5"]
+)
+def test_words_in_figures_lie_on_no_marker_and_not_on_each_other(name):
+    drawn = [*script("results").figures("".join(re.findall(rf"images/{name}_pareto\S+", RESULTS)))]
+    assert drawn
+    for file, figure in drawn:
+        figure.draw_without_rendering()
+        (axis,), (legend,) = figure.axes, figure.legends
+        texts = [*legend.get_texts(), axis.title, axis.xaxis.label, axis.yaxis.label]
+        for side in (axis.xaxis, axis.yaxis):
+            low, high = sorted(side.get_view_interval())
+            ticks = zip(side.get_ticklocs(), side.get_ticklabels(), strict=True)
+            texts += [text for place, text in ticks if low <= place <= high]
+        boxes = {text: text.get_window_extent() for text in texts}
+        for (one, box), (other, its) in itertools.combinations(boxes.items(), 2):
+            assert not box.overlaps(its), f"{file}: {one}, {other}"
+        for text, box in boxes.items():
+            assert not box.overlaps(axis.get_window_extent()), f"{file}: {text} is among markers"
+            assert figure.bbox.padded(1).fully_containsx(box.x0), f"{file}: {text} is cut"
+            assert figure.bbox.padded(1).fully_containsx(box.x1), f"{file}: {text} is cut"
 
 
 def test_files_of_the_repository_that_pages_name_exist():

@@ -19,9 +19,9 @@ LINES = {
     "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
     "harness": 8_434,
-    "tests": 25_049,
+    "tests": 25_074,
 }
-WORDS = 63_201  # of all tracked markdown but the changelog
+WORDS = 63_197  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

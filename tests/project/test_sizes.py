@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_434,
     "tests": 25_074,
 }
-WORDS = 63_197  # of all tracked markdown but the changelog
+WORDS = 63_250  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -159,9 +159,9 @@ function describe({ limit, algorithm, steps, sampled, greedy }) {
     kept: "it keeps the limit.",
     exceeded: "it exceeds the limit.",
     undecided: "the interval has the limit in it, so whether it keeps the limit is undecided.",
-  }[sampled.verdict];
+  }[greedy.verdict];
   $("agent").textContent = `${algorithm}, ${steps.toLocaleString("en")} training steps. ` +
-    `Trained ${limit === null ? "without a limit" : `at ${limit}`}, its mean cost is ${cost(sampled)}` +
+    `Trained ${limit === null ? "without a limit" : `at ${limit}`}, its mean cost is ${cost(greedy)}` +
     `${says ? `: ${says}` : "."}`;
   const rows = [["sampled", sampled], ["most likely", greedy]];
   $("measured").caption.textContent = `After training: ${sampled.episodes} episodes each`;
@@ -181,7 +181,9 @@ function seat(chosen) {
 }
 
 async function enter(chosen) {
-  const request = ++asked, first = chosen.agents.at(-1);
+  // the least limit that an agent keeps, if one does
+  const kept = ({ greedy }) => greedy.verdict === "kept";
+  const request = ++asked, first = chosen.agents.findLast(kept) ?? chosen.agents.at(-1);
   const [spec] = await Promise.all([read(`${chosen.env}.json`).then((a) => a.json()), load(first)]);
   if (request !== asked) return;
   // from here on nothing waits: the next frame sees the new world as a whole

@@ -34,7 +34,7 @@ SAYS = {
 }
 LONG = "cpo_in_one_file"  # tests/docs/test_cpo_in_one_file.py
 LENGTHS = {
-    r"1_000_000|[1235]00_000": "200",
+    r"1_000_000|[12356]00_000": "200",
     r"n_steps=(1000|500)": "n_steps=20",
     r"(make_model\([^()]*?),?\s*\)": r"\1, n_steps=20)",
     r"batch_size=1000": "batch_size=200",
@@ -195,10 +195,10 @@ def test_the_notebook_runs(tmp_path):
     notebook.cells.insert(0, nbformat.v4.new_code_cell(SHORT_EPISODES))
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": tmp_path}}).execute()
     made = {path.name for path in tmp_path.iterdir()}
-    assert made == {"cpo_hazards", "cpo_ghosts", "hazards.mp4", "ghosts.mp4"}
+    assert made == {"training", "agent", "hazards.mp4"}
     kinds = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert not [output for output in kinds if output.get("name") == "stderr"]
-    assert sum("image/png" in output.get("data", {}) for output in kinds) == 3
+    assert sum("image/png" in output.get("data", {}) for output in kinds) == 4
 
 
 def test_the_notebook_shows_what_it_is_about_and_stays_small():
@@ -207,5 +207,6 @@ def test_the_notebook_shows_what_it_is_about_and_stays_small():
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in code] == [*range(1, len(code) + 1)]
     shown = json.dumps([cell.outputs for cell in code])
-    assert shown.count("image/png") == 3 and shown.count("<video") == 2
+    assert shown.count("image/png") == 4 and shown.count("<video") == 1
+    assert "certified: mean cost" in shown
     assert "/tmp" not in shown and "stderr" not in shown

@@ -19,7 +19,7 @@ LINES = {
     "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
     "harness": 8_434,
-    "tests": 25_076,
+    "tests": 25_077,
 }
 WORDS = 63_250  # of all tracked markdown but the changelog
 

@@ -227,6 +227,8 @@ def main() -> None:
             picture(env_id, args.output / f"{stem}.png", camera, args.seed, zoom)
         for stem, env_id in SAFETY.items():
             picture(env_id, args.output / f"{stem}.png", None, args.seed)
+        racecar = args.output / "safety_racecar.png"
+        picture("SafetyRacecarGoal1-v0", racecar, "track", args.seed, 2.0)
         for stem, (env_id, params) in VARIANTS.items():
             picture(env_id, args.output / f"{stem}.png", "fixed", args.seed, **params)
         import_module("robots")  # scripts/robots.py fetches and registers them

@@ -44,7 +44,7 @@ _ROBOTS: tuple[type[Robot], ...] = (
     gym_mujoco.AntV4, gym_mujoco.HalfCheetahV4, gym_mujoco.HopperV4, gym_mujoco.HumanoidV4,
     gym_mujoco.SwimmerV4, gym_mujoco.Walker2dV4,
     safety_gymnasium.SafetyPoint, safety_gymnasium.SafetyCar, safety_gymnasium.SafetyAnt,
-    safety_gymnasium.SafetyDoggo,
+    safety_gymnasium.SafetyDoggo, safety_gymnasium.SafetyRacecar,
 )  # fmt: skip
 ROBOTS = {robot.__name__: robot for robot in _ROBOTS}
 TASKS: dict[str, type[Task]] = _parts(

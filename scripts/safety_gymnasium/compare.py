@@ -1,6 +1,6 @@
 """How far our tasks are from Safety-Gymnasium 1.0.0's, over all that was recorded of it.
 
-``python scripts/safety_gymnasium/compare.py`` prints two tables, of all 52 navigation ids
+``python scripts/safety_gymnasium/compare.py`` prints two tables, of all 65 navigation ids
 (``tests/data/safety_gymnasium``), with a column or two rows for each robot. What is observed and
 rewarded in a recorded state: the largest differences, relative to the value or to 0.01 if that is
 more; observations in the files have 21 bits, 4.8e-7. And one control step from a recorded state, by

@@ -68,7 +68,13 @@ def test_every_event_that_the_task_knows_is_in_the_trace(name):
 
 @pytest.mark.parametrize(
     ("robot", "usual", "most"),  # m or rad; the files resolve 5e-7
-    [("Point", 1e-6, 1e-6), ("Car", 1e-6, 1e-5), ("Ant", 1e-3, 0.1), ("Doggo", 1e-6, 1e-5)],
+    [
+        ("Point", 1e-6, 1e-6),
+        ("Car", 1e-6, 1e-5),
+        ("Ant", 1e-3, 0.1),
+        ("Doggo", 1e-6, 1e-5),
+        ("Racecar", 1e-4, 1e-2),
+    ],
 )
 def test_one_control_step_of_another_mujoco(robot, usual, most):
     t = Trace(f"{robot}Goal0")
@@ -137,6 +143,21 @@ def test_ids_and_time_limits():
         assert gymnasium.spec(f"Safety{name}-v0").max_episode_steps == steps
     env = gymnasium.make("SafetyPointGoal0-v0")
     assert env.observation_space.shape == (28,) and env.action_space.shape == (2,)
+
+
+def test_a_racecar_drives_the_same_with_scaled_actions():
+    env, scaled = (
+        gymnasium.make("SafetyRacecarCircle1-v0", robot=changes)
+        for changes in ({}, {"scaled": True})
+    )
+    np.testing.assert_allclose(env.action_space.high, [20.0, 0.785])
+    np.testing.assert_array_equal(scaled.action_space.high, [1.0, 1.0])
+    env.reset(seed=0), scaled.reset(seed=0)
+    for _ in range(20):
+        seen, *_ = env.step(np.array([10.0, 0.785], dtype=np.float32))
+        same, *_ = scaled.step(np.array([0.5, 1.0], dtype=np.float32))
+    np.testing.assert_allclose(seen, same, atol=1e-5)
+    assert seen[3] > 0.1  # m/s ahead
 
 
 SLOW = pytest.mark.slow

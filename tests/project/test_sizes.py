@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_468,
-    "sb3_guard/envs": 8_830,
+    "sb3_guard": 26_483,
+    "sb3_guard/envs": 8_844,
     "sb3_guard/algorithms": 5_773,
     "sb3_guard/common": 2_515,
     "sb3_guard/deployment": 916,
-    "harness": 8_434,
-    "tests": 25_077,
+    "harness": 8_435,
+    "tests": 25_107,
 }
-WORDS = 63_250  # of all tracked markdown but the changelog
+WORDS = 63_454  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

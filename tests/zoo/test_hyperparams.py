@@ -61,6 +61,12 @@ def test_safety_gymnasiums_tasks_have_its_limit(algo):
     check(algo, ALGORITHMS[algo], values)
 
 
+def test_the_longest_pattern_wins():
+    values = read_hyperparams("cpo", "SafetyRacecarGoal1-v0")
+    assert values.pop("env_kwargs") == {"robot": {"scaled": True}}
+    assert values == read_hyperparams("cpo", "SafetyPointGoal1-v0")
+
+
 def test_command_line_wins(conf):
     values = read_hyperparams("cpo", "Anything-v0", conf, {"n_steps": 7, "gamma": 0.9})
     assert values == {"gamma": 0.9, "n_steps": 7, "n_timesteps": 1e5}

@@ -81,7 +81,7 @@ class MJCFRobot(Robot):
     workspace: ClassVar[str] = "planar"
     lidar_bodies: ClassVar[tuple[str, ...]] = ("robot",)
     center: ClassVar[str] = "robot"  # the body whose origin is the robot's position
-    scaled: ClassVar[bool] = True  # whether actions are shares of the actuators' control ranges
+    scaled = True  # whether actions are shares of the actuators' control ranges
     floor: ClassVar[bool] = True  # False: it slides at a fixed height and never meets the floor
     complete: ClassVar[bool] = False  # whether the file is a world with a floor of its own
     aware: ClassVar[bool] = False  # whether it observes what no sensor of the file measures

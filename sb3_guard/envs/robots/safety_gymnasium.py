@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sb3_guard.envs.observation import Observations, Values
+from sb3_guard.envs.parameters import param
 from sb3_guard.envs.part import Simulation
 from sb3_guard.envs.robots.robot import PREFIX, MJCFRobot
 from sb3_guard.envs.types import Array, Generators
@@ -107,3 +108,16 @@ class SafetyDoggo(SafetyRobot):
         *(f"jointvel_{joint}" for joint in _DOGGO),
         *(f"jointpos_{joint}" for joint in _DOGGO),
     )
+
+
+@dataclass
+class SafetyRacecar(SafetyRobot):
+    """Safety-Gymnasium's Racecar: the speed of its rear axle, rad/s, and its front wheels' angle.
+
+    ``robot={"scaled": True}`` takes both from actions in [-1, 1], which policies learn sooner.
+    """
+
+    asset = "safety_racecar.xml"
+    timestep = 0.004
+    integrator = "RK4"
+    scaled: bool = param(False, "actions in [-1, 1] are scaled to the controls")

@@ -9,7 +9,7 @@ from sb3_guard.envs.registry import ROBOTS
 from sb3_guard.envs.robots.safety_gymnasium import SafetyRobot
 from sb3_guard.envs.suites.suite import Suite
 
-NAMES = ("Point", "Car", "Ant", "Doggo")
+NAMES = ("Point", "Car", "Ant", "Doggo", "Racecar")
 HAZARDS = {"size": 0.2}
 VASES = {"size": 0.1, "keepout": 0.15, "density": 0.001, "sink": 4e-5, "separate": True}
 GREMLINS = {
@@ -125,10 +125,10 @@ def _scenario(robot: str, level: str) -> dict[str, Any]:
     size, constraints = LEVELS[level]
     seen = {*SEEN.get(task, ()), *constraints}
     lidars = [f"{thing}_lidar" for thing in ORDER if thing in seen]
-    # where something may lie still, and is more work than the robot
-    sleep = robot != "Ant" and bool(seen & {"vases", "box"})
     body = ROBOTS[f"Safety{robot}"]
     assert issubclass(body, SafetyRobot)
+    # where something may lie still, which RK4 does not let it
+    sleep = body.integrator != "RK4" and bool(seen & {"vases", "box"})
     return {
         "robot": f"Safety{robot}",
         "task": task,

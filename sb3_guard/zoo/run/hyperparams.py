@@ -123,8 +123,8 @@ def read_hyperparams(
     The hyperparameters of an algorithm on an environment, not yet checked.
 
     :param algo: key of the algorithm, names the shipped file
-    :param env_id: its own entry is taken, with or without a version, else the first pattern that
-        fits, else ``default``
+    :param env_id: its own entry is taken, with or without a version, else the longest pattern
+        that fits, else ``default``
     :param conf_file: file to read instead of the shipped one; ``paper``: the shipped one, with what
         is different in the paper's table
     :param overrides: what the command line says
@@ -152,7 +152,8 @@ def read_hyperparams(
 def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] | None:
     """The entry of a file that an environment takes; None: there is none."""
     env_id = env_id.rpartition(":")[2]  # without the module that registers it
-    patterns = (name for name in content if "*" in name and fnmatchcase(env_id, name))
+    fitting = (name for name in content if "*" in name and fnmatchcase(env_id, name))
+    patterns = sorted(fitting, key=len, reverse=True)
     for name in (env_id, env_id.rsplit("-v", 1)[0], *patterns, "default"):
         if name in content:
             return content[name]

@@ -162,7 +162,7 @@ class DeliveryCallback(BaseCallback):
                 tries=TRIES,
             )
             if certificate.verdict == "certified":
-                self._write(certificate)
+                self._write(certificate, steps)
                 return f"Delivered, the policy of {steps:,} steps: {certificate}"
             refused.append(certificate)
         nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
@@ -191,10 +191,12 @@ class DeliveryCallback(BaseCallback):
             part.mean, part.var, part.count = mean.numpy(), var.numpy(), count
         return int(content["num_timesteps"])
 
-    def _write(self, certificate: Certificate) -> None:
+    def _write(self, certificate: Certificate, steps: int) -> None:
         self.certificate = certificate
+        trained, self.model.num_timesteps = self.model.num_timesteps, steps
         with replacing(self.folder / "certified_model.zip") as file:
             self.model.save(file)
+        self.model.num_timesteps = trained
         normalizer = unwrap_vec_normalize(self.eval_env)
         if normalizer is not None:
             normalizer.save(str(self.folder / "certified_model_vecnormalize.pkl"))

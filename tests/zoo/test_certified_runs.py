@@ -8,7 +8,7 @@ import torch
 from killed import crash, runs_of
 from typed import LENGTH, SMALL, TOY, refused, trained
 
-from sb3_guard import enjoy, export_agent, hub, train
+from sb3_guard import CPO, enjoy, export_agent, hub, train
 from sb3_guard.common.certificate import Certificate
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.run import Run
@@ -40,6 +40,16 @@ def test_a_run_delivers_and_says_so(run, capsys, tmp_path):
     sampled = [*here, "--stochastic", "-o", str(tmp_path / "policy.onnx")]
     assert export_agent.main(sampled) == 0
     assert json.loads((tmp_path / "contract.json").read_text())["trained"]["certificate"] is None
+
+
+def test_the_certified_model_knows_its_age(run):
+    model = CPO.load(run / "certified_model.zip")
+    ages = {}
+    for file in (run / "candidates").iterdir():
+        candidate = torch.load(file)
+        ages[candidate["num_timesteps"]] = candidate["policy"]
+    for key, value in model.policy.state_dict().items():
+        assert torch.equal(value, ages[model.num_timesteps][key])
 
 
 def test_a_repository_has_the_certificate(run, capsys, tmp_path):

@@ -1,11 +1,10 @@
 """Print what an update costs, where its time goes, and what that makes of the paper's runs.
 
 ``python scripts/bench_training.py`` measures on-policy algorithms with the settings of their files
-(30,000 steps an update; in trust regions 80 full-batch steps of each critic) beside a bare physics
-loop timed in the same run; the best of several updates counts. The safety layers are measured
-switched on. ``--beside-sb3`` compares first-order and off-policy algorithms with SB3's PPO, SAC and
-TD3 and SB3-contrib's TQC of the same settings instead: updates of the two by turns, the median of
-the ratios.
+(30,000 steps an update) beside a bare physics loop timed in the same run; the best of several
+updates counts. The safety layers are measured switched on. ``--beside-sb3`` compares first-order
+and off-policy algorithms with SB3's PPO, SAC and TD3 and SB3-contrib's TQC of the same settings
+instead: updates of the two by turns, the median of the ratios.
 """
 
 from __future__ import annotations

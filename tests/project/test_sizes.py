@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_435,
     "tests": 25_117,
 }
-WORDS = 63_489  # of all tracked markdown but the changelog
+WORDS = 63_514  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

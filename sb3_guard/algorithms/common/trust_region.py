@@ -123,9 +123,9 @@ class TrustRegion(CostRollouts):
 
     @property
     def critic_batch(self) -> int | None:
-        """Rows per critic step: ``batch_size``, but a pass has ten steps."""
-        rows = self.n_steps * self.n_envs
-        return None if self.batch_size is None else min(self.batch_size, -(-rows // 10))
+        """Rows per critic step: ``batch_size``, but a pass has ten steps, of 64 rows at least."""
+        tenth = -(-self.n_steps * self.n_envs // 10)
+        return None if self.batch_size is None else min(self.batch_size, max(tenth, 64))
 
     def train(self) -> None:
         """One update from the rollout: the policy's step, what a leaf learns, the critics."""

@@ -82,7 +82,7 @@ class TRPOUSL(FilteredTrustRegion):
             (batch.observations, self._executed(batch)),
             batch.cost_returns / unit,
             self.n_critic_updates,
-            self.critic_batch,
+            self.critic_batch(len(batch.cost_returns)),
         )
         self._check_finite("cost_model_loss", loss)
         self.logger.record("train/cost_model_loss", loss)

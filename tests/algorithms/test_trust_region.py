@@ -231,11 +231,11 @@ def test_a_regression_takes_the_steps_of_a_loop_by_hand(batch_size: int | None) 
 
 
 @pytest.mark.parametrize(
-    ("n_steps", "batch_size", "rows"),
+    ("pass_of", "batch_size", "rows"),
     [(30_000, 2000, 2000), (2_000, 2000, 200), (100, 2000, 64), (100, 10, 10), (100, None, None)],
 )
-def test_a_pass_of_the_critics_has_ten_steps(n_steps, batch_size, rows) -> None:
-    assert CPO("MlpPolicy", CostPoint(), n_steps=n_steps, batch_size=batch_size).critic_batch == rows
+def test_a_pass_of_the_critics_has_ten_steps(pass_of, batch_size, rows) -> None:
+    assert CPO("MlpPolicy", CostPoint(), batch_size=batch_size).critic_batch(pass_of) == rows
 
 
 def test_value_regression_moves_the_value_network_alone() -> None:

@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_485,
+    "sb3_guard": 26_487,
     "sb3_guard/envs": 8_844,
-    "sb3_guard/algorithms": 5_773,
+    "sb3_guard/algorithms": 5_775,
     "sb3_guard/common": 2_517,
     "sb3_guard/deployment": 916,
     "harness": 8_435,
-    "tests": 25_117,
+    "tests": 25_124,
 }
-WORDS = 63_514  # of all tracked markdown but the changelog
+WORDS = 63_554  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

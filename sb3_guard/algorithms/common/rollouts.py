@@ -291,21 +291,25 @@ class CostRollouts(Constrained, OnPolicyAlgorithm):
         batch = self.rollout_buffer.whole()
         assert self.cost_units is not None
         units = np.where(self.cost_units, self.cost_units, np.float32(1.0))
-        targets = batch.cost_returns / th.as_tensor(units).to(batch.cost_returns)
         learnt = self.critic_rows(batch.cost_returns)
+        targets = (batch.cost_returns / th.as_tensor(units).to(batch.cost_returns))[learnt]
         loss = regress(
             self.cost_critic,
             self.cost_critic.parameters(),
             self.cost_critic.optimizer,
             rows(batch.observations, learnt),
-            targets[learnt],
+            targets,
             getattr(self, "n_epochs", 1) if n_epochs is None else n_epochs,
-            getattr(self, "critic_batch", getattr(self, "batch_size", None)),
+            self.critic_batch(len(targets)),
             self.cost_rng,
         )
         self._check_finite("cost_value_loss", loss)
         self.logger.record("train/cost_value_loss", loss)
         self._record_violation()
+
+    def critic_batch(self, rows: int) -> int | None:
+        """Rows of a critic's step, where a pass has so many; None: all."""
+        return getattr(self, "batch_size", None)
 
     def critic_rows(self, targets: th.Tensor) -> slice | th.Tensor:
         """Which rows of the rollout the cost critic learns from: all.

@@ -121,11 +121,9 @@ class TrustRegion(CostRollouts):
 
     # Updating
 
-    @property
-    def critic_batch(self) -> int | None:
-        """Rows per critic step: ``batch_size``, but a pass has ten steps, of 64 rows at least."""
-        tenth = -(-self.n_steps * self.n_envs // 10)
-        return None if self.batch_size is None else min(self.batch_size, max(tenth, 64))
+    def critic_batch(self, rows: int) -> int | None:
+        """``batch_size``, but a pass has ten steps, of 64 rows at least."""
+        return None if self.batch_size is None else min(self.batch_size, max(-(-rows // 10), 64))
 
     def train(self) -> None:
         """One update from the rollout: the policy's step, what a leaf learns, the critics."""
@@ -154,7 +152,7 @@ class TrustRegion(CostRollouts):
             batch.observations,
             batch.returns[:, None],
             self.n_critic_updates,
-            self.critic_batch,
+            self.critic_batch(len(batch.returns)),
         )
         self._check_finite("value_loss", loss)
         if self.uses_cost_critic:

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_guard.algorithms.common.costs import limits_at
 from sb3_guard.common.evaluation import (
     Evaluation,
+    check_agent,
     evaluate_policy,
     share_environment,
     sync_normalization,
@@ -180,6 +181,7 @@ class CostEvalCallback(EvalCallback):
             warnings.filterwarnings("ignore", "Training and eval env are not of the same type")
             super()._init_callback()
         self.limits()
+        check_agent(self.model, self.eval_env)
         if share_environment(self.training_env, self.eval_env):
             raise ValueError(
                 "eval_env is the training environment, whose episodes every evaluation would "

@@ -13,7 +13,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_guard.common.certificate import LEAST, MOST, Certificate, certify, limits_of
-from sb3_guard.common.evaluation import evaluate_policy, moments_of, sync_normalization
+from sb3_guard.common.evaluation import (
+    check_agent,
+    evaluate_policy,
+    moments_of,
+    sync_normalization,
+)
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
@@ -74,10 +79,11 @@ class DeliveryCallback(BaseCallback):
     def _init_callback(self) -> None:
         """
         :raises ValueError: the limit is not finite, or does not fit the costs, or ``eval_env`` is
-            not normalised as the training is
+            not normalised as the training is, or has other actions
         """
         self._limits()
         sync_normalization(self.training_env, self.eval_env)
+        check_agent(self.model, self.eval_env)
 
     def _limits(self) -> list[float]:
         keys = cost_keys_of(self.model, self.eval_env)

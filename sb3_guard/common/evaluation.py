@@ -139,9 +139,12 @@ def check_agent(model: Any, env: VecEnv) -> None:
     :param model: an algorithm or a policy
     :param env: environments to play it in
     :raises NumberError: a weight is not finite
-    :raises ValueError: the statistics of observations do not fit, see :func:`check_normalizer`
+    :raises ValueError: the statistics of observations do not fit, see :func:`check_normalizer`, or
+        the actions are others
     """
     policy = getattr(model, "policy", model)
+    if (own := getattr(policy, "action_space", env.action_space)) != env.action_space:
+        raise ValueError(f"the agent's actions are {own}, those here {env.action_space}")
     if isinstance(policy, th.nn.Module):
         for name, weights in policy.named_parameters():  # a buffer may hold -inf, as masks do
             if not th.isfinite(weights).all():

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import DependencyNotInstalled
+from gymnasium.vector import VectorEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
 from sb3_guard.common.native import GuardVecEnv
@@ -22,15 +24,13 @@ from sb3_guard.ids import ENTRY_POINT, IMPORT_FIRST, UnknownId, with_version
 from sb3_guard.spelling import nearest
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
-
     from sb3_guard.envs.scenario import Scenario
 
 
 class Source(NamedTuple):
     """Where environments come from.
 
-    :param env_id: the id in full; None for a function that makes environments
+    :param env_id: the id in full; of a class or function its name with its module
     :param make: makes one from its keyword arguments
     :param batch: makes n on one batch of simulations, ``batch(n, **kwargs)``; None where that is
         not possible: environments of others, and ours with wrappers in their registration
@@ -38,7 +38,7 @@ class Source(NamedTuple):
     :param spec: how those are registered with Gymnasium that may have a vector environment
     """
 
-    env_id: str | None
+    env_id: str
     make: Callable[..., gymnasium.Env]
     batch: Callable[..., VecEnv] | None = None
     scenario: Scenario | None = None
@@ -59,19 +59,25 @@ class Source(NamedTuple):
         return vec_env or ("dummy" if spec.entry_point else "gymnasium")
 
 
-def find(
-    env_id: str | Path | Mapping[str, Any] | Scenario | Callable[..., gymnasium.Env],
-) -> Source:
+def find(env_id: Any) -> Source:
     """The environments that an id stands for.
 
     :param env_id: an id of sb3_guard or of Safety-Gymnasium, with or without its version, any id
         registered with Gymnasium, a scenario, its plain data or its YAML file, or a class or
         function that makes an environment
     :raises ValueError: nothing of that name exists, with the nearest match
+    :raises TypeError: it is an environment, not what makes one
     :raises gymnasium.error.DependencyNotInstalled: the package that has it is absent or too old
     """
+    if isinstance(env_id, gymnasium.Env | VectorEnv | VecEnv):
+        name = repr(spec.id) if (spec := getattr(env_id, "spec", None)) else "MyEnv"
+        raise TypeError(
+            f"this {type(env_id).__name__} is made already: give an id, a class, or a function "
+            f"that makes another one, such as {name}"
+        )
     if callable(env_id):
-        return Source(None, partial(_make_and_cut, env_id))
+        name = getattr(env_id, "__qualname__", type(env_id).__name__)
+        return Source(f"{env_id.__module__}.{name}", partial(_make_and_cut, env_id))
     if not isinstance(env_id, str) or env_id.endswith((".yml", ".yaml")):
         return _ours(env_id)
     env_id = env_id.removeprefix("sb3_guard:")

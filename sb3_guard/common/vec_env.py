@@ -74,8 +74,6 @@ def make_vec_env(
     rest = kwargs or vec_env or wrapper_class or num_threads
     if isinstance(env_id, VectorEnv | BatchVecEnv) and not rest and n_envs in (1, env_id.num_envs):
         venv = as_vec_env(env_id)
-    elif isinstance(env_id, gymnasium.Env | VectorEnv | VecEnv):
-        raise _is_made(env_id)
     else:
         source = env_id if isinstance(env_id, Source) else find(env_id)
         venv = _make(source, n_envs, vec_env, wrapper_class, num_threads, kwargs)
@@ -98,7 +96,7 @@ def _make(
     if vec_env == "native":
         if source.batch is None:
             raise ValueError(
-                f"{source.env_id or source.make!r} is not an sb3_guard environment, or has "
+                f"{source.env_id!r} is not an sb3_guard environment, or has "
                 "wrappers of its own: use vec_env 'dummy' or 'subproc'"
             )
         if wrapper_class is not None:
@@ -123,15 +121,6 @@ def _make(
     if vec_env == "subproc":
         return _subprocesses(make_one, n_envs)
     return DummyVecEnv([make_one] * int(n_envs))
-
-
-def _is_made(env: Any) -> TypeError:
-    spec = getattr(env, "spec", None)
-    name = repr(spec.id) if spec else "MyEnv"
-    return TypeError(
-        f"this {type(env).__name__} is made already: give an id, a class, or a function "
-        f"that makes another one, as make_vec_env({name}, n_envs=4)"
-    )
 
 
 def _subprocesses(make: Callable[[], gymnasium.Env], n_envs: int) -> VecEnv:

@@ -297,5 +297,4 @@ def test_the_commands_train_and_play_on_six_values_without_mujoco_4(tmp_path):
 def test_the_pages_examples_run():
     page = Path(__file__).parents[2] / "docs" / "your_environment.md"
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL)
-    assert len(blocks) == 4
     exec(compile("\n".join(blocks), str(page), "exec"), {})

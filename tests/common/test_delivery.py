@@ -151,3 +151,13 @@ def test_a_wrong_limit_is_told_before_the_training(limit, tmp_path):
     with pytest.raises(ValueError, match="cost_limit"):
         trained(tmp_path, limit)
     assert not [*tmp_path.iterdir()]
+
+
+def test_other_actions_are_told_before_the_training(tmp_path):
+    class Scaled(Dose):
+        action_space = spaces.Box(-20.0, 20.0, (1,), np.float32)
+
+    other = VecNormalize(make_vec_env(Scaled, vec_env="dummy"), norm_reward=False, training=False)
+    with pytest.raises(ValueError, match=r"the agent's actions are Box\(.* those here Box\(-20.0"):
+        trained(tmp_path, 1.0, eval_env=other)
+    assert not [*tmp_path.iterdir()]

@@ -261,7 +261,7 @@ def test_an_update_that_is_not_a_number(capsys, tmp_path, monkeypatch):
 def test_kept_model_that_is_not_there(capsys, run, tmp_path):
     play = [*TOY, "-f", str(tmp_path), "--no-render"]
     refused(enjoy.main, [*play, "--load-checkpoint", "30"], capsys, "no model at 30 steps")
-    refused(enjoy.main, [*play, "--load-best"], capsys, "best_model.zip", "needs no --load-best")
+    refused(enjoy.main, [*play, "--load-best"], capsys, "best_model.zip", "--load-final takes")
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from torch import nn
 
 from sb3_guard import ALGORITHMS, make_model, make_vec_env, train
 from sb3_guard.algorithms import CostReplay
+from sb3_guard.envs import Scenario
 from sb3_guard.zoo.cli.names import classes
 from sb3_guard.zoo.cli.usage import UsageError
 from sb3_guard.zoo.run.algos import baselines
@@ -162,8 +163,26 @@ def test_make_model_takes_a_class_or_a_function() -> None:
         agents.append(th.cat([weights.flatten() for weights in model.policy.parameters()]))
     assert all(th.equal(agents[0], agent) for agent in agents)
     assert model.costs.horizon == 20.0
-    with pytest.raises(ValueError, match="no cost limit is known for CostPoint: give cost_limit"):
-        make_model("cpo", CostPoint)
+    for name in "CostPoint", "SafetyRacecarOfMine":  # which no pattern of a file means
+        mine = type(name, (CostPoint,), {"__module__": "mine"})
+        with pytest.raises(ValueError, match=rf"no cost limit is known for mine\.{name}: give"):
+            make_model("cpo", mine)
+    with pytest.raises(ValueError, match=r"can.t make cost_envs\.CostPoint: "):
+        make_model("cpo", CostPoint, cost_limit=1.0, env_kwargs={"size": 2})
+    with pytest.raises(TypeError, match="this CostPoint is made already"):
+        make_model("cpo", CostPoint())
+
+
+def test_arguments_of_a_part_join_those_of_the_file() -> None:
+    """A Racecar's actions are scaled in the file, also where a user changes something else."""
+    small: dict[str, Any] = {"n_envs": 2, "n_steps": 20, "seed": 0}
+    changed = {"robot": {"keepout": 0.5}}
+    model = make_model("cpo", "SafetyRacecarGoal1-v0", env_kwargs=changed, **small)
+    (scenario,) = model.get_env().get_attr("scenario", 0)
+    assert scenario.robot_params["keepout"] == 0.5 and model.action_space.high.max() == 1.0
+    scenario = Scenario(robot="SafetyRacecar", task="Goal")
+    model = make_model("cpo", scenario, cost_limit=1.0, **small)
+    assert model.action_space.high.max() == 20.0
 
 
 def test_sizes_of_a_file_are_not_warned_of(tmp_path) -> None:

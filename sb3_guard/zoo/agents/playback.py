@@ -30,7 +30,7 @@ from sb3_guard.zoo.run.algos import algorithm
 from sb3_guard.zoo.run.checkpoint import load_model, read_normalizer
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.folder import RunFolder, folder_name, is_run, latest_run
-from sb3_guard.zoo.run.hyperparams import check, without_withdrawn
+from sb3_guard.zoo.run.hyperparams import check, merged, without_withdrawn
 from sb3_guard.zoo.run.make_envs import BAD_NUMBERS, source_of
 from sb3_guard.zoo.run.run import Run
 
@@ -94,7 +94,7 @@ def find_model(run: RunFolder, flags: AgentFlags) -> tuple[Path, Path]:
     if not model.is_file():
         fix = "the run has not reached that point"
         if flags.load_best and run.model.is_file():
-            fix = "the run ended before an evaluation; its last model needs no --load-best"
+            fix = "the run ended before an evaluation; --load-final takes its last model"
         raise UsageError(f"there is no {model}: {fix}")
     return model, statistics
 
@@ -156,7 +156,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     hyperparams = check(flags.algo, algorithm(flags.algo), hyperparams)
     named = {"algo": flags.algo, "env": flags.env, "gym_packages": flags.gym_packages}
     played = Run(RunFlags.of(named), hyperparams)
-    env_id, ours = str(played.source.env_id), played.source.batch is not None
+    env_id, ours = played.source.env_id, played.source.batch is not None
     if flags.num_threads > 0:
         th.set_num_threads(flags.num_threads)
     normalizer = None
@@ -173,7 +173,7 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
         n_envs if native else 1,
         flags.seed,
         vec_env=played.source.stepped(wrapped=ours and not native),
-        env_kwargs={**size, **(hyperparams.get("env_kwargs") or {}), **(flags.env_kwargs or {})},
+        env_kwargs=size | merged(hyperparams.get("env_kwargs") or {}, flags.env_kwargs or {}),
         evaluation=True,
         normalizer=normalizer,
         render_mode=render_mode,

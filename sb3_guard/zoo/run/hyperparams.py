@@ -160,6 +160,12 @@ def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] 
     return None
 
 
+def merged(there: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of an environment, in which those of a part, such as ``robot``, are joined too."""
+    parts = {k: there[k] | v for k, v in given.items() if isinstance(there.get(k), dict)}
+    return {**there, **given, **parts}
+
+
 def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
     """The hyperparameters an algorithm takes, from its constructor and those it hands on to."""
     arguments = signature(algorithm, getattr(algorithm, "fixed_arguments", frozenset())).parameters

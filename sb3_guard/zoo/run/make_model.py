@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -16,6 +16,9 @@ from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.hyperparams import annotations
 from sb3_guard.zoo.run.run import Run
 
+if TYPE_CHECKING:
+    from sb3_guard.envs.scenario import Scenario
+
 # Hyperparameters of a run that are none of its model, and what takes them.
 ELSEWHERE = {
     "callback": "model.learn", "n_timesteps": "model.learn", "selection_limit": "CostEvalCallback"
@@ -24,7 +27,7 @@ ELSEWHERE = {
 
 def make_model(
     algo: str,
-    env_id: str | Callable[..., gym.Env],
+    env_id: "str | Path | Mapping[str, Any] | Scenario | Callable[..., gym.Env]",
     *,
     conf: str | Path | None = None,
     seed: int | None = None,
@@ -49,8 +52,8 @@ def make_model(
     hyperparameters say so.
 
     :param algo: what ``--algo`` takes: an algorithm of this package, or one of RL-Zoo as a baseline
-    :param env_id: an environment, whose version may be left out; or a class or function that makes
-        one
+    :param env_id: an environment, whose version may be left out; a scenario, its plain data or its
+        YAML file; or a class or function that makes one
     :param conf: hyperparameters: ``"paper"`` or a file; None for the defaults in
         ``hyperparams/<algo>.yml``
     :param seed: of networks and environments; None for a random one
@@ -66,14 +69,17 @@ def make_model(
         ``env_wrapper``, ``vec_env_wrapper``
     :return: the model, not yet trained
     :raises ValueError: a name or value is not allowed; the message says what is
+    :raises TypeError: ``env_id`` is an environment, not what makes one
     """
     for argument in ELSEWHERE.keys() & hyperparams:
         raise ValueError(f"make_model takes no {argument!r}; give it to {ELSEWHERE[argument]}")
+    named = isinstance(env_id, str) and not env_id.endswith((".yml", ".yaml"))
+    source = None if named else find(env_id)
     try:
         flags = RunFlags.read(
             {
                 "algo": algo,
-                "env": getattr(env_id, "__name__", str(env_id)),
+                "env": source.env_id if source else env_id,
                 "seed": seed,
                 "conf_file": None if conf is None else str(conf),
                 "env_kwargs": env_kwargs,
@@ -89,7 +95,7 @@ def make_model(
         # What a file can't hold is not checked as data; the constructor looks at it.
         objects = {n: v for n, v in hyperparams.items() if n in names and not is_data(v)}
         flags.hyperparams = {n: v for n, v in hyperparams.items() if n not in objects}
-        run = Run.check(flags, find(env_id) if callable(env_id) else None)
+        run = Run.check(flags, source)
         run.arguments.update(objects)
         model = run.make_model()
     except UsageError as error:

@@ -67,6 +67,7 @@ from sb3_guard.zoo.run.folder import PLAYED, RunFolder, is_run, lock, run_path, 
 from sb3_guard.zoo.run.hyperparams import (
     action_noise,
     check,
+    merged,
     model_arguments,
     normalization,
     read_hyperparams,
@@ -173,7 +174,7 @@ class Run:
         A new run, checked as far as that goes without making anything.
 
         :param flags: those given; the rest follows from files and defaults
-        :param source: the environments, where ``flags.env`` is no id but a name for them
+        :param source: the environments, where ``flags.env`` is not registered
         :raises UsageError: anything is wrong with them
         """
         flags = dataclasses.replace(flags)
@@ -183,7 +184,7 @@ class Run:
         algo = run.algorithm
         if source is not None:
             run.source = source
-        flags.env = str(run.source.env_id or flags.env)
+        flags.env = run.source.env_id
         if flags.seed < 0:
             flags.seed = int(np.random.default_rng().integers(2**31))
         values = read_hyperparams(flags.algo, flags.env, flags.conf_file, flags.overrides())
@@ -195,7 +196,7 @@ class Run:
                 "(-params cost_limit:25)"
             )
         if flags.env_kwargs:
-            values["env_kwargs"] = {**(values.get("env_kwargs") or {}), **flags.env_kwargs}
+            values["env_kwargs"] = merged(values.get("env_kwargs") or {}, flags.env_kwargs)
         # What wraps single environments needs single ones.
         lone = values.get("env_wrapper") is not None
         flags.vec_env = run.source.stepped(flags.vec_env, lone)
@@ -542,7 +543,7 @@ class Run:
             changed = {name: getattr(given, name) for name in {*given.given, "progress", "verbose"}}
             changed |= {name: getattr(saved, name) for name in ("trained_agent", "hyperparams")}
             run = cls(dataclasses.replace(saved, **changed), folder=folder)
-            run.flags.env = str(run.source.env_id)
+            run.flags.env = run.source.env_id
             overrides = given.overrides()
             run.hyperparams = check(saved.algo, algorithm(saved.algo), {**values, **overrides})
             free = {"n_timesteps": None, "log_folder": None}

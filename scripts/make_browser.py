@@ -20,7 +20,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sb3_guard.costs import interval, verdict
 from sb3_guard.envs import GuardEnv, env_spec
 from sb3_guard.envs.constraints.obstacles import Obstacles
 from sb3_guard.envs.engine import Engine
@@ -32,10 +31,11 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "docs" / "browser"
 OUTPUT = ROOT / "docs" / "_build" / "html" / "browser"
 MODULES = ROOT / "docs" / "_build" / "npm"  # outside of the sources
-#: Trainings of the agents at each cost limit of an episode; None: without a limit.
-LIMITS: dict[str, tuple[float | None, ...]] = {
-    "Goal_Point_8Hazards-v0": (None, 10, 5, 2),
-    "SafetyPointGoal1-v0": (None, 50, 25, 10),
+PRETRAINED = "the agent that comes with the package"
+#: Algorithm of the agents at each cost limit of an episode; None: without a limit.
+AGENTS: dict[str, dict[float | None, str]] = {
+    "Goal_Point_8Hazards-v0": {None: "trpo", 10: "cpo", 5: "cpo"},
+    "SafetyPointGoal1-v0": {None: "trpo", 50: "cpo", 25: PRETRAINED},
 }
 # Parameters that the page needs
 GOAL = ("size", "bonus", "reward_distance", "reward_limit")
@@ -50,29 +50,29 @@ def stem(env: str, limit: float | None) -> str:
 
 def trainings() -> Iterator[str]:
     """The commands that train an agent for each environment and limit."""
-    for env, limits in LIMITS.items():
-        for limit in limits:
-            algo = "trpo" if limit is None else "cpo"
+    for env, agents in AGENTS.items():
+        for limit, algo in agents.items():
             bound = "" if limit is None else f" -params cost_limit:{limit}"
-            folder = f"logs/{stem(env, limit)}"
-            yield f"sb3-guard train --algo {algo} --env {env} -n 1e6 --seed 0 -f {folder}{bound}"
+            train = f"sb3-guard train --algo {algo} --env {env} -n 1e6 --seed 0"
+            if algo != PRETRAINED:
+                yield f"{train} -f logs/{stem(env, limit)}{bound}"
 
 
-def measured(episodes: dict[str, list[float]], limit: float | None) -> dict[str, Any]:
-    """Mean return and cost of a policy's final episodes, and whether its limit was kept."""
-    low, high = interval(np.array(episodes["costs"]))
+def measured(certificate: dict[str, Any], limit: float | None) -> dict[str, Any]:
+    """Mean return and cost of an agent's fresh episodes, bounds of the cost, and the verdict."""
+    (cost,) = certificate["costs"].values()
     return {
-        "episodes": len(episodes["costs"]),
-        "return": round(float(np.mean(episodes["returns"])), 2),
-        "cost": round(float(np.mean(episodes["costs"])), 2),
-        "low": round(low, 2),
-        "high": round(high, 2),
-        "verdict": "" if limit is None else verdict(low, high, limit),
+        "episodes": certificate["episodes"],
+        "return": round(certificate["mean_return"], 2),
+        "cost": round(cost["mean"], 2),
+        "low": round(cost["lower"], 2),
+        "high": round(cost["upper"], 2),
+        "verdict": "" if limit is None else certificate["verdict"],
     }
 
 
 def pack(logs: Path, source: Path = SOURCE) -> None:
-    """Export the agents of finished trainings, and list them with their measured episodes.
+    """Export the agents of finished trainings, and list them with what fresh episodes show.
 
     :param logs: the trainings' folders
     :param source: folder of the page's sources, whose agents are replaced
@@ -80,33 +80,39 @@ def pack(logs: Path, source: Path = SOURCE) -> None:
     shutil.rmtree(source / "agents", ignore_errors=True)
     (source / "agents").mkdir(parents=True)
     entries = []
-    for env, limits in LIMITS.items():
+    for env, algos in AGENTS.items():
         agents = []
-        for limit in limits:
-            name = stem(env, limit)
-            file = next((logs / name).glob("*/*/result.json"), None)
-            if file is None:
-                print(f"{logs / name}: no finished training, left out")
-                continue
-            result = json.loads(file.read_text())
-            with tempfile.TemporaryDirectory() as folder:  # contract.json goes there too
-                exported = Path(folder) / f"{name}.onnx"
-                flags = [
-                    *("--env", env, "--algo", result["algo"], "--folder", str(logs / name)),
-                    *("--n-episodes", "1", "--output", str(exported)),
-                ]
-                subprocess.run([sys.executable, "-m", "sb3_guard.export_agent", *flags], check=True)
-                shutil.copy(exported, source / "agents")
-            agents.append({
-                "limit": limit,
-                "file": f"agents/{name}.onnx",
-                "algorithm": result["label"],
-                "steps": result["n_timesteps"],
-                "sampled": measured(result["final"]["stochastic"], limit),
-                "greedy": measured(result["final"]["greedy"], limit),
-            })  # fmt: skip
+        for limit, algo in algos.items():
+            folder, name = logs / stem(env, limit), f"agents/{stem(env, limit)}.onnx"
+            own = ["--pretrained"] if algo == PRETRAINED else ["--algo", algo, "-f", str(folder)]
+            agents.append({"limit": limit, "file": name, **packed(env, own, limit, source / name)})
         entries.append({"env": env, "agents": agents})
     (source / "agents.json").write_text(json.dumps(entries, indent=1) + "\n")
+
+
+def packed(env: str, own: list[str], limit: float | None, file: Path) -> dict[str, Any]:
+    """Export an agent, the certified one where a training delivered it, and let it play."""
+    own = ["--env", env, *own]
+    with tempfile.TemporaryDirectory() as folder:  # contract.json goes there too
+        exported = Path(folder) / "agent.onnx"
+        call("export_agent", *own, "--n-episodes", "1", "--output", str(exported))
+        shutil.copy(exported, file)
+        trained = json.loads((Path(folder) / "contract.json").read_text())["trained"]
+        agent = {"algorithm": trained["algorithm"], "steps": trained["timesteps"]}
+        # Without a limit: more than an episode can cost
+        bound = ["--cost-limit", "1e4" if limit is None else str(limit)]
+        for name, mode in {"sampled": ["--stochastic"], "greedy": []}.items():
+            report = Path(folder) / f"{name}.json"
+            call("certify_agent", *own, *mode, *bound, "--json", str(report))
+            agent[name] = measured(json.loads(report.read_text()), limit)
+    return agent
+
+
+def call(command: str, *flags: str) -> None:
+    """Run a command of the package; 1 says that an agent is not certified."""
+    done = subprocess.run([sys.executable, "-m", f"sb3_guard.{command}", *flags], check=False)
+    if done.returncode not in (0, 1):
+        raise SystemExit(done.returncode)
 
 
 def mjcf(engine: Engine) -> str:
@@ -242,7 +248,7 @@ def build(output: Path, number: int = 0) -> None:
     package = MODULES / "node_modules" / "@mujoco" / "mujoco"
     for name in ("mujoco.js", "mujoco.wasm"):
         shutil.copy(package / name, output)
-    for env_id in LIMITS:
+    for env_id in AGENTS:
         (output / f"{env_id}.json").write_text(json.dumps(world(env_id)))
         if number:
             (output / f"{env_id}.states.json").write_text(json.dumps(states(env_id, number)))

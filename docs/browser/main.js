@@ -156,9 +156,9 @@ async function choose(index) {
 function describe({ limit, algorithm, steps, sampled, greedy }) {
   const cost = ({ cost, low, high }) => `${tenths(cost)} [${tenths(low)}, ${tenths(high)}]`;
   const says = {
-    kept: "it keeps the limit.",
-    exceeded: "it exceeds the limit.",
-    undecided: "the interval has the limit in it, so whether it keeps the limit is undecided.",
+    certified: "certified, it keeps the limit.",
+    exceeds: "it exceeds the limit.",
+    undecided: "the limit lies between the bounds, so whether it keeps the limit is undecided.",
   }[greedy.verdict];
   $("agent").textContent = `${algorithm}, ${steps.toLocaleString("en")} training steps. ` +
     `Trained ${limit === null ? "without a limit" : `at ${limit}`}, its mean cost is ${cost(greedy)}` +
@@ -181,8 +181,8 @@ function seat(chosen) {
 }
 
 async function enter(chosen) {
-  // the least limit that an agent keeps, if one does
-  const kept = ({ greedy }) => greedy.verdict === "kept";
+  // the least limit that an agent is certified to keep, if one is
+  const kept = ({ greedy }) => greedy.verdict === "certified";
   const request = ++asked, first = chosen.agents.findLast(kept) ?? chosen.agents.at(-1);
   const [spec] = await Promise.all([read(`${chosen.env}.json`).then((a) => a.json()), load(first)]);
   if (request !== asked) return;

@@ -201,7 +201,7 @@ def test_dragging_moves_an_object_that_the_agent_observes(
     assert np.abs(np.subtract(before["obs"], after["obs"])).max() > 1e-3
     visited.run("worlds[0].spec.steps = worlds[0].steps + 3; click('pause')")
     until(visited, "!document.getElementById('verdict').hidden")
-    assert visited.run(RECORDS)[0].startswith("agent, limit 10, moved objects|1|")
+    assert visited.run(RECORDS)[0].startswith("agent, limit 5, moved objects|1|")
     assert visited.messages == []
 
 
@@ -249,13 +249,13 @@ def test_an_episode_ends_with_a_verdict(
     visited.run(f"worlds[0].cost = () => {cost}; worlds[0].spec.steps = 15; click('again')")
     until(visited, "worlds[0].steps >= 15")
     assert visited.run("says('verdict')").startswith(f"Limit {verdict}return ")
-    assert f"cost {15 * cost}.0 of at most 10" in visited.run("says('verdict')")
+    assert f"cost {15 * cost}.0 of at most 5" in visited.run("says('verdict')")
     assert visited.run("document.getElementById('verdict').checkVisibility()")
     assert driver == "agent" or "return 0.0," in visited.run("says('verdict')")  # not -0.0
     rows = [row.split("|") for row in visited.run(RECORDS)]
-    assert rows[0][:2] == [driver if driver == "you" else "agent, limit 10", "1"]
+    assert rows[0][:2] == [driver if driver == "you" else "agent, limit 5", "1"]
     assert float(rows[0][3]) == 15 * cost
-    assert [row[0] for row in rows[1:]] == (["agent, limit 10"] if driver == "you" else [])
+    assert [row[0] for row in rows[1:]] == (["agent, limit 5"] if driver == "you" else [])
     visited.run("worlds[0].spec.steps = 1000")
     until(visited, "document.getElementById('verdict').hidden")  # the next episode begins
 
@@ -279,8 +279,8 @@ def test_the_limit_chooses_the_agent_and_says_what_it_was_measured_to_do(
             assert ("without a limit" if name == "none" else f"Trained at {name},") in text
             numbers = [float(number) for number in re.findall(r"\d+\.\d", text)]
             assert numbers == pytest.approx([cost["cost"], cost["low"], cost["high"]], abs=0.051)
-            assert (cost["verdict"] == "exceeded") == ("it exceeds the limit" in text)
-            assert (cost["verdict"] == "kept") == ("it keeps the limit." in text)
+            assert (cost["verdict"] == "exceeds") == ("it exceeds the limit" in text)
+            assert (cost["verdict"] == "certified") == ("certified, it keeps the limit." in text)
             cells = "[...document.querySelectorAll('#measured td:last-child')]"
             stated = visited.run(f"{cells}.map((cell) => cell.textContent)")
             assert stated == [agent[key]["verdict"] or "–" for key in ("sampled", "greedy")]

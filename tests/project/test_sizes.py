@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_448,
     "tests": 25_152,
 }
-WORDS = 63_558  # of all tracked markdown but the changelog
+WORDS = 63_616  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -29,6 +29,7 @@ def export_agent(flags: Flags) -> int:
     with closing(agent.env):
         how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
         episodes = flags.n_episodes or EPISODES
+        print(f"Playing {episodes} episodes: --n-episodes 1 plays one", flush=True)
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
             evaluation = evaluate_policy(agent.model, agent.env, episodes, **how)
         settings, certificate = agent.run.hyperparams(), agent.certificate

@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import DependencyNotInstalled
-from gymnasium.vector import VectorEnv
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.common.adapters import is_safety_gymnasium, make_safety_gymnasium
 from sb3_guard.common.native import GuardVecEnv
@@ -24,6 +22,8 @@ from sb3_guard.ids import ENTRY_POINT, IMPORT_FIRST, UnknownId, with_version
 from sb3_guard.spelling import nearest
 
 if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
     from sb3_guard.envs.scenario import Scenario
 
 
@@ -69,7 +69,7 @@ def find(env_id: Any) -> Source:
     :raises TypeError: it is an environment, not what makes one
     :raises gymnasium.error.DependencyNotInstalled: the package that has it is absent or too old
     """
-    if isinstance(env_id, gymnasium.Env | VectorEnv | VecEnv):
+    if hasattr(env_id, "step") and not isinstance(env_id, type):
         name = repr(spec.id) if (spec := getattr(env_id, "spec", None)) else "MyEnv"
         raise TypeError(
             f"this {type(env_id).__name__} is made already: give an id, a class, or a function "

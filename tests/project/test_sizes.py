@@ -19,7 +19,7 @@ LINES = {
     "sb3_guard/common": 2_523,
     "sb3_guard/deployment": 916,
     "harness": 8_449,
-    "tests": 25_152,
+    "tests": 25_154,
 }
 WORDS = 63_803  # of all tracked markdown but the changelog
 

@@ -22,6 +22,7 @@ from sb3_guard.zoo.run.hyperparams import (
     RUN_KEYS,
     action_noise,
     check,
+    merged,
     model_arguments,
     normalization,
     parameters,
@@ -180,6 +181,7 @@ def test_arguments_of_a_part_join_those_of_the_file() -> None:
     model = make_model("cpo", "SafetyRacecarGoal1-v0", env_kwargs=changed, **small)
     (scenario,) = model.get_env().get_attr("scenario", 0)
     assert scenario.robot_params["keepout"] == 0.5 and model.action_space.high.max() == 1.0
+    assert merged({"hazards": {"num": 4}, "a": 1}, {"hazards": None}) == {"hazards": None, "a": 1}
     scenario = Scenario(robot="SafetyRacecar", task="Goal")
     model = make_model("cpo", scenario, cost_limit=1.0, **small)
     assert model.action_space.high.max() == 20.0

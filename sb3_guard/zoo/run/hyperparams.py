@@ -162,8 +162,8 @@ def entry(content: Mapping[str, dict[str, Any]], env_id: str) -> dict[str, Any] 
 
 def merged(there: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of an environment, in which those of a part, such as ``robot``, are joined too."""
-    parts = {k: there[k] | v for k, v in given.items() if isinstance(there.get(k), dict)}
-    return {**there, **given, **parts}
+    both = (k for k in given if isinstance(there.get(k), dict) and isinstance(given[k], dict))
+    return {**there, **given, **{k: there[k] | given[k] for k in both}}
 
 
 def parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:

@@ -20,7 +20,7 @@ from archives import archives
 from sb3_guard.common.certificate import ERROR, LOOKS, MOST, UPPER, mean_bounds
 from sb3_guard.common.delivery import TRIES
 
-CANDIDATES, SCREENING = 8, 40  # as `DeliveryCallback` has them
+CANDIDATES, SCREENING = 6, 50  # as `DeliveryCallback` has them
 Draw = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]
 
 

@@ -85,7 +85,7 @@ from sb3_guard.zoo.run.make_envs import (
 from sb3_guard.zoo.run.progress import Epochs, summary
 
 FINAL_EPISODES = 100  # of each policy, after training
-DELIVERY_ENVS = 40  # in which candidates are screened and certified
+DELIVERY_ENVS = 50  # in which candidates are screened and certified
 WANDB = "wandb.txt"  # beside the run's configuration: its id at Weights & Biases
 
 

@@ -28,7 +28,7 @@ def certify_agent(flags: Flags) -> int:
             agent.env,
             limits[0] if len(limits) == 1 else limits or None,
             n_episodes=flags.n_episodes or MOST,
-            deterministic=not flags.stochastic,
+            deterministic=not agent.stochastic,
             seed=flags.seed,
         )
     print(f"{agent.path} on {agent.env_id}")

@@ -27,7 +27,7 @@ def export_agent(flags: Flags) -> int:
         raise UsageError(f"--output {flags.output!r} must end in .onnx")
     agent = open_agent(flags, None, min(flags.n_episodes or BATCH, BATCH))
     with closing(agent.env):
-        how: dict[str, Any] = {"deterministic": not flags.stochastic, "seed": flags.seed}
+        how: dict[str, Any] = {"deterministic": not agent.stochastic, "seed": flags.seed}
         episodes = flags.n_episodes or EPISODES
         print(f"Playing {episodes} episodes: --n-episodes 1 plays one", flush=True)
         with explained(f"can't play {agent.path}", *BAD_NUMBERS):
@@ -54,7 +54,7 @@ def export_agent(flags: Flags) -> int:
                 agent.model,
                 path,
                 env=agent.env,
-                sampled=flags.stochastic,
+                sampled=agent.stochastic,
                 stop=flags.stop,
                 trained=trained,
             )

@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
 
 HELP = "more steps (-n), a lower cost_limit than is certified, or SAC-Lagrangian may help"
-TRIES = 3  # candidates that may be certified; they share the error
+TRIES = 3  # of candidates, with one kind of actions or the other; they share the error
 
 
 class DeliveryCallback(BaseCallback):
@@ -32,12 +32,13 @@ class DeliveryCallback(BaseCallback):
     End a training with an agent that is certified to keep its limit.
 
     From the middle of the training on its policies are kept as *candidates*, with their observation
-    statistics. After its end each plays a few episodes; of those whose mean cost plus its standard
-    error is within the limit, the one of highest return is certified by fresh episodes
-    (:func:`~sb3_guard.certify`), then the next, up to three, which share the error. The first that
-    is certified is written as ``certified_model.zip``, with ``certified_model_vecnormalize.pkl``
-    where observations are normalised, and ``certificate.json``, which vouches for them: it is of
-    the last training that ended in this folder. The model itself keeps its last weights.
+    statistics. After its end each plays a few episodes with its most likely actions; of those whose
+    mean cost plus its standard error is within the limit, the one of highest return is certified by
+    fresh episodes (:func:`~sb3_guard.certify`), then the next. If neither is, the same is done with
+    sampled actions; the three tries share the error. The first candidate that is certified is
+    written as ``certified_model.zip``, with ``certified_model_vecnormalize.pkl`` where observations
+    are normalised, and ``certificate.json``, which vouches for them: it is of the last training
+    that ended in this folder. The model itself keeps its last weights.
 
     A training that was cut and continues keeps the candidates that it has, and ends alike; one that
     begins takes those of another away.
@@ -48,7 +49,8 @@ class DeliveryCallback(BaseCallback):
     :param candidates: how many policies are kept, the last one among them
     :param screening: episodes of each
     :param n_episodes: most episodes of a certificate, at least 100
-    :param deterministic: certify the most likely actions, or sampled ones
+    :param deterministic: certify the most likely actions, or sampled ones; None: these where those
+        fail
     :param seed: the episodes' seeds are drawn from it
     :param verbose: 1 prints what is delivered, or how far the nearest candidate is away
     """
@@ -62,7 +64,7 @@ class DeliveryCallback(BaseCallback):
         candidates: int = 6,
         screening: int = 50,
         n_episodes: int = MOST,
-        deterministic: bool = True,
+        deterministic: bool | None = None,
         seed: int = 0,
         verbose: int = 1,
     ) -> None:
@@ -150,21 +152,16 @@ class DeliveryCallback(BaseCallback):
     def _deliver(self) -> str:
         """Certify the best candidate; what to say of it."""
         limits = self._limits()
-        screened = {file: self._screen(file, np.array(limits)) for file in self._files()}
-        best = sorted(screened, key=lambda file: screened[file], reverse=True)
         refused: list[Certificate] = []
-        for number, file in enumerate(best[:TRIES]):
-            looks_right, _ = screened[file]
-            if number > 0 and not looks_right:
-                break  # those that look wrong are not worth a try, but for a verdict
+        for file, deterministic in self._tries(np.array(limits)):
             steps = self._put(file)
             certificate = certify(
                 self.model,
                 self.eval_env,
                 limits,
                 n_episodes=self.n_episodes,
-                deterministic=self.deterministic,
-                seed=self.seed + number,
+                deterministic=deterministic,
+                seed=self.seed + len(refused),
                 tries=TRIES,
             )
             if certificate.verdict == "certified":
@@ -174,11 +171,30 @@ class DeliveryCallback(BaseCallback):
         nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
         return f"Nothing is delivered. The nearest candidate: {nearest}; {HELP}"
 
-    def _screen(self, file: Path, limits: np.ndarray) -> tuple[bool, float]:
+    def _tries(self, limits: np.ndarray) -> Iterator[tuple[Path, bool]]:
+        """
+        Candidates that look right, best first, and whether with their most likely actions.
+
+        The last try is for sampled actions, if it may be. If nothing looks right, the nearest one
+        is tried, for a verdict.
+        """
+        left, scores = TRIES, dict[tuple[Path, bool], float]()
+        for deterministic in (True, False) if self.deterministic is None else (self.deterministic,):
+            screened = {file: self._screen(file, deterministic, limits) for file in self._files()}
+            scores |= {(file, deterministic): score for file, (_, score) in screened.items()}
+            right = [file for file, (looks_right, _) in screened.items() if looks_right]
+            right.sort(key=lambda file: screened[file][1], reverse=True)
+            for file in right[: left - (self.deterministic is None and deterministic)]:
+                left -= 1
+                yield file, deterministic
+        if left == TRIES:
+            yield max(scores, key=lambda candidate: scores[candidate])
+
+    def _screen(self, file: Path, deterministic: bool, limits: np.ndarray) -> tuple[bool, float]:
         """Whether a candidate looks right in a few episodes; its return, or how near it is."""
         self._put(file)
         played = evaluate_policy(
-            self.model, self.eval_env, self.screening, self.deterministic, seed=self.seed
+            self.model, self.eval_env, self.screening, deterministic, seed=self.seed
         )
         costs = played.limited  # [E, m]; NaN after a physics error
         if len(costs) < self.screening or np.isnan(costs).any():

@@ -128,7 +128,7 @@ def actor_of(model: BaseAlgorithm, sampled: bool) -> Actor:
     if isinstance(actor, SACActor | TQCActor):
         return Squashed(actor, space, sampled)
     if sampled and (isinstance(space, spaces.Discrete) or isinstance(actor, TD3Actor)):
-        raise ValueError(f"{name} {can} with sampled actions: leave out sampled (--stochastic)")
+        raise ValueError(f"{name} {can} with sampled actions: leave out sampled (--deterministic)")
     if isinstance(policy, ActorCriticPolicy):
         return Categorical(policy, space, sampled)
     if isinstance(actor, TD3Actor):

@@ -125,6 +125,31 @@ def test_a_callback_delivers_each_training_and_leaves_the_model_and_its_statisti
     assert all(th.equal(value, weights[name]) for name, value in last["policy"].items())
 
 
+class Restless(Dose):
+    """An action costs three times the limit if it is the last one again, else nothing."""
+
+    last = None
+
+    def step(self, action):
+        observation, reward, ended, cut, _ = super().step(action)
+        again, self.last = self.last == action[0], action[0]
+        return observation, reward, ended, cut, {"cost": 3.0 * again}
+
+
+@pytest.mark.parametrize("deterministic", [None, True])
+def test_sampled_actions_are_certified_where_the_most_likely_ones_cost_too_much(
+    deterministic, tmp_path
+):
+    model = CPO("MlpPolicy", make_vec_env(Restless, n_envs=10), n_steps=10, cost_limit=1.0)
+    env = make_vec_env(Restless, n_envs=10)
+    deliver = DeliveryCallback(env, tmp_path, deterministic=deterministic, verbose=0)
+    model.learn(200, deliver)
+    if deterministic:
+        assert deliver.certificate is None
+    else:
+        assert not deliver.certificate.deterministic and deliver.certificate.tries == 3
+
+
 class Endless(Dose):
     def step(self, action):
         observation, reward, _, _, info = super().step(action)

@@ -42,6 +42,21 @@ def test_a_run_delivers_and_says_so(run, capsys, tmp_path):
     assert json.loads((tmp_path / "contract.json").read_text())["trained"]["certificate"] is None
 
 
+def test_an_agent_is_played_with_the_actions_that_are_certified(run, capsys, tmp_path):
+    file, path = run / "certificate.json", tmp_path / "policy.onnx"
+    before = file.read_text()
+    file.write_text(before.replace('"deterministic": true', '"deterministic": false'))
+    here = ["-f", str(run), *TOY[:2], "--n-episodes", "2"]
+    for flag, sampled in ([], True), (["--deterministic"], False):
+        assert enjoy.main([*here, "--no-render", *flag]) == 0
+        assert ("sampled actions, confidence" in capsys.readouterr().out) == sampled
+        assert export_agent.main([*here, "-o", str(path), *flag]) == 0
+        contract = json.loads((tmp_path / "contract.json").read_text())
+        assert bool(contract["trained"]["certificate"]) == sampled
+        assert any(entry["name"] == "noise" for entry in contract["inputs"]) == sampled
+    file.write_text(before)
+
+
 def test_the_certified_model_knows_its_age(run):
     model = CPO.load(run / "certified_model.zip")
     ages = {}

@@ -235,7 +235,7 @@ def recording(agent: Any, flags: EnjoyFlags, n_episodes: int) -> Iterator[None]:
     limited = [bounded_name(key, getattr(model, "limit_on", "sum")) for key in keys]
     about = {
         "algorithm_name": flags.algo,
-        "actions": "sampled" if flags.stochastic else "most likely",
+        "actions": "sampled" if agent.stochastic else "most likely",
         "cost_limits": dict(zip(limited, limits_on(model, keys), strict=False)),
         "certificate": certificate and json.loads(certificate.to_json()),
         "command": shlex.join(["sb3-guard", "enjoy", *flags.words(flags.names())]),

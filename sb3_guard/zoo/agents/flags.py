@@ -29,7 +29,9 @@ class AgentFlags(Command):
     What is played:
 
     :param n_episodes: number of episodes (default: 100; 5 in a window, 1 to record)
-    :param stochastic: sample actions instead of taking the most likely ones
+    :param stochastic: sample actions; else the most likely ones are taken, but for an agent that is
+        certified with sampled ones
+    :param deterministic: take the most likely actions in any case
     :param seed: random seed of the episodes (default: 0)
     :param env_kwargs: arguments of the environment, which replace those of training
     :param gym_packages: modules to import first, such as those that training imported
@@ -51,6 +53,7 @@ class AgentFlags(Command):
     load_last_checkpoint: bool = flag(default=False, exclusive="model")
     n_episodes: int | None = flag(low=1, metavar="N", exclusive="length")
     stochastic: bool = flag(default=False, exclusive="actions")
+    deterministic: bool = flag(default=False, exclusive="actions")
     seed: int = flag(default=0, low=0, high=2**32)
     env_kwargs: dict[str, Any] | None = flag()
     gym_packages: list[str] = flag(default=[], metavar="MODULE")
@@ -66,7 +69,6 @@ class EnjoyFlags(AgentFlags):
     What is played:
 
     :param n_timesteps: number of steps to play, instead of --n-episodes
-    :param deterministic: take the most likely actions (default)
 
     Output:
 
@@ -89,7 +91,6 @@ class EnjoyFlags(AgentFlags):
   sb3-guard enjoy --pretrained --env Goal_Point_8Hazards --dataset point/usl-v0
 """
     n_timesteps: int | None = flag("-n", low=1, metavar="N", exclusive="length")
-    deterministic: bool = flag(default=False, exclusive="actions")
     record: str | None = flag(nargs="?", const="", metavar="FILE.mp4")
     dataset: str | None = flag(metavar="NAME")
     window: bool = flag(default=False, exclusive="window")

@@ -122,13 +122,19 @@ class Agent:
         """What was certified of this very agent, and of such actions."""
         if PRETRAINED in self.path.parents:
             return certificates(self.run)["stochastic" if self.stochastic else "deterministic"]
-        file = self.path.with_name("certificate.json")
-        if self.path.name != "certified_model.zip" or not file.is_file():
+        certificate = _filed(self.path)
+        if certificate is None or certificate.deterministic == self.stochastic:
             return None
-        with explained(f"{file} is damaged"):
-            certificate = Certificate.from_json(file.read_text())
-        same = certificate.agent == agent_hash(self.model, self.env)
-        return certificate if same and certificate.deterministic != self.stochastic else None
+        return certificate if certificate.agent == agent_hash(self.model, self.env) else None
+
+
+def _filed(path: Path) -> Certificate | None:
+    """The certificate that lies beside a certified model."""
+    file = path.with_name("certificate.json")
+    if path.name != "certified_model.zip" or not file.is_file():
+        return None
+    with explained(f"{file} is damaged"):
+        return Certificate.from_json(file.read_text())
 
 
 def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> Agent:
@@ -182,7 +188,9 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     if shipped is not None:
         sync_envs_normalization(shipped, env)
         shipped.close()
-    return Agent(run, path, env_id, model, env, flags.stochastic)
+    certificate = None if flags.deterministic else _filed(path)
+    sampled = flags.stochastic or (certificate is not None and not certificate.deterministic)
+    return Agent(run, path, env_id, model, env, sampled)
 
 
 def play(flags: EnjoyFlags, render_mode: str | None) -> int:
@@ -223,7 +231,7 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
             agent.model,
             agent.env,
             n_eval_episodes=asked,
-            deterministic=not flags.stochastic,
+            deterministic=not agent.stochastic,
             seed=flags.seed,
             max_steps=flags.n_timesteps,
             on_step=on_step,

@@ -274,6 +274,8 @@ def certified(name: str) -> pd.DataFrame:
             ).mean()
             row = {"suite": suite, "algo": algo, "label": group["label"].iloc[0], **means}
             row["delivered"] = f"{len(given)} of {len(results)}"
+            if sampled := sum(not one.get("deterministic", True) for one in given):
+                row["delivered"] += f", {sampled} sampled"
             for kind in ("stochastic", "greedy"):
                 final = pd.DataFrame([one["final"][kind] for one in results])
                 row[kind] = tuple(final[key].map(np.mean).mean() for key in ("returns", "costs"))

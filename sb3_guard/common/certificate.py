@@ -197,7 +197,7 @@ class Certificate:
         return "\n  ".join([f"{self.verdict}: {tail}", *lines])
 
     def summary(self) -> dict[str, Any]:
-        """Return, and of each cost its mean, bound, limit and share above it, as plain data."""
+        """Return, actions, and of each cost its mean, bound, limit and share above it."""
         costs = {
             key: {
                 "mean": cost.mean,
@@ -207,7 +207,8 @@ class Certificate:
             }
             for key, cost in self.costs.items()
         }
-        return {"return": self.mean_return, "costs": costs, "episodes": self.episodes}
+        played = {"episodes": self.episodes, "deterministic": self.deterministic}
+        return {"return": self.mean_return, "costs": costs, **played}
 
     def to_json(self) -> str:
         """All fields, with the verdict, as JSON."""

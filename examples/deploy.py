@@ -1,4 +1,4 @@
-"""How do I run an exported agent at 50 Hz, with onnxruntime alone?"""
+"""How do I run what ``sb3-guard export`` writes at 50 Hz, with onnxruntime alone?"""
 
 import json
 import time
@@ -8,11 +8,10 @@ import onnxruntime
 
 import sb3_guard  # the simulation that stands in for the robot
 
-# sb3-guard export --pretrained writes both files
 contract, policy = json.load(open("contract.json")), onnxruntime.InferenceSession("policy.onnx")
 period, output, bound = contract["control_step"], contract["outputs"][0], contract["costs"][0]
 inputs = {part["name"]: part["shape"][1:] for part in contract["inputs"]}
-if other := inputs.keys() - {"observation", "last_cost"} | {*contract["wrappers"]}:
+if other := inputs.keys() - {"observation", "last_cost", "noise"} | {*contract["wrappers"]}:
     raise SystemExit(f"this loop does not compute {', '.join(other)}, which contract.json names")
 assert None not in output["stop"], "say what stops the robot: sb3-guard export --stop 0:0.0"
 stop = np.array([np.nan if value == "hold" else value for value in output["stop"]], np.float32)
@@ -24,7 +23,8 @@ for _ in range(500):
     began, lost = time.perf_counter(), sent is not None and rng.random() < 0.05  # 1 in 20 is lost
     missing, observation = (missing + 1, observation) if lost else (0, latest)
     frames = np.append(frames[len(latest) :], np.float32(observation))
-    values = {"observation": frames[None], "last_cost": np.float32([[cost]])}
+    noise = np.float32(rng.standard_normal((1, *inputs.get("noise", ()))))  # where it samples
+    values = {"observation": frames[None], "last_cost": np.float32([[cost]]), "noise": noise}
     action = policy.run(["action"], {name: values[name] for name in inputs})[0][0]
     late = sent is not None and time.perf_counter() - began > period
     if missing > 2 or late or not np.isfinite(np.append(frames, action)).all():

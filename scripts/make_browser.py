@@ -95,13 +95,15 @@ def packed(env: str, own: list[str], limit: float | None, file: Path) -> dict[st
     own = ["--env", env, *own]
     with tempfile.TemporaryDirectory() as folder:  # contract.json goes there too
         exported = Path(folder) / "agent.onnx"
-        call("export_agent", *own, "--n-episodes", "1", "--output", str(exported))
+        call(
+            "export_agent", *own, "--deterministic", "--n-episodes", "1", "--output", str(exported)
+        )
         shutil.copy(exported, file)
         trained = json.loads((Path(folder) / "contract.json").read_text())["trained"]
         agent = {"algorithm": trained["algorithm"], "steps": trained["timesteps"]}
         # Without a limit: more than an episode can cost
         bound = ["--cost-limit", "1e4" if limit is None else str(limit)]
-        for name, mode in {"sampled": ["--stochastic"], "greedy": []}.items():
+        for name, mode in {"sampled": ["--stochastic"], "greedy": ["--deterministic"]}.items():
             report = Path(folder) / f"{name}.json"
             call("certify_agent", *own, *mode, *bound, "--json", str(report))
             agent[name] = measured(json.loads(report.read_text()), limit)

@@ -274,8 +274,7 @@ def certified(name: str) -> pd.DataFrame:
             ).mean()
             row = {"suite": suite, "algo": algo, "label": group["label"].iloc[0], **means}
             row["delivered"] = f"{len(given)} of {len(results)}"
-            if sampled := sum(not one.get("deterministic", True) for one in given):
-                row["delivered"] += f", {sampled} sampled"
+            row["sampled"] = sum(not one.get("deterministic", True) for one in given)
             for kind in ("stochastic", "greedy"):
                 final = pd.DataFrame([one["final"][kind] for one in results])
                 row[kind] = tuple(final[key].map(np.mean).mean() for key in ("returns", "costs"))
@@ -288,7 +287,8 @@ def delivered(name: str) -> str:
     rows = []
     for row in certified(name).to_dict("records"):
         digits = _digits(row["stochastic"][0])
-        cells = [row["suite"], row["label"], row["delivered"], number(row["return"], digits)]
+        given = row["delivered"] + (f", {row['sampled']} sampled" if row["sampled"] else "")
+        cells = [row["suite"], row["label"], given, number(row["return"], digits)]
         cells += [number(row["mean"], 1), number(row["upper"], 1), percent(row["share_above"])]
         for kind in ("stochastic", "greedy"):
             cells.append(f"{number(row[kind][0], digits)} / {number(row[kind][1], 1)}")

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_guard.common.certificate import LEAST, MOST, Certificate, certify, limits_of
 from sb3_guard.common.evaluation import (
@@ -50,7 +52,7 @@ class DeliveryCallback(BaseCallback):
     :param screening: episodes of each
     :param n_episodes: most episodes of a certificate, at least 100
     :param deterministic: certify the most likely actions, or sampled ones; None: these where those
-        fail
+        fail, if the agent can be exported with them
     :param seed: the episodes' seeds are drawn from it
     :param verbose: 1 prints what is delivered, or how far the nearest candidate is away
     """
@@ -175,20 +177,36 @@ class DeliveryCallback(BaseCallback):
         """
         Candidates that look right, best first, and whether with their most likely actions.
 
-        The last try is for sampled actions, if it may be. If nothing looks right, the nearest one
-        is tried, for a verdict.
+        One try is kept for sampled actions, if any look right. If nothing does, the nearest
+        candidate is tried, for a verdict.
         """
-        left, scores = TRIES, dict[tuple[Path, bool], float]()
-        for deterministic in (True, False) if self.deterministic is None else (self.deterministic,):
+        left, kept, scores = TRIES, list[tuple[Path, bool]](), dict[tuple[Path, bool], float]()
+        kinds = self._kinds()
+        for deterministic in kinds:
             screened = {file: self._screen(file, deterministic, limits) for file in self._files()}
             scores |= {(file, deterministic): score for file, (_, score) in screened.items()}
-            right = [file for file, (looks_right, _) in screened.items() if looks_right]
-            right.sort(key=lambda file: screened[file][1], reverse=True)
-            for file in right[: left - (self.deterministic is None and deterministic)]:
+            right = [
+                (file, deterministic) for file, (looks_right, _) in screened.items() if looks_right
+            ]
+            right.sort(key=lambda candidate: scores[candidate], reverse=True)
+            now = left - (deterministic is not kinds[-1])
+            kept += right[now:]
+            for candidate in right[:now]:
                 left -= 1
-                yield file, deterministic
+                yield candidate
+        yield from kept[:left]
         if left == TRIES:
             yield max(scores, key=lambda candidate: scores[candidate])
+
+    def _kinds(self) -> list[bool]:
+        """Whether the most likely actions, in the order in which they are tried."""
+        if self.deterministic is not None:
+            return [self.deterministic]
+        # Those whose sampled actions are the same, are of noise that is not saved, or can't be
+        # exported, have the most likely ones alone.
+        policy, noisy = self.model.policy, getattr(self.model, "use_sde", False)
+        box = isinstance(self.model.action_space, spaces.Box)
+        return [True, False] if box and not noisy and not isinstance(policy, TD3Policy) else [True]
 
     def _screen(self, file: Path, deterministic: bool, limits: np.ndarray) -> tuple[bool, float]:
         """Whether a candidate looks right in a few episodes; its return, or how near it is."""

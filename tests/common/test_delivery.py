@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_guard import CPO, make_vec_env
+from sb3_guard import CPO, TD3Lag, make_vec_env
 from sb3_guard.common.certificate import Certificate, agent_hash, certify
 from sb3_guard.common.delivery import DeliveryCallback
 
@@ -128,6 +128,7 @@ def test_a_callback_delivers_each_training_and_leaves_the_model_and_its_statisti
 class Restless(Dose):
     """An action costs three times the limit if it is the last one again, else nothing."""
 
+    action_space = spaces.Box(-5, 5, (1,), np.float32)
     last = None
 
     def step(self, action):
@@ -136,18 +137,66 @@ class Restless(Dose):
         return observation, reward, ended, cut, {"cost": 3.0 * again}
 
 
+def restless(algorithm=CPO, env=Restless, **kwargs):
+    model = algorithm("MlpPolicy", make_vec_env(env, n_envs=10), cost_limit=1.0, seed=0, **kwargs)
+    return model, make_vec_env(env, n_envs=10)
+
+
 @pytest.mark.parametrize("deterministic", [None, True])
 def test_sampled_actions_are_certified_where_the_most_likely_ones_cost_too_much(
     deterministic, tmp_path
 ):
-    model = CPO("MlpPolicy", make_vec_env(Restless, n_envs=10), n_steps=10, cost_limit=1.0)
-    env = make_vec_env(Restless, n_envs=10)
+    model, env = restless(n_steps=10)
     deliver = DeliveryCallback(env, tmp_path, deterministic=deterministic, verbose=0)
     model.learn(200, deliver)
     if deterministic:
         assert deliver.certificate is None
     else:
         assert not deliver.certificate.deterministic and deliver.certificate.tries == 3
+        assert deliver.certificate.costs["cost"].mean == 0.0
+
+
+class Doses(Restless):
+    action_space = spaces.Discrete(3)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "env", "kwargs"),
+    [(CPO, Doses, {}), (CPO, Restless, {"use_sde": True}), (TD3Lag, Restless, {})],
+)
+def test_actions_that_are_sampled_alike_or_not_exported_are_not_tried(algorithm, env, kwargs):
+    model, eval_env = restless(algorithm, env, **kwargs)
+    deliver = DeliveryCallback(eval_env)
+    deliver.init_callback(model)
+    assert deliver._kinds() == [True]
+
+
+@pytest.mark.parametrize(
+    ("greedy", "sampled", "tried"),
+    [
+        ("012", "345", "0 1 s3"),  # the last try is kept for sampled actions
+        ("012", "", "0 1 2"),  # which do not need it
+        ("", "3210", "s3 s2 s1"),
+        ("1", "23", "1 s2 s3"),
+        ("", "", "5"),  # nothing looks right: the nearest, for a verdict
+    ],
+)
+def test_three_tries_at_most_the_best_first(greedy, sampled, tried, tmp_path, monkeypatch):
+    (tmp_path / "candidates").mkdir()
+    for name in "012345":
+        (tmp_path / "candidates" / f"{name}.pt").touch()
+    model, env = restless()
+    deliver = DeliveryCallback(env, tmp_path)
+    deliver.init_callback(model)
+
+    def screen(file, deterministic, limits):
+        best_first = greedy if deterministic else sampled
+        place = best_first.find(file.stem)
+        return place >= 0, -place if place >= 0 else int(file.stem) - 10
+
+    monkeypatch.setattr(deliver, "_screen", screen)
+    tries = deliver._tries(np.ones(1))
+    assert " ".join("s" * (not most_likely) + file.stem for file, most_likely in tries) == tried
 
 
 class Endless(Dose):

@@ -164,7 +164,7 @@ def test_the_loop_around_a_policy_stacks_frames_and_knows_the_last_cost(quick, m
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"inputs": [{"name": "noise", "shape": ["batch", 2]}]}, "does not compute noise, which"),
+        ({"inputs": [{"name": "budget", "shape": ["batch", 2]}]}, "does not compute budget, which"),
         ({"wrappers": ["MaxCost"]}, "does not compute MaxCost, which contract.json names"),
     ],
 )

@@ -8,7 +8,7 @@ import torch
 from killed import crash, runs_of
 from typed import LENGTH, SMALL, TOY, refused, trained
 
-from sb3_guard import CPO, enjoy, export_agent, hub, train
+from sb3_guard import CPO, certify_agent, enjoy, export_agent, hub, train
 from sb3_guard.common.certificate import Certificate
 from sb3_guard.zoo.run.flags import RunFlags
 from sb3_guard.zoo.run.run import Run
@@ -42,7 +42,14 @@ def test_a_run_delivers_and_says_so(run, capsys, tmp_path):
     assert json.loads((tmp_path / "contract.json").read_text())["trained"]["certificate"] is None
 
 
-def test_an_agent_is_played_with_the_actions_that_are_certified(run, capsys, tmp_path):
+def test_an_agent_is_played_with_the_actions_that_are_certified(run, capsys, tmp_path, monkeypatch):
+    predict, played = CPO.predict, set()
+
+    def watched(self, *args, deterministic=False, **kwargs):
+        played.add(not deterministic)
+        return predict(self, *args, deterministic=deterministic, **kwargs)
+
+    monkeypatch.setattr(CPO, "predict", watched)
     file, path = run / "certificate.json", tmp_path / "policy.onnx"
     before = file.read_text()
     file.write_text(before.replace('"deterministic": true', '"deterministic": false'))
@@ -50,10 +57,18 @@ def test_an_agent_is_played_with_the_actions_that_are_certified(run, capsys, tmp
     for flag, sampled in ([], True), (["--deterministic"], False):
         assert enjoy.main([*here, "--no-render", *flag]) == 0
         assert ("sampled actions, confidence" in capsys.readouterr().out) == sampled
+        assert played == {sampled}
+        played.clear()
         assert export_agent.main([*here, "-o", str(path), *flag]) == 0
         contract = json.loads((tmp_path / "contract.json").read_text())
         assert bool(contract["trained"]["certificate"]) == sampled
         assert any(entry["name"] == "noise" for entry in contract["inputs"]) == sampled
+        assert sampled in played  # beside the comparison with the file
+        played.clear()
+        certify_agent.main([*here[:-2], "--n-episodes", "100", *flag])
+        assert ("sampled actions" in capsys.readouterr().out) == sampled
+        assert played == {sampled}
+        played.clear()
     file.write_text(before)
 
 

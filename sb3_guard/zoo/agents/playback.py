@@ -122,19 +122,13 @@ class Agent:
         """What was certified of this very agent, and of such actions."""
         if PRETRAINED in self.path.parents:
             return certificates(self.run)["stochastic" if self.stochastic else "deterministic"]
-        certificate = _filed(self.path)
-        if certificate is None or certificate.deterministic == self.stochastic:
+        file = self.path.with_name("certificate.json")
+        if self.path.name != "certified_model.zip" or not file.is_file():
             return None
-        return certificate if certificate.agent == agent_hash(self.model, self.env) else None
-
-
-def _filed(path: Path) -> Certificate | None:
-    """The certificate that lies beside a certified model."""
-    file = path.with_name("certificate.json")
-    if path.name != "certified_model.zip" or not file.is_file():
-        return None
-    with explained(f"{file} is damaged"):
-        return Certificate.from_json(file.read_text())
+        with explained(f"{file} is damaged"):
+            certificate = Certificate.from_json(file.read_text())
+        same = certificate.agent == agent_hash(self.model, self.env)
+        return certificate if same and certificate.deterministic != self.stochastic else None
 
 
 def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> Agent:
@@ -188,9 +182,10 @@ def open_agent(flags: AgentFlags, render_mode: str | None, n_envs: int = 1) -> A
     if shipped is not None:
         sync_envs_normalization(shipped, env)
         shipped.close()
-    certificate = None if flags.deterministic else _filed(path)
-    sampled = flags.stochastic or (certificate is not None and not certificate.deterministic)
-    return Agent(run, path, env_id, model, env, sampled)
+    agent = Agent(run, path, env_id, model, env, stochastic=True)
+    as_certified = not flags.pretrained and agent.certificate is not None
+    agent.stochastic = flags.stochastic or (as_certified and not flags.deterministic)
+    return agent
 
 
 def play(flags: EnjoyFlags, render_mode: str | None) -> int:
@@ -214,7 +209,8 @@ def play(flags: EnjoyFlags, render_mode: str | None) -> int:
     if flags.verbose > 0:
         limit = result.get("trained_at")
         trained_at = "" if limit is None else f", trained at limit {limit:g}"
-        print(f"Playing {agent.path} on {agent.env_id}{trained_at}")
+        sampled = ", sampled actions" if agent.stochastic else ""
+        print(f"Playing {agent.path} on {agent.env_id}{trained_at}{sampled}")
         if agent.certificate is not None:
             print(agent.certificate)
     shown: AbstractContextManager[Any] = nullcontext(None)

@@ -25,7 +25,10 @@ from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
 
-HELP = "more steps (-n), a lower cost_limit than is certified, or SAC-Lagrangian may help"
+HELP = (
+    "a training with more steps (-n), more episodes (--certify), a lower cost_limit than you need, "
+    "or SAC-Lagrangian may help"
+)
 TRIES = 3  # of candidates, with one kind of actions or the other; they share the error
 
 

@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_454,
     "tests": 25_258,
 }
-WORDS = 64_473  # of all tracked markdown but the changelog
+WORDS = 64_501  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -6,7 +6,7 @@ from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
-from sb3_guard.algorithms.common.replay import CostReplay
+from sb3_guard.algorithms.common.replay import CostReplay, descend
 from sb3_guard.algorithms.common.replay_buffers import CostReplayBufferSamples
 
 
@@ -39,27 +39,21 @@ class TD3Lag(CostReplay, TD3):
             target = batch.rewards + (1 - batch.dones) * discounts * after
         values = self.critic(batch.observations, batch.actions)
         critic_loss = sum(F.mse_loss(value, target) for value in values)
-        self.critic.optimizer.zero_grad()
-        critic_loss.backward()  # type: ignore[union-attr]
-        self.critic.optimizer.step()
+        descend(critic_loss, self.critic.optimizer)  # type: ignore[arg-type]
         logs = {"critic_loss": critic_loss.item()}  # type: ignore[union-attr]
         logs["cost_critic_loss"] = self.fit_cost_critic(batch, next_actions)
 
         if self._n_updates % self.policy_delay == 0:
             actions = self.actor(batch.observations)
-            self.actor.optimizer.zero_grad()
             weights = self.batch_weights(values[0])
             loss = -self.critic.q1_forward(batch.observations, actions)
             if weights.any():
                 costs = (self.cost_critic(batch.observations, actions) * weights).sum(1, True)
                 loss = (loss + costs) / (1.0 + float(self.prices.sum()))
             loss = loss.mean()
-            loss.backward(inputs=[part for part in self.actor.parameters() if part.requires_grad])
-            self.actor.optimizer.step()
+            descend(loss, self.actor.optimizer)
             logs["actor_loss"] = loss.item()
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-            polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+            polyak_update(self._learners, self._targets, self.tau)
             polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
             polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)
-            self.cost_critic.follow(self.tau)
         return logs

@@ -8,7 +8,6 @@ import torch as th
 from stable_baselines3.common.policies import BaseModel, BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.utils import polyak_update
 from torch import nn
 from torch.nn import functional as F
 
@@ -137,7 +136,3 @@ class CostQ(nn.Module):
     def forward(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         """Q_C of actions as the buffer has them, in [-1, 1], shape [B, m]."""
         return self.value(self.predict(self.online, observations, actions))
-
-    def follow(self, tau: float) -> None:
-        """Move the target networks by a share of the way."""
-        polyak_update(self.online.parameters(), self.target.parameters(), tau)

@@ -10,11 +10,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn
+from stable_baselines3.common.type_aliases import RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.arguments import hyperparameter
@@ -29,6 +27,15 @@ from sb3_guard.algorithms.common.replay_buffers import (
 )
 
 WINDOW = 50  # episodes whose mean cost the multipliers follow
+
+
+def descend(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
+    """One step down a loss; what the optimizer does not move gets no gradient."""
+    parameters = [part for group in optimizer.param_groups for part in group["params"]]
+    for part in parameters:
+        part.grad = None  # as zero_grad, which also talks to the profiler
+    loss.backward(inputs=[part for part in parameters if part.requires_grad])
+    optimizer.step()
 
 
 class CostReplay(Lagrangian, OffPolicyAlgorithm):
@@ -81,20 +88,10 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
 
     replay_buffer: CostReplayBuffer | CostDictReplayBuffer
 
-    def __init__(
-        self, policy: str | type[BasePolicy], env: GymEnv | str, *args: Any, **kwargs: Any
-    ) -> None:
-        if isinstance(env, str):  # made here already, to look at its actions
-            env = maybe_make_env(env, kwargs.get("verbose", 0))
-        space = getattr(env, "single_action_space", None) or getattr(env, "action_space", None)
-        if space is not None and not isinstance(space, spaces.Box):
-            raise ValueError(
-                f"{type(self).__name__} needs continuous actions (Box), not {space}: for others "
-                "there are on-policy algorithms such as PPOLag"
-            )
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.cost_deviation = np.zeros(0, np.float32)  # of Q_C in the last batch, shape (m,)
         self.latest_costs: list[np.ndarray] = []  # of the last episodes, each of shape (m,)
-        super().__init__(policy, env, *args, **kwargs)
+        super().__init__(*args, **kwargs)
 
     # Construction and saving
 
@@ -129,10 +126,22 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         # Its first weights take nothing from the stream that actions are sampled from.
         with th.random.fork_rng(devices=[]):
             self.cost_critic = self.make_cost_critic()
+        pairs = [(self.cost_critic.online, self.cost_critic.target)]
+        for name in "actor", "critic":
+            if hasattr(self, f"{name}_target"):
+                pairs.append((getattr(self, name), getattr(self, f"{name}_target")))
+        # Their parameters, so that no gradient step walks over the modules
+        self._learners, self._targets = (
+            [part for network in networks for part in network.parameters()]
+            for networks in zip(*pairs, strict=True)
+        )
 
     def make_cost_critic(self) -> CostQ:
         """The critics of the costs, before they have learnt."""
         return CostQ(self.policy, len(self.cost_keys), self.lr_schedule(1))
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_learners", "_targets"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
@@ -217,9 +226,7 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         values = critic.value(predicted.detach())
         self.cost_deviation = values.std(dim=0, correction=0).cpu().numpy()
         loss = critic.loss(predicted, target)
-        critic.optimizer.zero_grad()
-        loss.backward()
-        critic.optimizer.step()
+        descend(loss, critic.optimizer)
         return loss.item()
 
     def batch_weights(self, values: th.Tensor) -> th.Tensor:

@@ -9,7 +9,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional as F
 
-from sb3_guard.algorithms.common.replay import CostReplay
+from sb3_guard.algorithms.common.replay import CostReplay, descend
 from sb3_guard.algorithms.common.replay_buffers import CostReplayBufferSamples
 
 
@@ -107,9 +107,7 @@ class SoftActorCritic(CostReplay):
             alpha = th.exp(self.log_ent_coef.detach())
             entropy = log_prob.detach() + float(self.target_entropy)
             alpha_loss = -(self.log_ent_coef * entropy).mean()
-            self.ent_coef_optimizer.zero_grad()
-            alpha_loss.backward()
-            self.ent_coef_optimizer.step()
+            descend(alpha_loss, self.ent_coef_optimizer)
             logs["ent_coef_loss"] = alpha_loss.item()
         logs["ent_coef"] = alpha.item()
 
@@ -122,27 +120,22 @@ class SoftActorCritic(CostReplay):
             target = batch.rewards + (1 - batch.dones) * discounts * after
         values = self.critic(batch.observations, batch.actions)
         critic_loss = self.critic_loss(values, target)
-        self.critic.optimizer.zero_grad()
-        critic_loss.backward()
-        self.critic.optimizer.step()
+        descend(critic_loss, self.critic.optimizer)
         logs["critic_loss"] = critic_loss.item()
         logs["cost_critic_loss"] = self.fit_cost_critic(batch, next_actions)
 
         # Actor: down (α log π - Q + Σ w_i Q_Ci) / (1 + Σ λ_i)
-        self.actor.optimizer.zero_grad()
         weights = self.batch_weights(self.expected(values))
         loss = alpha * log_prob - self.estimate(self.critic(batch.observations, actions))
         if weights.any():
             costs = (self.cost_critic(batch.observations, actions) * weights).sum(1, keepdim=True)
             loss = (loss + costs) / (1.0 + float(self.prices.sum()))
         loss = loss.mean()
-        loss.backward(inputs=[part for part in self.actor.parameters() if part.requires_grad])
-        self.actor.optimizer.step()
+        descend(loss, self.actor.optimizer)
         logs["actor_loss"] = loss.item()
 
         # Targets
         if step % self.target_update_interval == 0:
-            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            polyak_update(self._learners, self._targets, self.tau)
             polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
-            self.cost_critic.follow(self.tau)
         return logs

@@ -15,7 +15,7 @@ run is in italics, which the site shows in grey.
 
 ``--curves`` draws the learning curves: of each algorithm's page, beside an unconstrained algorithm,
 from the first of ``GRIDS`` that has it, ``docs/images/curve_<algo>.png``; of all algorithms of
-``PAPER``, ``curves_<suite>.png``; and good runs of docs/keeping_a_limit.md beside bad ones,
+``PAPER``, ``curves_<suite>.png``; and good runs beside bad ones,
 ``healthy_<algo>.png``.
 """
 
@@ -73,7 +73,7 @@ PAPER = {
 }
 HAZARDS = "Goal_Point_8Hazards-v0"
 ROWS = DOCS.parent / "sb3_guard" / "zoo" / "results" / "rows.csv"
-# Of docs/keeping_a_limit.md, a good run and a bad one: label, limit, archive and folder.
+# A good run and a bad one: label, limit, archive and folder.
 HEALTHY = {
     "pcpo": (
         ("healthy: seed 23", 2.0, "guard_limit2", f"guard_limit2/pcpo/{HAZARDS}_24"),

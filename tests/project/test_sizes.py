@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_454,
     "tests": 25_257,
 }
-WORDS = 64_502  # of all tracked markdown but the changelog
+WORDS = 64_096  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -37,13 +37,13 @@ class DeliveryCallback(BaseCallback):
     End a training with an agent that is certified to keep its limit.
 
     From the middle of the training on its policies are kept as *candidates*, with their observation
-    statistics. After its end each plays a few episodes with its most likely actions; of those whose
-    mean cost plus its standard error is within the limit, the one of highest return is certified by
-    fresh episodes (:func:`~sb3_guard.certify`), then the next. If neither is, the same is done with
-    sampled actions; the three tries share the error. The first candidate that is certified is
-    written as ``certified_model.zip``, with ``certified_model_vecnormalize.pkl`` where observations
-    are normalised, and ``certificate.json``, which vouches for them: it is of the last training
-    that ended in this folder. The model itself keeps its last weights.
+    statistics. After its end each plays a few episodes with its most likely actions and a few with
+    sampled ones. Of those whose mean cost plus its standard error is within the limit, the one of
+    highest return is certified by fresh episodes (:func:`~sb3_guard.certify`); if it is refused,
+    others follow, which are further within it. The three tries share the error. What is certified
+    is written as ``certified_model.zip``, with ``certified_model_vecnormalize.pkl`` where
+    observations are normalised, and ``certificate.json``, which vouches for them: it is of the last
+    training that ended in this folder. The model itself keeps its last weights.
 
     A training that was cut and continues keeps the candidates that it has, and ends alike; one that
     begins takes those of another away.
@@ -52,10 +52,10 @@ class DeliveryCallback(BaseCallback):
     :param folder: where the files are written; the current one unless it is given
     :param cost_limit: d, one number or one per cost; None: the model's own at the end
     :param candidates: how many policies are kept, the last one among them
-    :param screening: episodes of each
+    :param screening: episodes of each, with each kind of actions
     :param n_episodes: most episodes of a certificate, at least 100
-    :param deterministic: certify the most likely actions, or sampled ones; None: these where those
-        fail, if the agent can be exported with them
+    :param deterministic: certify the most likely actions, or sampled ones; None: either, if the
+        agent can be exported with sampled ones
     :param seed: the episodes' seeds are drawn from it
     :param verbose: 1 prints what is delivered, or how far the nearest candidate is away
     """
@@ -66,7 +66,7 @@ class DeliveryCallback(BaseCallback):
         folder: str | os.PathLike[str] = ".",
         cost_limit: float | Sequence[float] | None = None,
         *,
-        candidates: int = 6,
+        candidates: int = 4,
         screening: int = 50,
         n_episodes: int = MOST,
         deterministic: bool | None = None,
@@ -178,31 +178,27 @@ class DeliveryCallback(BaseCallback):
 
     def _tries(self, limits: np.ndarray) -> Iterator[tuple[Path, bool]]:
         """
-        Candidates that look right, best first, and whether with their most likely actions.
+        Candidates in the order in which they are tried, and whether with their most likely actions.
 
-        One try is kept for sampled actions, if any look right. If nothing does, the nearest
-        candidate is tried, for a verdict.
+        First the one of highest return whose mean cost plus its standard error is within the limit;
+        after a refusal plus twice that, then three times. If none is, the nearest.
         """
-        left, kept, scores = TRIES, list[tuple[Path, bool]](), dict[tuple[Path, bool], float]()
-        kinds = self._kinds()
-        for deterministic in kinds:
-            screened = {file: self._screen(file, deterministic, limits) for file in self._files()}
-            scores |= {(file, deterministic): score for file, (_, score) in screened.items()}
-            right = [
-                (file, deterministic) for file, (looks_right, _) in screened.items() if looks_right
-            ]
-            right.sort(key=lambda candidate: scores[candidate], reverse=True)
-            now = left - (deterministic is not kinds[-1])
-            kept += right[now:]
-            for candidate in right[:now]:
-                left -= 1
-                yield candidate
-        yield from kept[:left]
-        if left == TRIES:
-            yield max(scores, key=lambda candidate: scores[candidate])
+        screened = {
+            (file, deterministic): self._screen(file, deterministic, limits)
+            for deterministic in self._kinds()
+            for file in self._files()
+        }
+        for caution in range(1, min(TRIES, len(screened)) + 1):
+            ranks = dict[tuple[Path, bool], tuple[bool, float]]()
+            for candidate, (mean_return, excess, error) in screened.items():
+                most = float(np.max(excess + caution * error))
+                ranks[candidate] = (True, mean_return) if most <= 0.0 else (False, -most)
+            best = max(ranks, key=lambda candidate: ranks[candidate])
+            del screened[best]
+            yield best
 
     def _kinds(self) -> list[bool]:
-        """Whether the most likely actions, in the order in which they are tried."""
+        """The kinds of actions: whether the most likely ones."""
         if self.deterministic is not None:
             return [self.deterministic]
         # Those whose sampled actions are the same, are of noise that is not saved, or can't be
@@ -211,18 +207,19 @@ class DeliveryCallback(BaseCallback):
         box = isinstance(self.model.action_space, spaces.Box)
         return [True, False] if box and not noisy and not isinstance(policy, TD3Policy) else [True]
 
-    def _screen(self, file: Path, deterministic: bool, limits: np.ndarray) -> tuple[bool, float]:
-        """Whether a candidate looks right in a few episodes; its return, or how near it is."""
+    def _screen(
+        self, file: Path, deterministic: bool, limits: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Mean return, mean costs above the limits and their standard errors, shape [m]."""
         self._put(file)
         played = evaluate_policy(
             self.model, self.eval_env, self.screening, deterministic, seed=self.seed
         )
         costs = played.limited  # [E, m]; NaN after a physics error
         if len(costs) < self.screening or np.isnan(costs).any():
-            return False, -np.inf
+            return -np.inf, np.full(len(limits), np.inf), np.zeros(len(limits))
         error = costs.std(axis=0, ddof=1) / np.sqrt(len(costs))
-        excess = float(np.max(costs.mean(axis=0) + error - limits))
-        return (True, float(played.returns.mean())) if excess <= 0.0 else (False, -excess)
+        return float(played.returns.mean()), costs.mean(axis=0) - limits, error
 
     def _put(self, file: Path) -> int:
         """Give the model and the environment the weights and statistics of a candidate."""

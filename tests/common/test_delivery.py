@@ -172,16 +172,15 @@ def test_actions_that_are_sampled_alike_or_not_exported_are_not_tried(algorithm,
 
 
 @pytest.mark.parametrize(
-    ("greedy", "sampled", "tried"),
+    ("screened", "tried"),
     [
-        ("012", "345", "0 1 s3"),  # the last try is kept for sampled actions
-        ("012", "", "0 1 2"),  # which do not need it
-        ("", "3210", "s3 s2 s1"),
-        ("1", "23", "1 s2 s3"),
-        ("", "", "5"),  # nothing looks right: the nearest, for a verdict
+        # The best return whose mean is 1, 2, 3 errors (of 0.1) below the limit, of either kind
+        ({"0": (9, -0.15), "s1": (8, -0.25), "2": (7, -0.35), "s3": (6, -0.9)}, "0 s1 2"),
+        ({"s0": (9, -0.15), "s1": (8, -0.15), "2": (7, -0.9)}, "s0 2 s1"),  # then the nearest
+        ({}, "5 s5 4"),
     ],
 )
-def test_three_tries_at_most_the_best_first(greedy, sampled, tried, tmp_path, monkeypatch):
+def test_three_tries_the_best_first_then_more_cautious(screened, tried, tmp_path, monkeypatch):
     (tmp_path / "candidates").mkdir()
     for name in "012345":
         (tmp_path / "candidates" / f"{name}.pt").touch()
@@ -190,9 +189,10 @@ def test_three_tries_at_most_the_best_first(greedy, sampled, tried, tmp_path, mo
     deliver.init_callback(model)
 
     def screen(file, deterministic, limits):
-        best_first = greedy if deterministic else sampled
-        place = best_first.find(file.stem)
-        return place >= 0, -place if place >= 0 else int(file.stem) - 10
+        name = "s" * (not deterministic) + file.stem
+        above = 2.0 - int(file.stem) / 10 + 0.01 * (not deterministic)
+        mean_return, excess = screened.get(name, (99.0, above))
+        return mean_return, np.array([excess]), np.array([0.1])
 
     monkeypatch.setattr(deliver, "_screen", screen)
     tries = deliver._tries(np.ones(1))

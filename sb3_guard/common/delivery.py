@@ -194,6 +194,8 @@ class DeliveryCallback(BaseCallback):
                 most = float(np.max(excess + caution * error))
                 ranks[candidate] = (True, mean_return) if most <= 0.0 else (False, -most)
             best = max(ranks, key=lambda candidate: ranks[candidate])
+            if caution > 1 and ranks[best][1] == -np.inf:  # its episodes did not end
+                return
             del screened[best]
             yield best
 

@@ -2,6 +2,7 @@
 
 import itertools
 import pickle
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,26 @@ def test_while_the_limit_holds_it_is_sb3s_bit_for_bit(ours: Any, theirs: Any, mo
     assert model.logger.name_to_value["train/cost_critic_loss"] > 0.0
     # A limit that is broken makes another run of it.
     assert state_of(ours("MlpPolicy", VecNormalize(points()), **kwargs()).learn(200)) != state
+
+
+@shared
+def test_targets_follow_what_learns(cls: Any, tmp_path: Path) -> None:
+    """Also of a model that was saved, loaded and given other parameters."""
+    cls("MlpPolicy", points(), **settings()).learn(60).save(tmp_path / "model.zip")
+    assert "_targets" not in zipfile.ZipFile(tmp_path / "model.zip").read("data").decode()
+    model = cls.load(tmp_path / "model.zip", points()).learn(60)
+    model.set_parameters(model.get_parameters())
+    pairs = [(model.cost_critic.online, model.cost_critic.target)]
+    pairs.append((model.critic, model.critic_target))
+    if cls is TD3Lag:
+        pairs.append((model.actor, model.actor_target))
+    before = [[part.clone() for part in target.parameters()] for _, target in pairs]
+    model._n_updates = 1  # the next one is one of TD3's actor, too
+    model.train(1, 32)
+    for old, (online, target) in zip(before, pairs, strict=True):
+        for was, now, goal in zip(old, target.parameters(), online.parameters(), strict=True):
+            assert th.allclose(now, (1 - model.tau) * was + model.tau * goal)
+            assert not th.equal(was, now)
 
 
 class Clock(gymnasium.Env[Any, Any]):

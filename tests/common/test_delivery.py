@@ -9,7 +9,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_guard import CPO, TD3Lag, make_vec_env
+from sb3_guard import CPO, TD3Lag, evaluate_policy, make_vec_env
 from sb3_guard.common.certificate import Certificate, agent_hash, certify
 from sb3_guard.common.delivery import DeliveryCallback
 
@@ -192,11 +192,40 @@ def test_three_tries_the_best_first_then_more_cautious(screened, tried, tmp_path
         name = "s" * (not deterministic) + file.stem
         above = 2.0 - int(file.stem) / 10 + 0.01 * (not deterministic)
         mean_return, excess = screened.get(name, (99.0, above))
-        return mean_return, np.array([excess]), np.array([0.1])
+        return mean_return, np.array([-9.0, excess]), np.array([0.1, 0.1])
 
     monkeypatch.setattr(deliver, "_screen", screen)
     tries = deliver._tries(np.ones(1))
     assert " ".join("s" * (not most_likely) + file.stem for file, most_likely in tries) == tried
+
+
+class TwoCosts(Dose):
+    action_space = spaces.Box(-5, 5, (1,), np.float32)
+
+    def step(self, action):
+        observation, reward, ended, cut, info = super().step(action)
+        return observation, reward, ended, cut, {"cost": 2.0 - info["cost"], "dose": abs(reward)}
+
+
+def test_the_screening_of_several_costs(tmp_path, monkeypatch):
+    keys = {"cost_keys": ("cost", "dose")}
+    env = make_vec_env(TwoCosts, n_envs=5, monitor_kwargs=keys)
+    model = CPO("MlpPolicy", env, cost_limit=[1.0, 4.0], seed=0, **keys)
+    deliver = DeliveryCallback(env, tmp_path, screening=20)
+    deliver.init_callback(model)
+    deliver._keep(file := tmp_path / "candidates" / "000.pt")
+    for deterministic in True, False:
+        th.manual_seed(0)
+        played = evaluate_policy(model, env, 20, deterministic, seed=deliver.seed)
+        th.manual_seed(0)
+        mean_return, excess, error = deliver._screen(file, deterministic, np.array([1.0, 4.0]))
+        assert mean_return == pytest.approx(played.returns.mean())
+        assert excess == pytest.approx(played.limited.mean(axis=0) - [1.0, 4.0])
+        assert error == pytest.approx(played.limited.std(axis=0, ddof=1) / 20**0.5)
+    # Episodes without an end, or that ended in a physics error: only a first try, for a verdict
+    played.limited[3, 1] = np.nan
+    monkeypatch.setattr("sb3_guard.common.delivery.evaluate_policy", lambda *args, **kwargs: played)
+    assert list(deliver._tries(np.array([1.0, 4.0]))) == [(file, True)]
 
 
 class Endless(Dose):

@@ -71,8 +71,8 @@ def certified(costs: np.ndarray, limit: float, tries: int = 1) -> np.ndarray:
 
 def delivered(draw: Draw, rng: np.random.Generator, runs: int, limit: float) -> float:
     """Share of trainings that deliver, whose candidates' costs are all drawn alike."""
-    safe = certified(draw(rng, (runs * TRIES, MOST)), limit, TRIES)
-    return float(np.mean(safe.reshape(runs, TRIES).any(axis=1)))
+    costs = draw(rng, (runs, TRIES * MOST)).reshape(runs * TRIES, MOST)
+    return float(np.mean(certified(costs, limit, TRIES).reshape(runs, TRIES).any(axis=1)))
 
 
 def main() -> None:

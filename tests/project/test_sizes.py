@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_536,
+    "sb3_guard": 26_538,
     "sb3_guard/envs": 8_844,
     "sb3_guard/algorithms": 5_764,
-    "sb3_guard/common": 2_558,
+    "sb3_guard/common": 2_560,
     "sb3_guard/deployment": 916,
     "harness": 8_454,
-    "tests": 25_257,
+    "tests": 25_307,
 }
-WORDS = 64_093  # of all tracked markdown but the changelog
+WORDS = 64_282  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -511,6 +511,7 @@ def test_sampling_draws_what_sb3s_buffer_draws() -> None:
         ({"batch_size": 0}, "batch_size = 0 must be at least 1"),
         ({"tau": 2.0}, "tau = 2.0 must be at least 0 and at most 1"),
         ({"safety_margin": 1.0}, "safety_margin = 1.0 must be"),
+        ({"env": "CartPole-v1"}, r"^\w+ needs continuous actions \(Box\), not Discrete"),
     ],
 )
 def test_bad_input(more: Any, error: str) -> None:

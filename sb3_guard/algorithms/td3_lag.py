@@ -54,6 +54,7 @@ class TD3Lag(CostReplay, TD3):
             descend(loss, self.actor.optimizer)
             logs["actor_loss"] = loss.item()
             polyak_update(self._learners, self._targets, self.tau)
+            polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
             polyak_update(self.critic_batch_norm_stats, self.critic_batch_norm_stats_target, 1.0)
             polyak_update(self.actor_batch_norm_stats, self.actor_batch_norm_stats_target, 1.0)
         return logs

@@ -13,9 +13,9 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_550,
+    "sb3_guard": 26_546,
     "sb3_guard/envs": 8_844,
-    "sb3_guard/algorithms": 5_776,
+    "sb3_guard/algorithms": 5_772,
     "sb3_guard/common": 2_560,
     "sb3_guard/deployment": 916,
     "harness": 8_454,

@@ -138,15 +138,10 @@ class CostReplay(Lagrangian, OffPolicyAlgorithm):
         # Its first weights take nothing from the stream that actions are sampled from.
         with th.random.fork_rng(devices=[]):
             self.cost_critic = self.make_cost_critic()
-        pairs = [(self.cost_critic.online, self.cost_critic.target)]
-        for name in "actor", "critic":
-            if hasattr(self, f"{name}_target"):
-                pairs.append((getattr(self, name), getattr(self, f"{name}_target")))
-        # Their parameters, so that no gradient step walks over the modules
-        self._learners, self._targets = (
-            [part for network in networks for part in network.parameters()]
-            for networks in zip(*pairs, strict=True)
-        )
+        # Parameters of the critics, so that no gradient step walks over the modules.
+        critic, target = self.critic, self.critic_target  # type: ignore[attr-defined]
+        self._learners = [*critic.parameters(), *self.cost_critic.online.parameters()]
+        self._targets = [*target.parameters(), *self.cost_critic.target.parameters()]
 
     def make_cost_critic(self) -> CostQ:
         """The critics of the costs, before they have learnt."""

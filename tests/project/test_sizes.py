@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_454,
     "tests": 25_308,
 }
-WORDS = 64_360  # of all tracked markdown but the changelog
+WORDS = 64_328  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

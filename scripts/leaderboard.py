@@ -36,12 +36,15 @@ BLOCK = re.compile(r"(<!-- glance -->\n).*?(<!-- end -->)", re.DOTALL)
 # Grid and folder, whose name is that of its archive; several grids may share one.
 GRIDS = (
     ("grand_table", "grand_table"),
+    ("grand_table_first_order", "grand_table"),
     ("grand_table_guard", "grand_table_guard"),
     ("grand_table_guard_seeds", "grand_table_guard"),
     ("grand_table_10m", "grand_table_10m"),
+    ("grand_table_10m_first_order", "grand_table_10m"),
     ("grand_table_off_policy", "grand_table"),
     ("grand_table_2m", "grand_table_2m"),
     ("grand_table_tasks", "grand_table"),
+    ("grand_table_tasks_first_order", "grand_table"),
     ("grand_table_algorithms", "grand_table"),
 )
 FOLDERS = (*dict.fromkeys(folder for _, folder in GRIDS),)

@@ -241,7 +241,7 @@ def _described(env: VecEnv) -> dict[str, Any]:
         spec = env.get_attr("spec")[0]
         kwargs = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
         return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs, default=str))}
-    except (AttributeError, IndexError):
+    except (AttributeError, IndexError, NotImplementedError):
         return {"id": "", "kwargs": {}}
 
 
@@ -279,12 +279,14 @@ def certify(
     :param tries: how many agents share this error, such as candidates of one training. If there
         are others, one whose mean is above the limit at a look is not looked at again
     :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
-        a cost, or the normalisation of the model's observations is absent
+        a cost, the normalisation of the model's observations is absent, or a wrapper of ``env`` is
+        for training only, as ``VecEarlyTermination``
     """
     fit("n_episodes", n_episodes, int, LEAST, ends="[)")
     fit("tries", tries, int, 1, ends="[)")
     fit("error", error, float, 0.0, 0.5)
     env = as_vec_env(env)
+    refuse_training_only(env)
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
     limits = limits_of(model, cost_limit, keys)
     seed = int(np.random.SeedSequence().generate_state(1)[0] if seed is None else seed)
@@ -319,6 +321,14 @@ def certify(
         agent=agent_hash(model, env),
         versions={name: version(name) for name in PACKAGES},
     )
+
+
+def refuse_training_only(env: VecEnv) -> None:
+    """
+    :raises ValueError: a wrapper is for training only: other costs would be certified
+    """
+    if getattr(env, "training_only", False):  # of any wrapper
+        raise ValueError("a wrapper of env is for training only: certify without it")
 
 
 def limits_of(model: Any, cost_limit: Any, keys: tuple[str, ...]) -> list[float]:

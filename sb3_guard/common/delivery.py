@@ -14,7 +14,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_guard.common.certificate import LEAST, MOST, Certificate, certify, limits_of
+from sb3_guard.common.certificate import (
+    LEAST,
+    MOST,
+    Certificate,
+    certify,
+    limits_of,
+    refuse_training_only,
+)
 from sb3_guard.common.evaluation import (
     check_agent,
     evaluate_policy,
@@ -29,6 +36,7 @@ HELP = (
     "a training with more steps (-n), more episodes (--certify), a lower cost_limit than you need, "
     "or SAC-Lagrangian may help"
 )
+MODEL, NORMALIZER = "certified_model.zip", "certified_model_vecnormalize.pkl"
 TRIES = 3  # of candidates, with one kind of actions or the other; they share the error
 
 
@@ -48,7 +56,8 @@ class DeliveryCallback(BaseCallback):
     A training that was cut and continues keeps the candidates that it has, and ends alike; one that
     begins takes those of another away.
 
-    :param eval_env: environment to play in, wrapped as the training environment is
+    :param eval_env: environment to play in, wrapped as the training environment is, but for
+        wrappers that are for training only
     :param folder: where the files are written; the current one unless it is given
     :param cost_limit: d, one number or one per cost; None: the model's own at the end
     :param candidates: how many policies are kept, the last one among them
@@ -86,11 +95,15 @@ class DeliveryCallback(BaseCallback):
     def _init_callback(self) -> None:
         """
         :raises ValueError: the limit is not finite, or does not fit the costs, or ``eval_env`` is
-            not normalised as the training is, or has other actions
+            not normalised as the training is, has other actions, or a wrapper that is for training
+            only
+        :raises OSError: the folder can't be written
         """
         self._limits()
+        refuse_training_only(self.eval_env)
         sync_normalization(self.training_env, self.eval_env)
         check_agent(self.model, self.eval_env)
+        (self.folder / "candidates").mkdir(parents=True, exist_ok=True)
 
     def _limits(self) -> list[float]:
         keys = cost_keys_of(self.model, self.eval_env)
@@ -121,7 +134,6 @@ class DeliveryCallback(BaseCallback):
         return self.folder / "candidates" / f"{part:03d}.pt"
 
     def _keep(self, file: Path) -> None:
-        file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as written:
             content = {
                 "num_timesteps": self.num_timesteps,
@@ -142,14 +154,16 @@ class DeliveryCallback(BaseCallback):
             return
         last = self._candidate(self.num_timesteps)
         self._keep(last)
-        (self.folder / "certificate.json").unlink(missing_ok=True)
+        trained = self._load(last)  # another training may write into the same folder
+        for name in ("certificate.json", MODEL, NORMALIZER):
+            (self.folder / name).unlink(missing_ok=True)
         began = time.process_time()
         try:
             tried = self._deliver()
         except ValueError as error:  # such as episodes without an end: the training is kept
             tried = f"Nothing is delivered: {error}"
         finally:
-            self._put(last)
+            self._put(trained)
         if self.verbose > 0:
             taken = f"({time.process_time() - began:.0f} s of a processor)"
             print(f"{tried} {taken}")
@@ -159,7 +173,7 @@ class DeliveryCallback(BaseCallback):
         limits = self._limits()
         refused: list[Certificate] = []
         for file, deterministic in self._tries(np.array(limits)):
-            steps = self._put(file)
+            steps = self._put(self._load(file))
             certificate = certify(
                 self.model,
                 self.eval_env,
@@ -213,7 +227,7 @@ class DeliveryCallback(BaseCallback):
         self, file: Path, deterministic: bool, limits: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
         """Mean return, mean costs above the limits and their standard errors, shape [m]."""
-        self._put(file)
+        self._put(self._load(file))
         played = evaluate_policy(
             self.model, self.eval_env, self.screening, deterministic, seed=self.seed
         )
@@ -223,9 +237,8 @@ class DeliveryCallback(BaseCallback):
         error = costs.std(axis=0, ddof=1) / np.sqrt(len(costs))
         return float(played.returns.mean()), costs.mean(axis=0) - limits, error
 
-    def _put(self, file: Path) -> int:
+    def _put(self, content: dict[str, Any]) -> int:
         """Give the model and the environment the weights and statistics of a candidate."""
-        content = self._load(file)
         self.model.policy.load_state_dict(content["policy"])
         moments = moments_of(self.eval_env)
         for name, (mean, var, count) in content["statistics"].items():
@@ -234,13 +247,13 @@ class DeliveryCallback(BaseCallback):
         return int(content["num_timesteps"])
 
     def _write(self, certificate: Certificate, steps: int) -> None:
-        self.certificate = certificate
         trained, self.model.num_timesteps = self.model.num_timesteps, steps
-        with replacing(self.folder / "certified_model.zip") as file:
+        with replacing(self.folder / MODEL) as file:
             self.model.save(file)
         self.model.num_timesteps = trained
         normalizer = unwrap_vec_normalize(self.eval_env)
         if normalizer is not None:
-            normalizer.save(str(self.folder / "certified_model_vecnormalize.pkl"))
+            normalizer.save(str(self.folder / NORMALIZER))
         with replacing(self.folder / "certificate.json") as file:  # last: it vouches for the others
             file.write(certificate.to_json().encode())
+        self.certificate = certificate

@@ -210,7 +210,8 @@ def moments_of(env: VecEnv | None) -> dict[str, RunningMeanStd]:
 
 def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
     """Whether an agent learnt from normalised observations, and ``env`` has no means of them."""
-    if not getattr(model, "learnt_normalized", False):
+    learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
+    if not getattr(model, "learnt_normalized", learnt_with is not None and learnt_with.norm_obs):
         return False
     moments = moments_of(env)
     # Those of a new VecNormalize are of no observation.

@@ -9,9 +9,9 @@ import pytest
 from gymnasium import spaces
 from scipy import stats
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from sb3_guard import CPO, SCPO
+from sb3_guard import CPO, SCPO, DeliveryCallback
 from sb3_guard.common.certificate import (
     ERROR,
     LOOKS,
@@ -21,6 +21,7 @@ from sb3_guard.common.certificate import (
     certify,
     mean_bounds,
 )
+from sb3_guard.common.vec_budgets import VecEarlyTermination
 
 
 class Lottery(gym.Env):
@@ -113,6 +114,23 @@ def test_the_episodes_depend_on_the_seed_alone():
     assert several.episodes == MOST and several.verdict == "certified"
 
 
+@pytest.mark.parametrize("tries", [1, 3])
+def test_bounds_looks_costs_and_tries_share_the_error(tries, monkeypatch):
+    """Whatever the shares are: those of all bounds of all tries add up to the error."""
+    shares = []
+
+    def spied(values, error):
+        shares.append(error)
+        return mean_bounds(values, error)
+
+    monkeypatch.setattr("sb3_guard.common.certificate.mean_bounds", spied)
+    keys = ("cost", "other")
+    certify(Idle(), Lottery(keys=keys), (3.0, 6.0), cost_keys=keys, seed=1, tries=tries)
+    # Of each cost a lower bound at three looks, and the upper bound of the last one.
+    looks = np.reshape(shares, (3, 2, 2))
+    assert tries * (looks[:, :, 0].sum() + looks[-1, :, 1].sum()) == pytest.approx(ERROR)
+
+
 def test_tries_and_costs_share_the_error():
     bounds = [certify(Idle(), Lottery(), 3.0, seed=1, tries=n).nearest.upper for n in (1, 3)]
     assert bounds[0] < bounds[1]
@@ -136,6 +154,7 @@ def test_tries_and_costs_share_the_error():
 
 def test_the_hash_knows_weights_and_normaliser():
     env = VecNormalize(DummyVecEnv([Lottery]), norm_reward=False)
+    env.reset()
     hashes = []
     for seed in (0, 0, 1):
         model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=seed)
@@ -213,5 +232,29 @@ def test_episodes_without_an_end_are_refused(monkeypatch):
 def test_an_absent_normaliser_is_refused():
     env = VecNormalize(DummyVecEnv([Lottery]), norm_reward=False)
     model = PPO("MlpPolicy", env, n_steps=8, batch_size=8)
-    with pytest.raises(ValueError, match="VecNormalize"):
-        certify(model, DummyVecEnv([Lottery]), 1.0)
+    for other in DummyVecEnv([Lottery]), VecNormalize(DummyVecEnv([Lottery])):  # of no observation
+        with pytest.raises(ValueError, match="VecNormalize"):
+            certify(model, other, 1.0)
+
+
+def test_a_wrapper_for_training_only_is_refused():
+    """Episodes that end when a budget is spent can't exceed it."""
+    env = VecMonitor(VecEarlyTermination(DummyVecEnv([Lottery]), budget=1.0))
+    with pytest.raises(ValueError, match="training only"):
+        certify(Idle(), env, 1.0)
+    model = CPO("MlpPolicy", Lottery(), n_steps=8)
+    with pytest.raises(ValueError, match="training only"):
+        DeliveryCallback(env).init_callback(model)
+
+
+class Closed(DummyVecEnv):
+    """Says nothing of what its environments are, as a VecEnv of a user's may."""
+
+    def get_attr(self, attr_name, indices=None):
+        if attr_name == "spec":
+            raise NotImplementedError
+        return super().get_attr(attr_name, indices)
+
+
+def test_an_environment_that_says_nothing_of_itself_has_no_id():
+    assert certify(Idle(), Closed([Lottery]), 3.0, seed=1).env["id"] == ""

@@ -1,5 +1,6 @@
 """A training ends with a certified agent, or says how far the nearest is away."""
 
+import re
 import shutil
 
 import gymnasium as gym
@@ -78,11 +79,22 @@ def test_candidates_are_of_the_last_half_in_equal_parts(delivered):
     assert [candidate["num_timesteps"] for candidate in kept(delivered[0])] == [300, 500, 600]
 
 
-def test_nothing_is_delivered_where_nothing_keeps_the_limit(tmp_path, capsys):
+def test_nothing_is_delivered_where_nothing_keeps_the_limit(tmp_path, capsys, monkeypatch):
+    tried = []
+
+    def spied(*args, **kwargs):
+        tried.append(certify(*args, **kwargs))
+        return tried[-1]
+
+    monkeypatch.setattr("sb3_guard.common.delivery.certify", spied)
     _, deliver = trained(tmp_path, 0.01)
     assert deliver.certificate is None
     assert [path.name for path in tmp_path.iterdir()] == ["candidates"]
-    assert "Nothing is delivered. The nearest candidate: exceeded: " in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "Nothing is delivered. The nearest candidate: exceeded: " in said
+    assert re.search(r"\(\d+ s of a processor\)", said)
+    # Each try has fresh episodes.
+    assert len({certificate.seed for certificate in tried}) == len(tried) == 3
 
 
 def test_a_training_that_continues_keeps_the_candidates_that_it_has(delivered, tmp_path):
@@ -107,7 +119,7 @@ def test_another_training_in_the_folder_has_nothing_of_the_first(delivered, tmp_
     _, deliver = trained(tmp_path, -1.0, seed=1, policy_kwargs={"net_arch": [8]})
     assert [candidate["num_timesteps"] for candidate in kept(tmp_path)] == [300, 500, 600]
     assert "Nothing is delivered" in capsys.readouterr().out
-    assert deliver.certificate is None and not (tmp_path / "certificate.json").exists()
+    assert deliver.certificate is None and not [*tmp_path.glob("certifi*")]
 
 
 def test_a_callback_delivers_each_training_and_leaves_the_model_and_its_statistics(tmp_path):
@@ -164,9 +176,11 @@ class Doses(Restless):
     ("algorithm", "env", "kwargs"),
     [(CPO, Doses, {}), (CPO, Restless, {"use_sde": True}), (TD3Lag, Restless, {})],
 )
-def test_actions_that_are_sampled_alike_or_not_exported_are_not_tried(algorithm, env, kwargs):
+def test_actions_that_are_sampled_alike_or_not_exported_are_not_tried(
+    algorithm, env, kwargs, tmp_path
+):
     model, eval_env = restless(algorithm, env, **kwargs)
-    deliver = DeliveryCallback(eval_env)
+    deliver = DeliveryCallback(eval_env, tmp_path)
     deliver.init_callback(model)
     assert deliver._kinds() == [True]
 
@@ -254,6 +268,12 @@ def test_a_wrong_limit_is_told_before_the_training(limit, tmp_path):
     with pytest.raises(ValueError, match="cost_limit"):
         trained(tmp_path, limit)
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_folder_that_is_none_is_told_before_the_training(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        trained(tmp_path / "file", 1.0)
 
 
 def test_other_actions_are_told_before_the_training(tmp_path):

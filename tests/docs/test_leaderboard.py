@@ -1,5 +1,6 @@
 """The leaderboard is made of packed logs."""
 
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -7,6 +8,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from fake_runs import fake_run
+
+from sb3_guard.benchmark import Flags, with_file
+from sb3_guard.zoo.grids.grid import expand
+from sb3_guard.zoo.run.flags import RunFlags
+from sb3_guard.zoo.run.run import Run
 
 ROOT = Path(__file__).parents[2]
 
@@ -149,3 +155,24 @@ def test_the_page_is_made_of_its_logs(scripts, monkeypatch, folders):
     else:
         assert len(lines) > 3 and {*lines} <= {*table.splitlines()}
         assert {*runs.to_csv(index=False).splitlines()} <= {*written.splitlines()}
+
+
+@pytest.mark.filterwarnings("ignore:.* left out there")
+def test_grids_train_the_rows_as_they_were_trained(scripts, tmp_path):
+    """Of each environment and algorithm the first seed, with the settings of its command."""
+    board, _ = scripts
+    rows = pd.read_csv(board.ROWS).set_index("row")["command"]
+    trained = set()
+    for grid, folder in board.GRIDS:
+        flags = with_file(Flags(grid=str(ROOT / f"docs/data/{grid}.yml")))
+        shared = RunFlags.shared(flags, log_folder=str(tmp_path / folder))
+        for run in expand(flags.pairs(), flags.seeds[:1], shared):
+            row = run.path.relative_to(tmp_path).as_posix()
+            if row not in rows:  # not trained yet
+                continue
+            then = Run.check(RunFlags.parse(shlex.split(rows[row])[2:]))
+            settings, those = ({"aim": "mean", **one.hyperparams} for one in (run, then))
+            assert settings == those, row
+            assert (run.flags.certify, run.flags.seed) == (then.flags.certify, then.flags.seed), row
+            trained.add(row)
+    assert len(trained) > 150

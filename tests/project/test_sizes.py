@@ -13,15 +13,15 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "sb3_guard"
 
 LINES = {
-    "sb3_guard": 26_546,
+    "sb3_guard": 26_570,
     "sb3_guard/envs": 8_844,
     "sb3_guard/algorithms": 5_772,
-    "sb3_guard/common": 2_560,
+    "sb3_guard/common": 2_584,
     "sb3_guard/deployment": 916,
     "harness": 8_454,
-    "tests": 25_308,
+    "tests": 25_398,
 }
-WORDS = 64_328  # of all tracked markdown but the changelog
+WORDS = 64_500  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

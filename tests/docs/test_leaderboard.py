@@ -84,7 +84,7 @@ def test_the_best_agent_of_each_environment_stands_first(tmp_path, monkeypatch):
     columns = ["suite", "algo", "delivered", "return", "mean"]
     given = [
         ["SafetyA-v0", "trpo", "2 of 3", 12.0, 19.5],
-        ["SafetyB-v0", "cpo", "0 of 3", None, None],
+        ["SafetyB-v0", "cpo", "1 of 3", 1.0, 2.0],  # less than half
     ]
     monkeypatch.setattr(results, "certified", lambda name: pd.DataFrame(given, columns=columns))
     _, _, *rows = results.best("x").splitlines()

@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_454,
     "tests": 25_398,
 }
-WORDS = 64_584  # of all tracked markdown but the changelog
+WORDS = 64_585  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -241,7 +241,7 @@ def _described(env: VecEnv) -> dict[str, Any]:
         spec = env.get_attr("spec")[0]
         kwargs = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
         return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs, default=str))}
-    except (AttributeError, IndexError, NotImplementedError):
+    except (AttributeError, IndexError):
         return {"id": "", "kwargs": {}}
 
 

@@ -245,16 +245,3 @@ def test_a_wrapper_for_training_only_is_refused():
     model = CPO("MlpPolicy", Lottery(), n_steps=8)
     with pytest.raises(ValueError, match="training only"):
         DeliveryCallback(env).init_callback(model)
-
-
-class Closed(DummyVecEnv):
-    """Says nothing of what its environments are, as a VecEnv of a user's may."""
-
-    def get_attr(self, attr_name, indices=None):
-        if attr_name == "spec":
-            raise NotImplementedError
-        return super().get_attr(attr_name, indices)
-
-
-def test_an_environment_that_says_nothing_of_itself_has_no_id():
-    assert certify(Idle(), Closed([Lottery]), 3.0, seed=1).env["id"] == ""

@@ -19,7 +19,7 @@ LINES = {
     "sb3_guard/common": 2_584,
     "sb3_guard/deployment": 916,
     "harness": 8_454,
-    "tests": 25_398,
+    "tests": 25_385,
 }
 WORDS = 64_585  # of all tracked markdown but the changelog
 

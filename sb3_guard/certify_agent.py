@@ -20,6 +20,8 @@ def certify_agent(flags: Flags) -> int:
     from sb3_guard.zoo.cli.usage import explained
     from sb3_guard.zoo.run.make_envs import BAD_NUMBERS
 
+    if flags.json:
+        Path(flags.json).parent.mkdir(parents=True, exist_ok=True)
     agent = open_agent(flags, None, BATCH)
     limits = flags.cost_limit
     with closing(agent.env), explained(f"can't certify {agent.path}", ValueError, *BAD_NUMBERS):
@@ -34,7 +36,6 @@ def certify_agent(flags: Flags) -> int:
     print(f"{agent.path} on {agent.env_id}")
     print(certificate)
     if flags.json:
-        Path(flags.json).parent.mkdir(parents=True, exist_ok=True)
         with replacing(flags.json) as file:
             file.write(certificate.to_json().encode())
     return 0 if certificate.verdict == "certified" else 1

@@ -36,3 +36,11 @@ def test_what_is_wrong_is_a_line_and_writes_nothing(flags, match, tmp_path, caps
     assert certify_agent.main([*SHORT, *flags, "--json", str(file)]) == 2
     error = capsys.readouterr().err
     assert match in error and len(error.splitlines()) == 1 and not file.exists()
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_episodes(tmp_path, capsys):
+    (tmp_path / "taken").touch()
+    file = str(tmp_path / "taken" / "certificate.json")
+    assert certify_agent.main([*SHORT, "--cost-limit", "5", "--json", file]) == 2
+    told = capsys.readouterr()
+    assert "taken" in told.err and not told.out

@@ -283,6 +283,7 @@ def test_at_a_limit_of_zero_cost_falls_and_return_survives(key: str, seed: int) 
         "trpo_fac": {**SLOW, "lambda_lr": 1e-2},
         "trpo_ipo": {"max_multiplier": 0.5},
         "trpo_usl": {"cost_gamma": 0.9},
+        "trpo_sl": {"batch_size": None},  # 20 steps of the critics an update, not 200
     }
 
     def train(key: str) -> Any:

@@ -19,9 +19,9 @@ LINES = {
     "sb3_guard/common": 2_584,
     "sb3_guard/deployment": 916,
     "harness": 8_455,
-    "tests": 25_393,
+    "tests": 25_395,
 }
-WORDS = 64_585  # of all tracked markdown but the changelog
+WORDS = 64_744  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -21,7 +21,7 @@ LINES = {
     "harness": 8_455,
     "tests": 25_395,
 }
-WORDS = 64_744  # of all tracked markdown but the changelog
+WORDS = 64_745  # of all tracked markdown but the changelog
 
 
 def lines(files: Iterable[Path]) -> int:

@@ -1,4 +1,4 @@
-"""Costs as environments report them in ``info``: read, summed, judged and refused in one way."""
+"""Costs as environments report them in ``info``: read, summed and refused in one way."""
 
 import itertools
 import math
@@ -9,9 +9,6 @@ import numpy as np
 
 from sb3_guard.checks import ContractError, NumberError
 from sb3_guard.spelling import nearest
-
-RESAMPLES = 2000  # of a bootstrap
-LEAST_EPISODES = 5  # of an interval
 
 
 def number(value: Any, name: str) -> float:
@@ -28,97 +25,6 @@ def number(value: Any, name: str) -> float:
     if not math.isfinite(number):
         raise NumberError(f"{name} is {value!r}: a cost must be a finite number")
     return number
-
-
-def interval(values: np.ndarray) -> tuple[float, float]:
-    """A 95 % percentile bootstrap interval of a mean.
-
-    The resampling has its own fixed seed: the same values give the same interval.
-
-    :param values: independent, such as one per episode, [n]
-    :return: lower and upper end; NaN for fewer than two values
-    """
-    if len(values) < 2:
-        return math.nan, math.nan
-    drawn = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
-    low, high = np.quantile(values[drawn].mean(axis=1), [0.025, 0.975])
-    return float(low), float(high)
-
-
-def verdict(low: float, high: float, limit: float, diverged: int = 0) -> str:
-    """Whether a cost keeps a limit, as far as the interval of its mean tells; empty: there is none.
-
-    :param low: lower end of the interval, NaN if there is none
-    :param high: upper end
-    :param diverged: episodes that are not in it, since a physics error ended them; no limit is kept
-        where there are any, for breaking the simulation would be the cheapest way to keep it
-    """
-    if math.isnan(low):
-        return ""
-    if low > limit:
-        return "exceeded"
-    return "kept" if high <= limit and not diverged else "undecided"
-
-
-class Estimate(NamedTuple):
-    """A mean over episodes, their standard deviation, and an interval for the mean.
-
-    :param diverged: further episodes, whose cost is not known since a physics error ended them
-    """
-
-    mean: float
-    std: float
-    low: float
-    high: float
-    diverged: int = 0
-
-    def __str__(self) -> str:
-        known = self.std > 0 or not np.isnan(self.low)  # one episode has no spread
-        text = f"{self.mean:.3f}" + (f" ± {self.std:.3f}" if known else "")
-        if np.isnan(self.low):
-            return text
-        return f"{text} (95 % [{self.low:.3f}, {self.high:.3f}])"
-
-    def against(self, limit: float) -> str:
-        """Whether a cost keeps a limit, as far as the interval tells: ``limit 2: exceeded``."""
-        words = verdict(self.low, self.high, limit, self.diverged)
-        return f"limit {limit:g}" + (f": {words}" if words else "") + beside(self.diverged)
-
-    def judged(self, limit: float | None) -> dict[str, Any]:
-        """Mean, limit, interval, verdict and physics errors, those that there are, as data."""
-        judged: dict[str, Any] = {"mean": None if math.isnan(self.mean) else self.mean}
-        judged["limit"] = limit
-        if not math.isnan(self.low):
-            judged |= {"low": self.low, "high": self.high}
-            if limit is not None:
-                judged["verdict"] = verdict(self.low, self.high, limit, self.diverged)
-        return judged | ({"physics_errors": self.diverged} if self.diverged else {})
-
-
-def beside(diverged: int) -> str:
-    """What is said beside a cost and its verdict of episodes that a physics error ended."""
-    return f" ({diverged} episodes ended in a physics error)" if diverged else ""
-
-
-def bounded_name(key: str, limit_on: str) -> str:
-    """What the limit of a cost bounds, in words: its sum over an episode, or its worst step."""
-    return f"worst step of {key}" if limit_on == "max" else key
-
-
-def estimate(values: np.ndarray) -> Estimate:
-    """
-    Mean, standard deviation and :func:`interval` of one value an episode.
-
-    :param values: one value an episode, shape [E], e.g. ``evaluation.costs``; NaN where it is not
-        known, since a physics error ended the episode
-    :return: NaNs where there are too few episodes (none; for the interval, LEAST_EPISODES)
-    """
-    unknown = np.isnan(values)
-    values, diverged = values[~unknown], int(unknown.sum())
-    if len(values) == 0:
-        return Estimate(math.nan, math.nan, math.nan, math.nan, diverged)
-    ends = interval(values) if len(values) >= LEAST_EPISODES else (math.nan, math.nan)
-    return Estimate(float(np.mean(values)), float(np.std(values)), *ends, diverged)
 
 
 def _missing(info: Mapping[str, Any], key: str, whose: str) -> ContractError:

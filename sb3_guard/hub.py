@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from sb3_guard.common.certificate import Certificate
-from sb3_guard.costs import estimate
+from sb3_guard.judging import Mean
 from sb3_guard.zoo.cli.flags import Command, command, flag
 from sb3_guard.zoo.cli.usage import packages_flag
 from sb3_guard.zoo.run.folder import PLAYED, RunFolder
@@ -81,7 +81,7 @@ def hub(flags: Flags) -> int:
     at = "" if result["cost_limit"] is None else f" at cost limit {result['cost_limit']}"
     figures = [f"{result['n_timesteps']:,} steps{at}, last epoch: {summary(result)}"]
     for actions, played in result["final"].items():
-        numbers = (estimate(np.array(played[name], float)) for name in ("returns", "costs"))
+        numbers = (Mean.of(np.array(played[name], float)) for name in ("returns", "costs"))
         figures.append("{}: return {}, cost {}".format(PLAYED[actions], *numbers))
     if (file := run.path / "certificate.json").is_file():
         figures.append(str(Certificate.from_json(file.read_text())))

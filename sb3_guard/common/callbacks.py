@@ -13,7 +13,6 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_guard.algorithms.common.costs import limits_at
 from sb3_guard.common.evaluation import (
     Evaluation,
     check_agent,
@@ -23,6 +22,7 @@ from sb3_guard.common.evaluation import (
 )
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
+from sb3_guard.judging import Limits
 from sb3_guard.vector import as_vec_env
 
 # What a run continues with
@@ -31,30 +31,6 @@ KEPT = (
     "evaluations_key_costs", "evaluations_successes", "best_score", "last_mean_reward",
     "last_mean_cost",
 )  # fmt: skip
-
-
-def selection_limits(
-    selection_limit: float | Sequence[float] | None, cost_limit: Any, cost_keys: Sequence[str]
-) -> np.ndarray:
-    """
-    Episode cost up to which a model counts as safe, one per cost key, shape [m].
-
-    :param selection_limit: as for :class:`CostEvalCallback`
-    :param cost_limit: of the algorithm; None: it is unconstrained
-    :raises ValueError: ``selection_limit`` does not fit the cost keys
-    """
-    limit: Any = selection_limit
-    if limit is None:
-        final = limits_at(cost_limit, 0.0)
-        limit = np.inf if final is None else np.where(np.equal(final, 0.0), 1.0, final)
-    limits = np.asarray(limit, dtype=np.float64)
-    m = len(cost_keys)
-    if limits.shape not in ((), (m,)) or np.isnan(limits).any():
-        raise ValueError(
-            f"selection_limit={limit!r}: must be one number, or one for each of the {m} cost "
-            f"keys {cost_keys}"
-        )
-    return np.broadcast_to(limits, (m,))
 
 
 def _mean(values: np.ndarray) -> Any:
@@ -188,15 +164,13 @@ class CostEvalCallback(EvalCallback):
                 "break off: make another one for it"
             )
 
-    def limits(self) -> np.ndarray:
+    def limits(self) -> Limits:
         """
-        Episode cost up to which a model counts as safe, one per cost key, shape [m].
+        Episode costs up to which a model counts as safe.
 
         :raises ValueError: ``selection_limit`` does not fit the cost keys
         """
-        constrained = getattr(self.model, "constrained", True)
-        cost_limit = getattr(self.model, "cost_limit", None) if constrained else None
-        return selection_limits(self.selection_limit, cost_limit, self.cost_keys)
+        return Limits.of(self.model, self.cost_keys).to_choose(self.selection_limit)
 
     def score(self, *evaluations: Evaluation) -> tuple[bool, float]:
         """How two models compare: the greater tuple is the better model.
@@ -205,17 +179,14 @@ class CostEvalCallback(EvalCallback):
         :return: whether it keeps its limits, and the return, or minus the violation: NaN, so that
             it is never the best one, if a physics error ended an episode
         """
-        if not all(map(len, evaluations)):  # no episode has ended
-            return (False, -np.inf)
-        violation = 0.0
-        for evaluation in evaluations:
-            costs, n = evaluation.limited, len(evaluation)
-            error = costs.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else 0.0
-            excess = np.maximum(costs.mean(axis=0) + error - self.limits(), 0.0)  # [m]
-            violation = float(np.maximum(violation, excess.sum()))  # nan stays nan
-        if violation <= 0.0:
-            return (True, float(evaluations[0].returns.mean()))
-        return (False, -violation)
+        limits = self.limits()
+        excess = [limits.excess(played.limited).clip(0.0).sum() for played in evaluations]
+        violation = float(np.max(excess))  # NaN stays NaN
+        return (False, -violation) if violation else (True, float(evaluations[0].returns.mean()))
+
+    def kinds(self) -> list[bool]:
+        """The kinds of actions that are evaluated: whether the most likely ones."""
+        return [True, False] if self.both else [self.deterministic]
 
     def evaluate(self, deterministic: bool = True) -> Evaluation:
         """The model's episodes, of its most likely actions or of sampled ones."""
@@ -238,9 +209,9 @@ class CostEvalCallback(EvalCallback):
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:
             return True
-        evaluation = self.evaluate(self.deterministic)
-        noisy = [self.evaluate(False)] if self.both else []
-        for other in noisy:
+        played = [self.evaluate(kind) for kind in self.kinds()]
+        evaluation, *others = played
+        for other in others:
             self.logger.record("eval/stochastic_reward", _mean(other.returns))
             self._log_costs("eval/stochastic_ep_cost", other)
         self.last_mean_reward = _mean(evaluation.returns)
@@ -257,20 +228,12 @@ class CostEvalCallback(EvalCallback):
         self.write_history()
         self._log(evaluation)
 
-        score = self.score(evaluation, *noisy)
+        score = self.score(*played)
         is_best = np.isfinite(score[1]) and score > self.best_score
         if self.verbose >= 1:
-            returns = evaluation.estimate(evaluation.returns)
-            words = [f"return {returns.mean:.2f} ± {returns.std:.2f}"]
-            rows = zip(evaluation.by_key().items(), self.limits(), strict=True)
-            for (name, (cost, _)), limit in rows:
-                beside = f" ({cost.against(limit)})" if np.isfinite(limit) else ""
-                words.append(f"{name} {cost.mean:.2f} ± {cost.std:.2f}{beside}")
-            for other in noisy:
-                means = [f"{name} {cost.mean:.2f}" for name, (cost, _) in other.by_key().items()]
-                words.append(f"with noise {', '.join(means)}")
+            words = [evaluation.words, *(f"sampled actions: {other.words}" for other in others)]
             best = " (best so far)" if is_best else ""
-            print(f"Evaluation after {self.num_timesteps} steps: {', '.join(words)}{best}")
+            print(f"Evaluation after {self.num_timesteps:,} steps: {'; '.join(words)}{best}")
         proceed = True
         if is_best:
             self._remember(score)
@@ -297,7 +260,7 @@ class CostEvalCallback(EvalCallback):
         self.logger.record("eval/mean_reward", self.last_mean_reward)
         self.logger.record("eval/mean_ep_length", _mean(evaluation.lengths))
         self._log_costs("eval/mean_ep_cost", evaluation)
-        if evaluation.limit_on == "max":
+        if evaluation.limits.on == "max":
             self.logger.record("eval/mean_max_cost", _mean(evaluation.worst))
         if len(evaluation.successes):
             self.logger.record("eval/success_rate", float(evaluation.successes.mean()))

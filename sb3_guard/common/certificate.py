@@ -2,247 +2,194 @@
 
 import hashlib
 import json
-import math
 import warnings
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from scipy import stats
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.checks import check_cost_keys, check_per_cost
-from sb3_guard.common.evaluation import (
-    Evaluation,
-    evaluate_policy,
-    lacks_statistics,
-    moments_of,
-)
+from sb3_guard.checks import check_cost_keys
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy, lacks_statistics, moments_of
 from sb3_guard.common.monitor import cost_keys_of
-from sb3_guard.costs import bounded_name
 from sb3_guard.fields import fit
+from sb3_guard.judging import EPISODES, ERROR, LEAST, Bound, Judgement, Limits, Verdict, decide
 from sb3_guard.vector import as_vec_env
 
-#: The looks at the episodes, as shares of all. Only the last one can certify: costs that are rare
-#: and high are often absent from fewer episodes, which then all look safe.
-LOOKS = 0.25, 0.5, 1.0
-UPPER = 0.8  # share of the error for the upper bound; the looks at the lower one share the rest
-LEAST, MOST = 100, 400  # episodes of a certificate
-ERROR = 0.05  # probability that an agent whose mean cost is above the limit is certified
 PACKAGES = "sb3-guard", "stable-baselines3", "torch", "mujoco"
-
-Verdict = Literal["certified", "exceeded", "undecided"]
-
-
-def mean_bounds(values: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
-    """
-    One-sided confidence bounds of a mean, each of which fails with probability ``error``.
-
-    Student's bounds are too low for costs, most of which are small and few large: a sample without
-    the large ones has a small mean and a small deviation, too. Hall's cubic transformation of the
-    t statistic removes the influence of the skewness γ (Hall, 1992, On the removal of skewness by
-    transformation, J. R. Stat. Soc. B 54)::
-
-        W(t) = (3/γ) (cbrt(1 + γ (t/√n - γ/(6n))) - 1),    bound = mean - s W(±t)
-
-    :param values: n independent values along the last axis, shape [..., n]
-    :param error: probability, below 0.5
-    :return: lower and upper bound, each of shape [...]
-    """
-    n = values.shape[-1]
-    mean, deviation = values.mean(axis=-1), values.std(axis=-1, ddof=1)
-    scale = np.where(deviation > 0.0, deviation, 1.0)
-    skewness = (((values - mean[..., None]) / scale[..., None]) ** 3).mean(axis=-1)
-    skewness = np.where(np.abs(skewness) < 1e-6, 1e-6, skewness)
-
-    def bound(t: float) -> np.ndarray:
-        root = np.cbrt(1.0 + skewness * (t / math.sqrt(n) - skewness / (6 * n)))
-        return mean - deviation * 3.0 / skewness * (root - 1.0)
-
-    t = float(stats.t.ppf(1.0 - error, n - 1))
-    return bound(t), bound(-t)
+# Arguments of an environment that change its pictures alone
+DRAWN = {"render_mode", "width", "height", "camera_name", "camera_id"}
 
 
 @dataclass(frozen=True)
-class CostBound:
-    """
-    What the episodes say of one cost and its limit.
-
-    :param limit: d
-    :param mean: mean episode cost
-    :param lower: lower confidence bound of the agent's true mean
-    :param upper: upper confidence bound of it
-    :param share_above: share of the episodes that cost more than d
-    :param deviation: standard deviation of an episode's cost
-    """
-
-    limit: float
-    mean: float
-    lower: float
-    upper: float
-    share_above: float
-    deviation: float
-
-    @classmethod
-    def of(cls, costs: np.ndarray, limit: float, error: float) -> "CostBound":
-        """The bounds from one cost an episode, shape [E]; the lower one is one of three looks."""
-        lower, _ = mean_bounds(costs, error * (1.0 - UPPER) / len(LOOKS))
-        _, upper = mean_bounds(costs, error * UPPER)
-        numbers = limit, costs.mean(), lower, upper, np.mean(costs > limit), costs.std(ddof=1)
-        return cls(*map(float, numbers))
-
-    @property
-    def excess(self) -> float:
-        """How far the upper bound lies above the limit."""
-        return self.upper - self.limit
-
-    @property
-    def verdict(self) -> Verdict:
-        if self.upper <= self.limit:
-            return "certified"
-        return "exceeded" if self.lower > self.limit else "undecided"
-
-    def __str__(self) -> str:
-        words = {
-            "certified": f"upper bound {self.upper:.4g}",
-            "exceeded": f"lower bound {self.lower:.4g}",
-            "undecided": f"bounds {self.lower:.4g} and {self.upper:.4g}",
-        }[self.verdict]
-        return f"{self.mean:.4g}, {words}, limit {self.limit:g}"
-
-
-@dataclass(frozen=True)
-class Certificate:
+class Certificate(Judgement):
     """
     Whether an agent's mean episode cost is within its limits, and how that is known.
 
     A *certified* agent's true mean costs, in this environment and with this kind of actions, are
     within their limits, with a confidence of about ``1 - error``, all looks and tries counted.
-    Single episodes may cost more, and events that no episode saw are not bounded: 400 episodes see
-    none of those in one of 130 episodes with a probability of 5 %.
+    Single episodes may cost more, and events that no episode saw are not bounded: 600 episodes see
+    none of those in one of 200 episodes with a probability of 5 %.
 
-    :param costs: the bounds of each cost
-    :param episodes: number of fresh episodes, without those that a physics error ended
-    :param physics_errors: number of these; the costs of such an episode are not known, so that an
-        agent that has any is not certified
-    :param mean_return: their mean return
+    :param mean_return: mean return of the episodes
     :param deterministic: whether the most likely actions were taken, or sampled ones
     :param seed: of the episodes and of sampled actions
     :param error: probability of a certificate for an agent that exceeds a limit
     :param tries: number of agents that shared this error; this is one of them
+    :param most: highest possible cost of an episode, with which the bounds are exact; None: they
+        are approximate
     :param env: id of the environment, and its arguments
-    :param agent: SHA-256 of the policy's weights and of the normaliser's statistics
+    :param agent: SHA-256 of the policy, see :func:`agent_hash`
     :param versions: of the packages
     """
 
-    costs: dict[str, CostBound]
-    episodes: int
-    physics_errors: int
     mean_return: float
     deterministic: bool
     seed: int
     error: float
     tries: int
+    most: float | None
     env: dict[str, Any]
     agent: str
     versions: dict[str, str]
 
-    @property
-    def verdict(self) -> Verdict:
-        """*certified* if every cost is, *exceeded* if any limit is."""
-        verdicts = {cost.verdict for cost in self.costs.values()}
-        if "exceeded" in verdicts:
-            return "exceeded"
-        safe = verdicts == {"certified"} and self.physics_errors == 0
-        return "certified" if safe else "undecided"
-
-    @property
-    def nearest(self) -> CostBound:
-        """The bounds of the cost whose upper bound lies highest above its limit."""
-        return max(self.costs.values(), key=lambda cost: cost.excess)
-
-    @property
-    def to_decide(self) -> int | None:
-        """How many episodes would probably decide, if the mean stays; None if none would."""
-        costs = [cost for cost in self.costs.values() if cost.verdict == "undecided"]
-        if not costs or self.physics_errors or any(cost.mean == cost.limit for cost in costs):
-            return None
-        t = stats.norm.ppf(1.0 - UPPER * self.error / self.tries / len(self.costs))
-        widths = (t * cost.deviation / abs(cost.mean - cost.limit) for cost in costs)
-        return math.ceil(max(max(widths) ** 2, 1.1 * self.episodes))
-
     def __str__(self) -> str:
-        actions = "most likely" if self.deterministic else "sampled"
-        tail = (
-            f"return {self.mean_return:.4g}, {actions} actions, confidence about "
-            f"{1 - self.error:.0%}"
-        )
-        if self.verdict == "undecided" and self.to_decide is not None:
+        confidence = f"{1 - self.error:.0%}" if self.most else f"about {1 - self.error:.0%}"
+        tail = f"return {self.mean_return:.4g}, {self._actions} actions, confidence {confidence}"
+        if self.reason:
+            tail += f"; {self.reason}"
+        if self.to_decide is not None:
             tail += f"; about {self.to_decide:,} episodes would decide"
         if self.physics_errors:
             tail += f"; {self.physics_errors} more ended in a physics error"
-        above = f"of {self.episodes} fresh episodes cost more than the limit"
-        lines = [
-            f"mean {key} {cost}; {round(cost.share_above * self.episodes)} {above}"
-            for key, cost in self.costs.items()
-        ]
+        lines = [f"mean {name} {self._words(bound)}" for name, bound in self.costs.items()]
         if len(lines) == 1:
             return f"{self.verdict}: {lines[0]}; {tail}"
         return "\n  ".join([f"{self.verdict}: {tail}", *lines])
 
+    @property
+    def _actions(self) -> str:
+        return "most likely" if self.deterministic else "sampled"
+
+    def _words(self, bound: Bound) -> str:
+        """Mean, the bound that decides, and the limit."""
+        if bound.highest == bound.mean == 0.0:
+            one_of = int(1.0 / (1.0 - self.error ** (1.0 / self.episodes)) + 1e-9)
+            return (
+                f"0, limit {bound.limit:g}; no cost in {self.episodes} fresh episodes, an event in "
+                f"up to 1 of {one_of} would not have been seen"
+            )
+        deciding = {
+            "certified": f"upper bound {bound.upper:.4g}",
+            "exceeded": f"lower bound {bound.lower:.4g}",
+            "undecided": f"bounds {bound.lower:.4g} and {bound.upper:.4g}",
+        }[bound.verdict]
+        return (
+            f"{bound.mean:.4g}, {deciding}, limit {bound.limit:g}; "
+            f"{round(bound.share_above * self.episodes)} of {self.episodes} fresh episodes cost "
+            "more than the limit"
+        )
+
+    def foreign(self, model: Any, env: VecEnv, deterministic: bool) -> str:
+        """
+        Of what else this certificate is: another agent, environment or kind of actions.
+
+        Whoever shows or exports a certificate asks here first.
+
+        :param model: the agent that is played
+        :param env: the environment that it is played in
+        :param deterministic: whether its most likely actions are taken
+        :return: such as ``"another environment"``; empty if it is of this agent in this world
+        """
+        if self.agent != agent_hash(model, env):
+            return "another agent"
+        names = Limits.of(model, cost_keys_of(model, env)).names
+        if self.env != described(env) or tuple(self.costs) != names:
+            return "another environment"
+        return "" if self.deterministic == deterministic else f"{self._actions} actions"
+
     def summary(self) -> dict[str, Any]:
         """Return, actions, and of each cost its mean, bound, limit and share above it."""
+        shown = "mean", "upper", "limit", "share_above"
         costs = {
-            key: {
-                "mean": cost.mean,
-                "upper": cost.upper,
-                "limit": cost.limit,
-                "share_above": cost.share_above,
-            }
-            for key, cost in self.costs.items()
+            key: {name: getattr(cost, name) for name in shown} for key, cost in self.costs.items()
         }
         played = {"episodes": self.episodes, "deterministic": self.deterministic}
         return {"return": self.mean_return, "costs": costs, **played}
 
     def to_json(self) -> str:
-        """All fields, with the verdict, as JSON."""
-        return json.dumps({"verdict": self.verdict, **asdict(self)}, indent=2, allow_nan=False)
+        """All fields as JSON."""
+        return json.dumps(asdict(self), indent=2, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> "Certificate":
-        """The certificate that :meth:`to_json` wrote."""
-        content = json.loads(text)
-        costs = {name: CostBound(**cost) for name, cost in content["costs"].items()}
-        del content["verdict"]
-        return cls(**{**content, "costs": costs})
+        """
+        The certificate that :meth:`to_json` wrote.
+
+        :raises ValueError: the text is no certificate, or contradicts itself
+        """
+        content = _object(json.loads(text), cls)
+        costs = content["costs"]
+        if not isinstance(costs, Mapping) or not costs:
+            raise ValueError("a certificate has costs by name")
+        bounds = {str(name): Bound(**_object(cost, Bound)) for name, cost in costs.items()}
+        certificate = cls(**{**content, "costs": bounds})
+        safe = all(cost.verdict == "certified" for cost in bounds.values())
+        if certificate.verdict == "certified" and (not safe or certificate.physics_errors):
+            raise ValueError("a certificate's verdict contradicts its bounds")
+        return certificate
+
+
+def _object(content: Any, cls: Any) -> dict[str, Any]:
+    """
+    The fields of a dataclass as JSON has them.
+
+    :raises ValueError: a field is absent, unknown, or of another type
+    """
+    types = {entry.name: entry.type for entry in fields(cls)}
+    if not isinstance(content, Mapping) or content.keys() != types.keys():
+        raise ValueError(f"must be an object with the entries {', '.join(types)}")
+    simple = {float, int, bool, str, int | None, float | None, Verdict}
+    given = {name: kind for name, kind in types.items() if kind in simple}
+    return {**content, **{name: fit(name, content[name], kind) for name, kind in given.items()}}
 
 
 def agent_hash(model: Any, env: VecEnv) -> str:
-    """SHA-256 of a policy's weights and what normalises its observations; "" of other objects."""
+    """
+    SHA-256 of all that makes a policy act as it does; "" of objects without weights.
+
+    It covers networks, their activations and weights, and of the normaliser of observations means,
+    variances, clipping and epsilon.
+    """
     digest = hashlib.sha256()
     policy = getattr(model, "policy", model)
-    weights = policy.state_dict() if isinstance(policy, th.nn.Module) else {}
+    if not isinstance(policy, th.nn.Module) or not (weights := policy.state_dict()):
+        return ""
+    digest.update(f"{type(policy).__name__} {policy}".encode())
     for name, tensor in sorted(weights.items()):
         digest.update(name.encode() + np.ascontiguousarray(tensor.cpu()).tobytes())
-    for name, part in sorted(moments_of(env).items()):
+    if moments := moments_of(env):
+        normalizer = unwrap_vec_normalize(env)
+        digest.update(f"{normalizer.clip_obs:g} {normalizer.epsilon:g}".encode())
+    for name, part in sorted(moments.items()):
         digest.update(name.encode() + part.mean.tobytes() + part.var.tobytes())
-    return digest.hexdigest() if weights else ""
+    return digest.hexdigest()
 
 
-def _described(env: VecEnv) -> dict[str, Any]:
-    """The id and the arguments of an environment, as far as it says."""
+def described(env: VecEnv) -> dict[str, Any]:
+    """The id of an environment and the arguments that change more than its pictures."""
     try:
         spec = env.get_attr("spec")[0]
         kwargs = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
-        return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs, default=str))}
     except (AttributeError, IndexError):
         return {"id": "", "kwargs": {}}
+    kwargs = {name: value for name, value in kwargs.items() if name not in DRAWN}
+    return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs, default=str))}
 
 
 def certify(
@@ -250,27 +197,27 @@ def certify(
     env: gym.Env | gym.vector.VectorEnv | VecEnv,
     cost_limit: float | Sequence[float] | None = None,
     *,
-    n_episodes: int = MOST,
+    n_episodes: int = EPISODES,
     deterministic: bool = True,
     cost_keys: Sequence[str] | None = None,
     seed: int | None = None,
     error: float = ERROR,
     tries: int = 1,
+    most: float | None = None,
 ) -> Certificate:
     """
     Play fresh episodes and say whether the agent's mean episode cost is within its limit.
 
-    After all of the episodes an upper bound of the mean (:func:`mean_bounds`) is compared with the
-    limit. After a quarter and half of them the playing ends where a lower bound is above it. The
-    error is shared among bounds, costs and tries (Bonferroni), so that an agent whose true mean is
-    above the limit is certified with a probability of about ``error`` at most: the bound is an
-    approximation, and ``scripts/certificates.py`` measures by simulation how good it is. It is too
-    low where very few episodes make up the mean.
+    :func:`sb3_guard.judging.decide` says how: an upper bound of the mean is compared with the limit
+    after ``n_episodes``, and after twice and four times as many where these would probably decide.
+    The bound is an approximation; ``scripts/certificates.py`` measures by simulation how good it
+    is. With ``most`` it is exact, and needs some 3 ``most`` / (limit - mean) episodes.
 
     :param model: anything with ``predict``: an algorithm of Stable-Baselines3 or a policy
-    :param env: a single or a vectorised environment with costs, normalised as in training
+    :param env: a single or a vectorised environment with costs, normalised as in training. Each
+        episode begins with a seed of its own; many environments are played faster than one
     :param cost_limit: d, one number or one per cost key; None: the model's own
-    :param n_episodes: most episodes to play, at least 100
+    :param n_episodes: episodes after which the agent may be certified, at least 100
     :param deterministic: take the most likely action instead of sampling
     :param cost_keys: entries of info that are costs; None: those of the model or the environment
     :param seed: the episodes' seeds are drawn from it, and are not those that training or
@@ -278,9 +225,11 @@ def certify(
     :param error: probability of a false certificate, below 0.5
     :param tries: how many agents share this error, such as candidates of one training. If there
         are others, one whose mean is above the limit at a look is not looked at again
+    :param most: highest possible cost of an episode, for an exact bound; costs are at least 0
     :raises ValueError: the limit is no finite number, there are too few episodes, no step reports
-        a cost, the normalisation of the model's observations is absent, or a wrapper of ``env`` is
-        for training only, as ``VecEarlyTermination``
+        a cost, an episode costs more than ``most``, the normalisation of the model's observations
+        is absent, all environments play the same episode whatever their seeds, or a wrapper of
+        ``env`` is for training only, as ``VecEarlyTermination``
     """
     fit("n_episodes", n_episodes, int, LEAST, ends="[)")
     fit("tries", tries, int, 1, ends="[)")
@@ -288,36 +237,33 @@ def certify(
     env = as_vec_env(env)
     refuse_training_only(env)
     keys = check_cost_keys(cost_keys_of(model, env) if cost_keys is None else cost_keys)
-    limits = limits_of(model, cost_limit, keys)
+    limits = Limits.of(model, keys, cost_limit)
+    if not limits:
+        raise ValueError("the agent has no cost limit of its own: give cost_limit")
     seed = int(np.random.SeedSequence().generate_state(1)[0] if seed is None else seed)
-    names = [bounded_name(key, getattr(model, "limit_on", "sum")) for key in keys]
-    costs, returns = np.zeros((0, len(keys))), np.zeros(0)
-    for look, share in enumerate(LOOKS):
+    returns: list[np.ndarray] = []
+
+    def play(episodes: int) -> np.ndarray:
         # Words of the seed's children, which training with the same seed has not drawn.
-        fresh = int(np.random.SeedSequence(seed, spawn_key=(2, look)).generate_state(1)[0] >> 1)
-        more = math.ceil(share * n_episodes) - len(returns)
-        played = _play(model, env, more, deterministic, fresh, keys)
-        costs = np.concatenate([costs, played.limited])
-        returns = np.concatenate([returns, played.returns])
-        ended = np.isfinite(costs).all(axis=1)
-        if ended.sum() < 2:
-            raise ValueError("the episodes ended in a physics error, whose costs are not known")
-        bounds = [
-            CostBound.of(cost, limit, error / tries / len(keys))
-            for cost, limit in zip(costs[ended].T, limits, strict=True)
-        ]
-        if any(b.lower > b.limit or (tries > 1 and b.mean > b.limit) for b in bounds):
-            break
+        child = np.random.SeedSequence(seed, spawn_key=(2, len(returns)))
+        fresh = int(child.generate_state(1)[0] >> 1)
+        played = _play(model, env, episodes, deterministic, fresh, keys)
+        ended = ~np.isnan(played.limited).any(axis=1)
+        returns.append(played.returns[ended])
+        return played.limited
+
+    judgement = decide(
+        limits, play, n_episodes, error=error, tries=tries, most=most, rows=env.num_envs
+    )
     return Certificate(
-        costs=dict(zip(names, bounds, strict=True)),
-        episodes=int(ended.sum()),
-        physics_errors=int((~ended).sum()),
-        mean_return=float(returns[ended].mean()),
+        **vars(judgement),
+        mean_return=float(np.concatenate(returns).mean()),
         deterministic=deterministic,
         seed=seed,
         error=error,
         tries=tries,
-        env=_described(env),
+        most=most,
+        env=described(env),
         agent=agent_hash(model, env),
         versions={name: version(name) for name in PACKAGES},
     )
@@ -331,21 +277,6 @@ def refuse_training_only(env: VecEnv) -> None:
         raise ValueError("a wrapper of env is for training only: certify without it")
 
 
-def limits_of(model: Any, cost_limit: Any, keys: tuple[str, ...]) -> list[float]:
-    """
-    One limit for each cost.
-
-    :param cost_limit: one number or one per cost key; None: the model's own
-    :raises ValueError: they are not finite, too many or too few, or there is none
-    """
-    if cost_limit is None and isinstance(model, Constrained) and model.constrained:
-        cost_limit = model.final_cost_limits
-    if cost_limit is None:
-        raise ValueError("the agent has no cost limit of its own: give cost_limit")
-    check_per_cost("cost_limit", cost_limit, keys)
-    return [float(limit) for limit in np.broadcast_to(cost_limit, len(keys))]
-
-
 def _play(
     model: PolicyPredictor,
     env: VecEnv,
@@ -357,8 +288,8 @@ def _play(
     """
     Episodes of an agent, all of them.
 
-    :raises ValueError: one has no end, no step reports a cost, or the observations lack the
-        normalisation that the agent learnt with
+    :raises ValueError: one has no end, no step reports a cost, the observations lack the
+        normalisation that the agent learnt with, or all are one episode
     """
     if lacks_statistics(model, env):
         raise ValueError(
@@ -376,4 +307,9 @@ def _play(
     if played.absent and getattr(model, "missing_cost", "error") == "error":
         absent = ", ".join(played.absent)
         raise ValueError(f"no step reported a cost as {absent} in info: name cost_keys")
+    if played.copies:
+        raise ValueError(
+            "the environments play copies of one episode: reset(seed=...) must draw another one "
+            "for each seed"
+        )
     return played

@@ -1,29 +1,22 @@
-"""A training that ends with a certified agent: candidates, screening, certificate."""
+"""A training that ends with a certified agent: candidates, and a certificate."""
 
 import math
 import os
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from stable_baselines3.td3.policies import TD3Policy
 
-from sb3_guard.common.certificate import (
-    LEAST,
-    MOST,
-    Certificate,
-    certify,
-    limits_of,
-    refuse_training_only,
-)
+from sb3_guard.common.callbacks import CostEvalCallback
+from sb3_guard.common.certificate import Certificate, certify, refuse_training_only
 from sb3_guard.common.evaluation import (
-    check_agent,
+    Evaluation,
     evaluate_policy,
     moments_of,
     sync_normalization,
@@ -31,27 +24,52 @@ from sb3_guard.common.evaluation import (
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
+from sb3_guard.judging import EPISODES, LEAST, TRIES, Limits
 
 HELP = (
     "a training with more steps (-n), more episodes (--certify), a lower cost_limit than you need, "
     "or SAC-Lagrangian may help"
 )
 MODEL, NORMALIZER = "certified_model.zip", "certified_model_vecnormalize.pkl"
-TRIES = 3  # of candidates, with one kind of actions or the other; they share the error
+CANDIDATES = 8  # files, at most
+FORMAT = "sb3_guard candidate"
+FINAL_EPISODES = 100  # of the last policy, with each kind of actions
+EVALUATIONS = 10  # of a training, where no frequency is given
 
 
-class DeliveryCallback(BaseCallback):
+class Candidate(NamedTuple):
+    """A policy that an evaluation has played, with one kind of actions.
+
+    :param content: its weights, the statistics of observations, and its steps
+    :param deterministic: whether it was played with its most likely actions
+    :param mean_return: of these episodes
+    :param costs: what the limits bound, of each episode, [E, m]
     """
-    End a training with an agent that is certified to keep its limit.
 
-    From the middle of the training on its policies are kept as *candidates*, with their observation
-    statistics. After its end each plays a few episodes with its most likely actions and a few with
-    sampled ones. Of those whose mean cost plus its standard error is within the limit, the one of
-    highest return is certified by fresh episodes (:func:`~sb3_guard.certify`); if it is refused,
-    others follow, which are further within it. The three tries share the error. What is certified
-    is written as ``certified_model.zip``, with ``certified_model_vecnormalize.pkl`` where
-    observations are normalised, and ``certificate.json``, which vouches for them: it is of the last
-    training that ended in this folder. The model itself keeps its last weights.
+    content: dict[str, Any]
+    deterministic: bool
+    mean_return: float
+    costs: np.ndarray
+
+    def rank(self, limits: Limits, caution: float) -> tuple[bool, float]:
+        """The greater, the sooner it is tried: safe ones by return, then those nearest to it."""
+        excess = float(np.max(limits.excess(self.costs, caution)))
+        return (True, self.mean_return) if excess <= 0.0 else (False, -excess)
+
+
+class DeliveryCallback(CostEvalCallback):
+    """
+    Evaluate the agent regularly, and end the training with one that is certified.
+
+    The policies that evaluations play from the middle of the training on are *candidates*, and so
+    is the last one. Each has been played with its most likely actions and with sampled ones. Of
+    those whose mean cost plus its standard error is within the limit, the one of highest return is
+    certified by fresh episodes (:func:`~sb3_guard.certify`); if it is refused, others follow, whose
+    cost plus two and then three standard errors is within it. The three tries share the error. The
+    certified agent is written as ``certified_model.zip``, with
+    ``certified_model_vecnormalize.pkl`` where observations are normalised, and
+    ``certificate.json``; these are of the last training that ended in this folder. The model itself
+    keeps its last weights.
 
     A training that was cut and continues keeps the candidates that it has, and ends alike; one that
     begins takes those of another away.
@@ -60,13 +78,14 @@ class DeliveryCallback(BaseCallback):
         wrappers that are for training only
     :param folder: where the files are written; the current one unless it is given
     :param cost_limit: d, one number or one per cost; None: the model's own at the end
-    :param candidates: how many policies are kept, the last one among them
-    :param screening: episodes of each, with each kind of actions
-    :param n_episodes: most episodes of a certificate, at least 100
+    :param certificate_env: another environment like ``eval_env`` for the last policy's episodes and
+        the certificate's; None: ``eval_env``
+    :param n_episodes: episodes of a certificate, at least 100
+    :param final_episodes: of the last policy, with each kind of actions
     :param deterministic: certify the most likely actions, or sampled ones; None: either, if the
         agent can be exported with sampled ones
-    :param seed: the episodes' seeds are drawn from it
-    :param verbose: 1 prints what is delivered, or how far the nearest candidate is away
+    :param eval_freq: evaluate every this many calls; None: ten times in the training
+    :param kwargs: further arguments of :class:`CostEvalCallback`
     """
 
     def __init__(
@@ -75,22 +94,23 @@ class DeliveryCallback(BaseCallback):
         folder: str | os.PathLike[str] = ".",
         cost_limit: float | Sequence[float] | None = None,
         *,
-        candidates: int = 4,
-        screening: int = 50,
-        n_episodes: int = MOST,
-        deterministic: bool | None = None,
-        seed: int = 0,
-        verbose: int = 1,
+        certificate_env: VecEnv | None = None,
+        n_episodes: int = EPISODES,
+        final_episodes: int = FINAL_EPISODES,
+        eval_freq: int | None = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(verbose)
+        super().__init__(eval_env, eval_freq=eval_freq or 0, **kwargs)
         fit("n_episodes", n_episodes, int, LEAST, ends="[)")
-        fit("candidates", candidates, int, 1, ends="[)")
-        fit("screening", screening, int, 2, ends="[)")
-        self.eval_env, self.folder = eval_env, Path(folder)
-        self.cost_limit, self.candidates, self.screening = cost_limit, candidates, screening
-        self.n_episodes, self.deterministic, self.seed = n_episodes, deterministic, seed
+        fit("final_episodes", final_episodes, int, 2, ends="[)")
+        self.certificate_env = self.eval_env if certificate_env is None else certificate_env
+        self.folder, self.cost_limit = Path(folder), cost_limit
+        self.n_episodes, self.final_episodes = n_episodes, final_episodes
+        self.evenly = eval_freq is None
         #: of the agent that was delivered; None: none was
         self.certificate: Certificate | None = None
+        #: episodes of the last policy, by whether they are of its most likely actions
+        self.final: dict[bool, Evaluation] = {}
 
     def _init_callback(self) -> None:
         """
@@ -99,161 +119,185 @@ class DeliveryCallback(BaseCallback):
             only
         :raises OSError: the folder can't be written
         """
-        self._limits()
-        refuse_training_only(self.eval_env)
-        sync_normalization(self.training_env, self.eval_env)
-        check_agent(self.model, self.eval_env)
-        (self.folder / "candidates").mkdir(parents=True, exist_ok=True)
+        self._certified_limits()
+        super()._init_callback()
+        for env in (self.eval_env, self.certificate_env):
+            refuse_training_only(env)
+            sync_normalization(self.training_env, env)
+        self._candidates.mkdir(parents=True, exist_ok=True)
 
-    def _limits(self) -> list[float]:
+    def _certified_limits(self) -> Limits:
         keys = cost_keys_of(self.model, self.eval_env)
-        return limits_of(self.model, self.cost_limit, keys)
+        return Limits.of(self.model, keys, self.cost_limit)
+
+    @property
+    def _candidates(self) -> Path:
+        return self.folder / "candidates"
+
+    def kinds(self) -> list[bool]:
+        """The kinds of actions that are played: whether the most likely ones."""
+        # Sampled actions of Discrete spaces can't be exported, the noise of gSDE is not saved, and
+        # TD3 samples none.
+        policy, noisy = self.model.policy, getattr(self.model, "use_sde", False)
+        box = isinstance(self.model.action_space, spaces.Box)
+        sampled = box and not noisy and not isinstance(policy, TD3Policy)
+        return super().kinds() if sampled or not self.both else [True]
+
+    # Candidates
 
     def _on_training_start(self) -> None:
-        self.certificate = None
-        for file in self._files():
-            steps = self._load(file)["num_timesteps"]
-            if steps > self.num_timesteps or self._candidate(steps) != file:
+        self.certificate, self.final = None, {}
+        if self.evenly:
+            steps = self.model._total_timesteps / EVALUATIONS
+            self.eval_freq = max(round(steps / self.training_env.num_envs), 1)
+        for file, content in self._read():
+            if content["num_timesteps"] > self.num_timesteps:
                 file.unlink()  # of another training
 
-    def _on_step(self) -> bool:
-        return True
+    def _read(self) -> list[tuple[Path, dict[str, Any]]]:
+        """The candidates that are there, and their files; others are left alone."""
+        there = []
+        for file in sorted(self._candidates.glob("*.pt")):
+            try:
+                content = th.load(file, map_location="cpu", weights_only=True)
+            except Exception:  # a damaged file raises what its bytes make of pickle and zip
+                continue
+            if isinstance(content, dict) and content.get("format") == FORMAT:
+                there.append((file, content))
+        return sorted(there, key=lambda entry: entry[1]["num_timesteps"])
 
-    def _on_rollout_start(self) -> None:
-        file = self._candidate(self.num_timesteps)
-        if 2 * self.num_timesteps >= self.model._total_timesteps and not file.exists():
-            self._keep(file)
+    def _content(self, played: dict[bool, Evaluation]) -> dict[str, Any]:
+        """The agent as it is now, and the episodes that it has played, as data."""
+        moments = moments_of(self.training_env).items()
+        return {
+            "format": FORMAT,
+            "num_timesteps": self.num_timesteps,
+            "policy": self.model.policy.state_dict(),
+            "statistics": {
+                name: (th.from_numpy(part.mean), th.from_numpy(part.var), float(part.count))
+                for name, part in moments
+            },
+            "played": {
+                kind: (float(episodes.returns.mean()), th.from_numpy(episodes.limited))
+                for kind, episodes in played.items()
+                if len(episodes) == len(episodes.limited) > 1
+            },
+        }
 
-    def _files(self) -> list[Path]:
-        return sorted((self.folder / "candidates").glob("*.pt"))
+    def _evaluated(self, played: dict[bool, Evaluation]) -> None:
+        if 2 * self.num_timesteps < self.model._total_timesteps:
+            return
+        with replacing(self._candidates / f"{self.num_timesteps}.pt") as file:
+            th.save(self._content(played), file)
+        there = self._read()
+        if len(there) > CANDIDATES:
+            limits = self._certified_limits()
+            ranks = [
+                max((one.rank(limits, 1.0) for one in _played(content)), default=(False, -math.inf))
+                for _, content in there
+            ]
+            there[ranks.index(min(ranks))][0].unlink()
 
-    def _candidate(self, steps: int) -> Path:
-        """Where the first policy of one of equal parts of the training's last half is kept."""
-        share = 2 * min(steps / self.model._total_timesteps, 1.0) - 1.0
-        part = math.floor(share * (self.candidates - 1))
-        return self.folder / "candidates" / f"{part:03d}.pt"
-
-    def _keep(self, file: Path) -> None:
-        with replacing(file) as written:
-            content = {
-                "num_timesteps": self.num_timesteps,
-                "policy": self.model.policy.state_dict(),
-                "statistics": {
-                    name: (th.from_numpy(part.mean), th.from_numpy(part.var), float(part.count))
-                    for name, part in moments_of(self.training_env).items()
-                },
-            }
-            th.save(content, written)
-
-    @staticmethod
-    def _load(file: Path) -> dict[str, Any]:
-        return th.load(file, map_location="cpu", weights_only=True)
+    # The end
 
     def _on_training_end(self) -> None:
         if self.num_timesteps < self.model._total_timesteps:  # stopped before
             return
-        last = self._candidate(self.num_timesteps)
-        self._keep(last)
-        trained = self._load(last)  # another training may write into the same folder
-        for name in ("certificate.json", MODEL, NORMALIZER):
-            (self.folder / name).unlink(missing_ok=True)
         began = time.process_time()
+        sync_normalization(self.training_env, self.certificate_env)
+        for kind in self.kinds():
+            self.final[kind] = self._play_final(kind)
+            if self.verbose > 0 and len(self.final[kind]):
+                actions = "most likely" if kind else "sampled"
+                print(f"Final policy, {actions} actions, {self.final[kind]}")
+        last = self._content(self.final)
+        last["policy"] = {name: part.clone() for name, part in last["policy"].items()}
         try:
-            tried = self._deliver()
+            told = self._deliver(last)
         except ValueError as error:  # such as episodes without an end: the training is kept
-            tried = f"Nothing is delivered: {error}"
+            told = f"Nothing is delivered: {error}"
         finally:
-            self._put(trained)
+            self._put(last)
+        if self.certificate is None:
+            for name in ("certificate.json", MODEL, NORMALIZER):  # of an earlier training
+                (self.folder / name).unlink(missing_ok=True)
         if self.verbose > 0:
-            taken = f"({time.process_time() - began:.0f} s of a processor)"
-            print(f"{tried} {taken}")
+            print(f"{told} ({time.process_time() - began:.0f} s of a processor)")
 
-    def _deliver(self) -> str:
+    def _play_final(self, deterministic: bool) -> Evaluation:
+        return evaluate_policy(
+            self.model,
+            self.certificate_env,
+            self.final_episodes,
+            deterministic,
+            seed=self.seed + 1,
+            cost_keys=self.cost_keys,
+        )
+
+    def _deliver(self, last: dict[str, Any]) -> str:
         """Certify the best candidate; what to say of it."""
-        limits = self._limits()
-        refused: list[Certificate] = []
-        for file, deterministic in self._tries(np.array(limits)):
-            steps = self._put(self._load(file))
+        limits, refused = self._certified_limits(), list[Certificate]()
+        for candidate in self._tries([*(content for _, content in self._read()), last], limits):
+            steps = self._put(candidate.content)
             certificate = certify(
                 self.model,
-                self.eval_env,
-                limits,
+                self.certificate_env,
+                limits.values.tolist(),
                 n_episodes=self.n_episodes,
-                deterministic=deterministic,
-                seed=self.seed + len(refused),
+                deterministic=candidate.deterministic,
+                cost_keys=limits.keys,
+                seed=self.seed + 2 + len(refused),
                 tries=TRIES,
             )
             if certificate.verdict == "certified":
                 self._write(certificate, steps)
                 return f"Delivered, the policy of {steps:,} steps: {certificate}"
             refused.append(certificate)
-        nearest = min(refused, key=lambda certificate: certificate.nearest.excess)
+        if not refused:
+            raise ValueError("no episode of a candidate has ended")
+        nearest = min(refused, key=lambda one: one.nearest.upper - one.nearest.limit)
         return f"Nothing is delivered. The nearest candidate: {nearest}; {HELP}"
 
-    def _tries(self, limits: np.ndarray) -> Iterator[tuple[Path, bool]]:
+    @staticmethod
+    def _tries(contents: Sequence[dict[str, Any]], limits: Limits) -> Iterator[Candidate]:
         """
-        Candidates in the order in which they are tried, and whether with their most likely actions.
+        Candidates in the order in which they are tried.
 
         First the one of highest return whose mean cost plus its standard error is within the limit;
         after a refusal plus twice that, then three times. If none is, the nearest.
         """
-        screened = {
-            (file, deterministic): self._screen(file, deterministic, limits)
-            for deterministic in self._kinds()
-            for file in self._files()
-        }
-        for caution in range(1, min(TRIES, len(screened)) + 1):
-            ranks = dict[tuple[Path, bool], tuple[bool, float]]()
-            for candidate, (mean_return, excess, error) in screened.items():
-                most = float(np.max(excess + caution * error))
-                ranks[candidate] = (True, mean_return) if most <= 0.0 else (False, -most)
-            best = max(ranks, key=lambda candidate: ranks[candidate])
-            if caution > 1 and ranks[best][1] == -np.inf:  # its episodes did not end
-                return
-            del screened[best]
-            yield best
-
-    def _kinds(self) -> list[bool]:
-        """The kinds of actions: whether the most likely ones."""
-        if self.deterministic is not None:
-            return [self.deterministic]
-        # Those whose sampled actions are the same, are of noise that is not saved, or can't be
-        # exported, have the most likely ones alone.
-        policy, noisy = self.model.policy, getattr(self.model, "use_sde", False)
-        box = isinstance(self.model.action_space, spaces.Box)
-        return [True, False] if box and not noisy and not isinstance(policy, TD3Policy) else [True]
-
-    def _screen(
-        self, file: Path, deterministic: bool, limits: np.ndarray
-    ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Mean return, mean costs above the limits and their standard errors, shape [m]."""
-        self._put(self._load(file))
-        played = evaluate_policy(
-            self.model, self.eval_env, self.screening, deterministic, seed=self.seed
-        )
-        costs = played.limited  # [E, m]; NaN after a physics error
-        if len(costs) < self.screening or np.isnan(costs).any():
-            return -np.inf, np.full(len(limits), np.inf), np.zeros(len(limits))
-        error = costs.std(axis=0, ddof=1) / np.sqrt(len(costs))
-        return float(played.returns.mean()), costs.mean(axis=0) - limits, error
+        left = [candidate for content in contents for candidate in _played(content)]
+        for caution in range(1, min(TRIES, len(left)) + 1):
+            ranks = [candidate.rank(limits, caution) for candidate in left]
+            yield left.pop(ranks.index(max(ranks)))
 
     def _put(self, content: dict[str, Any]) -> int:
         """Give the model and the environment the weights and statistics of a candidate."""
         self.model.policy.load_state_dict(content["policy"])
-        moments = moments_of(self.eval_env)
+        moments = moments_of(self.certificate_env)
         for name, (mean, var, count) in content["statistics"].items():
             part = moments[name]
             part.mean, part.var, part.count = mean.numpy(), var.numpy(), count
         return int(content["num_timesteps"])
 
     def _write(self, certificate: Certificate, steps: int) -> None:
+        """Put the certified agent into the place of an earlier one."""
         trained, self.model.num_timesteps = self.model.num_timesteps, steps
         with replacing(self.folder / MODEL) as file:
             self.model.save(file)
         self.model.num_timesteps = trained
-        normalizer = unwrap_vec_normalize(self.eval_env)
+        normalizer = unwrap_vec_normalize(self.certificate_env)
         if normalizer is not None:
             normalizer.save(str(self.folder / NORMALIZER))
-        with replacing(self.folder / "certificate.json") as file:  # last: it vouches for the others
+        # Last: until then the earlier certificate is of another agent than the one that is there.
+        with replacing(self.folder / "certificate.json") as file:
             file.write(certificate.to_json().encode())
         self.certificate = certificate
+
+
+def _played(content: dict[str, Any]) -> list[Candidate]:
+    """The candidates that a policy is, with each kind of actions; none if episodes did not end."""
+    return [
+        Candidate(content, kind, mean_return, costs.numpy())
+        for kind, (mean_return, costs) in content["played"].items()
+    ]

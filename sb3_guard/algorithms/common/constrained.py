@@ -25,9 +25,10 @@ from sb3_guard.algorithms.common.arguments import (
     signature,
     stated,
 )
-from sb3_guard.algorithms.common.costs import Costs, limits_of, time_limit
+from sb3_guard.algorithms.common.costs import Costs, scheduled_limits, time_limit
 from sb3_guard.checks import check_cost_keys
 from sb3_guard.costs import read_costs
+from sb3_guard.judging import Limits
 from sb3_guard.lost_costs import refuse_lost_costs
 from sb3_guard.vector import as_vec_env
 
@@ -52,8 +53,7 @@ class Constrained(BaseAlgorithm):
     :param limit_fall: share of the training over which it falls
     :param aim: what the training keeps within the limit: ``"mean"``, the mean cost of an episode;
         or ``"certificate"``, the mean and the half-width of its interval
-        (:meth:`~sb3_guard.algorithms.common.costs.Costs.half_width`), so that the agent can be
-        certified
+        (:meth:`~sb3_guard.judging.Limits.half_width`), so that the agent can be certified
     :param missing_cost: ``"error"`` if every ``info`` must have the cost keys, ``"zero"`` if an
         absent key means that nothing was charged
     :raises TypeError: an argument is not known; the message names the nearest one
@@ -150,7 +150,7 @@ class Constrained(BaseAlgorithm):
         self.cost_keys = check_cost_keys(self.cost_keys)  # loading turns tuples into lists
         check_theirs(self)
         for remaining in (1.0, 0.0):
-            limits_of(self, remaining)
+            scheduled_limits(self, remaining)
 
     def _setup_model(self) -> None:
         self._check_hyperparameters()
@@ -178,12 +178,12 @@ class Constrained(BaseAlgorithm):
 
         :raises ValueError: ``cost_limit`` was set to something that is not a limit
         """
-        return limits_of(self, self._current_progress_remaining)
+        return scheduled_limits(self, self._current_progress_remaining)
 
     @property
     def final_cost_limits(self) -> np.ndarray:
         """The limits at the end of the training, by which an agent is judged, shape (m,)."""
-        return limits_of(self, 0.0)
+        return scheduled_limits(self, 0.0)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         # The last rollout may go beyond the training's end, which no schedule knows of.
@@ -195,7 +195,7 @@ class Constrained(BaseAlgorithm):
         """Set the limits that the next update keeps to."""
         self.costs.limits = limits = self.cost_limits
         if self.aim == "certificate":
-            self.costs.limits = limits - self.costs.half_width(limits)
+            self.costs.limits = limits - Limits(limits).half_width(np.array(self.costs.recent))
 
     # Episodes
 

@@ -15,9 +15,6 @@ from sb3_guard.costs import EpisodeCosts
 # Agents that were saved while the estimate was one of these are read; their costs begin anew.
 CostEstimate = namedtuple("CostEstimate", "episode_cost horizon violation")
 
-# A certificate's last look: its episodes, and the quantile of its error, which three agents share.
-LAST_LOOK, QUANTILE = 400, 2.22
-
 _NUMBER = r"(-?\d+\.?\d*(?:e[+-]?\d+)?)"
 _LINE = re.compile(f"lin_{_NUMBER}_{_NUMBER}")
 
@@ -45,7 +42,7 @@ def limits_at(limit: Any, remaining: float) -> Any:
     return limit(remaining) if callable(limit) else limit
 
 
-def limits_of(algorithm: Any, remaining: float) -> np.ndarray:
+def scheduled_limits(algorithm: Any, remaining: float) -> np.ndarray:
     """d of each cost at a time of the training, by ``cost_limit`` and ``limit_start``, shape (m,).
 
     :param remaining: progress to come, from 1 at the beginning to 0 at the end
@@ -112,8 +109,8 @@ class Costs:
         self.episodes = EpisodeCosts(*shape, self.limit_on)
         #: what the last step cost, 0 before the first one of an episode, shape (n_envs, m)
         self.last = np.zeros(shape)
-        # What the limits bound, of the latest episodes, each of shape (m,)
-        self._recent: deque[np.ndarray] = deque(maxlen=100)
+        #: what the limits bound, of the latest episodes, each of shape (m,)
+        self.recent: deque[np.ndarray] = deque(maxlen=100)
 
     def forget(self) -> None:
         """Forget the episodes that have ended: the next estimate is about others."""
@@ -137,7 +134,7 @@ class Costs:
             if episode.row in broken:
                 continue
             self.ended.append(episode.bounded)
-            self._recent.append(episode.bounded)
+            self.recent.append(episode.bounded)
             self._lengths.append(episode.length)
             self.latest.append(episode.total)
         self.seen_lately |= seen
@@ -161,23 +158,6 @@ class Costs:
             self.horizon = self._length or length()
             self.episode_cost = rate * self.horizon
         return bool(self.ended) or rate is not None
-
-    def half_width(self, limits: np.ndarray) -> np.ndarray:
-        """How far J_C has to stay below the limits for a certificate, shape (m,).
-
-        ::
-
-            h = min(z s / √n, |d| / 2)        z = 2.22, n = 400
-
-        s is the standard deviation of the latest 100 episodes' costs; h is half of the interval of
-        :func:`sb3_guard.certify` for one cost, where three agents share an error of 5 %.
-
-        :param limits: d, shape (m,)
-        """
-        if len(self._recent) < 2:
-            return np.zeros(len(limits))
-        width = QUANTILE * np.std(self._recent, axis=0, ddof=1) / np.sqrt(LAST_LOOK)
-        return np.minimum(width, np.abs(limits) / 2)
 
     @property
     def violation(self) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_guard.costs import bounded_name
+from sb3_guard.judging import named
 from sb3_guard.spelling import did_you_mean
 from sb3_guard.zoo.cli.usage import UsageError, explained, one_line
 from sb3_guard.zoo.run.folder import RunFolder
@@ -112,7 +112,7 @@ def read_run(path: Path) -> dict[str, Any]:
     costs, limit_on, by_key = result["costs"], result.get("limit_on", "sum"), {}
     if len(costs) > 1 or limit_on != "sum":  # limits are on other costs than the total
         for key, cost in costs.items():
-            name = bounded_name(key, limit_on)
+            name = named(key, limit_on)
             by_key[f"M_c/{name}"] = _number(cost["mean"])
             by_key[f"cost_limit/{name}"] = _number(cost["limit"])
     rollout = [config.get(name) for name in ("n_envs", "n_steps")]

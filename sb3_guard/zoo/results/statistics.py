@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sb3_guard.costs import bounded_name, verdict
+from sb3_guard.judging import kept, named
 from sb3_guard.zoo.results.runs import REFERENCE, read_episodes
 from sb3_guard.zoo.run.folder import EPOCH, PLAYED
 
@@ -70,7 +70,7 @@ def read_splits(path: str | Path, epoch: float = math.nan) -> dict[str, pd.DataF
         splits["training"] = last_epochs(read_episodes(path), epoch).filter(regex="^(J_r|M_c)")
     for split, episodes in result.get("final", {}).items():
         bounded = episodes.get("bounded", {}).items()
-        keys = {f"M_c/{bounded_name(key, limit_on)}": costs for key, costs in bounded}
+        keys = {f"M_c/{named(key, limit_on)}": costs for key, costs in bounded}
         costs = {"M_c": episodes["costs"], **keys}
         # NaN: a physics error ended it
         splits[split] = pd.DataFrame({"J_r": episodes["returns"], **costs}, dtype=float)
@@ -128,7 +128,7 @@ def judge(runs: pd.DataFrame) -> pd.DataFrame:
         (empty: the total), ``seeds``, ``limit`` (NaN: none), ``return`` and ``cost``, means over
         seeds of their episodes' means, with ``_std`` (over seeds; NaN for one), ``low`` and
         ``high`` of the cost (:func:`nested_interval`), ``verdict``
-        (:func:`~sb3_guard.costs.verdict`, SafeRLEval's tier; empty: no limit), ``diverged``
+        (:func:`~sb3_guard.judging.kept`, SafeRLEval's tier; empty: no limit), ``diverged``
         (further episodes, which a physics error ended), ``above`` and ``excess``
         (:func:`violations`, of all seeds' episodes)
     """
@@ -169,7 +169,7 @@ def _row(seeds: Sequence[pd.DataFrame], column: str, limit: float) -> dict[str, 
         "cost_std": means[column].std(),
         "low": low,
         "high": high,
-        "verdict": "" if math.isnan(limit) else verdict(low, high, limit, diverged) or "undecided",
+        "verdict": "" if math.isnan(limit) else kept(low, high, limit, diverged),
         "diverged": diverged,
         "above": math.nan if math.isnan(limit) else above,
         "excess": excess,

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sb3_guard.common.files import replacing
-from sb3_guard.costs import beside
+from sb3_guard.judging import physics_errors
 from sb3_guard.zoo.cli.markdown import escaped, table
 from sb3_guard.zoo.cli.usage import explained
 from sb3_guard.zoo.results.figure_data import Data
@@ -147,7 +147,7 @@ VERDICT_HEADINGS: Columns = {
     "limit": lambda row: (
         "–"
         if pd.isna(row["limit"])
-        else f"{row['limit']:g}: {row['verdict']}" + beside(row["diverged"])
+        else f"{row['limit']:g}: {row['verdict']}" + physics_errors(row["diverged"])
     ),
     "above limit, %": lambda row: number(100 * row["above"], 1),
     "excess": "excess",

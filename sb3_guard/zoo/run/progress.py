@@ -18,7 +18,7 @@ import sb3_guard
 from sb3_guard.algorithms.common.costs import limits_at
 from sb3_guard.checks import NumberError
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
-from sb3_guard.costs import estimate
+from sb3_guard.judging import Mean
 from sb3_guard.zoo.run.folder import EPOCH
 
 DIVERGED = 10  # episodes in a row that a physics error ended, after which training stops
@@ -143,9 +143,9 @@ class Epochs(BaseCallback):
 
         :return: ``label`` and ``family`` that the algorithm's class states; of the last epoch in
             which any episode ended the number of ``episodes``, ``return``, ``cost`` and
-            ``length``, means, and ``costs``, by key the ``mean`` of what its limit bounds, the
-            95 % interval of that mean (``low``, ``high``), the ``limit`` and the ``verdict``, which
-            need five episodes, and the number of further episodes that ended in ``physics_errors``;
+            ``length``, means, and ``costs``, by key the ``mean`` of what its limit bounds, its
+            ``standard_error``, the ``limit``, and the number of further episodes that ended in
+            ``physics_errors``;
             ``cost_rate``, cumulative cost ÷ steps of the whole run, ``physics_errors``, the number
             of episodes that one ended, ``cost_limit`` (None: unconstrained), ``limit_on`` of an
             algorithm that limits the worst step, ``cut`` where a wrapper ended the episodes early,
@@ -160,11 +160,9 @@ class Epochs(BaseCallback):
         means = episodes[:, :3].mean(axis=0).tolist() if len(episodes) else [None] * 3
         bounded = self.last[:, 3:].T if len(self.last) else np.zeros((len(keys), 0))
         costs = {
-            key: estimate(values).judged(limit)
+            key: {**Mean.of(values).data(), "limit": limit}
             for key, values, limit in zip(keys, bounded, limits, strict=True)
         }
-        for cost in costs.values() if self.cut else ():
-            cost.pop("verdict", None)
         rate = monitor.total_cost / monitor.total_steps if monitor.total_steps else None
         return {
             "label": getattr(model, "label", None),

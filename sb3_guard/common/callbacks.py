@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.costs import limits_at
 from sb3_guard.common.evaluation import (
+    BROKEN_OFF,
     Evaluation,
     check_agent,
     evaluate_policy,
@@ -23,7 +24,7 @@ from sb3_guard.common.evaluation import (
 )
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of, find_monitor
-from sb3_guard.vector import as_vec_env
+from sb3_guard.vector import as_vec_env, normalizer_of
 
 # What a run continues with
 KEPT = (
@@ -183,10 +184,7 @@ class CostEvalCallback(EvalCallback):
         self.limits()
         check_agent(self.model, self.eval_env)
         if share_environment(self.training_env, self.eval_env):
-            raise ValueError(
-                "eval_env is the training environment, whose episodes every evaluation would "
-                "break off: make another one for it"
-            )
+            raise ValueError(BROKEN_OFF)
 
     def limits(self) -> np.ndarray:
         """
@@ -311,7 +309,7 @@ class CostEvalCallback(EvalCallback):
         folder = Path(self.best_model_save_path)
         with replacing(folder / "best_model.zip") as file:
             self.model.save(file)
-        normalizer = self.model.get_vec_normalize_env()
+        normalizer = normalizer_of(self.training_env)
         if normalizer is not None:
             with replacing(folder / "best_model_vecnormalize.pkl") as file:
                 pickle.dump(normalizer, file)

@@ -18,16 +18,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_guard.algorithms.common.constrained import Constrained
 from sb3_guard.checks import check_cost_keys, check_per_cost
-from sb3_guard.common.evaluation import (
-    Evaluation,
-    evaluate_policy,
-    lacks_statistics,
-    moments_of,
-)
+from sb3_guard.common.evaluation import Evaluation, evaluate_policy
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.costs import bounded_name
 from sb3_guard.fields import fit
-from sb3_guard.vector import as_vec_env
+from sb3_guard.vector import as_vec_env, lacks_statistics, moments_of, own_statistics
 
 #: The looks at the episodes, as shares of all. Only the last one can certify: costs that are rare
 #: and high are often absent from fewer episodes, which then all look safe.
@@ -65,7 +60,7 @@ def mean_bounds(values: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarra
         root = np.cbrt(1.0 + skewness * (t / math.sqrt(n) - skewness / (6 * n)))
         return mean - deviation * 3.0 / skewness * (root - 1.0)
 
-    t = float(stats.t.ppf(1.0 - error, n - 1))
+    t = float(stats.t.isf(error, n - 1))
     return bound(t), bound(-t)
 
 
@@ -173,7 +168,7 @@ class Certificate:
         costs = [cost for cost in self.costs.values() if cost.verdict == "undecided"]
         if not costs or self.physics_errors or any(cost.mean == cost.limit for cost in costs):
             return None
-        t = stats.norm.ppf(1.0 - UPPER * self.error / self.tries / len(self.costs))
+        t = stats.norm.isf(UPPER * self.error / self.tries / len(self.costs))
         widths = (t * cost.deviation / abs(cost.mean - cost.limit) for cost in costs)
         return math.ceil(max(max(widths) ** 2, 1.1 * self.episodes))
 
@@ -325,10 +320,13 @@ def certify(
 
 def refuse_training_only(env: VecEnv) -> None:
     """
-    :raises ValueError: a wrapper is for training only: other costs would be certified
+    :raises ValueError: a wrapper is for training only, or has statistics that move: other costs
+        would be certified
     """
     if getattr(env, "training_only", False):  # of any wrapper
         raise ValueError("a wrapper of env is for training only: certify without it")
+    if fault := own_statistics(env):
+        raise ValueError(fault)
 
 
 def limits_of(model: Any, cost_limit: Any, keys: tuple[str, ...]) -> list[float]:

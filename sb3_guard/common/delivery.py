@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_guard.common.certificate import (
@@ -22,15 +22,11 @@ from sb3_guard.common.certificate import (
     limits_of,
     refuse_training_only,
 )
-from sb3_guard.common.evaluation import (
-    check_agent,
-    evaluate_policy,
-    moments_of,
-    sync_normalization,
-)
+from sb3_guard.common.evaluation import check_agent, evaluate_policy, sync_normalization
 from sb3_guard.common.files import replacing
 from sb3_guard.common.monitor import cost_keys_of
 from sb3_guard.fields import fit
+from sb3_guard.vector import moments_of, normalizer_of
 
 HELP = (
     "a training with more steps (-n), more episodes (--certify), a lower cost_limit than you need, "
@@ -251,7 +247,7 @@ class DeliveryCallback(BaseCallback):
         with replacing(self.folder / MODEL) as file:
             self.model.save(file)
         self.model.num_timesteps = trained
-        normalizer = unwrap_vec_normalize(self.eval_env)
+        normalizer = normalizer_of(self.eval_env)
         if normalizer is not None:
             normalizer.save(str(self.folder / NORMALIZER))
         with replacing(self.folder / "certificate.json") as file:  # last: it vouches for the others

@@ -4,7 +4,7 @@ import copy
 import inspect
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,16 +16,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import PolicyPredictor
-from stable_baselines3.common.vec_env import (
-    VecEnv,
-    VecMonitor,
-    VecNormalize,
-    is_vecenv_wrapped,
-    unwrap_vec_normalize,
-)
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 from sb3_guard.algorithms.common.constrained import Constrained
-from sb3_guard.checks import NumberError, check_cost_keys, is_number
+from sb3_guard.checks import NumberError, check_cost_keys
 from sb3_guard.common.monitor import cost_keys_of, total_cost
 from sb3_guard.costs import (
     EpisodeCost,
@@ -36,8 +30,20 @@ from sb3_guard.costs import (
     estimate,
     read_costs,
 )
-from sb3_guard.vector import as_vec_env
+from sb3_guard.vector import (
+    as_vec_env,
+    lacks_statistics,
+    layers,
+    moments_of,
+    normalizer_of,
+    own_statistics,
+    step_limits,
+)
 
+BROKEN_OFF = (
+    "eval_env is the training environment, whose episodes every evaluation would break off: make "
+    "another one for it"
+)
 LONGEST = 20_000  # steps of an episode that nothing ends, after which it is given up
 
 
@@ -120,7 +126,7 @@ def sync_normalization(env: VecEnv, eval_env: VecEnv) -> None:
     :param eval_env: evaluation environment
     :raises ValueError: the evaluation environment is not normalised, but training is
     """
-    training, evaluation = unwrap_vec_normalize(env), unwrap_vec_normalize(eval_env)
+    training, evaluation = normalizer_of(env), normalizer_of(eval_env)
     if training is None:
         return
     if evaluation is None:
@@ -152,7 +158,7 @@ def check_agent(model: Any, env: VecEnv) -> None:
                     f"the agent can't act: its weights {name!r} are not finite; take an earlier "
                     "model, or train it again with a lower learning_rate"
                 )
-    normalizer = unwrap_vec_normalize(env)
+    normalizer = normalizer_of(env)
     if normalizer is not None:
         check_normalizer(normalizer, normalizer.venv.observation_space)
 
@@ -172,50 +178,36 @@ def check_normalizer(normalizer: Any, space: spaces.Space) -> None:
     if not normalizer.norm_obs:
         return
     several = isinstance(space, spaces.Dict)
-    entries: Any = space.spaces if isinstance(space, spaces.Dict) else {None: space}
+    entries: Any = space.spaces if isinstance(space, spaces.Dict) else {"": space}
     zeros = {name: np.zeros(entry.shape or ()) for name, entry in entries.items()}
     try:
         with np.errstate(all="ignore"):
-            seen: Any = normalizer.normalize_obs(zeros if several else zeros[None])
+            seen: Any = normalizer.normalize_obs(zeros if several else zeros[""])
     except Exception as error:
         fault = f"{type(error).__name__}: {error}"
         raise ValueError(f"observation statistics do not fit {space}: {fault}") from None
-    for name, values in (seen if several else {None: seen}).items():
-        if np.shape(values) != zeros[name].shape or not np.isfinite(values).all():
-            of = "" if name is None else f" of {name!r}"
+    moments = moments_of(normalizer)
+    for name, values in (seen if several else {"": seen}).items():
+        part = moments.get(name, RunningMeanStd(shape=zeros[name].shape))
+        shapes = {np.shape(numbers) for numbers in (values, part.mean, part.var)}
+        sound = np.isfinite(values).all() and np.all(part.var > 0.0)
+        if shapes != {zeros[name].shape} or not sound:
+            of = f" of {name!r}" if name else ""
             raise ValueError(
                 f"observation statistics do not fit {space}: means and variances{of} have another "
-                "shape, or are not finite"
+                "shape, or are not finite, or a variance is not above 0"
             )
 
 
 def share_environment(one: VecEnv, other: VecEnv) -> bool:
     """Whether to reset one of two vectorised environments resets something of the other, too."""
-    parts: list[set[int]] = []
-    for env in (one.unwrapped, other.unwrapped):
-        inner = getattr(env, "envs", [])  # a list of single environments, or one batch
+
+    def parts(env: VecEnv) -> set[int]:
+        inner = getattr(env.unwrapped, "envs", [])  # a list of single environments, or one batch
         inner = inner if isinstance(inner, list) else [inner]
-        parts.append({id(env), *(id(part.unwrapped) for part in inner)})
-    return not parts[0].isdisjoint(parts[1])
+        return {id(env.unwrapped), *(id(part.unwrapped) for part in inner)}
 
-
-def moments_of(env: VecEnv | None) -> dict[str, RunningMeanStd]:
-    """What normalises observations, by their entries (``""``: they have none); empty: nothing."""
-    normalizer = None if env is None else unwrap_vec_normalize(env)
-    if normalizer is None or not normalizer.norm_obs:
-        return {}
-    moments = normalizer.obs_rms
-    return moments if isinstance(moments, dict) else {"": moments}
-
-
-def lacks_statistics(model: Any, env: VecEnv | None) -> bool:
-    """Whether an agent learnt from normalised observations, and ``env`` has no means of them."""
-    learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
-    if not getattr(model, "learnt_normalized", learnt_with is not None and learnt_with.norm_obs):
-        return False
-    moments = moments_of(env)
-    # Those of a new VecNormalize are of no observation.
-    return not moments or any(part.count < 1 for part in moments.values())
+    return not parts(one).isdisjoint(parts(other))
 
 
 @contextmanager
@@ -224,9 +216,9 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
 
     :raises ValueError: the model's own environment normalises observations, and this one nothing
     """
-    learnt_with = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
-    normalizer = unwrap_vec_normalize(env)
-    if normalizer is None and learnt_with is not None and learnt_with.norm_obs:
+    normalizer = normalizer_of(env)
+    learnt_with = moments_of(model.get_env()) if isinstance(model, BaseAlgorithm) else None
+    if normalizer is None and learnt_with:
         raise ValueError(
             "the model learnt from normalised observations, and env has no VecNormalize: "
             "evaluate it in model.get_env(), or wrap env in VecNormalize and call "
@@ -238,6 +230,8 @@ def _constant_normalization(model: PolicyPredictor, env: VecEnv) -> Iterator[Non
             "unless it normalises them in another way, these are not its return and cost",
             stacklevel=4,
         )
+    if fault := own_statistics(env):
+        warnings.warn(fault, stacklevel=4)
     if normalizer is None:
         yield
         return
@@ -288,8 +282,8 @@ def evaluate_policy(
     sb3-contrib's MaskablePPO, is given those of environments that have the method.
 
     A model's own training environment will do: if ``learn`` is called again, it begins new
-    episodes. In a callback, which runs during ``learn``, evaluate in another environment. The
-    statistics of ``VecNormalize`` stay as they are.
+    episodes. During a rollout, as in a callback, it is refused. The statistics of
+    ``VecNormalize`` stay as they are.
 
     :param model: anything with ``predict``: an algorithm or a policy
     :param env: a single or a vectorised environment; it is reset first
@@ -307,7 +301,8 @@ def evaluate_policy(
     :param on_step: called after each step, e.g. to render
     :param on_episode: called with return, cost and length of each counted episode as it ends
     :raises ValueError: ``n_eval_episodes`` is below 1, a cost is not finite or missing where it
-        must not be, or the model's own environment normalises observations and ``env`` nothing
+        must not be, ``env`` is the environment of a training that is under way, or the model's own
+        environment normalises observations and ``env`` nothing
     """
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, not {n_eval_episodes}")
@@ -319,13 +314,18 @@ def evaluate_policy(
     zero_if_missing = getattr(model, "missing_cost", "zero") == "zero"
     policy = getattr(model, "policy", model)
     acts_on_cost = getattr(policy, "acts_on_cost", False)
-    if isinstance(model, Constrained) and model.env is not None:
-        model.begin_anew |= share_environment(model.env, env)
+    if isinstance(model, Constrained) and model.env and share_environment(model.env, env):
+        if model.collecting:
+            raise ValueError(BROKEN_OFF)
+        model._last_obs = None  # so the next learn begins new episodes, as after set_env
 
-    longest = _longest_episode(env) if max_steps is None else None
+    # steps after which an episode is given up
+    longest = int(max([LONGEST, *step_limits(env)])) if max_steps is None else None
     tally = _Tally(env, n_eval_episodes, keys, on_episode, longest)
-    # sampled actions are drawn from the seed, and torch's generators stay as they were
-    with _constant_normalization(model, env), th.random.fork_rng(enabled=seed is not None):
+    # sampled actions are drawn from the seed, and the generators that draw them stay as they were
+    device = th.device(getattr(model, "device", "cpu"))
+    forked = th.random.fork_rng([device] if device.type == "cuda" else [], seed is not None)
+    with _constant_normalization(model, env), forked:
         if seed is not None:
             th.manual_seed(seed)
             env.seed(seed)
@@ -352,15 +352,6 @@ def evaluate_policy(
     return tally.evaluation(getattr(model, "limit_on", "sum"), limits_on(model, keys))
 
 
-def _longest_episode(env: VecEnv) -> int:
-    """Steps after which an episode is given up."""
-    limits: list[Any] = []
-    for name in ("_max_episode_steps", "max_episode_steps"):  # of TimeLimit, and of our batches
-        with suppress(NotImplementedError):  # a vectorised environment need not tell
-            limits += env.get_attr(name) if env.has_attr(name) else []
-    return max([LONGEST, *(int(limit) for limit in limits if is_number(limit))])
-
-
 class _Tally:
     """
     Return, costs and steps of the episodes of vectorised environments, under way and ended.
@@ -377,9 +368,15 @@ class _Tally:
         on_episode: Callable[[float, float, int], Any] | None,
         longest: int | None,
     ) -> None:
-        n = env.num_envs
+        n, self.env = env.num_envs, env
         self.keys, self.on_episode, self.longest = keys, on_episode, longest
-        self.monitored = is_vecenv_wrapped(env, VecMonitor) or env.env_is_wrapped(Monitor)[0]
+        self.monitored = env.env_is_wrapped(Monitor)[0]
+        normalizer = normalizer_of(env)
+        #: VecNormalize where it changes rewards; returns that a monitor outside of it reports are
+        #: of changed ones
+        self.changing = normalizer if normalizer and normalizer.norm_reward else None
+        kinds = (layer for layer in layers(env) if isinstance(layer, VecMonitor | VecNormalize))
+        self.reported = not (self.changing and isinstance(next(kinds), VecMonitor))
         self.asked = n_eval_episodes
         self.left = shares(n_eval_episodes, n)
         self.returns = np.zeros(n)
@@ -397,7 +394,7 @@ class _Tally:
         infos: list[dict[str, Any]],
     ) -> None:
         """Add a step of every environment, and the episodes that it ends; give up endless ones."""
-        self.returns += rewards
+        self.returns += rewards if self.changing is None else self.changing.get_original_reward()
         if self.absent:
             self.absent.difference_update(*infos)
         if len(self.keys) == 1:
@@ -405,8 +402,8 @@ class _Tally:
         else:
             totals = np.array([[total_cost(info, self.keys)] for info in infos])
         over = np.array(dones, dtype=bool)
-        for i in np.flatnonzero(dones):
-            over[i] = self._is_over(infos[i])
+        for i in np.flatnonzero(dones).tolist():
+            over[i] = self._is_over(i, infos[i])
         for cost in self.costs.step(np.hstack([costs, totals]), over):
             self._end(cost, infos[cost.row])
         if self.longest is not None:
@@ -420,13 +417,14 @@ class _Tally:
         lengths = self.costs.lengths
         return np.stack([self.returns, self.costs.totals[:, -1], lengths], axis=1)[rows]
 
-    def _is_over(self, info: dict[str, Any]) -> bool:
+    def _is_over(self, row: int, info: dict[str, Any]) -> bool:
         """Whether an episode that a step ended has come to its true end.
 
-        That of one cut by a wrapper outside the monitor (a life lost, in Atari) is still to come,
-        unless the wrapper is EarlyTermination.
+        Where a wrapper outside Monitor has ended it, it goes on if Monitor has not been reset, as
+        after a life lost in Atari.
         """
-        return not self.monitored or "episode" in info or "budget_exceeded" in info
+        reset = not self.monitored or "episode" in info
+        return reset or not self.env.get_attr("rewards", [row])[0]
 
     def _end(self, cost: EpisodeCost, info: dict[str, Any]) -> None:
         """Count an episode that is over, if one is still to be played."""
@@ -434,8 +432,9 @@ class _Tally:
         if self.left[i]:
             self.left[i] -= 1
             earned, steps = float(self.returns[i]), cost.length
-            episode = info.get("episode")
-            if episode is not None:
+            episode = info.get("episode") if self.reported else None
+            # Other steps than Monitor's are of several episodes, some ended by a wrapper outside.
+            if episode is not None and (self.monitored or episode["l"] == steps):
                 earned, steps = float(episode["r"]), int(episode["l"])
             cost = cost.known(info)
             self.ended.append((earned, steps, cost))
